@@ -1,0 +1,1 @@
+"""The controller process: native step and its binding, loop, fallback, pure pursuit."""

@@ -1,0 +1,1 @@
+"""What runs the parts together: race, benchmark, report, command line."""
