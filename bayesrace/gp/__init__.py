@@ -1,0 +1,27 @@
+"""The GP residual as data (:mod:`.weights`) and as an expression (:mod:`.expression`, CasADi)."""
+
+from bayesrace.gp.weights import (
+    FEATURES,
+    KERNELS,
+    OUTPUTS,
+    GpOutput,
+    GpWeights,
+    decode_weights,
+    encode_weights,
+    read_weights,
+    write_weights,
+    zero_weights,
+)
+
+__all__ = [
+    "FEATURES",
+    "KERNELS",
+    "OUTPUTS",
+    "GpOutput",
+    "GpWeights",
+    "decode_weights",
+    "encode_weights",
+    "read_weights",
+    "write_weights",
+    "zero_weights",
+]

@@ -1,0 +1,43 @@
+"""Which samples to keep when there are more than the controller has room for."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesrace.gp.expression import kernel_matrix
+
+__all__ = ["evenly", "most_informative"]
+
+Floats = NDArray[np.float64]
+
+
+def evenly(count: int, wanted: int) -> NDArray[np.int64]:
+    """``wanted`` of ``count`` indices, evenly spaced; all if there are not more."""
+    if count <= wanted:
+        return np.arange(count)
+    return np.floor((np.arange(wanted) + 0.5) * count / wanted).astype(np.int64)
+
+
+def most_informative(
+    kind: str, z: Floats, length_scales: Floats, noise_ratio: float, wanted: int
+) -> NDArray[np.int64]:
+    """Indices of ``wanted`` samples, each of largest posterior variance given those before it.
+
+    A pivoted Cholesky factorisation: O(n wanted^2) time, O(n wanted) memory. ``noise_ratio`` is
+    noise over signal variance. Sorted, so that blocks of samples stay blocks of a drive.
+    """
+    count = len(z)
+    if count <= wanted:
+        return np.arange(count)
+    variance = np.ones(count)
+    columns = np.zeros((wanted, count))
+    chosen = np.zeros(wanted, dtype=np.int64)
+    for step in range(wanted):
+        pivot = int(np.argmax(variance))
+        chosen[step] = pivot
+        column = kernel_matrix(kind, z, z[pivot : pivot + 1], length_scales)[:, 0]
+        column -= columns[:step, pivot] @ columns[:step]
+        column /= np.sqrt(max(variance[pivot], 0.0) + noise_ratio)
+        columns[step] = column
+        variance -= column**2
+        variance[pivot] = -np.inf
+    return np.sort(chosen)

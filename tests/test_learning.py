@@ -1,0 +1,395 @@
+"""Learning: samples, residual, likelihood, training, validation."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
+
+from bayesrace.errors import InputError
+from bayesrace.gp.expression import evaluate_mean
+from bayesrace.gp.weights import FEATURES, OUTPUTS, GpOutput, GpWeights, zero_weights
+from bayesrace.integrators import PREDICTION, Discretisation
+from bayesrace.messages import State, Telemetry
+from bayesrace.vehicles import get_car
+from bayesrace.vehicles.models import Model, dynamic, e_kinematic
+from learning.crossvalidation import held_out
+from learning.dataset import Dataset, concatenate, dataset_from_arrays, filter_dataset
+from learning.hyperparameters import BOUNDS, maximise, starts
+from learning.likelihood import MarginalLikelihood
+from learning.logs import dataset_from_log, dataset_from_messages
+from learning.published import read_published
+from learning.residual import identity, residual
+from learning.subset import evenly, most_informative
+from learning.training import TrainingSettings, train
+from learning.validation import predictive_sigma, validate, with_metrics
+
+Floats = NDArray[np.float64]
+
+CAR = get_car("orca")
+STEP_S = PREDICTION.step_s
+NU = {"matern05": 0.5, "matern15": 1.5, "matern25": 2.5}
+QUICK = TrainingSettings(kernels=("rbf",), restarts=0, hyper_points=100, iterations=25)
+
+
+def drive(model: Model, count: int, seed: int, substeps: int = 10, vx: float = 1.5) -> Dataset:
+    """Random smooth inputs within the limits, one unbroken drive."""
+    random = np.random.default_rng(seed)
+    step = Discretisation(scheme="rk4", step_s=STEP_S, substeps=substeps).discretise(model)
+    phase = random.uniform(0, 2 * np.pi, 3)
+    x = [np.array([0, 0, 0, vx, 0, 0, 0.0])]
+    u = []
+    for k in range(count):
+        target = 0.25 * np.sin(0.13 * k + phase[0]) + 0.05 * np.sin(0.71 * k + phase[1])
+        rate = np.clip((target - x[-1][6]) / STEP_S, -5, 5)
+        duty = np.clip(0.35 + 0.3 * np.sin(0.05 * k + phase[2]), -0.1, 1)
+        u.append([duty, rate])
+        x.append(np.array(step(x[-1], u[-1]))[:, 0])
+    return dataset_from_arrays(CAR, STEP_S, np.array(x), np.array(u))
+
+
+@pytest.fixture(scope="module")
+def driven() -> Dataset:
+    return drive(dynamic(CAR), 160, seed=1)
+
+
+def gp_problem(count: int, seed: int = 0) -> tuple[Floats, Floats]:
+    random = np.random.default_rng(seed)
+    z = random.normal(size=(count, 6))
+    return z, np.sin(2 * z[:, 0]) + z[:, 1] * z[:, 3] + 0.1 * random.normal(size=count)
+
+
+# --- samples ---------------------------------------------------------------------------------
+
+
+def test_residual_of_the_nominal_model_with_itself_is_zero() -> None:
+    data = drive(e_kinematic(CAR), 60, seed=0, substeps=PREDICTION.substeps)
+    assert np.abs(residual(data, PREDICTION)).max() < 1e-12
+
+
+def test_residual_of_another_scheme_is_not_zero() -> None:
+    """Why there is one discretisation object: mixed integrators look like model mismatch."""
+    data = drive(e_kinematic(CAR), 60, seed=0, substeps=1)
+    euler = Discretisation(scheme="euler", step_s=STEP_S, substeps=1)
+    assert np.abs(residual(data, euler)).max() > 1e-3
+    assert identity(data, euler) != identity(data, PREDICTION)
+
+
+def test_residual_needs_the_recorded_step(driven: Dataset) -> None:
+    with pytest.raises(InputError, match="step"):
+        residual(driven, Discretisation(scheme="rk4", step_s=0.01, substeps=1))
+
+
+def test_filter_counts_what_it_leaves_out(driven: Dataset) -> None:
+    assert len(filter_dataset(driven)) == len(driven)
+    x, u, x_next = driven.x.copy(), driven.u.copy(), driven.x_next.copy()
+    x[0, 3] = 0.01
+    u[1, 0], u[2, 1], x[3, 6] = 1.2, 5.1, -0.36
+    x_next[4, 6] += 0.01
+    kept = filter_dataset(Dataset(CAR, STEP_S, x, u, x_next))
+    assert len(kept) == len(driven) - 5
+    assert dict(kept.dropped) == {
+        "standstill": 1,
+        "outside limits": 3,
+        "steering does not match its rate": 1,
+    }
+
+
+def test_datasets_are_checked(driven: Dataset) -> None:
+    with pytest.raises(InputError, match="shape"):
+        Dataset(CAR, STEP_S, driven.x, driven.u[:-1], driven.x_next)
+    broken = driven.u.copy()
+    broken[3, 0] = np.nan
+    with pytest.raises(InputError, match="row 3"):
+        Dataset(CAR, STEP_S, driven.x, broken, driven.x_next)
+    with pytest.raises(InputError, match="mixed"):
+        concatenate([driven, Dataset(CAR, 0.01, driven.x, driven.u, driven.x_next)])
+    with pytest.raises(InputError):
+        concatenate([])
+    both = concatenate([driven, driven])
+    assert len(both) == 2 * len(driven)
+    assert both.digest() != driven.digest()
+    assert driven.select(slice(None)).digest() == driven.digest()
+    assert driven.features.shape == (len(driven), len(FEATURES))
+
+
+def state(run: int, seq: int, x: Floats, u: Floats) -> State:
+    values: dict[str, Any] = {"seq": seq, "source_time_ns": 0, "run": run, "lap": 0}
+    time_s = round(seq * STEP_S, 9)
+    return State(**values, time_s=time_s, x=tuple(x), u_applied=tuple(u), lockstep=True)
+
+
+def telemetry(run: int, state_seq: int, fallback: int) -> Telemetry:
+    zero = ("seq", "source_time_ns", "status", "iterations", "solve_us", "s_ref_m", "n_ref_m")
+    residuals = ("residual_dynamics", "residual_bounds", "residual_stationarity")
+    values: dict[str, Any] = dict.fromkeys(zero + residuals, 0) | {"plan_x": (), "plan_u": ()}
+    return Telemetry(**values, run=run, state_seq=state_seq, fallback=fallback)
+
+
+def logged(data: Dataset, run: int) -> list[State]:
+    """The states a plant would publish: each tells the input of the period before."""
+    x = np.vstack((data.x, data.x_next[-1:]))
+    u = np.vstack((np.zeros(2), data.u))
+    return [state(run, k, x[k], u[k]) for k in range(len(x))]
+
+
+def test_messages_become_the_samples_that_were_driven(driven: Dataset) -> None:
+    states = logged(driven, 0)
+    data = dataset_from_messages(states, [telemetry(0, 5, 0)], CAR, STEP_S)
+    assert np.array_equal(data.x, driven.x)
+    assert np.array_equal(data.u, driven.u)
+    assert np.array_equal(data.x_next, driven.x_next)
+    assert not data.dropped
+
+
+def test_gaps_fallback_and_other_runs_are_left_out(driven: Dataset) -> None:
+    first, second = logged(driven, 0), logged(driven, 1)
+    messages = first[:10] + first[11:] + second
+    seen = [telemetry(0, 3, 1), telemetry(0, 4, 2), telemetry(1, 3, 0)]
+    everything = dataset_from_messages(messages, seen, CAR, STEP_S)
+    assert dict(everything.dropped) == {"gap": 1, "fallback": 2}
+    assert len(everything) == 2 * len(driven) - 2 - 2
+    one = dataset_from_messages(messages, seen, CAR, STEP_S, runs=(1,))
+    assert len(one) == len(driven)
+    with pytest.raises(InputError, match="driven"):
+        dataset_from_messages([], [], CAR, STEP_S)
+
+
+def test_a_missing_log_is_an_input_error(tmp_path: Path) -> None:
+    with pytest.raises(InputError):
+        dataset_from_log(tmp_path / "none.mcap", CAR, STEP_S)
+
+
+@pytest.mark.parametrize("rows", [6, 7])
+def test_published_arrays_hold_the_angle_at_the_end_of_the_step(tmp_path: Path, rows: int) -> None:
+    random = np.random.default_rng(0)
+    states = random.normal(size=(rows, 8))
+    inputs = np.vstack((np.full(7, 0.5), random.uniform(-0.3, 0.3, 7)))
+    states[:, 6:], inputs[:, 6:] = 0, 0
+    np.savez(tmp_path / "drive.npz", states=states, inputs=inputs)
+    data = read_published(tmp_path / "drive.npz", CAR, STEP_S)
+    assert len(data) == 5  # two padding columns are gone
+    assert data.x[0, 6] == 0
+    assert np.allclose(data.x_next[:, 6], inputs[1, :5])
+    assert np.allclose(data.x[:, 6] + STEP_S * data.u[:, 1], data.x_next[:, 6])
+
+
+def test_other_arrays_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "x.npz"
+    np.savez(path, states=np.zeros((5, 4)), inputs=np.zeros((2, 3)))
+    with pytest.raises(InputError, match="states"):
+        read_published(path, CAR, STEP_S)
+    np.savez(path, states=np.zeros((6, 4)))
+    with pytest.raises(InputError, match="inputs"):
+        read_published(path, CAR, STEP_S)
+    np.savez(path, states=np.array([{}]), inputs=np.zeros((2, 3)))  # a pickle in disguise
+    with pytest.raises(InputError):
+        read_published(path, CAR, STEP_S)
+    path.write_bytes(b"nothing")
+    with pytest.raises(InputError):
+        read_published(path, CAR, STEP_S)
+    with pytest.raises(InputError):
+        read_published(tmp_path / "none.npz", CAR, STEP_S)
+
+
+# --- likelihood, cross-validation, choice of samples -------------------------------------------
+
+
+def sklearn_gp(kind: str, theta: Floats, z: Floats, y: Floats) -> GaussianProcessRegressor:
+    lengths = np.exp(theta[1:-1])
+    base = RBF(lengths) if kind == "rbf" else Matern(lengths, nu=NU[kind])
+    covariance = ConstantKernel(np.exp(theta[0])) * base + WhiteKernel(np.exp(theta[-1]))
+    return GaussianProcessRegressor(covariance, alpha=0.0, optimizer=None).fit(z, y)
+
+
+@pytest.mark.parametrize("kind", ["rbf", "matern05", "matern15", "matern25"])
+def test_likelihood_and_gradient_equal_scikit_learn(kind: str) -> None:
+    z, y = gp_problem(50)
+    for theta in starts(2, seed=3):
+        ours, our_gradient = MarginalLikelihood(kind, z, y)(theta)
+        gp = sklearn_gp(kind, theta, z, y)
+        theirs, their_gradient = gp.log_marginal_likelihood(theta, eval_gradient=True)
+        assert ours == pytest.approx(theirs, rel=1e-9)
+        assert our_gradient == pytest.approx(their_gradient, rel=1e-6, abs=1e-7)
+
+
+def test_singular_covariance_is_minus_infinity_not_an_error() -> None:
+    z, y = np.zeros((5, 6)), np.arange(5.0)
+    value, gradient = MarginalLikelihood("rbf", z, y)(np.log([1.0] + [1.0] * 6 + [1e-30]))
+    assert value == -np.inf
+    assert not gradient.any()
+
+
+def test_optimum_has_no_slope_within_the_bounds() -> None:
+    z, y = gp_problem(80)
+    fit = maximise("rbf", z, y, starts(0, 0)[0], 200)
+    _, gradient = MarginalLikelihood("rbf", z, y)(fit.theta)
+    free = (fit.theta > BOUNDS[:, 0] + 1e-9) & (fit.theta < BOUNDS[:, 1] - 1e-9)
+    assert np.abs(gradient[free]).max() / len(y) < 1e-3
+    assert np.exp(fit.theta[-1]) == pytest.approx(0.01, rel=0.9)
+
+
+def test_block_errors_equal_training_without_the_block() -> None:
+    z, y = gp_problem(30)
+    theta = np.log([2.0] + [1.5] * 6 + [0.02])
+    gp = sklearn_gp("rbf", theta, z, y)
+    checked = held_out(np.linalg.inv(gp.L_ @ gp.L_.T), y, 3)
+    without = sklearn_gp("rbf", theta, z[10:], y[10:])
+    mean, sigma = without.predict(z[:10], return_std=True)
+    assert checked.error[:10] == pytest.approx(y[:10] - mean, abs=1e-9)
+    assert checked.sigma[:10] == pytest.approx(sigma, abs=1e-9)
+
+
+def test_informative_samples_beat_the_same_number_of_first_ones() -> None:
+    z, _ = gp_problem(120)
+    lengths = np.full(6, 2.0)
+    chosen = most_informative("rbf", z, lengths, 0.01, 30)
+    assert len(set(chosen.tolist())) == 30
+    assert list(chosen) == sorted(chosen)
+    theta = np.log([1.0] + [2.0] * 6 + [0.01])
+
+    def uncertainty(rows: Any) -> float:
+        gp = sklearn_gp("rbf", theta, z[rows], np.zeros(len(rows)))
+        return float(gp.predict(z, return_std=True)[1].mean())
+
+    assert uncertainty(chosen) < uncertainty(np.arange(30))
+    assert len(most_informative("rbf", z, lengths, 0.01, 500)) == 120
+
+
+def test_greedy_choice_takes_the_largest_posterior_variance() -> None:
+    z, _ = gp_problem(25)
+    chosen = set(most_informative("matern25", z, np.ones(6), 0.1, 6).tolist())
+    base, picked = Matern(np.ones(6), nu=2.5), [0]
+    while len(picked) < 6:
+        own = base(z[picked]) + 0.1 * np.eye(len(picked))
+        cross = base(z, z[picked])
+        variance = 1 - np.einsum("ij,jk,ik->i", cross, np.linalg.inv(own), cross)
+        variance[picked] = -1
+        picked.append(int(np.argmax(variance)))
+    assert chosen == set(picked)
+
+
+def test_even_choice_covers_the_whole() -> None:
+    assert list(evenly(4, 10)) == [0, 1, 2, 3]
+    chosen = evenly(1000, 10)
+    assert len(set(chosen.tolist())) == 10
+    assert chosen[0] < 100 < 900 <= chosen[-1]
+
+
+# --- training and validation -------------------------------------------------------------------
+
+
+def test_training_corrects_the_model(driven: Dataset) -> None:
+    seen: list[float] = []
+    weights = train(driven, PREDICTION, QUICK, progress=lambda share, text: seen.append(share))
+    checked = validate(weights, drive(dynamic(CAR), 100, seed=2), PREDICTION)
+    for name in OUTPUTS:
+        metrics = checked.metrics[name]
+        assert metrics["rmse"] < 0.3 * metrics["uncorrected_rmse"]
+        assert metrics["r2"] > 0.8
+    assert seen == sorted(seen)
+    assert seen[-1] == pytest.approx(1.0)
+    assert weights.dataset_digest == driven.digest()
+    assert with_metrics(weights, checked).metrics["vx"]["rmse"] == checked.metrics["vx"]["rmse"]
+
+
+def test_training_is_reproducible_and_named_by_content(driven: Dataset) -> None:
+    first, again = (train(driven, PREDICTION, QUICK) for _ in range(2))
+    assert first.version == again.version
+    for a, b in zip(first.outputs, again.outputs, strict=True):
+        assert np.array_equal(a.alpha, b.alpha)
+    other = train(driven.select(slice(100)), PREDICTION, QUICK)
+    assert other.version != first.version
+
+
+def test_trained_weights_evaluate_as_scikit_learn_predicts(driven: Dataset) -> None:
+    """Scaling is done once and undone once (scikit-learn's normalize_y would do it again)."""
+    weights = train(driven, PREDICTION, QUICK)
+    z, y = driven.features, residual(driven, PREDICTION)
+    for i, output in enumerate(weights.outputs):
+        theta = np.log([output.signal_variance, *output.length_scales, output.noise_variance])
+        gp = sklearn_gp(output.kernel, theta, z, (y[:, i] - y[:, i].mean()) / y[:, i].std())
+        mean, sigma = gp.predict(z[::7] * 1.1, return_std=True)
+        ours = evaluate_mean(weights, z[::7] * 1.1)[:, i]
+        theirs = y[:, i].mean() + y[:, i].std() * mean
+        # Two factorisations of a matrix of condition 1e9 agree to that times 1e-16.
+        assert np.abs(ours - theirs).max() < 1e-6 * y[:, i].std()
+        our_sigma = predictive_sigma(weights, z[::7] * 1.1)[:, i]
+        assert our_sigma == pytest.approx(sigma * y[:, i].std(), rel=1e-4)
+
+
+def test_sigma_equals_scikit_learn() -> None:
+    z, y = gp_problem(40)
+    theta = np.log([2.0] + [1.5] * 6 + [0.02])
+    for kind in ("rbf", "matern05", "matern15", "matern25"):
+        gp = sklearn_gp(kind, theta, z, y)
+        output = GpOutput(kind, np.full(6, 1.5), 2.0, 0.02, z, gp.alpha_, 0.0, 3.0)
+        weights = GpWeights("v", "orca", "d", (output, output, output))
+        new, _ = gp_problem(15, seed=5)
+        _, sigma = gp.predict(new, return_std=True)
+        assert predictive_sigma(weights, new)[:, 1] == pytest.approx(3.0 * sigma, abs=1e-10)
+
+
+def test_coverage_is_nominal_where_the_gp_is_right() -> None:
+    """Data drawn from a GP with noise: the 95 % interval holds 95 %."""
+    random = np.random.default_rng(7)
+    z = random.uniform(-1, 1, size=(500, 6)) * [1, 0.2, 3, 0.3, 0.5, 3] + [2, 0, 0, 0, 0.4, 0]
+    scales = np.array([1.0, 0.4, 4.0, 0.4, 2.0, 8.0])
+    cov = RBF(scales)(z) + 1e-10 * np.eye(500)
+    noise = 0.05 * random.normal(size=(500, 3))
+    error = np.linalg.cholesky(cov) @ random.normal(size=(500, 3)) + noise
+    x = np.column_stack((np.zeros((500, 3)), z[:, :4]))
+    step = PREDICTION.discretise(e_kinematic(CAR))
+    x_next = np.array(step(x.T, z[:, 4:].T)).T
+    x_next[:, 3:6] += error
+    data = Dataset(CAR, STEP_S, x, z[:, 4:], x_next)
+    settings = TrainingSettings(kernels=("rbf",), restarts=0)
+    weights = train(data.select(slice(250)), PREDICTION, settings)
+    checked = validate(weights, data.select(slice(250, None)), PREDICTION)
+    for name in OUTPUTS:
+        assert 0.89 <= checked.metrics[name]["coverage"] <= 0.995
+
+
+def test_update_with_new_driving_improves(driven: Dataset) -> None:
+    fast, test = (drive(dynamic(CAR), 120, seed=s, vx=2.5) for s in (11, 12))
+    before = train(driven.select(slice(80)), PREDICTION, QUICK)
+    after = train(concatenate([driven, fast]), PREDICTION, QUICK, initial=before)
+    old, new = (validate(weights, test, PREDICTION).metrics for weights in (before, after))
+    assert all(new[name]["rmse"] < old[name]["rmse"] for name in OUTPUTS)
+    assert after.kernels == before.kernels
+    assert after.version != before.version
+
+
+def test_capacity_is_kept(driven: Dataset) -> None:
+    settings = QUICK.model_copy(update={"capacity": 40})
+    weights = train(driven, PREDICTION, settings)
+    assert weights.counts == (40, 40, 40)
+    metrics = validate(weights, driven, PREDICTION).metrics
+    assert all(metrics[name]["r2"] > 0.9 for name in OUTPUTS)
+
+
+def test_kernel_is_chosen_among_the_candidates(driven: Dataset) -> None:
+    settings = QUICK.model_copy(update={"kernels": ("matern05", "matern25")})
+    assert set(train(driven, PREDICTION, settings).kernels) == {"matern25"}  # smooth dynamics
+
+
+def test_zero_weights_validate_as_uncorrected(driven: Dataset) -> None:
+    checked = validate(zero_weights("orca", identity(driven, PREDICTION)), driven, PREDICTION)
+    for name in OUTPUTS:
+        assert checked.metrics[name]["rmse"] == checked.metrics[name]["uncorrected_rmse"]
+
+
+def test_wrong_use_is_refused(driven: Dataset) -> None:
+    with pytest.raises(InputError, match="at least 20"):
+        train(driven.select(slice(5)), PREDICTION)
+    other = zero_weights("orca", "another model")
+    with pytest.raises(InputError, match="another model"):
+        train(driven, PREDICTION, QUICK, initial=other)
+    with pytest.raises(InputError, match="another model"):
+        validate(other, driven, PREDICTION)
+    own = zero_weights("orca", identity(driven, PREDICTION))
+    with pytest.raises(InputError, match="no samples"):
+        validate(own, driven.select(slice(0)), PREDICTION)
