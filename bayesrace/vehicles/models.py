@@ -27,6 +27,7 @@ __all__ = [
     "dynamic",
     "e_kinematic",
     "kinematic",
+    "longitudinal_force",
     "motor_force",
 ]
 
@@ -74,6 +75,11 @@ def _rolling_resistance(car: CarParameters, vx: Any) -> Any:
     return car.cr0 * _smooth_sign(vx, ROLL_SPEED_MPS) + car.cr2 * vx * ca.fabs(vx)
 
 
+def longitudinal_force(car: CarParameters, vx: Any, d: Any) -> Any:
+    """F_r,x of the true car: motor less rolling and drag resistance [N]; section 3 of the paper."""
+    return motor_force(car, vx, d) - _rolling_resistance(car, vx)
+
+
 def _lateral_force(tyre: Pacejka, alpha: Any) -> Any:
     return tyre.d * ca.sin(tyre.c * ca.atan(tyre.b * alpha))
 
@@ -112,7 +118,7 @@ def dynamic(car: CarParameters) -> Model:
     vx, vy, omega, delta = x[3], x[4], x[5], x[6]
     alpha_f, alpha_r = _slip_angles(car, x)
     f_front, f_rear = _lateral_force(car.front, alpha_f), _lateral_force(car.rear, alpha_r)
-    f_drive = motor_force(car, vx, u[0]) - _rolling_resistance(car, vx)
+    f_drive = longitudinal_force(car, vx, u[0])
     m = car.mass_kg
     xdot = [
         *_pose_rates(x),

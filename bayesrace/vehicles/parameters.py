@@ -65,8 +65,8 @@ class CarParameters(_Frozen):
 
 
 # ORCA 1:43: Liniger, Domahidi, Morari, "Optimization-based autonomous racing of 1:43 scale RC
-# cars", 2015, with the paper's actuator limits. `friction` is what a skid-pad run of this car
-# gives at the steering angles it can reach, rounded down; docs/raceline.md says how it was chosen.
+# cars", 2015, with the paper's actuator limits. `friction` is the largest lateral acceleration over
+# g that the car holds on a circle (benchmarks/skid_pad.py).
 _ORCA: Final = CarParameters(
     name="orca",
     lf_m=0.029,
@@ -83,7 +83,7 @@ _ORCA: Final = CarParameters(
     d_max=1.0,
     delta_max_rad=0.35,
     delta_rate_max_radps=5.0,
-    friction=0.8,
+    friction=0.75,
     width_m=0.05,
     length_m=0.1,
 )

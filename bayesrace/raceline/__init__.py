@@ -1,0 +1,30 @@
+"""Racing lines: minimum-time optimisation, the line as data, its file form.
+
+CasADi is imported on the first call of :func:`compute_raceline`, not with this package.
+"""
+
+from bayesrace.raceline.line import RaceLine, read_raceline, write_raceline
+from bayesrace.raceline.settings import RaceLineError, RaceLineSettings
+from bayesrace.tracks import Track
+from bayesrace.vehicles.parameters import CarParameters
+
+__all__ = [
+    "RaceLine",
+    "RaceLineError",
+    "RaceLineSettings",
+    "compute_raceline",
+    "read_raceline",
+    "write_raceline",
+]
+
+
+def compute_raceline(
+    track: Track, car: CarParameters, settings: RaceLineSettings | None = None
+) -> RaceLine:
+    """Minimum-time flying lap of ``car`` on ``track``; see :mod:`bayesrace.raceline.ocp`.
+
+    Raises InputError when the margin leaves no room, RaceLineError when the optimiser fails.
+    """
+    from bayesrace.raceline.ocp import solve
+
+    return solve(track, car, settings or RaceLineSettings())

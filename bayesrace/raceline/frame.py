@@ -1,0 +1,90 @@
+"""The curvilinear frame of the optimisation: stations on a smoothed centreline.
+
+Only the frame is smooth; the room to the left and right of each station is measured to the edges of
+the real track.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from bayesrace.errors import InputError
+from bayesrace.tracks import Track
+from bayesrace.tracks.shapes import resample_closed, smooth_closed
+from bayesrace.tracks.spline import FloatArray, fit_arc_length
+
+__all__ = ["Frame", "build_frame"]
+
+_FOLD: Final = 0.85
+"""Largest n * kappa: beyond 1 neighbouring normals cross and stations lose their order."""
+
+_ROOM_M: Final = 0.005
+_OVERSAMPLING: Final = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """N stations, arrays (N,): position of station k at offset n is xy[k] + n normal[k]."""
+
+    xy_m: FloatArray
+    normal: FloatArray
+    heading_rad: FloatArray
+    """Direction of the frame's tangent, continuous."""
+    turn_rad: FloatArray
+    """Heading of the next station minus that of this one; sums up to +-2 pi over the lap."""
+    kappa_radpm: FloatArray
+    n_min_m: FloatArray
+    n_max_m: FloatArray
+    length_m: float
+
+
+def build_frame(track: Track, step_m: float, smoothing_m: float, margin_m: float) -> Frame:
+    """Stations about ``step_m`` apart; offsets keep ``margin_m`` from the track's edges.
+
+    Raises InputError if the margin leaves no room somewhere.
+    """
+    room = track.width_left_m + track.width_right_m - 2 * margin_m
+    _check_room(track, track.s_m, room, margin_m)
+    count = max(24, round(track.length_m / step_m))
+    dense = count * _OVERSAMPLING
+    points = track.position(np.arange(dense) * (track.length_m / dense))
+    smooth = smooth_closed(points, smoothing_m * dense / track.length_m)
+    curve = fit_arc_length(resample_closed(smooth, track.length_m / dense))
+    station = np.arange(count, dtype=np.float64) * (curve.period / count)
+    xy, first, second = curve.derivatives(station)
+    tangent = first / np.linalg.norm(first, axis=1, keepdims=True)
+    normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
+    heading = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
+    turn = np.diff(np.append(heading, heading[0]))
+    turn[-1] = np.remainder(turn[-1] + np.pi, 2 * np.pi) - np.pi
+    kappa = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+    n_max = _room(track, xy, normal, margin_m)
+    n_min = -_room(track, xy, -normal, margin_m)
+    with np.errstate(divide="ignore"):
+        fold = _FOLD / np.abs(kappa)
+    n_max = np.where(kappa > 0, np.minimum(n_max, fold), n_max)
+    n_min = np.where(kappa < 0, np.maximum(n_min, -fold), n_min)
+    _check_room(track, station, n_max - n_min, margin_m)
+    return Frame(xy, normal, heading, turn, kappa, n_min, n_max, curve.period)
+
+
+def _check_room(track: Track, s: FloatArray, room: FloatArray, margin_m: float) -> None:
+    tight = room < _ROOM_M
+    if tight.any():
+        at = float(s[int(np.argmax(tight))])
+        raise InputError(
+            f"track '{track.name}' is too narrow for a margin of {margin_m:.3g} m "
+            f"near s = {at:.2f} m; choose a smaller margin"
+        )
+
+
+def _room(track: Track, xy: FloatArray, outward: FloatArray, margin_m: float) -> FloatArray:
+    """How far one can go from each station along ``outward`` until the margin to the edge."""
+    reach = np.full(len(xy), float(np.mean(track.width_left_m + track.width_right_m)) / 2)
+    for _ in range(20):
+        excess = track.project_path(xy + reach[:, None] * outward, 0.0).off_track_m + margin_m
+        reach = reach - excess
+        if float(np.max(np.abs(excess))) < 1e-6:
+            break
+    return reach

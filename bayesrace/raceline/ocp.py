@@ -1,0 +1,253 @@
+"""Minimum-time lap as a nonlinear programme (CasADi, IPOPT).
+
+Per station k of the frame: lateral offset n, path direction xi against the frame, squared speed
+E = v^2, path curvature kappa, acceleration a along the path. Between two stations the path is a
+clothoid (kappa linear in its length l) and E has slope 2 a with a linear in l, so that
+
+    psi' - psi = l (kappa' + kappa) / 2              E' - E = l (a' + a)
+    chord direction = (psi + psi') / 2 - l (kappa' - kappa) / 12
+    l = chord (1 + (psi' - psi)^2 / 24)              time = 2 l / (v + v')
+
+(' marks the next station; the chord formulas are exact to fourth order in l). No curvature of the
+frame enters: the path is as smooth as the car can drive even where the centreline isn't.
+
+Limits, with ay = kappa E: friction circle a^2 + ay^2 <= (mu g)^2; motor, straight(v, d_min) <= a
+<= straight(v, d_max); steering angle and its rate; track edges less the margin. All of it can be
+measured without tyre curves: mass, geometry, motor and one friction number. What the tyres' slip
+costs in a bend is left to the controller.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import casadi as ca
+import numpy as np
+
+from bayesrace.raceline.frame import Frame, build_frame
+from bayesrace.raceline.guess import speed_profile
+from bayesrace.raceline.line import RaceLine
+from bayesrace.raceline.sample import Clothoids, sample_line
+from bayesrace.raceline.settings import RaceLineError, RaceLineSettings
+from bayesrace.tracks import Track
+from bayesrace.tracks.spline import FloatArray
+from bayesrace.vehicles.models import longitudinal_force
+from bayesrace.vehicles.parameters import GRAVITY_MPS2, CarParameters
+
+__all__ = ["CarLimits", "car_limits", "solve"]
+
+_V_MIN_MPS: Final = 0.2
+_V_ANY_MPS: Final = 30.0
+_A_ANY_MPS2: Final = 50.0
+_XI_MAX_RAD: Final = 1.2
+_KAPPA_WEIGHT: Final = 1e-6
+_TOLERANCE_M: Final = 5e-4
+_ROUNDS: Final = 3
+
+
+@dataclass(frozen=True)
+class CarLimits:
+    """What the car can do, from what one can measure; works on numbers and CasADi expressions."""
+
+    car: CarParameters
+    grip_mps2: float
+    """Radius of the friction circle."""
+    straight: ca.Function
+    """(v, d) to the acceleration without cornering [m/s^2]."""
+
+    def steering(self, kappa: Any) -> Any:
+        """Steering angle that a path of this curvature needs [rad].
+
+        Kinematic bicycle: sin(beta) = lr kappa and tan(beta) = lr / L tan(delta).
+        """
+        slope = self.car.wheelbase_m * kappa / ca.sqrt(1 - (self.car.lr_m * kappa) ** 2)
+        return ca.atan(slope)
+
+    @property
+    def kappa_max_radpm(self) -> float:
+        """Curvature at full lock."""
+        slope = self.car.lr_m / self.car.wheelbase_m * np.tan(self.car.delta_max_rad)
+        return float(np.sin(np.arctan(slope)) / self.car.lr_m)
+
+    def straight_values(self, v: FloatArray, d: float) -> FloatArray:
+        """``straight`` at many speeds."""
+        return np.asarray(self.straight(v.reshape(1, -1), d)).ravel()
+
+
+def car_limits(car: CarParameters, settings: RaceLineSettings) -> CarLimits:
+    """The limits of a car, friction from the settings or else the car's."""
+    v, d = ca.SX.sym("v"), ca.SX.sym("d")
+    straight = longitudinal_force(car, v, d) / car.mass_kg
+    friction = car.friction if settings.friction is None else settings.friction
+    return CarLimits(
+        car=car,
+        grip_mps2=friction * GRAVITY_MPS2,
+        straight=ca.Function("straight", [v, d], [straight]),
+    )
+
+
+def solve(track: Track, car: CarParameters, settings: RaceLineSettings) -> RaceLine:
+    """Racing line of ``car`` on ``track``; raises InputError or RaceLineError.
+
+    The margin holds at the stations; should the path between them come nearer to the real edge
+    than allowed, it is optimised again with that much more.
+    """
+    margin = car.width_m / 2 if settings.margin_m is None else settings.margin_m
+    limits = car_limits(car, settings)
+    extra = 0.0
+    for _ in range(_ROUNDS):
+        frame = build_frame(track, settings.step_m, settings.smoothing_m, margin + extra)
+        line = sample_line(
+            track, _optimise(track.name, frame, limits, settings), settings.spacing_m
+        )
+        excess = float(np.max(track.project_path(line.xy_m).off_track_m)) + margin
+        if excess <= _TOLERANCE_M:
+            return line
+        extra += excess
+    raise RaceLineError(
+        f"the racing line for track '{track.name}' passes the margin by {1e3 * excess:.1f} mm "
+        "between stations; choose a smaller step_m"
+    )
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """The nonlinear programme: minimise f(x) with g_min <= g(x) <= 0 and bounds on x."""
+
+    x: Any
+    f: Any
+    g: Any
+    g_min: FloatArray
+    length: Any
+    """Arc lengths between stations, (N, 1)."""
+
+
+def _following(x: Any) -> Any:
+    """The values at the next station, around the lap."""
+    return ca.vertcat(x[1:], x[0])
+
+
+def _problem(frame: Frame, limits: CarLimits, settings: RaceLineSettings) -> _Problem:
+    """Objective and constraints over x = [n, xi, E, kappa, a], each (N, 1)."""
+    count = len(frame.kappa_radpm)
+    step = frame.length_m / count
+    n, xi, energy, kappa, a = (ca.SX.sym(x, count) for x in ("n", "xi", "E", "kappa", "a"))
+
+    x, y = (frame.xy_m[:, i] + n * frame.normal[:, i] for i in range(2))
+    dx, dy = _following(x) - x, _following(y) - y
+    turn = _following(xi) - xi + frame.turn_rad
+    length = ca.sqrt(dx**2 + dy**2) * (1 + turn**2 / 24)
+    chord = frame.heading_rad + xi + turn / 2 - length * (_following(kappa) - kappa) / 12
+    equal = [
+        turn - length * (_following(kappa) + kappa) / 2,
+        (ca.cos(chord) * dy - ca.sin(chord) * dx) / step,
+        _following(energy) - energy - length * (_following(a) + a),
+    ]
+    v = ca.sqrt(energy)
+    time = 2 * length / (_following(v) + v)
+    within = _car_within(limits, time, energy, kappa, a)
+    rough = settings.rate_weight * (_following(a) - a) ** 2
+    rough += _KAPPA_WEIGHT * (_following(kappa) - kappa) ** 2
+    return _Problem(
+        x=ca.vertcat(n, xi, energy, kappa, a),
+        f=ca.sum1(time) + ca.sum1(rough) / step,
+        g=ca.vertcat(*(ca.vec(part) for part in equal + within)),
+        g_min=np.repeat([0.0] * len(equal) + [-np.inf] * len(within), count),
+        length=length,
+    )
+
+
+def _car_within(
+    limits: CarLimits, time: Any, energy: Any, kappa: Any, a: Any
+) -> list[Any]:
+    """What the car can do, as expressions that must be <= 0; all arguments (N, 1).
+
+    The steering angle's limit is the bound on kappa.
+    """
+    car = limits.car
+    v, ay = ca.sqrt(energy), kappa * energy
+    steering = limits.steering(kappa)
+    steered = _following(steering) - steering
+    return [
+        (ay / limits.grip_mps2) ** 2 + (a / limits.grip_mps2) ** 2 - 1,
+        a.T - limits.straight(v.T, car.d_max),
+        limits.straight(v.T, car.d_min) - a.T,
+        steered - car.delta_rate_max_radps * time,
+        -steered - car.delta_rate_max_radps * time,
+    ]
+
+
+def _bounds(frame: Frame, limits: CarLimits, v_max: float) -> tuple[FloatArray, FloatArray]:
+    """Lower and upper bounds of x."""
+    one = np.ones(len(frame.kappa_radpm))
+    kappa = limits.kappa_max_radpm
+    low = [frame.n_min_m, -_XI_MAX_RAD * one, _V_MIN_MPS**2 * one, -kappa * one, -_A_ANY_MPS2 * one]
+    high = [frame.n_max_m, _XI_MAX_RAD * one, (1.05 * v_max) ** 2 * one, kappa * one]
+    return np.concatenate(low), np.concatenate([*high, _A_ANY_MPS2 * one])
+
+
+def _guess(frame: Frame, limits: CarLimits, v_max: float) -> FloatArray:
+    """x on the frame's own line with the speeds that the car could drive there."""
+    car = limits.car
+    count = len(frame.kappa_radpm)
+    step = frame.length_m / count
+    kappa_max = 0.9 * limits.kappa_max_radpm
+    kappa = np.clip(frame.kappa_radpm, -kappa_max, kappa_max)
+    v = speed_profile(
+        kappa,
+        np.full(count, step),
+        limits.grip_mps2,
+        lambda v: limits.straight_values(v, car.d_max),
+        lambda v: limits.straight_values(v, car.d_min),
+        2 * _V_MIN_MPS,
+        v_max,
+    )
+    n = np.clip(0.0, frame.n_min_m, frame.n_max_m)
+    a = (np.roll(v, -1) ** 2 - v**2) / (2 * step)
+    return np.concatenate([n, np.zeros(count), v**2, kappa, a])
+
+
+def _optimise(name: str, frame: Frame, limits: CarLimits, settings: RaceLineSettings) -> Clothoids:
+    problem = _problem(frame, limits, settings)
+    options: dict[str, Any] = {
+        "print_time": False,
+        "error_on_fail": False,
+        "ipopt": {
+            "print_level": 0,
+            "sb": "yes",
+            "tol": 1e-6,
+            "acceptable_iter": 0,
+            "max_iter": settings.max_iterations,
+        },
+    }
+    nlp = {"x": problem.x, "f": problem.f, "g": problem.g}
+    solver = ca.nlpsol("raceline", "ipopt", nlp, options)
+    v_max = _top_speed(limits)
+    low, high = _bounds(frame, limits, v_max)
+    start = _guess(frame, limits, v_max)
+    result = solver(x0=start, lbx=low, ubx=high, lbg=problem.g_min, ubg=0.0)
+    stats = solver.stats()
+    if not stats["success"]:
+        raise RaceLineError(
+            f"no racing line for track '{name}': IPOPT ended with {stats['return_status']} after "
+            f"{stats['iter_count']} iterations; try a smaller margin_m, another step_m or more "
+            "max_iterations"
+        )
+    n, xi, energy, kappa, a = np.asarray(result["x"]).reshape(5, -1)
+    lengths = ca.Function("length", [problem.x], [problem.length])(result["x"])
+    return Clothoids(
+        xy_m=frame.xy_m + n[:, None] * frame.normal,
+        psi_rad=frame.heading_rad + xi,
+        kappa_radpm=kappa,
+        energy=energy,
+        ax_mps2=a,
+        step_m=np.asarray(lengths).ravel(),
+        turn_rad=float(frame.turn_rad.sum()),
+    )
+
+
+def _top_speed(limits: CarLimits) -> float:
+    """Speed at which full drive only balances the resistances [m/s]."""
+    v = np.linspace(0.0, _V_ANY_MPS, 3001)
+    spent = limits.straight_values(v, limits.car.d_max) <= 0
+    spent[0] = False  # a standing car has no resistance but may have no drive either
+    return float(v[int(np.argmax(spent))]) if spent.any() else _V_ANY_MPS

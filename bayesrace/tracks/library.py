@@ -1,0 +1,52 @@
+"""One way to any track: a built-in name, ``random:SEED`` or a CSV file."""
+
+from pathlib import Path
+
+from bayesrace.errors import InputError
+from bayesrace.tracks.builtin import builtin_track, builtin_tracks
+from bayesrace.tracks.files import default_car_width_m, read_track
+from bayesrace.tracks.generator import random_track
+from bayesrace.tracks.track import Track
+
+__all__ = ["load_track"]
+
+_RANDOM = "random:"
+
+
+def load_track(name_or_path: str | Path, car_width_m: float | None = None) -> Track:
+    """The built-in track of that name, ``random:SEED``, or the track in that CSV file.
+
+    ``car_width_m``: least width of a track from a file; default: the ORCA car's. Raises InputError
+    saying what there is instead.
+    """
+    text = str(name_or_path)
+    if text in builtin_tracks():
+        return _wide_enough(builtin_track(text), car_width_m)
+    if text.startswith(_RANDOM):
+        return _wide_enough(random_track(_seed(text)), car_width_m)
+    path = Path(name_or_path)
+    if not path.is_file():
+        raise InputError(
+            f"no track '{text}': neither a file nor built in; "
+            f"built in: {', '.join(builtin_tracks())}, random:SEED"
+        )
+    return read_track(path, car_width_m)
+
+
+def _seed(text: str) -> int:
+    digits = text[len(_RANDOM) :]
+    if not (digits.isascii() and digits.isdigit()):
+        raise InputError(f"'{text}': the seed must be a whole number from 0 on, as in random:7")
+    return int(digits)
+
+
+def _wide_enough(track: Track, car_width_m: float | None) -> Track:
+    """The same track; raises InputError if it is narrower than the car."""
+    width = float((track.width_right_m + track.width_left_m).min())
+    car = default_car_width_m(car_width_m)
+    if width < car:
+        raise InputError(
+            f"track '{track.name}' is {width:.3g} m wide, the car {car:.3g} m; "
+            "choose a wider track or a smaller car"
+        )
+    return track

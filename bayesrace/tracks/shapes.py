@@ -1,0 +1,65 @@
+"""Centrelines from corner points: straights joined by arcs, then eased into one another."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from bayesrace.tracks.spline import FloatArray
+
+__all__ = ["Corner", "resample_closed", "rounded_polygon", "smooth_closed"]
+
+Corner = tuple[float, float, float]
+"""x [m], y [m] of a polygon's vertex and the radius [m] of the arc that rounds it."""
+
+
+def rounded_polygon(
+    corners: Sequence[Corner], spacing_m: float = 0.04, easing_m: float = 0.05
+) -> FloatArray | None:
+    """Points (n, 2), about ``spacing_m`` apart, along the closed polygon with rounded corners.
+
+    Smoothing over ``easing_m`` lets the curvature grow over a short way instead of jumping where
+    an arc begins. None if arcs overlap: the radii don't fit into the polygon.
+    """
+    vertices = np.array([corner[:2] for corner in corners])
+    radii = np.array([corner[2] for corner in corners])
+    edge = np.roll(vertices, -1, axis=0) - vertices
+    length = np.linalg.norm(edge, axis=1)
+    out = edge / length[:, None]
+    into = np.roll(out, 1, axis=0)
+    turn = np.arctan2(into[:, 0] * out[:, 1] - into[:, 1] * out[:, 0], np.sum(into * out, axis=1))
+    tangent = radii * np.tan(np.abs(turn) / 2)
+    if np.any(tangent + np.roll(tangent, -1) > length):
+        return None
+    dense = [
+        _arc(vertices[i] - tangent[i] * into[i], into[i], turn[i], radii[i])
+        for i in range(len(corners))
+    ]
+    points = resample_closed(np.concatenate(dense), 0.005)
+    return resample_closed(smooth_closed(points, easing_m / 0.005), spacing_m)
+
+
+def smooth_closed(points: FloatArray, sigma_samples: float) -> FloatArray:
+    """Periodic Gaussian filter of evenly spaced points (n, 2); sigma counted in points."""
+    frequency = 2 * np.pi * np.fft.rfftfreq(len(points))
+    gain = np.exp(-0.5 * (sigma_samples * frequency) ** 2)
+    spectrum = np.fft.rfft(points, axis=0) * gain[:, None]
+    return np.asarray(np.fft.irfft(spectrum, len(points), axis=0))
+
+
+def resample_closed(points: FloatArray, spacing_m: float) -> FloatArray:
+    """Evenly spaced points on the closed polyline, starting at its first point."""
+    closed = np.concatenate([points, points[:1]])
+    s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
+    count = max(8, round(float(s[-1]) / spacing_m))
+    at = np.arange(count) * (s[-1] / count)
+    return np.column_stack([np.interp(at, s, closed[:, 0]), np.interp(at, s, closed[:, 1])])
+
+
+def _arc(start: FloatArray, direction: FloatArray, turn: float, radius: float) -> FloatArray:
+    """Points from ``start`` along an arc that turns by ``turn`` [rad], a few mm apart."""
+    count = max(2, int(np.ceil(abs(turn) * radius / 0.005)))
+    angle = np.linspace(0.0, turn, count)
+    left = np.array([-direction[1], direction[0]])
+    sign = np.sign(turn) if turn else 1.0
+    forward, sideways = radius * np.sin(np.abs(angle)), radius * (1 - np.cos(angle))
+    return np.asarray(start + forward[:, None] * direction + sign * sideways[:, None] * left)

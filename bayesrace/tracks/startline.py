@@ -1,0 +1,71 @@
+"""The start line as a short segment: counting and timing laps without any spline."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from bayesrace.tracks.track import Track
+
+__all__ = ["Crossing", "StartLine"]
+
+_ON_LINE_M = 1e-9
+"""A car placed on the line is past it, whatever rounding makes of its coordinates."""
+
+
+class Crossing(NamedTuple):
+    """Whether a step crossed the line: +1 in driving direction, -1 against it, 0 not at all."""
+
+    direction: int
+    fraction: float
+    """Part of the step at which it crossed, in [0, 1]; 0 without a crossing."""
+
+
+class StartLine:
+    """The line across the track at s = 0, as long as the track is wide and a little beyond.
+
+    It ends half-way to the next piece of the track, so that a car there isn't counted.
+    """
+
+    def __init__(self, track: Track) -> None:
+        x, y, psi = track.start_pose()
+        self._x, self._y = x, y
+        self._cos, self._sin = math.cos(psi), math.sin(psi)
+        self.right_m = self._reach(track, float(track.width_right_m[0]), -1.0)
+        """How far the line reaches to the right of the centreline."""
+        self.left_m = self._reach(track, float(track.width_left_m[0]), 1.0)
+        """How far the line reaches to the left of the centreline."""
+
+    def signed_distance(self, x: float, y: float) -> float:
+        """Distance past the line along the driving direction [m], negative before it."""
+        return (x - self._x) * self._cos + (y - self._y) * self._sin
+
+    def crossing(self, prev_xy: tuple[float, float], cur_xy: tuple[float, float]) -> Crossing:
+        """Whether the straight step from ``prev_xy`` to ``cur_xy`` [m] crosses the line.
+
+        A point on the line counts as past it, so that of two successive steps exactly one crosses.
+        """
+        before = self.signed_distance(prev_xy[0], prev_xy[1])
+        after = self.signed_distance(cur_xy[0], cur_xy[1])
+        was_past, is_past = before >= -_ON_LINE_M, after >= -_ON_LINE_M
+        if was_past == is_past:
+            return Crossing(0, 0.0)
+        fraction = min(max(before / (before - after), 0.0), 1.0)
+        x = prev_xy[0] + fraction * (cur_xy[0] - prev_xy[0]) - self._x
+        y = prev_xy[1] + fraction * (cur_xy[1] - prev_xy[1]) - self._y
+        lateral = y * self._cos - x * self._sin
+        if not -self.right_m <= lateral <= self.left_m:
+            return Crossing(0, 0.0)
+        return Crossing(1 if is_past else -1, fraction)
+
+    def _reach(self, track: Track, width: float, side: float) -> float:
+        """Twice the width, but not beyond the middle between this piece and the next one."""
+        count = max(4 * len(track.s_m), round(track.length_m / (0.1 * max(width, 1e-3))))
+        points = track.position(np.arange(count) * (track.length_m / count))
+        dx, dy = points[:, 0] - self._x, points[:, 1] - self._y
+        along = dx * self._cos + dy * self._sin
+        across = side * (dy * self._cos - dx * self._sin)
+        change = along * np.roll(along, -1) <= 0
+        hits = across[change & (across > 0.5 * width)]
+        nearest = float(hits.min()) if len(hits) else math.inf
+        return max(width, min(2.0 * width, nearest / 2.0))

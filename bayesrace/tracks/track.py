@@ -1,0 +1,229 @@
+"""A closed track: centreline and width on both sides, over arc length.
+
+Signs: the lateral offset n and the normal point to the LEFT of the driving direction; curvature is
+positive in a left-hand bend. Any real s is accepted and wraps at the start line.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import overload
+
+import numpy as np
+import numpy.typing as npt
+
+from bayesrace.errors import InputError
+from bayesrace.tracks.checks import find_fault
+from bayesrace.tracks.projection import CentrelineSearch
+from bayesrace.tracks.spline import FloatArray, PlaneSpline, fit_arc_length
+
+__all__ = ["PathProjection", "Projection", "Track"]
+
+
+@dataclass(frozen=True)
+class Projection:
+    """Where one point is on a track."""
+
+    s_m: float
+    """Arc length of the foot point, in [0, length)."""
+    n_m: float
+    """Lateral offset, positive to the left."""
+    off_track_m: float
+    """Distance outside the track; <= 0 inside."""
+
+
+@dataclass(frozen=True, eq=False)
+class PathProjection:
+    """Where the points of a trajectory are on a track; arrays of shape (m,)."""
+
+    s_m: FloatArray
+    """Arc length of the foot points, in [0, length)."""
+    n_m: FloatArray
+    """Lateral offsets, positive to the left."""
+    off_track_m: FloatArray
+    """Distances outside the track; <= 0 inside."""
+    progress_m: FloatArray
+    """Arc length without wrapping, first value in [-length/2, length/2): + length each lap."""
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Closed track given by nodes of its centreline; node 0 is the start line.
+
+    Arrays have shape (n,); the last node is not a repetition of the first. Make one with
+    :meth:`from_points`, :func:`bayesrace.tracks.load_track` or the random generator.
+    """
+
+    name: str
+    s_m: FloatArray
+    x_m: FloatArray
+    y_m: FloatArray
+    width_right_m: FloatArray
+    width_left_m: FloatArray
+    length_m: float
+
+    @classmethod
+    def from_points(
+        cls,
+        name: str,
+        xy: npt.ArrayLike,
+        width_right: npt.ArrayLike,
+        width_left: npt.ArrayLike,
+        min_width_m: float = 0.0,
+    ) -> "Track":
+        """Track through points (n, 2) [m], widths scalar or (n,) [m].
+
+        A repetition of the first point at the end is dropped. Raises InputError naming the point
+        (counted from 0) when the points don't make a track at least ``min_width_m`` wide.
+        """
+        points = np.array(xy, dtype=float)
+        if points.ndim != 2 or points.shape[1:] != (2,):
+            raise InputError(
+                f"track '{name}': expected points of shape (n, 2), got {points.shape}; "
+                "give one row with x and y per point"
+            )
+        right = np.broadcast_to(np.asarray(width_right, dtype=float), len(points))
+        left = np.broadcast_to(np.asarray(width_left, dtype=float), len(points))
+        rows: Sequence[int] = range(len(points))
+        points, right, left = drop_repeated(points, right, left)
+        fault = find_fault(points, right, left, min_width_m)
+        if fault is not None:
+            raise InputError(fault.text(f"track '{name}'", "point", rows))
+        return cls._from_checked(name, points, right, left)
+
+    @classmethod
+    def _from_checked(
+        cls, name: str, points: FloatArray, right: FloatArray, left: FloatArray
+    ) -> "Track":
+        spline = fit_arc_length(points)
+        arrays = (spline.knots, points[:, 0].copy(), points[:, 1].copy(), right + 0.0, left + 0.0)
+        for array in arrays:
+            array.setflags(write=False)
+        return cls(name, *arrays, spline.period)
+
+    @cached_property
+    def centreline(self) -> PlaneSpline:
+        """The centreline as a spline over arc length."""
+        return PlaneSpline(self.s_m, np.column_stack([self.x_m, self.y_m]), self.length_m)
+
+    @cached_property
+    def _search(self) -> CentrelineSearch:
+        total = float(np.min(self.width_right_m + self.width_left_m))
+        return CentrelineSearch(self.centreline, spacing_m=total / 16.0)
+
+    @cached_property
+    def _width_table(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        right, left = self.width_right_m, self.width_left_m
+        return (
+            np.append(self.s_m, self.length_m),
+            np.append(right, right[0]),
+            np.append(left, left[0]),
+        )
+
+    def position(self, s: npt.ArrayLike) -> FloatArray:
+        """Centreline point(s), shape (..., 2) [m]."""
+        return self.centreline(s)
+
+    def heading(self, s: npt.ArrayLike) -> FloatArray:
+        """Direction of the centreline's tangent, in (-pi, pi] [rad]."""
+        tangent = self.centreline(s, 1)
+        return np.asarray(np.arctan2(tangent[..., 1], tangent[..., 0]))
+
+    def normal(self, s: npt.ArrayLike) -> FloatArray:
+        """Unit normal(s) to the left of the driving direction, shape (..., 2)."""
+        tangent = self.centreline(s, 1)
+        tangent = tangent / np.linalg.norm(tangent, axis=-1, keepdims=True)
+        return np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
+
+    def curvature(self, s: npt.ArrayLike) -> FloatArray:
+        """Curvature of the centreline, positive in a left-hand bend [rad/m]."""
+        _, first, second = self.centreline.derivatives(np.asarray(s, dtype=float))
+        cross = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
+        return np.asarray(cross / np.linalg.norm(first, axis=-1) ** 3)
+
+    def widths(self, s: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Distance from the centreline to the right and to the left edge, linear in s [m]."""
+        nodes, right, left = self._width_table
+        wrapped = np.mod(np.asarray(s, dtype=float), self.length_m)
+        return np.interp(wrapped, nodes, right), np.interp(wrapped, nodes, left)
+
+    def boundaries(self, spacing_m: float = 0.02) -> tuple[FloatArray, FloatArray]:
+        """Right and left edge as points (m, 2), about ``spacing_m`` apart along the centreline."""
+        count = max(8, round(self.length_m / spacing_m))
+        s = np.arange(count) * (self.length_m / count)
+        centre, normal = self.position(s), self.normal(s)
+        right, left = self.widths(s)
+        return centre - right[:, None] * normal, centre + left[:, None] * normal
+
+    def start_pose(self) -> tuple[float, float, float]:
+        """x [m], y [m] of node 0 and the heading there [rad]."""
+        return float(self.x_m[0]), float(self.y_m[0]), float(self.heading(0.0))
+
+    def project(self, xy: npt.ArrayLike, s_guess_m: float | None = None) -> Projection:
+        """Foot point of one point (2,) on the centreline.
+
+        Without a guess, the nearest over the whole centreline. With one, the foot point reached by
+        going from the guess in the direction in which the distance falls: it stays on the same
+        piece where another one comes near (even nearer).
+        """
+        point = np.asarray(xy, dtype=float).reshape(1, 2)
+        if s_guess_m is None:
+            s = self._search.nearest(point)
+        else:
+            s = self._search.descend(point, s_guess_m)
+        n = self._offsets(point, s)
+        return Projection(float(s[0]), float(n[0]), float(self._off_track(s, n)[0]))
+
+    def project_points(self, xy: npt.ArrayLike) -> PathProjection:
+        """Nearest foot points of points (m, 2) that need not be a trajectory."""
+        points = np.asarray(xy, dtype=float).reshape(-1, 2)
+        return self._projected(points, self._search.nearest(points))
+
+    def project_path(self, xy: npt.ArrayLike, s_guess_m: float | None = None) -> PathProjection:
+        """Foot points of a trajectory (m, 2), each sought from its predecessor's.
+
+        A neighbouring piece of the track can't capture the trajectory. After a leap longer than
+        the track is wide, or farther than that from the piece, the search is global again.
+        """
+        points = np.asarray(xy, dtype=float).reshape(-1, 2)
+        reach = float(np.max(self.width_right_m + self.width_left_m))
+        return self._projected(points, self._search.follow(points, s_guess_m, reach))
+
+    @overload
+    def off_track_m(self, projection: Projection) -> float: ...
+    @overload
+    def off_track_m(self, projection: PathProjection) -> FloatArray: ...
+    def off_track_m(self, projection: Projection | PathProjection) -> float | FloatArray:
+        """How far outside the track [m]; <= 0 inside."""
+        return projection.off_track_m
+
+    def mirrored(self) -> "Track":
+        """The track mirrored at the x axis: left-hand bends become right-hand bends."""
+        points = np.column_stack([self.x_m, -self.y_m])
+        name = f"{self.name}-mirrored"
+        return Track._from_checked(name, points, self.width_left_m, self.width_right_m)
+
+    def _projected(self, points: FloatArray, s: FloatArray) -> PathProjection:
+        n = self._offsets(points, s)
+        progress = np.unwrap(s, period=self.length_m)
+        if len(s) and s[0] >= self.length_m / 2:
+            progress = progress - self.length_m
+        return PathProjection(s, n, self._off_track(s, n), progress)
+
+    def _offsets(self, points: FloatArray, s: FloatArray) -> FloatArray:
+        return np.asarray(np.sum((points - self.position(s)) * self.normal(s), axis=-1))
+
+    def _off_track(self, s: FloatArray, n: FloatArray) -> FloatArray:
+        right, left = self.widths(s)
+        return np.maximum(n - left, -n - right)
+
+
+def drop_repeated(
+    points: FloatArray, right: FloatArray, left: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The same without a last point that repeats the first (to a thousandth of the spacing)."""
+    if len(points) > 2:
+        spacing = float(np.median(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+        if np.linalg.norm(points[-1] - points[0]) <= 1e-3 * spacing:
+            return points[:-1], right[:-1], left[:-1]
+    return points, right, left

@@ -1,0 +1,179 @@
+"""Track files: the communities' variants are read, broken ones are refused with row and remedy."""
+
+import contextlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bayesrace.errors import InputError
+from bayesrace.tracks import builtin_tracks, load_track, read_track, write_track
+from tests.reference import reference_file
+
+HEADER = "# x_m,y_m,w_tr_right_m,w_tr_left_m"
+
+
+def rows(count: int = 12) -> list[str]:
+    """Rows of a circle of radius 1, width .2 right and .3 left."""
+    angle = np.arange(count) * (2 * np.pi / count)
+    return [f"{np.cos(a):.6f},{np.sin(a):.6f},0.2,0.3" for a in angle]
+
+
+def written(folder: Path, lines: list[str]) -> Path:
+    path = folder / "loop.csv"
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def refusal(path: Path, **options: float) -> str:
+    with pytest.raises(InputError) as caught:
+        read_track(path, **options)
+    message = str(caught.value)
+    assert str(path) in message
+    assert ";" in message, "no remedy"
+    return message
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        [HEADER, *rows()],
+        rows(),
+        ["x_m,y_m,w_tr_right_m,w_tr_left_m", *rows()],
+        ["# one", "", "  # two", *[row.replace(",", " , ") for row in rows()], ""],
+        [HEADER, *[row.replace(",", "; ") for row in rows()]],
+        [*[row + "  # note" for row in rows()], rows()[0]],
+        ["\ufeff" + HEADER, *rows()],
+    ],
+    ids=["hash", "bare", "names", "spaces", "semicolon", "repeated", "bom"],
+)
+def test_every_variant_gives_the_same_track(tmp_path: Path, lines: list[str]) -> None:
+    track = read_track(written(tmp_path, lines))
+    assert track.name == "loop"
+    assert len(track.x_m) == 12
+    assert track.length_m == pytest.approx(2 * np.pi, rel=1e-2)
+    np.testing.assert_allclose(track.width_right_m, 0.2)
+    np.testing.assert_allclose(track.width_left_m, 0.3)
+
+
+def test_windows_line_ends_count_rows_the_same(tmp_path: Path) -> None:
+    path = tmp_path / "dos.csv"
+    lines = [HEADER, *rows()]
+    lines[4] = "1,2"
+    path.write_bytes("\r\n".join(lines).encode())
+    assert "row 5: 2 columns instead of 4" in refusal(path)
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ("1,2,3", "row 6: 3 columns instead of 4"),
+        ("1,2,3,4,5", "row 6: 5 columns instead of 4"),
+        ("1 2 3 4", "row 6: 1 columns instead of 4"),
+        ("1,2,abc,4", "row 6: 'abc' is not a number"),
+        ("1,2,,4", "row 6: '' is not a number"),
+        ("1,nan,.2,.3", "row 6: a value is not finite"),
+        ("1,2,inf,.3", "row 6: a value is not finite"),
+        ("-.5,.866,-.1,.3", "row 6: a width is negative"),
+        ("-.5,.866,.02,.02", "row 6: the track is 0.04 m wide, the car 0.05 m"),
+    ],
+)
+def test_a_bad_row_is_named(tmp_path: Path, bad: str, message: str) -> None:
+    lines = [HEADER, *rows()]
+    lines[5] = bad
+    assert message in refusal(written(tmp_path, lines))
+
+
+def test_the_car_decides_how_wide_a_track_must_be(tmp_path: Path) -> None:
+    path = written(tmp_path, [HEADER, *rows()])
+    assert "0.5 m wide, the car 0.6 m" in refusal(path, car_width_m=0.6)
+    read_track(path, car_width_m=0.4)
+
+
+def test_duplicates_name_both_rows_but_the_closing_point_is_none(tmp_path: Path) -> None:
+    lines = [HEADER, *rows()]
+    lines.insert(4, lines[4])
+    assert "row 6: the same point as row 5" in refusal(written(tmp_path, lines))
+
+
+def test_a_self_crossing_names_both_rows(tmp_path: Path) -> None:
+    angle = np.arange(40) * (2 * np.pi / 40) + 0.1
+    eight = [f"{np.sin(a):.5f};{np.sin(2 * a):.5f};.1;.1" for a in angle]
+    message = refusal(written(tmp_path, [HEADER, *eight]))
+    assert "crosses itself" in message
+    assert message.count("row") == 2
+
+
+def test_points_out_of_order_are_refused(tmp_path: Path) -> None:
+    lines = rows(24)
+    lines[7], lines[12] = lines[12], lines[7]
+    assert "in driving order" in refusal(written(tmp_path, lines))
+
+
+def test_a_line_there_and_back_is_refused(tmp_path: Path) -> None:
+    there = [f"{0.1 * i:.2f},0,.1,.1" for i in range(10)]
+    back = [f"{0.1 * i + 0.05:.2f},0,.1,.1" for i in reversed(range(9))]
+    assert "turns back on itself" in refusal(written(tmp_path, there + back))
+
+
+@pytest.mark.parametrize("lines", [[], [HEADER], [HEADER, *rows(4)]])
+def test_too_few_points(tmp_path: Path, lines: list[str]) -> None:
+    message = refusal(written(tmp_path, lines))
+    assert "too few points" in message
+    assert "at least 8" in message
+
+
+def test_unreadable_files(tmp_path: Path) -> None:
+    assert "can't be read" in refusal(tmp_path / "absent.csv")
+    assert "can't be read" in refusal(tmp_path)
+    binary = tmp_path / "binary.csv"
+    binary.write_bytes(bytes(range(256)))
+    assert "not a text file" in refusal(binary)
+
+
+@pytest.mark.parametrize("name", builtin_tracks())
+def test_export_and_import_give_the_same_track(tmp_path: Path, name: str) -> None:
+    track = load_track(name)
+    path = tmp_path / f"{name}.csv"
+    write_track(path, track)
+    again = load_track(path)
+    assert again.name == name
+    for field in ("x_m", "y_m", "s_m", "width_right_m", "width_left_m"):
+        np.testing.assert_array_equal(getattr(again, field), getattr(track, field))
+
+
+@given(text=st.text(alphabet="0123456789.,;-+e#naif \n", max_size=300))
+@settings(max_examples=200, deadline=None)
+def test_any_text_is_a_track_or_an_input_error(
+    tmp_path_factory: pytest.TempPathFactory, text: str
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "fuzz.csv"
+    path.write_text(text, encoding="utf-8")
+    with contextlib.suppress(InputError):
+        read_track(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "length", "width", "car_width"),
+    [
+        ("ethz", 17.84, 0.37, None),
+        ("ethzmobil", 12.85, 0.46, None),
+        ("f1tenth_monza_centerline", 446.1, 2.2, 0.3),
+        ("f1tenth_spielberg_centerline", 343.4, 2.2, 0.3),
+    ],
+)
+def test_published_tracks_are_read(
+    name: str, length: float, width: float, car_width: float | None
+) -> None:
+    track = load_track(reference_file(f"tracks/{name}.csv"), car_width)
+    assert track.length_m == pytest.approx(length, rel=1e-3)
+    np.testing.assert_allclose(track.width_right_m + track.width_left_m, width)
+
+
+def test_ethz_starts_south_east() -> None:
+    """reference/README.md: the paper's car starts there with heading -45 degrees."""
+    assert load_track(reference_file("tracks/ethz.csv")).start_pose()[2] == pytest.approx(
+        np.radians(-45), abs=np.radians(0.5)
+    )
