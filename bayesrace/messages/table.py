@@ -1,0 +1,127 @@
+"""The process boundary in one table: key expression, message, rate, quality of service."""
+
+import re
+from dataclasses import dataclass
+from typing import Any, Final, Generic, Literal, TypeVar
+
+from bayesrace.errors import InputError
+from bayesrace.messages.types import (
+    Actuation,
+    Event,
+    Message,
+    Reply,
+    RunRequest,
+    State,
+    Status,
+    StatusRequest,
+    StopRequest,
+    Telemetry,
+)
+
+__all__ = [
+    "ACTUATION",
+    "ALIVE",
+    "EVENT",
+    "RUN",
+    "SERVICES",
+    "STATE",
+    "STATUS",
+    "STOP",
+    "TELEMETRY",
+    "TOPICS",
+    "WEIGHTS",
+    "Qos",
+    "Service",
+    "Topic",
+    "car_key",
+]
+
+M = TypeVar("M", bound=Message)
+A = TypeVar("A", bound=Message)
+
+Source = Literal["plant", "controller", "race"]
+
+_CAR_NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")
+
+
+@dataclass(frozen=True)
+class Qos:
+    """How a topic travels.
+
+    In lockstep every topic blocks the sender rather than lose a message; ``wall_clock_blocks``
+    says whether it does so in free-running mode too, where late is late.
+    """
+
+    priority: Literal["real_time", "interactive_high", "data", "data_low"]
+    express: bool
+    """Sent at once, never batched."""
+    reliable: bool
+    wall_clock_blocks: bool
+
+
+@dataclass(frozen=True)
+class Topic(Generic[M]):
+    """One row of the table of published messages."""
+
+    name: str
+    key: str
+    """Key expression; ``{car}`` and, for events, ``{source}`` are filled in."""
+    message: type[M]
+    sources: tuple[Source, ...]
+    rate: str
+    qos: Qos
+
+
+@dataclass(frozen=True)
+class Service(Generic[M, A]):
+    """One row of the table of requests. ``request`` None: the payload is not a message."""
+
+    name: str
+    key: str
+    request: type[M] | None
+    answer: type[A]
+    timeout_s: float
+
+
+_CONTROL: Final = Qos("real_time", express=True, reliable=True, wall_clock_blocks=False)
+_REPORT: Final = Qos("data_low", express=False, reliable=True, wall_clock_blocks=False)
+_NEWS: Final = Qos("data", express=True, reliable=True, wall_clock_blocks=True)
+
+STATE: Final = Topic(
+    "state", "bayesrace/{car}/state", State, ("plant",), "each period (50 Hz)", _CONTROL
+)
+ACTUATION: Final = Topic(
+    "actuation", "bayesrace/{car}/actuation", Actuation, ("controller",), "each state", _CONTROL
+)
+TELEMETRY: Final = Topic(
+    "telemetry", "bayesrace/{car}/telemetry", Telemetry, ("controller",), "each state", _REPORT
+)
+EVENT: Final = Topic(
+    "event",
+    "bayesrace/{car}/event/{source}",
+    Event,
+    ("plant", "controller", "race"),
+    "when something happens",
+    _NEWS,
+)
+TOPICS: Final[tuple[Topic[Any], ...]] = (STATE, ACTUATION, TELEMETRY, EVENT)
+
+RUN: Final = Service("run", "bayesrace/{car}/plant/run", RunRequest, Reply, 5.0)
+STOP: Final = Service("stop", "bayesrace/{car}/plant/stop", StopRequest, Reply, 5.0)
+STATUS: Final = Service("status", "bayesrace/{car}/{source}/status", StatusRequest, Status, 5.0)
+WEIGHTS: Final[Service[Message, Reply]] = Service(
+    "weights", "bayesrace/{car}/controller/weights", None, Reply, 10.0
+)
+SERVICES: Final[tuple[Service[Any, Any], ...]] = (RUN, STOP, STATUS, WEIGHTS)
+
+ALIVE: Final = "bayesrace/{car}/alive/{source}"
+"""Liveliness token of a process."""
+
+
+def car_key(template: str, car: str, source: str = "") -> str:
+    """A key expression of the table for one car (and one source, where the key has it)."""
+    if not _CAR_NAME.fullmatch(car):
+        raise InputError(
+            f"car name '{car}' cannot be part of a key; use up to 40 letters, digits, '-' or '_'"
+        )
+    return template.format(car=car, source=source)

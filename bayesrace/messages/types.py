@@ -1,0 +1,196 @@
+"""The messages: immutable, typed, each field with its rule.
+
+Clocks: ``source_time_ns`` is the sender's ``time.monotonic_ns()``; it is comparable only between
+processes of one machine. ``time_s`` is the plant's own time since the start of the run.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Final
+
+from bayesrace.messages.rules import (
+    Choice,
+    Flag,
+    Integer,
+    Real,
+    Scalar,
+    Scalars,
+    Text,
+    Vector,
+)
+
+__all__ = [
+    "END_REASONS",
+    "Actuation",
+    "Event",
+    "Message",
+    "Reply",
+    "RunRequest",
+    "State",
+    "Status",
+    "StatusRequest",
+    "StopRequest",
+    "Telemetry",
+]
+
+END_REASONS: Final = (
+    "laps", "max_time", "stopped", "controller_lost", "actuation_timeout", "left_world",
+    "interrupted",
+)  # fmt: skip
+"""Why a run ended, in the ``kind="run_ended"`` event's data under ``reason``."""
+
+Count = Annotated[int, Integer()]
+Signed = Annotated[int, Integer(-(2**31), 2**31 - 1)]
+Seconds = Annotated[float, Real(0.0, 1e9)]
+Metre = Annotated[float, Real(-1e6, 1e6)]
+Width = Annotated[float, Real(0.0, 1e3)]
+Short = Annotated[str, Text(200)]
+Long = Annotated[str, Text(2000)]
+DataMap = Annotated[Mapping[str, Scalar], Scalars()]
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """What every message starts with."""
+
+    SCHEMA: ClassVar[int] = 1
+    """Version of the message's fields; a reader refuses any other."""
+
+    seq: Count
+    """Number of this message among those of its sender on its key, from 0, without gaps."""
+    source_time_ns: Count
+    """Sender's monotonic clock when the message was made [ns]."""
+
+
+@dataclass(frozen=True, slots=True)
+class State(Message):
+    """What the sensors tell: ``bayesrace/{car}/state``."""
+
+    run: Count
+    """Number of the run, from its request; it separates one run's messages from the next one's."""
+    time_s: Seconds
+    """Plant time since the start of the run."""
+    x: Annotated[tuple[float, ...], Vector(7)]
+    """x, y [m], psi [rad, unwrapped], vx, vy [m/s], omega [rad/s], delta [rad]."""
+    u_applied: Annotated[tuple[float, ...], Vector(2)]
+    """d [-] and delta_rate [rad/s] that acted during the period before; zeros at the start."""
+    lap: Signed
+    """Start-line crossings so far, forwards minus backwards."""
+    lockstep: Annotated[bool, Flag()]
+    """True if the plant waits for the actuation that answers this very message."""
+
+
+@dataclass(frozen=True, slots=True)
+class Actuation(Message):
+    """The controller's answer to one state: ``bayesrace/{car}/actuation``."""
+
+    run: Count
+    state_seq: Count
+    """``seq`` of the state that this answers."""
+    u: Annotated[tuple[float, ...], Vector(2, limit=1e3)]
+    """d [-], delta_rate [rad/s]; the range here is sanity, the car's limits are the plant's."""
+    weights_version: Short
+    """Version of the residual's weights that made it; empty without any."""
+    status: Annotated[int, Integer(0, 255)]
+    """The controller's status code of this step; 0 is good."""
+
+
+@dataclass(frozen=True, slots=True)
+class Telemetry(Message):
+    """How the actuation came about: ``bayesrace/{car}/telemetry``."""
+
+    run: Count
+    state_seq: Count
+    status: Annotated[int, Integer(0, 255)]
+    fallback: Annotated[int, Integer(0, 9)]
+    """0 solution, 1 shifted previous plan, 2 braking along the last safe steering, 3 stop."""
+    iterations: Annotated[int, Integer(0, 100_000)]
+    solve_us: Annotated[float, Real(0.0, 1e9)]
+    """Execution time of the controller's step [us]."""
+    plan_x: Annotated[tuple[float, ...], Vector(7, rows=501)]
+    """Predicted states row by row, N + 1 rows of 7; empty without a prediction."""
+    plan_u: Annotated[tuple[float, ...], Vector(2, rows=500)]
+    """Planned inputs row by row, N rows of 2."""
+    residual_dynamics: Annotated[float, Real(-1.0, 1e12)]
+    """Largest dynamics defect of the plan; -1 if not known or not finite (the others as well)."""
+    residual_bounds: Annotated[float, Real(-1.0, 1e12)]
+    """Largest violation of a bound."""
+    residual_stationarity: Annotated[float, Real(-1.0, 1e12)]
+    """Norm of the gradient of the Lagrangian."""
+    s_ref_m: Annotated[float, Real(-1e6, 1e6)]
+    """Arc length of the reference point on the racing line."""
+    n_ref_m: Annotated[float, Real(-1e6, 1e6)]
+    """Lateral offset from the racing line, positive to the left."""
+
+
+@dataclass(frozen=True, slots=True)
+class Event(Message):
+    """Something happened that a person may want to know: ``bayesrace/{car}/event/{source}``."""
+
+    run: Count
+    source: Annotated[str, Choice(("plant", "controller", "race"))]
+    kind: Short
+    text: Long
+    data: DataMap
+
+
+@dataclass(frozen=True, slots=True)
+class RunRequest(Message):
+    """Start a run: asked of ``bayesrace/{car}/plant/run``; the answer is a :class:`Reply`."""
+
+    run: Count
+    lockstep: Annotated[bool, Flag()]
+    """True: the plant advances only on the matching actuation; False: by the wall clock."""
+    x0: Annotated[tuple[float, ...], Vector(7)]
+    """Start state, as in :class:`State`."""
+    line_x_m: Metre
+    line_y_m: Metre
+    line_heading_rad: Annotated[float, Real(-1e3, 1e3)]
+    """Direction of driving across the start line."""
+    line_left_m: Width
+    line_right_m: Width
+    """Reach of the start line from its point to each side, margin included."""
+    laps: Annotated[int, Integer(0, 100_000)]
+    """The run ends at this many crossings; 0 is without end."""
+    max_time_s: Annotated[float, Real(0.0, 1e6)]
+    actuation_timeout_s: Annotated[float, Real(0.001, 600.0)]
+    """Lockstep: how long to wait for an answer before the run ends. Free-running: older than this,
+    an actuation no longer acts and the plant brakes."""
+
+
+@dataclass(frozen=True, slots=True)
+class StopRequest(Message):
+    """End the run that is under way: asked of ``bayesrace/{car}/plant/stop``."""
+
+    text: Long
+    """Why; it comes back in the end-of-run event."""
+
+
+@dataclass(frozen=True, slots=True)
+class StatusRequest(Message):
+    """Asked of ``bayesrace/{car}/plant/status`` and ``…/controller/status``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reply(Message):
+    """Answer to a request that changes something."""
+
+    accepted: Annotated[bool, Flag()]
+    text: Long
+    """Why not, or what now."""
+    data: DataMap
+
+
+@dataclass(frozen=True, slots=True)
+class Status(Message):
+    """State of a process, answered on request."""
+
+    source: Annotated[str, Choice(("plant", "controller"))]
+    phase: Short
+    """plant: idle, running; controller: waiting, driving, fallback."""
+    run: Count
+    text: Long
+    """The last thing worth saying, such as why the last run ended."""
+    weights_version: Short
+    counters: DataMap
+    """Everything counted since the process started."""

@@ -1,0 +1,28 @@
+"""Zenoh, wrapped thinly: sessions with explicit endpoints, publishers, one inbox per thread."""
+
+from bayesrace.transport.client import Director, ask
+from bayesrace.transport.inbox import Inbox, Item, Kind, Request, decode_request
+from bayesrace.transport.session import (
+    CONTROLLER_ENDPOINT,
+    PLANT_ENDPOINT,
+    Endpoints,
+    Publisher,
+    free_endpoint,
+    open_session,
+)
+
+__all__ = [
+    "CONTROLLER_ENDPOINT",
+    "PLANT_ENDPOINT",
+    "Director",
+    "Endpoints",
+    "Inbox",
+    "Item",
+    "Kind",
+    "Publisher",
+    "Request",
+    "ask",
+    "decode_request",
+    "free_endpoint",
+    "open_session",
+]

@@ -1,0 +1,135 @@
+"""Asking other processes, and following a run from outside."""
+
+import time
+from collections.abc import Collection
+from typing import Any, TypeVar
+
+import zenoh
+
+from bayesrace.errors import InputError
+from bayesrace.messages import (
+    EVENT,
+    RUN,
+    STATUS,
+    STOP,
+    WEIGHTS,
+    Decoder,
+    Event,
+    Message,
+    Reply,
+    RunRequest,
+    Service,
+    Status,
+    StatusRequest,
+    StopRequest,
+    car_key,
+    decode,
+    encode,
+)
+from bayesrace.transport.inbox import Inbox, Kind
+
+__all__ = ["Director", "ask"]
+
+A = TypeVar("A", bound=Message)
+
+
+def ask(
+    session: Any, service: Service[Any, A], car: str, request: Message | bytes, source: str = ""
+) -> A:
+    """Ask a process and wait for its answer, as long as the table says.
+
+    Raises InputError if nobody answers in time or the answer is not a valid one.
+    """
+    key = car_key(service.key, car, source)
+    payload = request if isinstance(request, bytes) else encode(request)
+    replies = session.get(
+        key,
+        payload=payload,
+        timeout=service.timeout_s,
+        target=zenoh.QueryTarget.ALL,
+        congestion_control=zenoh.CongestionControl.BLOCK,
+    )
+    for reply in replies:
+        if reply.ok is not None:
+            return decode(service.answer, reply.ok.payload.to_bytes())
+    raise InputError(
+        f"nobody answered on {key}; is the process for car '{car}' running, and its endpoint "
+        "among those to connect to?"
+    )
+
+
+class Director:
+    """Starts and follows runs of one car; for one thread."""
+
+    def __init__(self, session: Any, car: str) -> None:
+        self._session = session
+        self._car = car
+        self._decode = Decoder(Event)
+        self.inbox = Inbox(session, car)
+        self.inbox.subscribe(EVENT)
+        self.inbox.watch("plant")
+        self.inbox.watch("controller")
+
+    def wait_for(self, sources: Collection[str], timeout_s: float) -> None:
+        """Wait until these processes are there and know of this one's subscriptions."""
+        deadline = time.monotonic() + timeout_s
+        while missing := set(sources) - self.inbox.alive:
+            left_s = deadline - time.monotonic()
+            if left_s <= 0:
+                raise InputError(
+                    f"no {' and no '.join(sorted(missing))} for car '{self._car}' within "
+                    f"{timeout_s:g} s; start it, or check the endpoints"
+                )
+            self._raise_on_signal(self.inbox.get(left_s))
+        # What was declared before a request is known to who has answered it.
+        for source in sources:
+            self.status(source)
+
+    def status(self, source: str) -> Status:
+        """What the process says of itself."""
+        request = StatusRequest(0, time.monotonic_ns())
+        return ask(self._session, STATUS, self._car, request, source)
+
+    def start(self, request: RunRequest) -> Reply:
+        """Start a run; InputError with the plant's reason if it refuses."""
+        return self._accepted("run", ask(self._session, RUN, self._car, request))
+
+    def stop(self, text: str) -> Reply:
+        """End the run under way."""
+        return ask(self._session, STOP, self._car, StopRequest(0, time.monotonic_ns(), text))
+
+    def send_weights(self, data: bytes) -> str:
+        """Hand new weights to the running controller; their version, or InputError if refused."""
+        reply = self._accepted("weights", ask(self._session, WEIGHTS, self._car, data))
+        return str(reply.data.get("version", ""))
+
+    def wait_for_end(self, run: int, timeout_s: float) -> Event:
+        """The ``run_ended`` event of a run.
+
+        Raises InputError if the plant vanishes or the time is over; KeyboardInterrupt on a signal
+        that the inbox catches.
+        """
+        deadline = time.monotonic() + timeout_s
+        while (left_s := deadline - time.monotonic()) > 0:
+            item = self.inbox.get(min(left_s, 1.0))
+            if item is None:
+                continue
+            self._raise_on_signal(item)
+            if item.kind is Kind.GONE and item.name == "plant":
+                raise InputError(f"the plant of car '{self._car}' vanished during run {run}")
+            if item.kind is Kind.MESSAGE:
+                event = self._decode(item.value)
+                if event is not None and event.run == run and event.kind == "run_ended":
+                    return event
+        raise InputError(f"run {run} of car '{self._car}' did not end within {timeout_s:g} s")
+
+    @staticmethod
+    def _accepted(what: str, reply: Reply) -> Reply:
+        if not reply.accepted:
+            raise InputError(f"{what} refused: {reply.text}")
+        return reply
+
+    @staticmethod
+    def _raise_on_signal(item: Any) -> None:
+        if item is not None and item.kind is Kind.SIGNAL:
+            raise KeyboardInterrupt

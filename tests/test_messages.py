@@ -1,0 +1,206 @@
+"""The codec's promise: a message survives the wire unchanged, and nothing else gets through."""
+
+import logging
+import math
+from typing import Any, get_args, get_type_hints
+
+import msgpack
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from bayesrace.errors import InputError
+from bayesrace.messages import (
+    RUN,
+    SERVICES,
+    STATUS,
+    STOP,
+    TOPICS,
+    Decoder,
+    Event,
+    Message,
+    Reply,
+    State,
+    Status,
+    Telemetry,
+    car_key,
+    decode,
+    encode,
+    json_schema,
+)
+from bayesrace.messages.codec import peek_seq
+from bayesrace.messages.rules import (
+    Choice,
+    Flag,
+    Integer,
+    Real,
+    Scalars,
+    Text,
+    Vector,
+)
+
+KINDS: list[type[Message]] = [
+    *(topic.message for topic in TOPICS),
+    *(service.request for service in SERVICES if service.request is not None),
+    Reply,
+    Status,
+]
+
+STATE = State(3, 10**9, 1, 0.5, (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 0.1), (0.1, 0.2), 0, True)
+
+_text = st.text(st.characters(codec="utf-8"), max_size=30)
+_scalar = st.one_of(
+    st.booleans(), st.integers(-(2**63) + 1, 2**63 - 1), st.floats(-1e12, 1e12), _text
+)
+
+
+def values(rule: Any) -> st.SearchStrategy[Any]:
+    """Every value that a rule accepts, more or less."""
+    match rule:
+        case Integer():
+            return st.integers(rule.low, rule.high)
+        case Real():
+            return st.floats(rule.low, rule.high)
+        case Flag():
+            return st.booleans()
+        case Text():
+            return _text
+        case Choice():
+            return st.sampled_from(rule.words)
+        case Scalars():
+            return st.dictionaries(_text, _scalar, max_size=5)
+        case Vector():
+            numbers = st.floats(-rule.limit, rule.limit)
+            rows = st.just(1) if rule.rows is None else st.integers(0, 4)
+            return rows.flatmap(lambda n: st.tuples(*[numbers] * (n * rule.length)))
+    raise AssertionError(rule)
+
+
+@st.composite
+def messages(draw: st.DrawFn) -> Message:
+    kind = draw(st.sampled_from(KINDS))
+    hints = get_type_hints(kind, include_extras=True)
+    names = [name for name in hints if name != "SCHEMA"]
+    return kind(*[draw(values(get_args(hints[name])[1])) for name in names])
+
+
+@settings(deadline=None)
+@given(messages())
+def test_every_message_survives_the_wire(message: Message) -> None:
+    data = encode(message)
+    assert decode(type(message), data) == message
+    assert peek_seq(data) == message.seq
+
+
+@settings(deadline=None)
+@given(st.sampled_from(KINDS), st.binary(max_size=300))
+@example(State, b"")
+@example(State, b"\xc1")
+@example(Telemetry, b"\xdf\xff\xff\xff\xff")
+@example(Telemetry, b"\x91" * 5000)
+@example(Event, b"\xd6\xff\xff\xff\xff\xff")
+def test_any_bytes_decode_or_are_refused(kind: type[Message], data: bytes) -> None:
+    try:
+        message = decode(kind, data)
+    except InputError:
+        return
+    assert decode(kind, encode(message)) == message
+
+
+@settings(max_examples=300, deadline=None)
+@given(messages(), st.data())
+def test_damaged_messages_decode_to_something_valid_or_are_refused(
+    message: Message, data: st.DataObject
+) -> None:
+    """Bits flipped, parts cut: what still decodes is itself a valid, finite message."""
+    damaged = bytearray(encode(message))
+    for _ in range(data.draw(st.integers(1, 3))):
+        damaged[data.draw(st.integers(0, len(damaged) - 1))] ^= data.draw(st.integers(1, 255))
+    damaged = damaged[: data.draw(st.integers(0, len(damaged)))]
+    try:
+        survivor = decode(type(message), bytes(damaged))
+    except InputError:
+        return
+    assert decode(type(message), encode(survivor)) == survivor
+
+
+def _changed(**changes: Any) -> bytes:
+    content = msgpack.unpackb(encode(STATE))
+    content.update(changes)
+    packed: bytes = msgpack.packb({k: v for k, v in content.items() if v is not Ellipsis})
+    return packed
+
+
+@pytest.mark.parametrize(
+    ("changes", "names"),
+    [
+        ({"x": [math.nan] * 7}, "State.x"),
+        ({"x": [math.inf] + [0.0] * 6}, "State.x"),
+        ({"x": [0.0] * 6}, "State.x: expected 7 numbers, got 6"),
+        ({"x": [0] * 7}, "State.x"),
+        ({"x": "1234567"}, "State.x: expected an array"),
+        ({"seq": -1}, "State.seq"),
+        ({"seq": True}, "State.seq: expected an integer, got bool"),
+        ({"seq": 2**63}, "State.seq"),
+        ({"time_s": 1}, "State.time_s: expected a float"),
+        ({"time_s": math.nan}, "State.time_s"),
+        ({"lockstep": 1}, "State.lockstep"),
+        ({"schema": 2}, "schema version 2, this program reads 1"),
+        ({"schema": 1.0}, "schema version"),
+        ({"extra": 1}, "missing or unknown: 'extra'"),
+        ({"lap": ...}, "missing or unknown: 'lap'"),
+    ],
+)
+def test_a_refusal_names_the_field_and_the_fault(changes: dict[str, Any], names: str) -> None:
+    with pytest.raises(InputError, match=names.replace(".", r"\.")):
+        decode(State, _changed(**changes))
+
+
+def test_trailing_bytes_and_repeated_names_are_refused() -> None:
+    data = encode(STATE)
+    with pytest.raises(InputError, match="extra data"):
+        decode(State, data + b"\x00")
+    repeated = bytes([data[0] + 1]) + data[1:] + b"\xa3seq\x07"
+    with pytest.raises(InputError, match="twice"):
+        decode(State, repeated)
+
+
+def test_the_decoder_counts_drops_and_logs_at_a_limited_rate(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    decoder = Decoder(State, logging.getLogger("test"))
+    with caplog.at_level(logging.WARNING):
+        assert [decoder(b"junk") for _ in range(100)] == [None] * 100
+    assert decoder(encode(STATE)) == STATE
+    assert (decoder.refused, decoder.accepted) == (100, 1)
+    assert len(caplog.records) == 1
+    silent = Decoder(State)
+    assert silent(b"junk") is None
+    assert "not a m" in silent.last_reason
+
+
+def test_maps_in_messages_are_read_only() -> None:
+    event = Event(0, 0, 0, "plant", "kind", "text", {"a": 1})
+    read = decode(Event, encode(event))
+    with pytest.raises(TypeError):
+        read.data["a"] = 2  # type: ignore[index]
+
+
+def test_keys_take_a_plain_car_name_only() -> None:
+    assert car_key(STATUS.key, "orca-2", "plant") == "bayesrace/orca-2/plant/status"
+    for bad in ("", "a/b", "*", "a b", "$x", "x" * 41):
+        with pytest.raises(InputError, match="car name"):
+            car_key(RUN.key, bad)
+
+
+def test_keys_of_the_table_are_distinct() -> None:
+    keys = [topic.key for topic in TOPICS] + [service.key for service in SERVICES]
+    assert len(set(keys)) == len(keys)
+    assert STOP.request is not None
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_published_schema_names_exactly_the_fields_on_the_wire(kind: type[Message]) -> None:
+    schema = json_schema(kind)
+    hints = set(get_type_hints(kind)) - {"SCHEMA"}
+    assert set(schema["properties"]) == set(schema["required"]) == hints | {"schema"}

@@ -1,0 +1,203 @@
+"""Sessions, publishers, the inbox and requests, over real loopback links within one process."""
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import pytest
+
+from bayesrace.errors import InputError
+from bayesrace.messages import (
+    EVENT,
+    STATE,
+    STATUS,
+    STOP,
+    WEIGHTS,
+    Event,
+    Reply,
+    State,
+    Status,
+    StatusRequest,
+    StopRequest,
+    encode,
+)
+from bayesrace.transport import (
+    Director,
+    Endpoints,
+    Inbox,
+    Item,
+    Kind,
+    Publisher,
+    ask,
+    decode_request,
+    free_endpoint,
+    open_session,
+)
+
+
+@pytest.fixture
+def pair() -> Iterator[tuple[Any, Any]]:
+    """Two connected sessions."""
+    endpoint = free_endpoint()
+    with ExitStack() as stack:
+        one = stack.enter_context(open_session(Endpoints(listen=(endpoint,))))
+        two = stack.enter_context(open_session(Endpoints(connect=(endpoint,))))
+        yield one, two
+
+
+def state(seq: int) -> State:
+    return State(seq, 0, 1, 0.0, (0.0,) * 7, (0.0, 0.0), 0, True)
+
+
+def take(inbox: Inbox, kind: Kind, timeout_s: float = 5.0) -> Item:
+    deadline = time.monotonic() + timeout_s
+    while (left := deadline - time.monotonic()) > 0:
+        item = inbox.get(left)
+        if item is not None and item.kind is kind:
+            return item
+    raise AssertionError(f"no {kind} within {timeout_s} s")
+
+
+def meet(one: Inbox, two: Inbox) -> None:
+    """Each knows what the other has declared."""
+    one.watch("controller")
+    two.watch("plant")
+    one.announce("plant")
+    two.announce("controller")
+    take(one, Kind.ALIVE)
+    take(two, Kind.ALIVE)
+
+
+def test_nothing_is_lost_or_reordered_in_lockstep(pair: tuple[Any, Any]) -> None:
+    sender, receiver = Inbox(pair[0], "orca"), Inbox(pair[1], "orca")
+    receiver.subscribe(STATE)
+    meet(sender, receiver)
+    publisher = Publisher(pair[0], STATE, "orca")
+    for _ in range(3000):
+        publisher.put(state(publisher.next_seq), lockstep=True)
+    for seq in range(3000):
+        item = take(receiver, Kind.MESSAGE)
+        assert item.name == "state"
+        assert item.value == _encoded(seq)
+    assert receiver.overflowed == 0
+
+
+def _encoded(seq: int) -> bytes:
+    return encode(state(seq))
+
+
+def test_cars_do_not_hear_each_other(pair: tuple[Any, Any]) -> None:
+    sender, receiver = Inbox(pair[0], "one"), Inbox(pair[1], "one")
+    receiver.subscribe(STATE)
+    meet(sender, receiver)
+    Publisher(pair[0], STATE, "two").put(state(0), lockstep=True)
+    Publisher(pair[0], STATE, "one").put(state(1), lockstep=True)
+    assert take(receiver, Kind.MESSAGE).value == _encoded(1)
+
+
+def test_requests_are_answered_and_silence_is_an_error(pair: tuple[Any, Any]) -> None:
+    server, client = Inbox(pair[0], "orca"), Inbox(pair[1], "orca")
+    server.serve(STATUS, "plant")
+    server.serve(WEIGHTS)
+    server.serve(STOP)
+    meet(server, client)
+    status = Status(0, 1, "plant", "idle", 0, "fine", "", {"late": 3})
+
+    def answer() -> None:
+        take(server, Kind.REQUEST).value.answer(status)
+        request = take(server, Kind.REQUEST).value
+        request.answer(Reply(0, 0, True, f"{len(request.payload)} bytes", {}))
+        request = take(server, Kind.REQUEST).value
+        message, why_not = decode_request(request)
+        assert (message, why_not) == (StopRequest(0, 0, "enough"), "")
+        request.answer(Reply(0, 0, False, "no", {}))
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    session = pair[1]
+    try:
+        assert ask(session, STATUS, "orca", StatusRequest(0, 0), "plant") == status
+        # Larger than one batch of the transport: weights are.
+        assert ask(session, WEIGHTS, "orca", bytes(300_000)).text == "300000 bytes"
+        assert not ask(session, STOP, "orca", StopRequest(0, 0, "enough")).accepted
+    finally:
+        thread.join()
+    with pytest.raises(InputError, match="nobody answered on bayesrace/other/plant/status"):
+        ask(session, STATUS, "other", StatusRequest(0, 0), "plant")
+
+
+def test_a_malformed_request_is_refused_with_a_reason(pair: tuple[Any, Any]) -> None:
+    server, client = Inbox(pair[0], "orca"), Inbox(pair[1], "orca")
+    server.serve(STOP)
+    meet(server, client)
+    thread = threading.Thread(target=ask, args=(pair[1], STOP, "orca", b"junk"))
+    thread.start()
+    request = take(server, Kind.REQUEST).value
+    message, why_not = decode_request(request)
+    request.answer(Reply(0, 0, False, why_not, {}))
+    thread.join()
+    assert message is None
+    assert why_not.startswith("StopRequest: ")
+
+
+def test_coming_and_going_is_seen() -> None:
+    endpoint = free_endpoint()
+    with open_session(Endpoints(listen=(endpoint,))) as session:
+        inbox = Inbox(session, "orca")
+        inbox.watch("controller")
+        with open_session(Endpoints(connect=(endpoint,))) as other:
+            theirs = Inbox(other, "orca")
+            theirs.announce("controller")
+            assert take(inbox, Kind.ALIVE).name == "controller"
+            assert inbox.alive == {"controller"}
+        assert take(inbox, Kind.GONE).name == "controller"
+        assert inbox.alive == set()
+
+
+def test_who_connects_first_is_connected_when_the_other_appears() -> None:
+    endpoint = free_endpoint()
+    with open_session(Endpoints(connect=(endpoint,))) as session:
+        inbox = Inbox(session, "orca")
+        inbox.watch("plant")
+        assert inbox.get(0.3) is None
+        with open_session(Endpoints(listen=(endpoint,))) as other:
+            theirs = Inbox(other, "orca")
+            theirs.announce("plant")
+            take(inbox, Kind.ALIVE)
+
+
+def test_an_absent_peer_is_an_error_that_says_what_to_do() -> None:
+    with open_session(Endpoints(connect=(free_endpoint(),))) as session:
+        director = Director(session, "orca")
+        with pytest.raises(InputError, match="no controller and no plant for car 'orca' within"):
+            director.wait_for(("plant", "controller"), 0.2)
+
+
+def test_a_taken_port_is_an_error_that_says_what_to_do() -> None:
+    endpoint = free_endpoint()
+    with (
+        open_session(Endpoints(listen=(endpoint,))),
+        pytest.raises(InputError, match=f"cannot listen on {endpoint}: Address already in use"),
+        open_session(Endpoints(listen=(endpoint,))),
+    ):
+        pass
+
+
+@pytest.mark.parametrize(
+    "endpoint", ["", "localhost", "tcp/localhost", "tcp/localhost:70000", "ftp/x:1", "tcp/ a:1"]
+)
+def test_a_malformed_endpoint_is_refused_by_name(endpoint: str) -> None:
+    with pytest.raises(InputError, match="endpoint"), open_session(Endpoints(connect=(endpoint,))):
+        pass
+
+
+def test_events_of_all_sources_arrive(pair: tuple[Any, Any]) -> None:
+    sender, receiver = Inbox(pair[0], "orca"), Inbox(pair[1], "orca")
+    receiver.subscribe(EVENT)
+    meet(sender, receiver)
+    for source in ("plant", "race"):
+        event = Event(0, 0, 0, source, "kind", "text", {})
+        Publisher(pair[0], EVENT, "orca", source).put(event, lockstep=True)
+    assert {take(receiver, Kind.MESSAGE).name for _ in range(2)} == {"event"}
