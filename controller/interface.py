@@ -1,0 +1,69 @@
+"""What the controller process drives: any object with these methods."""
+
+from dataclasses import dataclass, field
+from typing import Any, Final, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from bayesrace.messages import State
+
+__all__ = ["NO_PLAN", "Array", "Controller", "StepOutput"]
+
+Array = npt.NDArray[np.float64]
+
+NO_PLAN: Final[Array] = np.zeros((0, 2))
+"""``plan_u`` of a controller that does not look ahead."""
+
+_NO_STATES: Final[Array] = np.zeros((0, 7))
+
+
+@dataclass(slots=True)
+class StepOutput:
+    """Result of one step. A controller may hand out the same object each time, with new values;
+    the process has used it up before the next step."""
+
+    u: Array
+    """Shape (2,): d [-], delta_rate [rad/s]. Looked at only if ``status`` is 0."""
+    status: int = 0
+    """0: usable. Else the controller's own code (1 to 255): the fallback takes over."""
+    iterations: int = 0
+    solve_us: float = 0.0
+    """Execution time of the step [us]; 0: the process measures it from outside."""
+    plan_x: Array = field(default_factory=lambda: _NO_STATES)
+    """Shape (N + 1, 7) or (0, 7): predicted states."""
+    plan_u: Array = field(default_factory=lambda: NO_PLAN)
+    """Shape (N, 2) or (0, 2): planned inputs, the first of which is ``u``."""
+    residual_dynamics: float = -1.0
+    residual_bounds: float = -1.0
+    residual_stationarity: float = -1.0
+    """As in :class:`bayesrace.messages.Telemetry`; -1 if there is none."""
+    s_ref_m: float = 0.0
+    n_ref_m: float = 0.0
+
+
+class Controller(Protocol):
+    """One car's controller. All calls come from one thread; none may block or do input/output."""
+
+    @property
+    def weights_version(self) -> str:
+        """Version of the residual's weights in use; empty if it takes none."""
+
+    def reset(self, state: State) -> None:
+        """Forget everything about the past: ``state`` is the first of a run."""
+
+    def step(self, x: Array, u_previous: Array) -> StepOutput:
+        """The input for state ``x`` (7,), where ``u_previous`` (2,) acted until now.
+
+        Both arrays are the caller's and change with the next state. Never raises for a finite
+        state: what goes wrong is told by the status.
+        """
+
+    def set_weights(self, data: bytes) -> str:
+        """Take over weights (``bayesrace.gp.weights`` file content) from the next step on.
+
+        Returns their version; InputError says why they are refused, and the old ones stay.
+        """
+
+    def describe(self) -> dict[str, Any]:
+        """Name and settings for the log: flat, numbers and short texts."""

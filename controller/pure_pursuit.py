@@ -1,0 +1,164 @@
+"""Pure pursuit along a racing line: the driver that collects training data. Not tuned well.
+
+Coulter, "Implementation of the pure pursuit path tracking algorithm", 1992: steer on the circle
+through the rear axle and a point ahead on the line, delta = atan(2 L sin(alpha) / l). The steering
+angle is a target that a rate within the car's limit pursues; the speed follows the line's (or
+less) by a proportional duty cycle. A seeded disturbance on both inputs makes the data worth
+learning from.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from bayesrace.errors import InputError
+from bayesrace.messages import State
+from bayesrace.vehicles.parameters import CarParameters
+from controller.interface import Array, StepOutput
+
+__all__ = ["PurePursuit", "PurePursuitSettings"]
+
+
+class PurePursuitSettings(BaseModel):
+    """How it drives; lengths are those of a 1:43 car, scaled by wheelbase / 0.062 m."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    lookahead_m: float = Field(
+        default=0.16, gt=0, description="distance of the target at standstill"
+    )
+    lookahead_s: float = Field(default=0.05, ge=0, description="added distance per speed")
+    speed_scale: float = Field(
+        default=0.95, gt=0, le=1.5, description="fraction of the line's speed"
+    )
+    speed_gain: float = Field(default=0.9, gt=0, description="duty cycle per speed error [s/m]")
+    speed_min_mps: float = Field(default=0.4, ge=0, description="target speed is never below")
+    excite_d: float = Field(
+        default=0.1, ge=0, le=1, description="std. deviation of the d disturbance"
+    )
+    excite_delta_rad: float = Field(
+        default=0.04, ge=0, le=1, description="std. deviation of the steering disturbance"
+    )
+    excite_s: float = Field(default=0.1, gt=0, description="correlation time of the disturbances")
+    seed: int = Field(default=0, ge=0, description="of the disturbances")
+    step_s: float = Field(default=0.02, gt=0, le=1, description="sampling time")
+
+
+class PurePursuit:
+    """See the module; implements :class:`controller.interface.Controller`."""
+
+    def __init__(
+        self,
+        car: CarParameters,
+        x_m: Array,
+        y_m: Array,
+        vx_mps: Array,
+        settings: PurePursuitSettings | None = None,
+    ) -> None:
+        """``x_m``, ``y_m``, ``vx_mps``: a closed line's points in order of driving, (n,) each, the
+        last not repeated."""
+        self._car = car
+        self._settings = settings or PurePursuitSettings()
+        self._points = np.column_stack([x_m, y_m]).astype(np.float64)
+        self._speeds = np.asarray(vx_mps, dtype=np.float64)
+        if len(self._points) < 10 or not np.isfinite(self._points).all():
+            raise InputError("pure pursuit needs a line of at least 10 finite points")
+        if self._speeds.shape != (len(self._points),) or not np.isfinite(self._speeds).all():
+            raise InputError("pure pursuit needs one finite speed for each point of the line")
+        steps = np.linalg.norm(np.roll(self._points, -1, axis=0) - self._points, axis=1)
+        if not (steps > 0).all():
+            raise InputError(
+                "the line repeats a point; leave out the last point if it is the first"
+            )
+        # Twice around, so that every window of indices is one slice.
+        self._twice_x, self._twice_y = np.tile(self._points, (2, 1)).T.copy()
+        self._lengths = np.concatenate([[0.0], np.cumsum(steps)])
+        self._scale = car.wheelbase_m / 0.062
+        self._spacing = float(self._lengths[-1]) / len(steps)
+        self._nearest = 0
+        self._random = np.random.default_rng(self._settings.seed)
+        self._noise = np.zeros(2)
+        self._output = StepOutput(u=np.zeros(2))
+
+    @property
+    def weights_version(self) -> str:
+        """None: it has no residual."""
+        return ""
+
+    def reset(self, state: State) -> None:
+        """Search the whole line; begin the disturbance anew."""
+        self._nearest = int(np.argmin(self._squared_distances(state.x[0], state.x[1])))
+        self._random = np.random.default_rng(self._settings.seed)
+        self._noise[:] = 0.0
+
+    def set_weights(self, data: bytes) -> str:
+        """Always refused."""
+        raise InputError("pure pursuit takes no weights; send them to the predictive controller")
+
+    def describe(self) -> dict[str, Any]:
+        """Name and settings."""
+        return {"controller": "pure-pursuit", **self._settings.model_dump()}
+
+    def step(self, x: Array, u_previous: Array) -> StepOutput:
+        """Steer towards the target point, hold the line's speed."""
+        car, settings, output = self._car, self._settings, self._output
+        px, py, psi, vx, delta = (float(x[i]) for i in (0, 1, 2, 3, 6))
+        self._follow(px, py)
+        self._excite()
+        target_speed, delta_target = self._targets(px, py, psi, vx)
+        d = settings.speed_gain * (target_speed - vx) + self._hold(vx) + float(self._noise[0])
+        rate = (delta_target + float(self._noise[1]) - delta) / settings.step_s
+        lowest = max(-car.delta_rate_max_radps, (-car.delta_max_rad - delta) / settings.step_s)
+        highest = min(car.delta_rate_max_radps, (car.delta_max_rad - delta) / settings.step_s)
+        output.u[0] = min(max(d, car.d_min), car.d_max)
+        output.u[1] = min(max(rate, lowest), highest)
+        output.s_ref_m = float(self._lengths[self._nearest])
+        return output
+
+    def _targets(self, px: float, py: float, psi: float, vx: float) -> tuple[float, float]:
+        """Speed [m/s] and steering angle [rad] to aim for."""
+        car, settings = self._car, self._settings
+        reach = (settings.lookahead_m + settings.lookahead_s * max(vx, 0.0)) * self._scale
+        ahead = (self._nearest + max(1, round(reach / self._spacing))) % len(self._points)
+        rear_x = px - car.lr_m * math.cos(psi)
+        rear_y = py - car.lr_m * math.sin(psi)
+        dx, dy = float(self._points[ahead, 0]) - rear_x, float(self._points[ahead, 1]) - rear_y
+        alpha = math.atan2(dy, dx) - psi
+        delta = math.atan2(2 * car.wheelbase_m * math.sin(alpha), math.hypot(dx, dy))
+        speed = max(settings.speed_scale * float(self._speeds[ahead]), settings.speed_min_mps)
+        return speed, min(max(delta, -car.delta_max_rad), car.delta_max_rad)
+
+    def _hold(self, vx: float) -> float:
+        """Duty cycle that about balances rolling resistance at this speed."""
+        car = self._car
+        return (car.cr0 + car.cr2 * vx * vx) / max(car.cm1 - car.cm2 * vx, 0.1 * car.cm1)
+
+    def _excite(self) -> None:
+        """First-order low-pass noise (Ornstein-Uhlenbeck) of the set standard deviations."""
+        settings = self._settings
+        keep = math.exp(-settings.step_s / settings.excite_s)
+        fresh = self._random.standard_normal(2) * math.sqrt(1 - keep * keep)
+        fresh *= (settings.excite_d, settings.excite_delta_rad)
+        self._noise *= keep
+        self._noise += fresh
+
+    def _follow(self, px: float, py: float) -> None:
+        """Nearest point near the last one; the whole line if the car has left it by far."""
+        count = len(self._points)
+        reach = min(max(3, int(0.4 * self._scale / self._spacing)), count // 3)
+        first = (self._nearest - reach // 2) % count
+        window = slice(first, first + reach // 2 + reach)
+        dx, dy = self._twice_x[window] - px, self._twice_y[window] - py
+        squared = dx * dx + dy * dy
+        best = int(squared.argmin())
+        if squared[best] > (0.5 * self._scale) ** 2:
+            self._nearest = int(np.argmin(self._squared_distances(px, py)))
+        else:
+            self._nearest = (first + best) % count
+
+    def _squared_distances(self, px: float, py: float) -> Array:
+        offsets = self._points - (px, py)
+        result: Array = np.einsum("ij,ij->i", offsets, offsets)
+        return result

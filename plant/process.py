@@ -1,0 +1,240 @@
+"""The plant process: waits for a request, runs it, says how it went, waits for the next."""
+
+import gc
+import logging
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from bayesrace.clock import die_with_parent, pin_to_cpu, quiet_garbage_collector
+from bayesrace.errors import InputError
+from bayesrace.messages import (
+    ACTUATION,
+    EVENT,
+    RUN,
+    STATE,
+    STATUS,
+    STOP,
+    Actuation,
+    Decoder,
+    Event,
+    Reply,
+    RunRequest,
+    Scalar,
+    Status,
+)
+from bayesrace.transport import (
+    PLANT_ENDPOINT,
+    Endpoints,
+    Inbox,
+    Item,
+    Kind,
+    Publisher,
+    Request,
+    decode_request,
+    open_session,
+)
+from bayesrace.vehicles.models import dynamic
+from bayesrace.vehicles.parameters import get_car
+from plant.run import End, Run, RunCounters
+from plant.simulator import Simulator
+
+__all__ = ["PlantProcess", "PlantSettings", "main"]
+
+_log = logging.getLogger("bayesrace.plant")
+
+
+class PlantSettings(BaseModel):
+    """How a plant process is started; what a run is like comes with its request."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    car: str = Field(default="orca", description="car whose parameters drive the model")
+    name: str = Field(default="", description="name in message keys; the car's own if empty")
+    endpoints: Endpoints = Endpoints(listen=(PLANT_ENDPOINT,))
+    cpu: int | None = Field(default=None, ge=0, description="CPU to bind to")
+    controller_wait_s: float = Field(
+        default=2.0,
+        ge=0,
+        le=60,
+        description="how long a lockstep run waits for a controller to appear",
+    )
+    die_with_parent: bool = Field(False, description="end when the starting process ends")
+
+
+class PlantProcess:
+    """Serves one car's runs over an open session."""
+
+    def __init__(self, session: Any, settings: PlantSettings) -> None:
+        self._settings = settings
+        self.name = settings.name or settings.car
+        self._simulator = Simulator(dynamic(get_car(settings.car)))
+        self._states = Publisher(session, STATE, self.name)
+        self._events = Publisher(session, EVENT, self.name, "plant")
+        self._decoder: Decoder[Actuation] = Decoder(Actuation)
+        self._counters = RunCounters()
+        self._run: Run | None = None
+        self._run_number = 0
+        self._runs = 0
+        self._text = "no run so far"
+        self._stopping = False
+        inbox = self.inbox = Inbox(session, self.name)
+        inbox.subscribe(ACTUATION)
+        for service in (RUN, STOP):
+            inbox.serve(service)
+        inbox.serve(STATUS, "plant")
+        inbox.watch("controller")
+        inbox.announce("plant")
+
+    def serve(self) -> None:
+        """Until SIGINT or SIGTERM."""
+        while not self._stopping:
+            item = self.inbox.get(1.0)
+            if item is None or item.kind is Kind.MESSAGE:
+                continue
+            if item.kind is Kind.REQUEST and item.name == RUN.name:
+                self._serve_run(item.value)
+            else:
+                self._react(item)
+
+    def _serve_run(self, request: Request) -> None:
+        """Check and answer the request, then execute it."""
+        message, why_not = decode_request(request)
+        if message is not None:
+            why_not = self._prepare(message)
+        request.answer(self._reply(not why_not, why_not or f"run {message.run} started"))
+        if why_not or self._run is None:
+            _log.warning("run refused: %s", why_not)
+            return
+        self._text = f"run {message.run} under way"
+        mode = "lockstep" if message.lockstep else "free-running"
+        self._publish_event("run_started", f"run {message.run} in {mode}", {"mode": mode})
+        gc.collect()
+        end = self._run.execute()
+        self._conclude(message, end)
+
+    def _prepare(self, message: RunRequest) -> str:
+        """Make the run; returns why it cannot be, or ""."""
+        if message.lockstep and not self._controller_there():
+            return (
+                f"no controller for car '{self.name}': start one that connects to this plant "
+                "(bayesrace controller)"
+            )
+        try:
+            self._run = Run(
+                message,
+                self._simulator,
+                self.inbox,
+                self._states,
+                self._decoder,
+                self._counters,
+                self._react,
+            )
+        except InputError as error:
+            return str(error)
+        self._run_number = message.run
+        self._runs += 1
+        return ""
+
+    def _controller_there(self) -> bool:
+        deadline = time.monotonic() + self._settings.controller_wait_s
+        while "controller" not in self.inbox.alive:
+            left_s = deadline - time.monotonic()
+            if left_s <= 0 or self._stopping:
+                return False
+            item = self.inbox.get(left_s)
+            if item is not None and item.kind in (Kind.REQUEST, Kind.SIGNAL):
+                self._react(item)
+        return True
+
+    def _conclude(self, message: RunRequest, end: End) -> None:
+        run = self._run
+        self._run = None
+        if run is None:
+            return
+        self._text = f"run {message.run} ended after {run.time_s:.2f} s: {end.text}"
+        _log.info("%s", self._text)
+        data: dict[str, Scalar] = {
+            "reason": end.reason,
+            "time_s": run.time_s,
+            "laps": run.laps,
+            **self._count(),
+        }
+        self._publish_event("run_ended", self._text, data)
+
+    def _react(self, item: Item) -> End | None:
+        """Everything that may happen at any time; what it returns ends a run under way."""
+        if item.kind is Kind.SIGNAL:
+            self._stopping = True
+            return End("interrupted", "the plant process was told to end")
+        if item.kind is Kind.GONE:
+            _log.warning("the controller of car '%s' is gone", self.name)
+        elif item.kind is Kind.REQUEST:
+            return self._serve(item.value)
+        return None
+
+    def _serve(self, request: Request) -> End | None:
+        if request.service is RUN:
+            request.answer(self._reply(False, f"busy: {self._text}"))
+            return None
+        message, why_not = decode_request(request)
+        if request.service is STATUS:
+            request.answer(self._status())
+            return None
+        if message is None or self._run is None:
+            request.answer(self._reply(False, why_not or "no run to stop"))
+            return None
+        request.answer(self._reply(True, f"run {self._run_number} stops"))
+        return End("stopped", f"stopped on request: {message.text}")
+
+    def _publish_event(self, kind: str, text: str, data: Mapping[str, Scalar]) -> None:
+        now_ns = time.monotonic_ns()
+        event = Event(
+            self._events.next_seq, now_ns, self._run_number, "plant", kind, text[:2000], data
+        )
+        self._events.put(event, lockstep=True)
+
+    def _count(self) -> dict[str, Scalar]:
+        return {
+            "runs": self._runs,
+            "refused": self._decoder.refused,
+            "overflowed": self.inbox.overflowed,
+            **self._counters.as_dict(),
+            **self._simulator.guard.counters.as_dict(),
+        }
+
+    def _reply(self, accepted: bool, text: str) -> Reply:
+        return Reply(0, time.monotonic_ns(), accepted, text[:2000], {})
+
+    def _status(self) -> Status:
+        phase = "idle" if self._run is None else "running"
+        return Status(
+            0,
+            time.monotonic_ns(),
+            "plant",
+            phase,
+            self._run_number,
+            self._text[:2000],
+            "",
+            self._count(),
+        )
+
+
+def main(settings: PlantSettings) -> int:
+    """Run a plant until SIGINT or SIGTERM; returns the exit code. Raises InputError at a bad start.
+
+    Call it from the main thread of a process: it takes over the signals.
+    """
+    if settings.die_with_parent:
+        die_with_parent()
+    if refusal := pin_to_cpu(settings.cpu):
+        _log.warning("%s", refusal)
+    with open_session(settings.endpoints) as session:
+        process = PlantProcess(session, settings)
+        process.inbox.catch_signals()
+        quiet_garbage_collector()
+        _log.info("plant of car '%s' on %s", process.name, ", ".join(settings.endpoints.listen))
+        process.serve()
+    return 0

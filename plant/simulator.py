@@ -1,0 +1,188 @@
+"""The car as a simulated thing: guarded input, the true dynamics, one sampling period at a time.
+
+The guard is the car's own: whatever arrives, duty cycle, steering rate and steering angle stay
+within the car's limits, what is not finite never gets to the motor, and without a usable command
+the car brakes.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from bayesrace.errors import InputError
+from bayesrace.integrators import Discretisation
+from bayesrace.vehicles.models import Model
+from bayesrace.vehicles.parameters import CarParameters
+
+__all__ = ["BRAKE_FADE_MPS", "PLANT", "GuardCounters", "PlantGuard", "Simulator"]
+
+Array = npt.NDArray[np.float64]
+
+PLANT: Final = Discretisation(scheme="rk4", step_s=0.02, substeps=20)
+"""How the plant integrates: 1 ms steps, far inside the tyres' stability limit at low speed."""
+
+BRAKE_FADE_MPS: Final = 0.1
+"""Below this speed the guard's braking fades linearly to none, so that a car stops and stays."""
+
+_CLIP_TOLERANCE: Final = 1e-9
+"""Excess that is rounding of the sender's arithmetic: corrected, not counted as clipped."""
+
+
+@dataclass(slots=True)
+class GuardCounters:
+    """How often the guard had to act since it was made."""
+
+    rejected: int = 0
+    """Commands that were not finite; the car braked instead."""
+    clipped: int = 0
+    """Commands beyond a limit of duty cycle, steering rate or steering angle."""
+    braked: int = 0
+    """Periods without a usable command."""
+
+    def as_dict(self) -> dict[str, int]:
+        """Name to count."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+class PlantGuard:
+    """Turns any command into one that the car's actuators can follow for one period."""
+
+    def __init__(self, car: CarParameters) -> None:
+        self._d_min, self._d_max = car.d_min, car.d_max
+        self._rate_max = car.delta_rate_max_radps
+        self._delta_max = car.delta_max_rad
+        self.counters = GuardCounters()
+
+    def apply(
+        self, u: Sequence[float], vx_mps: float, delta_rad: float, duration_s: float
+    ) -> tuple[float, float]:
+        """Duty cycle [-] and steering rate [rad/s] that act for the command ``u``."""
+        d, rate = float(u[0]), float(u[1])
+        if not (math.isfinite(d) and math.isfinite(rate)):
+            self.counters.rejected += 1
+            return self.brake(vx_mps)
+        d_safe = min(max(d, self._d_min), self._d_max)
+        rate_safe = self._steerable(rate, delta_rad, duration_s)
+        if abs(d_safe - d) > _CLIP_TOLERANCE or abs(rate_safe - rate) > _CLIP_TOLERANCE:
+            self.counters.clipped += 1
+        return d_safe, rate_safe
+
+    def brake(self, vx_mps: float) -> tuple[float, float]:
+        """Full brake while rolling forward, fading to none at standstill; steering held."""
+        self.counters.braked += 1
+        return self._d_min * min(max(vx_mps / BRAKE_FADE_MPS, 0.0), 1.0), 0.0
+
+    def _steerable(self, rate: float, delta_rad: float, duration_s: float) -> float:
+        """The nearest rate within its limit that leaves the angle within its own at the end."""
+        lowest = (-self._delta_max - delta_rad) / duration_s
+        highest = (self._delta_max - delta_rad) / duration_s
+        rate = min(max(rate, lowest), highest)
+        return min(max(rate, -self._rate_max), self._rate_max)
+
+    def angle_after(self, delta_rad: float, rate: float, duration_s: float) -> float:
+        """Steering angle after that long at ``rate``, free of the integrator's rounding."""
+        return min(max(delta_rad + duration_s * rate, -self._delta_max), self._delta_max)
+
+
+class _Map:
+    """A CasADi map x_next = F(x, u) called in place on preallocated buffers.
+
+    An ordinary call converts to and from DM, which costs more than the integration itself.
+    """
+
+    def __init__(self, function: Any, x: Array, u: Array) -> None:
+        self._x = x
+        self._x_next: Array = np.zeros_like(x)
+        self._function = function  # the buffer does not keep it alive
+        self._buffer, self._evaluate = function.buffer()
+        self._buffer.set_arg(0, x.data)
+        self._buffer.set_arg(1, u.data)
+        self._buffer.set_res(0, self._x_next.data)
+
+    def advance(self) -> None:
+        self._evaluate()
+        self._x[:] = self._x_next
+
+
+class Simulator:
+    """A car that advances by one sampling period per call; deterministic to the bit.
+
+    ``x`` is the state after the last step: read it, but do not write into it.
+    """
+
+    def __init__(self, model: Model, discretisation: Discretisation = PLANT) -> None:
+        self.car = model.car
+        self.step_s = discretisation.step_s
+        self.substeps = discretisation.substeps
+        self.guard = PlantGuard(model.car)
+        self.u_applied: tuple[float, float] = (0.0, 0.0)
+        """What acted during the last period; the mean over it if it changed within."""
+        self.steps = 0
+        self.x: Array = np.zeros(len(model.states))
+        self._u: Array = np.zeros(len(model.inputs))
+        substep = Discretisation(
+            scheme=discretisation.scheme, step_s=self.step_s / self.substeps, substeps=1
+        )
+        self._period = _Map(discretisation.discretise(model), self.x, self._u)
+        self._substep = _Map(substep.discretise(model), self.x, self._u)
+
+    @property
+    def time_s(self) -> float:
+        """Time since the reset, exact multiples of the period."""
+        return self.steps * self.step_s
+
+    def reset(self, x0: Sequence[float]) -> None:
+        """Put the car into state ``x0`` at time zero; InputError if it cannot be in it."""
+        start = np.asarray(x0, dtype=np.float64)
+        if start.shape != self.x.shape or not np.isfinite(start).all():
+            raise InputError(f"start state needs {self.x.size} finite numbers, got {x0!r}")
+        if abs(start[6]) > self.car.delta_max_rad:
+            raise InputError(
+                f"start state has a steering angle of {start[6]:.3f} rad; "
+                f"{self.car.name} steers within ±{self.car.delta_max_rad} rad"
+            )
+        self.x[:] = start
+        self.u_applied = (0.0, 0.0)
+        self.steps = 0
+
+    def step(self, u: Sequence[float] | None) -> None:
+        """Hold the command ``u`` = (d, delta_rate) for one period; None brakes."""
+        self.u_applied = self._hold(u, self._period, 1, self.step_s)
+        self.steps += 1
+
+    def step_switched(self, commands: Sequence[tuple[int, Sequence[float] | None]]) -> None:
+        """One period in which the command changes: (substeps, command) in order of time.
+
+        The substeps must add up to :attr:`substeps`.
+        """
+        if sum(count for count, _ in commands) != self.substeps:
+            raise ValueError(f"the commands must last {self.substeps} substeps together")
+        if len(commands) == 1:
+            self.step(commands[0][1])
+            return
+        d_sum = rate_sum = 0.0
+        for count, u in commands:
+            if count == 0:
+                continue
+            d, rate = self._hold(u, self._substep, count, self.step_s * count / self.substeps)
+            d_sum += count * d
+            rate_sum += count * rate
+        self.u_applied = (d_sum / self.substeps, rate_sum / self.substeps)
+        self.steps += 1
+
+    def _hold(
+        self, u: Sequence[float] | None, advance: _Map, times: int, duration_s: float
+    ) -> tuple[float, float]:
+        x = self.x
+        vx, delta = float(x[3]), float(x[6])
+        guard = self.guard
+        applied = guard.brake(vx) if u is None else guard.apply(u, vx, delta, duration_s)
+        self._u[0], self._u[1] = applied
+        for _ in range(times):
+            advance.advance()
+        x[6] = guard.angle_after(delta, applied[1], duration_s)
+        return applied

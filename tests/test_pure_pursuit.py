@@ -1,0 +1,125 @@
+"""The data-collecting driver: laps complete, limits hold, the car is excited, seeds repeat."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bayesrace.errors import InputError
+from bayesrace.messages import State
+from bayesrace.tracks import DEFAULT_TRAINING_TRACK, load_track
+from bayesrace.vehicles.models import dynamic
+from bayesrace.vehicles.parameters import get_car
+from controller.pure_pursuit import PurePursuit, PurePursuitSettings
+from plant.laps import LineCounter
+from plant.simulator import Simulator
+
+CAR = get_car("orca")
+SIMULATOR = Simulator(dynamic(CAR))
+
+
+def oval(points: int = 200) -> tuple[Any, Any, Any]:
+    angle = np.linspace(0, 2 * np.pi, points, endpoint=False)
+    return 2 * np.cos(angle), np.sin(angle), np.full(points, 1.5)
+
+
+def first_state(x0: tuple[float, ...]) -> State:
+    return State(0, 0, 0, 0.0, x0, (0.0, 0.0), 0, True)
+
+
+def drive(
+    driver: PurePursuit, x0: tuple[float, ...], laps: int, time_s: float
+) -> tuple[int, Any, Any]:
+    """Laps done, states (n, 7) and applied inputs (n, 2)."""
+    line = LineCounter(x0[0], x0[1], x0[2], 0.5, 0.5)
+    line.restart(x0[0], x0[1])
+    SIMULATOR.reset(x0)
+    driver.reset(first_state(x0))
+    u = np.zeros(2)
+    states, inputs = [], []
+    while line.crossings < laps and SIMULATOR.time_s < time_s:
+        SIMULATOR.step(driver.step(SIMULATOR.x, u).u.tolist())
+        u[:] = SIMULATOR.u_applied
+        states.append(SIMULATOR.x.copy())
+        inputs.append(u.copy())
+        line.move(float(SIMULATOR.x[0]), float(SIMULATOR.x[1]))
+    return line.crossings, np.array(states), np.array(inputs)
+
+
+START = (2.0, 0.0, math.pi / 2, 0.1, 0.0, 0.0, 0.0)
+
+
+def test_it_laps_an_oval_without_leaving_it() -> None:
+    laps, states, _ = drive(PurePursuit(CAR, *oval()), START, 2, 60.0)
+    assert laps == 2
+    radius = np.hypot(states[:, 0] / 2, states[:, 1])
+    assert np.abs(radius - 1).max() < 0.2
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_it_laps_a_built_in_track_within_the_cars_limits(seed: int) -> None:
+    """Along the centreline at 1.6 m/s: no racing line is needed to see it drive."""
+    track = load_track(DEFAULT_TRAINING_TRACK)
+    s_m = np.linspace(0, track.length_m, 400, endpoint=False)
+    xy = track.position(s_m)
+    driver = PurePursuit(CAR, xy[:, 0], xy[:, 1], np.full(400, 1.6), PurePursuitSettings(seed=seed))
+    clipped = SIMULATOR.guard.counters.clipped
+    laps, states, inputs = drive(driver, (*track.start_pose(), 0.1, 0.0, 0.0, 0.0), 2, 60.0)
+    assert laps == 2
+    assert SIMULATOR.guard.counters.clipped == clipped, "it saturates as the car does"
+    assert (inputs[:, 0] >= CAR.d_min).all()
+    assert (inputs[:, 0] <= CAR.d_max).all()
+    assert (np.abs(inputs[:, 1]) <= CAR.delta_rate_max_radps).all()
+    assert (np.abs(states[:, 6]) <= CAR.delta_max_rad).all()
+    off = track.off_track_m(track.project_path(states[:, :2]))
+    assert off.max() < 0.1
+    assert inputs[:, 0].std() > 0.05
+    assert inputs[:, 1].std() > 0.3
+
+
+def test_the_seed_and_nothing_else_decides_the_disturbance() -> None:
+    runs = [
+        drive(PurePursuit(CAR, *oval(), PurePursuitSettings(seed=seed)), START, 1, 3.0)[1]
+        for seed in (5, 5, 6)
+    ]
+    np.testing.assert_array_equal(runs[0], runs[1])
+    assert np.abs(runs[0] - runs[2]).max() > 1e-3
+
+
+def test_a_mirrored_line_is_driven_with_mirrored_steering() -> None:
+    quiet = PurePursuitSettings(excite_d=0.0, excite_delta_rad=0.0)
+    x, y, v = oval()
+    _, left, _ = drive(PurePursuit(CAR, x, y, v, quiet), START, 1, 3.0)
+    mirrored = (*START[:2], -START[2], *START[3:])
+    _, right, _ = drive(PurePursuit(CAR, x, -y, v, quiet), mirrored, 1, 3.0)
+    signs = np.array([1, -1, -1, 1, -1, -1, -1])
+    np.testing.assert_allclose(right, left * signs, rtol=0, atol=1e-6)
+
+
+def test_a_car_far_from_where_it_was_finds_the_line_again() -> None:
+    driver = PurePursuit(CAR, *oval())
+    driver.reset(first_state(START))
+    elsewhere = np.array([-2.0, 0.1, -math.pi / 2, 1.0, 0.0, 0.0, 0.0])
+    arc = driver.step(elsewhere, np.zeros(2)).s_ref_m
+    perimeter = 9.688
+    assert arc == pytest.approx(perimeter / 2, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("line", "fault"),
+    [
+        (oval(5), "at least 10 finite points"),
+        ((oval()[0] * np.nan, *oval()[1:]), "finite points"),
+        ((*oval()[:2], np.ones(3)), "one finite speed for each point"),
+        ((np.append(oval()[0], 2.0), np.append(oval()[1], 0.0), np.ones(201)), "repeats a point"),
+    ],
+)
+def test_an_unusable_line_is_refused(line: Any, fault: str) -> None:
+    with pytest.raises(InputError, match=fault):
+        PurePursuit(CAR, *line)
+
+
+def test_weights_are_refused() -> None:
+    with pytest.raises(InputError, match="takes no weights"):
+        PurePursuit(CAR, *oval()).set_weights(b"")
