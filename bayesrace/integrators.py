@@ -48,34 +48,83 @@ SCHEMES: Final[dict[str, tuple[int, Callable[[Rate, Any, float], Any]]]] = {
 """Scheme name to (order of the global error, one step)."""
 
 
+def _pose_from_velocities(x: Any, velocities: Any, h: float) -> Any:
+    """Pose after h when (vx, vy, omega) go linearly from those in x to ``velocities``.
+
+    The heading is then a quadratic in time, and Simpson's rule gives the position to O(h^4).
+    """
+    import casadi as ca
+
+    def rates(psi: Any, v: Any) -> Any:
+        return ca.vertcat(
+            v[0] * ca.cos(psi) - v[1] * ca.sin(psi), v[0] * ca.sin(psi) + v[1] * ca.cos(psi)
+        )
+
+    psi, start = x[2], x[3:6]
+    psi_mid = psi + h / 8 * (3 * start[2] + velocities[2])
+    psi_end = psi + h / 2 * (start[2] + velocities[2])
+    middle = rates(psi_mid, (start + velocities) / 2)
+    change = h / 6 * (rates(psi, start) + 4 * middle + rates(psi_end, velocities))
+    return ca.vertcat(x[:2] + change, psi_end)
+
+
 class Discretisation(BaseModel):
-    """How a continuous-time model becomes x_{k+1} = F(x_k, u_k), input held over the step."""
+    """How a continuous-time model becomes x_{k+1} = F(x_k, u_k), input held over the step.
+
+    ``pose``: "integrated" takes the pose from the scheme like every other state; "interpolated"
+    from the velocities at both ends of the step, the *corrected* ones where there is a residual.
+    The e-kinematic model's accelerations are wrong by up to 100 rad/s^2 while steering; a residual
+    that corrects the velocities alone leaves what they did to the pose during the step.
+    docs/decisions/ has the measurement.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     scheme: Literal["euler", "heun", "rk4"] = Field("rk4", description="integration scheme")
     step_s: float = Field(0.02, gt=0, le=1, description="sampling time Ts")
     substeps: int = Field(1, ge=1, le=1000, description="integration steps within Ts")
+    pose: Literal["integrated", "interpolated"] = Field(
+        "integrated", description="where x, y, psi come from"
+    )
 
     def discretise(self, model: "Model") -> "ca.Function":
         """F: (x, u) -> x_next for the given model, as a CasADi SX function."""
         import casadi as ca
 
+        corrected = self.corrected(model)
         x = ca.SX.sym("x", len(model.states))
         u = ca.SX.sym("u", len(model.inputs))
+        x_next = corrected(x, u, 0)
+        return ca.Function(f"F_{model.name}", [x, u], [x_next], ["x", "u"], ["x_next"])
+
+    def corrected(self, model: "Model") -> "ca.Function":
+        """(x, u, e) -> x_next, where e (3,) is added to vx, vy, omega at the end of the step.
+
+        With pose "integrated" this is F(x, u) + [0, 0, 0, e, 0] to the letter (paper, eq. 7). The
+        kinematic model, which lacks these states, ignores e.
+        """
+        import casadi as ca
+
+        x = ca.SX.sym("x", len(model.states))
+        u = ca.SX.sym("u", len(model.inputs))
+        e = ca.SX.sym("e", 3)
         _, step = SCHEMES[self.scheme]
         x_next = x
         for _ in range(self.substeps):
             x_next = step(lambda s: model.ode(s, u), x_next, self.step_s / self.substeps)
-        return ca.Function(f"F_{model.name}", [x, u], [x_next], ["x", "u"], ["x_next"])
+        if len(model.states) == 7:
+            x_next[3:6] += e
+            if self.pose == "interpolated":
+                x_next[:3] = _pose_from_velocities(x, x_next[3:6], self.step_s)
+        return ca.Function(f"F_{model.name}", [x, u, e], [x_next], ["x", "u", "e"], ["x_next"])
 
     def identity(self, model_name: str, car: CarParameters) -> str:
         """Text that two discretised models share if and only if they are the same map."""
-        scheme = f"{self.scheme}x{self.substeps}"
+        scheme = f"{self.scheme}x{self.substeps}-{self.pose}"
         return f"{model_name}/{scheme}/{self.step_s:.9g}s/{car.name}-{car.digest()}"
 
 
-PREDICTION: Final = Discretisation(scheme="rk4", step_s=0.02, substeps=1)
+PREDICTION: Final = Discretisation(scheme="rk4", step_s=0.02, substeps=1, pose="interpolated")
 """Default for the e-kinematic model in the OCP, in residuals and in validation."""
 
 PERFECT: Final = Discretisation(scheme="rk4", step_s=0.02, substeps=10)

@@ -1,4 +1,8 @@
-"""The corrected model f_corr = f_kin + [0, 0, 0, mu_vx, mu_vy, mu_omega, 0] (paper, eq. 7)."""
+"""The corrected model f_corr: the nominal one with the posterior mean added to vx, vy, omega.
+
+Paper, eq. 7; how the correction reaches the pose is the discretisation's matter
+(:meth:`bayesrace.integrators.Discretisation.corrected`).
+"""
 
 import casadi as ca
 
@@ -17,9 +21,9 @@ def corrected_function(
 
     ``weights`` None: no correction.
     """
-    nominal = discretisation.discretise(model)
     if weights is None or not any(output.count or output.y_mean for output in weights.outputs):
-        return nominal
+        return discretisation.discretise(model)
+    f = discretisation.corrected(model)
     x, u = ca.MX.sym("x", 7), ca.MX.sym("u", 2)
     features = ca.vertcat(x[3:7], u)
     counts = [max(1, count) for count in weights.counts]
@@ -29,5 +33,4 @@ def corrected_function(
         posterior_mean(output.kernel, features, *flat[j * size : (j + 1) * size])
         for j, output in enumerate(weights.outputs)
     ]
-    correction = ca.vertcat(ca.MX.zeros(3), *means, 0)
-    return ca.Function("f_corr", [x, u], [nominal(x, u) + correction], ["x", "u"], ["x_next"])
+    return ca.Function("f_corr", [x, u], [f(x, u, ca.vertcat(*means))], ["x", "u"], ["x_next"])

@@ -1,0 +1,58 @@
+"""What a built controller is: written by codegen, read by whoever loads it.
+
+The manifest names everything that shaped the artefact. Weights learned for another model, step
+or scheme are refused by comparing :attr:`Manifest.discretisation`.
+"""
+
+from pathlib import Path
+from typing import Final
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from bayesrace.errors import InputError
+
+__all__ = ["ABI", "LIBRARY", "MANIFEST", "Manifest", "read_manifest"]
+
+ABI: Final = 1
+"""Version of the C interface in controller/native/bayesrace_mpc.h."""
+
+LIBRARY: Final = "libmpc.so"
+MANIFEST: Final = "manifest.json"
+
+
+class Manifest(BaseModel):
+    """Identity of one built controller."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    abi: int = Field(description="version of the C interface")
+    model: str = Field(description="vehicle model the OCP predicts with")
+    car: str
+    discretisation: str = Field(description="identity of model, scheme, step and car")
+    horizon: int = Field(gt=0, description="stages N")
+    step_s: float = Field(gt=0, description="sampling time Ts")
+    gp_capacity: int = Field(gt=0, description="training points per output that fit")
+    casadi: str
+    compiler: str
+    flags: list[str]
+    build_hash: str = Field(description="hash of everything that shaped the artefact")
+    library_sha256: str
+
+
+def read_manifest(artefact: Path) -> Manifest:
+    """Manifest of the artefact folder; InputError if it is not one or belongs to another ABI."""
+    path = artefact / MANIFEST
+    try:
+        manifest = Manifest.model_validate_json(path.read_text())
+    except FileNotFoundError:
+        raise InputError(
+            f"{artefact} is not a built controller (no {MANIFEST}): run 'bayesrace build'"
+        ) from None
+    except ValidationError as error:
+        raise InputError(f"{path} cannot be read: {error}; run 'bayesrace build'") from None
+    if manifest.abi != ABI:
+        raise InputError(
+            f"{path} was built for interface {manifest.abi}, this program has {ABI}: "
+            "run 'bayesrace build'"
+        )
+    return manifest

@@ -1,0 +1,111 @@
+"""Finds a C compiler and turns C files into a shared library."""
+
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Final
+
+from bayesrace.errors import InputError
+
+__all__ = ["FLAGS", "CompileError", "Compiler", "cpu_identity", "find_compiler"]
+
+FLAGS: Final = (
+    "-std=gnu11",
+    "-O3",
+    "-march=native",
+    "-fPIC",
+    "-fvisibility=hidden",
+    "-ffp-contract=fast",
+    # square roots and comparisons without errno and traps vectorise; NaN checks stay intact,
+    # which -ffast-math would delete
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-Wall",
+)
+
+
+class CompileError(RuntimeError):
+    """The C compiler failed; the message carries what it printed."""
+
+
+@dataclass(frozen=True)
+class Compiler:
+    """A C compiler command and the version it states."""
+
+    command: tuple[str, ...]
+    version: str
+
+    def shared_library(
+        self,
+        sources: list[Path],
+        includes: list[Path],
+        archives: list[Path],
+        out: Path,
+        flags: tuple[str, ...] = FLAGS,
+    ) -> None:
+        """Compiles ``sources`` and links them with ``archives`` (their symbols stay hidden)."""
+        line = [
+            *self.command,
+            *flags,
+            *(f"-I{path}" for path in includes),
+            "-shared",
+            *(str(path) for path in sources),
+            *(str(path) for path in archives),
+            "-lm",
+            "-o",
+            str(out),
+        ]
+        if platform.system() == "Linux":
+            line.append("-Wl,--exclude-libs,ALL")
+        done = subprocess.run(line, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise CompileError(f"{shlex.join(line)}\n{done.stderr[-4000:]}")
+
+
+def _candidates() -> list[tuple[str, ...]]:
+    chosen = os.environ.get("CC")
+    if chosen:
+        return [tuple(shlex.split(chosen))]
+    found = [(name,) for name in ("cc", "gcc", "clang") if shutil.which(name)]
+    if find_spec("ziglang"):
+        found.append((sys.executable, "-m", "ziglang", "cc"))
+    return found
+
+
+@cache
+def find_compiler() -> Compiler:
+    """$CC, the system's cc, gcc or clang, or ziglang; InputError with the remedy if none works."""
+    tried = []
+    for command in _candidates():
+        try:
+            done = subprocess.run(
+                [*command, "--version"], capture_output=True, text=True, check=False, timeout=60
+            )
+        except OSError as error:
+            tried.append(f"{shlex.join(command)}: {error}")
+            continue
+        if done.returncode == 0:
+            return Compiler(command, done.stdout.splitlines()[0])
+        tried.append(f"{shlex.join(command)}: {done.stderr.strip()[:200]}")
+    details = f" (tried: {'; '.join(tried)})" if tried else ""
+    raise InputError(
+        f"no C compiler found{details}: install gcc or clang, or 'pip install ziglang'"
+    )
+
+
+@cache
+def cpu_identity() -> str:
+    """What -march=native depends on: a library built on one CPU may not run on another."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    wanted = ("model name", "flags", "Features", "CPU part")
+    return "\n".join(dict.fromkeys(s for s in lines if s.startswith(wanted)))

@@ -1,0 +1,28 @@
+"""What shapes the generated code. Everything else of the OCP is set at run time."""
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from bayesrace.integrators import PERFECT, PREDICTION, Discretisation
+
+__all__ = ["BuildSettings"]
+
+
+class BuildSettings(BaseModel):
+    """One controller to build."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    car: str = Field("orca", description="built-in car")
+    model: Literal["e_kinematic", "dynamic"] = Field(
+        "e_kinematic", description="model the OCP predicts with; dynamic is BestCase"
+    )
+    discretisation: Discretisation = Field(PREDICTION, description="scheme, step, sub-steps")
+    horizon: int = Field(20, ge=2, le=100, description="stages N")
+    gp_capacity: int = Field(1024, ge=8, le=16384, description="training points per output")
+
+    @classmethod
+    def best_case(cls, car: str = "orca") -> "BuildSettings":
+        """The controller with the perfect model, for comparison and validation only."""
+        return cls(car=car, model="dynamic", discretisation=PERFECT, gp_capacity=8)

@@ -1,0 +1,83 @@
+"""The nominal model of one stage with its derivatives, as the CasADi function that becomes C."""
+
+import casadi as ca
+
+from bayesrace.integrators import Discretisation
+from bayesrace.vehicles.models import Model
+
+__all__ = ["linearise_function"]
+
+_NX, _NV, _NE = 7, 9, 3
+_NW = _NV + _NE
+
+
+def _derivatives(f: ca.Function, name: str) -> ca.Function:
+    """``(w, lambda) -> (x_next, J, H)`` of f(x, u, e), w = [x; u; e], all dense."""
+    w, lam = ca.SX.sym("w", _NW), ca.SX.sym("lambda", _NX)
+    x_next = f(w[:_NX], w[_NX:_NV], w[_NV:])
+    jacobian = ca.jacobian(x_next, w)
+    hessian, _ = ca.hessian(ca.dot(lam, x_next), w)
+    outputs = [x_next, ca.densify(jacobian), ca.densify(hessian)]
+    return ca.Function(name, [w, lam], outputs, {"cse": True})
+
+
+def _composed(model: Model, discretisation: Discretisation) -> ca.Function:
+    """The same for many sub-steps, by the chain rule, so that code grows by calls.
+
+    With S_i = d [x_i; u] / d [x; u] and lambda_i the costate of sub-step i:
+
+        J = d x_n / d v,    H = sum_i S_i' H_i(lambda_i) S_i,    lambda_i = A_i' lambda_{i+1}
+
+    e enters at the end of the step: its columns of J are unit vectors, those of H zero.
+    """
+    n = discretisation.substeps
+    one = discretisation.model_copy(update={"step_s": discretisation.step_s / n, "substeps": 1})
+    substep = _derivatives(one.corrected(model), "br_substep")
+    w, lam = ca.MX.sym("w", _NW), ca.MX.sym("lambda", _NX)
+    u, no_e = w[_NX:_NV], ca.DM.zeros(_NE)
+    states, jacobians, curvature = [w[:_NX]], [], None
+    for i in range(n):
+        weight = lam if i == n - 1 else ca.DM.zeros(_NX)  # only the last costate is known yet
+        x_next, jacobian, curvature = substep(ca.vertcat(states[-1], u, no_e), weight)
+        states.append(x_next)
+        jacobians.append(jacobian[:, :_NV])
+    hold_u = ca.horzcat(ca.MX.zeros(2, _NX), ca.MX.eye(2))
+    sensitivities = [ca.MX.eye(_NV)]
+    for jacobian in jacobians:
+        sensitivities.append(ca.vertcat(jacobian @ sensitivities[-1], hold_u))
+    costate = lam
+    hessian = sensitivities[n - 1].T @ curvature[:_NV, :_NV] @ sensitivities[n - 1]
+    for i in reversed(range(n - 1)):
+        costate = jacobians[i + 1][:, :_NX].T @ costate
+        _, _, curvature = substep(ca.vertcat(states[i], u, no_e), costate)
+        hessian += sensitivities[i].T @ curvature[:_NV, :_NV] @ sensitivities[i]
+    enters = ca.vertcat(ca.DM.zeros(3, _NE), ca.DM.eye(_NE), ca.DM.zeros(1, _NE))
+    jacobian = ca.horzcat(sensitivities[n][:_NX, :], enters)
+    hessian = ca.diagcat(hessian, ca.DM.zeros(_NE, _NE))
+    x_next = states[-1] + enters @ w[_NV:]
+    outputs = [x_next, ca.densify(jacobian), ca.densify(hessian)]
+    return ca.Function("br_composed", [w, lam], outputs, {"cse": True})
+
+
+def linearise_function(model: Model, discretisation: Discretisation) -> ca.Function:
+    """``(x, u, e, lambda) -> (F, J', H)`` of the discretised model, all dense.
+
+    e (3) is the residual's mean, added to vx, vy, omega at the end of the step; with w = [x; u; e],
+    J' (12 x 7) is the transposed Jacobian (column major, so C reads it as J row major) and H
+    (12 x 12) the Hessian of lambda' F. The chain through e, which depends on x and u, is closed
+    natively (controller/native/br_stage.c).
+    """
+    if discretisation.substeps > 1 and discretisation.pose == "integrated":
+        derivatives = _composed(model, discretisation)
+    else:
+        derivatives = _derivatives(discretisation.corrected(model), "br_derivatives")
+    x, u, e = ca.MX.sym("x", _NX), ca.MX.sym("u", 2), ca.MX.sym("e", _NE)
+    lam = ca.MX.sym("lambda", _NX)
+    x_next, jacobian, hessian = derivatives(ca.vertcat(x, u, e), lam)
+    return ca.Function(
+        "br_linearise",
+        [x, u, e, lam],
+        [x_next, jacobian.T, hessian],
+        ["x", "u", "e", "lambda"],
+        ["x_next", "jacobian_transposed", "hessian"],
+    )

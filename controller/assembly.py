@@ -1,0 +1,50 @@
+"""Puts a predictive controller together from the files that describe it."""
+
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from bayesrace.errors import InputError
+from bayesrace.gp.weights import read_weights
+from bayesrace.raceline.line import read_raceline
+from bayesrace.tracks import load_track
+from bayesrace.vehicles import CarParameters
+from controller.mpc import PredictiveController
+from controller.native_step import NativeStep
+from controller.path_table import make_path_table
+from controller.settings import MpcSettings
+
+__all__ = ["predictive_controller", "read_settings"]
+
+
+def read_settings(path: Path | None) -> MpcSettings:
+    """OCP settings from a JSON file; the defaults without one."""
+    if path is None:
+        return MpcSettings()
+    try:
+        return MpcSettings.model_validate_json(path.read_text())
+    except OSError as error:
+        raise InputError(f"cannot read the settings {path}: {error.strerror}") from None
+    except ValidationError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def predictive_controller(
+    artefact: Path,
+    car: CarParameters,
+    track: str | Path,
+    raceline: Path,
+    settings: Path | None = None,
+    weights: Path | None = None,
+) -> PredictiveController:
+    """The compiled controller of ``artefact`` on a track, ready to drive.
+
+    Raises InputError naming the file that cannot be used.
+    """
+    step = NativeStep(artefact, car, read_settings(settings))
+    step.set_path(make_path_table(load_track(track, car.width_m), read_raceline(raceline)))
+    if weights is None:
+        return PredictiveController(step)
+    loaded = read_weights(weights)
+    step.set_weights(loaded)
+    return PredictiveController(step, loaded.version)

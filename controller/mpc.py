@@ -1,0 +1,59 @@
+"""The predictive controller as the process drives it: native step, weights, telemetry."""
+
+import time
+from typing import Any
+
+from bayesrace.gp.weights import decode_weights
+from bayesrace.messages import State
+from controller.interface import Array, StepOutput
+from controller.native_step import NativeStep
+
+__all__ = ["PredictiveController"]
+
+
+class PredictiveController:
+    """See :class:`controller.interface.Controller`; BestCase, WorstCase and BayesRace alike."""
+
+    def __init__(self, step: NativeStep, weights_version: str = "") -> None:
+        """``step``: with parameters and path set. ``weights_version``: of what it holds already."""
+        self._step = step
+        self._version = weights_version
+        self._output = StepOutput(u=step.u, plan_x=step.plan_x, plan_u=step.plan_u)
+
+    @property
+    def weights_version(self) -> str:
+        """Version of the weights in use; empty while there is no correction."""
+        return self._version
+
+    def reset(self, state: State) -> None:
+        """Next step starts cold."""
+        self._step.reset()
+
+    def set_weights(self, data: bytes) -> str:
+        """From the next step on; the plan and everything else goes on as it is."""
+        weights = decode_weights(data)
+        self._step.set_weights(weights)
+        self._version = weights.version
+        return weights.version
+
+    def describe(self) -> dict[str, Any]:
+        """Identity of the artefact."""
+        return {"controller": "mpc", **self._step.manifest.model_dump(exclude={"flags"})}
+
+    def step(self, x: Array, u_previous: Array) -> StepOutput:
+        """One native step, timed around the C call."""
+        native, output = self._step, self._output
+        begin_ns = time.perf_counter_ns()
+        status = native.step(x, float(u_previous[0]))
+        output.solve_us = (time.perf_counter_ns() - begin_ns) * 1e-3
+        native.read_plan()
+        info = native.info
+        # Acceptable and converged may both be driven; the residuals below tell them apart.
+        output.status = 0 if status.usable else int(status)
+        output.iterations = info.iterations
+        output.residual_dynamics = info.defect
+        output.residual_bounds = max(info.bound, 0.0)
+        output.residual_stationarity = info.stationarity
+        output.s_ref_m = info.s_ref_m
+        output.n_ref_m = info.lateral_m
+        return output

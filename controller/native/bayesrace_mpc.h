@@ -1,0 +1,163 @@
+/* BayesRace model predictive controller: public interface.
+ *
+ * One controller lives in one block of memory that the caller owns. After br_mpc_init nothing
+ * here allocates, prints, locks, reads a clock or exits; every function is bounded in time by the
+ * dimensions below and the iteration limit in br_mpc_parameters. Not re-entrant per object:
+ * one thread at a time may call functions on the same br_mpc.
+ *
+ * Two enums, after OSQP: br_mpc_error says what is wrong with a call, br_mpc_status what became
+ * of the optimisation problem. The status is derived from residuals measured at the returned plan.
+ *
+ * Units are SI. x = [x, y, psi, vx, vy, omega, delta], u = [d, delta_rate].
+ */
+#ifndef BAYESRACE_MPC_H
+#define BAYESRACE_MPC_H
+
+#include <stddef.h>
+
+#include "br_config.h" /* generated: BR_N, BR_TS, BR_GP_CAPACITY, BR_MODEL_NAME */
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define BR_ABI 1
+#define BR_NX 7
+#define BR_NU 2
+#define BR_NV (BR_NX + BR_NU)      /* stage variables v = [x; u] */
+#define BR_NZ 6                    /* GP features z = v[3..8] = [vx vy omega delta d delta_rate] */
+#define BR_NE 3                    /* GP outputs: vx, vy, omega */
+#define BR_PATH_COLUMNS 7          /* see br_mpc_set_path */
+#define BR_PATH_CAPACITY 8192      /* points of the path table */
+
+#if defined(_WIN32)
+#define BR_API __declspec(dllexport)
+#else
+#define BR_API __attribute__((visibility("default")))
+#endif
+
+typedef struct br_mpc br_mpc;
+
+typedef enum {
+    BR_OK = 0,
+    BR_ERROR_NULL = 1,        /* a required pointer is NULL */
+    BR_ERROR_MEMORY = 2,      /* block too small or not aligned to 64 bytes */
+    BR_ERROR_PARAMETERS = 3,  /* a parameter is not finite or out of its range */
+    BR_ERROR_PATH = 4,        /* path table: size, spacing or values */
+    BR_ERROR_WEIGHTS = 5,     /* GP weights: size, kernel or values */
+    BR_ERROR_NOT_READY = 6    /* parameters or path have not been set */
+} br_mpc_error;
+
+typedef enum {
+    BR_CONVERGED = 0,     /* all residuals below tolerance */
+    BR_ACCEPTABLE = 1,    /* dynamics and bounds hold to defect_max; not stationary to tolerance */
+    BR_DEFECT = 2,        /* predicted trajectory violates the dynamics by more than defect_max */
+    BR_INFEASIBLE = 3,    /* the QP has no solution */
+    BR_QP_LIMIT = 4,      /* the QP solver hit its iteration limit or cycled */
+    BR_NOT_FINITE = 5,    /* a number in the problem or its solution is not finite */
+    BR_BAD_STATE = 6      /* the measured state is not finite or absurd; nothing was solved */
+} br_mpc_status;
+
+typedef enum {
+    BR_KERNEL_RBF = 0,
+    BR_KERNEL_MATERN05 = 1,
+    BR_KERNEL_MATERN15 = 2,
+    BR_KERNEL_MATERN25 = 3
+} br_mpc_kernel;
+
+/* Run-time parameters of the OCP, paper equation (8). Objective without factor 1/2. */
+typedef struct {
+    double q_position;       /* Q = q I, weight of the squared position error [1/m^2] */
+    double r_duty;           /* weight of (d_k - d_{k-1})^2 */
+    double r_delta_rate;     /* weight of delta_rate_k^2 [s^2/rad^2] */
+    double s_slack;          /* weight of eps^2 [1/m^2]; 0 switches the track constraints off */
+    double margin_m;         /* distance kept from the track edges */
+    double d_min, d_max;
+    double delta_max_rad;
+    double delta_rate_max_radps;
+    double tolerance;        /* of the scaled KKT residual for BR_CONVERGED */
+    double defect_max;       /* largest dynamics defect of an acceptable plan */
+    int iterations;          /* SQP iterations a step may use */
+    int iterations_cold;     /* the same for the first step after a reset */
+} br_mpc_parameters;
+
+/* Posterior mean of one output: mean(z) = offset + scale * sum_i alpha_i k(r_i),
+ * r_i = || (z - inputs_i) / length_scales ||. n = 0 gives offset alone. */
+typedef struct {
+    int kernel;                    /* br_mpc_kernel */
+    int n;                         /* training points, at most BR_GP_CAPACITY */
+    double offset, scale;
+    const double *length_scales;   /* BR_NZ */
+    const double *inputs;          /* n x BR_NZ, row major */
+    const double *alpha;           /* n */
+} br_mpc_gp;
+
+/* One stage of the reference: position, and the track as lower <= normal . p <= upper. */
+typedef struct {
+    double x, y, normal_x, normal_y, lower, upper;
+} br_mpc_reference;
+
+typedef struct {
+    int iterations;          /* SQP iterations used */
+    int qp_iterations;       /* active-set iterations, summed */
+    int regularised;         /* iterations whose Hessian had to be made positive definite */
+    int shortened;           /* steps that the line search halved */
+    double stationarity;     /* scaled infinity norms at the returned plan */
+    double defect;
+    double bound;
+    double cost;             /* objective at the returned plan, slack included */
+    double slack_max_m;
+    double s_ref_m;          /* projection of the car on the racing line */
+    double lateral_m;        /* distance of the car from the racing line, positive left */
+} br_mpc_info;
+
+/* --- set-up; none of these is for the control loop except br_mpc_set_weights ---------------- */
+
+BR_API size_t br_mpc_memory_size(void);
+BR_API br_mpc_error br_mpc_init(void *memory, size_t size, br_mpc **out);
+BR_API br_mpc_error br_mpc_set_parameters(br_mpc *mpc, const br_mpc_parameters *parameters);
+
+/* Racing line and track, n rows of BR_PATH_COLUMNS sampled every spacing_m along the closed line:
+ * x, y, speed, left unit normal of the centreline (2), lower and upper bound of normal . p. */
+BR_API br_mpc_error br_mpc_set_path(br_mpc *mpc, const double *table, int n, double spacing_m);
+
+/* Copies the weights; the next step uses them. About 10 us per 400 points and output. */
+BR_API br_mpc_error br_mpc_set_weights(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]);
+
+/* --- the control loop ------------------------------------------------------------------------ */
+
+/* Forgets the previous plan, working set and position on the line. */
+BR_API void br_mpc_reset(br_mpc *mpc);
+
+/* One control step: projects the car on the racing line, makes the reference, solves, checks.
+ * x: measured state. d_previous: duty cycle that acts now. u: first input of the plan; written
+ * only for BR_CONVERGED and BR_ACCEPTABLE. info may be NULL. */
+BR_API br_mpc_error br_mpc_step(br_mpc *mpc, const double x[BR_NX], double d_previous,
+                                double u[BR_NU], br_mpc_status *status, br_mpc_info *info);
+
+/* The same with a reference of the caller's own planner, stages 1..BR_N. */
+BR_API br_mpc_error br_mpc_solve(br_mpc *mpc, const double x[BR_NX], double d_previous,
+                                 const br_mpc_reference reference[BR_N], double u[BR_NU],
+                                 br_mpc_status *status, br_mpc_info *info);
+
+/* Plan of the last step, row major: x (BR_N + 1) x BR_NX, u BR_N x BR_NU. */
+BR_API br_mpc_error br_mpc_get_plan(const br_mpc *mpc, double *x, double *u);
+BR_API br_mpc_error br_mpc_get_reference(const br_mpc *mpc, br_mpc_reference reference[BR_N]);
+
+/* --- for tests and tools ----------------------------------------------------------------------- */
+
+/* Corrected model at v = [x; u]: x_next (7), J = d x_next / d v (7 x 9 row major) and
+ * H = sum_i lambda_i d^2 x_next_i / d v^2 (9 x 9). */
+BR_API br_mpc_error br_mpc_evaluate(const br_mpc *mpc, const double v[BR_NV],
+                                    const double lambda[BR_NX], double x_next[BR_NX],
+                                    double jacobian[BR_NX * BR_NV], double hessian[BR_NV * BR_NV]);
+
+BR_API const char *br_mpc_error_text(br_mpc_error error);
+BR_API const char *br_mpc_status_text(br_mpc_status status);
+BR_API const char *br_mpc_model_name(void);
+BR_API int br_mpc_abi(void);
+
+#ifdef __cplusplus
+}
+#endif
+#endif

@@ -1,0 +1,111 @@
+/* Memory, parameters, weights, texts: everything of the interface that is not the control step. */
+#include <math.h>
+
+#include "br_internal.h"
+#include "br_model.h"
+
+size_t br_mpc_memory_size(void) { return sizeof(br_mpc); }
+
+br_mpc_error br_mpc_init(void *memory, size_t size, br_mpc **out) {
+    if (!memory || !out) return BR_ERROR_NULL;
+    if (size < sizeof(br_mpc) || (uintptr_t)memory % 64) return BR_ERROR_MEMORY;
+    br_mpc *mpc = memory;
+    memset(mpc, 0, sizeof *mpc);
+    br_qp_init(&mpc->qp);
+    *out = mpc;
+    return BR_OK;
+}
+
+static int valid(const br_mpc_parameters *p) {
+    const double numbers[] = {p->q_position, p->r_duty, p->r_delta_rate, p->s_slack, p->margin_m,
+                              p->d_min, p->d_max, p->delta_max_rad, p->delta_rate_max_radps,
+                              p->tolerance, p->defect_max};
+    return br_all_finite(numbers, sizeof numbers / sizeof numbers[0]) && p->q_position > 0 &&
+           p->r_duty > 0 && p->r_delta_rate > 0 && p->s_slack >= 0 && p->margin_m >= 0 &&
+           p->d_min < p->d_max && p->delta_max_rad > 0 && p->delta_rate_max_radps > 0 &&
+           p->tolerance > 0 && p->defect_max > 0 && p->iterations >= 1 && p->iterations_cold >= 1;
+}
+
+br_mpc_error br_mpc_set_parameters(br_mpc *mpc, const br_mpc_parameters *parameters) {
+    if (!mpc || !parameters) return BR_ERROR_NULL;
+    if (!valid(parameters)) return BR_ERROR_PARAMETERS;
+    mpc->parameters = *parameters;
+    mpc->has_parameters = 1;
+    return BR_OK;
+}
+
+br_mpc_error br_mpc_set_path(br_mpc *mpc, const double *table, int n, double spacing_m) {
+    if (!mpc || !table) return BR_ERROR_NULL;
+    return br_path_load(&mpc->path, table, n, spacing_m);
+}
+
+br_mpc_error br_mpc_set_weights(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]) {
+    if (!mpc || !outputs) return BR_ERROR_NULL;
+    const br_mpc_error error = br_gp_load(&mpc->gp[!mpc->gp_in_use], outputs);
+    if (error) return error; /* the weights in use stay */
+    mpc->gp_in_use = !mpc->gp_in_use;
+    mpc->linearised = 0;
+    return BR_OK;
+}
+
+void br_mpc_reset(br_mpc *mpc) {
+    if (!mpc) return;
+    mpc->warm = 0;
+    mpc->linearised = 0;
+    mpc->path.known = 0;
+}
+
+br_mpc_error br_mpc_get_plan(const br_mpc *mpc, double *x, double *u) {
+    if (!mpc || !x || !u) return BR_ERROR_NULL;
+    memcpy(x, mpc->plan.x, sizeof mpc->plan.x);
+    memcpy(u, mpc->plan.u, sizeof mpc->plan.u);
+    return BR_OK;
+}
+
+br_mpc_error br_mpc_get_reference(const br_mpc *mpc, br_mpc_reference reference[BR_N]) {
+    if (!mpc || !reference) return BR_ERROR_NULL;
+    memcpy(reference, mpc->reference, sizeof mpc->reference);
+    return BR_OK;
+}
+
+br_mpc_error br_mpc_evaluate(const br_mpc *mpc, const double v[BR_NV], const double lambda[BR_NX],
+                             double x_next[BR_NX], double jacobian[BR_NX * BR_NV],
+                             double hessian[BR_NV * BR_NV]) {
+    if (!mpc || !v || !lambda || !x_next || !jacobian || !hessian) return BR_ERROR_NULL;
+    br_stage stage;
+    br_stage_linearise(&mpc->gp[mpc->gp_in_use], v, v + BR_NX, lambda, &stage);
+    memcpy(x_next, stage.f, sizeof stage.f);
+    memcpy(jacobian, stage.jacobian, sizeof stage.jacobian);
+    memcpy(hessian, stage.hessian, sizeof stage.hessian);
+    return BR_OK;
+}
+
+const char *br_mpc_error_text(br_mpc_error error) {
+    switch (error) {
+    case BR_OK: return "no error";
+    case BR_ERROR_NULL: return "a required pointer is NULL";
+    case BR_ERROR_MEMORY: return "memory block too small or not aligned to 64 bytes";
+    case BR_ERROR_PARAMETERS: return "a parameter is not finite or out of its range";
+    case BR_ERROR_PATH: return "path table is unusable";
+    case BR_ERROR_WEIGHTS: return "GP weights are unusable";
+    case BR_ERROR_NOT_READY: return "parameters or path have not been set";
+    }
+    return "unknown error";
+}
+
+const char *br_mpc_status_text(br_mpc_status status) {
+    switch (status) {
+    case BR_CONVERGED: return "converged";
+    case BR_ACCEPTABLE: return "acceptable";
+    case BR_DEFECT: return "dynamics defect too large";
+    case BR_INFEASIBLE: return "QP infeasible";
+    case BR_QP_LIMIT: return "QP iteration limit";
+    case BR_NOT_FINITE: return "not finite";
+    case BR_BAD_STATE: return "bad state";
+    }
+    return "unknown status";
+}
+
+const char *br_mpc_model_name(void) { return BR_MODEL_NAME; }
+
+int br_mpc_abi(void) { return BR_ABI; }

@@ -1,0 +1,126 @@
+/* What the parts of the controller know of each other; not for users. */
+#ifndef BR_INTERNAL_H
+#define BR_INTERNAL_H
+
+#include <daqp/types.h>
+
+#include "bayesrace_mpc.h"
+#include "br_vector.h"
+
+#define BR_M (BR_NU * BR_N)                      /* condensed variables */
+#define BR_MP (((BR_M + 7) / 8) * 8)             /* padded to whole vectors */
+#define BR_ROWS (BR_M + 2 * BR_N)                /* input bounds, steering angle, half-planes */
+#define BR_COLS ((((BR_ROWS + 1) + 7) / 8) * 8)  /* right-hand sides of one substitution */
+#define BR_LINE_SEARCH_TRIALS 5
+#define BR_GP_PADDED (((BR_GP_CAPACITY + 7) / 8) * 8)
+
+/* One output of the residual as the kernel wants it: scaled features, structure of arrays. */
+typedef struct {
+    int kernel, n_padded;
+    double offset;
+    double inverse_scale[BR_NZ];
+    BR_ALIGNED double inputs[BR_NZ][BR_GP_PADDED];
+    BR_ALIGNED double alpha[BR_GP_PADDED]; /* signal scale folded in */
+} br_gp_output;
+
+typedef struct {
+    int any; /* 0 while every output is constant zero: WorstCase and BestCase skip the kernels */
+    br_gp_output output[BR_NE];
+} br_gp;
+
+/* Linearisation of the corrected model at one stage. */
+typedef struct {
+    double f[BR_NX];
+    double jacobian[BR_NX][BR_NV];
+    double hessian[BR_NV][BR_NV]; /* weighted with the costate of the stage's end */
+} br_stage;
+
+typedef struct {
+    int n, ready;
+    double spacing, length;
+    double table[BR_PATH_CAPACITY][BR_PATH_COLUMNS];
+    int known;     /* the projection of the step before is valid */
+    double s;      /* arc length of the last projection */
+} br_path;
+
+typedef struct {
+    BR_ALIGNED double g[BR_N + 1][BR_NX][BR_MP]; /* sensitivity of stage k to all inputs */
+    BR_ALIGNED double costate[2][BR_NX][BR_MP];
+    BR_ALIGNED double h[BR_M][BR_MP];            /* condensed Hessian, then its Cholesky factor */
+    BR_ALIGNED double y[BR_M][BR_COLS];          /* L^{-1} [A' | gradient] */
+    double diagonal[BR_M];
+    double xbar[BR_N + 1][BR_NX];
+    double gradient[BR_M];
+    double lower[BR_ROWS], upper[BR_ROWS], scale[BR_ROWS];
+    double delta_u[BR_M];
+    double multiplier[BR_ROWS]; /* of the rows above, QP units */
+    double delta_x[BR_N + 1][BR_NX];
+    double costate_next[BR_N + 1][BR_NX];
+    /* DAQP's least-distance problem, in our memory */
+    DAQPWorkspace daqp;
+    DAQPSettings settings;
+    BR_ALIGNED double m[BR_ROWS * BR_M];
+    double dupper[BR_ROWS], dlower[BR_ROWS], unit[BR_ROWS];
+    int sense[BR_ROWS];
+    double lam[2][BR_M + BR_N + 2], l[(BR_M + BR_N + 2) * (BR_M + BR_N + 3) / 2],
+        d[BR_M + BR_N + 2], xldl[BR_M + BR_N + 2], zldl[BR_M + BR_N + 2], u[BR_M];
+    int working_set[BR_M + BR_N + 2];
+} br_qp;
+
+/* Trajectory with its multipliers. costate[k] belongs to the dynamics into stage k,
+ * multiplier to the rows of the QP. */
+typedef struct {
+    double x[BR_N + 1][BR_NX];
+    double u[BR_N][BR_NU];
+    double costate[BR_N + 1][BR_NX];
+    double multiplier[BR_ROWS];
+} br_plan;
+
+struct br_mpc {
+    br_mpc_parameters parameters;
+    int has_parameters;
+    br_path path;
+    br_gp gp[2];
+    int gp_in_use;
+    /* the problem */
+    double d_previous;
+    double x0[BR_NX];
+    br_mpc_reference reference[BR_N];
+    /* the plan, primal and dual */
+    int warm;            /* a plan from the step before is there */
+    int linearised;      /* stage[] belongs to the plan and the weights in use */
+    br_plan plan;
+    br_plan before;      /* the plan that the iteration at hand started from */
+    br_stage stage[BR_N];
+    br_qp qp;
+    double merit;        /* of the plan, see br_residuals */
+    br_mpc_info info;
+};
+
+/* br_gp.c */
+void br_gp_evaluate(const br_gp *gp, const double z[BR_NZ], double mean[BR_NE],
+                    double gradient[BR_NE][BR_NZ], double hessian[BR_NE][BR_NZ][BR_NZ]);
+br_mpc_error br_gp_load(br_gp *gp, const br_mpc_gp outputs[BR_NE]);
+
+/* br_planner.c */
+br_mpc_error br_path_load(br_path *path, const double *table, int n, double spacing);
+void br_path_plan(br_path *path, const double x[BR_NX], br_mpc_reference reference[BR_N],
+                  double *lateral);
+
+/* br_stage.c */
+void br_stage_linearise(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
+                        const double lambda[BR_NX], br_stage *stage);
+
+/* br_qp.c: condensing and the QP of one SQP iteration */
+void br_qp_init(br_qp *qp);
+void br_qp_condense(br_mpc *mpc);
+br_mpc_status br_qp_solve(br_mpc *mpc, int warm);
+void br_qp_shift_working_set(br_qp *qp);
+void br_qp_forget_working_set(br_qp *qp);
+
+/* br_residuals.c */
+int br_all_finite(const double *values, int n);
+void br_residuals(br_mpc *mpc, double penalty);
+br_mpc_status br_judge(const br_mpc *mpc);
+
+#endif

@@ -1,0 +1,188 @@
+/* Real-time SQP: shift, plan the reference, iterate, judge by residuals.
+ *
+ * An iteration solves the QP at the linearisation in store, takes a step (the full one unless the
+ * plan gets worse) and linearises at the new plan. That linearisation gives the residuals from which the status is derived, and,
+ * shifted by a stage, it is what the next control step starts from: only its last stage is new.
+ */
+#include <math.h>
+
+#include "br_internal.h"
+
+static void linearise(br_mpc *mpc, int first) {
+    for (int k = first; k < BR_N; ++k)
+        br_stage_linearise(&mpc->gp[mpc->gp_in_use], mpc->plan.x[k], mpc->plan.u[k], mpc->plan.costate[k + 1], &mpc->stage[k]);
+}
+
+/* Without a plan from before: hold the steering, half throttle, see where that leads. */
+static void cold_start(br_mpc *mpc) {
+    memcpy(mpc->plan.x[0], mpc->x0, sizeof mpc->x0);
+    memset(mpc->plan.costate, 0, sizeof mpc->plan.costate);
+    memset(mpc->plan.multiplier, 0, sizeof mpc->plan.multiplier);
+    for (int k = 0; k < BR_N; ++k) {
+        mpc->plan.u[k][0] = fmin(fmax(mpc->d_previous, 0.5 * mpc->parameters.d_max), mpc->parameters.d_max);
+        mpc->plan.u[k][1] = 0;
+        br_stage_linearise(&mpc->gp[mpc->gp_in_use], mpc->plan.x[k], mpc->plan.u[k], mpc->plan.costate[k + 1], &mpc->stage[k]);
+        memcpy(mpc->plan.x[k + 1], mpc->stage[k].f, sizeof mpc->plan.x[k + 1]);
+    }
+    br_qp_forget_working_set(&mpc->qp);
+    mpc->linearised = 1;
+}
+
+static void shift(br_mpc *mpc) {
+    const int last = BR_N - 1;
+    memmove(mpc->plan.x, mpc->plan.x + 1, BR_N * sizeof mpc->plan.x[0]);
+    memmove(mpc->plan.u, mpc->plan.u + 1, last * sizeof mpc->plan.u[0]);
+    memmove(mpc->plan.costate, mpc->plan.costate + 1, BR_N * sizeof mpc->plan.costate[0]);
+    memmove(mpc->stage, mpc->stage + 1, last * sizeof mpc->stage[0]);
+    br_qp_shift_working_set(&mpc->qp);
+    /* hold the duty cycle at the new end; the steering rate goes to zero so that the angle stays */
+    mpc->plan.u[last][1] = 0;
+    linearise(mpc, mpc->linearised ? last : 0);
+    memcpy(mpc->plan.x[BR_N], mpc->stage[last].f, sizeof mpc->plan.x[BR_N]);
+    mpc->linearised = 1;
+}
+
+/* Changes of the states under the QP's inputs, and the costates from the QP's optimality:
+ * lambda_k = grad_x cost + W (dx, du) + A' lambda_{k+1} + (constraint normals)' multipliers. */
+static void direction(br_mpc *mpc) {
+    br_qp *qp = &mpc->qp;
+    memcpy(qp->delta_x[0], qp->xbar[0], sizeof qp->xbar[0]);
+    for (int k = 0; k < BR_N; ++k) {
+        const double *dx = qp->delta_x[k], *du = &qp->delta_u[BR_NU * k];
+        for (int i = 0; i < BR_NX; ++i) {
+            const double *row = mpc->stage[k].jacobian[i];
+            double sum = mpc->stage[k].f[i] - mpc->plan.x[k + 1][i];
+            for (int j = 0; j < BR_NX; ++j) sum += row[j] * dx[j];
+            for (int c = 0; c < BR_NU; ++c) sum += row[BR_NX + c] * du[c];
+            qp->delta_x[k + 1][i] = sum;
+        }
+    }
+    for (int k = BR_N; k >= 1; --k) {
+        const br_mpc_reference *ref = &mpc->reference[k - 1];
+        const double *x = mpc->plan.x[k], *dx = qp->delta_x[k];
+        const double q = 2 * mpc->parameters.q_position, track = qp->multiplier[BR_M + BR_N + k - 1];
+        double *lambda = qp->costate_next[k];
+        memset(lambda, 0, sizeof qp->costate_next[k]);
+        lambda[0] = q * (x[0] + dx[0] - ref->x) + track * ref->normal_x;
+        lambda[1] = q * (x[1] + dx[1] - ref->y) + track * ref->normal_y;
+        lambda[6] = qp->multiplier[BR_M + k - 1];
+        if (k == BR_N) continue;
+        const br_stage *stage = &mpc->stage[k];
+        const double *after = qp->costate_next[k + 1], *du = &qp->delta_u[BR_NU * k];
+        for (int i = 0; i < BR_NX; ++i) {
+            for (int j = 0; j < BR_NX; ++j)
+                lambda[i] += stage->jacobian[j][i] * after[j] + stage->hessian[i][j] * dx[j];
+            for (int c = 0; c < BR_NU; ++c) lambda[i] += stage->hessian[i][BR_NX + c] * du[c];
+        }
+    }
+}
+
+static void blend(double *out, const double *from, const double *to, double t, int n) {
+    for (int i = 0; i < n; ++i) out[i] = from[i] + t * (to[i] - from[i]);
+}
+
+/* The plan at a fraction t of the step from mpc->before, linearised. */
+static void move(br_mpc *mpc, double t) {
+    const br_plan *from = &mpc->before;
+    const br_qp *qp = &mpc->qp;
+    double *x = mpc->plan.x[0], *u = mpc->plan.u[0];
+    const double *x_from = from->x[0], *u_from = from->u[0], *dx = qp->delta_x[0];
+    for (int i = 0; i < (BR_N + 1) * BR_NX; ++i) x[i] = x_from[i] + t * dx[i];
+    for (int i = 0; i < BR_M; ++i) u[i] = u_from[i] + t * qp->delta_u[i];
+    blend(mpc->plan.costate[1], from->costate[1], qp->costate_next[1], t, BR_N * BR_NX);
+    blend(mpc->plan.multiplier, from->multiplier, qp->multiplier, t, BR_ROWS);
+    linearise(mpc, 0);
+}
+
+/* Exact penalty: above every costate that prices a defect. */
+static double penalty(const br_qp *qp) {
+    const double *costate = qp->costate_next[1];
+    double largest = 0;
+    for (int i = 0; i < BR_N * BR_NX; ++i) largest = fmax(largest, fabs(costate[i]));
+    return 1.5 * largest;
+}
+
+/* Full step; halved while neither the merit nor the KKT residuals improve (Newton's own steps may
+ * raise the merit near a solution, where the residuals tell the truth). */
+static void line_search(br_mpc *mpc) {
+    direction(mpc);
+    const double weight = penalty(&mpc->qp);
+    br_residuals(mpc, weight);
+    const double merit = mpc->merit, residual = fmax(mpc->info.stationarity, mpc->info.defect);
+    mpc->before = mpc->plan;
+    double t = 1.0;
+    for (int trial = 0; trial < BR_LINE_SEARCH_TRIALS; ++trial, t *= 0.5) {
+        move(mpc, t);
+        br_residuals(mpc, weight);
+        if (mpc->merit <= merit || fmax(mpc->info.stationarity, mpc->info.defect) <= 0.9 * residual) return;
+        mpc->info.shortened += 1;
+    }
+}
+
+static br_mpc_status optimise(br_mpc *mpc) {
+    const int cold = !mpc->warm;
+    const int limit = cold ? mpc->parameters.iterations_cold : mpc->parameters.iterations;
+    if (cold) cold_start(mpc);
+    else shift(mpc);
+    br_mpc_status status = BR_DEFECT;
+    for (int i = 0; i < limit && (status == BR_ACCEPTABLE || status == BR_DEFECT); ++i) {
+        br_qp_condense(mpc);
+        status = br_qp_solve(mpc, i > 0 || !cold);
+        if (status != BR_CONVERGED) break;
+        line_search(mpc);
+        mpc->info.iterations = i + 1;
+        status = br_judge(mpc);
+    }
+    return status;
+}
+
+static int plausible_state(const double x[BR_NX]) {
+    static const double limit[BR_NX] = {1e4, 1e4, 1e4, 100, 100, 1e3, 1.5};
+    for (int i = 0; i < BR_NX; ++i)
+        if (!(fabs(x[i]) <= limit[i])) return 0;
+    return 1;
+}
+
+static void solve(br_mpc *mpc, double u[BR_NU], br_mpc_status *status, br_mpc_info *info) {
+    *status = optimise(mpc);
+    const int good = *status == BR_CONVERGED || *status == BR_ACCEPTABLE;
+    if (good) memcpy(u, mpc->plan.u[0], sizeof mpc->plan.u[0]);
+    mpc->warm = good; /* a bad plan is no start for the next step */
+    if (info) *info = mpc->info;
+}
+
+static br_mpc_error begin(br_mpc *mpc, const double x[BR_NX], double d_previous, const double *u,
+                          br_mpc_status *status, br_mpc_info *info) {
+    if (!mpc || !x || !u || !status) return BR_ERROR_NULL;
+    if (!mpc->has_parameters) return BR_ERROR_NOT_READY;
+    memset(&mpc->info, 0, sizeof mpc->info);
+    if (info) *info = mpc->info;
+    *status = BR_BAD_STATE;
+    if (!plausible_state(x) || !(fabs(d_previous) <= 1e3)) return BR_OK;
+    *status = BR_ACCEPTABLE;
+    memcpy(mpc->x0, x, sizeof mpc->x0);
+    mpc->d_previous = d_previous;
+    return BR_OK;
+}
+
+br_mpc_error br_mpc_step(br_mpc *mpc, const double x[BR_NX], double d_previous, double u[BR_NU],
+                         br_mpc_status *status, br_mpc_info *info) {
+    const br_mpc_error error = begin(mpc, x, d_previous, u, status, info);
+    if (error || *status == BR_BAD_STATE) return error;
+    if (!mpc->path.ready) return BR_ERROR_NOT_READY;
+    br_path_plan(&mpc->path, x, mpc->reference, &mpc->info.lateral_m);
+    mpc->info.s_ref_m = mpc->path.s;
+    solve(mpc, u, status, info);
+    return BR_OK;
+}
+
+br_mpc_error br_mpc_solve(br_mpc *mpc, const double x[BR_NX], double d_previous,
+                          const br_mpc_reference reference[BR_N], double u[BR_NU],
+                          br_mpc_status *status, br_mpc_info *info) {
+    if (!reference) return BR_ERROR_NULL;
+    const br_mpc_error error = begin(mpc, x, d_previous, u, status, info);
+    if (error || *status == BR_BAD_STATE) return error;
+    memcpy(mpc->reference, reference, sizeof mpc->reference);
+    solve(mpc, u, status, info);
+    return BR_OK;
+}

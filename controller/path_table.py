@@ -1,0 +1,59 @@
+"""Racing line and track as the table that the native planner reads (br_mpc_set_path)."""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from bayesrace.raceline.line import RaceLine
+from bayesrace.tracks import Track
+
+__all__ = ["CAPACITY", "PathTable", "make_path_table"]
+
+CAPACITY: Final = 8192
+"""BR_PATH_CAPACITY in controller/native/bayesrace_mpc.h."""
+
+SPACING_M: Final = 0.005
+"""Wanted distance of rows: between them the planner interpolates linearly, which at a curvature
+of 5 rad/m is wrong by .016 mm."""
+
+
+@dataclass(frozen=True, eq=False)
+class PathTable:
+    """Rows x, y, speed, left unit normal of the centreline (2), lower and upper bound of n . p.
+
+    ``rows`` has shape (n, 7), sampled every ``spacing_m`` along the closed racing line.
+    """
+
+    rows: npt.NDArray[np.float64]
+    spacing_m: float
+
+
+def make_path_table(track: Track, line: RaceLine, spacing_m: float = SPACING_M) -> PathTable:
+    """Samples the line and, at each sample's projection on the centreline, the two half-planes.
+
+    The half-planes are parallel to the centreline (paper, equation 8d), their normal has length 1,
+    their distance is the track's width there.
+    """
+    count = min(CAPACITY, max(8, math.ceil(line.length_m / spacing_m)))
+    s = np.arange(count) * (line.length_m / count)
+    nodes = np.append(line.s_m, line.length_m)
+    xy = np.column_stack([_periodic(s, nodes, line.x_m), _periodic(s, nodes, line.y_m)])
+    speed = np.interp(s, nodes, np.append(line.vx_mps, line.vx_mps[0]))
+    on_track = track.project_path(xy)
+    normal = track.normal(on_track.s_m)
+    right, left = track.widths(on_track.s_m)
+    along = np.sum(normal * track.position(on_track.s_m), axis=1)
+    rows = np.column_stack([xy, speed, normal, along - right, along + left])
+    return PathTable(np.ascontiguousarray(rows), line.length_m / count)
+
+
+def _periodic(
+    s: npt.NDArray[np.float64], nodes: npt.NDArray[np.float64], values: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    from scipy.interpolate import CubicSpline
+
+    spline = CubicSpline(nodes, np.append(values, values[0]), bc_type="periodic")
+    return np.asarray(spline(s))

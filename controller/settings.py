@@ -1,0 +1,24 @@
+"""Run-time settings of the OCP (paper, equation 8) and of the SQP that solves it."""
+
+from pydantic import BaseModel, ConfigDict, Field
+
+__all__ = ["MpcSettings"]
+
+
+class MpcSettings(BaseModel):
+    """All of these can change between two steps; nothing needs a recompilation."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    q_position: float = Field(1.0, gt=0, description="Q: squared position error [1/m^2]")
+    r_duty: float = Field(0.002, gt=0, description="R: squared change of the duty cycle")
+    r_delta_rate: float = Field(3e-5, gt=0, description="R: squared steering rate [s^2/rad^2]")
+    s_slack: float = Field(100.0, gt=0, description="S: squared track violation [1/m^2]")
+    constraints: bool = Field(True, description="track constraints (8d) on or off")
+    margin_m: float = Field(0.01, ge=0, description="distance kept from the track edges")
+    tolerance: float = Field(1e-6, gt=0, description="KKT residual of a converged step")
+    defect_max: float = Field(
+        0.1, gt=0, description="largest dynamics defect (m, rad, m/s, 10 rad/s) of a usable plan"
+    )
+    iterations: int = Field(1, ge=1, le=1000, description="SQP iterations a step may use")
+    iterations_cold: int = Field(30, ge=1, le=1000, description="the same after a reset")
