@@ -1,0 +1,67 @@
+"""The Typer application: one module per group of subcommands, and errors as one line."""
+
+import logging
+import sys
+from typing import Annotated
+
+import typer
+
+from bayesrace import __version__
+from bayesrace.errors import InputError
+from experiments.cli import evaluation, parts, preparation
+
+__all__ = ["app", "main"]
+
+app = typer.Typer(
+    name="bayesrace",
+    help="Real-time GP-MPC racing: a compiled controller that learns from its own laps.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="markdown",
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"bayesrace {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print and exit.")
+    ] = False,
+) -> None:
+    logging.basicConfig(level=logging.INFO, format="%(name)s: %(message)s", stream=sys.stderr)
+
+
+for group in (evaluation, preparation, parts):
+    group.register(app)
+
+
+def main() -> None:
+    """Runs the command line; bad input and lost processes end in one line, not in a traceback."""
+    try:
+        app(standalone_mode=False)
+    except InputError as error:
+        _fail(str(error))
+    except typer.Abort:
+        _fail("aborted", 130)
+    except KeyboardInterrupt:
+        _fail("interrupted", 130)
+    except RuntimeError as error:
+        # our own: RaceError, RaceLineError, CompileError
+        if type(error).__module__.split(".")[0] not in ("bayesrace", "codegen", "experiments"):
+            raise
+        _fail(str(error), 1)
+    except Exception as error:
+        click_error = getattr(error, "format_message", None)
+        if click_error is None:
+            raise
+        _fail(click_error())
+
+
+def _fail(text: str, code: int = 2) -> None:
+    typer.secho(f"bayesrace: {text}", err=True, fg=typer.colors.RED)
+    sys.exit(code)

@@ -1,0 +1,157 @@
+"""``race``, ``drive``, ``report``, ``bench``: what runs parts together."""
+
+from datetime import UTC, datetime
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK
+from experiments.cli.options import Car, LowLatency, TrackName
+
+__all__ = ["register"]
+
+
+class Mode(StrEnum):
+    """Time mode."""
+
+    lockstep = "lockstep"
+    realtime = "realtime"
+
+
+def race(
+    car: Car = "orca",
+    track: TrackName = DEFAULT_RACE_TRACK,
+    train_track: TrackName = DEFAULT_TRAINING_TRACK,
+    laps: Annotated[int, typer.Option(min=1, help="Laps per controller, first from rest.")] = 2,
+    mode: Annotated[Mode, typer.Option(help="Simulated or wall-clock time.")] = Mode.lockstep,
+    constraints: Annotated[bool, typer.Option(help="Track constraints of the OCP.")] = True,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Run directory [runs/DATE-TIME].")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the training drive and the GP.")] = 0,
+) -> None:
+    """Drive the paper's comparison: WorstCase, BayesRace, BayesRace-updated, BestCase.
+
+    Computes racing lines, drives the training track by pure pursuit, trains the GPs, builds the
+    controllers, and drives them as two processes over Zenoh. Leaves a run directory with the log,
+    result.json and report.html.
+    """
+    from rich.console import Console
+
+    from experiments.analysis import analyse, write_result
+    from experiments.progress import stages_on
+    from experiments.race import FILES
+    from experiments.race import race as drive_all
+    from experiments.report import render_report
+    from experiments.settings import RaceSettings
+    from experiments.table import print_table
+
+    settings = RaceSettings(
+        car=car, track=track, train_track=train_track, laps=laps, mode=mode.value, seed=seed
+    )
+    mpc = settings.mpc.model_copy(update={"constraints": constraints})
+    settings = settings.model_copy(update={"mpc": mpc})
+    out = out or Path("runs") / datetime.now(UTC).astimezone().strftime("%Y%m%d-%H%M%S")
+    console = Console()
+    with stages_on(console) as stages:
+        drive_all(settings, out, stages)
+        with stages.stage("result and report"):
+            result = analyse(out)
+            write_result(out / FILES.result, result)
+            report = render_report(out, result)
+    print_table(result, console)
+    console.print(f"{report}", highlight=False, soft_wrap=True)
+
+
+def report(
+    run: Annotated[Path, typer.Argument(help="Run directory; a broken-off run will do.")],
+) -> None:
+    """Make result.json, the table and report.html again from a run's log."""
+    from rich.console import Console
+
+    from experiments.analysis import analyse, write_result
+    from experiments.race import FILES
+    from experiments.report import render_report
+    from experiments.table import print_table
+
+    result = analyse(run)
+    write_result(run / FILES.result, result)
+    print_table(result, Console())
+    typer.echo(str(render_report(run, result)))
+
+
+def drive(
+    track: TrackName = DEFAULT_RACE_TRACK,
+    laps: Annotated[int, typer.Option(min=1, help="Laps to drive, first from rest.")] = 2,
+    mode: Annotated[Mode, typer.Option(help="Simulated or wall-clock time.")] = Mode.lockstep,
+    endpoint: Annotated[
+        list[str] | None,
+        typer.Option(help="Plant and controller, one each; the defaults of both without."),
+    ] = None,
+    max_time: Annotated[float, typer.Option(min=1, help="Time limit [s].")] = 60.0,
+    log: Annotated[Path, typer.Option(help="Log to write (MCAP).")] = Path("run.mcap"),
+    car: Car = "orca",
+    low_latency: LowLatency = False,
+) -> None:
+    """Start a run on a plant and a controller that are waiting elsewhere, and record it."""
+    from bayesrace.log import Recorder
+    from bayesrace.messages import EVENT, Event
+    from bayesrace.tracks import load_track
+    from bayesrace.transport import (
+        CONTROLLER_ENDPOINT,
+        PLANT_ENDPOINT,
+        Director,
+        Endpoints,
+        Publisher,
+        open_session,
+    )
+    from experiments.drive import RunPlan, execute
+
+    endpoints = Endpoints(
+        connect=tuple(endpoint or (PLANT_ENDPOINT, CONTROLLER_ENDPOINT)), low_latency=low_latency
+    )
+    course = load_track(track)
+    with open_session(endpoints) as session, Recorder(session, car, log):
+        director = Director(session, car)
+        director.inbox.catch_signals()
+        director.wait_for(("plant", "controller"), 10.0)
+        publisher: Publisher[Event] = Publisher(session, EVENT, car, "race")
+        number = director.status("plant").run + 1
+        plan = RunPlan(number, "manual", laps, max_time, mode is Mode.lockstep)
+        end = execute(director, publisher, course, plan)
+    typer.echo(f"{end.text}; log: {log}")
+
+
+def bench(
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the numbers to this file.")
+    ] = None,
+    track: TrackName = DEFAULT_RACE_TRACK,
+    problems: Annotated[int, typer.Option(min=10, help="Recorded problems, step.")] = 400,
+    peers: Annotated[int, typer.Option(min=1, help="Of these, solved by IPOPT.")] = 25,
+    points: Annotated[int, typer.Option(min=20, max=1024, help="Training points per GP.")] = 400,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+) -> None:
+    """Time the compiled step beside the paper's formulation in CasADi + IPOPT, same problems."""
+    from rich.console import Console
+
+    from experiments.bench import BenchSettings, run_bench
+    from experiments.progress import stages_on
+
+    console = Console()
+    with stages_on(console) as stages:
+        settings = BenchSettings(
+            track=track, problems=problems, peers=peers, points=points, seed=seed
+        )
+        result = run_bench(settings, stages)
+    result.print(console)
+    if json_file:
+        json_file.write_text(result.model_dump_json(indent=1) + "\n")
+
+
+def register(app: typer.Typer) -> None:
+    """Adds this module's subcommands."""
+    for command in (race, drive, report, bench):
+        app.command()(command)

@@ -1,0 +1,162 @@
+"""``tracks``, ``raceline``, ``collect``, ``train``, ``build``: each with files in and out."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from experiments.cli.options import Car, OutFile, RaceLineFile, TrackName
+
+__all__ = ["register"]
+
+
+class PredictionModel(StrEnum):
+    """What the OCP predicts with."""
+
+    e_kinematic = "e_kinematic"
+    dynamic = "dynamic"
+
+
+def tracks(
+    name: Annotated[
+        str | None, typer.Argument(help="Built-in name, random:SEED or CSV file; all without.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Write it as CSV.")] = None,
+) -> None:
+    """List the built-in tracks, check a track file, or write a track to a file."""
+    import numpy as np
+    from rich.console import Console
+    from rich.table import Table
+
+    from bayesrace.errors import InputError
+    from bayesrace.tracks import builtin_tracks, load_track, write_track
+
+    if out is not None and name is None:
+        raise InputError("--out needs the name of the track to write")
+    table = Table("track", "length m", "width m", "tightest radius m", "points")
+    for one in [name] if name else builtin_tracks():
+        track = load_track(one)
+        width = track.width_left_m + track.width_right_m
+        bend = np.abs(track.curvature(np.arange(0, track.length_m, 0.01))).max()
+        table.add_row(
+            track.name, f"{track.length_m:.2f}", f"{width.min():.2f}–{width.max():.2f}",
+            f"{1 / bend:.2f}", str(len(track.s_m)),
+        )  # fmt: skip
+        if out is not None:
+            write_track(out, track)
+    Console().print(table)
+
+
+def raceline(
+    track: Annotated[str, typer.Argument(help="Built-in name, random:SEED or CSV file.")],
+    out: OutFile = Path("raceline.csv"),
+    car: Car = "orca",
+    friction: Annotated[
+        float | None, typer.Option(help="Usable acceleration over g [the car's].")
+    ] = None,
+    margin: Annotated[
+        float | None, typer.Option(help="Centre of gravity to track edge [m].")
+    ] = None,
+) -> None:
+    """Compute the minimum-time racing line of a track."""
+    from bayesrace.raceline import RaceLineSettings, compute_raceline, write_raceline
+    from bayesrace.tracks import load_track
+    from bayesrace.vehicles import get_car
+
+    parameters = get_car(car)
+    settings = RaceLineSettings(friction=friction, margin_m=margin)
+    line = compute_raceline(load_track(track, parameters.width_m), parameters, settings)
+    write_raceline(out, line)
+    typer.echo(f"{line.length_m:.2f} m in {line.lap_time_s:.3f} s: {out}")
+
+
+def collect(
+    track: TrackName,
+    raceline: RaceLineFile,
+    out: OutFile = Path("collect.mcap"),
+    duration: Annotated[float, typer.Option(min=1, help="Length of the drive [s].")] = 12.0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the excitation.")] = 0,
+    car: Car = "orca",
+) -> None:
+    """Drive a track by pure pursuit and log it: training data."""
+    from bayesrace.raceline import read_raceline
+    from bayesrace.tracks import load_track
+    from bayesrace.vehicles import get_car
+    from controller.pure_pursuit import PurePursuitSettings
+    from experiments.collect import collect as drive
+
+    settings = PurePursuitSettings(seed=seed)
+    line = read_raceline(raceline)
+    samples = drive(load_track(track), line, get_car(car), out, duration, settings)
+    typer.echo(f"{samples} samples: {out}")
+
+
+def train(
+    logs: Annotated[list[Path], typer.Argument(help="Run logs (MCAP).")],
+    out: OutFile = Path("weights.bin"),
+    points: Annotated[int, typer.Option(min=20, max=20000, help="Points per output.")] = 400,
+    seed: Annotated[int, typer.Option(min=0, help="Of the optimiser's starts.")] = 0,
+    car: Car = "orca",
+) -> None:
+    """Train the three GPs on the residual that run logs show."""
+    from rich.console import Console
+
+    from bayesrace.gp.weights import write_weights
+    from bayesrace.integrators import PREDICTION
+    from bayesrace.vehicles import get_car
+    from experiments.progress import stages_on
+    from learning.dataset import concatenate
+    from learning.logs import dataset_from_log
+    from learning.training import TrainingSettings
+    from learning.training import train as fit
+
+    parameters = get_car(car)
+    samples = concatenate([dataset_from_log(log, parameters, PREDICTION.step_s) for log in logs])
+    console = Console()
+    with stages_on(console) as stages, stages.stage("train the residual") as stage:
+        settings = TrainingSettings(capacity=points, seed=seed)
+        weights = fit(samples, PREDICTION, settings, progress=stage.update)
+    write_weights(out, weights)
+    dropped = ", ".join(f"{n} {why}" for why, n in samples.dropped.items()) or "none"
+    console.print(
+        f"{weights.version}: {len(samples)} samples (left out: {dropped}), "
+        f"kernels {', '.join(weights.kernels)}: {out}",
+        highlight=False,
+    )
+
+
+def build(
+    model: Annotated[PredictionModel, typer.Option(help="Prediction model.")] = (
+        PredictionModel.e_kinematic
+    ),
+    horizon: Annotated[int, typer.Option(min=2, max=100, help="Stages N.")] = 20,
+    gp_capacity: Annotated[int, typer.Option(min=8, max=16384, help="Points per output.")] = 1024,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Copy the artefact here.")] = None,
+    car: Car = "orca",
+) -> None:
+    """Generate and compile a controller, or find it in the cache; prints its folder."""
+    import shutil
+
+    from bayesrace.integrators import PERFECT, PREDICTION
+    from codegen.build import build as make
+    from codegen.settings import BuildSettings
+
+    settings = BuildSettings(
+        car=car,
+        model=model.value,
+        discretisation=PERFECT if model is PredictionModel.dynamic else PREDICTION,
+        horizon=horizon,
+        gp_capacity=gp_capacity,
+    )
+    folder, _ = make(settings)
+    if out is not None:
+        shutil.copytree(folder, out, dirs_exist_ok=True)
+        folder = out
+    typer.echo(str(folder))
+
+
+def register(app: typer.Typer) -> None:
+    """Adds this module's subcommands."""
+    for command in (tracks, raceline, collect, train, build):
+        app.command()(command)

@@ -1,0 +1,65 @@
+"""Directs one run of a waiting plant and controller, from the start line to the last lap."""
+
+import time
+from dataclasses import dataclass
+
+from bayesrace.messages import EVENT, Event, RunRequest
+from bayesrace.tracks import StartLine, Track
+from bayesrace.transport import Director, Publisher
+
+__all__ = ["RunPlan", "execute", "run_request"]
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """One run: its number in all messages, who drives, how long."""
+
+    run: int
+    controller: str
+    laps: int
+    max_time_s: float
+    lockstep: bool
+    start_speed_mps: float = 0.1
+
+
+def run_request(track: Track, plan: RunPlan) -> RunRequest:
+    """What the plant needs to know: the start state and the start line, not the track."""
+    x, y, psi = track.start_pose()
+    line = StartLine(track)
+    return RunRequest(
+        seq=0,
+        source_time_ns=time.monotonic_ns(),
+        run=plan.run,
+        lockstep=plan.lockstep,
+        x0=(x, y, psi, plan.start_speed_mps, 0.0, 0.0, 0.0),
+        line_x_m=x,
+        line_y_m=y,
+        line_heading_rad=psi,
+        line_left_m=line.left_m,
+        line_right_m=line.right_m,
+        laps=plan.laps,
+        max_time_s=plan.max_time_s,
+        actuation_timeout_s=5.0 if plan.lockstep else 0.1,
+    )
+
+
+def _announce(publisher: Publisher[Event], plan: RunPlan, weights_version: str) -> None:
+    """Puts into the log, before the run, who is going to drive it."""
+    text = f"run {plan.run}: {plan.controller}"
+    data = {"run": plan.run, "controller": plan.controller, "weights_version": weights_version}
+    now_ns = time.monotonic_ns()
+    event = Event(publisher.next_seq, now_ns, plan.run, "race", "run", text, data)
+    publisher.put(event, lockstep=True)
+
+
+def execute(
+    director: Director, publisher: Publisher[Event], track: Track, plan: RunPlan
+) -> Event:
+    """Announces and starts the run and waits for its end; the plant's ``run_ended`` event.
+
+    InputError if the plant refuses or vanishes; KeyboardInterrupt on a signal.
+    """
+    _announce(publisher, plan, director.status("controller").weights_version)
+    director.start(run_request(track, plan))
+    # In lockstep simulated time passes faster than the clock's, but nobody promises it.
+    return director.wait_for_end(plan.run, 30.0 + 3.0 * plan.max_time_s)

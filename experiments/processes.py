@@ -1,0 +1,65 @@
+"""Starting plant and controller as the processes a person would start, and ending them surely."""
+
+import contextlib
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+__all__ = ["Child", "child"]
+
+_PATIENCE_S = 3.0
+
+
+class Child:
+    """A running ``bayesrace`` subcommand whose output goes to a file."""
+
+    def __init__(self, arguments: list[str], output: Path) -> None:
+        self.output = output
+        self._file = output.open("ab")
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "experiments.cli", *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=self._file,
+            stderr=subprocess.STDOUT,
+        )
+
+    @property
+    def pid(self) -> int:
+        """Process number."""
+        return self._process.pid
+
+    def ended(self) -> str:
+        """Why the process is not running any more, with its last words; "" while it runs."""
+        code = self._process.poll()
+        if code is None:
+            return ""
+        words = self.output.read_text(errors="replace").strip().splitlines()
+        said = f": {words[-1]}" if words else ""
+        how = f"was killed by signal {-code}" if code < 0 else f"ended with code {code}"
+        return f"{how}{said}"
+
+    def stop(self) -> None:
+        """SIGTERM, and SIGKILL for who does not listen."""
+        if self._process.poll() is None:
+            self._process.send_signal(signal.SIGTERM)
+            try:
+                self._process.wait(_PATIENCE_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+        self._process.wait()
+        self._file.close()
+
+
+@contextlib.contextmanager
+def child(arguments: list[str], output: Path) -> Iterator[Child]:
+    """A child process that does not outlive the block, however the block ends.
+
+    With ``--die-with-parent`` among the arguments it does not outlive this process either.
+    """
+    process = Child(arguments, output)
+    try:
+        yield process
+    finally:
+        process.stop()

@@ -1,0 +1,92 @@
+"""What a person sees while the parts work: a line per stage with its time."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Protocol
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+__all__ = ["Stage", "Stages", "SilentStages", "stages_on"]
+
+
+class Stage(Protocol):
+    """One stage under way."""
+
+    def update(self, share: float, text: str = "") -> None:
+        """``share`` of it is done (0 to 1); ``text`` says what is going on."""
+
+
+class Stages(Protocol):
+    """Where stages are shown."""
+
+    def stage(self, name: str) -> "StageContext":
+        """Context of one stage; it is marked done when the block ends well."""
+
+
+class StageContext(Protocol):
+    """``with`` this, get the stage."""
+
+    def __enter__(self) -> Stage: ...
+    def __exit__(self, *error: object) -> bool | None: ...
+
+
+class _Shown:
+    def __init__(self, progress: Progress, name: str) -> None:
+        self._progress = progress
+        self._task = progress.add_task(name, total=1.0, note="")
+
+    def update(self, share: float, text: str = "") -> None:
+        self._progress.update(self._task, completed=min(share, 1.0), note=text)
+
+
+class _RichStages:
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[Stage]:
+        shown = _Shown(self._progress, name)
+        yield shown
+        shown.update(1.0)
+
+
+class _Silent:
+    def update(self, share: float, text: str = "") -> None:
+        """Nothing."""
+
+
+class SilentStages:
+    """Shows nothing; for tests and scripts."""
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[Stage]:
+        """A stage nobody sees."""
+        yield _Silent()
+
+
+@contextmanager
+def stages_on(console: Console) -> Iterator[Stages]:
+    """Stages as progress bars on the console, plain lines where it is not a terminal."""
+    if not console.is_terminal:
+        yield _PlainStages(console)
+        return
+    columns = (
+        SpinnerColumn(finished_text="[green]✓"),
+        TextColumn("{task.description:<34}"),
+        BarColumn(bar_width=20),
+        TimeElapsedColumn(),
+        TextColumn("[dim]{task.fields[note]}"),
+    )
+    with Progress(*columns, console=console) as progress:
+        yield _RichStages(progress)
+
+
+class _PlainStages:
+    def __init__(self, console: Console) -> None:
+        self._console = console
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[Stage]:
+        self._console.print(f"{name} …", highlight=False)
+        yield _Silent()

@@ -1,0 +1,256 @@
+"""The whole chain: racing lines, training drive, GP, controllers, and the laps of the paper.
+
+Plant and controller are processes of their own, started as a person would start them; this one
+directs, records everything that is said on the network, and hands over weights.
+"""
+
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from bayesrace.errors import InputError
+from bayesrace.gp.weights import GpWeights, write_weights
+from bayesrace.log import Recorder
+from bayesrace.messages import EVENT, Event
+from bayesrace.raceline import RaceLine, compute_raceline, write_raceline
+from bayesrace.tracks import Track, load_track, write_track
+from bayesrace.transport import Director, Endpoints, Publisher, free_endpoint, open_session
+from bayesrace.vehicles import CarParameters, get_car
+from codegen.build import build
+from codegen.settings import BuildSettings
+from experiments.collect import collect
+from experiments.drive import RunPlan, execute
+from experiments.processes import Child, child
+from experiments.progress import Stage, Stages
+from experiments.settings import RaceSettings
+from learning.dataset import Dataset, concatenate
+from learning.logs import dataset_from_log
+from learning.training import TrainingSettings, train
+
+__all__ = ["FILES", "RaceError", "race"]
+
+_START_S: Final = 20.0
+
+
+class RaceError(RuntimeError):
+    """The race could not be driven to its end; the message says why. The log is readable."""
+
+
+@dataclass(frozen=True)
+class _Files:
+    """Names in the run directory."""
+
+    settings: str = "settings.json"
+    log: str = "run.mcap"
+    collect_log: str = "collect.mcap"
+    result: str = "result.json"
+    weights: str = "weights-bayesrace.bin"
+    weights_updated: str = "weights-updated.bin"
+    mpc: str = "mpc.json"
+
+
+FILES: Final = _Files()
+
+
+@dataclass(frozen=True, eq=False)
+class _Course:
+    """A track with its racing line, and the files that the processes read them from."""
+
+    track: Track
+    line: RaceLine
+    track_file: Path
+    line_file: Path
+
+
+class _Race:
+    def __init__(self, settings: RaceSettings, out: Path, stages: Stages) -> None:
+        self.settings, self.out, self.stages = settings, out, stages
+        self.car: CarParameters = get_car(settings.car)
+        self._run = 0
+
+    # Preparation -------------------------------------------------------------------------------
+
+    def course(self, name: str, label: str) -> _Course:
+        """Loads the track, computes the line, writes both into the run directory."""
+        track = load_track(name, self.car.width_m)
+        line = compute_raceline(track, self.car, self.settings.raceline)
+        files = self.out / f"{label}.csv", self.out / f"{label}_raceline.csv"
+        write_track(files[0], track)
+        write_raceline(files[1], line)
+        return _Course(track, line, *files)
+
+    def training_drive(self, course: _Course) -> Dataset:
+        """Drives the training track by pure pursuit and reads the samples from the log."""
+        settings = self.settings
+        log = self.out / FILES.collect_log
+        pursuit = settings.pursuit.model_copy(update={"seed": settings.seed})
+        collect(
+            course.track, course.line, self.car, log, settings.collect_s, pursuit,
+            settings.start_speed_mps,
+        )  # fmt: skip
+        return dataset_from_log(log, self.car, settings.discretisation.step_s)
+
+    def train(
+        self, dataset: Dataset, points: int, name: str, stage: Stage, initial: GpWeights | None
+    ) -> GpWeights:
+        """Weights of at most ``points`` points per output, written to the run directory."""
+        settings = TrainingSettings(capacity=points, seed=self.settings.seed)
+        weights = train(dataset, self.settings.discretisation, settings, initial, stage.update)
+        write_weights(self.out / name, weights)
+        return weights
+
+    def artefact(self, model: str) -> Path:
+        """Builds the controller, or takes it from the cache; its manifest goes into the run."""
+        if model == "dynamic":
+            settings = BuildSettings.best_case(self.car.name)
+        else:
+            settings = BuildSettings(
+                car=self.car.name, discretisation=self.settings.discretisation
+            )
+        folder, manifest = build(settings)
+        (self.out / f"manifest-{model}.json").write_text(manifest.model_dump_json(indent=1) + "\n")
+        return folder
+
+    # Driving -----------------------------------------------------------------------------------
+
+    def plan(self, controller: str, course: _Course) -> RunPlan:
+        """The next run."""
+        self._run += 1
+        settings = self.settings
+        limit_s = settings.time_limit * course.line.lap_time_s * settings.laps + 2.0
+        lockstep = settings.mode == "lockstep"
+        return RunPlan(
+            self._run, controller, settings.laps, limit_s, lockstep, settings.start_speed_mps
+        )
+
+
+@contextmanager
+def _explained(children: list[Child]) -> Iterator[None]:
+    """Turns the end of a child into the reason of what went wrong because of it."""
+    try:
+        yield
+    except InputError as error:
+        time.sleep(0.2)  # the system tells of a death a moment after the network does
+        ended = [f"{c.output.stem} {why}" for c in children if (why := c.ended())]
+        raise RaceError("; ".join([str(error), *ended])) from error
+
+
+class _Paddock:
+    """The processes of a race and the session that directs and records them."""
+
+    def __init__(self, race: _Race, course: _Course, stack: ExitStack) -> None:
+        self._race, self._course, self._stack = race, course, stack
+        self._plant_endpoint = free_endpoint()
+        self._controller_endpoint = free_endpoint()
+        self._low_latency = False
+        self.children: list[Child] = []
+        self.children.append(stack.enter_context(self._plant()))
+        endpoints = Endpoints(
+            connect=(self._plant_endpoint, self._controller_endpoint),
+            low_latency=self._low_latency,
+        )
+        session = stack.enter_context(open_session(endpoints))
+        stack.callback(self._stop_children)
+        self.recorder = stack.enter_context(
+            Recorder(session, race.car.name, race.out / FILES.log, self._metadata())
+        )
+        self.director = Director(session, race.car.name)
+        self.director.inbox.catch_signals()
+        self._events: Publisher[Event] = Publisher(session, EVENT, race.car.name, "race")
+
+    def _metadata(self) -> dict[str, dict[str, str]]:
+        return {"race": {"settings": self._race.settings.model_dump_json()}}
+
+    def _flags(self) -> list[str]:
+        return ["--die-with-parent", *(["--low-latency"] if self._low_latency else [])]
+
+    def _plant(self) -> Any:
+        arguments = ["plant", "--car", self._race.car.name, "--endpoint", self._plant_endpoint]
+        return child([*arguments, *self._flags()], self._race.out / "plant.log")
+
+    def _stop_children(self) -> None:
+        for process in self.children:
+            process.stop()
+
+    @contextmanager
+    def controller(self, artefact: Path, name: str) -> Iterator[None]:
+        """A controller process for the block; ready for its first run."""
+        race, course = self._race, self._course
+        settings_file = race.out / FILES.mpc
+        settings_file.write_text(race.settings.mpc.model_dump_json(indent=1) + "\n")
+        arguments = [
+            "controller", "--car", race.car.name, "--artefact", str(artefact),
+            "--track", str(course.track_file), "--raceline", str(course.line_file),
+            "--settings", str(settings_file), "--endpoint", self._plant_endpoint,
+            "--listen", self._controller_endpoint, *self._flags(),
+        ]  # fmt: skip
+        with child(arguments, race.out / f"controller-{name}.log") as process:
+            self.children.append(process)
+            with _explained(self.children):
+                self._wait_for_both()
+                yield
+            self.children.remove(process)
+
+    def _wait_for_both(self) -> None:
+        deadline = time.monotonic() + _START_S
+        while True:
+            try:
+                return self.director.wait_for(("plant", "controller"), 0.5)
+            except InputError:
+                dead = any(process.ended() for process in self.children)
+                if dead or time.monotonic() > deadline:
+                    raise
+
+    def drive(self, controller: str) -> RunPlan:
+        """One run; RaceError if it ended by anything but its laps or the time limit."""
+        plan = self._race.plan(controller, self._course)
+        end = execute(self.director, self._events, self._course.track, plan)
+        if end.data.get("reason") not in ("laps", "max_time", "left_world"):
+            raise InputError(f"run {plan.run} ({controller}) ended early: {end.text}")
+        return plan
+
+    def flushed(self, plan: RunPlan, car: CarParameters, step_s: float) -> Dataset:
+        """Samples of a run, from the log."""
+        self.recorder.settle()
+        return dataset_from_log(self._race.out / FILES.log, car, step_s, runs=(plan.run,))
+
+
+def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
+    """Drives WorstCase, BayesRace, BayesRace-updated and BestCase; leaves everything in ``out``.
+
+    Raises InputError for unusable settings, RaceError when a process is lost (the log stays
+    readable), KeyboardInterrupt on Ctrl-C; no process outlives the call.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    (out / FILES.settings).write_text(settings.model_dump_json(indent=1) + "\n")
+    this = _Race(settings, out, stages)
+    with stages.stage("racing line, training track"):
+        training = this.course(settings.train_track, "train")
+    with stages.stage("racing line, race track"):
+        course = this.course(settings.track, "race")
+    with stages.stage("training drive (pure pursuit)"):
+        samples = this.training_drive(training)
+    with stages.stage("train the residual") as stage:
+        weights = this.train(samples, settings.points, FILES.weights, stage, None)
+    with stages.stage("build the controllers"):
+        artefact, perfect = this.artefact("e_kinematic"), this.artefact("dynamic")
+    with ExitStack() as stack:
+        paddock = _Paddock(this, course, stack)
+        with paddock.controller(artefact, "bayesrace"):
+            with stages.stage("drive WorstCase"):
+                paddock.drive("worstcase")
+            with stages.stage("drive BayesRace"):
+                paddock.director.send_weights((out / FILES.weights).read_bytes())
+                driven = paddock.drive("bayesrace")
+            with stages.stage("update the residual") as stage:
+                lap = paddock.flushed(driven, this.car, settings.discretisation.step_s)
+                both = concatenate([samples, lap])
+                this.train(both, settings.points_updated, FILES.weights_updated, stage, weights)
+            with stages.stage("drive BayesRace-updated"):
+                paddock.director.send_weights((out / FILES.weights_updated).read_bytes())
+                paddock.drive("bayesrace-updated")
+        with paddock.controller(perfect, "bestcase"), stages.stage("drive BestCase"):
+            paddock.drive("bestcase")

@@ -1,0 +1,39 @@
+"""Everything a race can be told, as one resolved object that goes into the run directory."""
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from bayesrace.integrators import PREDICTION, Discretisation
+from bayesrace.raceline import RaceLineSettings
+from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK
+from controller.pure_pursuit import PurePursuitSettings
+from controller.settings import MpcSettings
+
+__all__ = ["RaceSettings"]
+
+
+class RaceSettings(BaseModel):
+    """Settings of ``bayesrace race``; defaults are the shown run."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    car: str = Field("orca", description="built-in car")
+    track: str = Field(DEFAULT_RACE_TRACK, description="race track: name, random:SEED or CSV file")
+    train_track: str = Field(DEFAULT_TRAINING_TRACK, description="the same for the training track")
+    laps: int = Field(
+        2, ge=1, le=100, description="laps a controller drives: one from standstill, then flying"
+    )
+    mode: Literal["lockstep", "realtime"] = Field("lockstep", description="time mode of the runs")
+    seed: int = Field(0, ge=0, description="of the training drive and of the GP's starts")
+    start_speed_mps: float = Field(0.1, ge=0, le=5, description="speed at the start line")
+    time_limit: float = Field(
+        3.0, gt=1, description="a run ends at this multiple of the racing line's time"
+    )
+    collect_s: float = Field(12.0, ge=1, le=600, description="length of the training drive")
+    points: int = Field(400, ge=20, le=1024, description="training points, first model")
+    points_updated: int = Field(800, ge=20, le=1024, description="training points, updated model")
+    discretisation: Discretisation = PREDICTION
+    raceline: RaceLineSettings = RaceLineSettings()
+    pursuit: PurePursuitSettings = PurePursuitSettings()
+    mpc: MpcSettings = MpcSettings()
