@@ -207,8 +207,10 @@ class Recorder:
 
     def _write(self, sample: Any) -> None:
         now_ns = time.monotonic_ns()
-        self._quiet_since_ns = now_ns
         key, data = str(sample.key_expr), sample.payload.to_bytes()
+        if not data:  # an inbox of the same session waking itself
+            return
+        self._quiet_since_ns = now_ns
         seq = peek_seq(data)
         self._account(key, seq)
         with self._lock:

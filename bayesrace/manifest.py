@@ -7,7 +7,7 @@ or scheme are refused by comparing :attr:`Manifest.discretisation`.
 from pathlib import Path
 from typing import Final
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.errors import InputError
 
@@ -44,11 +44,11 @@ def read_manifest(artefact: Path) -> Manifest:
     path = artefact / MANIFEST
     try:
         manifest = Manifest.model_validate_json(path.read_text())
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         raise InputError(
             f"{artefact} is not a built controller (no {MANIFEST}): run 'bayesrace build'"
         ) from None
-    except ValidationError as error:
+    except (OSError, ValueError) as error:
         raise InputError(f"{path} cannot be read: {error}; run 'bayesrace build'") from None
     if manifest.abi != ABI:
         raise InputError(

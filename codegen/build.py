@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
+from bayesrace.errors import InputError
 from bayesrace.manifest import ABI, LIBRARY, MANIFEST, Manifest, read_manifest
 from bayesrace.vehicles import get_car
 from codegen.compiler import FLAGS, Compiler, cpu_identity, find_compiler
@@ -121,8 +122,13 @@ def build(
     identity = build_hash(settings, compiler)
     target = cache_folder() / f"{settings.model}-{identity}"
     if (target / MANIFEST).is_file():
-        progress(f"{settings.model}: cached")
-        return target, read_manifest(target)
+        try:
+            manifest = read_manifest(target)
+        except InputError:  # damaged: build it again
+            shutil.rmtree(target, ignore_errors=True)
+        else:
+            progress(f"{settings.model}: cached")
+            return target, manifest
     progress(f"{settings.model}: generating and compiling")
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".build-") as temporary:

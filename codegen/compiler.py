@@ -63,7 +63,11 @@ class Compiler:
             str(out),
         ]
         if platform.system() == "Linux":
-            line.append("-Wl,--exclude-libs,ALL")
+            # A version script instead of --exclude-libs, which zig's linker does not know; -z defs,
+            # or a library that lacks a symbol would fail only when it is loaded.
+            exports = out.with_suffix(".map")
+            exports.write_text("{ global: br_mpc_*; local: *; };\n")
+            line += [f"-Wl,--version-script={exports}", "-Wl,-z,defs"]
         done = subprocess.run(line, capture_output=True, text=True, check=False)
         if done.returncode:
             raise CompileError(f"{shlex.join(line)}\n{done.stderr[-4000:]}")
@@ -73,7 +77,9 @@ def _candidates() -> list[tuple[str, ...]]:
     chosen = os.environ.get("CC")
     if chosen:
         return [tuple(shlex.split(chosen))]
-    found = [(name,) for name in ("cc", "gcc", "clang") if shutil.which(name)]
+    found: list[tuple[str, ...]] = [
+        (name,) for name in ("cc", "gcc", "clang") if shutil.which(name)
+    ]
     if find_spec("ziglang"):
         found.append((sys.executable, "-m", "ziglang", "cc"))
     return found

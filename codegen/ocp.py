@@ -1,8 +1,8 @@
 """The optimal control problem of the paper, equation (8), as one CasADi NLP.
 
 The definition that the native step is measured against: same objective, same constraints, any
-prediction model. Solved by IPOPT it is the oracle of the tests, and, expanded to scalars and started
-cold as the published code does, the peer of ``bayesrace bench``.
+prediction model. Solved by IPOPT it is the oracle of the tests, and, expanded to scalars and
+started cold as the published code does, the peer of ``bayesrace bench``.
 
     min  sum_{k=1}^N q |p_k - p_ref,k|^2
        + sum_{k=0}^{N-1} r_d (d_k - d_{k-1})^2 + r_delta delta_rate_k^2 + s |eps_k|^2
@@ -69,8 +69,11 @@ class RacingOcp:
     ) -> None:
         self.horizon, self._car = horizon, car
         self._nlp, self._split = self._formulate(f)
-        settings = {"print_time": False, "expand": expand, "error_on_fail": False}
+        settings: dict[str, Any] = {"print_time": False, "expand": expand, "error_on_fail": False}
         settings |= {"ipopt": {"print_level": 0, "sb": "yes"} | (options or {})}
+        self._objective = ca.Function(
+            "objective", [self._nlp["x"], self._nlp["p"]], [self._nlp["f"]]
+        )
         self._solver = ca.nlpsol("racing_ocp", "ipopt", self._nlp, settings)
         self._bounds = self._variable_bounds()
 
@@ -127,12 +130,10 @@ class RacingOcp:
         ``reference`` (N, 6): x, y, unit normal (2), lower, upper.
         """
         n = self.horizon
-        p = parameters
-        weight = [p.q_position, p.r_duty, p.r_delta_rate, p.s_slack, p.margin_m]
         start: Any = 0
         if guess is not None:
-            start = ca.veccat(guess[1].T, guess[0][1:].T, self._slack(guess[0], reference, p))
-        values = ca.veccat(x0, d_previous, reference.T, weight)
+            start = self._variables(guess[0], guess[1], reference, parameters)
+        values = self._values(x0, d_previous, reference, parameters)
         started = perf_counter()
         out = self._solver(x0=start, p=values, **self._bounds)
         seconds = perf_counter() - started
@@ -147,8 +148,29 @@ class RacingOcp:
             seconds=seconds,
         )
 
+    def cost(
+        self, x: Floats, u: Floats, d_previous: float, reference: Floats, parameters: OcpParameters
+    ) -> float:
+        """Objective of a plan x (N + 1, 7), u (N, 2), with the slack that it needs."""
+        variables = self._variables(x, u, reference, parameters)
+        values = self._values(x[0], d_previous, reference, parameters)
+        return float(self._objective(variables, values))
+
+    @staticmethod
+    def _values(
+        x0: Floats, d_previous: float, reference: Floats, parameters: OcpParameters
+    ) -> ca.DM:
+        p = parameters
+        weight = [p.q_position, p.r_duty, p.r_delta_rate, p.s_slack, p.margin_m]
+        return ca.veccat(x0, d_previous, reference.T, weight)
+
+    def _variables(
+        self, x: Floats, u: Floats, reference: Floats, parameters: OcpParameters
+    ) -> ca.DM:
+        return ca.veccat(u.T, x[1:].T, self._slack(x, reference, parameters))
+
     def _slack(self, x: Floats, reference: Floats, parameters: OcpParameters) -> Floats:
         along = np.sum(reference[:, 2:4] * x[1:, :2], axis=1)
         over = along - reference[:, 5] + parameters.margin_m
         under = reference[:, 4] + parameters.margin_m - along
-        return np.maximum(0.0, np.vstack([over, under]))
+        return np.asarray(np.maximum(0.0, np.vstack([over, under])))

@@ -21,6 +21,20 @@ def _derivatives(f: ca.Function, name: str) -> ca.Function:
     return ca.Function(name, [w, lam], outputs, {"cse": True})
 
 
+def _substep_functions(f: ca.Function) -> tuple[ca.Function, ca.Function]:
+    """``(v, lambda) -> (x_next, J, H)`` and ``v -> (x_next, J)`` of f(x, u), v = [x; u]."""
+    v, lam = ca.SX.sym("v", _NV), ca.SX.sym("lambda", _NX)
+    x_next = f(v[:_NX], v[_NX:])
+    jacobian = ca.densify(ca.jacobian(x_next, v))
+    hessian, _ = ca.hessian(ca.dot(lam, x_next), v)
+    outputs = [x_next, jacobian, ca.densify(hessian)]
+    options = {"cse": True}
+    return (
+        ca.Function("br_substep", [v, lam], outputs, options),
+        ca.Function("br_substep_forward", [v], outputs[:2], options),
+    )
+
+
 def _composed(model: Model, discretisation: Discretisation) -> ca.Function:
     """The same for many sub-steps, by the chain rule, so that code grows by calls.
 
@@ -32,25 +46,27 @@ def _composed(model: Model, discretisation: Discretisation) -> ca.Function:
     """
     n = discretisation.substeps
     one = discretisation.model_copy(update={"step_s": discretisation.step_s / n, "substeps": 1})
-    substep = _derivatives(one.corrected(model), "br_substep")
+    substep, forward = _substep_functions(one.discretise(model))
     w, lam = ca.MX.sym("w", _NW), ca.MX.sym("lambda", _NX)
-    u, no_e = w[_NX:_NV], ca.DM.zeros(_NE)
-    states, jacobians, curvature = [w[:_NX]], [], None
-    for i in range(n):
-        weight = lam if i == n - 1 else ca.DM.zeros(_NX)  # only the last costate is known yet
-        x_next, jacobian, curvature = substep(ca.vertcat(states[-1], u, no_e), weight)
+    u = w[_NX:_NV]
+    states, jacobians = [w[:_NX]], []
+    for _ in range(n - 1):
+        x_next, jacobian = forward(ca.vertcat(states[-1], u))
         states.append(x_next)
-        jacobians.append(jacobian[:, :_NV])
+        jacobians.append(jacobian)
+    x_next, jacobian, curvature = substep(ca.vertcat(states[-1], u), lam)
+    states.append(x_next)
+    jacobians.append(jacobian)
     hold_u = ca.horzcat(ca.MX.zeros(2, _NX), ca.MX.eye(2))
     sensitivities = [ca.MX.eye(_NV)]
     for jacobian in jacobians:
         sensitivities.append(ca.vertcat(jacobian @ sensitivities[-1], hold_u))
     costate = lam
-    hessian = sensitivities[n - 1].T @ curvature[:_NV, :_NV] @ sensitivities[n - 1]
+    hessian = sensitivities[n - 1].T @ curvature @ sensitivities[n - 1]
     for i in reversed(range(n - 1)):
         costate = jacobians[i + 1][:, :_NX].T @ costate
-        _, _, curvature = substep(ca.vertcat(states[i], u, no_e), costate)
-        hessian += sensitivities[i].T @ curvature[:_NV, :_NV] @ sensitivities[i]
+        _, _, curvature = substep(ca.vertcat(states[i], u), costate)
+        hessian += sensitivities[i].T @ curvature @ sensitivities[i]
     enters = ca.vertcat(ca.DM.zeros(3, _NE), ca.DM.eye(_NE), ca.DM.zeros(1, _NE))
     jacobian = ca.horzcat(sensitivities[n][:_NX, :], enters)
     hessian = ca.diagcat(hessian, ca.DM.zeros(_NE, _NE))

@@ -16,7 +16,7 @@ from bayesrace.errors import InputError
 from bayesrace.gp.weights import KERNELS, GpWeights
 from bayesrace.manifest import ABI, LIBRARY, Manifest, read_manifest
 from bayesrace.vehicles import CarParameters
-from controller.path_table import PathTable
+from controller.path_table import PATH_COLUMNS, PathTable
 from controller.settings import MpcSettings
 
 __all__ = ["NativeStep", "Reference", "StepInfo", "StepStatus"]
@@ -58,6 +58,7 @@ class _Parameters(ct.Structure):
                 "delta_rate_max_radps",
                 "tolerance",
                 "defect_max",
+                "settle",
             )
         ),
         ("iterations", ct.c_int),
@@ -214,6 +215,7 @@ class NativeStep:
             car.delta_rate_max_radps,
             settings.tolerance,
             settings.defect_max,
+            settings.settle,
             settings.iterations,
             settings.iterations_cold,
         )
@@ -223,13 +225,13 @@ class NativeStep:
     def set_path(self, table: PathTable) -> None:
         """Racing line and track; copied."""
         rows = np.ascontiguousarray(table.rows, dtype=np.float64)
-        error = self._library.br_mpc_set_path(
-            self._mpc, _address(rows), len(rows), table.spacing_m
-        )
+        if rows.ndim != 2 or rows.shape[1] != PATH_COLUMNS:
+            raise InputError(f"path table has shape {rows.shape}, not (n, {PATH_COLUMNS})")
+        error = self._library.br_mpc_set_path(self._mpc, _address(rows), len(rows), table.spacing_m)
         self._check(error, "path")
 
     def set_weights(self, weights: GpWeights) -> None:
-        """Takes over the weights from the next step on; InputError if they are for another model."""
+        """Uses the weights from the next step on; InputError if they are for another model."""
         if weights.discretisation != self.manifest.discretisation:
             raise InputError(
                 f"weights '{weights.version}' were learned for {weights.discretisation}, this "
@@ -306,12 +308,12 @@ class NativeStep:
         self._library.br_mpc_get_reference(self._mpc, _address(rows))
         return rows
 
-    def evaluate(
-        self, v: _DOUBLES, costate: _DOUBLES
-    ) -> tuple[_DOUBLES, _DOUBLES, _DOUBLES]:
-        """Corrected model at v = [x; u] (9,): x_next (7,), J (7, 9), H of costate' x_next (9, 9)."""
+    def evaluate(self, v: _DOUBLES, costate: _DOUBLES) -> tuple[_DOUBLES, _DOUBLES, _DOUBLES]:
+        """Corrected model at v = [x; u] (9,): x_next (7,), J (7, 9), H of lambda' x_next (9, 9)."""
         v = np.ascontiguousarray(v, dtype=np.float64)
         costate = np.ascontiguousarray(costate, dtype=np.float64)
+        if v.shape != (9,) or costate.shape != (7,):
+            raise InputError(f"evaluate takes v (9,), costate (7,), not {v.shape}, {costate.shape}")
         x_next, jacobian, hessian = np.zeros(7), np.zeros((7, 9)), np.zeros((9, 9))
         arrays = (v, costate, x_next, jacobian, hessian)
         self._check(

@@ -10,10 +10,13 @@ import numpy.typing as npt
 from bayesrace.raceline.line import RaceLine
 from bayesrace.tracks import Track
 
-__all__ = ["CAPACITY", "PathTable", "make_path_table"]
+__all__ = ["CAPACITY", "PATH_COLUMNS", "PathTable", "make_path_table"]
 
 CAPACITY: Final = 8192
 """BR_PATH_CAPACITY in controller/native/bayesrace_mpc.h."""
+
+PATH_COLUMNS: Final = 7
+"""BR_PATH_COLUMNS there."""
 
 SPACING_M: Final = 0.005
 """Wanted distance of rows: between them the planner interpolates linearly, which at a curvature
@@ -38,7 +41,7 @@ def make_path_table(track: Track, line: RaceLine, spacing_m: float = SPACING_M) 
     their distance is the track's width there.
     """
     count = min(CAPACITY, max(8, math.ceil(line.length_m / spacing_m)))
-    s = np.arange(count) * (line.length_m / count)
+    s: npt.NDArray[np.float64] = np.arange(count, dtype=np.float64) * (line.length_m / count)
     nodes = np.append(line.s_m, line.length_m)
     xy = np.column_stack([_periodic(s, nodes, line.x_m), _periodic(s, nodes, line.y_m)])
     speed = np.interp(s, nodes, np.append(line.vx_mps, line.vx_mps[0]))

@@ -35,6 +35,7 @@ from bayesrace.messages import (
 )
 from bayesrace.transport import (
     CONTROLLER_ENDPOINT,
+    LOCKSTEP_SPIN_S,
     PLANT_ENDPOINT,
     Endpoints,
     Inbox,
@@ -128,6 +129,7 @@ class ControllerProcess:
         controller, fallback = self._controller, self._fallback
         if state.run != self._run:
             self._run = state.run
+            self.inbox.spin_s = LOCKSTEP_SPIN_S if state.lockstep else 0.0
             fallback.reset()
             controller.reset(state)
         self._x[:] = state.x

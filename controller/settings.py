@@ -20,5 +20,11 @@ class MpcSettings(BaseModel):
     defect_max: float = Field(
         0.1, gt=0, description="largest dynamics defect (m, rad, m/s, 10 rad/s) of a usable plan"
     )
-    iterations: int = Field(1, ge=1, le=1000, description="SQP iterations a step may use")
+    settle: float = Field(
+        1e-4,
+        ge=0,
+        description="stationarity, and tenth of the defect, at which a step stops iterating; "
+        "0: only when converged",
+    )
+    iterations: int = Field(3, ge=1, le=1000, description="SQP iterations a step may use")
     iterations_cold: int = Field(30, ge=1, le=1000, description="the same after a reset")

@@ -3,6 +3,9 @@
 import time
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from bayesrace.log import LogWriter
 from bayesrace.messages import ACTUATION, STATE, Actuation, State, car_key, encode
 from bayesrace.raceline import RaceLine
@@ -12,7 +15,41 @@ from bayesrace.vehicles.models import dynamic
 from controller.pure_pursuit import PurePursuit, PurePursuitSettings
 from plant.simulator import Simulator
 
-__all__ = ["collect"]
+__all__ = ["collect", "drive_samples"]
+
+Floats = NDArray[np.float64]
+
+
+def drive_samples(
+    track: Track,
+    line: RaceLine,
+    car: CarParameters,
+    duration_s: float,
+    settings: PurePursuitSettings,
+    start_speed_mps: float = 0.1,
+) -> tuple[Floats, Floats]:
+    """Drives for ``duration_s``: states (n + 1, 7), inputs that acted (n, 2).
+
+    Driver and car take turns in one process, which is lockstep without a transport. The same
+    settings give the same drive to the bit.
+    """
+    simulator = Simulator(dynamic(car))
+    x, y, psi = track.start_pose()
+    simulator.reset([x, y, psi, start_speed_mps, 0.0, 0.0, 0.0])
+    driver = PurePursuit(car, line.x_m, line.y_m, line.vx_mps, settings)
+    driver.reset(_state(0, simulator.x, (0.0, 0.0), simulator.step_s, 0))
+    states, inputs = [simulator.x.copy()], []
+    for _ in range(round(duration_s / simulator.step_s)):
+        u = driver.step(simulator.x, np.array(simulator.u_applied)).u
+        simulator.step((float(u[0]), float(u[1])))
+        states.append(simulator.x.copy())
+        inputs.append(simulator.u_applied)
+    return np.array(states), np.array(inputs)
+
+
+def _state(seq: int, x: Floats, u_applied: tuple[float, float], step_s: float, lap: int) -> State:
+    now_ns = time.monotonic_ns()
+    return State(seq, now_ns, 0, seq * step_s, tuple(x.tolist()), u_applied, lap, True)
 
 
 def collect(
@@ -24,45 +61,27 @@ def collect(
     settings: PurePursuitSettings,
     start_speed_mps: float = 0.1,
 ) -> int:
-    """Drives for ``duration_s`` and writes states and actuations to the log at ``path``.
+    """Drives and writes states and actuations to the log at ``path``; the number of samples.
 
-    One process: driver and car take turns, which is lockstep without a transport. Returns the
-    number of samples. The same settings give the same drive to the bit.
+    Pure pursuit saturates its commands as the car does: what it asked for is what acted.
     """
-    simulator = Simulator(dynamic(car))
-    x, y, psi = track.start_pose()
-    simulator.reset([x, y, psi, start_speed_mps, 0.0, 0.0, 0.0])
-    driver = PurePursuit(car, line.x_m, line.y_m, line.vx_mps, settings)
-    start_line, laps = StartLine(track), 0
+    states, inputs = drive_samples(track, line, car, duration_s, settings, start_speed_mps)
+    start_line, lap = StartLine(track), 0
     state_key, actuation_key = (car_key(topic.key, car.name) for topic in (STATE, ACTUATION))
-    samples = round(duration_s / simulator.step_s)
     log = LogWriter(path, {"collect": {"track": track.name, "car": car.name}})
+    applied = (0.0, 0.0)
     try:
-        for seq in range(samples + 1):
-            now_ns = time.monotonic_ns()
-            position = (float(simulator.x[0]), float(simulator.x[1]))
-            state = State(
-                seq,
-                now_ns,
-                0,
-                simulator.time_s,
-                tuple(simulator.x.tolist()),
-                simulator.u_applied,
-                laps,
-                True,
-            )
-            log.write(state_key, encode(state), now_ns, seq)
-            if seq == samples:
+        for seq, x in enumerate(states):
+            if seq:
+                before, after = (tuple(states[k, :2].tolist()) for k in (seq - 1, seq))
+                lap += start_line.crossing(before, after).direction
+            state = _state(seq, x, applied, settings.step_s, lap)
+            log.write(state_key, encode(state), state.source_time_ns, seq)
+            if seq == len(inputs):
                 break
-            if seq == 0:
-                driver.reset(state)
-            u = driver.step(simulator.x, simulator.x[:2]).u
-            command = (float(u[0]), float(u[1]))
-            actuation = Actuation(seq, now_ns, 0, seq, command, "", 0)
-            log.write(actuation_key, encode(actuation), now_ns, seq)
-            simulator.step(command)
-            after = (float(simulator.x[0]), float(simulator.x[1]))
-            laps += start_line.crossing(position, after).direction
+            applied = (float(inputs[seq, 0]), float(inputs[seq, 1]))
+            actuation = Actuation(seq, state.source_time_ns, 0, seq, applied, "", 0)
+            log.write(actuation_key, encode(actuation), state.source_time_ns, seq)
     finally:
         log.close()
-    return samples
+    return len(inputs)

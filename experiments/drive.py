@@ -3,7 +3,7 @@
 import time
 from dataclasses import dataclass
 
-from bayesrace.messages import EVENT, Event, RunRequest
+from bayesrace.messages import Event, RunRequest, Scalar
 from bayesrace.tracks import StartLine, Track
 from bayesrace.transport import Director, Publisher
 
@@ -46,15 +46,17 @@ def run_request(track: Track, plan: RunPlan) -> RunRequest:
 def _announce(publisher: Publisher[Event], plan: RunPlan, weights_version: str) -> None:
     """Puts into the log, before the run, who is going to drive it."""
     text = f"run {plan.run}: {plan.controller}"
-    data = {"run": plan.run, "controller": plan.controller, "weights_version": weights_version}
+    data: dict[str, Scalar] = {
+        "run": plan.run,
+        "controller": plan.controller,
+        "weights_version": weights_version,
+    }
     now_ns = time.monotonic_ns()
     event = Event(publisher.next_seq, now_ns, plan.run, "race", "run", text, data)
     publisher.put(event, lockstep=True)
 
 
-def execute(
-    director: Director, publisher: Publisher[Event], track: Track, plan: RunPlan
-) -> Event:
+def execute(director: Director, publisher: Publisher[Event], track: Track, plan: RunPlan) -> Event:
     """Announces and starts the run and waits for its end; the plant's ``run_ended`` event.
 
     InputError if the plant refuses or vanishes; KeyboardInterrupt on a signal.

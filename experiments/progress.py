@@ -1,7 +1,7 @@
 """What a person sees while the parts work: a line per stage with its time."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Protocol
 
 from rich.console import Console
@@ -20,15 +20,8 @@ class Stage(Protocol):
 class Stages(Protocol):
     """Where stages are shown."""
 
-    def stage(self, name: str) -> "StageContext":
+    def stage(self, name: str) -> AbstractContextManager[Stage]:
         """Context of one stage; it is marked done when the block ends well."""
-
-
-class StageContext(Protocol):
-    """``with`` this, get the stage."""
-
-    def __enter__(self) -> Stage: ...
-    def __exit__(self, *error: object) -> bool | None: ...
 
 
 class _Shown:

@@ -94,10 +94,10 @@ class _Race:
         return dataset_from_log(log, self.car, settings.discretisation.step_s)
 
     def train(
-        self, dataset: Dataset, points: int, name: str, stage: Stage, initial: GpWeights | None
+        self, dataset: Dataset, name: str, stage: Stage, initial: GpWeights | None = None
     ) -> GpWeights:
-        """Weights of at most ``points`` points per output, written to the run directory."""
-        settings = TrainingSettings(capacity=points, seed=self.settings.seed)
+        """Weights learned from the samples, written to the run directory."""
+        settings = TrainingSettings(capacity=self.settings.points, seed=self.settings.seed)
         weights = train(dataset, self.settings.discretisation, settings, initial, stage.update)
         write_weights(self.out / name, weights)
         return weights
@@ -107,9 +107,7 @@ class _Race:
         if model == "dynamic":
             settings = BuildSettings.best_case(self.car.name)
         else:
-            settings = BuildSettings(
-                car=self.car.name, discretisation=self.settings.discretisation
-            )
+            settings = BuildSettings(car=self.car.name, discretisation=self.settings.discretisation)
         folder, manifest = build(settings)
         (self.out / f"manifest-{model}.json").write_text(manifest.model_dump_json(indent=1) + "\n")
         return folder
@@ -145,13 +143,11 @@ class _Paddock:
         self._race, self._course, self._stack = race, course, stack
         self._plant_endpoint = free_endpoint()
         self._controller_endpoint = free_endpoint()
-        self._low_latency = False
+        # Per link, and links that carry weights cannot have it: large messages need fragments.
+        self._low_latency = race.settings.mode == "lockstep"
         self.children: list[Child] = []
         self.children.append(stack.enter_context(self._plant()))
-        endpoints = Endpoints(
-            connect=(self._plant_endpoint, self._controller_endpoint),
-            low_latency=self._low_latency,
-        )
+        endpoints = Endpoints(connect=(self._plant_endpoint, self._controller_endpoint))
         session = stack.enter_context(open_session(endpoints))
         stack.callback(self._stop_children)
         self.recorder = stack.enter_context(
@@ -234,7 +230,7 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
     with stages.stage("training drive (pure pursuit)"):
         samples = this.training_drive(training)
     with stages.stage("train the residual") as stage:
-        weights = this.train(samples, settings.points, FILES.weights, stage, None)
+        weights = this.train(samples, FILES.weights, stage)
     with stages.stage("build the controllers"):
         artefact, perfect = this.artefact("e_kinematic"), this.artefact("dynamic")
     with ExitStack() as stack:
@@ -248,7 +244,7 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
             with stages.stage("update the residual") as stage:
                 lap = paddock.flushed(driven, this.car, settings.discretisation.step_s)
                 both = concatenate([samples, lap])
-                this.train(both, settings.points_updated, FILES.weights_updated, stage, weights)
+                this.train(both, FILES.weights_updated, stage, weights)
             with stages.stage("drive BayesRace-updated"):
                 paddock.director.send_weights((out / FILES.weights_updated).read_bytes())
                 paddock.drive("bayesrace-updated")

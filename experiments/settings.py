@@ -31,8 +31,7 @@ class RaceSettings(BaseModel):
         3.0, gt=1, description="a run ends at this multiple of the racing line's time"
     )
     collect_s: float = Field(12.0, ge=1, le=600, description="length of the training drive")
-    points: int = Field(400, ge=20, le=1024, description="training points, first model")
-    points_updated: int = Field(800, ge=20, le=1024, description="training points, updated model")
+    points: int = Field(400, ge=20, le=1024, description="training points per output")
     discretisation: Discretisation = PREDICTION
     raceline: RaceLineSettings = RaceLineSettings()
     pursuit: PurePursuitSettings = PurePursuitSettings()

@@ -7,7 +7,7 @@ from typing import Final
 
 from bayesrace.clock import sleep_until_ns
 from bayesrace.messages import Actuation, Decoder, RunRequest, State
-from bayesrace.transport import Inbox, Item, Kind, Publisher
+from bayesrace.transport import LOCKSTEP_SPIN_S, Inbox, Item, Kind, Publisher
 from plant.laps import LineCounter
 from plant.simulator import Simulator
 
@@ -94,7 +94,14 @@ class Run:
 
     def execute(self) -> End:
         """Drive until something ends the run."""
-        return self._lockstep() if self.request.lockstep else self._wall_clock()
+        if self.request.lockstep:
+            self._inbox.spin_s = LOCKSTEP_SPIN_S
+            try:
+                return self._lockstep()
+            finally:
+                self._inbox.spin_s = 0.0
+        with self._inbox.stamped():
+            return self._wall_clock()
 
     # Both modes --------------------------------------------------------------------------------
 

@@ -156,9 +156,7 @@ def _problem(frame: Frame, limits: CarLimits, settings: RaceLineSettings) -> _Pr
     )
 
 
-def _car_within(
-    limits: CarLimits, time: Any, energy: Any, kappa: Any, a: Any
-) -> list[Any]:
+def _car_within(limits: CarLimits, time: Any, energy: Any, kappa: Any, a: Any) -> list[Any]:
     """What the car can do, as expressions that must be <= 0; all arguments (N, 1).
 
     The steering angle's limit is the bound on kappa.

@@ -1,7 +1,14 @@
 """Zenoh, wrapped thinly: sessions with explicit endpoints, publishers, one inbox per thread."""
 
 from bayesrace.transport.client import Director, ask
-from bayesrace.transport.inbox import Inbox, Item, Kind, Request, decode_request
+from bayesrace.transport.inbox import (
+    LOCKSTEP_SPIN_S,
+    Inbox,
+    Item,
+    Kind,
+    Request,
+    decode_request,
+)
 from bayesrace.transport.session import (
     CONTROLLER_ENDPOINT,
     PLANT_ENDPOINT,
@@ -13,6 +20,7 @@ from bayesrace.transport.session import (
 
 __all__ = [
     "CONTROLLER_ENDPOINT",
+    "LOCKSTEP_SPIN_S",
     "PLANT_ENDPOINT",
     "Director",
     "Endpoints",

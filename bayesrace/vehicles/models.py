@@ -6,7 +6,8 @@ has ``x = [x, y, psi, v, delta]`` and ``u = [a, delta_rate]``.
 
 The equations hold exactly as printed for vx above :data:`BLEND_SPEED_MPS`. Below it, slip angles
 and rolling resistance go to zero with the speed through twice continuously differentiable
-polynomials, so that a standing car stays where it is and no solver meets a division by zero.
+polynomials (drag, cr2 vx |vx|, once), so that a standing car stays where it is and no solver meets
+a division by zero.
 """
 
 from collections.abc import Callable
@@ -145,7 +146,7 @@ def e_kinematic(car: CarParameters) -> Model:
 
 
 def kinematic(car: CarParameters) -> Model:
-    """Kinematic bicycle model (paper table 1, left column); inputs a [m/s^2], delta_rate [rad/s]."""
+    """Kinematic bicycle model (paper table 1, left column); u = [a m/s^2, delta_rate rad/s]."""
     x, u = ca.SX.sym("x", 5), ca.SX.sym("u", 2)
     psi, v, delta = x[2], x[3], x[4]
     beta = ca.atan(car.lr_m / car.wheelbase_m * ca.tan(delta))

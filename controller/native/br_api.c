@@ -19,11 +19,11 @@ br_mpc_error br_mpc_init(void *memory, size_t size, br_mpc **out) {
 static int valid(const br_mpc_parameters *p) {
     const double numbers[] = {p->q_position, p->r_duty, p->r_delta_rate, p->s_slack, p->margin_m,
                               p->d_min, p->d_max, p->delta_max_rad, p->delta_rate_max_radps,
-                              p->tolerance, p->defect_max};
+                              p->tolerance, p->defect_max, p->settle};
     return br_all_finite(numbers, sizeof numbers / sizeof numbers[0]) && p->q_position > 0 &&
            p->r_duty > 0 && p->r_delta_rate > 0 && p->s_slack >= 0 && p->margin_m >= 0 &&
            p->d_min < p->d_max && p->delta_max_rad > 0 && p->delta_rate_max_radps > 0 &&
-           p->tolerance > 0 && p->defect_max > 0 && p->iterations >= 1 && p->iterations_cold >= 1;
+           p->tolerance > 0 && p->defect_max > 0 && p->settle >= 0 && p->iterations >= 1 && p->iterations_cold >= 1;
 }
 
 br_mpc_error br_mpc_set_parameters(br_mpc *mpc, const br_mpc_parameters *parameters) {

@@ -113,9 +113,9 @@ void br_stage_linearise(const br_gp *gp, const double x[BR_NX], const double u[B
 
 /* br_qp.c: condensing and the QP of one SQP iteration */
 void br_qp_init(br_qp *qp);
-void br_qp_condense(br_mpc *mpc);
+br_mpc_status br_qp_condense(br_mpc *mpc);
 br_mpc_status br_qp_solve(br_mpc *mpc, int warm);
-void br_qp_shift_working_set(br_qp *qp);
+void br_qp_shift_rows(void *rows, size_t size);
 void br_qp_forget_working_set(br_qp *qp);
 
 /* br_residuals.c */

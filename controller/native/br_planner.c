@@ -13,9 +13,11 @@ enum { X = 0, Y = 1, SPEED = 2, NORMAL_X = 3, NORMAL_Y = 4, LOWER = 5, UPPER = 6
 
 #define WINDOW_BACK_M 0.3
 #define WINDOW_AHEAD_M 0.5
+#define SPACING_MAX_M 0.1 /* the window must hold several rows */
 
 br_mpc_error br_path_load(br_path *path, const double *table, int n, double spacing) {
-    if (n < 8 || n > BR_PATH_CAPACITY || !isfinite(spacing) || spacing <= 0) return BR_ERROR_PATH;
+    if (n < 8 || n > BR_PATH_CAPACITY || !(spacing > 0 && spacing <= SPACING_MAX_M))
+        return BR_ERROR_PATH;
     if (!br_all_finite(table, n * BR_PATH_COLUMNS)) return BR_ERROR_PATH;
     for (int i = 0; i < n; ++i) {
         const double *row = &table[i * BR_PATH_COLUMNS];

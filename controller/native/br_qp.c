@@ -11,7 +11,7 @@
  * DAQP gets M = A L^{-T} (H = L L') in caller-owned memory; only its core daqp_ldp is called,
  * which neither allocates nor reads a clock. docs/decisions/ says why DAQP and not HPIPM.
  */
-#include <daqp/api.h>
+#include <daqp/daqp.h>
 #include <math.h>
 
 #include "br_internal.h"
@@ -23,10 +23,17 @@
 void br_qp_init(br_qp *qp) {
     DAQPWorkspace *work = &qp->daqp;
     memset(work, 0, sizeof *work);
-    daqp_default_settings(&qp->settings);
-    qp->settings.primal_tol = 1e-9;
-    qp->settings.dual_tol = 1e-12;
-    qp->settings.iter_limit = 200;
+    qp->settings = (DAQPSettings){
+        .primal_tol = 1e-9,
+        .dual_tol = DEFAULT_DUAL_TOL,
+        .zero_tol = DEFAULT_ZERO_TOL,
+        .pivot_tol = DEFAULT_PIVOT_TOL,
+        .progress_tol = DEFAULT_PROG_TOL,
+        .cycle_tol = DEFAULT_CYCLE_TOL,
+        .iter_limit = 200,
+        .fval_bound = DAQP_INF,
+        .rho_soft = DEFAULT_RHO_SOFT,
+    };
     for (int i = 0; i < BR_ROWS; ++i) qp->unit[i] = 1.0;
     work->n = BR_M;
     work->M = qp->m;
@@ -48,11 +55,14 @@ void br_qp_forget_working_set(br_qp *qp) {
     for (int i = 0; i < BR_ROWS; ++i) qp->sense[i] = i >= ROW_TRACK ? SOFT : 0;
 }
 
-/* The working set moves with the horizon: stage k takes what stage k + 1 had. */
-void br_qp_shift_working_set(br_qp *qp) {
-    memmove(qp->sense, qp->sense + BR_NU, (BR_M - BR_NU) * sizeof(int));
-    memmove(qp->sense + ROW_DELTA, qp->sense + ROW_DELTA + 1, (BR_N - 1) * sizeof(int));
-    memmove(qp->sense + ROW_TRACK, qp->sense + ROW_TRACK + 1, (BR_N - 1) * sizeof(int));
+/* What belongs to rows moves with the horizon: stage k takes what stage k + 1 had. */
+void br_qp_shift_rows(void *rows, size_t size) {
+    char *at = rows;
+    memmove(at, at + BR_NU * size, (BR_M - BR_NU) * size);
+    at += ROW_DELTA * size;
+    memmove(at, at + size, (BR_N - 1) * size);
+    at += (ROW_TRACK - ROW_DELTA) * size;
+    memmove(at, at + size, (BR_N - 1) * size);
 }
 
 /* Whole vectors that cover columns 0..n-1 of a BR_MP-wide row; the rest of a row is zero. */
@@ -196,16 +206,17 @@ static int cholesky(br_qp *qp) {
 
 /* With the exact Hessian if that is positive definite in the inputs; else with less and less of
  * its second-order part, down to Gauss-Newton, which always is. */
-void br_qp_condense(br_mpc *mpc) {
+br_mpc_status br_qp_condense(br_mpc *mpc) {
     static const double curvature[] = {1.0, 0.5, 0.25, 0.0};
     sensitivities(mpc);
     for (int attempt = 0; attempt < 4; ++attempt) {
         condense_hessian(mpc, curvature[attempt]);
-        if (!cholesky(&mpc->qp) && attempt < 3) continue;
+        if (!cholesky(&mpc->qp)) continue;
         condense_gradient(mpc, curvature[attempt]);
         mpc->info.regularised += attempt > 0;
-        return;
+        return BR_CONVERGED;
     }
+    return BR_NOT_FINITE; /* Gauss-Newton is positive definite by construction */
 }
 
 static void bounds(br_mpc *mpc) {

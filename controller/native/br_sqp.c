@@ -34,7 +34,8 @@ static void shift(br_mpc *mpc) {
     memmove(mpc->plan.u, mpc->plan.u + 1, last * sizeof mpc->plan.u[0]);
     memmove(mpc->plan.costate, mpc->plan.costate + 1, BR_N * sizeof mpc->plan.costate[0]);
     memmove(mpc->stage, mpc->stage + 1, last * sizeof mpc->stage[0]);
-    br_qp_shift_working_set(&mpc->qp);
+    br_qp_shift_rows(mpc->plan.multiplier, sizeof mpc->plan.multiplier[0]);
+    br_qp_shift_rows(mpc->qp.sense, sizeof mpc->qp.sense[0]);
     /* hold the duty cycle at the new end; the steering rate goes to zero so that the angle stays */
     mpc->plan.u[last][1] = 0;
     linearise(mpc, mpc->linearised ? last : 0);
@@ -119,19 +120,30 @@ static void line_search(br_mpc *mpc) {
     }
 }
 
+/* Another iteration would change little that matters for the next 20 ms, or, where the Hessian is
+ * indefinite and convergence slow, cost more than it gives. settle = 0 means to go on regardless. */
+static int settled(const br_mpc *mpc, double *residual) {
+    const double before = *residual;
+    *residual = fmax(mpc->info.stationarity, 0.1 * mpc->info.defect);
+    if (mpc->parameters.settle == 0) return 0;
+    return *residual <= mpc->parameters.settle || (mpc->warm && *residual > 0.5 * before);
+}
+
 static br_mpc_status optimise(br_mpc *mpc) {
     const int cold = !mpc->warm;
     const int limit = cold ? mpc->parameters.iterations_cold : mpc->parameters.iterations;
     if (cold) cold_start(mpc);
     else shift(mpc);
     br_mpc_status status = BR_DEFECT;
+    double residual = INFINITY;
     for (int i = 0; i < limit && (status == BR_ACCEPTABLE || status == BR_DEFECT); ++i) {
-        br_qp_condense(mpc);
-        status = br_qp_solve(mpc, i > 0 || !cold);
+        status = br_qp_condense(mpc);
+        if (status == BR_CONVERGED) status = br_qp_solve(mpc, i > 0 || !cold);
         if (status != BR_CONVERGED) break;
         line_search(mpc);
         mpc->info.iterations = i + 1;
         status = br_judge(mpc);
+        if (status == BR_ACCEPTABLE && settled(mpc, &residual)) break;
     }
     return status;
 }

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK
-from experiments.cli.options import Car, LowLatency, TrackName
+from experiments.cli.options import Car, TrackName
 
 __all__ = ["register"]
 
@@ -40,7 +40,7 @@ def race(
     """
     from rich.console import Console
 
-    from experiments.analysis import analyse, write_result
+    from experiments.analysis import read_race, write_result
     from experiments.progress import stages_on
     from experiments.race import FILES
     from experiments.race import race as drive_all
@@ -58,10 +58,10 @@ def race(
     with stages_on(console) as stages:
         drive_all(settings, out, stages)
         with stages.stage("result and report"):
-            result = analyse(out)
-            write_result(out / FILES.result, result)
-            report = render_report(out, result)
-    print_table(result, console)
+            analysis = read_race(out)
+            write_result(out / FILES.result, analysis.result)
+            report = render_report(out, analysis.result, analysis)
+    print_table(analysis.result, console)
     console.print(f"{report}", highlight=False, soft_wrap=True)
 
 
@@ -71,15 +71,15 @@ def report(
     """Make result.json, the table and report.html again from a run's log."""
     from rich.console import Console
 
-    from experiments.analysis import analyse, write_result
+    from experiments.analysis import read_race, write_result
     from experiments.race import FILES
     from experiments.report import render_report
     from experiments.table import print_table
 
-    result = analyse(run)
-    write_result(run / FILES.result, result)
-    print_table(result, Console())
-    typer.echo(str(render_report(run, result)))
+    analysis = read_race(run)
+    write_result(run / FILES.result, analysis.result)
+    print_table(analysis.result, Console())
+    typer.echo(str(render_report(run, analysis.result, analysis)))
 
 
 def drive(
@@ -93,7 +93,6 @@ def drive(
     max_time: Annotated[float, typer.Option(min=1, help="Time limit [s].")] = 60.0,
     log: Annotated[Path, typer.Option(help="Log to write (MCAP).")] = Path("run.mcap"),
     car: Car = "orca",
-    low_latency: LowLatency = False,
 ) -> None:
     """Start a run on a plant and a controller that are waiting elsewhere, and record it."""
     from bayesrace.log import Recorder
@@ -109,9 +108,7 @@ def drive(
     )
     from experiments.drive import RunPlan, execute
 
-    endpoints = Endpoints(
-        connect=tuple(endpoint or (PLANT_ENDPOINT, CONTROLLER_ENDPOINT)), low_latency=low_latency
-    )
+    endpoints = Endpoints(connect=tuple(endpoint or (PLANT_ENDPOINT, CONTROLLER_ENDPOINT)))
     course = load_track(track)
     with open_session(endpoints) as session, Recorder(session, car, log):
         director = Director(session, car)

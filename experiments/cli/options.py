@@ -16,7 +16,7 @@ OutFile = Annotated[Path, typer.Option("--out", "-o", help="File to write.")]
 LowLatency = Annotated[
     bool,
     typer.Option(
-        help="Send in the calling thread; all peers must do so too. For lockstep.",
+        help="Send in the calling thread. For lockstep, on plant and controller alike.",
     ),
 ]
 DieWithParent = Annotated[bool, typer.Option(hidden=True, help="End when the parent ends.")]

@@ -26,9 +26,7 @@ def plant(
     from bayesrace.transport import Endpoints
     from plant.process import PlantSettings, main
 
-    endpoints = Endpoints(
-        listen=(endpoint,), connect=tuple(connect or ()), low_latency=low_latency
-    )
+    endpoints = Endpoints(listen=(endpoint,), connect=tuple(connect or ()), low_latency=low_latency)
     settings = PlantSettings(car=car, endpoints=endpoints, die_with_parent=die_with_parent)
     raise typer.Exit(main(settings))
 
