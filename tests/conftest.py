@@ -1,0 +1,248 @@
+"""What the tests of the native step share: built controllers, a track, weights, a recorded drive.
+
+Everything is synthetic and made in seconds: no optimal racing line, no trained model, no data file.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike, NDArray
+
+from bayesrace.gp.expression import kernel_matrix
+from bayesrace.gp.weights import KERNELS, GpOutput, GpWeights
+from bayesrace.integrators import PREDICTION, Discretisation
+from bayesrace.raceline.line import RaceLine
+from bayesrace.tracks import Track
+from bayesrace.vehicles import CarParameters, get_car
+from bayesrace.vehicles.models import Model, dynamic, e_kinematic
+from codegen.build import build
+from codegen.settings import BuildSettings
+from controller.native_step import NativeStep, _Parameters
+from controller.path_table import PathTable, make_path_table
+from controller.settings import MpcSettings
+
+Floats = NDArray[np.float64]
+
+# the components that change sign in a mirror at the x axis
+MIRROR_STATE = np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0, -1.0])
+MIRROR_INPUT = np.array([1.0, -1.0])
+_MIRROR_OUTPUT = (1.0, -1.0, -1.0)
+
+SETTINGS = MpcSettings(
+    q_position=1.0,
+    r_duty=0.005,
+    r_delta_rate=1e-4,
+    s_slack=100.0,
+    constraints=True,
+    margin_m=0.0,
+    tolerance=1e-6,
+    defect_max=0.1,
+    settle=0.0,
+    iterations=1,
+    iterations_cold=30,
+)
+"""Written out, so that tuning the defaults does not change what is tested."""
+
+TRUTH = Discretisation(scheme="rk4", step_s=0.02, substeps=20)
+"""Accurate for the dynamic model also at standstill, where the tyres are stiff."""
+
+NOISE = 0.02
+LENGTH_SCALES = np.array([2.0, 1.0, 10.0, 0.5, 1.5, 10.0])
+
+
+def discrete(
+    model: Model, discretisation: Discretisation = TRUTH
+) -> Callable[[Floats, Floats], Floats]:
+    """The discretised model as a function of numpy arrays."""
+    function = discretisation.discretise(model)
+    return lambda x, u: np.asarray(function(x, u), dtype=float).ravel()
+
+
+def smooth_drive(car: CarParameters, count: int, seed: int) -> tuple[Floats, Floats]:
+    """States (count, 7) and inputs (count, 2) of the dynamic model under smooth random driving."""
+    random, step = np.random.default_rng(seed), discrete(dynamic(car))
+    x, u = np.array([0.0, 0, 0, 1.5, 0, 0, 0]), np.array([0.5, 0.0])
+    states, inputs = [], []
+    for k in range(count):
+        if k % 8 == 0:
+            duty = random.uniform(0.0, 1.0) if x[3] < 2.5 else random.uniform(-0.1, 0.3)
+            target = random.uniform(-0.3, 0.3)
+        u = np.array([duty, np.clip(8 * (target - x[6]), -5, 5)])
+        states.append(x)
+        inputs.append(u)
+        x = step(x, u)
+    return np.array(states), np.array(inputs)
+
+
+def fit_output(kind: str, z: Floats, y: Floats) -> GpOutput:
+    """Posterior mean for fixed hyperparameters; the noise keeps the alphas moderate."""
+    mean, scale = float(y.mean()), float(y.std())
+    gram = kernel_matrix(kind, z, z, LENGTH_SCALES) + NOISE * np.eye(len(z))
+    alpha = np.asarray(np.linalg.solve(gram, (y - mean) / scale), dtype=np.float64)
+    return GpOutput(kind, LENGTH_SCALES, 1.0, NOISE, z, alpha, mean, scale)
+
+
+def fit_weights(
+    car: CarParameters, kinds: tuple[str, str, str], count: int = 160, seed: int = 1
+) -> GpWeights:
+    """Weights learned from the one-step error of the e-kinematic model on a random drive."""
+    states, inputs = smooth_drive(car, count + 1, seed)
+    nominal = discrete(e_kinematic(car), PREDICTION)
+    predicted = np.array([nominal(x, u) for x, u in zip(states[:-1], inputs[:-1], strict=True)])
+    residual = (states[1:] - predicted)[:, 3:6]
+    z = np.column_stack([states[:-1, 3:7], inputs[:-1]])
+    vx, vy, omega = (fit_output(kinds[j], z, residual[:, j]) for j in range(3))
+    identity = PREDICTION.identity("e_kinematic", car)
+    return GpWeights("-".join(kinds), car.name, identity, (vx, vy, omega))
+
+
+def mirrored_weights(weights: GpWeights) -> GpWeights:
+    """The weights that the mirrored car would have learned."""
+    signs = np.r_[MIRROR_STATE[3:], MIRROR_INPUT]
+    vx, vy, omega = (
+        replace(o, inputs=o.inputs * signs, alpha=o.alpha * sign, y_mean=o.y_mean * sign)
+        for o, sign in zip(weights.outputs, _MIRROR_OUTPUT, strict=True)
+    )
+    return replace(weights, version=f"{weights.version}-mirrored", outputs=(vx, vy, omega))
+
+
+def mirrored_line(line: RaceLine) -> RaceLine:
+    """The line mirrored at the x axis."""
+    return replace(line, y_m=-line.y_m, psi_rad=-line.psi_rad, kappa_radpm=-line.kappa_radpm)
+
+
+def offset_line(track: Track, offset_m: float, lateral_mps2: float, v_max: float) -> RaceLine:
+    """A line that swings about the centreline, at the speed of a lateral acceleration limit."""
+    count = round(track.length_m / 0.02)
+    s = np.arange(count) * (track.length_m / count)
+    n = offset_m * np.sin(4 * np.pi * s / track.length_m)
+    xy = track.position(s) + n[:, None] * track.normal(s)
+    chord = np.roll(xy, -1, axis=0) - xy
+    step = np.linalg.norm(chord, axis=1)
+    psi = np.unwrap(np.arctan2(chord[:, 1], chord[:, 0]))
+    kappa = np.angle(np.exp(1j * (np.roll(psi, -1) - psi))) / step
+    v = np.minimum(v_max, np.sqrt(lateral_mps2 / np.maximum(np.abs(kappa), 1e-3)))
+    v = np.real(np.fft.ifft(np.fft.fft(v) * np.exp(-((np.fft.fftfreq(count) * 60) ** 2))))
+    along = np.r_[0.0, np.cumsum(step)]
+    return RaceLine(
+        track.name, along[:-1], xy[:, 0], xy[:, 1], psi, kappa, v, 0 * v, float(along[-1])
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """One recorded control step: everything that shaped it."""
+
+    x0: Floats
+    d_previous: float
+    reference: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Circuit:
+    """Track, line, and the table made of them."""
+
+    track: Track
+    line: RaceLine
+    table: PathTable
+
+    def start(self, s_m: float = 0.0, v_mps: float = 1.0) -> Floats:
+        """State of a car that follows the line at arc length ``s_m``."""
+        i = int(np.searchsorted(self.line.s_m, s_m))
+        line = self.line
+        return np.array([line.x_m[i], line.y_m[i], line.psi_rad[i], v_mps, 0.0, 0.0, 0.0])
+
+
+@pytest.fixture(scope="session")
+def car() -> CarParameters:
+    """The 1:43 car."""
+    return get_car("orca")
+
+
+@pytest.fixture(scope="session")
+def kinematic_artefact() -> Path:
+    """Built controller that predicts with the e-kinematic model, from the cache if it is there."""
+    return build(BuildSettings())[0]
+
+
+@pytest.fixture(scope="session")
+def dynamic_artefact() -> Path:
+    """Built BestCase controller."""
+    return build(BuildSettings.best_case())[0]
+
+
+@pytest.fixture(scope="session")
+def weights(car: CarParameters) -> GpWeights:
+    """Plausible weights of 160 points with three different kernels."""
+    return fit_weights(car, ("rbf", "matern25", "matern15"))
+
+
+def native_numbers(settings: MpcSettings, car: CarParameters, weights: GpWeights) -> Floats:
+    """Parameters and weights in the order of the C structures, as the C programs read them."""
+    names = [field[0] for field in _Parameters._fields_]
+    parts: list[ArrayLike] = [
+        [float(getattr(car if hasattr(car, name) else settings, name)) for name in names]
+    ]
+    for output in weights.outputs:
+        scale = output.y_scale * output.signal_variance
+        parts.append([KERNELS.index(output.kernel), output.count, output.y_mean, scale])
+        parts += [output.length_scales, output.inputs.ravel(), output.alpha]
+    return np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
+
+
+def make_circuit() -> Circuit:
+    """A peanut of 6.4 m, bends to both sides, with a line on which every kind of limit binds."""
+    angle = np.linspace(0, 2 * np.pi, 160, endpoint=False)
+    radius = 0.8 + 0.32 * np.cos(2 * angle)
+    points = np.column_stack([1.15 * radius * np.cos(angle), radius * np.sin(angle)])
+    track = Track.from_points("peanut", points, 0.16, 0.18)
+    line = offset_line(track, offset_m=0.17, lateral_mps2=6.0, v_max=2.6)
+    return Circuit(track, line, make_path_table(track, line))
+
+
+@pytest.fixture(scope="session")
+def circuit() -> Circuit:
+    """Track, racing line and table, synthetic."""
+    return make_circuit()
+
+
+def drive(
+    step: NativeStep, circuit: Circuit, count: int, x: Floats | None = None
+) -> tuple[list[Problem], Floats]:
+    """Closed loop with the dynamic model as plant: problems and the inputs (count, 2) applied."""
+    car = get_car("orca")
+    plant = discrete(dynamic(car))
+    x, d, problems, inputs = circuit.start() if x is None else x, 0.0, [], []
+    for _ in range(count):
+        status = step.step(x, d)
+        assert status.usable, status
+        problems.append(Problem(x.copy(), d, step.read_reference()))
+        inputs.append(step.u.copy())
+        d, x = float(step.u[0]), plant(x, step.u)
+        x[6] = np.clip(x[6], -car.delta_max_rad, car.delta_max_rad)
+    return problems, np.array(inputs)
+
+
+@pytest.fixture
+def native(
+    kinematic_artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit
+) -> NativeStep:
+    """A ready GP controller on the circuit."""
+    step = NativeStep(kinematic_artefact, car, SETTINGS)
+    step.set_weights(weights)
+    step.set_path(circuit.table)
+    return step
+
+
+@pytest.fixture(scope="session")
+def recorded(
+    kinematic_artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit
+) -> list[Problem]:
+    """Problems of 300 closed-loop steps with the GP, constraints on: about two laps."""
+    step = NativeStep(kinematic_artefact, car, SETTINGS)
+    step.set_weights(weights)
+    step.set_path(circuit.table)
+    return drive(step, circuit, 300)[0]

@@ -1,0 +1,288 @@
+"""Code generation: the cache's hash sees everything, and what cannot be built or loaded is told."""
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from importlib.util import find_spec
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import codegen.build as build_module
+from bayesrace.errors import InputError
+from bayesrace.integrators import PERFECT, PREDICTION, Discretisation
+from bayesrace.manifest import LIBRARY, MANIFEST, read_manifest
+from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles.models import MODELS
+from codegen.build import build, build_hash, cache_folder, generate
+from codegen.compiler import CompileError, Compiler, find_compiler
+from codegen.settings import BuildSettings
+from codegen.stage import linearise_function
+from controller.native_step import NativeStep
+from controller.settings import MpcSettings
+
+SMALL = BuildSettings(
+    horizon=3, gp_capacity=8, discretisation=Discretisation(scheme="euler", pose="integrated")
+)
+
+
+@pytest.fixture(autouse=True)
+def _fresh_compiler_search() -> Iterator[None]:
+    find_compiler.cache_clear()
+    yield
+    find_compiler.cache_clear()
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("BAYESRACE_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@pytest.fixture
+def artefact(kinematic_artefact: Path, tmp_path: Path) -> Path:
+    """A copy that may be damaged."""
+    return Path(shutil.copytree(kinematic_artefact, tmp_path / "copy"))
+
+
+def test_the_second_build_comes_from_the_cache(cache: Path) -> None:
+    first_words: list[str] = []
+    second_words: list[str] = []
+    folder, manifest = build(SMALL, first_words.append)
+    library = (folder / LIBRARY).stat()
+    again, same = build(SMALL, second_words.append)
+    assert (folder, manifest) == (again, same)
+    assert "compiling" in first_words[0]
+    assert "cached" in second_words[0]
+    assert (again / LIBRARY).stat().st_mtime_ns == library.st_mtime_ns
+    assert folder.parent == cache == cache_folder()
+    assert list(cache.iterdir()) == [folder]  # nothing temporary is left
+
+
+def test_the_artefact_describes_itself(kinematic_artefact: Path, car: CarParameters) -> None:
+    manifest = read_manifest(kinematic_artefact)
+    settings = BuildSettings()
+    assert manifest.discretisation == settings.discretisation.identity("e_kinematic", car)
+    assert (manifest.horizon, manifest.step_s) == (settings.horizon, 0.02)
+    assert manifest.gp_capacity == settings.gp_capacity
+    assert manifest.car == car.name
+    assert find_compiler().version == manifest.compiler
+    for name in ("br_model.c", "br_config.h", "bayesrace_mpc.h", "br_sqp.c"):
+        assert (kinematic_artefact / name).is_file()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"model": "dynamic"},
+        {"horizon": 21},
+        {"gp_capacity": 1025},
+        {"discretisation": PERFECT},
+        {"discretisation": PREDICTION.model_copy(update={"step_s": 0.021})},
+        {"discretisation": PREDICTION.model_copy(update={"substeps": 2})},
+        {"discretisation": PREDICTION.model_copy(update={"scheme": "heun"})},
+    ],
+)
+def test_the_hash_changes_with_every_setting(change: dict[str, object]) -> None:
+    compiler = find_compiler()
+    ours = build_hash(BuildSettings(), compiler)
+    assert build_hash(BuildSettings().model_copy(update=change), compiler) != ours
+
+
+def test_the_hash_changes_with_compiler_flags_cpu_casadi_car_and_sources(
+    monkeypatch: pytest.MonkeyPatch, car: CarParameters
+) -> None:
+    compiler, settings = find_compiler(), BuildSettings()
+    seen = {build_hash(settings, compiler)}
+
+    def another(identity: str) -> None:
+        assert identity not in seen
+        seen.add(identity)
+
+    another(build_hash(settings, Compiler(("othercc",), compiler.version)))
+    another(build_hash(settings, Compiler(compiler.command, "version 99")))
+    source = next(build_module.NATIVE.glob("br_sqp.c"))
+    read = Path.read_bytes
+    replacements = {
+        "FLAGS": ("-O0",),
+        "cpu_identity": lambda: "another CPU",
+        "_casadi_version": lambda: "9.9",
+        "get_car": lambda _: car.model_copy(update={"mass_kg": 0.05}),
+    }
+    for name, value in replacements.items():
+        with monkeypatch.context() as patch:
+            patch.setattr(build_module, name, value)
+            another(build_hash(settings, compiler))
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "read_bytes", lambda p: read(p) + (b" " if p == source else b""))
+        another(build_hash(settings, compiler))
+    assert build_hash(settings, compiler) in seen
+
+
+@pytest.mark.parametrize(
+    ("name", "discretisation"),
+    [("e_kinematic", PREDICTION), ("dynamic", PERFECT), ("dynamic", PREDICTION)],
+)
+def test_the_chain_rule_gives_the_derivatives_of_the_whole(
+    car: CarParameters, name: str, discretisation: Discretisation
+) -> None:
+    """(F, J', H) of the stage function against CasADi's own derivatives of corrected(x, u, e)."""
+    model = MODELS[name](car)
+    stage = linearise_function(model, discretisation)
+    whole = discretisation.corrected(model)
+    w, lam = ca.MX.sym("w", 12), ca.MX.sym("lam", 7)
+    x_next = whole(w[:7], w[7:9], w[9:])
+    jacobian = ca.jacobian(x_next, w)
+    hessian = ca.hessian(ca.dot(lam, x_next), w)[0]
+    oracle = ca.Function("oracle", [w, lam], [x_next, jacobian.T, hessian])
+    random = np.random.default_rng(0)
+    for _ in range(5):
+        at = np.array([0, 0, 0.3, 1.8, 0.1, 1, 0.1, 0.5, 1, 0.01, 0.02, 0.1])
+        at += 0.1 * random.normal(size=12)
+        costate = random.normal(size=7)
+        ours = stage(at[:7], at[7:9], at[9:], costate)
+        for a, b in zip(ours, oracle(at, costate), strict=True):
+            expected = np.asarray(ca.densify(b))
+            size = np.abs(expected).max()
+            np.testing.assert_allclose(np.asarray(a), expected, rtol=0, atol=1e-12 * size)
+
+
+def test_a_compile_error_comes_with_the_compilers_words(tmp_path: Path) -> None:
+    source = tmp_path / "wrong.c"
+    source.write_text("int main(void) { return undeclared_thing; }\n")
+    with pytest.raises(CompileError, match="undeclared_thing"):
+        find_compiler().shared_library([source], [], [], tmp_path / "out.so")
+
+
+def test_a_failed_build_leaves_nothing_in_the_cache(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(settings: BuildSettings, folder: Path) -> None:
+        generate(settings, folder)
+        (folder / "br_model.h").write_text("#error broken on purpose\n")
+
+    monkeypatch.setattr(build_module, "generate", broken)
+    with pytest.raises(CompileError, match="broken on purpose"):
+        build(SMALL)
+    assert list(cache.iterdir()) == []
+
+
+def test_no_compiler_is_an_input_error_with_the_remedy(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr("codegen.compiler.find_spec", lambda _: None)
+    with pytest.raises(InputError, match=r"no C compiler.*install gcc.*ziglang"):
+        build(SMALL)
+
+
+def test_a_chosen_compiler_that_does_not_work_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CC", "no-such-compiler -m64")
+    with pytest.raises(InputError, match="no-such-compiler"):
+        find_compiler()
+    find_compiler.cache_clear()
+    monkeypatch.setenv("CC", "false")
+    with pytest.raises(InputError, match="false"):
+        find_compiler()
+
+
+def load(folder: Path, car: CarParameters) -> NativeStep:
+    return NativeStep(folder, car, MpcSettings())
+
+
+def test_a_damaged_library_is_refused(artefact: Path, car: CarParameters) -> None:
+    load(artefact, car)
+    data = bytearray((artefact / LIBRARY).read_bytes())
+    data[len(data) // 2] ^= 1
+    (artefact / LIBRARY).write_bytes(data)
+    with pytest.raises(InputError, match=r"not the library its manifest describes.*build"):
+        load(artefact, car)
+    (artefact / LIBRARY).unlink()
+    with pytest.raises(InputError, match="cannot be read"):
+        load(artefact, car)
+
+
+def test_a_manifest_of_another_interface_is_refused(artefact: Path, car: CarParameters) -> None:
+    manifest = read_manifest(artefact)
+    other = manifest.model_copy(update={"abi": manifest.abi + 1})
+    (artefact / MANIFEST).write_text(other.model_dump_json())
+    with pytest.raises(InputError, match=r"built for interface .*build"):
+        load(artefact, car)
+
+
+@pytest.mark.parametrize("text", ["", "{", "{}", '{"abi": "one"}'])
+def test_a_broken_manifest_is_refused(artefact: Path, car: CarParameters, text: str) -> None:
+    (artefact / MANIFEST).write_text(text)
+    with pytest.raises(InputError, match="cannot be read"):
+        load(artefact, car)
+
+
+def test_a_folder_that_is_no_controller_and_another_car_are_refused(
+    artefact: Path, tmp_path: Path, car: CarParameters
+) -> None:
+    with pytest.raises(InputError, match="not a built controller"):
+        load(tmp_path, car)
+    with pytest.raises(InputError, match="built for car"):
+        load(artefact, car.model_copy(update={"name": "other"}))
+
+
+def test_concurrent_builds_of_the_same_hash_all_succeed(cache: Path) -> None:
+    with ThreadPoolExecutor(3) as pool:
+        results = list(pool.map(lambda _: build(SMALL), range(3)))
+    folders = {folder for folder, _ in results}
+    assert len(folders) == 1
+    folder = folders.pop()
+    assert list(cache.iterdir()) == [folder]
+    assert build(SMALL)[1] == read_manifest(folder)
+
+
+def test_the_library_exports_the_interface_only(kinematic_artefact: Path) -> None:
+    if not shutil.which("nm"):
+        pytest.skip("nm (binutils) is not installed")
+    line = ["nm", "-D", "--defined-only", str(kinematic_artefact / LIBRARY)]
+    listing = subprocess.run(line, capture_output=True, text=True, check=True).stdout
+    names = {row.split()[-1] for row in listing.splitlines()}
+    assert {n for n in names if not n.startswith("br_mpc_")} == set()
+    header = (kinematic_artefact / "bayesrace_mpc.h").read_text()
+    assert all(name in header for name in names)
+    assert "br_mpc_step" in names
+
+
+def test_the_library_cannot_print_exit_or_start_threads(kinematic_artefact: Path) -> None:
+    """It is not linked with functions for that; that it never allocates is counted in C."""
+    if not shutil.which("nm"):
+        pytest.skip("nm (binutils) is not installed")
+    line = ["nm", "-D", "--undefined-only", str(kinematic_artefact / LIBRARY)]
+    listing = subprocess.run(line, capture_output=True, text=True, check=True).stdout
+    names = {row.split()[-1].split("@")[0] for row in listing.splitlines()}
+    unwanted = ("printf", "puts", "putchar", "fwrite", "exit", "abort", "pthread", "mutex", "Py")
+    assert not [name for name in names if any(word in name for word in unwanted)]
+
+
+def test_ziglang_builds_the_controller_where_there_is_no_compiler(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, car: CarParameters
+) -> None:
+    if not find_spec("ziglang"):
+        pytest.skip("ziglang is not installed (pip install ziglang)")
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setattr("codegen.compiler.shutil.which", lambda _: None)
+    compiler = find_compiler()
+    assert compiler.command == (sys.executable, "-m", "ziglang", "cc")
+    folder, manifest = build(BuildSettings(gp_capacity=8))
+    assert manifest.compiler == compiler.version
+    step = load(folder, car)
+    x_next, _, _ = step.evaluate(np.r_[0.0, 0, 0, 1, 0, 0, 0, 0.5, 0], np.zeros(7))
+    expected = PREDICTION.discretise(MODELS["e_kinematic"](car))([0, 0, 0, 1, 0, 0, 0], [0.5, 0])
+    np.testing.assert_allclose(x_next, np.asarray(expected).ravel(), rtol=1e-12, atol=1e-14)
+
+
+def test_cache_folder_follows_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("BAYESRACE_CACHE", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", os.sep + "somewhere")
+    assert cache_folder() == Path(os.sep) / "somewhere" / "bayesrace"

@@ -1,0 +1,150 @@
+"""The artefact's C without Python: under sanitizers, without allocations, to the same bits."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from bayesrace.gp.weights import GpWeights, zero_weights
+from bayesrace.vehicles import CarParameters
+from codegen.build import casadi_includes
+from codegen.compiler import FLAGS
+from controller.native_step import NativeStep
+from tests.conftest import SETTINGS, Circuit, Problem, native_numbers
+
+Floats = NDArray[np.float64]
+
+HARNESS = Path(__file__).parent / "native" / "harness.c"
+STEPS = 300
+STRICT = ("-Wall", "-Wextra", "-Werror", "-Wno-unused-parameter", "-Wno-unused-function")
+
+
+def states(recorded: list[Problem]) -> Floats:
+    """x and d_previous of a drive with bad measurements strewn in, shape (STEPS, 8)."""
+    rows = np.array([np.r_[p.x0, p.d_previous] for p in recorded[:STEPS]])
+    bad = np.array([np.nan, np.inf, -np.inf, 1e300, 99.0, -99.0, 1.4, 0.6])
+    random = np.random.default_rng(0)
+    for k in range(5, STEPS, 11):
+        rows[k, random.integers(8)] = bad[k % len(bad)]
+    rows[30::60, 6] = 0.6  # steered farther than a period can bring back
+    return rows
+
+
+@pytest.fixture(scope="module")
+def problems(
+    tmp_path_factory: pytest.TempPathFactory,
+    recorded: list[Problem],
+    circuit: Circuit,
+    weights: GpWeights,
+    car: CarParameters,
+) -> Path:
+    """The harness' input file."""
+    table = circuit.table
+    parts = [
+        np.r_[table.spacing_m, len(table.rows), table.rows.ravel()],
+        native_numbers(SETTINGS, car, weights),
+        np.r_[STEPS, states(recorded).ravel()],
+    ]
+    path = tmp_path_factory.mktemp("native") / "problems.bin"
+    np.concatenate(parts).tofile(path)
+    return path
+
+
+def compiled(artefact: Path, folder: Path, *flags: str) -> Path:
+    """The harness linked with the artefact's sources and DAQP."""
+    gcc = shutil.which("gcc")
+    if gcc is None:
+        pytest.skip("gcc is not installed")
+    include, daqp = casadi_includes()
+    out = folder / "harness"
+    sources = [*sorted(artefact.glob("*.c")), HARNESS]
+    # -isystem: the warnings are for our own code
+    line = [gcc, *flags, f"-I{artefact}", "-isystem", include, *sources, daqp, "-lm", "-o", out]
+    done = subprocess.run([str(word) for word in line], capture_output=True, text=True, check=False)
+    if "cannot find -lasan" in done.stderr or "cannot find -lubsan" in done.stderr:
+        pytest.skip("gcc's sanitizer libraries are not installed")
+    assert done.returncode == 0, done.stderr[-4000:]
+    return out
+
+
+def run(program: Path, problems: Path, folder: Path) -> Floats:
+    results = folder / "results.bin"
+    done = subprocess.run(
+        [program, problems, results], capture_output=True, text=True, check=False, timeout=90
+    )
+    assert done.returncode == 0, done.stderr[-4000:]
+    return np.fromfile(results).reshape(STEPS, 4)
+
+
+def test_the_control_loop_never_allocates_and_python_sees_the_same_bits(
+    kinematic_artefact: Path,
+    problems: Path,
+    tmp_path: Path,
+    car: CarParameters,
+    weights: GpWeights,
+    circuit: Circuit,
+    recorded: list[Problem],
+) -> None:
+    wraps = [f"-Wl,--wrap={name}" for name in ("malloc", "calloc", "realloc", "free")]
+    flags = [flag for flag in FLAGS if flag != "-fPIC"]
+    program = compiled(kinematic_artefact, tmp_path, *flags, "-DCOUNT_ALLOCATIONS", *STRICT, *wraps)
+    results = run(program, problems, tmp_path)
+    assert (results[:, 0] == 0).all()
+    assert set(np.unique(results[:, 1])) >= {1.0, 3.0, 6.0}  # acceptable, infeasible, bad state
+
+    step = NativeStep(kinematic_artefact, car, SETTINGS)
+    step.set_weights(weights)
+    step.set_path(circuit.table)
+    # as the harness does, up to where it begins to spoil references
+    for k, row in enumerate(states(recorded)[: STEPS // 2]):
+        if k % 50 == 40:
+            if k % 100 == 40:
+                step.set_zero_weights()
+            else:
+                step.set_weights(weights)
+        if k % 97 == 96:
+            step.reset()
+        status = step.step(row[:7], float(row[7]))
+        assert status == results[k, 1]
+        if status.usable:
+            assert step.u.tobytes() == results[k, 2:].tobytes()
+
+
+@pytest.mark.parametrize(
+    "artefact",
+    ["kinematic_artefact", pytest.param("dynamic_artefact", marks=pytest.mark.slow)],
+)
+def test_no_sanitizer_finds_anything(
+    artefact: str,
+    problems: Path,
+    tmp_path: Path,
+    car: CarParameters,
+    weights: GpWeights,
+    request: pytest.FixtureRequest,
+) -> None:
+    folder: Path = request.getfixturevalue(artefact)
+    if artefact == "dynamic_artefact":  # its capacity is 8 points
+        nothing = native_numbers(SETTINGS, car, zero_weights(car.name, "none"))
+        full = len(native_numbers(SETTINGS, car, weights))
+        data = np.fromfile(problems)
+        steps = data[-(8 * STEPS + 1) :]
+        head = data[: len(data) - len(steps) - full]
+        problems = tmp_path / "problems.bin"
+        np.concatenate([head, nothing, steps]).tofile(problems)
+    flags = ("-O1", "-g", "-std=gnu11", "-march=native", "-fno-omit-frame-pointer")
+    sanitize = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+    results = run(compiled(folder, tmp_path, *flags, *sanitize), problems, tmp_path)
+    assert (results[:, 0] == 0).all()
+
+
+def test_the_public_header_is_plain_c99(kinematic_artefact: Path, tmp_path: Path) -> None:
+    gcc = shutil.which("gcc")
+    if gcc is None:
+        pytest.skip("gcc is not installed")
+    source = tmp_path / "user.c"
+    source.write_text('#include "bayesrace_mpc.h"\nint main(void) { return br_mpc_abi() - 1; }\n')
+    line = [gcc, "-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-fsyntax-only"]
+    subprocess.run([*line, f"-I{kinematic_artefact}", str(source)], check=True)

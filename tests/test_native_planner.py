@@ -1,0 +1,202 @@
+"""The compiled motion planner: projection and theta recursion (paper, section 4.3) in numpy."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from bayesrace.errors import InputError
+from bayesrace.vehicles import CarParameters
+from controller.native_step import NativeStep
+from controller.path_table import PathTable
+from controller.settings import MpcSettings
+from tests.conftest import Circuit
+
+Floats = NDArray[np.float64]
+
+TS, HORIZON = 0.02, 20
+
+
+def row_at(table: PathTable, s: float) -> Floats:
+    """The table, linear between rows, periodic."""
+    rows, n = table.rows, len(table.rows)
+    position = s / table.spacing_m % n
+    i = int(position) % n
+    w = position - int(position)
+    return np.asarray((1 - w) * rows[i] + w * rows[(i + 1) % n])
+
+
+def nearest(table: PathTable, xy: Floats) -> tuple[float, float]:
+    """Arc length and signed distance, by projecting on every segment."""
+    a = table.rows[:, :2]
+    t = np.roll(a, -1, axis=0) - a
+    w = np.clip(np.sum((xy - a) * t, axis=1) / np.sum(t * t, axis=1), 0, 1)
+    foot = a + w[:, None] * t
+    i = int(np.argmin(np.linalg.norm(xy - foot, axis=1)))
+    e = xy - foot[i]
+    side = np.sign(t[i, 0] * (xy - a[i])[1] - t[i, 1] * (xy - a[i])[0])
+    return (i + w[i]) * table.spacing_m, float(side * np.linalg.norm(e))
+
+
+def references(table: PathTable, s: float) -> Floats:
+    """theta_k = theta_{k-1} + Ts v(theta_{k-1}); stages 1..N."""
+    stages = []
+    for _ in range(HORIZON):
+        s += TS * row_at(table, s)[2]
+        row = row_at(table, s)
+        norm = np.hypot(row[3], row[4])
+        stages.append(np.r_[row[:2], row[3:7] / norm])
+    return np.array(stages)
+
+
+def planner(artefact: Path, car: CarParameters, table: PathTable) -> NativeStep:
+    """A controller of which only the planner is looked at."""
+    step = NativeStep(artefact, car, MpcSettings(iterations=1, iterations_cold=1))
+    step.set_path(table)
+    return step
+
+
+def place(step: NativeStep, xy: Floats, psi: float = 0.0) -> tuple[float, float, Floats]:
+    """Arc length, lateral distance and reference after one step at this pose."""
+    step.step(np.r_[xy, psi, 1.0, 0, 0, 0], 0.0)
+    return step.info.s_ref_m, step.info.lateral_m, step.read_reference()
+
+
+def test_projection_and_recursion_equal_numpy(
+    kinematic_artefact: Path, car: CarParameters, circuit: Circuit
+) -> None:
+    step, table = planner(kinematic_artefact, car, circuit.table), circuit.table
+    random, s = np.random.default_rng(0), 0.0
+    length = len(table.rows) * table.spacing_m
+    for _ in range(400):  # several laps, so across the start line too
+        s += random.uniform(0.0, 0.12)
+        row, ahead = row_at(table, s), row_at(table, s + 1e-3)
+        tangent = (ahead - row)[:2] / np.linalg.norm((ahead - row)[:2])
+        xy = row[:2] + random.uniform(-0.1, 0.1) * np.array([-tangent[1], tangent[0]])
+        s_ref, lateral, reference = place(step, xy, np.arctan2(tangent[1], tangent[0]))
+        expected, distance = nearest(table, xy)
+        assert abs((s_ref - expected + length / 2) % length - length / 2) < 1e-9
+        assert lateral == pytest.approx(distance, abs=1e-12)
+        np.testing.assert_allclose(reference, references(table, expected), rtol=0, atol=1e-9)
+
+
+def test_references_carry_the_tracks_half_planes(native: NativeStep, circuit: Circuit) -> None:
+    """Unit normals, bounds a track's width apart, and the edges where the track has them."""
+    track = circuit.track
+    for s in np.linspace(0, circuit.line.length_m, 25, endpoint=False):
+        native.reset()
+        native.step(circuit.start(float(s)), 0.3)
+        ref = native.read_reference()
+        np.testing.assert_allclose(np.hypot(ref[:, 2], ref[:, 3]), 1, atol=1e-12)
+        np.testing.assert_allclose(ref[:, 5] - ref[:, 4], 0.34, atol=1e-4)
+        along = ref[:, 2] * ref[:, 0] + ref[:, 3] * ref[:, 1]
+        outside = np.maximum(along - ref[:, 5], ref[:, 4] - along)
+        expected = track.project_points(ref[:, :2]).off_track_m
+        np.testing.assert_allclose(outside, expected, atol=1e-4)
+
+
+def hairpin_table() -> PathTable:
+    """Two straights of 2 m, 0.16 m apart, one there and one back, joined by half circles."""
+    spacing, radius, straight = 0.005, 0.08, 2.0
+    turn = np.arange(0, np.pi * radius, spacing)
+    out = [(x, 0.0) for x in np.arange(0, straight, spacing)]
+    right = [(straight + radius * np.sin(a), radius - radius * np.cos(a)) for a in turn / radius]
+    back = [(straight - x, 2 * radius) for x in np.arange(0, straight, spacing)]
+    left = [(-radius * np.sin(a), radius + radius * np.cos(a)) for a in turn / radius]
+    xy = np.array(out + right + back + left)
+    length = np.sum(np.linalg.norm(np.roll(xy, -1, axis=0) - xy, axis=1))
+    tangent = np.roll(xy, -1, axis=0) - np.roll(xy, 1, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1)[:, None]
+    normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
+    along = np.sum(normal * xy, axis=1)
+    rows = np.column_stack([xy, np.full(len(xy), 1.5), normal, along - 0.2, along + 0.2])
+    return PathTable(np.ascontiguousarray(rows), length / len(xy))
+
+
+def test_a_neighbouring_piece_of_the_track_does_not_capture(
+    kinematic_artefact: Path, car: CarParameters
+) -> None:
+    step = planner(kinematic_artefact, car, hairpin_table())
+    for k, x in enumerate(np.arange(0.3, 1.6, 0.04)):
+        drift = min(0.13, 0.01 * k)  # beyond the middle, nearer to the way back
+        s_ref, lateral, _ = place(step, np.array([x, drift]))
+        assert s_ref == pytest.approx(x, abs=0.01)
+        assert lateral == pytest.approx(drift, abs=1e-3)
+
+
+def test_the_first_projection_prefers_the_piece_that_leads_where_the_car_points(
+    kinematic_artefact: Path, car: CarParameters
+) -> None:
+    """From nothing, the heading decides between two pieces that are equally near."""
+    step = planner(kinematic_artefact, car, hairpin_table())
+    for offset in (0.07, 0.08, 0.09):
+        step.reset()
+        assert place(step, np.array([1.0, offset]), 0.0)[0] == pytest.approx(1.0, abs=0.01)
+        step.reset()
+        assert place(step, np.array([1.0, offset]), np.pi)[0] > 2.0
+
+
+def test_after_a_leap_the_car_is_found_again(
+    kinematic_artefact: Path, car: CarParameters, circuit: Circuit
+) -> None:
+    step, table = planner(kinematic_artefact, car, circuit.table), circuit.table
+    length = len(table.rows) * table.spacing_m
+    place(step, row_at(table, 0.5)[:2], circuit.start(0.5)[2])
+    there = circuit.start(length / 2)
+    s_ref, lateral, _ = place(step, there[:2], there[2])
+    assert s_ref == pytest.approx(length / 2, abs=0.05)
+    assert abs(lateral) < 1e-3
+
+
+def test_the_reference_runs_on_across_the_start_line(
+    kinematic_artefact: Path, car: CarParameters, circuit: Circuit
+) -> None:
+    step, table = planner(kinematic_artefact, car, circuit.table), circuit.table
+    length = len(table.rows) * table.spacing_m
+    for s in (length - 0.2, length - 1e-4, length - 1e-12, 0.0, 1e-9):
+        step.reset()
+        row = row_at(table, s)
+        psi = circuit.start(0.0)[2]
+        s_ref, _, reference = place(step, row[:2], psi)
+        assert abs((s_ref - s + length / 2) % length - length / 2) < 1e-9
+        assert 0 <= s_ref < length + 1e-9
+        gaps = np.linalg.norm(np.diff(reference[:, :2], axis=0), axis=1)
+        at = np.array([nearest(table, p)[0] for p in reference[:-1, :2]])
+        speeds = np.array([row_at(table, float(s))[2] for s in at])
+        np.testing.assert_allclose(gaps, TS * speeds, rtol=0.01)
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    ["few", "nan", "speed", "bounds", "normal", "spacing", "spacing nan", "many", "repeated"],
+)
+def test_an_unusable_table_is_an_input_error_and_the_old_one_stays(
+    kinematic_artefact: Path, car: CarParameters, circuit: Circuit, spoil: str
+) -> None:
+    step = planner(kinematic_artefact, car, circuit.table)
+    start = circuit.start(1.0)
+    before = place(step, start[:2], start[2])
+    rows, spacing = circuit.table.rows.copy(), circuit.table.spacing_m
+    if spoil == "few":
+        rows = rows[:7]
+    elif spoil == "many":
+        rows = np.tile(rows, (8192 // len(rows) + 1, 1))
+    elif spoil == "nan":
+        rows[-1, 6] = np.nan
+    elif spoil == "speed":
+        rows[3, 2] = 0.0
+    elif spoil == "bounds":
+        rows[3, 5] = rows[3, 6]
+    elif spoil == "repeated":
+        rows[-1] = rows[0]
+    elif spoil == "normal":
+        rows[3, 3:5] *= 1.01
+    else:
+        spacing = np.nan if spoil.endswith("nan") else 0.0
+    with pytest.raises(InputError, match="path"):
+        step.set_path(PathTable(rows, spacing))
+    step.reset()
+    after = place(step, start[:2], start[2])
+    assert before[:2] == after[:2]
+    np.testing.assert_array_equal(before[2], after[2])

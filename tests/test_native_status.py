@@ -1,0 +1,138 @@
+"""The compiled SQP step: every status has a real cause, and a failure leaves no trace."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bayesrace.errors import InputError
+from bayesrace.gp.weights import GpWeights
+from bayesrace.vehicles import CarParameters
+from controller.native_step import NativeStep, StepStatus
+from tests.conftest import SETTINGS, Circuit, Problem
+
+
+@pytest.mark.parametrize("index", range(7))
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e9])
+def test_an_absurd_state_is_bad_state_and_leaves_the_input(
+    native: NativeStep, circuit: Circuit, index: int, value: float
+) -> None:
+    x = circuit.start()
+    x[index] = value
+    native.u[:] = 0.125
+    assert native.step(x, 0.0) is StepStatus.BAD_STATE
+    assert (native.u == 0.125).all()
+    assert native.step(circuit.start(), 0.0).usable
+
+
+def test_an_absurd_duty_cycle_is_bad_state(native: NativeStep, circuit: Circuit) -> None:
+    for value in (np.nan, np.inf, -np.inf, 1e200):
+        assert native.step(circuit.start(), value) is StepStatus.BAD_STATE
+
+
+def broken_step(native: NativeStep, problem: Problem, how: str) -> StepStatus:
+    x, reference = problem.x0.copy(), problem.reference.copy()
+    if how == "steering":
+        x[6] = 0.35 + 5 * 0.02 + 1e-3  # the rate cannot bring it back within a period
+    elif how == "reference":
+        reference[11, 5] = np.nan
+    return native.solve(x, problem.d_previous, reference)
+
+
+@pytest.mark.parametrize(
+    ("how", "expected"),
+    [
+        ("steering", StepStatus.INFEASIBLE),
+        ("reference", StepStatus.NOT_FINITE),
+    ],
+)
+@pytest.mark.parametrize("warm", [False, True])
+def test_a_failed_step_says_why_keeps_the_input_and_leaves_no_trace(
+    native: NativeStep,
+    kinematic_artefact: Path,
+    car: CarParameters,
+    weights: GpWeights,
+    recorded: list[Problem],
+    how: str,
+    expected: StepStatus,
+    warm: bool,
+) -> None:
+    if warm:
+        for problem in recorded[:20]:
+            native.solve(problem.x0, problem.d_previous, problem.reference)
+    native.u[:] = 0.125
+    assert broken_step(native, recorded[20], how) is expected
+    assert (native.u == 0.125).all()
+    fresh = NativeStep(kinematic_artefact, car, SETTINGS)
+    fresh.set_weights(weights)
+    for p in recorded[21:31]:
+        status = native.solve(p.x0, p.d_previous, p.reference)
+        assert status is fresh.solve(p.x0, p.d_previous, p.reference)
+        assert status.usable
+        assert native.u.tobytes() == fresh.u.tobytes()
+
+
+def test_a_steering_angle_that_the_rate_can_bring_back_is_solved(
+    native: NativeStep, recorded: list[Problem], car: CarParameters
+) -> None:
+    p = recorded[0]
+    for side in (1, -1):
+        x = p.x0.copy()
+        x[6] = side * (car.delta_max_rad + 0.09)
+        native.reset()
+        assert native.solve(x, p.d_previous, p.reference).usable
+        assert side * native.u[1] <= -0.09 / 0.02 + 1e-6
+
+
+def test_a_plan_off_the_dynamics_is_a_defect(
+    kinematic_artefact: Path, car: CarParameters, weights: GpWeights, recorded: list[Problem]
+) -> None:
+    strict = SETTINGS.model_copy(
+        update={"defect_max": 1e-13, "iterations": 1, "iterations_cold": 1}
+    )
+    step = NativeStep(kinematic_artefact, car, strict)
+    step.set_weights(weights)
+    p = recorded[50]
+    step.u[:] = 0.125
+    assert step.solve(p.x0, p.d_previous, p.reference) is StepStatus.DEFECT
+    assert step.info.defect > 1e-13
+    assert (step.u == 0.125).all()
+
+
+def test_weights_that_overflow_are_not_finite_and_others_recover(
+    native: NativeStep, weights: GpWeights, recorded: list[Problem]
+) -> None:
+    vx, vy, omega = weights.outputs
+    huge = replace(vy, alpha=np.full(vy.count, 1e306), signal_variance=1e3)
+    native.set_weights(replace(weights, outputs=(vx, huge, omega)))
+    p = recorded[0]
+    assert native.solve(p.x0, p.d_previous, p.reference) is StepStatus.NOT_FINITE
+    native.set_weights(weights)
+    assert native.solve(p.x0, p.d_previous, p.reference).usable
+
+
+def test_a_step_without_a_path_and_a_wrong_reference_are_input_errors(
+    kinematic_artefact: Path, car: CarParameters
+) -> None:
+    step = NativeStep(kinematic_artefact, car, SETTINGS)
+    with pytest.raises(InputError, match="have not been set"):
+        step.step(np.zeros(7), 0.0)
+    with pytest.raises(InputError, match="shape"):
+        step.solve(np.zeros(7), 0.0, np.zeros((19, 6)))
+
+
+def test_settle_ends_the_iterations_early(
+    kinematic_artefact: Path, car: CarParameters, weights: GpWeights, recorded: list[Problem]
+) -> None:
+    used = []
+    for settle in (0.0, 1e-5, 1e6):
+        changes = {"settle": settle, "iterations_cold": 12, "tolerance": 1e-14}
+        step = NativeStep(kinematic_artefact, car, SETTINGS.model_copy(update=changes))
+        step.set_weights(weights)
+        p = recorded[100]
+        assert step.solve(p.x0, p.d_previous, p.reference).usable
+        used.append(step.info.iterations)
+        if 0 < settle < 1:
+            assert max(step.info.stationarity, 0.1 * step.info.defect) <= settle
+    assert used[2] == 1 < used[1] <= used[0]

@@ -1,0 +1,368 @@
+"""The compiled SQP step: IPOPT's solution, honest residuals, symmetry, determinism."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
+from bayesrace.gp.corrected import corrected_function
+from bayesrace.gp.weights import GpWeights
+from bayesrace.integrators import PERFECT, PREDICTION
+from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles.models import dynamic, e_kinematic
+from codegen.ocp import OcpParameters, RacingOcp
+from controller.native_step import NativeStep, StepStatus
+from controller.path_table import make_path_table
+from controller.settings import MpcSettings
+from tests.conftest import (
+    MIRROR_INPUT,
+    MIRROR_STATE,
+    SETTINGS,
+    Circuit,
+    Problem,
+    drive,
+    mirrored_line,
+    mirrored_weights,
+)
+
+Floats = NDArray[np.float64]
+
+EXACT = SETTINGS.model_copy(update={"iterations": 60, "iterations_cold": 60, "tolerance": 1e-11})
+TIGHT_IPOPT = {
+    "tol": 1e-12,
+    "constr_viol_tol": 1e-12,
+    "compl_inf_tol": 1e-15,  # its barrier pushes weakly active bounds inwards
+    "bound_relax_factor": 0.0,
+}
+FROM_OUR_PLAN = {
+    "mu_init": 1e-9,
+    "bound_push": 1e-12,
+    "bound_frac": 1e-12,
+    "slack_bound_push": 1e-12,
+    "slack_bound_frac": 1e-12,
+}
+AT_BOUND = 1e-8
+
+
+def ocp_parameters(s: MpcSettings) -> OcpParameters:
+    return OcpParameters(s.q_position, s.r_duty, s.r_delta_rate, s.s_slack, s.margin_m)
+
+
+def solved(step: NativeStep, problem: Problem) -> tuple[StepStatus, Floats, Floats]:
+    """Status and plan of a solution from cold."""
+    step.reset()
+    status = step.solve(problem.x0, problem.d_previous, problem.reference)
+    x, u = step.read_plan()
+    return status, x.copy(), u.copy()
+
+
+@pytest.fixture
+def exact(kinematic_artefact: Path, car: CarParameters, weights: GpWeights) -> NativeStep:
+    step = NativeStep(kinematic_artefact, car, EXACT)
+    step.set_weights(weights)
+    return step
+
+
+@pytest.fixture(scope="module")
+def corrected(car: CarParameters, weights: GpWeights) -> ca.Function:
+    return corrected_function(e_kinematic(car), PREDICTION, weights)
+
+
+def active(problem: Problem, x: Floats, u: Floats, car: CarParameters) -> dict[str, bool]:
+    """Which kinds of limit bind in a plan."""
+    ref = problem.reference
+    along = np.sum(ref[:, 2:4] * x[1:, :2], axis=1)
+    return {
+        "slack": bool(np.maximum(along - ref[:, 5], ref[:, 4] - along).max() > 1e-6),
+        "duty": bool(np.min([u[:, 0] - car.d_min, car.d_max - u[:, 0]]) < AT_BOUND),
+        "rate": bool(np.abs(u[:, 1]).max() > car.delta_rate_max_radps - AT_BOUND),
+        "angle": bool(np.abs(x[1:, 6]).max() > car.delta_max_rad - AT_BOUND),
+    }
+
+
+def test_the_converged_step_is_the_solution_of_ipopt(
+    exact: NativeStep, corrected: ca.Function, recorded: list[Problem], car: CarParameters
+) -> None:
+    ocp = RacingOcp(corrected, car, 20, options=TIGHT_IPOPT | FROM_OUR_PLAN)
+    kinds: dict[str, int] = {}
+    for problem in recorded[::12]:
+        status, x, u = solved(exact, problem)
+        assert status is StepStatus.CONVERGED
+        oracle = ocp.solve(
+            problem.x0, problem.d_previous, problem.reference, ocp_parameters(EXACT), (x, u)
+        )
+        assert oracle.success, oracle.status
+        np.testing.assert_allclose(u, oracle.u, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(x, oracle.x, rtol=0, atol=1e-6)
+        assert exact.info.cost == pytest.approx(oracle.cost, rel=1e-7, abs=1e-9)
+        for kind, binds in active(problem, x, u, car).items():
+            kinds[kind] = kinds.get(kind, 0) + binds
+    # the comparison means little unless every kind of limit binds somewhere
+    assert all(count >= 2 for count in kinds.values()), kinds
+
+
+def test_nearly_every_problem_converges_from_cold(
+    exact: NativeStep, recorded: list[Problem]
+) -> None:
+    """Where the exact Hessian is indefinite, convergence is linear and may take too long."""
+    statuses = [solved(exact, problem)[0] for problem in recorded]
+    assert all(status.usable for status in statuses)
+    assert statuses.count(StepStatus.CONVERGED) >= 0.95 * len(statuses)
+
+
+@pytest.mark.slow
+def test_the_cost_is_no_worse_than_that_of_ipopt_from_its_own_start(
+    exact: NativeStep, corrected: ca.Function, recorded: list[Problem], car: CarParameters
+) -> None:
+    ocp = RacingOcp(corrected, car, 20, options=TIGHT_IPOPT | {"max_iter": 300})
+    same = 0
+    for problem in recorded[5::15]:
+        status, _, u = solved(exact, problem)
+        if status is not StepStatus.CONVERGED:
+            continue  # their share is bounded below
+        oracle = ocp.solve(problem.x0, problem.d_previous, problem.reference, ocp_parameters(EXACT))
+        if not oracle.success or np.abs(oracle.u - u).max() > 0.05:
+            continue  # another basin
+        same += 1
+        assert exact.info.cost <= oracle.cost + 1e-6
+    assert same >= 10
+
+
+def test_the_converged_best_case_step_is_the_solution_of_ipopt(
+    dynamic_artefact: Path, car: CarParameters, circuit: Circuit
+) -> None:
+    """The dynamic model with ten sub-steps, whose derivatives are composed by the chain rule."""
+    step = NativeStep(dynamic_artefact, car, SETTINGS)
+    step.set_path(circuit.table)
+    problems, _ = drive(step, circuit, 120)
+    step.set_parameters(car, EXACT)
+    f = PERFECT.discretise(dynamic(car))
+    ocp = RacingOcp(f, car, 20, options=TIGHT_IPOPT | FROM_OUR_PLAN)
+    for problem in problems[::30]:
+        status, x, u = solved(step, problem)
+        assert status is StepStatus.CONVERGED
+        oracle = ocp.solve(
+            problem.x0, problem.d_previous, problem.reference, ocp_parameters(EXACT), (x, u)
+        )
+        assert oracle.success, oracle.status
+        np.testing.assert_allclose(u, oracle.u, rtol=0, atol=1e-6)
+
+
+# --- residuals, recomputed from the plan alone -------------------------------------------------
+
+
+def objective(problem: Problem, x: Floats, u: Floats, s: MpcSettings) -> tuple[float, float]:
+    """Equation (8) at a plan in plain numpy: cost and largest slack."""
+    ref = problem.reference
+    along = np.sum(ref[:, 2:4] * x[1:, :2], axis=1)
+    over = np.maximum(along - ref[:, 5] + s.margin_m, ref[:, 4] + s.margin_m - along)
+    slack = np.maximum(0.0, over)
+    change = np.diff(np.r_[problem.d_previous, u[:, 0]])
+    cost = s.q_position * np.sum((x[1:, :2] - ref[:, :2]) ** 2) + s.r_duty * np.sum(change**2)
+    cost += s.r_delta_rate * np.sum(u[:, 1] ** 2) + s.s_slack * np.sum(slack**2)
+    return float(cost), float(slack.max())
+
+
+def stationarity_at_least(
+    problem: Problem, x: Floats, u: Floats, f: ca.Function, s: MpcSettings, car: CarParameters
+) -> float:
+    """Norm of the Lagrangian's gradient in the inputs for the *best* multipliers.
+
+    Costates by the adjoint recursion with CasADi's Jacobian; the multipliers of active bounds
+    with their proper signs by least squares.
+    """
+    n, ref = len(u), problem.reference
+    jacobian = f.factory("partials", ["x", "u"], ["jac:x_next:x", "jac:x_next:u"])
+    along = np.sum(ref[:, 2:4] * x[1:, :2], axis=1)
+    over, under = along - ref[:, 5] + s.margin_m, ref[:, 4] + s.margin_m - along
+    push = 2 * s.s_slack * (np.maximum(0, over) - np.maximum(0, under))
+    change = np.r_[np.diff(np.r_[problem.d_previous, u[:, 0]]), 0.0]
+    gradient, p = np.zeros((n, 2)), np.zeros(7)
+    rows: list[tuple[Floats, float]] = []
+    for k in range(n, 0, -1):
+        p[:2] += 2 * s.q_position * (x[k, :2] - ref[k - 1, :2]) + push[k - 1] * ref[k - 1, 2:4]
+        a, b = (np.asarray(ca.densify(m)) for m in jacobian(x[k - 1], u[k - 1]))
+        own = [2 * s.r_duty * (change[k - 1] - change[k]), 2 * s.r_delta_rate * u[k - 1, 1]]
+        gradient[k - 1] = own + b.T @ p
+        p = a.T @ p
+        if abs(x[k, 6]) > car.delta_max_rad - AT_BOUND:  # delta_k = delta_0 + Ts sum of rates
+            row = np.zeros((n, 2))
+            row[:k, 1] = PREDICTION.step_s
+            rows.append((row.ravel(), np.sign(x[k, 6])))
+    for c, low, high in ((0, car.d_min, car.d_max), (1, -5.0, 5.0)):
+        for k in range(n):
+            row = np.zeros((n, 2))
+            row[k, c] = 1.0
+            for bound, side in ((low, -1.0), (high, 1.0)):
+                if abs(u[k, c] - bound) < AT_BOUND:
+                    rows.append((row.ravel(), side))
+    if not rows:
+        return float(np.linalg.norm(gradient))
+    matrix = np.column_stack([side * row for row, side in rows])
+    fit = lsq_linear(matrix, -gradient.ravel(), (0, np.inf), tol=1e-14)
+    return float(np.linalg.norm(matrix @ fit.x + gradient.ravel()))
+
+
+def check_residuals(
+    step: NativeStep, problem: Problem, f: ca.Function, s: MpcSettings, car: CarParameters
+) -> float:
+    """Asserts that info tells what the plan is; returns the independent stationarity."""
+    x, u, info = step.plan_x, step.plan_u, step.info
+    predicted = np.asarray(f(x[:-1].T, u.T)).T
+    scale = np.array([1, 1, 1, 1, 1, 10, 1])
+    defect = max(np.abs((predicted - x[1:]) / scale).max(), np.abs(x[0] - problem.x0).max())
+    assert info.defect == pytest.approx(defect, rel=1e-9, abs=1e-13)
+    beyond = max(
+        np.max(u[:, 0] - car.d_max),
+        np.max(car.d_min - u[:, 0]),
+        np.max(np.abs(u[:, 1])) - car.delta_rate_max_radps,
+        np.max(np.abs(x[1:, 6])) - car.delta_max_rad,
+        0.0,
+    )
+    assert info.bound == pytest.approx(beyond, abs=1e-15)
+    cost, slack = objective(problem, x, u, s)
+    assert info.cost == pytest.approx(cost, rel=1e-10)
+    assert info.slack_max_m == pytest.approx(slack, abs=1e-14)
+    return stationarity_at_least(problem, x, u, f, s, car)
+
+
+def test_residuals_of_converged_plans_are_true(
+    exact: NativeStep, corrected: ca.Function, recorded: list[Problem], car: CarParameters
+) -> None:
+    for problem in recorded[3::25]:
+        assert solved(exact, problem)[0] is StepStatus.CONVERGED
+        assert check_residuals(exact, problem, corrected, EXACT, car) < 1e-8
+        assert exact.info.bound < 1e-9
+
+
+def test_residuals_of_real_time_steps_are_true(
+    native: NativeStep, corrected: ca.Function, recorded: list[Problem], car: CarParameters
+) -> None:
+    """One iteration a step: not stationary, and the step says so, never less than the truth."""
+    native.reset()
+    for k, problem in enumerate(recorded[:200]):
+        status = native.solve(problem.x0, problem.d_previous, problem.reference)
+        assert status.usable
+        if k % 10:
+            continue
+        native.read_plan()
+        best = check_residuals(native, problem, corrected, SETTINGS, car)
+        size = max(1.0, *np.abs(native.plan_u).ravel())  # of gradients: far below 1 here
+        if native.info.shortened == 0:
+            assert best <= np.sqrt(40) * native.info.stationarity * size + 1e-10
+        converged = max(native.info.stationarity, native.info.defect) <= SETTINGS.tolerance
+        assert (status is StepStatus.CONVERGED) == converged
+
+
+def test_without_track_constraints_equals_a_very_wide_track(
+    kinematic_artefact: Path, car: CarParameters, weights: GpWeights, recorded: list[Problem]
+) -> None:
+    wide_step = NativeStep(kinematic_artefact, car, EXACT)
+    free = NativeStep(kinematic_artefact, car, EXACT.model_copy(update={"constraints": False}))
+    for step in (wide_step, free):
+        step.set_weights(weights)
+    for problem in recorded[::40]:
+        wide = problem.reference + np.array([0, 0, 0, 0, -100, 100])
+        _, _, expected = solved(wide_step, replace(problem, reference=wide))
+        _, _, u = solved(free, problem)
+        np.testing.assert_allclose(u, expected, rtol=0, atol=1e-8)
+        assert free.info.slack_max_m == 0
+
+
+def test_the_margin_moves_the_half_planes(
+    kinematic_artefact: Path, car: CarParameters, weights: GpWeights, recorded: list[Problem]
+) -> None:
+    kept = NativeStep(kinematic_artefact, car, EXACT.model_copy(update={"margin_m": 0.03}))
+    plain = NativeStep(kinematic_artefact, car, EXACT)
+    for step in (kept, plain):
+        step.set_weights(weights)
+    for problem in recorded[::60]:
+        narrow = problem.reference + np.array([0, 0, 0, 0, 0.03, -0.03])
+        _, _, expected = solved(plain, replace(problem, reference=narrow))
+        _, _, u = solved(kept, problem)
+        np.testing.assert_allclose(u, expected, rtol=0, atol=1e-8)
+
+
+# --- symmetry and determinism ------------------------------------------------------------------
+
+
+def mirrored_problem(problem: Problem) -> Problem:
+    """Left normal and bounds as the mirrored track has them."""
+    x, y, nx, ny, lower, upper = problem.reference.T
+    reference = np.column_stack([x, -y, -nx, ny, -upper, -lower])
+    return Problem(problem.x0 * MIRROR_STATE, problem.d_previous, reference)
+
+
+def test_a_mirrored_problem_gives_mirrored_inputs(
+    exact: NativeStep,
+    kinematic_artefact: Path,
+    car: CarParameters,
+    weights: GpWeights,
+    recorded: list[Problem],
+) -> None:
+    other = NativeStep(kinematic_artefact, car, EXACT)
+    other.set_weights(mirrored_weights(weights))
+    for problem in recorded[7::30]:
+        _, _, u = solved(exact, problem)
+        _, _, mirrored = solved(other, mirrored_problem(problem))
+        np.testing.assert_allclose(mirrored * MIRROR_INPUT, u, rtol=0, atol=1e-8)
+
+
+def test_a_mirrored_track_gives_mirrored_laps(
+    native: NativeStep,
+    kinematic_artefact: Path,
+    car: CarParameters,
+    weights: GpWeights,
+    circuit: Circuit,
+) -> None:
+    track, line = circuit.track.mirrored(), mirrored_line(circuit.line)
+    mirror = Circuit(track, line, make_path_table(track, line))
+    other = NativeStep(kinematic_artefact, car, SETTINGS)
+    other.set_weights(mirrored_weights(weights))
+    other.set_path(mirror.table)
+    _, inputs = drive(native, circuit, 150)
+    _, mirrored = drive(other, mirror, 150)
+    np.testing.assert_allclose(mirrored * MIRROR_INPUT, inputs, rtol=0, atol=1e-6)
+
+
+def test_the_same_inputs_give_the_same_bits(
+    native: NativeStep,
+    kinematic_artefact: Path,
+    car: CarParameters,
+    weights: GpWeights,
+    circuit: Circuit,
+) -> None:
+    other = NativeStep(kinematic_artefact, car, SETTINGS)
+    other.set_weights(weights)
+    other.set_path(circuit.table)
+    first, second = drive(native, circuit, 60)[1], drive(other, circuit, 60)[1]
+    assert first.tobytes() == second.tobytes()
+
+
+def test_reset_forgets_everything(native: NativeStep, circuit: Circuit) -> None:
+    first = drive(native, circuit, 40)[1]
+    native.reset()
+    again = drive(native, circuit, 40)[1]
+    assert first.tobytes() == again.tobytes()
+
+
+def test_taking_over_identical_weights_changes_nothing(
+    native: NativeStep,
+    kinematic_artefact: Path,
+    car: CarParameters,
+    weights: GpWeights,
+    recorded: list[Problem],
+) -> None:
+    other = NativeStep(kinematic_artefact, car, SETTINGS)
+    other.set_weights(weights)
+    for k, p in enumerate(recorded[:60]):
+        if k % 7 == 3:
+            other.set_weights(weights)
+        assert native.solve(p.x0, p.d_previous, p.reference) is other.solve(
+            p.x0, p.d_previous, p.reference
+        )
+        assert native.u.tobytes() == other.u.tobytes()
