@@ -1,0 +1,44 @@
+"""Figures to SVG that can stand inside a page, and to PNG."""
+
+import io
+import re
+from pathlib import Path
+from typing import Final
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+
+__all__ = ["inline_svg", "write_png"]
+
+_PROLOGUE: Final = re.compile(r"^.*?(?=<svg )", re.DOTALL)
+_METADATA: Final = re.compile(r"\s*<metadata>.*?</metadata>", re.DOTALL)
+_SIZE: Final = re.compile(r'(<svg [^>]*?)\swidth="[^"]*"', re.DOTALL)
+_HEIGHT: Final = re.compile(r'(<svg [^>]*?)\sheight="[^"]*"', re.DOTALL)
+_GROUP_ID: Final = re.compile(r'<g id="[^"]*"')
+_COMMENT: Final = re.compile(r"\s*<!--.*?-->", re.DOTALL)
+_PATH: Final = re.compile(r' d="[^"]*"')
+_LONG: Final = re.compile(r"(\d+\.\d{2})\d+")
+
+
+def inline_svg(figure: Figure) -> str:
+    """The figure as an ``<svg>`` element that fills the width it is given.
+
+    Two figures on one page share no ids but those of identical definitions.
+    """
+    buffer = io.StringIO()
+    FigureCanvasSVG(figure)
+    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    text = _PROLOGUE.sub("", buffer.getvalue(), count=1)
+    text = _METADATA.sub("", text)
+    text = _COMMENT.sub("", text)
+    text = _HEIGHT.sub(r"\1", _SIZE.sub(r"\1", text, count=1), count=1)
+    text = _GROUP_ID.sub("<g", text)
+    # A hundredth of a point is enough for lines; texts keep their digits.
+    return _PATH.sub(lambda match: _LONG.sub(r"\1", match.group()), text)
+
+
+def write_png(figure: Figure, path: Path, dpi: int = 120) -> None:
+    """The figure as a PNG file."""
+    FigureCanvasAgg(figure)
+    figure.savefig(path, dpi=dpi, metadata={"Software": None})

@@ -1,0 +1,187 @@
+"""The report page: figures and tables put into the template."""
+
+import contextlib
+import json
+import platform
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from bayesrace.vehicles import get_car
+from experiments.analysis import RaceAnalysis, read_race
+from experiments.report.canvas import inline_svg, write_png
+from experiments.report.learning import UNCERTAIN, gp_figure, solve_figure, uncertain
+from experiments.report.maps import laps_on_track
+from experiments.report.published import LIMIT, SOURCE, compare_gp, compare_laps
+from experiments.report.style import figure_style, look
+from experiments.report.traces import deviation_figure, inputs_figure, speed_figure
+from experiments.results import LapResult, RaceResult
+from experiments.table import COLUMNS
+
+__all__ = ["PICTURE", "REPORT", "render_report"]
+
+REPORT: Final = "report.html"
+PICTURE: Final = "lap.png"
+
+_TEMPLATE: Final = "report.html.j2"
+_PACKAGES: Final = ("bayesrace", "casadi", "numpy", "scikit-learn", "eclipse-zenoh")
+
+
+class _Card(NamedTuple):
+    """One controller's headline."""
+
+    name: str
+    colour: str
+    what: str
+    time: str
+    behind: str
+    note: str
+
+
+def render_report(run_dir: Path, result: RaceResult, analysis: RaceAnalysis | None = None) -> Path:
+    """Writes ``report.html`` and ``lap.png`` into the run directory; returns the page's path.
+
+    ``result`` is what the tables show; ``analysis`` saves reading the log a second time. InputError
+    if it is no run directory.
+    """
+    run_dir = Path(run_dir)
+    analysis = analysis or read_race(run_dir)
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    page = environment.get_template(_TEMPLATE).render(
+        result=result,
+        columns=COLUMNS,
+        look=look,
+        cards=_cards(result),
+        facts=_facts(analysis, result),
+        versions=_versions(run_dir),
+        figures=_figures(analysis, run_dir / PICTURE),
+        uncertain=_uncertain(analysis),
+        period_us=round(analysis.recording.discretisation.step_s * 1e6),
+        limit_sigma=UNCERTAIN,
+        laps_compared=compare_laps(result),
+        gp_compared=compare_gp(result),
+        source=SOURCE,
+        limit=LIMIT,
+        title=_title(analysis, result),
+    )
+    path = run_dir / REPORT
+    scratch = path.with_name(path.name + ".part")
+    scratch.write_text(page, encoding="utf-8")
+    scratch.replace(path)
+    return path
+
+
+def _title(analysis: RaceAnalysis, result: RaceResult) -> str:
+    return f"{result.settings.track} · {analysis.track.length_m:.2f} m"
+
+
+def _cards(result: RaceResult) -> list[_Card]:
+    best = result.lap("bestcase")
+    reference_s = best.lap_time_s if best is not None else None
+    return [_card(lap, reference_s) for lap in result.laps]
+
+
+def _card(lap: LapResult, reference_s: float | None) -> _Card:
+    name, colour, what = look(lap.controller)
+    if lap.lap_time_s is None:
+        return _Card(name, colour, what, "DNF", "", lap.ended)
+    behind = ""
+    if reference_s is not None and lap.controller != "bestcase":
+        behind = f"{lap.lap_time_s - reference_s:+.3f} s to BestCase".replace("-", "−")
+    flying = lap.flying_lap_time_s
+    parts = [f"flying {flying:.3f} s"] if flying is not None else []
+    off = lap.off_track_samples
+    parts.append(f"{off} off track, {lap.off_track_max_m:.3f} m" if off else "none off track")
+    return _Card(name, colour, what, f"{lap.lap_time_s:.3f}", behind, " · ".join(parts))
+
+
+def _facts(analysis: RaceAnalysis, result: RaceResult) -> list[tuple[str, str]]:
+    summary, line = result.settings, analysis.line
+    started_ns = analysis.recording.started_ns
+    facts = [
+        ("driven", "–" if started_ns is None else _calendar(started_ns)),
+        ("car", summary.car),
+        ("trained on", summary.train_track),
+        ("mode", summary.mode),
+        ("seed", str(summary.seed)),
+        ("track constraints", "on" if summary.constraints else "off"),
+        ("racing line, flying", f"{line.lap_time_s:.3f} s"),
+    ]
+    if result.real_time_factor is not None:
+        facts.append(("lockstep at", f"{result.real_time_factor:.1f} × real time"))
+    return facts
+
+
+def _calendar(time_ns: int) -> str:
+    return datetime.fromtimestamp(time_ns * 1e-9, tz=UTC).strftime("%Y-%m-%d %H:%M UTC")
+
+
+def _versions(run_dir: Path) -> list[tuple[str, str]]:
+    found = [("Python", platform.python_version())]
+    for package in _PACKAGES:
+        try:
+            found.append((package, version(package)))
+        except PackageNotFoundError:  # run from a checkout that is not installed
+            continue
+    return found + _compilers(run_dir)
+
+
+def _compilers(run_dir: Path) -> list[tuple[str, str]]:
+    """What built the controllers, by the run's manifests: informative, so nothing is refused."""
+    pending: list[Any] = []
+    for path in sorted(run_dir.glob("manifest*.json"), reverse=True):
+        with contextlib.suppress(OSError, ValueError):
+            pending.append(json.loads(path.read_text(encoding="utf-8")))
+    named: dict[tuple[str, str], None] = {}
+    while pending:
+        item = pending.pop()
+        if not isinstance(item, Mapping):
+            continue
+        pending.extend(item.values())
+        if "build_hash" in item and "model" in item:
+            text = f"{str(item['build_hash'])[:12]}, {item.get('compiler', '')}"
+            named[(f"{item['model']} step", text.strip(", "))] = None
+    return list(named)
+
+
+def _uncertain(analysis: RaceAnalysis) -> list[tuple[str, int, int]]:
+    """(name of the controller, samples with a large sigma, all samples) for each GP."""
+    return [
+        (look(controller).name, int(uncertain(validation).sum()), len(validation.sigma))
+        for controller, validation in analysis.validations.items()
+    ]
+
+
+def _figures(analysis: RaceAnalysis, picture: Path) -> dict[str, str]:
+    """Name to SVG; a figure that has nothing to show is left out."""
+    runs, track, line = analysis.runs, analysis.track, analysis.line
+    driven = [run for run in runs if len(run.record.states) > 1]
+    figures: dict[str, str] = {}
+    with figure_style():
+        laps = laps_on_track(driven, track, line)
+        figures["laps"] = inline_svg(laps)
+        scratch = picture.with_name(picture.stem + ".part" + picture.suffix)
+        write_png(laps, scratch)
+        scratch.replace(picture)
+        if driven:
+            car = get_car(str(analysis.recording.settings.get("car", "orca")))
+            figures["speed"] = inline_svg(speed_figure(driven, track, line))
+            figures["inputs"] = inline_svg(inputs_figure(driven, track, car))
+            figures["deviation"] = inline_svg(deviation_figure(driven, track))
+        data = analysis.best_case
+        if data is not None and analysis.validations:
+            progress = track.project_path(data.x[:, :2]).progress_m
+            figures["gp"] = inline_svg(gp_figure(analysis.validations, progress, track.length_m))
+        if any(len(run.record.solve_us) for run in driven):
+            figures["solve"] = inline_svg(solve_figure(driven))
+    return figures

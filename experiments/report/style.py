@@ -1,0 +1,91 @@
+"""How the report's figures look, in one place."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, Final, NamedTuple, cast
+
+import matplotlib as mpl
+from matplotlib.colors import Colormap, LinearSegmentedColormap
+
+__all__ = ["INK", "MUTED", "SURFACE", "WARNING", "Look", "figure_style", "look", "speed_map"]
+
+INK: Final = "#1c1c1a"
+MUTED: Final = "#75756f"
+SURFACE: Final = "#e7e7e2"
+WARNING: Final = "#c8102e"
+
+
+class Look(NamedTuple):
+    """How a controller appears everywhere."""
+
+    name: str
+    colour: str
+    what: str
+
+
+# Okabe and Ito's colours: told apart by any eyes.
+_LOOKS: Final[Mapping[str, Look]] = {
+    "worstcase": Look("WorstCase", "#D55E00", "e-kinematic model, no correction"),
+    "bayesrace": Look("BayesRace", "#0072B2", "corrected by GPs learned from pure pursuit"),
+    "bayesrace-updated": Look(
+        "BayesRace updated", "#009E73", "GPs updated with BayesRace's own laps"
+    ),
+    "bestcase": Look("BestCase", "#3d3d3a", "the perfect model, for comparison"),
+    "purepursuit": Look("Pure pursuit", "#CC79A7", "the driver of the training laps"),
+}
+
+
+def look(controller: str) -> Look:
+    """Name, colour and description of a controller."""
+    return _LOOKS.get(controller, Look(controller, "#56B4E9", ""))
+
+
+def speed_map() -> Colormap:
+    """Perceptually uniform, and dark enough at its bright end for a light background."""
+    plasma = mpl.colormaps["plasma"]
+    shades = [plasma(share) for share in (i / 255 * 0.93 for i in range(256))]
+    return LinearSegmentedColormap.from_list("speed", shades)
+
+
+_STYLE: Final[dict[str, Any]] = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans", "Arial", "Helvetica"],
+    "font.size": 8.0,
+    "axes.titlesize": 9.0,
+    "axes.titlelocation": "left",
+    "axes.titlepad": 6.0,
+    "axes.labelsize": 8.0,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": "#b5b5ae",
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e9e9e4",
+    "grid.linewidth": 0.6,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.labelsize": 7.5,
+    "ytick.labelsize": 7.5,
+    "xtick.major.size": 0,
+    "ytick.major.size": 0,
+    "text.color": INK,
+    "lines.linewidth": 1.2,
+    "legend.frameon": False,
+    "legend.fontsize": 8.0,
+    "figure.facecolor": "white",
+    "axes.facecolor": "white",
+    "savefig.facecolor": "white",
+    # Text stays text: smaller, and it can be searched and read out.
+    "svg.fonttype": "none",
+    "svg.hashsalt": "bayesrace",
+    "path.simplify_threshold": 0.2,
+}
+
+
+@contextmanager
+def figure_style() -> Iterator[None]:
+    """Figures made and drawn in this context look alike."""
+    with mpl.rc_context(cast(Any, _STYLE)):
+        yield

@@ -1,0 +1,237 @@
+"""The analysis against numbers worked out by hand; what is cut short is told, not guessed."""
+
+import hashlib
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from bayesrace.errors import InputError
+from experiments.analysis import analyse, read_race, read_result, time_laps, write_result
+from experiments.results import LapResult, RaceResult
+from experiments.table import COLUMNS, print_table
+from tests.synthetic_race import LAP_S, LINE_M, STEP_S, Drive, Floats, circle, track, write_race
+
+TWO_LAPS: Floats = np.asarray(
+    2 * np.pi * STEP_S * np.arange(134) / LAP_S
+)  # crosses after samples 65 and 130
+
+
+def only_lap(path: Path) -> LapResult:
+    result = analyse(path)
+    assert len(result.laps) == 1
+    return result.laps[0]
+
+
+def test_two_laps_on_a_circle(tmp_path: Path) -> None:
+    lap = only_lap(write_race(tmp_path, [Drive("bayesrace", circle(TWO_LAPS, 1.1), weights="v1")]))
+    assert (lap.controller, lap.finished, lap.weights_version) == ("bayesrace", True, "v1")
+    assert lap.lap_times_s == pytest.approx([LAP_S, LAP_S], abs=1e-4)
+    assert lap.lap_time_s == lap.lap_times_s[0]
+    assert lap.flying_lap_time_s == lap.lap_times_s[1]
+    assert (lap.off_track_samples, lap.off_track_max_m) == (0, 0.0)
+    assert lap.deviation_mean_m == pytest.approx(1.1 - LINE_M, abs=1e-5)
+    assert lap.deviation_max_m == pytest.approx(1.1 - LINE_M, abs=1e-5)
+    assert lap.ended == "2 lap(s) done"
+
+
+def test_one_lap_has_no_flying_lap(tmp_path: Path) -> None:
+    lap = only_lap(write_race(tmp_path, [Drive("bayesrace", circle(TWO_LAPS[:100], 1.0))]))
+    assert lap.finished
+    assert lap.flying_lap_time_s is None
+
+
+def test_off_track_counts_up_to_the_last_counted_crossing(tmp_path: Path) -> None:
+    radius = np.full(134, 1.0)
+    radius[10:14] = (1.21, 1.23, 1.25, 1.21)  # outside on the right
+    radius[40] = 0.77  # outside on the left
+    radius[132:] = 1.5  # after the last lap's end
+    lap = only_lap(write_race(tmp_path, [Drive("bayesrace", circle(TWO_LAPS, radius))]))
+    assert lap.off_track_samples == 5
+    assert lap.off_track_max_m == pytest.approx(0.05, abs=1e-5)
+    mean = (126 * 0.05 + 0.16 + 0.18 + 0.2 + 0.16 + 0.28) / 131
+    assert lap.deviation_mean_m == pytest.approx(mean, abs=1e-5)
+    assert lap.deviation_max_m == pytest.approx(LINE_M - 0.77, abs=1e-5)
+
+
+def test_off_track_counts_all_samples_without_a_lap(tmp_path: Path) -> None:
+    lap = only_lap(write_race(tmp_path, [Drive("worstcase", circle(TWO_LAPS[:50], 1.3))]))
+    assert (lap.finished, lap.lap_time_s, lap.lap_times_s) == (False, None, [])
+    assert lap.off_track_samples == 50
+    assert lap.off_track_max_m == pytest.approx(0.1, abs=1e-5)
+
+
+def test_the_fingerprint_ends_with_the_sample_after_the_last_lap(tmp_path: Path) -> None:
+    x = circle(TWO_LAPS, 1.0)
+    whole = only_lap(write_race(tmp_path / "a", [Drive("bayesrace", x)]))
+    assert whole.trajectory_sha256 == hashlib.sha256(x[:132].astype("<f8").tobytes()).hexdigest()
+    tail = x.copy()
+    tail[132:] += 0.001
+    same = only_lap(write_race(tmp_path / "b", [Drive("bayesrace", tail)]))
+    assert same.trajectory_sha256 == whole.trajectory_sha256
+    part = only_lap(write_race(tmp_path / "c", [Drive("bayesrace", x[:30])]))
+    assert part.trajectory_sha256 == hashlib.sha256(x[:30].astype("<f8").tobytes()).hexdigest()
+
+
+def test_solve_times_and_fallbacks(tmp_path: Path) -> None:
+    drive = Drive("bayesrace", circle(TWO_LAPS[:102], 1.0), range(1, 102), (3, 4, 50))
+    lap = only_lap(write_race(tmp_path, [drive]))
+    assert lap.solve_us is not None
+    assert (lap.solve_us.p50, lap.solve_us.p99, lap.solve_us.max) == (51.0, 100.0, 101.0)
+    assert lap.fallbacks == 3
+
+
+def test_a_lap_counts_only_once_when_the_car_rolls_back_over_the_line() -> None:
+    there_and_back = np.array([0.05, 0.02, -0.01, -0.03, 0.01, 0.04])
+    angle = np.concatenate([there_and_back, np.arange(0.1, 2 * np.pi + 0.1, 0.05)])
+    xy = circle(angle, 1.0)[:, :2]
+    time_s: Floats = np.asarray(STEP_S * np.arange(len(angle)))
+    laps = time_laps(track(), time_s, xy, track().project_path(xy).s_m)
+    assert len(laps.times_s) == 1
+    before = laps.after[0] - 1
+    assert angle[before] < 2 * np.pi <= angle[before + 1]
+
+
+def test_a_short_cut_is_no_lap(tmp_path: Path) -> None:
+    angle = np.concatenate([np.linspace(0, 2, 40), np.linspace(4.5, 2 * np.pi + 1, 60)])
+    lap = only_lap(write_race(tmp_path, [Drive("worstcase", circle(angle, 1.0))]))
+    assert not lap.finished
+    assert "at 0.80 s the car left out a piece of the track" in lap.ended
+
+
+def test_laps_before_a_short_cut_count(tmp_path: Path) -> None:
+    angle = np.append(TWO_LAPS[:100], np.linspace(TWO_LAPS[99] + 2.0, 4 * np.pi + 1, 30))
+    lap = only_lap(write_race(tmp_path, [Drive("bayesrace", circle(angle, 1.0))]))
+    assert lap.lap_times_s == pytest.approx([LAP_S], abs=1e-4)
+
+
+def test_gp_metrics_are_those_of_the_bestcase_run(tmp_path: Path) -> None:
+    drives = [Drive("bayesrace", circle(TWO_LAPS, 1.1)), Drive("bestcase", circle(TWO_LAPS, 1.0))]
+    result = analyse(write_race(tmp_path, drives))
+    assert list(result.gp) == list(result.gp_updated) == ["vx", "vy", "omega"]
+    for metrics in result.gp.values():  # a GP that knows nothing corrects nothing
+        assert metrics.rmse == metrics.uncorrected_rmse
+
+
+def test_without_bestcase_or_weights_there_are_no_gp_metrics(tmp_path: Path) -> None:
+    drive = Drive("bestcase", circle(TWO_LAPS, 1.0))
+    assert analyse(write_race(tmp_path / "a", [drive], weights=False)).gp == {}
+    other = Drive("bayesrace", circle(TWO_LAPS, 1.0))
+    assert analyse(write_race(tmp_path / "b", [other])).gp == {}
+
+
+def test_real_time_factor_is_that_of_lockstep_runs(tmp_path: Path) -> None:
+    x = circle(TWO_LAPS, 1.0)
+    result = analyse(write_race(tmp_path / "a", [Drive("a", x), Drive("b", x, lockstep=False)]))
+    assert result.real_time_factor == pytest.approx(20.0)  # 20 ms simulated, 1 ms of the clock
+    alone = analyse(write_race(tmp_path / "b", [Drive("b", x, lockstep=False)]))
+    assert alone.real_time_factor is None
+
+
+def test_gaps_are_counted(tmp_path: Path) -> None:
+    drive = Drive("bayesrace", circle(TWO_LAPS, 1.0), drop=(0, 20, 21))
+    result = analyse(write_race(tmp_path, [drive]))
+    assert (result.complete, result.gaps) == (False, 3)
+    whole = analyse(write_race(tmp_path, [Drive("bayesrace", circle(TWO_LAPS, 1.0))]))
+    assert (whole.complete, whole.gaps) == (True, 0)
+
+
+def test_a_killed_plant_is_told(tmp_path: Path) -> None:
+    drive = Drive("bayesrace", circle(TWO_LAPS[:60], 1.0), ended=None)
+    lap = only_lap(write_race(tmp_path, [drive]))
+    assert not lap.finished
+    assert "the log ends 1.18 s into the run" in lap.ended
+
+
+def test_a_run_that_never_started_is_told(tmp_path: Path) -> None:
+    lap = only_lap(write_race(tmp_path, [Drive("bayesrace", np.zeros((0, 7)), ended=None)]))
+    assert not lap.finished
+    assert lap.ended == "the run never started"
+    assert (lap.deviation_mean_m, lap.deviation_max_m, lap.solve_us) == (None, None, None)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.8, 0.999])
+def test_a_log_that_was_cut_off_is_analysed_as_far_as_it_goes(tmp_path: Path, share: float) -> None:
+    drives = [Drive("bayesrace", circle(TWO_LAPS, 1.0)), Drive("bestcase", circle(TWO_LAPS, 1.0))]
+    path = write_race(tmp_path, drives)
+    log = path / "run.mcap"
+    data = log.read_bytes()
+    log.write_bytes(data[: int(share * len(data))])
+    result = analyse(path)
+    assert not result.complete
+    assert 1 <= len(result.laps) <= 2
+    assert result.laps[0].finished == (share >= 0.5)
+
+
+def test_settings_are_summarised(tmp_path: Path) -> None:
+    summary = analyse(write_race(tmp_path, [])).settings
+    assert (summary.track, summary.train_track, summary.mode) == ("circle", "paddock", "lockstep")
+    assert (summary.car, summary.seed, summary.laps, summary.constraints) == ("orca", 7, 2, True)
+
+
+def test_no_run_directory_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="give the directory of a race"):
+        analyse(tmp_path)
+
+
+def race(path: Path) -> Path:
+    angle: Floats = TWO_LAPS
+    return write_race(
+        path,
+        [
+            Drive("worstcase", circle(angle[:50], 1.3), [88.4], weights="worstcase"),
+            Drive("bayesrace", circle(angle, 1.1), [1234.5, 678.9], (5,), "orca-0123456789"),
+            Drive("bayesrace-updated", circle(angle, 1.06), [123456.0], (), "orca-9876543210"),
+            Drive("bestcase", circle(angle, 1.05), [99.5]),
+        ],
+    )
+
+
+def test_the_result_file_gives_back_the_result_and_its_form_is_fixed(tmp_path: Path) -> None:
+    result = analyse(race(tmp_path))
+    write_result(tmp_path / "result.json", result)
+    assert read_result(tmp_path / "result.json") == result
+    content = json.loads((tmp_path / "result.json").read_text())
+    assert [lap["controller"] for lap in content["laps"]] == [
+        "worstcase", "bayesrace", "bayesrace-updated", "bestcase",
+    ]  # fmt: skip
+    assert {"lap_time_s", "flying_lap_time_s", "off_track_samples", "trajectory_sha256"} < set(
+        content["laps"][0]
+    )
+    assert set(content["laps"][1]["solve_us"]) == {"p50", "p99", "max"}
+    assert {"rmse", "r2", "coverage"} < set(content["gp"]["vx"])
+    content["laps"][0]["speed"] = 1
+    with pytest.raises(ValueError, match="speed"):
+        RaceResult.model_validate(content)
+
+
+def test_reading_what_is_no_result_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "result.json"
+    with pytest.raises(InputError, match="cannot read"):
+        read_result(path)
+    path.write_text("{}")
+    with pytest.raises(InputError, match="no result of a race"):
+        read_result(path)
+
+
+def test_the_table_shows_the_results_numbers_within_100_columns(tmp_path: Path) -> None:
+    result = analyse(race(tmp_path))
+    text = io.StringIO()
+    print_table(result, Console(file=text, width=100))
+    lines = text.getvalue().splitlines()
+    assert max(map(len, lines)) <= 100
+    assert "…" not in text.getvalue()
+    for lap in result.laps:
+        row = next(line for line in lines if line.split()[:1] == [lap.controller])
+        assert row.split() == [cell for column in COLUMNS for cell in column.cell(lap).split()]
+    assert "worstcase did not finish" in text.getvalue()
+    assert any(line.split()[:1] == ["updated"] for line in lines)
+
+
+def test_analysis_reads_the_log_once_for_result_and_report(tmp_path: Path) -> None:
+    analysis = read_race(race(tmp_path))
+    assert analysis.result is analysis.result
+    assert analysis.result == analyse(tmp_path)

@@ -1,0 +1,144 @@
+"""The report: one file, the numbers of the result, and whatever the race left, something to see."""
+
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.analysis import analyse, read_race
+from experiments.report import render_report
+from experiments.report.published import compare_gp, compare_laps
+from experiments.results import RaceResult
+from experiments.table import COLUMNS
+from tests.synthetic_race import Drive, circle, write_race
+from tests.test_analysis import TWO_LAPS, race
+
+
+class _Tables(HTMLParser):
+    """Texts of the cells of each table with an id, row by row; and all tag names."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.rows: dict[str, list[list[str]]] = {}
+        self.tags: set[str] = set()
+        self._table = ""
+        self._cell = False
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        if tag == "table":
+            self._table = dict(attrs).get("id") or ""
+            self.rows[self._table] = []
+        elif tag == "tr":
+            self.rows[self._table].append([])
+        elif tag == "td":
+            self._cell = True
+            self.rows[self._table][-1].append("")
+
+    def handle_endtag(self, tag: str) -> None:
+        self._cell = self._cell and tag != "td"
+
+    def handle_data(self, data: str) -> None:
+        if self._cell:
+            self.rows[self._table][-1][-1] += data
+
+
+def parse(page: Path) -> _Tables:
+    tables = _Tables()
+    tables.feed(page.read_text(encoding="utf-8"))
+    return tables
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RaceResult]:
+    path = race(tmp_path_factory.mktemp("race"))
+    analysis = read_race(path)
+    return render_report(path, analysis.result, analysis), analysis.result
+
+
+def test_the_page_needs_nothing_but_itself(rendered: tuple[Path, RaceResult]) -> None:
+    text = rendered[0].read_text(encoding="utf-8")
+    assert rendered[0].name == "report.html"
+    assert len(text) < 4_000_000
+    assert not re.search(r"""(src|href)\s*=\s*["'](?!#|data:)""", text)
+    assert not re.search(r"@import|url\(\s*[\"']?(?!#|data:)", text)
+    assert "script" not in parse(rendered[0]).tags
+    assert text.count("<svg ") == 6
+    assert str(rendered[0].parent) not in text
+
+
+def test_the_page_shows_the_results_numbers(rendered: tuple[Path, RaceResult]) -> None:
+    page, result = rendered
+    tables = parse(page).rows
+    expected = [[column.cell(lap) for column in COLUMNS] for lap in result.laps]
+    assert [row for row in tables["result"] if row] == expected
+    gp = [row for row in tables["gp"] if row]
+    assert [row[0] for row in gp] == ["vx", "vx", "vy", "vy", "omega", "omega"]
+    assert gp[0][2] == f"{result.gp['vx'].rmse:.3g}"
+    assert gp[0][4:6] == [f"{result.gp['vx'].r2:.4f}", f"{result.gp['vx'].coverage:.3f}"]
+    for lap in result.laps:
+        assert lap.trajectory_sha256 in page.read_text(encoding="utf-8")
+
+
+def test_a_picture_lies_beside_the_page(rendered: tuple[Path, RaceResult]) -> None:
+    assert (rendered[0].parent / "lap.png").read_bytes().startswith(b"\x89PNG")
+    assert not list(rendered[0].parent.glob("*.part*"))
+
+
+def test_the_papers_numbers_stand_only_beside_laps_on_its_track(
+    rendered: tuple[Path, RaceResult],
+) -> None:
+    result = rendered[1]
+    assert "published" not in parse(rendered[0]).rows
+    assert not compare_laps(result)
+    assert not compare_gp(result)
+    on_ethz = result.model_copy(
+        update={"settings": result.settings.model_copy(update={"track": "ethz"})}
+    )
+    rows = compare_laps(on_ethz)
+    assert [row.controller for row in rows] == [lap.controller for lap in result.laps]
+    assert (rows[0].paper_lap, rows[1].paper_lap, rows[1].paper_off) == (
+        "DNF", "7.988", "9 / 0.015",
+    )  # fmt: skip
+    assert [row.output for row in compare_gp(on_ethz)] == ["vx", "vy", "omega"]
+
+
+def test_a_race_that_was_cut_off_still_gets_its_page(tmp_path: Path) -> None:
+    path = race(tmp_path)
+    data = (path / "run.mcap").read_bytes()
+    (path / "run.mcap").write_bytes(data[: int(0.3 * len(data))])
+    page = render_report(path, analyse(path))
+    text = page.read_text(encoding="utf-8")
+    assert "The log is not complete" in text
+    assert "DNF" in text
+
+
+@pytest.mark.parametrize("states", [0, 1, 2])
+def test_a_race_that_hardly_began_still_gets_its_page(tmp_path: Path, states: int) -> None:
+    drive = Drive("bestcase", circle(TWO_LAPS[:states], 1.0), ended=None)
+    path = write_race(tmp_path, [drive])
+    assert render_report(path, analyse(path)).is_file()
+    path = write_race(tmp_path / "empty", [])
+    assert render_report(path, analyse(path)).is_file()
+
+
+def test_names_from_files_are_text_not_markup(tmp_path: Path) -> None:
+    drive = Drive("<script>alert(1)</script>", circle(TWO_LAPS, 1.0), ended="<b>over</b>")
+    path = write_race(tmp_path, [drive])
+    tags = parse(render_report(path, analyse(path))).tags
+    assert "script" not in tags
+
+
+def test_a_car_that_wanders_off_does_not_shrink_the_track(tmp_path: Path) -> None:
+    from experiments.report.maps import laps_on_track
+    from experiments.report.style import figure_style
+
+    far = circle(TWO_LAPS[:100], np.linspace(1.0, 50.0, 100))
+    analysis = read_race(write_race(tmp_path, [Drive("worstcase", far)]))
+    with figure_style():
+        figure = laps_on_track(analysis.runs, analysis.track, analysis.line)
+    left, right = figure.axes[0].get_xlim()
+    assert -1.5 < left < -1.2 < 1.2 < right < 1.5
+    assert figure.axes[0].get_aspect() == 1.0
