@@ -60,6 +60,7 @@ static inline __attribute__((always_inline)) br_vec
 fill_block(const int kind, const br_gp_output *gp, const br_vec query[BR_NZ], int first, int count,
            block *out) {
     br_vec sum = {0};
+#pragma GCC unroll 2
     for (int i = 0; i < count; i += BR_LANES) {
         br_vec r2 = {0};
 #pragma GCC unroll 6

@@ -55,19 +55,14 @@ static inline br_vec br_exp_negative(br_vec x) {
     const br_vec n = shifted - magic;
     br_vec r = x - n * 6.93147180369123816490e-01;
     r = r - n * 1.90821492927058770002e-10;
-    br_vec p = br_splat(1.0 / 479001600);
-    p = p * r + 1.0 / 39916800;
-    p = p * r + 1.0 / 3628800;
-    p = p * r + 1.0 / 362880;
-    p = p * r + 1.0 / 40320;
-    p = p * r + 1.0 / 5040;
-    p = p * r + 1.0 / 720;
-    p = p * r + 1.0 / 120;
-    p = p * r + 1.0 / 24;
-    p = p * r + 1.0 / 6;
-    p = p * r + 0.5;
-    p = p * r + 1.0;
-    p = p * r + 1.0;
+    /* Estrin's scheme: the dependency chain, not the number of operations, sets the time. */
+    const br_vec r2 = r * r, r4 = r2 * r2, r8 = r4 * r4;
+    const br_vec p01 = 1.0 + r, p23 = 0.5 + r * (1.0 / 6);
+    const br_vec p45 = 1.0 / 24 + r * (1.0 / 120), p67 = 1.0 / 720 + r * (1.0 / 5040);
+    const br_vec p89 = 1.0 / 40320 + r * (1.0 / 362880);
+    const br_vec p1011 = 1.0 / 3628800 + r * (1.0 / 39916800);
+    const br_vec low = (p01 + p23 * r2) + (p45 + p67 * r2) * r4;
+    const br_vec p = low + ((p89 + p1011 * r2) + r4 * (1.0 / 479001600)) * r8;
     br_ivec bits;
     memcpy(&bits, &shifted, sizeof bits);
     const br_ivec exponent = (bits << 52) + ((int64_t)1023 << 52);
