@@ -50,11 +50,14 @@ def pin_to_cpu(cpu: int | None) -> str:
     return ""
 
 
-def die_with_parent() -> None:
-    """Ask for SIGTERM when the parent dies, however it dies (Linux; elsewhere nothing)."""
-    if not sys.platform.startswith("linux"):
+def die_with_parent(pid: int | None) -> None:
+    """Ask for SIGTERM when the parent ``pid`` dies, however it dies (Linux; elsewhere nothing).
+
+    Call it first of all: a parent that died while this process was starting is noticed by its
+    number. None does nothing.
+    """
+    if pid is None or not sys.platform.startswith("linux"):
         return
-    parent = os.getppid()
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
-    if os.getppid() != parent:  # it died before we asked
+    if os.getppid() != pid:  # it died before we asked
         os.kill(os.getpid(), signal.SIGTERM)

@@ -9,6 +9,7 @@ import struct
 import threading
 import time
 from collections.abc import Collection, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -140,6 +141,8 @@ class Recorder:
         metadata: Mapping[str, Mapping[str, str]] | None = None,
     ) -> None:
         self.counters = RecorderCounters()
+        self.failed = ""
+        """Why the log cannot be written; empty while it can. Messages are then let go."""
         self.gaps: list[str] = []
         """The first few gaps in the numbering, in words."""
         self._last: dict[str, int] = {}
@@ -163,23 +166,32 @@ class Recorder:
             self._writer.add_metadata(name, values)
 
     def settle(self, quiet_s: float = 0.1, at_most_s: float = 2.0) -> None:
-        """Wait until nothing has arrived for a while."""
+        """Wait until nothing has arrived for a while; then all of it can be read from the file.
+
+        Raises InputError if the log cannot be written any more, such as on a full disk.
+        """
         give_up_ns = time.monotonic_ns() + int(at_most_s * 1e9)
         while (now_ns := time.monotonic_ns()) < give_up_ns:
             if now_ns - self._quiet_since_ns >= quiet_s * 1e9:
-                return
+                break
             time.sleep(quiet_s / 5)
+        self._flush()
+        if self.failed:
+            raise InputError(self.failed)
 
     def close(self) -> None:
         """Wait for stragglers, stop, finish the file; a second call does nothing."""
         if self._stop.is_set():
             return
-        self.settle()
-        self._stop.set()
-        self._subscriber.undeclare()
-        for thread in self._threads:
-            thread.join()
-        self._writer.close()
+        try:
+            self.settle()
+        finally:
+            self._stop.set()
+            self._subscriber.undeclare()
+            for thread in self._threads:
+                thread.join()
+            with suppress(OSError):
+                self._writer.close()
 
     def __enter__(self) -> Self:
         return self
@@ -213,13 +225,27 @@ class Recorder:
         self._quiet_since_ns = now_ns
         seq = peek_seq(data)
         self._account(key, seq)
-        with self._lock:
-            self._writer.write(key, data, now_ns, 0 if seq is None else seq & 0xFFFFFFFF)
+        if self.failed:
+            return
+        try:
+            with self._lock:
+                self._writer.write(key, data, now_ns, 0 if seq is None else seq & 0xFFFFFFFF)
+        except OSError as error:
+            self._fail(error)
+
+    def _fail(self, error: OSError) -> None:
+        self.failed = f"cannot write the log: {error.strerror}; make room and drive again"
+
+    def _flush(self) -> None:
+        try:
+            with self._lock:
+                self._writer.flush()
+        except OSError as error:
+            self._fail(error)
 
     def _flush_often(self) -> None:
         while not self._stop.wait(FLUSH_PERIOD_S):
-            with self._lock:
-                self._writer.flush()
+            self._flush()
 
     def _account(self, key: str, seq: int | None) -> None:
         counters = self.counters

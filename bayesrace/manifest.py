@@ -28,12 +28,14 @@ class Manifest(BaseModel):
     abi: int = Field(description="version of the C interface")
     model: str = Field(description="vehicle model the OCP predicts with")
     car: str
+    car_digest: str = Field(description="identity of the car's parameters")
     discretisation: str = Field(description="identity of model, scheme, step and car")
     horizon: int = Field(gt=0, description="stages N")
     step_s: float = Field(gt=0, description="sampling time Ts")
     gp_capacity: int = Field(gt=0, description="training points per output that fit")
     casadi: str
     compiler: str
+    cpu: str = Field(description="identity of the CPU it was compiled for")
     flags: list[str]
     build_hash: str = Field(description="hash of everything that shaped the artefact")
     library_sha256: str

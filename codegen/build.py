@@ -1,7 +1,8 @@
 """From settings to a loadable controller: generate C, compile, cache by a hash of everything.
 
-The artefact folder holds the library, its manifest and all C it was made from, so that it can be
-rebuilt or embedded elsewhere without Python.
+The artefact folder holds the library, its manifest and everything it was made from (our C, CasADi's
+C, DAQP's headers and static library for this platform, MIT licence), so that it can be rebuilt or
+embedded without Python: ``cc -O3 *.c libdaqpstat.a -I. -lm``.
 """
 
 import hashlib
@@ -12,10 +13,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
+from bayesrace.cpu import cpu_digest, cpu_identity
 from bayesrace.errors import InputError
 from bayesrace.manifest import ABI, LIBRARY, MANIFEST, Manifest, read_manifest
 from bayesrace.vehicles import get_car
-from codegen.compiler import FLAGS, Compiler, cpu_identity, find_compiler
+from codegen.compiler import FLAGS, Compiler, find_compiler
 from codegen.settings import BuildSettings
 
 __all__ = ["NATIVE", "build", "build_hash", "cache_folder", "generate"]
@@ -108,7 +110,11 @@ def _compile(settings: BuildSettings, compiler: Compiler, folder: Path) -> None:
     generate(settings, folder)
     for path in NATIVE.glob("*.[ch]"):
         shutil.copy(path, folder)
-    compiler.shared_library(sorted(folder.glob("*.c")), [folder, include], [daqp], folder / LIBRARY)
+    shutil.copytree(include / "daqp", folder / "daqp")
+    shutil.copy(daqp, folder)
+    compiler.shared_library(
+        sorted(folder.glob("*.c")), [folder], [folder / daqp.name], folder / LIBRARY
+    )
 
 
 def build(
@@ -139,12 +145,14 @@ def build(
             abi=ABI,
             model=settings.model,
             car=settings.car,
+            car_digest=get_car(settings.car).digest(),
             discretisation=settings.discretisation.identity(settings.model, get_car(settings.car)),
             horizon=settings.horizon,
             step_s=settings.discretisation.step_s,
             gp_capacity=settings.gp_capacity,
             casadi=_casadi_version(),
             compiler=compiler.version,
+            cpu=cpu_digest(),
             flags=list(FLAGS),
             build_hash=identity,
             library_sha256=hashlib.sha256((folder / LIBRARY).read_bytes()).hexdigest(),

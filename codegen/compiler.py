@@ -6,6 +6,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tempfile
 from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
@@ -14,7 +15,7 @@ from typing import Final
 
 from bayesrace.errors import InputError
 
-__all__ = ["FLAGS", "CompileError", "Compiler", "cpu_identity", "find_compiler"]
+__all__ = ["FLAGS", "CompileError", "Compiler", "find_compiler"]
 
 FLAGS: Final = (
     "-std=gnu11",
@@ -85,33 +86,31 @@ def _candidates() -> list[tuple[str, ...]]:
     return found
 
 
+def _run(line: list[str]) -> str:
+    done = subprocess.run(line, capture_output=True, text=True, check=True, timeout=120)
+    return done.stdout
+
+
 @cache
 def find_compiler() -> Compiler:
-    """$CC, the system's cc, gcc or clang, or ziglang; InputError with the remedy if none works."""
+    """$CC, the system's cc, gcc or clang, or ziglang: the first that can build a library.
+
+    InputError with the remedy if none can.
+    """
     tried = []
     for command in _candidates():
         try:
-            done = subprocess.run(
-                [*command, "--version"], capture_output=True, text=True, check=False, timeout=60
-            )
-        except OSError as error:
-            tried.append(f"{shlex.join(command)}: {error}")
+            version = _run([*command, "--version"])
+            with tempfile.TemporaryDirectory() as folder:
+                probe = Path(folder) / "probe.c"
+                probe.write_text("#include <math.h>\nint probe(void) { return 0; }\n")
+                _run([*command, "-shared", "-fPIC", str(probe), "-lm", "-o", f"{probe}.so"])
+        except (OSError, subprocess.SubprocessError) as error:
+            words = getattr(error, "stderr", "") or str(error)
+            tried.append(f"{shlex.join(command)}: {words.strip()[:200]}")
             continue
-        if done.returncode == 0:
-            return Compiler(command, done.stdout.splitlines()[0])
-        tried.append(f"{shlex.join(command)}: {done.stderr.strip()[:200]}")
+        return Compiler(command, (version.splitlines() or ["unknown version"])[0])
     details = f" (tried: {'; '.join(tried)})" if tried else ""
     raise InputError(
         f"no C compiler found{details}: install gcc or clang, or 'pip install ziglang'"
     )
-
-
-@cache
-def cpu_identity() -> str:
-    """What -march=native depends on: a library built on one CPU may not run on another."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    wanted = ("model name", "flags", "Features", "CPU part")
-    return "\n".join(dict.fromkeys(s for s in lines if s.startswith(wanted)))

@@ -73,8 +73,10 @@ class Fallback:
             return None
         d, rate = float(output.u[0]), float(output.u[1])
         d_safe, rate_safe = self._limited(d, rate)
-        excess = max(abs(d - d_safe), abs(rate - rate_safe))
-        if not excess <= self._settings.tolerance:  # NaN as well
+        # Explicitly, because max(0.0, nan) is 0.0: a NaN steering rate must not get through.
+        if not (math.isfinite(d) and math.isfinite(rate)):
+            return None
+        if max(abs(d - d_safe), abs(rate - rate_safe)) > self._settings.tolerance:
             return None
         # The plan is kept only from solutions that were fit to be driven.
         if len(output.plan_u) and np.isfinite(output.plan_u).all():

@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from bayesrace.cpu import cpu_digest
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import KERNELS, GpWeights
 from bayesrace.manifest import ABI, LIBRARY, Manifest, read_manifest
@@ -125,6 +126,10 @@ def _load(path: Path, manifest: Manifest) -> ct.CDLL:
             f"{path} is not the library its manifest describes: remove the folder and run "
             "'bayesrace build'"
         )
+    if manifest.cpu != cpu_digest():
+        raise InputError(
+            f"{path} was compiled for another CPU: remove the folder and run 'bayesrace build' here"
+        )
     try:
         library = ct.CDLL(str(path))
     except OSError as error:
@@ -163,10 +168,11 @@ class NativeStep:
 
     def __init__(self, artefact: Path, car: CarParameters, settings: MpcSettings) -> None:
         self.manifest = read_manifest(artefact)
-        if self.manifest.car != car.name:
+        built_for = (self.manifest.car, self.manifest.car_digest)
+        if built_for != (car.name, car.digest()):
             raise InputError(
-                f"{artefact} was built for car '{self.manifest.car}', not '{car.name}': "
-                "run 'bayesrace build'"
+                f"{artefact} was built for car '{'-'.join(built_for)}', not "
+                f"'{car.name}-{car.digest()}': run 'bayesrace build'"
             )
         self._library = _load(artefact / LIBRARY, self.manifest)
         if self._library.br_mpc_abi() != ABI:

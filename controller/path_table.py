@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from bayesrace.raceline.line import RaceLine
 from bayesrace.tracks import Track
+from bayesrace.tracks.spline import PlaneSpline
 
 __all__ = ["CAPACITY", "PATH_COLUMNS", "PathTable", "make_path_table"]
 
@@ -42,21 +43,12 @@ def make_path_table(track: Track, line: RaceLine, spacing_m: float = SPACING_M) 
     """
     count = min(CAPACITY, max(8, math.ceil(line.length_m / spacing_m)))
     s: npt.NDArray[np.float64] = np.arange(count, dtype=np.float64) * (line.length_m / count)
-    nodes = np.append(line.s_m, line.length_m)
-    xy = np.column_stack([_periodic(s, nodes, line.x_m), _periodic(s, nodes, line.y_m)])
-    speed = np.interp(s, nodes, np.append(line.vx_mps, line.vx_mps[0]))
+    nodes = np.append(line.s_m, line.s_m[0] + line.length_m)
+    xy = PlaneSpline(line.s_m, line.xy_m, line.length_m)(s)
+    speed = np.interp(s, nodes, np.append(line.vx_mps, line.vx_mps[0]), period=line.length_m)
     on_track = track.project_path(xy)
     normal = track.normal(on_track.s_m)
     right, left = track.widths(on_track.s_m)
     along = np.sum(normal * track.position(on_track.s_m), axis=1)
     rows = np.column_stack([xy, speed, normal, along - right, along + left])
     return PathTable(np.ascontiguousarray(rows), line.length_m / count)
-
-
-def _periodic(
-    s: npt.NDArray[np.float64], nodes: npt.NDArray[np.float64], values: npt.NDArray[np.float64]
-) -> npt.NDArray[np.float64]:
-    from scipy.interpolate import CubicSpline
-
-    spline = CubicSpline(nodes, np.append(values, values[0]), bc_type="periodic")
-    return np.asarray(spline(s))

@@ -70,7 +70,7 @@ class ControllerSettings(BaseModel):
         default=0.5, gt=0, le=60, description="without a state for this long it counts as waiting"
     )
     cpu: int | None = Field(default=None, ge=0, description="CPU to bind to")
-    die_with_parent: bool = Field(False, description="end when the starting process ends")
+    parent_pid: int | None = Field(None, description="end when this process, the parent, ends")
 
 
 class ControllerProcess:
@@ -110,6 +110,7 @@ class ControllerProcess:
         """Waits for something to happen; the last state of all that has, if there is one."""
         item = self.inbox.get(self._settings.stale_s)
         if item is None:
+            self._decoder.report(_log)
             if self._phase != "waiting":
                 self._phase = "waiting"
                 gc.collect()
@@ -191,6 +192,7 @@ class ControllerProcess:
         if item.kind is Kind.SIGNAL:
             self._stopping = True
         elif item.kind is Kind.GONE:
+            self._run = None  # a plant that comes back begins its run numbers anew
             self._phase, self._text = "waiting", "the plant vanished: killed or unreachable"
             _log.warning("%s; waiting for it", self._text)
         elif item.kind is Kind.ALIVE:
@@ -270,18 +272,17 @@ def main(settings: ControllerSettings, controller: Controller) -> int:
 
     Call it from the main thread of a process: it takes over the signals.
     """
-    if settings.die_with_parent:
-        die_with_parent()
+    die_with_parent(settings.parent_pid)
     if refusal := pin_to_cpu(settings.cpu):
         _log.warning("%s", refusal)
     with open_session(settings.endpoints) as session:
         process = ControllerProcess(session, settings, controller)
-        process.inbox.catch_signals()
         quiet_garbage_collector()
         _log.info(
             "controller of car '%s', plant at %s",
             process.name,
             ", ".join(settings.endpoints.connect) or "(connects to us)",
         )
-        process.serve()
+        with process.inbox.catching_signals():
+            process.serve()
     return 0

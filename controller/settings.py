@@ -23,8 +23,8 @@ class MpcSettings(BaseModel):
     settle: float = Field(
         1e-4,
         ge=0,
-        description="stationarity, and tenth of the defect, at which a step stops iterating; "
-        "0: only when converged",
+        description="a step stops iterating at this stationarity and tenth of the defect, or, "
+        "warm started, when they fall by less than half; 0: neither",
     )
     iterations: int = Field(3, ge=1, le=1000, description="SQP iterations a step may use")
     iterations_cold: int = Field(30, ge=1, le=1000, description="the same after a reset")

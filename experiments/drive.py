@@ -1,8 +1,10 @@
 """Directs one run of a waiting plant and controller, from the start line to the last lap."""
 
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 
+from bayesrace.errors import InputError
 from bayesrace.messages import Event, RunRequest, Scalar
 from bayesrace.tracks import StartLine, Track
 from bayesrace.transport import Director, Publisher
@@ -63,5 +65,10 @@ def execute(director: Director, publisher: Publisher[Event], track: Track, plan:
     """
     _announce(publisher, plan, director.status("controller").weights_version)
     director.start(run_request(track, plan))
-    # In lockstep simulated time passes faster than the clock's, but nobody promises it.
-    return director.wait_for_end(plan.run, 30.0 + 3.0 * plan.max_time_s)
+    try:
+        # In lockstep simulated time passes faster than the clock's, but nobody promises it.
+        return director.wait_for_end(plan.run, 30.0 + 3.0 * plan.max_time_s)
+    except (InputError, KeyboardInterrupt):
+        with suppress(InputError):  # a car must not drive on when nobody watches it
+            director.stop("who started the run has left")
+        raise

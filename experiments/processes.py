@@ -23,6 +23,8 @@ class Child:
             stdin=subprocess.DEVNULL,
             stdout=self._file,
             stderr=subprocess.STDOUT,
+            # Ctrl-C at the terminal is for the starter, which ends its children in order
+            start_new_session=True,
         )
 
     @property
@@ -56,7 +58,7 @@ class Child:
 def child(arguments: list[str], output: Path) -> Iterator[Child]:
     """A child process that does not outlive the block, however the block ends.
 
-    With ``--die-with-parent`` among the arguments it does not outlive this process either.
+    With ``--parent-pid`` among the arguments it does not outlive this process either.
     """
     process = Child(arguments, output)
     try:

@@ -4,6 +4,7 @@ Plant and controller are processes of their own, started as a person would start
 directs, records everything that is said on the network, and hands over weights.
 """
 
+import os
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -86,9 +87,8 @@ class _Race:
         """Drives the training track by pure pursuit and reads the samples from the log."""
         settings = self.settings
         log = self.out / FILES.collect_log
-        pursuit = settings.pursuit.model_copy(update={"seed": settings.seed})
         collect(
-            course.track, course.line, self.car, log, settings.collect_s, pursuit,
+            course.track, course.line, self.car, log, settings.collect_s, settings.pursuit,
             settings.start_speed_mps,
         )  # fmt: skip
         return dataset_from_log(log, self.car, settings.discretisation.step_s)
@@ -154,14 +154,13 @@ class _Paddock:
             Recorder(session, race.car.name, race.out / FILES.log, self._metadata())
         )
         self.director = Director(session, race.car.name)
-        self.director.inbox.catch_signals()
         self._events: Publisher[Event] = Publisher(session, EVENT, race.car.name, "race")
 
     def _metadata(self) -> dict[str, dict[str, str]]:
         return {"race": {"settings": self._race.settings.model_dump_json()}}
 
     def _flags(self) -> list[str]:
-        return ["--die-with-parent", *(["--low-latency"] if self._low_latency else [])]
+        return ["--parent-pid", str(os.getpid()), *(["--low-latency"] if self._low_latency else [])]
 
     def _plant(self) -> Any:
         arguments = ["plant", "--car", self._race.car.name, "--endpoint", self._plant_endpoint]
@@ -204,6 +203,8 @@ class _Paddock:
         """One run; RaceError if it ended by anything but its laps or the time limit."""
         plan = self._race.plan(controller, self._course)
         end = execute(self.director, self._events, self._course.track, plan)
+        if end.data.get("reason") == "interrupted":
+            raise KeyboardInterrupt
         if end.data.get("reason") not in ("laps", "max_time", "left_world"):
             raise InputError(f"run {plan.run} ({controller}) ended early: {end.text}")
         return plan
@@ -220,6 +221,8 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
     Raises InputError for unusable settings, RaceError when a process is lost (the log stays
     readable), KeyboardInterrupt on Ctrl-C; no process outlives the call.
     """
+    if (out / FILES.log).exists():
+        raise InputError(f"{out} holds a run already; choose another folder or remove it")
     out.mkdir(parents=True, exist_ok=True)
     (out / FILES.settings).write_text(settings.model_dump_json(indent=1) + "\n")
     this = _Race(settings, out, stages)

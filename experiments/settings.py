@@ -1,14 +1,15 @@
 """Everything a race can be told, as one resolved object that goes into the run directory."""
 
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.raceline import RaceLineSettings
 from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK
 from controller.pure_pursuit import PurePursuitSettings
 from controller.settings import MpcSettings
+from plant.simulator import PLANT
 
 __all__ = ["RaceSettings"]
 
@@ -36,3 +37,13 @@ class RaceSettings(BaseModel):
     raceline: RaceLineSettings = RaceLineSettings()
     pursuit: PurePursuitSettings = PurePursuitSettings()
     mpc: MpcSettings = MpcSettings()
+
+    @model_validator(mode="after")
+    def _resolve(self) -> Self:
+        """One seed and one sampling time hold for all parts; the plant's time is not to choose."""
+        steps = {self.discretisation.step_s, self.pursuit.step_s, PLANT.step_s}
+        if len(steps) > 1:
+            raise ValueError(f"all parts must share the plant's period of {PLANT.step_s} s")
+        seeded = self.pursuit.model_copy(update={"seed": self.seed})
+        object.__setattr__(self, "pursuit", seeded)
+        return self

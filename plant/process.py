@@ -61,7 +61,7 @@ class PlantSettings(BaseModel):
         le=60,
         description="how long a lockstep run waits for a controller to appear",
     )
-    die_with_parent: bool = Field(False, description="end when the starting process ends")
+    parent_pid: int | None = Field(None, description="end when this process, the parent, ends")
 
 
 class PlantProcess:
@@ -73,7 +73,7 @@ class PlantProcess:
         self._simulator = Simulator(dynamic(get_car(settings.car)))
         self._states = Publisher(session, STATE, self.name)
         self._events = Publisher(session, EVENT, self.name, "plant")
-        self._decoder: Decoder[Actuation] = Decoder(Actuation)
+        self._decoder: Decoder[Actuation] = Decoder(Actuation, _log)
         self._counters = RunCounters()
         self._run: Run | None = None
         self._run_number = 0
@@ -227,14 +227,13 @@ def main(settings: PlantSettings) -> int:
 
     Call it from the main thread of a process: it takes over the signals.
     """
-    if settings.die_with_parent:
-        die_with_parent()
+    die_with_parent(settings.parent_pid)
     if refusal := pin_to_cpu(settings.cpu):
         _log.warning("%s", refusal)
     with open_session(settings.endpoints) as session:
         process = PlantProcess(session, settings)
-        process.inbox.catch_signals()
         quiet_garbage_collector()
         _log.info("plant of car '%s' on %s", process.name, ", ".join(settings.endpoints.listen))
-        process.serve()
+        with process.inbox.catching_signals():
+            process.serve()
     return 0

@@ -10,6 +10,7 @@ import hashlib
 import itertools
 import json
 import math
+import os
 import signal
 import struct
 import subprocess
@@ -104,10 +105,10 @@ def running_rig(
 ) -> Iterator[Rig]:
     at_plant, at_controller = free_endpoint(), free_endpoint()
     ends: dict[str, Any] = {"listen": [at_plant], "low_latency": low_latency}
-    plant = start(PLANT, json.dumps({"endpoints": ends, "die_with_parent": True}))
+    plant = start(PLANT, json.dumps({"endpoints": ends, "parent_pid": os.getpid()}))
     ends = {"listen": [at_controller], "connect": [at_plant], "low_latency": low_latency}
     controller = start(
-        controller_code, json.dumps({"endpoints": ends, "die_with_parent": True}), str(seed)
+        controller_code, json.dumps({"endpoints": ends, "parent_pid": os.getpid()}), str(seed)
     )
     try:
         with open_session(Endpoints(connect=(at_plant, at_controller))) as session:
@@ -193,7 +194,7 @@ def test_a_free_running_car_brakes_when_its_controller_dies(tmp_path: Path) -> N
         )
         time.sleep(1.0)
         rig.controller.kill()
-        end = rig.director.wait_for_end(1, 10.0)
+        end = rig.director.wait_for_end(1, 10.0, without_controller_s=10.0)
     assert end.data["reason"] == "max_time"
     states = LogReader(tmp_path / "log").select(STATE)
     assert max(state.x[3] for state in states) > 0.5
@@ -290,11 +291,13 @@ def test_weights_for_a_controller_without_any_are_refused_with_a_reason(rig: Rig
     assert rig.director.status("controller").counters["weights_refused"] == 1
 
 
-def test_processes_do_not_outlive_who_started_them(tmp_path: Path) -> None:
+@pytest.mark.parametrize("after_s", [0.0, 1.5])
+def test_processes_do_not_outlive_who_started_them(after_s: float) -> None:
+    """Whether the parent dies while the child runs or while it is still starting."""
     starter = (
-        "import subprocess, sys, time, json\n"
+        "import os, subprocess, sys, time, json\n"
         "from bayesrace.transport import free_endpoint\n"
-        "s = json.dumps({'endpoints': {'listen': [free_endpoint()]}, 'die_with_parent': True})\n"
+        "s = json.dumps({'endpoints': {'listen': [free_endpoint()]}, 'parent_pid': os.getpid()})\n"
         "p = subprocess.Popen([sys.executable, '-c', sys.argv[1], s])\n"
         "print(p.pid, flush=True)\n"
         "time.sleep(60)\n"
@@ -302,6 +305,6 @@ def test_processes_do_not_outlive_who_started_them(tmp_path: Path) -> None:
     parent = start(starter, PLANT)
     assert parent.stdout is not None
     assert parent.stdout.readline().strip().isdigit()
-    time.sleep(1.5)
+    time.sleep(after_s)
     parent.kill()
     parent.communicate(timeout=10)  # returns when the child, which holds the pipe too, has ended

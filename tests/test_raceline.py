@@ -76,9 +76,7 @@ def test_line_is_one_closed_consistent_curve(name: str) -> None:
     assert np.abs(np.angle(np.exp(1j * (chord - middle)))).max() < 2e-3
     # between two stations kappa is linear; within a sample it may kink by the steering rate limit
     kappa = (line.kappa_radpm + np.roll(line.kappa_radpm, -1)) / 2
-    np.testing.assert_allclose(
-        closed_difference(line.psi_rad, turn) / step, kappa, atol=0.1
-    )
+    np.testing.assert_allclose(closed_difference(line.psi_rad, turn) / step, kappa, atol=0.1)
     gained = closed_difference(line.vx_mps**2) / (2 * step)
     meant = (line.ax_mps2 + np.roll(line.ax_mps2, -1)) / 2
     assert np.abs(gained - meant).max() < 0.2

@@ -6,6 +6,7 @@ Paper, eq. 7; how the correction reaches the pose is the discretisation's matter
 
 import casadi as ca
 
+from bayesrace.errors import InputError
 from bayesrace.gp.expression import mean_parameters, posterior_mean
 from bayesrace.gp.weights import OUTPUTS, GpWeights
 from bayesrace.integrators import Discretisation
@@ -15,12 +16,21 @@ __all__ = ["corrected_function"]
 
 
 def corrected_function(
-    model: Model, discretisation: Discretisation, weights: GpWeights | None
+    model: Model,
+    discretisation: Discretisation,
+    weights: GpWeights | None,
+    check_identity: bool = True,
 ) -> ca.Function:
     """``(x, u) -> x_next`` of the discretised model plus the posterior mean, as MX function.
 
-    ``weights`` None: no correction.
+    ``weights`` None: no correction. InputError if they were learned for another discretised model,
+    unless the caller knows why (``check_identity``).
     """
+    identity = discretisation.identity(model.name, model.car)
+    if weights is not None and check_identity and weights.discretisation != identity:
+        raise InputError(
+            f"weights '{weights.version}' were learned for {weights.discretisation}, not {identity}"
+        )
     if weights is None or not any(output.count or output.y_mean for output in weights.outputs):
         return discretisation.discretise(model)
     f = discretisation.corrected(model)

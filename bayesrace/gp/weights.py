@@ -66,7 +66,8 @@ SCHEMA: Final = 1
 _MAGIC: Final = b"BRACEGP\n"
 _HEAD: Final = struct.Struct("<8sI")
 _DIGEST_BYTES: Final = 32
-_MAX_TEXT: Final = 256
+_MAX_TEXT: Final = 200
+"""A version fits into every actuation message, whose texts have this limit."""
 
 
 def _array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:

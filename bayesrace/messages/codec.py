@@ -162,16 +162,17 @@ class Decoder(Generic[M]):
             self.refused += 1
             self.last_reason = str(error)
             if self._logger is not None:
-                self._log()
+                self.report(self._logger)
             return None
         self.accepted += 1
         return message
 
-    def _log(self) -> None:
+    def report(self, logger: logging.Logger) -> None:
+        """Log what was refused since the last time, unless that was just now."""
         now_ns = time.monotonic_ns()
-        if now_ns < self._quiet_until_ns or self._logger is None:
+        if now_ns < self._quiet_until_ns or self.refused == self._logged:
             return
-        self._logger.warning(
+        logger.warning(
             "refused %d message(s), the last: %s", self.refused - self._logged, self.last_reason
         )
         self._logged = self.refused

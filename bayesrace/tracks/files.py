@@ -56,7 +56,7 @@ def read_table(path: Path, columns: tuple[str, ...]) -> tuple[FloatArray, list[i
     """Numbers (n, len(columns)) of a CSV file and the line number of each row.
 
     Raises InputError for a file that can't be read, a wrong column count or a cell that is no
-    number; what the numbers mean is checked by the caller (they may be nan or infinite).
+    number; what the numbers mean is checked by the caller.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")

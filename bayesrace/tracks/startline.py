@@ -7,7 +7,7 @@ import numpy as np
 
 from bayesrace.tracks.track import Track
 
-__all__ = ["Crossing", "StartLine"]
+__all__ = ["Crossing", "CrossingLine", "StartLine"]
 
 _ON_LINE_M = 1e-9
 """A car placed on the line is past it, whatever rounding makes of its coordinates."""
@@ -21,20 +21,19 @@ class Crossing(NamedTuple):
     """Part of the step at which it crossed, in [0, 1]; 0 without a crossing."""
 
 
-class StartLine:
-    """The line across the track at s = 0, as long as the track is wide and a little beyond.
+class CrossingLine:
+    """A line across the way: from a point, the direction of driving and the reach to each side.
 
-    It ends half-way to the next piece of the track, so that a car there isn't counted.
+    Plant and analysis count laps with this one piece of code, or a run could end with a lap that
+    does not count.
     """
 
-    def __init__(self, track: Track) -> None:
-        x, y, psi = track.start_pose()
-        self._x, self._y = x, y
-        self._cos, self._sin = math.cos(psi), math.sin(psi)
-        self.right_m = self._reach(track, float(track.width_right_m[0]), -1.0)
-        """How far the line reaches to the right of the centreline."""
-        self.left_m = self._reach(track, float(track.width_left_m[0]), 1.0)
-        """How far the line reaches to the left of the centreline."""
+    def __init__(
+        self, x_m: float, y_m: float, heading_rad: float, left_m: float, right_m: float
+    ) -> None:
+        self._x, self._y = x_m, y_m
+        self._cos, self._sin = math.cos(heading_rad), math.sin(heading_rad)
+        self.left_m, self.right_m = left_m, right_m
 
     def signed_distance(self, x: float, y: float) -> float:
         """Distance past the line along the driving direction [m], negative before it."""
@@ -57,6 +56,19 @@ class StartLine:
         if not -self.right_m <= lateral <= self.left_m:
             return Crossing(0, 0.0)
         return Crossing(1 if is_past else -1, fraction)
+
+
+class StartLine(CrossingLine):
+    """The line across the track at s = 0, as long as the track is wide and a little beyond.
+
+    It ends half-way to the next piece of the track, so that a car there isn't counted.
+    """
+
+    def __init__(self, track: Track) -> None:
+        x, y, psi = track.start_pose()
+        super().__init__(x, y, psi, 0.0, 0.0)
+        self.right_m = self._reach(track, float(track.width_right_m[0]), -1.0)
+        self.left_m = self._reach(track, float(track.width_left_m[0]), 1.0)
 
     def _reach(self, track: Track, width: float, side: float) -> float:
         """Twice the width, but not beyond the middle between this piece and the next one."""

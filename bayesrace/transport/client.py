@@ -73,14 +73,15 @@ class Director:
     def wait_for(self, sources: Collection[str], timeout_s: float) -> None:
         """Wait until these processes are there and know of this one's subscriptions."""
         deadline = time.monotonic() + timeout_s
-        while missing := set(sources) - self.inbox.alive:
-            left_s = deadline - time.monotonic()
-            if left_s <= 0:
-                raise InputError(
-                    f"no {' and no '.join(sorted(missing))} for car '{self._car}' within "
-                    f"{timeout_s:g} s; start it, or check the endpoints"
-                )
-            self._raise_on_signal(self.inbox.get(left_s))
+        with self.inbox.catching_signals():
+            while missing := set(sources) - self.inbox.alive:
+                left_s = deadline - time.monotonic()
+                if left_s <= 0:
+                    raise InputError(
+                        f"no {' and no '.join(sorted(missing))} for car '{self._car}' within "
+                        f"{timeout_s:g} s; start it, or check the endpoints"
+                    )
+                self._raise_on_signal(self.inbox.get(left_s))
         # What was declared before a request is known to who has answered it.
         for source in sources:
             self.status(source)
@@ -103,25 +104,31 @@ class Director:
         reply = self._accepted("weights", ask(self._session, WEIGHTS, self._car, data))
         return str(reply.data.get("version", ""))
 
-    def wait_for_end(self, run: int, timeout_s: float) -> Event:
+    def wait_for_end(self, run: int, timeout_s: float, without_controller_s: float = 1.0) -> Event:
         """The ``run_ended`` event of a run.
 
-        Raises InputError if the plant vanishes or the time is over; KeyboardInterrupt on a signal
-        that the inbox catches.
+        In lockstep the plant ends the run itself when the controller vanishes; by the wall clock
+        it brakes and goes on, which is allowed for ``without_controller_s``. Raises InputError if
+        a process vanishes or the time is over; KeyboardInterrupt on a signal.
         """
         deadline = time.monotonic() + timeout_s
-        while (left_s := deadline - time.monotonic()) > 0:
-            item = self.inbox.get(min(left_s, 1.0))
-            if item is None:
-                continue
-            self._raise_on_signal(item)
-            if item.kind is Kind.GONE and item.name == "plant":
-                raise InputError(f"the plant of car '{self._car}' vanished during run {run}")
-            if item.kind is Kind.MESSAGE:
-                event = self._decode(item.value)
-                if event is not None and event.run == run and event.kind == "run_ended":
-                    return event
-        raise InputError(f"run {run} of car '{self._car}' did not end within {timeout_s:g} s")
+        lost = ""
+        with self.inbox.catching_signals():
+            while (left_s := deadline - time.monotonic()) > 0:
+                item = self.inbox.get(min(left_s, 1.0))
+                if item is None:
+                    continue
+                self._raise_on_signal(item)
+                if item.kind is Kind.GONE and item.name == "plant":
+                    raise InputError(f"the plant of car '{self._car}' vanished during run {run}")
+                if item.kind is Kind.GONE and item.name == "controller":
+                    lost = f"the controller of car '{self._car}' vanished during run {run}"
+                    deadline = min(deadline, time.monotonic() + without_controller_s)
+                if item.kind is Kind.MESSAGE:
+                    event = self._decode(item.value)
+                    if event is not None and event.run == run and event.kind == "run_ended":
+                        return event
+        raise InputError(lost or f"run {run} of car '{self._car}' did not end in {timeout_s:g} s")
 
     @staticmethod
     def _accepted(what: str, reply: Reply) -> Reply:

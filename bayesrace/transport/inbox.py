@@ -157,14 +157,22 @@ class Inbox:
             self._session.liveliness().declare_subscriber(key, _direct(on_token), history=True)
         )
 
-    def catch_signals(self) -> None:
-        """Let SIGINT and SIGTERM arrive as items; main thread only."""
+    @contextmanager
+    def catching_signals(self) -> Iterator[None]:
+        """For the block, let SIGINT and SIGTERM arrive as items; nothing off the main thread."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
 
         def on_signal(number: int, _frame: FrameType | None) -> None:
             self._items.put(Item(Kind.SIGNAL, "", number, time.monotonic_ns()))
 
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, on_signal)
+        before = {n: signal.signal(n, on_signal) for n in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
 
     def get(self, timeout_s: float = 0.0) -> Item | None:
         """The next item; None if nothing arrives in time."""

@@ -77,7 +77,8 @@ typedef struct {
     double delta_rate_max_radps;
     double tolerance;        /* of the scaled KKT residual for BR_CONVERGED */
     double defect_max;       /* largest dynamics defect of an acceptable plan */
-    double settle;           /* stationarity, and tenth of the defect, that end a step early; 0: go on */
+    double settle;           /* a step ends at this stationarity and tenth of the defect, or, warm,
+                                when they fall by less than half; 0: neither */
     int iterations;          /* SQP iterations a step may use */
     int iterations_cold;     /* the same for the first step after a reset */
 } br_mpc_parameters;

@@ -201,6 +201,10 @@ br_mpc_error br_gp_load(br_gp *gp, const br_mpc_gp outputs[BR_NE]) {
                 out->inputs[a][i] = i < in->n ? in->inputs[i * BR_NZ + a] * out->inverse_scale[a] : 0;
         }
         for (int i = 0; i < out->n_padded; ++i) out->alpha[i] = i < in->n ? in->scale * in->alpha[i] : 0;
+        /* finite numbers may overflow once scaled: refused here, not found out while driving */
+        int finite = br_all_finite(out->alpha, out->n_padded) && br_all_finite(out->inverse_scale, BR_NZ);
+        for (int a = 0; a < BR_NZ; ++a) finite = finite && br_all_finite(out->inputs[a], out->n_padded);
+        if (!finite) return BR_ERROR_WEIGHTS;
         if (in->n || in->offset != 0.0) gp->any = 1;
     }
     return BR_OK;

@@ -120,6 +120,8 @@ void br_qp_forget_working_set(br_qp *qp);
 
 /* br_residuals.c */
 int br_all_finite(const double *values, int n);
+/* The larger one, and NaN if either is: fmax would lose a NaN and with it a bad solution. */
+static inline double br_worse(double a, double b) { return b > a || b != b ? b : a; }
 void br_residuals(br_mpc *mpc, double penalty);
 br_mpc_status br_judge(const br_mpc *mpc);
 

@@ -318,13 +318,16 @@ br_mpc_status br_qp_solve(br_mpc *mpc, int warm) {
     if (!br_all_finite(qp->dupper, rows) || !br_all_finite(qp->dlower, rows)) return BR_NOT_FINITE;
     if (!warm) br_qp_forget_working_set(qp);
     int flag = run_daqp(qp, rows, slack_weight);
+    mpc->info.qp_iterations += qp->daqp.iterations;
     if (flag < 0 && warm) { /* once more without the old working set before giving up */
         br_qp_forget_working_set(qp);
         flag = run_daqp(qp, rows, slack_weight);
+        mpc->info.qp_iterations += qp->daqp.iterations;
     }
-    mpc->info.qp_iterations += qp->daqp.iterations;
     if (flag == EXIT_INFEASIBLE) return BR_INFEASIBLE;
     if (flag < 0) return BR_QP_LIMIT;
     recover(qp);
-    return br_all_finite(qp->delta_u, BR_M) ? BR_CONVERGED : BR_NOT_FINITE;
+    return br_all_finite(qp->delta_u, BR_M) && br_all_finite(qp->multiplier, BR_ROWS)
+               ? BR_CONVERGED
+               : BR_NOT_FINITE;
 }

@@ -23,7 +23,7 @@ static double stage_cost(br_mpc *mpc, int k) {
     if (par->s_slack > 0) {
         const double along = ref->normal_x * x[0] + ref->normal_y * x[1];
         slack = fmax(0, fmax(ref->lower + par->margin_m - along, along - ref->upper + par->margin_m));
-        mpc->info.slack_max_m = fmax(mpc->info.slack_max_m, slack);
+        mpc->info.slack_max_m = br_worse(mpc->info.slack_max_m, slack);
     }
     return par->q_position * (ex * ex + ey * ey) + par->r_duty * change * change +
            par->r_delta_rate * u[1] * u[1] + par->s_slack * slack * slack;
@@ -35,7 +35,7 @@ static double bound_violation(const br_mpc *mpc, int k) {
     const double duty = fmax(par->d_min - u[0], u[0] - par->d_max);
     const double steering = fmax(fabs(u[1]) - par->delta_rate_max_radps,
                                  fabs(mpc->plan.x[k][6]) - par->delta_max_rad);
-    return fmax(duty, steering);
+    return br_worse(duty, steering);
 }
 
 /* Gradient of the Lagrangian in the inputs by the adjoint recursion, which makes it stationary in
@@ -58,8 +58,8 @@ static double stationarity(const br_mpc *mpc) {
         for (int c = 0; c < BR_NU; ++c) {
             double through = 0;
             for (int j = 0; j < BR_NX; ++j) through += stage->jacobian[j][BR_NX + c] * p[j];
-            worst = fmax(worst, fabs(own[c] + through + multiplier[BR_NU * (k - 1) + c]));
-            size = fmax(size, fabs(through));
+            worst = br_worse(worst, fabs(own[c] + through + multiplier[BR_NU * (k - 1) + c]));
+            size = br_worse(size, fabs(through));
         }
         double next[BR_NX] = {0};
         for (int i = 0; i < BR_NX; ++i)
@@ -79,11 +79,11 @@ void br_residuals(br_mpc *mpc, double penalty) {
         const double *model = k ? mpc->stage[k - 1].f : mpc->x0;
         for (int i = 0; i < BR_NX; ++i) {
             const double gap = fabs(model[i] - mpc->plan.x[k][i]);
-            info->defect = fmax(info->defect, gap / STATE_SCALE[i]);
+            info->defect = br_worse(info->defect, gap / STATE_SCALE[i]);
             sum += gap;
         }
         if (k == 0) continue;
-        bound = fmax(bound, bound_violation(mpc, k));
+        bound = br_worse(bound, bound_violation(mpc, k));
         info->cost += stage_cost(mpc, k);
     }
     info->bound = bound;

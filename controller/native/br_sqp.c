@@ -109,22 +109,22 @@ static void line_search(br_mpc *mpc) {
     direction(mpc);
     const double weight = penalty(&mpc->qp);
     br_residuals(mpc, weight);
-    const double merit = mpc->merit, residual = fmax(mpc->info.stationarity, mpc->info.defect);
+    const double merit = mpc->merit, residual = br_worse(mpc->info.stationarity, mpc->info.defect);
     mpc->before = mpc->plan;
     double t = 1.0;
     for (int trial = 0; trial < BR_LINE_SEARCH_TRIALS; ++trial, t *= 0.5) {
         move(mpc, t);
         br_residuals(mpc, weight);
-        if (mpc->merit <= merit || fmax(mpc->info.stationarity, mpc->info.defect) <= 0.9 * residual) return;
+        if (mpc->merit <= merit || br_worse(mpc->info.stationarity, mpc->info.defect) <= 0.9 * residual) return;
         mpc->info.shortened += 1;
     }
 }
 
-/* Another iteration would change little that matters for the next 20 ms, or, where the Hessian is
+/* Another iteration would change little that matters until the next step, or, where the Hessian is
  * indefinite and convergence slow, cost more than it gives. settle = 0 means to go on regardless. */
 static int settled(const br_mpc *mpc, double *residual) {
     const double before = *residual;
-    *residual = fmax(mpc->info.stationarity, 0.1 * mpc->info.defect);
+    *residual = br_worse(mpc->info.stationarity, 0.1 * mpc->info.defect);
     if (mpc->parameters.settle == 0) return 0;
     return *residual <= mpc->parameters.settle || (mpc->warm && *residual > 0.5 * before);
 }
@@ -149,7 +149,7 @@ static br_mpc_status optimise(br_mpc *mpc) {
 }
 
 static int plausible_state(const double x[BR_NX]) {
-    static const double limit[BR_NX] = {1e4, 1e4, 1e4, 100, 100, 1e3, 1.5};
+    static const double limit[BR_NX] = {1e4, 1e4, 1e7, 100, 100, 1e3, 1.5};
     for (int i = 0; i < BR_NX; ++i)
         if (!(fabs(x[i]) <= limit[i])) return 0;
     return 1;
@@ -164,24 +164,25 @@ static void solve(br_mpc *mpc, double u[BR_NU], br_mpc_status *status, br_mpc_in
 }
 
 static br_mpc_error begin(br_mpc *mpc, const double x[BR_NX], double d_previous, const double *u,
-                          br_mpc_status *status, br_mpc_info *info) {
+                          br_mpc_status *status, br_mpc_info *info, int *plausible) {
     if (!mpc || !x || !u || !status) return BR_ERROR_NULL;
-    if (!mpc->has_parameters) return BR_ERROR_NOT_READY;
+    *status = BR_BAD_STATE; /* until there is something better to say */
     memset(&mpc->info, 0, sizeof mpc->info);
     if (info) *info = mpc->info;
-    *status = BR_BAD_STATE;
-    if (!plausible_state(x) || !(fabs(d_previous) <= 1e3)) return BR_OK;
-    *status = BR_ACCEPTABLE;
-    memcpy(mpc->x0, x, sizeof mpc->x0);
+    if (!mpc->has_parameters) return BR_ERROR_NOT_READY;
+    *plausible = plausible_state(x) && fabs(d_previous) <= 1e3;
+    if (*plausible) memcpy(mpc->x0, x, sizeof mpc->x0);
     mpc->d_previous = d_previous;
     return BR_OK;
 }
 
 br_mpc_error br_mpc_step(br_mpc *mpc, const double x[BR_NX], double d_previous, double u[BR_NU],
                          br_mpc_status *status, br_mpc_info *info) {
-    const br_mpc_error error = begin(mpc, x, d_previous, u, status, info);
-    if (error || *status == BR_BAD_STATE) return error;
+    int plausible;
+    const br_mpc_error error = begin(mpc, x, d_previous, u, status, info, &plausible);
+    if (error) return error;
     if (!mpc->path.ready) return BR_ERROR_NOT_READY;
+    if (!plausible) return BR_OK;
     br_path_plan(&mpc->path, x, mpc->reference, &mpc->info.lateral_m);
     mpc->info.s_ref_m = mpc->path.s;
     solve(mpc, u, status, info);
@@ -192,8 +193,9 @@ br_mpc_error br_mpc_solve(br_mpc *mpc, const double x[BR_NX], double d_previous,
                           const br_mpc_reference reference[BR_N], double u[BR_NU],
                           br_mpc_status *status, br_mpc_info *info) {
     if (!reference) return BR_ERROR_NULL;
-    const br_mpc_error error = begin(mpc, x, d_previous, u, status, info);
-    if (error || *status == BR_BAD_STATE) return error;
+    int plausible;
+    const br_mpc_error error = begin(mpc, x, d_previous, u, status, info, &plausible);
+    if (error || !plausible) return error;
     memcpy(mpc->reference, reference, sizeof mpc->reference);
     solve(mpc, u, status, info);
     return BR_OK;

@@ -5,6 +5,7 @@ import sys
 from typing import Annotated
 
 import typer
+from pydantic import ValidationError
 
 from bayesrace import __version__
 from bayesrace.errors import InputError
@@ -46,6 +47,14 @@ def main() -> None:
         app(standalone_mode=False)
     except InputError as error:
         _fail(str(error))
+    except ValidationError as error:
+        words = "; ".join(
+            f"{'.'.join(str(part) for part in one['loc']) or 'settings'}: {one['msg']}"
+            for one in error.errors()
+        )
+        _fail(words)
+    except OSError as error:
+        _fail(f"{error.filename or 'system'}: {error.strerror or error}")
     except typer.Abort:
         _fail("aborted", 130)
     except KeyboardInterrupt:

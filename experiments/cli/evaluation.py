@@ -112,7 +112,6 @@ def drive(
     course = load_track(track)
     with open_session(endpoints) as session, Recorder(session, car, log):
         director = Director(session, car)
-        director.inbox.catch_signals()
         director.wait_for(("plant", "controller"), 10.0)
         publisher: Publisher[Event] = Publisher(session, EVENT, car, "race")
         number = director.status("plant").run + 1

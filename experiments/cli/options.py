@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-__all__ = ["Car", "DieWithParent", "LowLatency", "OutFile", "RaceLineFile", "TrackName"]
+__all__ = ["Car", "LowLatency", "OutFile", "ParentPid", "RaceLineFile", "TrackName"]
 
 Car = Annotated[str, typer.Option(help="Built-in car.")]
 TrackName = Annotated[str, typer.Option(help="Track: built-in name, random:SEED or CSV file.")]
@@ -19,4 +19,4 @@ LowLatency = Annotated[
         help="Send in the calling thread. For lockstep, on plant and controller alike.",
     ),
 ]
-DieWithParent = Annotated[bool, typer.Option(hidden=True, help="End when the parent ends.")]
+ParentPid = Annotated[int | None, typer.Option(hidden=True, help="End when this parent ends.")]

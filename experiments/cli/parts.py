@@ -5,7 +5,8 @@ from typing import Annotated
 
 import typer
 
-from experiments.cli.options import Car, DieWithParent, LowLatency, RaceLineFile, TrackName
+from bayesrace.clock import die_with_parent
+from experiments.cli.options import Car, LowLatency, ParentPid, RaceLineFile, TrackName
 
 __all__ = ["register"]
 
@@ -20,14 +21,15 @@ def plant(
         list[str] | None, typer.Option(help="Further endpoints to connect to.")
     ] = None,
     low_latency: LowLatency = False,
-    die_with_parent: DieWithParent = False,
+    parent_pid: ParentPid = None,
 ) -> None:
     """Play the car: waits for a run to be asked for ('bayesrace drive'), until Ctrl-C."""
+    die_with_parent(parent_pid)
     from bayesrace.transport import Endpoints
     from plant.process import PlantSettings, main
 
     endpoints = Endpoints(listen=(endpoint,), connect=tuple(connect or ()), low_latency=low_latency)
-    settings = PlantSettings(car=car, endpoints=endpoints, die_with_parent=die_with_parent)
+    settings = PlantSettings(car=car, endpoints=endpoints, parent_pid=parent_pid)
     raise typer.Exit(main(settings))
 
 
@@ -49,9 +51,10 @@ def controller(
         str, typer.Option(help="Zenoh endpoint to listen on, for who records or sends weights.")
     ] = _CONTROLLER,
     low_latency: LowLatency = False,
-    die_with_parent: DieWithParent = False,
+    parent_pid: ParentPid = None,
 ) -> None:
     """Drive the car of a plant process with the compiled controller, until Ctrl-C."""
+    die_with_parent(parent_pid)
     from bayesrace.transport import Endpoints
     from bayesrace.vehicles import get_car
     from controller.assembly import predictive_controller
@@ -61,7 +64,7 @@ def controller(
         listen=(listen,), connect=tuple(endpoint or (_PLANT,)), low_latency=low_latency
     )
     driver = predictive_controller(artefact, get_car(car), track, raceline, settings, weights)
-    process = ControllerSettings(car=car, endpoints=endpoints, die_with_parent=die_with_parent)
+    process = ControllerSettings(car=car, endpoints=endpoints, parent_pid=parent_pid)
     raise typer.Exit(main(process, driver))
 
 
