@@ -188,6 +188,7 @@ class _Paddock:
                 self._wait_for_both()
                 yield
             self.children.remove(process)
+        self.director.wait_until_gone("controller", _START_S)
 
     def _wait_for_both(self) -> None:
         deadline = time.monotonic() + _START_S

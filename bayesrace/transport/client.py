@@ -86,6 +86,12 @@ class Director:
         for source in sources:
             self.status(source)
 
+    def wait_until_gone(self, source: str, timeout_s: float) -> None:
+        """Wait until a process that has ended is no longer taken for present."""
+        deadline = time.monotonic() + timeout_s
+        while source in self.inbox.alive and (left_s := deadline - time.monotonic()) > 0:
+            self.inbox.get(left_s)
+
     def status(self, source: str) -> Status:
         """What the process says of itself."""
         request = StatusRequest(0, time.monotonic_ns())
@@ -111,7 +117,7 @@ class Director:
         it brakes and goes on, which is allowed for ``without_controller_s``. Raises InputError if
         a process vanishes or the time is over; KeyboardInterrupt on a signal.
         """
-        deadline = time.monotonic() + timeout_s
+        deadline = last = time.monotonic() + timeout_s
         lost = ""
         with self.inbox.catching_signals():
             while (left_s := deadline - time.monotonic()) > 0:
@@ -124,6 +130,8 @@ class Director:
                 if item.kind is Kind.GONE and item.name == "controller":
                     lost = f"the controller of car '{self._car}' vanished during run {run}"
                     deadline = min(deadline, time.monotonic() + without_controller_s)
+                if item.kind is Kind.ALIVE and item.name == "controller" and lost:
+                    lost, deadline = "", last
                 if item.kind is Kind.MESSAGE:
                     event = self._decode(item.value)
                     if event is not None and event.run == run and event.kind == "run_ended":

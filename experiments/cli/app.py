@@ -2,7 +2,7 @@
 
 import logging
 import sys
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 from pydantic import ValidationError
@@ -12,6 +12,8 @@ from bayesrace.errors import InputError
 from experiments.cli import evaluation, parts, preparation
 
 __all__ = ["app", "main"]
+
+_INTERRUPTED: Final = 130
 
 app = typer.Typer(
     name="bayesrace",
@@ -44,7 +46,11 @@ for group in (evaluation, preparation, parts):
 def main() -> None:
     """Runs the command line; bad input and lost processes end in one line, not in a traceback."""
     try:
-        app(standalone_mode=False)
+        # Typer turns Ctrl-C and Exit into the value it returns, and older ones Ctrl-C into Abort.
+        code = app(standalone_mode=False)
+        if code == _INTERRUPTED:
+            raise KeyboardInterrupt
+        sys.exit(code)
     except InputError as error:
         _fail(str(error))
     except ValidationError as error:
@@ -54,11 +60,10 @@ def main() -> None:
         )
         _fail(words)
     except OSError as error:
-        _fail(f"{error.filename or 'system'}: {error.strerror or error}")
-    except typer.Abort:
-        _fail("aborted", 130)
-    except KeyboardInterrupt:
-        _fail("interrupted", 130)
+        where = error.filename or "system"
+        _fail(f"{where}: {error.strerror or error}; choose a path that can be read or written")
+    except (typer.Abort, KeyboardInterrupt):
+        _fail("interrupted", _INTERRUPTED)
     except RuntimeError as error:
         # our own: RaceError, RaceLineError, CompileError
         if type(error).__module__.split(".")[0] not in ("bayesrace", "codegen", "experiments"):
@@ -72,5 +77,7 @@ def main() -> None:
 
 
 def _fail(text: str, code: int = 2) -> None:
+    if not text.strip():  # no command given: the help has been shown
+        sys.exit(code)
     typer.secho(f"bayesrace: {text}", err=True, fg=typer.colors.RED)
     sys.exit(code)
