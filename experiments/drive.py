@@ -11,6 +11,9 @@ from bayesrace.transport import Director, Publisher
 
 __all__ = ["RunPlan", "execute", "run_request"]
 
+_REGULAR = ("laps", "max_time", "left_world")
+"""Ends of a run that the car's driving, not a fault, has brought about."""
+
 
 @dataclass(frozen=True)
 class RunPlan:
@@ -61,14 +64,18 @@ def _announce(publisher: Publisher[Event], plan: RunPlan, weights_version: str) 
 def execute(director: Director, publisher: Publisher[Event], track: Track, plan: RunPlan) -> Event:
     """Announces and starts the run and waits for its end; the plant's ``run_ended`` event.
 
-    InputError if the plant refuses or vanishes; KeyboardInterrupt on a signal.
+    InputError if the plant refuses, or the run ended by anything but its laps, its time limit or
+    the car's leaving the world; KeyboardInterrupt on a signal.
     """
     _announce(publisher, plan, director.status("controller").weights_version)
     director.start(run_request(track, plan))
     try:
         # In lockstep simulated time passes faster than the clock's, but nobody promises it.
-        return director.wait_for_end(plan.run, 30.0 + 3.0 * plan.max_time_s)
+        end = director.wait_for_end(plan.run, 30.0 + 3.0 * plan.max_time_s)
     except (InputError, KeyboardInterrupt):
         with suppress(InputError):  # a car must not drive on when nobody watches it
             director.stop("who started the run has left")
         raise
+    if end.data.get("reason") not in _REGULAR:
+        raise InputError(f"run {plan.run} ({plan.controller}) ended early: {end.text}")
+    return end

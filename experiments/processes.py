@@ -38,7 +38,8 @@ class Child:
         if code is None:
             return ""
         words = self.output.read_text(errors="replace").strip().splitlines()
-        said = f": {words[-1]}" if words else ""
+        # Who is killed had no time for last words: those of the start would mislead.
+        said = f": {words[-1]}" if words and code != -signal.SIGKILL else ""
         how = f"was killed by signal {-code}" if code < 0 else f"ended with code {code}"
         return f"{how}{said}"
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK
-from experiments.cli.options import Car, TrackName
+from experiments.cli.options import Car, TrackName, writable
 
 __all__ = ["register"]
 
@@ -23,8 +23,12 @@ class Mode(StrEnum):
 def race(
     car: Car = "orca",
     track: TrackName = DEFAULT_RACE_TRACK,
-    train_track: TrackName = DEFAULT_TRAINING_TRACK,
-    laps: Annotated[int, typer.Option(min=1, help="Laps per controller, first from rest.")] = 2,
+    train_track: Annotated[
+        str, typer.Option(help="Track of the training drive: the same forms.")
+    ] = DEFAULT_TRAINING_TRACK,
+    laps: Annotated[
+        int, typer.Option(min=1, max=100, help="Laps per controller, first from rest.")
+    ] = 2,
     mode: Annotated[Mode, typer.Option(help="Simulated or wall-clock time.")] = Mode.lockstep,
     constraints: Annotated[bool, typer.Option(help="Track constraints of the OCP.")] = True,
     out: Annotated[
@@ -91,7 +95,9 @@ def drive(
         typer.Option(help="Plant and controller, one each; the defaults of both without."),
     ] = None,
     max_time: Annotated[float, typer.Option(min=1, help="Time limit [s].")] = 60.0,
-    log: Annotated[Path, typer.Option(help="Log to write (MCAP).")] = Path("run.mcap"),
+    log: Annotated[Path, typer.Option(callback=writable, help="Log to write (MCAP).")] = Path(
+        "run.mcap"
+    ),
     car: Car = "orca",
 ) -> None:
     """Start a run on a plant and a controller that are waiting elsewhere, and record it."""
@@ -122,13 +128,16 @@ def drive(
 
 def bench(
     json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the numbers to this file.")
+        Path | None,
+        typer.Option("--json", callback=writable, help="Write the numbers to this file."),
     ] = None,
     track: TrackName = DEFAULT_RACE_TRACK,
-    problems: Annotated[int, typer.Option(min=10, help="Recorded problems, step.")] = 400,
-    peers: Annotated[int, typer.Option(min=1, help="Of these, solved by IPOPT.")] = 25,
+    problems: Annotated[
+        int, typer.Option(min=10, help="Problems to record, all solved by the compiled step.")
+    ] = 400,
+    peers: Annotated[int, typer.Option(min=1, help="How many of them IPOPT solves too.")] = 25,
     points: Annotated[int, typer.Option(min=20, max=1024, help="Training points per GP.")] = 400,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the training drive and the GP.")] = 0,
 ) -> None:
     """Time the compiled step beside the paper's formulation in CasADi + IPOPT, same problems."""
     from rich.console import Console

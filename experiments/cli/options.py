@@ -5,14 +5,35 @@ from typing import Annotated
 
 import typer
 
-__all__ = ["Car", "LowLatency", "OutFile", "ParentPid", "RaceLineFile", "TrackName"]
+from bayesrace.errors import InputError
+
+__all__ = [
+    "Car",
+    "LowLatency",
+    "OutFile",
+    "ParentPid",
+    "RaceLineFile",
+    "TrackName",
+    "writable",
+]
 
 Car = Annotated[str, typer.Option(help="Built-in car.")]
 TrackName = Annotated[str, typer.Option(help="Track: built-in name, random:SEED or CSV file.")]
 RaceLineFile = Annotated[
     Path, typer.Option("--raceline", help="Racing line file, as 'bayesrace raceline' writes it.")
 ]
-OutFile = Annotated[Path, typer.Option("--out", "-o", help="File to write.")]
+
+
+def writable(path: Path | None) -> Path | None:
+    """Callback of options that name a file to write: complains before the work, not after it."""
+    if path is not None and not path.parent.is_dir():
+        raise InputError(f"cannot write {path}: no folder {path.parent}; make it first")
+    if path is not None and path.is_dir():
+        raise InputError(f"cannot write {path}: it is a folder; name a file in it")
+    return path
+
+
+OutFile = Annotated[Path, typer.Option("--out", "-o", callback=writable, help="File to write.")]
 LowLatency = Annotated[
     bool,
     typer.Option(

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from experiments.cli.options import Car, OutFile, RaceLineFile, TrackName
+from experiments.cli.options import Car, OutFile, RaceLineFile, TrackName, writable
 
 __all__ = ["register"]
 
@@ -22,7 +22,9 @@ def tracks(
     name: Annotated[
         str | None, typer.Argument(help="Built-in name, random:SEED or CSV file; all without.")
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Write it as CSV.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", callback=writable, help="Write it as CSV.")
+    ] = None,
 ) -> None:
     """List the built-in tracks, check a track file, or write a track to a file."""
     import numpy as np

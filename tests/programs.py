@@ -1,0 +1,145 @@
+"""The command line as its users have it: programs of their own, found again in /proc.
+
+What a race starts carries the race's process number in its arguments (``--parent-pid``), so that
+an orphan can be recognised whatever became of the race.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from bayesrace.tracks import Track, write_track
+
+__all__ = [
+    "COMMAND",
+    "PATIENCE_S",
+    "ROOT",
+    "Race",
+    "environment",
+    "finish",
+    "leftovers",
+    "peanut",
+    "run",
+    "start",
+    "started_by",
+    "until",
+]
+
+ROOT: Final = Path(__file__).resolve().parents[1]
+COMMAND: Final = (sys.executable, "-m", "experiments.cli")
+PATIENCE_S: Final = 240.0
+"""For what takes seconds on an idle machine; the tests' machine is not idle."""
+
+
+def environment() -> dict[str, str]:
+    """A wide terminal without colours, so that no cell of a table is wrapped."""
+    return {**os.environ, "COLUMNS": "200", "NO_COLOR": "1", "TERM": "dumb"}
+
+
+def start(*arguments: str | Path, **popen: Any) -> subprocess.Popen[str]:
+    """Starts ``bayesrace`` with these arguments, in the checkout, outputs captured as text."""
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **popen}
+    command = [*COMMAND, *map(str, arguments)]
+    return subprocess.Popen(
+        command, stdin=subprocess.DEVNULL, text=True, cwd=ROOT, env=environment(), **pipes
+    )
+
+
+def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """Runs ``bayesrace`` to its end, whatever the exit code."""
+    return finish(start(*arguments))
+
+
+def finish(process: subprocess.Popen[str]) -> subprocess.CompletedProcess[str]:
+    """Waits for the end and collects the outputs; kills what does not end."""
+    try:
+        out, err = process.communicate(timeout=PATIENCE_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.communicate()
+        raise
+    return subprocess.CompletedProcess(process.args, process.returncode, out, err)
+
+
+def until(true: Callable[[], object], what: str, seconds: float = PATIENCE_S) -> None:
+    """Waits until the condition holds; an AssertionError naming it if it never does."""
+    deadline = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < deadline, f"not within {seconds:g} s: {what}"
+        time.sleep(0.02)
+
+
+def _arguments(pid: str) -> list[str]:
+    try:
+        return (Path("/proc") / pid / "cmdline").read_bytes().decode().split("\0")
+    except OSError:  # it has just ended
+        return []
+
+
+def started_by(race: int) -> dict[str, int]:
+    """Subcommand to process number of what that race started and still runs."""
+    found = {}
+    for entry in Path("/proc").glob("[0-9]*"):
+        words = _arguments(entry.name)
+        if "--parent-pid" in words and words[words.index("--parent-pid") + 1] == str(race):
+            found[words[words.index("experiments.cli") + 1]] = int(entry.name)
+    return found
+
+
+def leftovers(race: int, seconds: float = 20.0) -> dict[str, int]:
+    """What still runs of a race that is over, after a while to end."""
+    deadline = time.monotonic() + seconds
+    while (alive := started_by(race)) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return alive
+
+
+def peanut(path: Path) -> Path:
+    """Writes a circuit of 6.4 m: the shortest race."""
+    angle = np.linspace(0, 2 * np.pi, 160, endpoint=False)
+    radius = 0.8 + 0.32 * np.cos(2 * angle)
+    points = np.column_stack([1.15 * radius * np.cos(angle), radius * np.sin(angle)])
+    write_track(path, Track.from_points("peanut", points, 0.16, 0.18))
+    return path
+
+
+@dataclass
+class Race:
+    """A race that ran to its end."""
+
+    out: Path
+    pid: int
+    process: subprocess.CompletedProcess[str]
+
+    @classmethod
+    def running(cls, out: Path, *arguments: str | Path) -> Callable[[], "Race"]:
+        """Starts a race; call the result to wait for its end."""
+        process = start("race", "--out", out, *arguments)
+
+        def wait() -> Race:
+            done = finish(process)
+            assert done.returncode == 0, done.stderr
+            return cls(out, process.pid, done)
+
+        return wait
+
+    @property
+    def result(self) -> dict[str, Any]:
+        """Content of result.json."""
+        content: dict[str, Any] = json.loads((self.out / "result.json").read_text())
+        return content
+
+    def lap(self, controller: str) -> dict[str, Any]:
+        """That controller's entry."""
+        found: dict[str, Any] = next(
+            lap for lap in self.result["laps"] if lap["controller"] == controller
+        )
+        return found

@@ -1,0 +1,361 @@
+"""The command line: help that reads well, errors in one line, and the chain of files by hand."""
+
+import logging
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from bayesrace.gp.weights import write_weights, zero_weights
+from bayesrace.integrators import Discretisation
+from bayesrace.log import LogReader
+from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY
+from bayesrace.raceline.line import write_raceline
+from bayesrace.tracks import write_track
+from bayesrace.transport import Director, free_endpoint
+from bayesrace.vehicles import get_car
+from experiments.cli import main
+from tests.conftest import Circuit
+from tests.programs import environment, finish, run, start, until
+
+SUBCOMMANDS = (
+    "race", "drive", "report", "bench", "tracks", "raceline", "collect", "train", "build",
+    "plant", "controller",
+)  # fmt: skip
+
+
+class Outcome:
+    """Exit code and what was said."""
+
+    def __init__(self, code: int, out: str, err: str) -> None:
+        self.code, self.out, self.err = code, out, err
+
+
+Cli = Callable[..., Outcome]
+
+
+@pytest.fixture
+def cli(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path) -> Cli:
+    """Calls the program's entry point here, in an empty folder, which is faster than a process."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "120")
+    monkeypatch.setenv("NO_COLOR", "1")
+    monkeypatch.setattr(logging, "basicConfig", lambda **_: None)
+
+    def call(*arguments: str | Path) -> Outcome:
+        monkeypatch.setattr(sys, "argv", ["bayesrace", *map(str, arguments)])
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as end:
+            main()
+        code = end.value.code
+        assert code is None or isinstance(code, int)
+        out, err = capfd.readouterr()
+        return Outcome(code or 0, out, err)
+
+    return call
+
+
+def refused(outcome: Outcome, *words: str) -> None:
+    """Bad input: code 2 and one line on stderr that names the thing and the remedy."""
+    assert outcome.code == 2, outcome.err
+    assert outcome.err.startswith("bayesrace: ")
+    assert len(outcome.err.strip().splitlines()) == 1, outcome.err
+    assert "Traceback" not in outcome.err + outcome.out
+    for word in words:
+        assert word in outcome.err, outcome.err
+
+
+@pytest.fixture
+def course(circuit: Circuit, tmp_path: Path) -> tuple[str | Path, ...]:
+    """Arguments that name a track and its line, as files."""
+    track, line = tmp_path / "track.csv", tmp_path / "line.csv"
+    write_track(track, circuit.track)
+    write_raceline(line, circuit.line)
+    return "--track", track, "--raceline", line
+
+
+# Help ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["", *SUBCOMMANDS])
+def test_help_reads_well(cli: Cli, name: str) -> None:
+    outcome = cli(*([name] if name else []), "--help")
+    assert outcome.code == 0
+    assert "Usage: bayesrace" in outcome.out
+    # what only our own processes say to each other, and Python's own words
+    for internal in ("parent-pid", "parent_pid", "None", "typer", "Traceback", "TODO", "_"):
+        if internal != "_":
+            assert internal not in outcome.out
+    options = re.findall(r"--[a-z-]+.*", outcome.out)
+    assert options
+    if not name:
+        assert all(command in outcome.out for command in SUBCOMMANDS)
+
+
+def test_every_option_says_what_it_is(cli: Cli) -> None:
+    import typer
+
+    from experiments.cli.app import app
+
+    group = typer.main.get_command(app)
+    commands = getattr(group, "commands")  # noqa: B009  (not in the type of a plain command)
+    assert sorted(commands) == sorted(SUBCOMMANDS)
+    for name, command in commands.items():
+        assert command.help, name
+        for parameter in command.params:
+            text = getattr(parameter, "help", "")
+            assert getattr(parameter, "hidden", False) or text, f"{name} {parameter.name}"
+
+
+def test_without_a_command_help_is_shown(cli: Cli) -> None:
+    outcome = cli()
+    assert "Usage: bayesrace" in outcome.out + outcome.err
+    assert "bayesrace: \n" not in outcome.err
+
+
+def test_version(cli: Cli) -> None:
+    outcome = cli("--version")
+    assert outcome.code == 0
+    assert re.fullmatch(r"bayesrace \d+\.\d+\.\d+\n", outcome.out)
+
+
+# Bad input -------------------------------------------------------------------------------------
+
+
+def test_an_unknown_command_or_option_is_refused(cli: Cli) -> None:
+    refused(cli("drift"), "drift")
+    refused(cli("race", "--lap", "3"), "--lap")
+    refused(cli("race", "--mode", "slow"), "lockstep", "realtime")
+    refused(cli("race", "--laps", "0"), "--laps")
+    refused(cli("race", "--laps", "101"), "--laps")
+    refused(cli("raceline", "paddock", "--friction", "-1"), "friction")
+
+
+def test_an_unknown_track_or_car_is_refused_with_those_there_are(cli: Cli, tmp_path: Path) -> None:
+    refused(cli("tracks", "nowhere"), "nowhere", "harbour", "paddock", "random:")
+    refused(cli("tracks", "random:x"), "random:x", "random:7")
+    refused(cli("raceline", "missing.csv"), "missing.csv", "harbour")
+    refused(cli("race", "--track", "nowhere", "--out", "out"), "nowhere", "harbour")
+    refused(cli("race", "--train-track", "nowhere", "--out", "out"), "nowhere")
+    assert not (tmp_path / "out").exists()
+    for command in ("race", "plant", "build"):
+        refused(cli(command, "--car", "lorry"), "lorry", "orca")
+    refused(cli("raceline", "paddock", "--car", "lorry"), "lorry", "orca")
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("0,0,.2,.2\n1,0,.2\n1,1,.2,.2\n", ("row 2", "3 columns")),
+        ("0,0,.2,.2\n1,nan,.2,.2\n1,1,.2,.2\n", ("row 2", "not finite")),
+        ("0,0,.2,.2\n1,x,.2,.2\n1,1,.2,.2\n", ("row 2", "not a number")),
+        ("0,0,.2,.2\n1,1,.2,.2\n", ("points",)),
+        ("", ("empty",)),
+    ],
+)
+def test_a_broken_track_file_is_refused_with_its_row(
+    cli: Cli, tmp_path: Path, content: str, words: tuple[str, ...]
+) -> None:
+    path = tmp_path / "broken.csv"
+    path.write_text(content)
+    refused(cli("tracks", path), "broken.csv", *words)
+
+
+def test_missing_and_wrong_input_files_are_refused(
+    cli: Cli, course: tuple[str | Path, ...], kinematic_artefact: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "junk").write_text("this is not what anybody expects here\n" * 9)
+    (tmp_path / "empty").mkdir()
+    track = course[:2]
+    for argument in ("missing.csv", "junk"):
+        refused(cli("collect", *track, "--raceline", argument), argument)
+    for argument in ("missing.mcap", "junk", "empty"):
+        refused(cli("train", argument), argument)
+    for argument in ("missing", "junk", "empty"):
+        refused(cli("report", argument), argument, "directory of a race")
+        refused(cli("controller", "--artefact", argument, *course), argument, "bayesrace build")
+    for argument in ("missing.bin", "junk"):
+        outcome = cli(
+            "controller", "--artefact", kinematic_artefact, *course, "--weights", argument
+        )
+        refused(outcome, argument)
+    refused(
+        cli("controller", "--artefact", kinematic_artefact, *course, "--settings", "missing.json"),
+        "missing.json",
+    )
+
+
+def test_weights_of_another_discretisation_are_refused(
+    cli: Cli, course: tuple[str | Path, ...], kinematic_artefact: Path, tmp_path: Path
+) -> None:
+    car = get_car("orca")
+    euler = Discretisation(scheme="euler", step_s=0.02).identity("e_kinematic", car)
+    write_weights(tmp_path / "euler.bin", zero_weights(car.name, euler))
+    outcome = cli("controller", "--artefact", kinematic_artefact, *course, "--weights", "euler.bin")
+    refused(outcome, "euler", "rk4")
+
+
+def test_endpoints_that_cannot_be_used_are_refused(
+    cli: Cli, course: tuple[str | Path, ...], kinematic_artefact: Path
+) -> None:
+    for command in (
+        ("plant",),
+        ("drive", "--log", "drive.mcap"),
+        ("controller", "--artefact", kinematic_artefact, *course),
+    ):
+        refused(cli(*command, "--endpoint", "nonsense"), "nonsense", "tcp/127.0.0.1:")
+        refused(cli(*command, "--endpoint", "tcp/127.0.0.1:99999"), "99999", "port")
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        refused(cli("plant", "--endpoint", endpoint), endpoint, "in use", "another endpoint")
+        artefact = ("--artefact", kinematic_artefact)
+        outcome = cli("controller", *artefact, *course, "--listen", endpoint)
+        refused(outcome, endpoint, "in use", "another endpoint")
+
+
+def test_drive_without_plant_is_refused(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    patient = Director.wait_for
+    monkeypatch.setattr(Director, "wait_for", lambda self, whom, _: patient(self, whom, 0.3))
+    endpoints = ("--endpoint", free_endpoint(), "--endpoint", free_endpoint())
+    refused(cli("drive", *endpoints), "no controller and no plant", "start it", "endpoints")
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("tracks", "paddock", "--out"),
+        ("raceline", "paddock", "--out"),
+        ("collect", "--track", "paddock", "--raceline", "line.csv", "--out"),
+        ("train", "log.mcap", "--out"),
+        ("bench", "--json"),
+        ("drive", "--log"),
+    ],
+    ids=lambda command: command[0],
+)
+def test_a_file_that_cannot_be_written_is_refused_before_the_work(
+    cli: Cli, command: tuple[str, ...]
+) -> None:
+    refused(cli(*command, "nowhere/file"), "nowhere/file", "make it")
+    refused(cli(*command, "."), "folder")
+
+
+def test_an_output_folder_that_cannot_be_written_is_refused(
+    cli: Cli, kinematic_artefact: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("")
+    refused(cli("race", "--out", "file"), "file")
+    refused(cli("race", "--out", "file/race"), "file/race")
+    refused(cli("build", "--out", "file/artefact"), "file/artefact")
+    if os.geteuid():
+        (tmp_path / "locked").mkdir(mode=0o500)
+        refused(cli("race", "--out", "locked/race"), "locked/race")
+
+
+def test_the_program_itself_fails_as_its_entry_point(tmp_path: Path) -> None:
+    """Once as a real process: code, one line, nothing else."""
+    done = run("tracks", tmp_path / "missing.csv")
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith("bayesrace: no track ")
+    assert len(done.stderr.splitlines()) == 1
+
+
+# The chain, by files ---------------------------------------------------------------------------
+
+
+def _succeed(*arguments: str | Path) -> str:
+    done = run(*arguments)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture
+def ended() -> Iterator[list[subprocess.Popen[str]]]:
+    """Processes that must not outlive the test."""
+    processes: list[subprocess.Popen[str]] = []
+    yield processes
+    for process in processes:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+@pytest.mark.slow
+def test_the_chain_by_files_in_four_terminals(
+    tmp_path: Path, ended: list[subprocess.Popen[str]]
+) -> None:
+    track, line, log = (tmp_path / name for name in ("track.csv", "line.csv", "collect.mcap"))
+    weights, artefact, drive_log = (tmp_path / name for name in ("w.bin", "mpc", "drive.mcap"))
+    assert "paddock" in _succeed("tracks", "paddock", "--out", track)
+    assert str(line) in _succeed("raceline", track, "--out", line)
+    assert "600 samples" in _succeed("collect", "--track", track, "--raceline", line, "--out", log)
+    assert "samples" in _succeed("train", log, "--out", weights, "--points", "100")
+    assert _succeed("build", "--out", artefact).strip() == str(artefact)
+
+    plant_at, controller_at = free_endpoint(), free_endpoint()
+    files = ("--artefact", artefact, "--track", track, "--raceline", line, "--weights", weights)
+    plant = start("plant", "--endpoint", plant_at)
+    controller = start("controller", *files, "--endpoint", plant_at, "--listen", controller_at)
+    ended += [plant, controller]
+    where = ("--endpoint", plant_at, "--endpoint", controller_at)
+    # Twice: a plant waits for the next run.
+    for _ in range(2):
+        said = _succeed("drive", "--track", track, "--laps", "1", *where, "--log", drive_log)
+    assert "1 lap(s) done" in said
+    assert str(drive_log) in said
+    controller.send_signal(signal.SIGINT)
+    plant.send_signal(signal.SIGTERM)
+    assert finish(controller).returncode == 0
+    assert finish(plant).returncode == 0
+
+    reader = LogReader(drive_log)
+    states, actuations = reader.select(STATE), reader.select(ACTUATION)
+    assert not reader.truncated
+    assert reader.refused == 0
+    assert len(states) > 200
+    assert {state.run for state in states} == {2}
+    assert [a.state_seq for a in actuations[: len(states)]] == [s.seq for s in states]
+    assert {a.weights_version for a in actuations} == {actuations[0].weights_version} != {""}
+    assert len(reader.select(TELEMETRY)) == len(actuations)
+    kinds = [event.kind for event in reader.select(EVENT)]
+    assert kinds == ["run", "run_started", "run_ended"]
+    # what was driven can be learned from
+    again = _succeed("train", log, drive_log, "--out", weights, "--points", "60")
+    assert str(len(states) // 10) not in ("", "0")
+    assert "samples" in again
+
+
+@pytest.mark.slow
+def test_drive_says_when_the_controller_is_lost(
+    tmp_path: Path,
+    course: tuple[str | Path, ...],
+    kinematic_artefact: Path,
+    ended: list[subprocess.Popen[str]],
+) -> None:
+    """The run breaks off, so drive fails; the plant is ready for the next controller."""
+    plant_at, controller_at, log = free_endpoint(), free_endpoint(), tmp_path / "drive.mcap"
+    plant = start("plant", "--endpoint", plant_at)
+    files = ("--artefact", kinematic_artefact, *course)
+    controller = start("controller", *files, "--endpoint", plant_at, "--listen", controller_at)
+    where = ("--endpoint", plant_at, "--endpoint", controller_at)
+    many = ("--laps", "10000", "--max-time", "3600")
+    drive = start("drive", *course[:2], *many, *where, "--log", log)
+    ended += [plant, controller, drive]
+    until(lambda: log.exists() and log.stat().st_size > 100_000, "a lap under way")
+    controller.kill()
+    done = finish(drive)
+    assert done.returncode not in (0, None)
+    assert "Traceback" not in done.stderr
+    assert "controller vanished" in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert LogReader(log).select(STATE)
+    assert plant.poll() is None
+    assert environment()["NO_COLOR"]

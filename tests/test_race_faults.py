@@ -1,0 +1,174 @@
+"""A race that breaks off says why, leaves a log that can be read, and no process behind.
+
+Each test starts a real race on a short track and spoils it in the middle of a lap.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from bayesrace.errors import InputError
+from bayesrace.log import LogReader
+from bayesrace.messages import EVENT, STATE, Event, State
+from tests.programs import finish, leftovers, peanut, run, start, started_by, until
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks into /proc"),
+]
+
+ENOUGH = 60
+"""States in the log after which a lap is under way."""
+
+
+def states_of(log: Path) -> list[State]:
+    try:
+        return LogReader(log).select(STATE)
+    except InputError:  # not there yet
+        return []
+
+
+@dataclass
+class Racing:
+    """A race that is in the middle of a lap, of which there are more than anybody waits for."""
+
+    out: Path
+    process: subprocess.Popen[str]
+    children: dict[str, int]
+    spoilt_ns: int = 0
+
+    def spoil(self, what: str, number: int) -> None:
+        """Sends the signal to "race", its whole "group", or a child by its subcommand."""
+        self.spoilt_ns = time.monotonic_ns()
+        if what == "group":
+            os.killpg(self.process.pid, number)
+        else:
+            os.kill({"race": self.process.pid, **self.children}[what], number)
+
+    def end(self) -> tuple[int, str]:
+        """Waits for it; exit code and what was said on stderr, which is one line or nothing."""
+        done = finish(self.process)
+        said = done.stderr.strip()
+        assert "Traceback" not in said
+        assert len(said.splitlines()) <= 1, said
+        assert leftovers(self.process.pid) == {}
+        return done.returncode, said
+
+    def assert_log_tells(self, *, ended_by_plant: bool) -> Event | None:
+        """The log is whole up to the last moment; the plant's last word, if it could say one."""
+        reader = LogReader(self.out / "run.mcap")
+        states = reader.select(STATE)
+        assert len(states) >= ENOUGH
+        assert reader.refused == 0
+        numbers = [state.seq for state in states]
+        assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+        # Five seconds for a busy machine; a file that is never flushed would be empty.
+        assert states[-1].source_time_ns > self.spoilt_ns - 5_000_000_000
+        ends = [event for event in reader.select(EVENT) if event.kind == "run_ended"]
+        assert bool(ends) is ended_by_plant
+        return ends[-1] if ends else None
+
+    def assert_report_shows_it(self) -> None:
+        """``bayesrace report`` works on what there is."""
+        done = run("report", self.out)
+        assert done.returncode == 0, done.stderr
+        assert "worstcase did not finish" in done.stdout
+        result = json.loads((self.out / "result.json").read_text())
+        (lap,) = result["laps"]
+        assert lap["ended"]
+        assert lap["samples"] >= ENOUGH
+        assert (self.out / "report.html").stat().st_size > 10_000
+
+
+@pytest.fixture
+def racing(tmp_path: Path) -> Iterator[Racing]:
+    track = peanut(tmp_path / "peanut.csv")
+    out = tmp_path / "out"
+    tracks = ("--track", track, "--train-track", track)
+    process = start("race", "--out", out, *tracks, "--laps", "100", start_new_session=True)
+
+    def driving() -> bool:
+        assert process.poll() is None, process.communicate()
+        return len(states_of(out / "run.mcap")) >= ENOUGH
+
+    try:
+        until(driving, "a lap under way")
+        yield Racing(out, process, started_by(process.pid))
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+        for pid in leftovers(process.pid).values():
+            os.kill(pid, signal.SIGKILL)
+
+
+def test_a_race_is_two_more_processes(racing: Racing) -> None:
+    """Ctrl-C at a terminal reaches everybody in the foreground: the race ends all in order."""
+    assert sorted(racing.children) == ["controller", "plant"]
+    racing.spoil("group", signal.SIGINT)
+    assert racing.end() == (130, "bayesrace: interrupted")
+    racing.assert_log_tells(ended_by_plant=True)
+    racing.assert_report_shows_it()
+
+
+def test_an_interrupt_of_the_race_alone_ends_all(racing: Racing) -> None:
+    racing.spoil("race", signal.SIGINT)
+    assert racing.end() == (130, "bayesrace: interrupted")
+    racing.assert_log_tells(ended_by_plant=True)
+
+
+def test_a_killed_plant_ends_the_race(racing: Racing) -> None:
+    racing.spoil("plant", signal.SIGKILL)
+    code, said = racing.end()
+    assert code == 1
+    assert "plant was killed by signal 9" in said
+    racing.assert_log_tells(ended_by_plant=False)
+    racing.assert_report_shows_it()
+
+
+def test_a_killed_controller_ends_the_race(racing: Racing) -> None:
+    racing.spoil("controller", signal.SIGKILL)
+    code, said = racing.end()
+    assert code == 1
+    assert "was killed by signal 9" in said
+    assert "controller" in said
+    assert "plant was killed" not in said
+    end = racing.assert_log_tells(ended_by_plant=True)
+    assert end is not None
+    assert end.data["reason"] == "controller_lost"
+    racing.assert_report_shows_it()
+
+
+def test_a_terminated_plant_ends_the_race_with_its_word(racing: Racing) -> None:
+    racing.spoil("plant", signal.SIGTERM)
+    code, said = racing.end()
+    assert code == 1
+    assert "plant" in said
+    racing.assert_log_tells(ended_by_plant=True)
+
+
+def test_a_killed_race_takes_its_processes_along(racing: Racing) -> None:
+    racing.spoil("race", signal.SIGKILL)
+    code, said = racing.end()
+    assert (code, said) == (-signal.SIGKILL, "")
+    assert LogReader(racing.out / "run.mcap").select(STATE)
+    racing.assert_report_shows_it()
+
+
+def test_an_interrupt_before_the_first_lap(tmp_path: Path) -> None:
+    track = peanut(tmp_path / "peanut.csv")
+    process = start("race", "--out", tmp_path / "out", "--track", track, "--train-track", track)
+    until(lambda: (tmp_path / "out" / "settings.json").exists(), "the race at work")
+    process.send_signal(signal.SIGINT)
+    done = finish(process)
+    assert done.returncode == 130
+    assert done.stderr.strip() == "bayesrace: interrupted"
+    assert leftovers(process.pid) == {}
