@@ -27,4 +27,4 @@ class MpcSettings(BaseModel):
         "warm started, when they fall by less than half; 0: neither",
     )
     iterations: int = Field(3, ge=1, le=1000, description="SQP iterations a step may use")
-    iterations_cold: int = Field(10, ge=1, le=1000, description="the same after a reset")
+    iterations_cold: int = Field(30, ge=1, le=1000, description="the same after a reset")

@@ -22,7 +22,7 @@ from bayesrace.transport import Director, free_endpoint
 from bayesrace.vehicles import get_car
 from experiments.cli import main
 from tests.conftest import Circuit
-from tests.programs import environment, finish, run, start, until
+from tests.programs import finish, run, start, until
 
 SUBCOMMANDS = (
     "race", "drive", "report", "bench", "tracks", "raceline", "collect", "train", "build",
@@ -89,11 +89,9 @@ def test_help_reads_well(cli: Cli, name: str) -> None:
     assert outcome.code == 0
     assert "Usage: bayesrace" in outcome.out
     # what only our own processes say to each other, and Python's own words
-    for internal in ("parent-pid", "parent_pid", "None", "typer", "Traceback", "TODO", "_"):
-        if internal != "_":
-            assert internal not in outcome.out
-    options = re.findall(r"--[a-z-]+.*", outcome.out)
-    assert options
+    for internal in ("parent-pid", "parent_pid", "None", "typer", "Traceback", "TODO"):
+        assert internal not in outcome.out
+    assert "--help" in outcome.out
     if not name:
         assert all(command in outcome.out for command in SUBCOMMANDS)
 
@@ -156,7 +154,7 @@ def test_an_unknown_track_or_car_is_refused_with_those_there_are(cli: Cli, tmp_p
         ("0,0,.2,.2\n1,nan,.2,.2\n1,1,.2,.2\n", ("row 2", "not finite")),
         ("0,0,.2,.2\n1,x,.2,.2\n1,1,.2,.2\n", ("row 2", "not a number")),
         ("0,0,.2,.2\n1,1,.2,.2\n", ("points",)),
-        ("", ("empty",)),
+        ("", ("points",)),
     ],
 )
 def test_a_broken_track_file_is_refused_with_its_row(
@@ -185,10 +183,11 @@ def test_missing_and_wrong_input_files_are_refused(
             "controller", "--artefact", kinematic_artefact, *course, "--weights", argument
         )
         refused(outcome, argument)
-    refused(
-        cli("controller", "--artefact", kinematic_artefact, *course, "--settings", "missing.json"),
-        "missing.json",
-    )
+    for argument in ("missing.json", "junk"):
+        outcome = cli(
+            "controller", "--artefact", kinematic_artefact, *course, "--settings", argument
+        )
+        refused(outcome, argument)
 
 
 def test_weights_of_another_discretisation_are_refused(
@@ -328,9 +327,7 @@ def test_the_chain_by_files_in_four_terminals(
     kinds = [event.kind for event in reader.select(EVENT)]
     assert kinds == ["run", "run_started", "run_ended"]
     # what was driven can be learned from
-    again = _succeed("train", log, drive_log, "--out", weights, "--points", "60")
-    assert str(len(states) // 10) not in ("", "0")
-    assert "samples" in again
+    assert "samples" in _succeed("train", log, drive_log, "--out", weights, "--points", "60")
 
 
 @pytest.mark.slow
@@ -358,4 +355,3 @@ def test_drive_says_when_the_controller_is_lost(
     assert len(done.stderr.strip().splitlines()) == 1
     assert LogReader(log).select(STATE)
     assert plant.poll() is None
-    assert environment()["NO_COLOR"]

@@ -65,8 +65,9 @@ class CarParameters(_Frozen):
 
 
 # ORCA 1:43: Liniger, Domahidi, Morari, "Optimization-based autonomous racing of 1:43 scale RC
-# cars", 2015, with the paper's actuator limits. `friction` is the largest lateral acceleration over
-# g that the car holds on a circle (benchmarks/skid_pad.py).
+# cars", 2015, with the paper's actuator limits. `friction` is the lateral acceleration over g that
+# the car holds on a circle with steering in reserve (benchmarks/skid_pad.py: .751 at 70 % of the
+# steering range, .773 at full lock).
 _ORCA: Final = CarParameters(
     name="orca",
     lf_m=0.029,

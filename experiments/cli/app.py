@@ -47,7 +47,7 @@ def main() -> None:
     """Runs the command line; bad input and lost processes end in one line, not in a traceback."""
     try:
         # Typer turns Ctrl-C and Exit into the value it returns, and older ones Ctrl-C into Abort.
-        code = app(standalone_mode=False)
+        code = app(standalone_mode=False, prog_name="bayesrace")
         if code == _INTERRUPTED:
             raise KeyboardInterrupt
         sys.exit(code)
@@ -77,7 +77,8 @@ def main() -> None:
 
 
 def _fail(text: str, code: int = 2) -> None:
-    if not text.strip():  # no command given: the help has been shown
+    line = "; ".join(filter(None, map(str.strip, text.splitlines())))
+    if not line:  # no command given: the help has been shown
         sys.exit(code)
-    typer.secho(f"bayesrace: {text}", err=True, fg=typer.colors.RED)
+    typer.secho(f"bayesrace: {line}", err=True, fg=typer.colors.RED)
     sys.exit(code)

@@ -1,5 +1,6 @@
 """``tracks``, ``raceline``, ``collect``, ``train``, ``build``: each with files in and out."""
 
+import shutil
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -138,8 +139,6 @@ def build(
     car: Car = "orca",
 ) -> None:
     """Generate and compile a controller, or find it in the cache; prints its folder."""
-    import shutil
-
     from bayesrace.integrators import PERFECT, PREDICTION
     from codegen.build import build as make
     from codegen.settings import BuildSettings
@@ -153,9 +152,16 @@ def build(
     )
     folder, _ = make(settings)
     if out is not None:
-        shutil.copytree(folder, out, dirs_exist_ok=True)
+        shutil.copytree(folder, out, dirs_exist_ok=True, copy_function=_replace)
         folder = out
     typer.echo(str(folder))
+
+
+def _replace(source: str, target: str) -> None:
+    """Copies beside the target and renames: a running controller keeps the library it loaded."""
+    beside = f"{target}.new"
+    shutil.copy2(source, beside)
+    Path(beside).replace(target)
 
 
 def register(app: typer.Typer) -> None:
