@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import IO, Any, Final, Generic, Self, TypeVar, cast
 
 import zenoh
-from mcap.exceptions import EndOfFile, InvalidMagic, McapError
+from mcap.exceptions import EndOfFile, McapError
 from mcap.records import Channel, Metadata
 from mcap.records import Message as Record
 from mcap.stream_reader import StreamReader
@@ -35,6 +35,7 @@ _BATCH_S: Final = 0.002
 _CHANNEL_CAPACITY: Final = 1 << 16
 _LARGEST_RECORD: Final = 1 << 27
 _MESSAGE_ENCODING: Final = "msgpack"
+_MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
 _BY_PREFIX: Final = {topic.key.split("/")[2]: topic for topic in TOPICS}
 
 
@@ -325,16 +326,14 @@ class LogReader:
     def _records(self) -> Iterator[Any]:
         self.truncated = False
         with self.path.open("rb") as file:
+            head = file.read(len(_MCAP_MAGIC))
+            file.seek(0)
+            if not _MCAP_MAGIC.startswith(head):
+                raise InputError(f"{self.path} is not an MCAP log; give the log of a run")
             try:
                 yield from StreamReader(
                     cast(Any, _Whole(file)), record_size_limit=_LARGEST_RECORD
                 ).records
-            except InvalidMagic:
-                if file.tell() <= 8:
-                    raise InputError(
-                        f"{self.path} is not an MCAP log; give the log of a run"
-                    ) from None
-                self.truncated = True
             except (McapError, struct.error, ValueError):
                 self.truncated = True
 

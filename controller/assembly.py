@@ -26,7 +26,10 @@ def read_settings(path: Path | None) -> MpcSettings:
     except OSError as error:
         raise InputError(f"cannot read the settings {path}: {error.strerror}") from None
     except ValidationError as error:
-        raise InputError(f"{path}: {error}") from None
+        faults = "; ".join(
+            f"{'.'.join(str(part) for part in one['loc'])}: {one['msg']}" for one in error.errors()
+        )
+        raise InputError(f"{path}: {faults}; controller/settings.py has the form") from None
 
 
 def predictive_controller(

@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from bayesrace.errors import InputError
 from bayesrace.raceline.line import RaceLine
 from bayesrace.tracks import Track
 from bayesrace.tracks.spline import PlaneSpline
@@ -18,6 +19,10 @@ CAPACITY: Final = 8192
 
 PATH_COLUMNS: Final = 7
 """BR_PATH_COLUMNS there."""
+
+ASTRAY_MAX: Final = 0.05
+"""Share of a line that may be farther out than half the track's width: with more it belongs to
+another track."""
 
 SPACING_M: Final = 0.005
 """Wanted distance of rows: between them the planner interpolates linearly, which at a curvature
@@ -39,7 +44,7 @@ def make_path_table(track: Track, line: RaceLine, spacing_m: float = SPACING_M) 
     """Samples the line and, at each sample's projection on the centreline, the two half-planes.
 
     The half-planes are parallel to the centreline (paper, equation 8d), their normal has length 1,
-    their distance is the track's width there.
+    their distance is the track's width there. InputError if the line belongs to another track.
     """
     count = min(CAPACITY, max(8, math.ceil(line.length_m / spacing_m)))
     s: npt.NDArray[np.float64] = np.arange(count, dtype=np.float64) * (line.length_m / count)
@@ -47,8 +52,14 @@ def make_path_table(track: Track, line: RaceLine, spacing_m: float = SPACING_M) 
     xy = PlaneSpline(line.s_m, line.xy_m, line.length_m)(s)
     speed = np.interp(s, nodes, np.append(line.vx_mps, line.vx_mps[0]), period=line.length_m)
     on_track = track.project_path(xy)
-    normal = track.normal(on_track.s_m)
     right, left = track.widths(on_track.s_m)
+    astray = float(np.mean(on_track.off_track_m > (right + left) / 2))
+    if astray > ASTRAY_MAX:
+        raise InputError(
+            f"{100 * astray:.0f} % of the racing line '{line.track_name}' is far outside the track "
+            f"'{track.name}': it was computed for another track; run 'bayesrace raceline'"
+        )
+    normal = track.normal(on_track.s_m)
     along = np.sum(normal * track.position(on_track.s_m), axis=1)
     rows = np.column_stack([xy, speed, normal, along - right, along + left])
     return PathTable(np.ascontiguousarray(rows), line.length_m / count)

@@ -1,5 +1,6 @@
 """The compiled motion planner: projection and theta recursion (paper, section 4.3) in numpy."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 from bayesrace.errors import InputError
 from bayesrace.vehicles import CarParameters
 from controller.native_step import NativeStep
-from controller.path_table import PathTable
+from controller.path_table import PathTable, make_path_table
 from controller.settings import MpcSettings
 from tests.conftest import Circuit
 
@@ -200,3 +201,9 @@ def test_an_unusable_table_is_an_input_error_and_the_old_one_stays(
     after = place(step, start[:2], start[2])
     assert before[:2] == after[:2]
     np.testing.assert_array_equal(before[2], after[2])
+
+
+def test_a_racing_line_of_another_track_is_refused(circuit: Circuit) -> None:
+    elsewhere = replace(circuit.line, x_m=circuit.line.x_m + 3.0, track_name="elsewhere")
+    with pytest.raises(InputError, match=r"'elsewhere' is far outside the track .*raceline"):
+        make_path_table(circuit.track, elsewhere)
