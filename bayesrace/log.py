@@ -161,11 +161,6 @@ class Recorder:
         for thread in self._threads:
             thread.start()
 
-    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """See :meth:`LogWriter.add_metadata`; from any thread."""
-        with self._lock:
-            self._writer.add_metadata(name, values)
-
     def settle(self, quiet_s: float = 0.1, at_most_s: float = 2.0) -> None:
         """Wait until nothing has arrived for a while; then all of it can be read from the file.
 

@@ -138,8 +138,7 @@ def _load(path: Path, manifest: Manifest) -> ct.CDLL:
             "remove the folder and run 'bayesrace build'"
         ) from None
     library.br_mpc_memory_size.restype = ct.c_size_t
-    for name in ("br_mpc_error_text", "br_mpc_status_text", "br_mpc_model_name"):
-        getattr(library, name).restype = ct.c_char_p
+    library.br_mpc_error_text.restype = ct.c_char_p
     library.br_mpc_init.argtypes = [ct.c_void_p, ct.c_size_t, ct.POINTER(ct.c_void_p)]
     library.br_mpc_set_path.argtypes = [ct.c_void_p, ct.c_void_p, ct.c_int, ct.c_double]
     library.br_mpc_reset.argtypes = [ct.c_void_p]

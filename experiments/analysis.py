@@ -202,10 +202,6 @@ class RaceAnalysis:
         self.track, self.line = recording.track, recording.line
         self.runs = [DrivenRun(run, self.track, self.line) for run in recording.runs]
 
-    def run_of(self, controller: str) -> DrivenRun | None:
-        """The last run of that controller, None if it did not drive."""
-        return next((run for run in reversed(self.runs) if run.controller == controller), None)
-
     @cached_property
     def best_case(self) -> Dataset | None:
         """The samples on which the GPs are validated: those of the BestCase run."""

@@ -7,7 +7,7 @@ from typing import Protocol
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-__all__ = ["Stage", "Stages", "SilentStages", "stages_on"]
+__all__ = ["Stage", "Stages", "stages_on"]
 
 
 class Stage(Protocol):
@@ -47,15 +47,6 @@ class _RichStages:
 class _Silent:
     def update(self, share: float, text: str = "") -> None:
         """Nothing."""
-
-
-class SilentStages:
-    """Shows nothing; for tests and scripts."""
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[Stage]:
-        """A stage nobody sees."""
-        yield _Silent()
 
 
 @contextmanager

@@ -134,6 +134,17 @@ class Run:
             return End("max_time", f"time limit of {self.request.max_time_s:g} s reached")
         return None
 
+    def _reached(self) -> int | End:
+        """Sends the state that a period led to; its number, or the end of the run.
+
+        The last state of a run is sent as well, unless no message could carry it.
+        """
+        end = self._finished()
+        if end is not None and end.reason == "left_world":
+            return end
+        seq = self._publish()
+        return seq if end is None else end
+
     # Lockstep ----------------------------------------------------------------------------------
 
     def _lockstep(self) -> End:
@@ -143,12 +154,10 @@ class Run:
             if isinstance(answer, End):
                 return answer
             self._simulator.step(answer)
-            end = self._finished()
-            if end is not None and end.reason == "left_world":
-                return end
-            seq = self._publish()
-            if end is not None:
-                return end
+            reached = self._reached()
+            if isinstance(reached, End):
+                return reached
+            seq = reached
 
     def _answer_to(self, seq: int) -> tuple[float, ...] | End:
         """Waits for the actuation that answers this state, or for what ends the run."""
@@ -192,12 +201,10 @@ class Run:
             if end is not None:
                 return end
             held = self._drive_period(begin_ns, held, arrivals, seq)
-            end = self._finished()
-            if end is not None and end.reason == "left_world":
-                return end
-            seq = self._publish()
-            if end is not None:
-                return end
+            reached = self._reached()
+            if isinstance(reached, End):
+                return reached
+            seq = reached
 
     def _arrivals(self, first_seq: int) -> tuple[list[tuple[int, _Held]], End | None]:
         """What arrived during the period: usable actuations with their times of arrival."""
