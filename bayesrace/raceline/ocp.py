@@ -23,6 +23,7 @@ from typing import Any, Final
 import casadi as ca
 import numpy as np
 
+from bayesrace.interrupts import deferred_interrupt
 from bayesrace.raceline.frame import Frame, build_frame
 from bayesrace.raceline.guess import speed_profile
 from bayesrace.raceline.line import RaceLine
@@ -222,7 +223,8 @@ def _optimise(name: str, frame: Frame, limits: CarLimits, settings: RaceLineSett
     v_max = _top_speed(limits)
     low, high = _bounds(frame, limits, v_max)
     start = _guess(frame, limits, v_max)
-    result = solver(x0=start, lbx=low, ubx=high, lbg=problem.g_min, ubg=0.0)
+    with deferred_interrupt():
+        result = solver(x0=start, lbx=low, ubx=high, lbg=problem.g_min, ubg=0.0)
     stats = solver.stats()
     if not stats["success"]:
         raise RaceLineError(
