@@ -1,11 +1,55 @@
-"""Ctrl-C at a moment when it can be dealt with."""
+"""Ctrl-C that is never lost, whatever library it strikes in."""
 
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import FrameType
+from typing import Any
 
-__all__ = ["deferred_interrupt"]
+__all__ = ["deferred_interrupt", "raise_if_interrupted", "remembering_interrupts"]
+
+_pending = threading.Event()
+
+
+@contextmanager
+def remembering_interrupts() -> Iterator[None]:
+    """For the block, SIGINT raises KeyboardInterrupt at once and is remembered as well.
+
+    An exception that strikes in a weak reference's callback or below a foreign library's frames
+    is swallowed there; :func:`raise_if_interrupted` raises it again. Nothing off the main thread.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def on_signal(_number: int, _frame: FrameType | None) -> None:
+        _pending.set()
+        raise KeyboardInterrupt
+
+    def on_unraisable(unraisable: Any) -> None:
+        if unraisable.exc_type is not KeyboardInterrupt:
+            hook_before(unraisable)
+
+    _pending.clear()
+    hook_before, sys.unraisablehook = sys.unraisablehook, on_unraisable
+    before = signal.signal(signal.SIGINT, on_signal)
+    try:
+        yield
+        raise_if_interrupted()
+    finally:
+        signal.signal(signal.SIGINT, before)
+        sys.unraisablehook = hook_before
+        # An interrupt in a string being executed (a dataclass being made) marks the interpreter
+        # to end by SIGINT, caught or not; the next string executed takes the mark off again.
+        exec("")  # noqa: S102
+
+
+def raise_if_interrupted() -> None:
+    """KeyboardInterrupt if one was remembered: call it between the parts of a long work."""
+    if _pending.is_set():
+        raise KeyboardInterrupt
 
 
 @contextmanager

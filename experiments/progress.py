@@ -7,6 +7,8 @@ from typing import Protocol
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
+from bayesrace.interrupts import raise_if_interrupted
+
 __all__ = ["Stage", "Stages", "stages_on"]
 
 
@@ -21,7 +23,7 @@ class Stages(Protocol):
     """Where stages are shown."""
 
     def stage(self, name: str) -> AbstractContextManager[Stage]:
-        """Context of one stage; it is marked done when the block ends well."""
+        """Context of one stage, marked done when the block ends well; KeyboardInterrupt if not."""
 
 
 class _Shown:
@@ -41,6 +43,7 @@ class _RichStages:
     def stage(self, name: str) -> Iterator[Stage]:
         shown = _Shown(self._progress, name)
         yield shown
+        raise_if_interrupted()
         shown.update(1.0)
 
 
@@ -74,3 +77,4 @@ class _PlainStages:
     def stage(self, name: str) -> Iterator[Stage]:
         self._console.print(f"{name} …", highlight=False)
         yield _Silent()
+        raise_if_interrupted()

@@ -9,6 +9,7 @@ from pydantic import ValidationError
 
 from bayesrace import __version__
 from bayesrace.errors import InputError
+from bayesrace.interrupts import remembering_interrupts
 from experiments.cli import evaluation, parts, preparation
 
 __all__ = ["app", "main"]
@@ -47,9 +48,10 @@ def main() -> None:
     """Runs the command line; bad input and lost processes end in one line, not in a traceback."""
     try:
         # Typer turns Ctrl-C and Exit into the value it returns, and older ones Ctrl-C into Abort.
-        code = app(standalone_mode=False, prog_name="bayesrace")
-        if code == _INTERRUPTED:
-            raise KeyboardInterrupt
+        with remembering_interrupts():
+            code = app(standalone_mode=False, prog_name="bayesrace")
+            if code == _INTERRUPTED:
+                raise KeyboardInterrupt
         sys.exit(code)
     except InputError as error:
         _fail(str(error))
