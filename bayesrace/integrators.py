@@ -68,6 +68,13 @@ def _pose_from_velocities(x: Any, velocities: Any, h: float) -> Any:
     return ca.vertcat(x[:2] + change, psi_end)
 
 
+def _symbols(model: "Model") -> tuple[Any, Any, Any]:
+    import casadi as ca
+
+    n, m = len(model.states), len(model.inputs)
+    return ca.SX.sym("x", n), ca.SX.sym("u", m), ca.SX.sym("e", 3)
+
+
 class Discretisation(BaseModel):
     """How a continuous-time model becomes x_{k+1} = F(x_k, u_k), input held over the step.
 
@@ -105,18 +112,34 @@ class Discretisation(BaseModel):
         """
         import casadi as ca
 
-        x = ca.SX.sym("x", len(model.states))
-        u = ca.SX.sym("u", len(model.inputs))
-        e = ca.SX.sym("e", 3)
+        x, u, e = _symbols(model)
+        x_next = self._advanced(model, x, u, e, self.step_s)
+        return ca.Function(f"F_{model.name}", [x, u, e], [x_next], ["x", "u", "e"], ["x_next"])
+
+    def over(self, model: "Model") -> "ca.Function":
+        """(x, u, e, h) -> x_next: :meth:`corrected` with the step h [s] instead of ``step_s``.
+
+        e is what the residual adds within h. For predictions over part of a step: the scheme, its
+        sub-steps and the pose stay as they are, only shorter.
+        """
+        import casadi as ca
+
+        x, u, e = _symbols(model)
+        h = ca.SX.sym("h")
+        x_next = self._advanced(model, x, u, e, h)
+        names = ["x", "u", "e", "h"]
+        return ca.Function(f"F_{model.name}_over", [x, u, e, h], [x_next], names, ["x_next"])
+
+    def _advanced(self, model: "Model", x: Any, u: Any, e: Any, step_s: Any) -> Any:
         _, step = SCHEMES[self.scheme]
         x_next = x
         for _ in range(self.substeps):
-            x_next = step(lambda s: model.ode(s, u), x_next, self.step_s / self.substeps)
+            x_next = step(lambda s: model.ode(s, u), x_next, step_s / self.substeps)
         if len(model.states) == 7:
             x_next[3:6] += e
             if self.pose == "interpolated":
-                x_next[:3] = _pose_from_velocities(x, x_next[3:6], self.step_s)
-        return ca.Function(f"F_{model.name}", [x, u, e], [x_next], ["x", "u", "e"], ["x_next"])
+                x_next[:3] = _pose_from_velocities(x, x_next[3:6], step_s)
+        return x_next
 
     def identity(self, model_name: str, car: CarParameters) -> str:
         """Text that two discretised models share if and only if they are the same map."""

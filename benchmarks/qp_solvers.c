@@ -15,6 +15,7 @@
  * reference (20 x 6). RESULTS: per problem and route, time [us], distance of the inputs' change
  * from ours (infinity norm), iterations, solver status.
  */
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <time.h>
@@ -25,7 +26,7 @@
 #include <hpipm_d_ocp_qp_sol.h>
 #include <hpipm_d_part_cond.h>
 
-#include "br_sqp.c" /* its iteration is static; not compiled separately */
+#include "br_internal.h"
 
 #define REPEATS 5
 #define ROUTES 5 /* ours, then HPIPM: BALANCE, SPEED, each without and with blocks */
@@ -226,6 +227,7 @@ static void run_ours(br_mpc *mpc, int warm, double result[4]) {
     for (int repeat = 0; repeat < REPEATS; ++repeat) {
         memcpy(mpc->qp.sense, sense, sizeof sense);
         mpc->info.qp_iterations = 0;
+        mpc->qp.factorised = 0;
         const double start = now_us();
         br_qp_condense(mpc);
         result[3] = br_qp_solve(mpc, warm);
@@ -290,13 +292,12 @@ int main(int argc, char **argv) {
         memcpy(mpc->reference, at + 8, sizeof mpc->reference);
         memset(&mpc->info, 0, sizeof mpc->info);
         const int warm = mpc->warm;
-        if (warm) shift(mpc);
-        else cold_start(mpc);
+        if (warm) br_sqp_shift(mpc);
+        else br_sqp_cold_start(mpc);
         double results[ROUTES][4];
         compare(mpc, warm, results);
-        br_qp_condense(mpc);
-        mpc->warm = br_qp_solve(mpc, warm) == BR_CONVERGED;
-        if (mpc->warm) line_search(mpc);
+        mpc->qp.factorised = 0; /* compare left that of the Gauss-Newton Hessian */
+        mpc->warm = br_sqp_iterate(mpc, warm, warm) <= BR_DEFECT;
         fwrite(results, sizeof results, 1, out);
     }
     fclose(out);

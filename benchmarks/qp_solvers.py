@@ -48,7 +48,7 @@ def compile_harness(artefact: Path, folder: Path) -> Path:
     """The C file with the artefact's sources, DAQP, HPIPM and BLASFEO."""
     include, daqp = casadi_includes()
     libraries, out = Path(casadi.__file__).parent, folder / "qp_solvers"
-    sources = [p for p in sorted(artefact.glob("*.c")) if p.name != "br_sqp.c"]
+    sources = sorted(artefact.glob("*.c"))
     flags = [flag for flag in FLAGS if flag != "-fPIC"]
     line = [*find_compiler().command, *flags, f"-I{artefact}", f"-I{include}"]
     line += [str(p) for p in (Path(__file__).with_suffix(".c"), *sources, daqp)]

@@ -76,15 +76,15 @@ def generate(settings: BuildSettings, folder: Path) -> None:
     import casadi as ca
 
     from bayesrace.vehicles.models import MODELS
-    from codegen.stage import linearise_function
+    from codegen.stage import advance_function, linearise_function
 
     model = MODELS[settings.model](get_car(settings.car))
-    function = linearise_function(model, settings.discretisation)
     # CasADi derives the include guard from the name and writes into the working folder
     generator = ca.CodeGenerator(
         "br_model.c", {"with_header": True, "casadi_int": "int", "with_export": False}
     )
-    generator.add(function)
+    generator.add(linearise_function(model, settings.discretisation))
+    generator.add(advance_function(model, settings.discretisation))
     generator.generate(str(folder) + os.sep)
     (folder / "br_config.h").write_text(
         "/* generated: dimensions of this controller */\n"

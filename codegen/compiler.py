@@ -71,7 +71,14 @@ class Compiler:
             line += [f"-Wl,--version-script={exports}", "-Wl,-z,defs"]
         done = subprocess.run(line, capture_output=True, text=True, check=False)
         if done.returncode:
-            raise CompileError(f"{shlex.join(line)}\n{done.stderr[-4000:]}")
+            raise CompileError(f"{shlex.join(line)}\n{_shortened(done.stderr)}")
+
+
+def _shortened(text: str, most: int = 4000) -> str:
+    """Beginning, where the first error is, and end, where the linker's are."""
+    if len(text) <= most:
+        return text
+    return f"{text[: most // 2]}\n[…]\n{text[-most // 2 :]}"
 
 
 def _candidates() -> list[tuple[str, ...]]:

@@ -1,11 +1,12 @@
-"""The nominal model of one stage with its derivatives, as the CasADi function that becomes C."""
+"""The nominal model of one stage, with its derivatives and over part of it, as CasADi functions
+that become C."""
 
 import casadi as ca
 
 from bayesrace.integrators import Discretisation
 from bayesrace.vehicles.models import Model
 
-__all__ = ["linearise_function"]
+__all__ = ["advance_function", "linearise_function"]
 
 _NX, _NV, _NE = 7, 9, 3
 _NW = _NV + _NE
@@ -97,3 +98,12 @@ def linearise_function(model: Model, discretisation: Discretisation) -> ca.Funct
         ["x", "u", "e", "lambda"],
         ["x_next", "jacobian_transposed", "hessian"],
     )
+
+
+def advance_function(model: Model, discretisation: Discretisation) -> ca.Function:
+    """``(x, u, e, h) -> x_next``: the model over h [s], e what the residual adds within it."""
+    over = discretisation.over(model)
+    x, u, e, h = (ca.SX.sym(name, n) for name, n in (("x", _NX), ("u", 2), ("e", _NE), ("h", 1)))
+    x_next = ca.densify(over(x, u, e, h))
+    names = ["x", "u", "e", "h"]
+    return ca.Function("br_advance", [x, u, e, h], [x_next], names, ["x_next"], {"cse": True})

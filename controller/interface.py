@@ -29,11 +29,13 @@ class StepOutput:
     """0: usable. Else the controller's own code (1 to 255): the fallback takes over."""
     iterations: int = 0
     solve_us: float = 0.0
-    """Execution time of the step [us]; 0: the process measures it from outside."""
+    """Execution time of the step (its feedback phase) [us]; 0: measured from outside."""
     plan_x: Array = field(default_factory=lambda: _NO_STATES)
     """Shape (N + 1, 7) or (0, 7): predicted states."""
     plan_u: Array = field(default_factory=lambda: NO_PLAN)
     """Shape (N, 2) or (0, 2): planned inputs, the first of which is ``u``."""
+    plan_step_s: float = 0.02
+    """Time from one row of the plan to the next."""
     residual_dynamics: float = -1.0
     residual_bounds: float = -1.0
     residual_stationarity: float = -1.0
@@ -52,11 +54,34 @@ class Controller(Protocol):
     def reset(self, state: State) -> None:
         """Forget everything about the past: ``state`` is the first of a run."""
 
-    def step(self, x: Array, u_previous: Array) -> StepOutput:
+    def step(
+        self, x: Array, u_previous: Array, elapsed_s: float, budget_s: float = 0.0
+    ) -> StepOutput:
         """The input for state ``x`` (7,), where ``u_previous`` (2,) acted until now.
 
-        Both arrays are the caller's and change with the next state. Never raises for a finite
-        state: what goes wrong is told by the status.
+        Both arrays are the caller's and change with the next state. ``elapsed_s``: time between
+        the state of the step before and this one (0 for the first). ``budget_s``: how long it may
+        take, best effort; 0 is as long as its settings say. Never raises for a finite state: what
+        goes wrong is told by the status.
+        """
+
+    def prepare(self, elapsed_s: float, budget_s: float = 0.0) -> None:
+        """What can be done for the next step before its state is there (preparation phase).
+
+        The next state is expected ``elapsed_s`` after the last one. What the last step handed out
+        is used up by now.
+        """
+
+    def predict(self, x: Array, u: Array, duration_s: float) -> Array:
+        """State (7,) after ``duration_s`` (at most 1 s) with input ``u`` (2,) held.
+
+        The array returned is overwritten by the next call.
+        """
+
+    def limit_speed(self, limit_mps: float, rate_mps2: float) -> None:
+        """From the next step on aim at no more than this speed, falling by the rate from there on.
+
+        ``math.inf`` and 0: no limit.
         """
 
     def set_weights(self, data: bytes) -> str:

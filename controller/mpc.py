@@ -18,7 +18,12 @@ class PredictiveController:
         """``step``: with parameters and path set. ``weights_version``: of what it holds already."""
         self._step = step
         self._version = weights_version
-        self._output = StepOutput(u=step.u, plan_x=step.plan_x, plan_u=step.plan_u)
+        self._output = StepOutput(
+            u=step.u,
+            plan_x=step.plan_x,
+            plan_u=step.plan_u,
+            plan_step_s=step.manifest.step_s,
+        )
 
     @property
     def weights_version(self) -> str:
@@ -40,11 +45,25 @@ class PredictiveController:
         """Identity of the artefact."""
         return {"controller": "mpc", **self._step.manifest.model_dump(exclude={"flags"})}
 
-    def step(self, x: Array, u_previous: Array) -> StepOutput:
+    def prepare(self, elapsed_s: float, budget_s: float = 0.0) -> None:
+        """Iterates on until converged if there is a budget, then shifts and condenses."""
+        self._step.prepare(elapsed_s, budget_s)
+
+    def predict(self, x: Array, u: Array, duration_s: float) -> Array:
+        """By the model the OCP predicts with, corrected by the weights in use."""
+        return self._step.predict(x, u, duration_s)
+
+    def limit_speed(self, limit_mps: float, rate_mps2: float) -> None:
+        """The reference point moves along the line no faster."""
+        self._step.set_speed_limit(limit_mps, rate_mps2)
+
+    def step(
+        self, x: Array, u_previous: Array, elapsed_s: float, budget_s: float = 0.0
+    ) -> StepOutput:
         """One native step, timed around the C call."""
         native, output = self._step, self._output
         begin_ns = time.perf_counter_ns()
-        status = native.step(x, float(u_previous[0]))
+        status = native.step(x, float(u_previous[0]), elapsed_s=elapsed_s, budget_s=budget_s)
         output.solve_us = (time.perf_counter_ns() - begin_ns) * 1e-3
         native.read_plan()
         info = native.info

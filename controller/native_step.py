@@ -4,19 +4,17 @@ ctypes with buffers made once: a step costs about 2 us beyond the C call.
 """
 
 import ctypes as ct
-import hashlib
-from enum import IntEnum
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
-from bayesrace.cpu import cpu_digest
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import KERNELS, GpWeights
-from bayesrace.manifest import ABI, LIBRARY, Manifest, read_manifest
+from bayesrace.manifest import read_manifest
 from bayesrace.vehicles import CarParameters
+from controller.native_library import Gp, Parameters, StepInfo, StepStatus, load_library
 from controller.path_table import PATH_COLUMNS, PathTable
 from controller.settings import MpcSettings
 
@@ -24,89 +22,6 @@ __all__ = ["NativeStep", "Reference", "StepInfo", "StepStatus"]
 
 _ALIGNMENT: Final = 64
 _DOUBLES = npt.NDArray[np.float64]
-
-
-class StepStatus(IntEnum):
-    """br_mpc_status: what became of the optimisation problem."""
-
-    CONVERGED = 0
-    ACCEPTABLE = 1
-    DEFECT = 2
-    INFEASIBLE = 3
-    QP_LIMIT = 4
-    NOT_FINITE = 5
-    BAD_STATE = 6
-
-    @property
-    def usable(self) -> bool:
-        """Whether the first input may go to the actuators."""
-        return self <= StepStatus.ACCEPTABLE
-
-
-class _Parameters(ct.Structure):
-    _fields_ = [
-        *(
-            (name, ct.c_double)
-            for name in (
-                "q_position",
-                "r_duty",
-                "r_delta_rate",
-                "s_slack",
-                "margin_m",
-                "d_min",
-                "d_max",
-                "delta_max_rad",
-                "delta_rate_max_radps",
-                "tolerance",
-                "defect_max",
-                "settle",
-            )
-        ),
-        ("iterations", ct.c_int),
-        ("iterations_cold", ct.c_int),
-    ]
-
-
-class _Gp(ct.Structure):
-    _fields_ = [
-        ("kernel", ct.c_int),
-        ("n", ct.c_int),
-        ("offset", ct.c_double),
-        ("scale", ct.c_double),
-        ("length_scales", ct.c_void_p),
-        ("inputs", ct.c_void_p),
-        ("alpha", ct.c_void_p),
-    ]
-
-
-class StepInfo(ct.Structure):
-    """br_mpc_info: residuals at the returned plan, cost, and the car's place on the line."""
-
-    _fields_ = [
-        ("iterations", ct.c_int),
-        ("qp_iterations", ct.c_int),
-        ("regularised", ct.c_int),
-        ("shortened", ct.c_int),
-        ("stationarity", ct.c_double),
-        ("defect", ct.c_double),
-        ("bound", ct.c_double),
-        ("cost", ct.c_double),
-        ("slack_max_m", ct.c_double),
-        ("s_ref_m", ct.c_double),
-        ("lateral_m", ct.c_double),
-    ]
-    iterations: int
-    qp_iterations: int
-    regularised: int
-    shortened: int
-    stationarity: float
-    defect: float
-    bound: float
-    cost: float
-    slack_max_m: float
-    s_ref_m: float
-    lateral_m: float
-
 
 Reference = _DOUBLES
 """Stages 1..N of the reference, shape (N, 6): x, y, normal (2), lower, upper."""
@@ -116,53 +31,11 @@ def _address(array: _DOUBLES) -> int:
     return array.ctypes.data
 
 
-def _load(path: Path, manifest: Manifest) -> ct.CDLL:
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path} cannot be read ({error}): run 'bayesrace build'") from None
-    if hashlib.sha256(data).hexdigest() != manifest.library_sha256:
-        raise InputError(
-            f"{path} is not the library its manifest describes: remove the folder and run "
-            "'bayesrace build'"
-        )
-    if manifest.cpu != cpu_digest():
-        raise InputError(
-            f"{path} was compiled for another CPU: remove the folder and run 'bayesrace build' here"
-        )
-    try:
-        library = ct.CDLL(str(path))
-    except OSError as error:
-        raise InputError(
-            f"{path} cannot be loaded here ({error}): it was built for another machine; "
-            "remove the folder and run 'bayesrace build'"
-        ) from None
-    library.br_mpc_memory_size.restype = ct.c_size_t
-    library.br_mpc_error_text.restype = ct.c_char_p
-    library.br_mpc_init.argtypes = [ct.c_void_p, ct.c_size_t, ct.POINTER(ct.c_void_p)]
-    library.br_mpc_set_path.argtypes = [ct.c_void_p, ct.c_void_p, ct.c_int, ct.c_double]
-    library.br_mpc_reset.argtypes = [ct.c_void_p]
-    library.br_mpc_reset.restype = None
-    pointers = ct.c_void_p
-    library.br_mpc_step.argtypes = [pointers, pointers, ct.c_double, pointers, pointers, pointers]
-    library.br_mpc_solve.argtypes = [
-        pointers,
-        pointers,
-        ct.c_double,
-        *[pointers] * 4,
-    ]
-    library.br_mpc_evaluate.argtypes = [pointers] * 6
-    library.br_mpc_get_plan.argtypes = [pointers] * 3
-    library.br_mpc_get_reference.argtypes = [pointers] * 2
-    library.br_mpc_set_parameters.argtypes = [pointers] * 2
-    library.br_mpc_set_weights.argtypes = [pointers] * 2
-    return library
-
-
 class NativeStep:
     """The compiled control step. Not thread-safe.
 
-    ``u`` (2,), ``info`` and the plan arrays are overwritten by each step.
+    ``u`` (2,), ``info`` and the plan arrays are overwritten by each step. Times are in seconds;
+    budgets are measured by the system's monotonic clock.
     """
 
     def __init__(self, artefact: Path, car: CarParameters, settings: MpcSettings) -> None:
@@ -173,14 +46,15 @@ class NativeStep:
                 f"{artefact} was built for car '{'-'.join(built_for)}', not "
                 f"'{car.name}-{car.digest()}': run 'bayesrace build'"
             )
-        self._library = _load(artefact / LIBRARY, self.manifest)
-        if self._library.br_mpc_abi() != ABI:
-            raise InputError(f"{artefact}: library and manifest disagree: run 'bayesrace build'")
+        self._library = load_library(artefact, self.manifest)
         self._mpc = self._new_object()
         n = self.manifest.horizon
+        self._step_s = self.manifest.step_s
         self.u = np.zeros(2)
         self.info = StepInfo()
         self._x = np.zeros(7)
+        self._u_held = np.zeros(2)
+        self._predicted = np.zeros(7)
         self._status = ct.c_int()
         self._u_address = _address(self.u)
         self._x_address = _address(self._x)
@@ -188,7 +62,12 @@ class NativeStep:
         self._info_address = ct.addressof(self.info)
         self.plan_x = np.zeros((n + 1, 7))
         self.plan_u = np.zeros((n, 2))
+        self._u_held_address = _address(self._u_held)
+        self._predicted_address = _address(self._predicted)
         self._step = self._library.br_mpc_step
+        self._prepare = self._library.br_mpc_prepare
+        self._predict = self._library.br_mpc_predict
+        self._set_clock()
         self.set_parameters(car, settings)
         self.set_zero_weights()
 
@@ -201,6 +80,10 @@ class NativeStep:
         self._check(self._library.br_mpc_init(address, size, ct.byref(mpc)), "init")
         return mpc
 
+    def _set_clock(self) -> None:
+        clock = ct.cast(self._library.br_mpc_monotonic, ct.c_void_p)
+        self._check(self._library.br_mpc_set_clock(self._mpc, clock, None), "clock")
+
     def _check(self, error: int, what: str) -> None:
         if error:
             text = self._library.br_mpc_error_text(error).decode()
@@ -208,7 +91,7 @@ class NativeStep:
 
     def set_parameters(self, car: CarParameters, settings: MpcSettings) -> None:
         """Weights, limits and tolerances of the OCP; effective from the next step."""
-        parameters = _Parameters(
+        parameters = Parameters(
             settings.q_position,
             settings.r_duty,
             settings.r_delta_rate,
@@ -227,6 +110,11 @@ class NativeStep:
         error = self._library.br_mpc_set_parameters(self._mpc, ct.byref(parameters))
         self._check(error, "parameters")
 
+    def set_speed_limit(self, limit_mps: float, rate_mps2: float = 0.0) -> None:
+        """The reference moves at most this fast, and by the rate less along the horizon."""
+        error = self._library.br_mpc_set_speed_limit(self._mpc, limit_mps, rate_mps2)
+        self._check(error, "speed limit")
+
     def set_path(self, table: PathTable) -> None:
         """Racing line and track; copied."""
         rows = np.ascontiguousarray(table.rows, dtype=np.float64)
@@ -243,7 +131,7 @@ class NativeStep:
                 f"controller predicts with {self.manifest.discretisation}: train with the same car "
                 "and discretisation"
             )
-        outputs = (_Gp * 3)()
+        outputs = (Gp * 3)()
         for target, output in zip(outputs, weights.outputs, strict=True):
             if len(output.alpha) > self.manifest.gp_capacity:
                 raise InputError(
@@ -262,20 +150,34 @@ class NativeStep:
 
     def set_zero_weights(self) -> None:
         """No correction: WorstCase with the e-kinematic model, BestCase with the dynamic one."""
-        self._check(self._library.br_mpc_set_weights(self._mpc, (_Gp * 3)()), "weights")
+        self._check(self._library.br_mpc_set_weights(self._mpc, (Gp * 3)()), "weights")
 
     def reset(self) -> None:
         """Forgets plan, working set and place on the line."""
         self._library.br_mpc_reset(self._mpc)
 
-    def step(self, x: _DOUBLES, d_previous: float) -> StepStatus:
-        """One control step from the measured state x (7,); results in ``u`` and ``info``."""
+    def step(
+        self,
+        x: _DOUBLES,
+        d_previous: float,
+        *,
+        elapsed_s: float | None = None,
+        budget_s: float = 0.0,
+    ) -> StepStatus:
+        """One control step from the measured state x (7,); results in ``u`` and ``info``.
+
+        ``elapsed_s``: since the state of the call before, of whatever status; None: one stage Ts.
+        ``budget_s``: iterate until settled or within this time from now; 0: the iteration limits
+        of the settings alone. InputError if ``elapsed_s`` is negative or not finite.
+        """
         self._x[:] = x
         self._check(
             self._step(
                 self._mpc,
                 self._x_address,
                 d_previous,
+                self._step_s if elapsed_s is None else elapsed_s,
+                budget_s,
                 self._u_address,
                 self._status_address,
                 self._info_address,
@@ -284,7 +186,15 @@ class NativeStep:
         )
         return StepStatus(self._status.value)
 
-    def solve(self, x: _DOUBLES, d_previous: float, reference: Reference) -> StepStatus:
+    def solve(
+        self,
+        x: _DOUBLES,
+        d_previous: float,
+        reference: Reference,
+        *,
+        elapsed_s: float | None = None,
+        budget_s: float = 0.0,
+    ) -> StepStatus:
         """As :meth:`step`, with the reference (N, 6) of another planner."""
         rows = np.ascontiguousarray(reference, dtype=np.float64)
         if rows.shape != (self.manifest.horizon, 6):
@@ -294,6 +204,8 @@ class NativeStep:
             self._mpc,
             self._x_address,
             d_previous,
+            self._step_s if elapsed_s is None else elapsed_s,
+            budget_s,
             _address(rows),
             self._u_address,
             self._status_address,
@@ -301,6 +213,41 @@ class NativeStep:
         )
         self._check(error, "solve")
         return StepStatus(self._status.value)
+
+    def prepare(self, elapsed_s: float | None = None, budget_s: float = 0.0) -> None:
+        """Makes ready what of the next step needs no state; call it after :meth:`step`.
+
+        ``elapsed_s``: expected of the next step; None: one stage Ts. With ``budget_s`` the last
+        problem is iterated on first. Results in ``u``, ``info`` and the plan stay. Leaving it out,
+        or another ``elapsed_s`` in the step, changes nothing but the time that the step takes.
+        """
+        elapsed = self._step_s if elapsed_s is None else elapsed_s
+        self._check(self._prepare(self._mpc, elapsed, budget_s), "prepare")
+
+    def predict(
+        self, x: _DOUBLES, u: _DOUBLES, duration_s: float, out: _DOUBLES | None = None
+    ) -> _DOUBLES:
+        """State (7,) after x (7,) with u (2,) held, by the model and the weights in use.
+
+        Written into ``out`` (may be x) if given. ``duration_s``: 0 to 1. InputError if it is not,
+        or if a number is not finite or absurd.
+        """
+        self._x[:] = x
+        self._u_held[:] = u
+        self._check(
+            self._predict(
+                self._mpc,
+                self._x_address,
+                self._u_held_address,
+                duration_s,
+                self._predicted_address,
+            ),
+            "predict",
+        )
+        if out is None:
+            return self._predicted.copy()
+        out[:] = self._predicted
+        return out
 
     def read_plan(self) -> tuple[_DOUBLES, _DOUBLES]:
         """The last plan, x (N + 1, 7) and u (N, 2), in buffers that the next call overwrites."""

@@ -1,60 +1,61 @@
-"""The controller process: answers each state with an actuation; everything else comes between.
+"""The controller process: a fixed-rate loop by the wall clock, an answer to each state in lockstep.
 
-The loop is the same in lockstep and free-running mode: take the newest state, step, send the
-actuation, then the telemetry. Between two cycles it takes over weights and answers for its status.
-It writes nothing to disk and logs nothing while it drives.
+By the wall clock the loop keeps its rate whatever arrives: it wakes shortly before a release,
+looks for the state that is due, steps, sends, and does everything else (telemetry, requests,
+heartbeat, preparation of the next step) in the time that is left. It writes nothing to disk, waits
+for no one and logs nothing while it drives.
 """
 
 import gc
 import logging
-import math
 import time
-from collections.abc import Mapping
-from typing import Any
+from typing import Any, Final
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from bayesrace.clock import die_with_parent, pin_to_cpu, quiet_garbage_collector
-from bayesrace.errors import InputError
-from bayesrace.messages import (
-    ACTUATION,
-    EVENT,
-    STATE,
-    STATUS,
-    TELEMETRY,
-    WEIGHTS,
-    Actuation,
-    Decoder,
-    Event,
-    Reply,
-    Scalar,
-    State,
-    Status,
-    Telemetry,
-)
+from bayesrace.clock import die_with_parent, sleep_until_ns
+from bayesrace.messages import ACTUATION, STATE, TELEMETRY, Actuation, Decoder, State
+from bayesrace.realtime import RealtimeSettings, prepare_thread
 from bayesrace.transport import (
     CONTROLLER_ENDPOINT,
+    HEARTBEAT_S,
     LOCKSTEP_SPIN_S,
+    NEWEST,
     PLANT_ENDPOINT,
     Endpoints,
     Inbox,
     Item,
     Kind,
     Publisher,
-    Request,
     open_session,
 )
 from bayesrace.vehicles.parameters import get_car
-from controller.fallback import Fallback, FallbackSettings, Level
-from controller.interface import Controller, StepOutput
+from controller.compensation import CompensationSettings
+from controller.driver import Decision, Driver
+from controller.fallback import FallbackSettings
+from controller.interface import Controller
+from controller.schedule import Schedule
+from controller.service import Service
+from controller.telemetry import Timing, telemetry_of
 
 __all__ = ["ControllerProcess", "ControllerSettings", "main"]
 
 _log = logging.getLogger("bayesrace.controller")
 
-_STEP_RAISED = 255
-"""Status of a cycle whose step raised an exception."""
+_SILENT_S: Final = 1.0
+"""Without a state for this long the controller waits for a plant and sends no more."""
+
+_LEAD: Final = 0.1
+"""How long before a release the loop wakes to look for the state (fraction of the period) ..."""
+_LEAD_NS: Final = 300_000
+"""... and at most: wake-up error and jitter of the arrival."""
+
+_GRACE: Final = 0.25
+"""How long after a release the loop still waits for the state that is due (fraction of the
+period)."""
+
+_LEAST_BUDGET: Final = 0.1
+"""What a step gets however late its cycle began (fraction of the period)."""
 
 
 class ControllerSettings(BaseModel):
@@ -65,11 +66,20 @@ class ControllerSettings(BaseModel):
     car: str = Field(default="orca", description="car whose limits hold")
     name: str = Field(default="", description="name in message keys; the car's own if empty")
     endpoints: Endpoints = Endpoints(listen=(CONTROLLER_ENDPOINT,), connect=(PLANT_ENDPOINT,))
+    rate_hz: float = Field(50.0, ge=1, le=500, description="of the loop by the wall clock")
+    budget: float = Field(
+        0.8, gt=0, le=1, description="fraction of the period that a cycle may take, step included"
+    )
+    compensation: CompensationSettings = CompensationSettings()
     fallback: FallbackSettings = FallbackSettings()
     stale_s: float = Field(
-        default=0.5, gt=0, le=60, description="without a state for this long it counts as waiting"
+        default=0.06, gt=0, le=60, description="age from which a state is not predicted forward"
     )
-    cpu: int | None = Field(default=None, ge=0, description="CPU to bind to")
+    stop_mps2: float = Field(
+        1.5, gt=0, le=100, description="deceleration along the line of a stop on command"
+    )
+    hold: bool = Field(False, description="wait for 'go' before driving")
+    realtime: RealtimeSettings = RealtimeSettings()
     parent_pid: int | None = Field(None, description="end when this process, the parent, ends")
 
 
@@ -78,193 +88,220 @@ class ControllerProcess:
 
     def __init__(self, session: Any, settings: ControllerSettings, controller: Controller) -> None:
         self._settings = settings
-        self._controller = controller
         self.name = settings.name or settings.car
-        self._fallback = Fallback(get_car(settings.car), settings.fallback)
+        self._driver = Driver(
+            controller,
+            get_car(settings.car),
+            settings.fallback,
+            settings.compensation,
+            settings.stale_s,
+            settings.stop_mps2,
+            settings.hold,
+        )
+        self._controller = controller
         self._decoder: Decoder[State] = Decoder(State)
         self._actuations = Publisher(session, ACTUATION, self.name)
         self._telemetry = Publisher(session, TELEMETRY, self.name)
-        self._events = Publisher(session, EVENT, self.name, "controller")
-        self._x = np.zeros(7)
-        self._u_previous = np.zeros(2)
-        self._run: int | None = None
-        self._phase = "waiting"
-        self._text = "waiting for the plant"
-        self._skipped = self._raised = self._weights_taken = self._weights_refused = 0
-        self._stopping = False
+        self._schedule = Schedule(settings.rate_hz)
+        self._timing = Timing()
+        self._arrived_ns = 0
         inbox = self.inbox = Inbox(session, self.name)
-        inbox.subscribe(STATE)
-        inbox.serve(STATUS, "controller")
-        inbox.serve(WEIGHTS)
+        inbox.subscribe(STATE, newest=NEWEST)
+        self._service = Service(
+            session, inbox, self.name, settings.rate_hz, self._driver, controller, self._counters
+        )
+        inbox.tell_time("controller")
         inbox.watch("plant")
         inbox.announce("controller")
 
     def serve(self) -> None:
         """Until SIGINT or SIGTERM."""
-        while not self._stopping:
-            newest = self._newest_state()
-            if newest is not None:
-                self._cycle(newest)
+        state: State | None = None
+        while not self._service.stopping:
+            if state is None or state.final:
+                state = self._wait()
+            elif state.lockstep:
+                state = self._lockstep(state)
+            else:
+                state = self._free_running(state)
 
-    def _newest_state(self) -> State | None:
-        """Waits for something to happen; the last state of all that has, if there is one."""
-        item = self.inbox.get(self._settings.stale_s)
+    # Waiting -----------------------------------------------------------------------------------
+
+    def _wait(self) -> State | None:
+        """Waits a little for a first state; serves whatever else happens."""
+        self._service.beat()
+        item = self.inbox.get(HEARTBEAT_S)
         if item is None:
             self._decoder.report(_log)
-            if self._phase != "waiting":
-                self._phase = "waiting"
-                gc.collect()
             return None
-        data: bytes | None = None
-        while item is not None:
-            if item.kind is Kind.MESSAGE:
-                if data is not None:
-                    self._skipped += 1
-                data = item.value
-            else:
-                self._react(item)
-            item = self.inbox.get()
-        return None if data is None or self._stopping else self._decoder(data)
+        return self._take(item)
 
-    def _cycle(self, state: State) -> None:
-        controller, fallback = self._controller, self._fallback
-        if state.run != self._run:
-            self._run = state.run
-            self.inbox.spin_s = LOCKSTEP_SPIN_S if state.lockstep else 0.0
-            fallback.reset()
-            controller.reset(state)
-        self._x[:] = state.x
-        self._u_previous[:] = state.u_applied
+    def _take(self, item: Item) -> State | None:
+        """The item's state if it is a new one to be driven on; other items are served."""
+        if item.kind is not Kind.MESSAGE:
+            self._service.react(item)
+            return None
         begin_ns = time.perf_counter_ns()
-        try:
-            output: StepOutput | None = controller.step(self._x, self._u_previous)
-        except Exception as error:
-            # Whatever it is, the car must not be left without an answer.
-            output = None
-            self._raised += 1
-            self._text = f"the step raised {type(error).__name__}: {error}"
-        solve_us = (time.perf_counter_ns() - begin_ns) * 1e-3
-        d, rate, level = fallback.decide(output, state.x[3])
-        status = _STEP_RAISED if output is None else output.status
+        state = self._decoder(item.value)
+        self._timing.decode_us = (time.perf_counter_ns() - begin_ns) * 1e-3
+        if state is None or not self._driver.observe(state):
+            return None
+        self._arrived_ns = item.received_ns
+        self._service.arrived_ns = item.received_ns
+        return state
+
+    def _silent(self) -> bool:
+        return time.monotonic_ns() - self._arrived_ns > _SILENT_S * 1e9
+
+    def _silence(self) -> None:
+        self._driver.lost()
+        gc.collect()
+
+    # Lockstep ----------------------------------------------------------------------------------
+
+    def _lockstep(self, first: State) -> State | None:
+        """Answers each state, until one comes that is not to be answered so, or none any more."""
+        inbox, timing = self.inbox, self._timing
+        inbox.spin_s = LOCKSTEP_SPIN_S
+        timing.wake_us = 0.0
+        timing.missed = False
+        state: State | None = first
+        while not self._service.stopping:
+            if state is not None:
+                if state.final or not state.lockstep:
+                    break
+                timing.released_ns = time.monotonic_ns()
+                self._driver.decide(state, state.time_s)
+                self._send(state, self._driver.settle())
+                self._prepare(self._driver.states.interval_s, 0.0)
+            elif self._silent() or not self._service.plant_there:
+                break
+            self._service.beat()
+            item = inbox.get(HEARTBEAT_S)
+            state = None if item is None else self._take(item)
+        inbox.spin_s = 0.0
+        self._silence()
+        return state
+
+    # Free-running ------------------------------------------------------------------------------
+
+    def _free_running(self, first: State) -> State | None:
+        """Keeps the rate, until a state comes that is not to be driven on, or none for long."""
+        schedule = self._schedule
+        schedule.start(self._arrived_ns)
+        self._timing.wake_us = 0.0
+        state, fresh = first, True
+        while not self._service.stopping:
+            if fresh and (state.final or state.lockstep):
+                break
+            if self._silent():
+                fresh = False
+                break
+            self._tick(state)
+            self._rest()
+            self._timing.skipped += schedule.advance(time.monotonic_ns())
+            newer = self._next_state()
+            fresh = newer is not None
+            state = newer or state
+        self._silence()
+        return state if fresh else None
+
+    def _tick(self, state: State) -> None:
+        """One cycle: decide, send, report."""
+        schedule, timing, driver = self._schedule, self._timing, self._driver
+        timing.released_ns = time.monotonic_ns()
+        budget_s = self._settings.budget * schedule.period_ns * 1e-9
+        spent_s = (timing.released_ns - schedule.release_ns) * 1e-9
+        basis_s = state.time_s + (timing.released_ns - self._arrived_ns) * 1e-9
+        driver.decide(state, basis_s, max(budget_s - spent_s, _LEAST_BUDGET * budget_s))
+        late_s = (time.monotonic_ns() - timing.released_ns) * 1e-9 - budget_s
+        timing.overruns += late_s > 0
+        self._send(state, driver.settle(max(late_s, 0.0)))
+        timing.missed = time.monotonic_ns() > schedule.deadline_ns
+        timing.misses += timing.missed
+
+    def _rest(self) -> None:
+        """The time until the next release: what has happened meanwhile, and the preparation."""
+        while (item := self.inbox.other()) is not None:
+            self._service.react(item)
+        self._service.beat()
+        end_ns = self._schedule.release_ns + round(self._settings.budget * self._schedule.period_ns)
+        left_s = (end_ns - time.monotonic_ns()) * 1e-9
+        if left_s > 0:
+            self._prepare(self._schedule.period_ns * 1e-9, left_s)
+
+    def _next_state(self) -> State | None:
+        """Sleeps until shortly before the release, then looks for the state that is due."""
+        schedule, period_ns = self._schedule, self._schedule.period_ns
+        release_ns = schedule.release_ns
+        wake_ns = release_ns - min(round(_LEAD * period_ns), _LEAD_NS)
+        sleep_until_ns(wake_ns)
+        self._timing.wake_us = max(time.monotonic_ns() - wake_ns, 0) * 1e-3
+        fresh: State | None = None
+        until_ns = release_ns + (round(_GRACE * period_ns) if self._state_due() else 0)
+        while (item := self.inbox.poll(0 if fresh else until_ns)) is not None:
+            state = self._take(item)
+            if state is not None:
+                fresh = state
+        if fresh is not None:
+            schedule.observe(self._arrived_ns, self._driver.states.interval_s * 1e9)
+        return fresh
+
+    def _state_due(self) -> bool:
+        """Whether a state is due at the next release: they may come less often than releases."""
+        schedule = self._schedule
+        interval_ns = self._driver.states.interval_s * 1e9 or schedule.period_ns
+        since_ns = schedule.release_ns - self._arrived_ns
+        away_ns = since_ns - round(since_ns / interval_ns) * interval_ns
+        return abs(away_ns) < schedule.period_ns / 2 or interval_ns < schedule.period_ns
+
+    # Both --------------------------------------------------------------------------------------
+
+    def _prepare(self, period_s: float, budget_s: float) -> None:
+        begin_ns = time.perf_counter_ns()
+        self._driver.prepare(period_s, budget_s)
+        self._timing.prepare_us = (time.perf_counter_ns() - begin_ns) * 1e-3
+
+    def _send(self, state: State, decision: Decision) -> None:
+        """The actuation, then how it came about."""
+        timing = self._timing
+        begin_ns = time.perf_counter_ns()
+        now_ns = time.monotonic_ns()
         self._actuations.put(
             Actuation(
                 self._actuations.next_seq,
-                time.monotonic_ns(),
+                now_ns,
+                state.epoch,
                 state.run,
                 state.seq,
-                (d, rate),
-                controller.weights_version,
-                status,
+                decision.basis_s,
+                (decision.d, decision.delta_rate),
+                self._controller.weights_version,
+                decision.status,
             ),
             lockstep=state.lockstep,
         )
-        self._phase = "driving" if level is Level.SOLUTION else "fallback"
-        self._report(state, output, status, level, solve_us)
+        timing.encode_us = (time.perf_counter_ns() - begin_ns) * 1e-3
+        timing.ticks += 1
+        timing.received_ns = self._arrived_ns
+        message = telemetry_of(self._telemetry.next_seq, state, decision, timing)
+        self._telemetry.put(message, lockstep=state.lockstep)
 
-    def _report(
-        self, state: State, output: StepOutput | None, status: int, level: Level, solve_us: float
-    ) -> None:
-        """Telemetry, after the actuation is on its way."""
-        if output is None:
-            output = StepOutput(u=self._u_previous)
-        self._telemetry.put(
-            Telemetry(
-                self._telemetry.next_seq,
-                time.monotonic_ns(),
-                state.run,
-                state.seq,
-                status,
-                int(level),
-                output.iterations,
-                output.solve_us or solve_us,
-                _finite(output.plan_x),
-                _finite(output.plan_u),
-                _known(output.residual_dynamics),
-                _known(output.residual_bounds),
-                _known(output.residual_stationarity),
-                output.s_ref_m if math.isfinite(output.s_ref_m) else 0.0,
-                output.n_ref_m if math.isfinite(output.n_ref_m) else 0.0,
-            ),
-            lockstep=state.lockstep,
-        )
-
-    def _react(self, item: Item) -> None:
-        if item.kind is Kind.SIGNAL:
-            self._stopping = True
-        elif item.kind is Kind.GONE:
-            self._run = None  # a plant that comes back begins its run numbers anew
-            self._phase, self._text = "waiting", "the plant vanished: killed or unreachable"
-            _log.warning("%s; waiting for it", self._text)
-        elif item.kind is Kind.ALIVE:
-            self._text = "the plant is there"
-        elif item.kind is Kind.REQUEST:
-            self._serve(item.value)
-
-    def _serve(self, request: Request) -> None:
-        if request.service is STATUS:
-            request.answer(self._status())
-        else:
-            request.answer(self._take_weights(request.payload))
-
-    def _take_weights(self, data: bytes) -> Reply:
-        data_map: dict[str, Scalar] = {}
-        try:
-            version = self._controller.set_weights(data)
-        except InputError as error:
-            self._weights_refused += 1
-            accepted, text = False, str(error)[:2000]
-        else:
-            self._weights_taken += 1
-            accepted, text = True, f"weights {version} in use from the next step on"
-            data_map["version"] = version
-        self._publish_event("weights_accepted" if accepted else "weights_refused", text, data_map)
-        return Reply(0, time.monotonic_ns(), accepted, text, data_map)
-
-    def _publish_event(self, kind: str, text: str, data: Mapping[str, Scalar]) -> None:
-        now_ns = time.monotonic_ns()
-        seq = self._events.next_seq
-        event = Event(seq, now_ns, self._run or 0, "controller", kind, text, data)
-        self._events.put(event, lockstep=True)
-
-    def _status(self) -> Status:
-        counts = self._fallback.counts
-        counters: dict[str, Scalar] = {
-            "cycles": sum(counts),
-            "solution": counts[Level.SOLUTION],
-            "shifted_plan": counts[Level.SHIFTED_PLAN],
-            "brake": counts[Level.BRAKE],
-            "stop": counts[Level.STOP],
-            "raised": self._raised,
-            "skipped": self._skipped,
+    def _counters(self) -> dict[str, int]:
+        """What the loop has counted, by name."""
+        timing, states = self._timing, self._driver.states
+        return {
+            "ticks": timing.ticks,
+            "skipped": timing.skipped,
+            "deadline_misses": timing.misses,
+            "overruns": timing.overruns,
+            "states_received": states.received,
+            "states_lost": states.lost,
+            "states_stale": states.stale,
             "refused": self._decoder.refused,
             "overflowed": self.inbox.overflowed,
-            "weights_taken": self._weights_taken,
-            "weights_refused": self._weights_refused,
+            "actuations_sent": self._actuations.next_seq,
         }
-        return Status(
-            0,
-            time.monotonic_ns(),
-            "controller",
-            self._phase,
-            self._run or 0,
-            self._text[:2000],
-            self._controller.weights_version,
-            counters,
-        )
-
-
-def _finite(plan: Any) -> tuple[float, ...]:
-    """The plan row by row; nothing of it if any of it is no number (receivers would refuse it)."""
-    if not len(plan):
-        return ()
-    flat = np.asarray(plan, dtype=np.float64).ravel()
-    if not (np.abs(flat) <= 1e6).all():
-        return ()
-    return tuple(flat.tolist())
-
-
-def _known(residual: float) -> float:
-    return float(residual) if 0.0 <= residual <= 1e12 else -1.0
 
 
 def main(settings: ControllerSettings, controller: Controller) -> int:
@@ -273,11 +310,10 @@ def main(settings: ControllerSettings, controller: Controller) -> int:
     Call it from the main thread of a process: it takes over the signals.
     """
     die_with_parent(settings.parent_pid)
-    if refusal := pin_to_cpu(settings.cpu):
-        _log.warning("%s", refusal)
     with open_session(settings.endpoints) as session:
         process = ControllerProcess(session, settings, controller)
-        quiet_garbage_collector()
+        for refusal in prepare_thread(settings.realtime):
+            _log.warning("%s", refusal)
         _log.info(
             "controller of car '%s', plant at %s",
             process.name,

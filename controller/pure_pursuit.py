@@ -81,6 +81,8 @@ class PurePursuit:
         self._random = np.random.default_rng(self._settings.seed)
         self._noise = np.zeros(2)
         self._output = StepOutput(u=np.zeros(2))
+        self._predicted = np.zeros(7)
+        self._limit_mps = math.inf
 
     @property
     def weights_version(self) -> str:
@@ -101,7 +103,29 @@ class PurePursuit:
         """Name and settings."""
         return {"controller": "pure-pursuit", **self._settings.model_dump()}
 
-    def step(self, x: Array, u_previous: Array) -> StepOutput:
+    def prepare(self, elapsed_s: float, budget_s: float = 0.0) -> None:
+        """Nothing can be done ahead."""
+
+    def predict(self, x: Array, u: Array, duration_s: float) -> Array:
+        """Dead reckoning: the velocities stay, the steering goes on at its rate."""
+        after = self._predicted
+        after[:] = x
+        psi_mid = float(x[2]) + 0.5 * duration_s * float(x[5])
+        vx, vy = float(x[3]), float(x[4])
+        after[0] += duration_s * (vx * math.cos(psi_mid) - vy * math.sin(psi_mid))
+        after[1] += duration_s * (vx * math.sin(psi_mid) + vy * math.cos(psi_mid))
+        after[2] += duration_s * float(x[5])
+        delta = float(x[6]) + duration_s * float(u[1])
+        after[6] = min(max(delta, -self._car.delta_max_rad), self._car.delta_max_rad)
+        return after
+
+    def limit_speed(self, limit_mps: float, rate_mps2: float) -> None:
+        """The target speed is no higher; it does not look ahead for the rate."""
+        self._limit_mps = limit_mps
+
+    def step(
+        self, x: Array, u_previous: Array, elapsed_s: float = 0.0, budget_s: float = 0.0
+    ) -> StepOutput:
         """Steer towards the target point, hold the line's speed."""
         car, settings, output = self._car, self._settings, self._output
         px, py, psi, vx, delta = (float(x[i]) for i in (0, 1, 2, 3, 6))
@@ -128,7 +152,7 @@ class PurePursuit:
         alpha = math.atan2(dy, dx) - psi
         delta = math.atan2(2 * car.wheelbase_m * math.sin(alpha), math.hypot(dx, dy))
         speed = max(settings.speed_scale * float(self._speeds[ahead]), settings.speed_min_mps)
-        return speed, min(max(delta, -car.delta_max_rad), car.delta_max_rad)
+        return min(speed, self._limit_mps), min(max(delta, -car.delta_max_rad), car.delta_max_rad)
 
     def _hold(self, vx: float) -> float:
         """Duty cycle that about balances rolling resistance at this speed."""

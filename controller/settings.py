@@ -24,7 +24,14 @@ class MpcSettings(BaseModel):
         1e-4,
         ge=0,
         description="a step stops iterating at this stationarity and tenth of the defect, or, "
-        "warm started, when they fall by less than half; 0: neither",
+        "warm started and without a time budget, when they fall by less than half; 0: neither",
     )
-    iterations: int = Field(3, ge=1, le=1000, description="SQP iterations a step may use")
-    iterations_cold: int = Field(30, ge=1, le=1000, description="the same after a reset")
+    iterations: int = Field(
+        3, ge=1, le=1000, description="SQP iterations a step without time budget may use"
+    )
+    iterations_cold: int = Field(
+        30,
+        ge=1,
+        le=1000,
+        description="the same after a reset; with a time budget the larger limits every step",
+    )

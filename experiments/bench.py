@@ -31,11 +31,9 @@ from codegen.ocp import OcpParameters, RacingOcp
 from codegen.settings import BuildSettings
 from controller.native_step import NativeStep, StepStatus
 from controller.path_table import make_path_table
-from controller.pure_pursuit import PurePursuitSettings
 from controller.settings import MpcSettings
-from experiments.collect import drive_samples
+from experiments.preparation import training_samples
 from experiments.progress import Stages
-from learning.dataset import Dataset, filter_dataset
 from learning.training import TrainingSettings, train
 from plant.simulator import Simulator
 
@@ -161,7 +159,7 @@ def run_bench(settings: BenchSettings, stages: Stages) -> BenchResult:
     with stages.stage("racing lines and training drive"):
         training, course = load_track(settings.train_track), load_track(settings.track)
         line = compute_raceline(course, car)
-        samples = _samples(training, car, settings)
+        samples = training_samples(training, car, _COLLECT_S, settings.seed)
     with stages.stage("train the residual") as stage:
         options = TrainingSettings(capacity=settings.points, seed=settings.seed)
         weights = train(samples, PREDICTION, options, progress=stage.update)
@@ -196,13 +194,6 @@ def run_bench(settings: BenchSettings, stages: Stages) -> BenchResult:
 
 def _pair() -> tuple[MpcSettings, MpcSettings]:
     return MpcSettings(), _CONVERGED
-
-
-def _samples(track: Track, car: CarParameters, settings: BenchSettings) -> Dataset:
-    line = compute_raceline(track, car)
-    pursuit = PurePursuitSettings(seed=settings.seed)
-    x, u = drive_samples(track, line, car, _COLLECT_S, pursuit, _START_SPEED_MPS)
-    return filter_dataset(Dataset(car, PREDICTION.step_s, x[:-1], u, x[1:]))
 
 
 def _controller(

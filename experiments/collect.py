@@ -49,7 +49,9 @@ def drive_samples(
 
 def _state(seq: int, x: Floats, u_applied: tuple[float, float], step_s: float, lap: int) -> State:
     now_ns = time.monotonic_ns()
-    return State(seq, now_ns, 0, seq * step_s, tuple(x.tolist()), u_applied, lap, True)
+    return State(
+        seq, now_ns, 0, 0, seq * step_s, tuple(x.tolist()), u_applied, lap, True, (), False
+    )
 
 
 def collect(
@@ -80,7 +82,9 @@ def collect(
             if seq == len(inputs):
                 break
             applied = (float(inputs[seq, 0]), float(inputs[seq, 1]))
-            actuation = Actuation(seq, state.source_time_ns, 0, seq, applied, "", 0)
+            actuation = Actuation(
+                seq, state.source_time_ns, 0, 0, seq, state.time_s, applied, "", 0
+            )
             log.write(actuation_key, encode(actuation), state.source_time_ns, seq)
     finally:
         log.close()

@@ -1,6 +1,7 @@
 """Directs one run of a waiting plant and controller, from the start line to the last lap."""
 
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -8,8 +9,9 @@ from bayesrace.errors import InputError
 from bayesrace.messages import Event, RunRequest, Scalar
 from bayesrace.tracks import StartLine, Track
 from bayesrace.transport import Director, Publisher
+from experiments.processes import Child, endings
 
-__all__ = ["RunPlan", "execute", "run_request"]
+__all__ = ["RunPlan", "execute", "run_request", "wait_for_both"]
 
 _REGULAR = ("laps", "max_time", "left_world")
 """Ends of a run that the car's driving, not a fault, has brought about."""
@@ -44,8 +46,22 @@ def run_request(track: Track, plan: RunPlan) -> RunRequest:
         line_right_m=line.right_m,
         laps=plan.laps,
         max_time_s=plan.max_time_s,
-        actuation_timeout_s=5.0 if plan.lockstep else 0.1,
+        actuation_timeout_s=5.0 if plan.lockstep else 0.2,
     )
+
+
+def wait_for_both(director: Director, children: Sequence[Child], timeout_s: float) -> None:
+    """Waits for plant and controller, as long as the processes that are to be them live.
+
+    InputError if they are not there in time.
+    """
+    deadline = time.monotonic() + timeout_s
+    while True:
+        try:
+            return director.wait_for(("plant", "controller"), 0.5)
+        except InputError:
+            if endings(children) or time.monotonic() > deadline:
+                raise
 
 
 def _announce(publisher: Publisher[Event], plan: RunPlan, weights_version: str) -> None:

@@ -4,22 +4,22 @@ import contextlib
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-__all__ = ["Child", "child"]
+__all__ = ["Child", "child", "endings"]
 
 _PATIENCE_S = 3.0
 
 
 class Child:
-    """A running ``bayesrace`` subcommand whose output goes to a file."""
+    """A running ``bayesrace`` subcommand, or other module, whose output goes to a file."""
 
-    def __init__(self, arguments: list[str], output: Path) -> None:
+    def __init__(self, arguments: list[str], output: Path, module: str = "experiments.cli") -> None:
         self.output = output
         self._file = output.open("ab")
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "experiments.cli", *arguments],
+            [sys.executable, "-m", module, *arguments],
             stdin=subprocess.DEVNULL,
             stdout=self._file,
             stderr=subprocess.STDOUT,
@@ -43,6 +43,14 @@ class Child:
         how = f"was killed by signal {-code}" if code < 0 else f"ended with code {code}"
         return f"{how}{said}"
 
+    def wait(self, timeout_s: float) -> bool:
+        """Whether it ends by itself in that time."""
+        try:
+            self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            return False
+        return True
+
     def stop(self) -> None:
         """SIGTERM, and SIGKILL for who does not listen."""
         if self._process.poll() is None:
@@ -56,13 +64,18 @@ class Child:
 
 
 @contextlib.contextmanager
-def child(arguments: list[str], output: Path) -> Iterator[Child]:
+def child(arguments: list[str], output: Path, module: str = "experiments.cli") -> Iterator[Child]:
     """A child process that does not outlive the block, however the block ends.
 
     With ``--parent-pid`` among the arguments it does not outlive this process either.
     """
-    process = Child(arguments, output)
+    process = Child(arguments, output, module)
     try:
         yield process
     finally:
         process.stop()
+
+
+def endings(children: Iterable[Child]) -> list[str]:
+    """Of those that have ended, how."""
+    return [f"{one.output.stem} {why}" for one in children if (why := one.ended())]

@@ -23,8 +23,8 @@ from bayesrace.vehicles import CarParameters, get_car
 from codegen.build import build
 from codegen.settings import BuildSettings
 from experiments.collect import collect
-from experiments.drive import RunPlan, execute
-from experiments.processes import Child, child
+from experiments.drive import RunPlan, execute, wait_for_both
+from experiments.processes import Child, child, endings
 from experiments.progress import Stage, Stages
 from experiments.settings import RaceSettings
 from learning.dataset import Dataset, concatenate
@@ -131,8 +131,7 @@ def _explained(children: list[Child]) -> Iterator[None]:
         yield
     except InputError as error:
         time.sleep(0.2)  # the system tells of a death a moment after the network does
-        ended = [f"{c.output.stem} {why}" for c in children if (why := c.ended())]
-        raise RaceError("; ".join([str(error), *ended])) from error
+        raise RaceError("; ".join([str(error), *endings(children)])) from error
 
 
 class _Paddock:
@@ -184,20 +183,10 @@ class _Paddock:
         with child(arguments, race.out / f"controller-{name}.log") as process:
             self.children.append(process)
             with _explained(self.children):
-                self._wait_for_both()
+                wait_for_both(self.director, self.children, _START_S)
                 yield
             self.children.remove(process)
         self.director.wait_until_gone("controller", _START_S)
-
-    def _wait_for_both(self) -> None:
-        deadline = time.monotonic() + _START_S
-        while True:
-            try:
-                return self.director.wait_for(("plant", "controller"), 0.5)
-            except InputError:
-                dead = any(process.ended() for process in self.children)
-                if dead or time.monotonic() > deadline:
-                    raise
 
     def drive(self, controller: str) -> RunPlan:
         """One run; InputError if it broke off."""

@@ -2,17 +2,19 @@
 
 import gc
 import logging
+import secrets
 import time
 from collections.abc import Mapping
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from bayesrace.clock import die_with_parent, pin_to_cpu, quiet_garbage_collector
+from bayesrace.clock import die_with_parent
 from bayesrace.errors import InputError
 from bayesrace.messages import (
     ACTUATION,
     EVENT,
+    HEARTBEAT,
     RUN,
     STATE,
     STATUS,
@@ -25,12 +27,16 @@ from bayesrace.messages import (
     Scalar,
     Status,
 )
+from bayesrace.realtime import RealtimeSettings, prepare_thread
 from bayesrace.transport import (
+    HEARTBEAT_S,
+    NEWEST,
     PLANT_ENDPOINT,
     Endpoints,
     Inbox,
     Item,
     Kind,
+    Numbering,
     Publisher,
     Request,
     decode_request,
@@ -39,7 +45,7 @@ from bayesrace.transport import (
 from bayesrace.vehicles.models import dynamic
 from bayesrace.vehicles.parameters import get_car
 from plant.run import End, Run, RunCounters
-from plant.simulator import Simulator
+from plant.simulator import Simulator, plant_discretisation
 
 __all__ = ["PlantProcess", "PlantSettings", "main"]
 
@@ -54,7 +60,16 @@ class PlantSettings(BaseModel):
     car: str = Field(default="orca", description="car whose parameters drive the model")
     name: str = Field(default="", description="name in message keys; the car's own if empty")
     endpoints: Endpoints = Endpoints(listen=(PLANT_ENDPOINT,))
-    cpu: int | None = Field(default=None, ge=0, description="CPU to bind to")
+    rate_hz: float = Field(
+        default=50.0, gt=0, description="how often the state is sampled; the period in lockstep"
+    )
+    delay_s: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="delay put on states and actuations each, when running by the wall clock",
+    )
+    realtime: RealtimeSettings = RealtimeSettings()
     controller_wait_s: float = Field(
         default=2.0,
         ge=0,
@@ -70,7 +85,14 @@ class PlantProcess:
     def __init__(self, session: Any, settings: PlantSettings) -> None:
         self._settings = settings
         self.name = settings.name or settings.car
-        self._simulator = Simulator(dynamic(get_car(settings.car)))
+        self._simulator = Simulator(
+            dynamic(get_car(settings.car)), plant_discretisation(settings.rate_hz)
+        )
+        # Two processes started in one nanosecond on two machines must differ too.
+        self._epoch = secrets.randbits(62)
+        self._numbering = Numbering()
+        self._heartbeats = Publisher(session, HEARTBEAT, self.name, "plant")
+        self._beat_due_ns = 0
         self._states = Publisher(session, STATE, self.name)
         self._events = Publisher(session, EVENT, self.name, "plant")
         self._decoder: Decoder[Actuation] = Decoder(Actuation, _log)
@@ -81,17 +103,19 @@ class PlantProcess:
         self._text = "no run so far"
         self._stopping = False
         inbox = self.inbox = Inbox(session, self.name)
-        inbox.subscribe(ACTUATION)
+        inbox.subscribe(ACTUATION, newest=NEWEST)
         for service in (RUN, STOP):
             inbox.serve(service)
         inbox.serve(STATUS, "plant")
+        inbox.tell_time("plant")
         inbox.watch("controller")
         inbox.announce("plant")
 
     def serve(self) -> None:
         """Until SIGINT or SIGTERM."""
         while not self._stopping:
-            item = self.inbox.get(1.0)
+            self._beat()
+            item = self.inbox.get(HEARTBEAT_S)
             if item is None or item.kind is Kind.MESSAGE:
                 continue
             if item.kind is Kind.REQUEST and item.name == RUN.name:
@@ -130,7 +154,11 @@ class PlantProcess:
                 self._states,
                 self._decoder,
                 self._counters,
+                self._numbering,
                 self._react,
+                self._beat,
+                self._epoch,
+                self._settings.delay_s,
             )
         except InputError as error:
             return str(error)
@@ -201,6 +229,9 @@ class PlantProcess:
             "runs": self._runs,
             "refused": self._decoder.refused,
             "overflowed": self.inbox.overflowed,
+            "states_sent": self._states.next_seq,
+            "actuations_received": self._numbering.received,
+            "actuations_lost": self._numbering.lost,
             **self._counters.as_dict(),
             **self._simulator.guard.counters.as_dict(),
         }
@@ -208,16 +239,28 @@ class PlantProcess:
     def _reply(self, accepted: bool, text: str) -> Reply:
         return Reply(0, time.monotonic_ns(), accepted, text[:2000], {})
 
-    def _status(self) -> Status:
+    def _beat(self) -> None:
+        """Publishes the status, if it is time to."""
+        now_ns = time.monotonic_ns()
+        if now_ns >= self._beat_due_ns:
+            self._beat_due_ns = now_ns + round(HEARTBEAT_S * 1e9)
+            self._heartbeats.put(self._status(self._heartbeats.next_seq), lockstep=False)
+
+    def _status(self, seq: int = 0) -> Status:
         phase = "idle" if self._run is None else "running"
+        now_ns = time.monotonic_ns()
         return Status(
-            0,
-            time.monotonic_ns(),
+            seq,
+            now_ns,
             "plant",
             phase,
+            self._epoch,
             self._run_number,
             self._text[:2000],
             "",
+            self._settings.rate_hz,
+            -1.0 if self._states.sent_ns is None else (now_ns - self._states.sent_ns) * 1e-9,
+            self._settings.delay_s,
             self._count(),
         )
 
@@ -228,11 +271,10 @@ def main(settings: PlantSettings) -> int:
     Call it from the main thread of a process: it takes over the signals.
     """
     die_with_parent(settings.parent_pid)
-    if refusal := pin_to_cpu(settings.cpu):
-        _log.warning("%s", refusal)
     with open_session(settings.endpoints) as session:
         process = PlantProcess(session, settings)
-        quiet_garbage_collector()
+        for refusal in prepare_thread(settings.realtime):
+            _log.warning("%s", refusal)
         _log.info("plant of car '%s' on %s", process.name, ", ".join(settings.endpoints.listen))
         with process.inbox.catching_signals():
             process.serve()

@@ -1,19 +1,27 @@
 """One run of the plant, in lockstep or by the wall clock; the same car below both."""
 
+import heapq
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Final
+from typing import Final, NamedTuple
 
 from bayesrace.clock import sleep_until_ns
 from bayesrace.messages import Actuation, Decoder, RunRequest, State
-from bayesrace.transport import LOCKSTEP_SPIN_S, Inbox, Item, Kind, Publisher
+from bayesrace.transport import LOCKSTEP_SPIN_S, Inbox, Item, Kind, Numbering, Publisher
 from plant.laps import LineCounter
 from plant.simulator import Simulator
 
 __all__ = ["End", "Run", "RunCounters"]
 
 _WORLD_M: Final = 1e4
+
+_REMEMBERED: Final = 1024
+"""States whose answers are taken; what answers an older one is stale."""
+
+_MOST_ANSWERS: Final = 64
+"""Rows that one state message has room for."""
 
 
 @dataclass(slots=True)
@@ -23,7 +31,7 @@ class RunCounters:
     late: int = 0
     """Periods that ended without the answer to the state at their beginning."""
     stale: int = 0
-    """Actuations for another state or run than the one waited for."""
+    """Actuations for another plant, run or state than the one under way, or overtaken ones."""
     overruns: int = 0
     """Periods that the plant itself finished more than a period too late."""
 
@@ -40,19 +48,20 @@ class End:
     text: str
 
 
-@dataclass(slots=True)
-class _Held:
-    """The command that acts, and the number of the state that it answers."""
+class _Waiting(NamedTuple):
+    """An actuation that has arrived; the order is that of acting."""
 
-    u: tuple[float, ...]
-    state_seq: int
+    acts_ns: int
+    number: int
+    """Of arrival: two may act at the same time."""
+    actuation: Actuation
 
 
 class Run:
     """Executes one accepted request.
 
     ``react`` handles what is neither an actuation nor the controller's going (requests, signals);
-    what it returns, if anything, ends the run.
+    what it returns, if anything, ends the run. ``beat`` is called once a period.
     """
 
     def __init__(
@@ -63,15 +72,24 @@ class Run:
         publisher: Publisher[State],
         decoder: Decoder[Actuation],
         counters: RunCounters,
+        numbering: Numbering,
         react: Callable[[Item], End | None],
+        beat: Callable[[], None],
+        epoch: int,
+        delay_s: float = 0.0,
     ) -> None:
+        """``delay_s``: added to states and actuations alike when running by the wall clock."""
         self.request = request
+        self._epoch = epoch
+        self._delay_ns = round(delay_s * 1e9)
         self._simulator = simulator
         self._inbox = inbox
         self._publisher = publisher
         self._decode = decoder
         self._counters = counters
         self._react = react
+        self._beat = beat
+        self._numbering = numbering
         self._line = LineCounter(
             request.line_x_m,
             request.line_y_m,
@@ -79,6 +97,11 @@ class Run:
             request.line_left_m,
             request.line_right_m,
         )
+        # Running by the wall clock:
+        self._outbox: deque[tuple[int, State]] = deque()
+        self._sampled_ns: dict[int, int] = {}
+        self._waiting: list[_Waiting] = []
+        self._held: Actuation | None = None
         simulator.reset(request.x0)
         self._line.restart(request.x0[0], request.x0[1])
 
@@ -105,22 +128,22 @@ class Run:
 
     # Both modes --------------------------------------------------------------------------------
 
-    def _publish(self) -> int:
-        """Send the state; returns its number."""
+    def _sample(self, seq: int, answers: tuple[float, ...] = (), final: bool = False) -> State:
+        """The state as the sensors tell it now."""
         simulator, request = self._simulator, self.request
-        seq = self._publisher.next_seq
-        state = State(
+        return State(
             seq,
             time.monotonic_ns(),
+            self._epoch,
             request.run,
             simulator.time_s,
             tuple(simulator.x.tolist()),
             simulator.u_applied,
             self._line.crossings,
             request.lockstep,
+            answers,
+            final,
         )
-        self._publisher.put(state, lockstep=request.lockstep)
-        return seq
 
     def _finished(self) -> End | None:
         """Judges the state that has just been reached."""
@@ -134,30 +157,23 @@ class Run:
             return End("max_time", f"time limit of {self.request.max_time_s:g} s reached")
         return None
 
-    def _reached(self) -> int | End:
-        """Sends the state that a period led to; its number, or the end of the run.
-
-        The last state of a run is sent as well, unless no message could carry it.
-        """
-        end = self._finished()
-        if end is not None and end.reason == "left_world":
-            return end
-        seq = self._publish()
-        return seq if end is None else end
-
     # Lockstep ----------------------------------------------------------------------------------
 
     def _lockstep(self) -> End:
-        seq = self._publish()
+        end: End | None = None
         while True:
+            seq = self._publisher.next_seq
+            self._publisher.put(self._sample(seq, final=end is not None), lockstep=True)
+            if end is not None:
+                return end
             answer = self._answer_to(seq)
             if isinstance(answer, End):
                 return answer
+            self._beat()
             self._simulator.step(answer)
-            reached = self._reached()
-            if isinstance(reached, End):
-                return reached
-            seq = reached
+            end = self._finished()
+            if end is not None and end.reason == "left_world":
+                return end  # no message could carry this state
 
     def _answer_to(self, seq: int) -> tuple[float, ...] | End:
         """Waits for the actuation that answers this state, or for what ends the run."""
@@ -171,7 +187,8 @@ class Run:
                 actuation = self._decode(item.value)
                 if actuation is None:
                     continue
-                if actuation.state_seq == seq and actuation.run == run:
+                self._numbering.note(actuation.seq)
+                if (actuation.epoch, actuation.run, actuation.state_seq) == (self._epoch, run, seq):
                     return actuation.u
                 self._counters.stale += 1
             elif item.kind is Kind.GONE:
@@ -189,66 +206,99 @@ class Run:
 
     def _wall_clock(self) -> End:
         period_ns = round(self._simulator.step_s * 1e9)
-        first_seq = seq = self._publish()
-        start_ns = time.monotonic_ns()
-        held: _Held | None = None
+        seq = self._publisher.next_seq
+        first = self._sample(seq)
+        start_ns = first.source_time_ns
+        self._enqueue(first)
         while True:
-            begin_ns = start_ns + (seq - first_seq) * period_ns
-            sleep_until_ns(begin_ns + period_ns)
+            begin_ns = start_ns + self._simulator.steps * period_ns
+            self._sleep_and_send(begin_ns + period_ns)
             if time.monotonic_ns() > begin_ns + 2 * period_ns:
                 self._counters.overruns += 1
-            arrivals, end = self._arrivals(first_seq)
+            end = self._receive()
             if end is not None:
                 return end
-            held = self._drive_period(begin_ns, held, arrivals, seq)
-            reached = self._reached()
-            if isinstance(reached, End):
-                return reached
-            seq = reached
+            answers = self._drive_period(begin_ns, begin_ns + period_ns, seq)
+            end = self._finished()
+            if end is not None and end.reason == "left_world":
+                return end  # no message could carry this state
+            seq += 1
+            self._enqueue(self._sample(seq, answers, final=end is not None))
+            if end is not None:
+                if self._outbox:
+                    self._sleep_and_send(self._outbox[-1][0])
+                return end
+            self._beat()
 
-    def _arrivals(self, first_seq: int) -> tuple[list[tuple[int, _Held]], End | None]:
-        """What arrived during the period: usable actuations with their times of arrival."""
-        arrivals: list[tuple[int, _Held]] = []
+    def _enqueue(self, state: State) -> None:
+        """Send the state when its delay is over; keep in mind when it was sampled."""
+        self._sampled_ns[state.seq] = state.source_time_ns
+        self._sampled_ns.pop(state.seq - _REMEMBERED, None)
+        self._outbox.append((state.source_time_ns + self._delay_ns, state))
+        self._sleep_and_send(0)
+
+    def _sleep_and_send(self, until_ns: int) -> None:
+        """Sleep, sending the states whose delay is over in the meantime."""
+        outbox = self._outbox
+        while outbox and outbox[0][0] <= max(until_ns, time.monotonic_ns()):
+            due_ns, state = outbox.popleft()
+            sleep_until_ns(due_ns)
+            self._publisher.put(state, lockstep=False)
+        sleep_until_ns(until_ns)
+
+    def _receive(self) -> End | None:
+        """Takes what has arrived since the last time; returns what ends the run, if anything."""
         while (item := self._inbox.get()) is not None:
             if item.kind is Kind.MESSAGE:
                 actuation = self._decode(item.value)
                 if actuation is None:
                     continue
-                if actuation.run == self.request.run and actuation.state_seq >= first_seq:
-                    arrivals.append((item.received_ns, _Held(actuation.u, actuation.state_seq)))
-                else:
+                self._numbering.note(actuation.seq)
+                mine = (actuation.epoch, actuation.run) == (self._epoch, self.request.run)
+                if not mine or actuation.state_seq not in self._sampled_ns:
                     self._counters.stale += 1
+                    continue
+                waiting = _Waiting(
+                    item.received_ns + self._delay_ns, self._numbering.received, actuation
+                )
+                heapq.heappush(self._waiting, waiting)
             elif item.kind is not Kind.GONE and (end := self._react(item)) is not None:
-                return arrivals, end
-        return arrivals, None
+                return end
+        return None
 
-    def _drive_period(
-        self, begin_ns: int, held: _Held | None, arrivals: list[tuple[int, _Held]], seq: int
-    ) -> _Held | None:
-        """One period of zero-order hold, to the substep; returns what is held at its end."""
+    def _drive_period(self, begin_ns: int, end_ns: int, seq: int) -> tuple[float, ...]:
+        """One period of zero-order hold, to the substep; returns ``State.answers``."""
         simulator = self._simulator
         substep_ns = simulator.step_s * 1e9 / simulator.substeps
         commands: list[tuple[int, tuple[float, ...] | None]] = []
+        answers: list[float] = []
         done = 0
-        for received_ns, new in arrivals:
-            if held is not None and new.state_seq <= held.state_seq:
+        while self._waiting and self._waiting[0].acts_ns < end_ns:
+            acts_ns, _, new = heapq.heappop(self._waiting)
+            arrival_s = (acts_ns - self._sampled_ns.get(new.state_seq, acts_ns)) * 1e-9
+            if self._held is not None and new.basis_s <= self._held.basis_s:
                 self._counters.stale += 1
+                answers += (float(new.state_seq), arrival_s, -1.0)
                 continue
             # It acts from the first substep that begins after its arrival.
-            at = min(max(-int((begin_ns - received_ns) // substep_ns), done), simulator.substeps)
+            at = min(max(-int((begin_ns - acts_ns) // substep_ns), done), simulator.substeps)
             if at > done:
-                commands.append((at - done, self._fresh(held, seq)))
-            held, done = new, at
+                commands.append((at - done, self._fresh(done)))
+            self._held, done = new, at
+            acting_s = simulator.time_s + at * substep_ns * 1e-9 - new.basis_s
+            answers += (float(new.state_seq), arrival_s, acting_s)
         if done < simulator.substeps:
-            commands.append((simulator.substeps - done, self._fresh(held, seq)))
+            commands.append((simulator.substeps - done, self._fresh(done)))
         simulator.step_switched(commands)
-        if held is None or held.state_seq < seq:
+        if self._held is None or self._held.state_seq < seq:
             self._counters.late += 1
-        return held
+        return tuple(answers[: 3 * _MOST_ANSWERS])
 
-    def _fresh(self, held: _Held | None, seq: int) -> tuple[float, ...] | None:
-        """The held command, or None (brake) if the state it answers is too old."""
-        if held is None:
+    def _fresh(self, substep: int) -> tuple[float, ...] | None:
+        """The held command, or None (brake) if what it was made from is too old."""
+        if self._held is None:
             return None
-        age_s = (seq - held.state_seq) * self._simulator.step_s
-        return held.u if age_s <= self.request.actuation_timeout_s else None
+        simulator = self._simulator
+        now_s = simulator.time_s + substep * simulator.step_s / simulator.substeps
+        age_s = now_s - self._held.basis_s
+        return self._held.u if age_s <= self.request.actuation_timeout_s else None

@@ -18,12 +18,36 @@ from bayesrace.integrators import Discretisation
 from bayesrace.vehicles.models import Model
 from bayesrace.vehicles.parameters import CarParameters
 
-__all__ = ["BRAKE_FADE_MPS", "PLANT", "GuardCounters", "PlantGuard", "Simulator"]
+__all__ = [
+    "BRAKE_FADE_MPS",
+    "PLANT",
+    "GuardCounters",
+    "PlantGuard",
+    "Simulator",
+    "plant_discretisation",
+]
 
 Array = npt.NDArray[np.float64]
 
-PLANT: Final = Discretisation(scheme="rk4", step_s=0.02, substeps=20)
-"""How the plant integrates: 1 ms steps, far inside the tyres' stability limit at low speed."""
+SUBSTEP_HZ: Final = 1000
+"""Integration steps of 1 ms, far inside the tyres' stability limit at low speed."""
+
+
+def plant_discretisation(rate_hz: float = 50.0) -> Discretisation:
+    """How the plant integrates when it samples its state at this rate.
+
+    Raises InputError unless a period is a whole number of integration steps.
+    """
+    substeps = round(SUBSTEP_HZ / rate_hz) if rate_hz > 0 else 0
+    if substeps < 1 or abs(substeps * rate_hz - SUBSTEP_HZ) > 1e-6:
+        raise InputError(
+            f"the plant cannot sample at {rate_hz:g} Hz: its period must be a whole number of "
+            "milliseconds; 50, 100, 200, 250 or 500 Hz will do"
+        )
+    return Discretisation(scheme="rk4", step_s=substeps / SUBSTEP_HZ, substeps=substeps)
+
+
+PLANT: Final = plant_discretisation()
 
 BRAKE_FADE_MPS: Final = 0.1
 """Below this speed the guard's braking fades linearly to none, so that a car stops and stays."""

@@ -20,7 +20,8 @@ from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import Model, dynamic, e_kinematic
 from codegen.build import build
 from codegen.settings import BuildSettings
-from controller.native_step import NativeStep, _Parameters
+from controller.native_library import Parameters
+from controller.native_step import NativeStep
 from controller.path_table import PathTable, make_path_table
 from controller.settings import MpcSettings
 
@@ -182,7 +183,7 @@ def weights(car: CarParameters) -> GpWeights:
 
 def native_numbers(settings: MpcSettings, car: CarParameters, weights: GpWeights) -> Floats:
     """Parameters and weights in the order of the C structures, as the C programs read them."""
-    names = [field[0] for field in _Parameters._fields_]
+    names = [field[0] for field in Parameters._fields_]
     parts: list[ArrayLike] = [
         [float(getattr(car if hasattr(car, name) else settings, name)) for name in names]
     ]

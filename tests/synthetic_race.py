@@ -104,11 +104,15 @@ class _Log:
                 continue
             u = (0.5, 0.0) if k else (0.0, 0.0)
             now, time_s, state = self.now_ns, STEP_S * k, tuple(x.tolist())
-            self.put("state", State(seq, now, run, time_s, state, u, 0, drive.lockstep))
-            if k == len(drive.x) - 1:
+            final = k == len(drive.x) - 1
+            self.put(
+                "state", State(seq, now, 1, run, time_s, state, u, 0, drive.lockstep, (), final)
+            )
+            if final:
                 break
             actuation = self.seq("actuation")
-            self.put("actuation", Actuation(actuation, now, run, seq, u, drive.weights, 0))
+            answer = Actuation(actuation, now, 1, run, seq, time_s, u, drive.weights, 0)
+            self.put("actuation", answer)
             self.put("telemetry", self._telemetry(run, seq, drive, k))
         if drive.ended is not None:
             self.event(run, "plant", "run_ended", drive.ended, {"reason": "laps"})
@@ -117,8 +121,9 @@ class _Log:
         level = int(k in drive.fallback_cycles)
         solve_us = float(drive.solve_us[k % len(drive.solve_us)])
         number = self.seq("telemetry")
+        timing = (number, self.now_ns, self.now_ns, False, 0.0, 0.0, 0.0, solve_us, 0.0, 0.0)
         return Telemetry(
-            number, self.now_ns, run, seq, 0, level, 1, solve_us, (), (), 0.0, 0.0, 0.0, 0.0, 0.0
+            number, self.now_ns, run, seq, 0, level, 1, *timing, (), (), 0.0, 0.0, 0.0, 0.0, 0.0
         )
 
     def close(self) -> None:

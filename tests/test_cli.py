@@ -321,7 +321,9 @@ def test_the_chain_by_files_in_four_terminals(
     assert reader.refused == 0
     assert len(states) > 200
     assert {state.run for state in states} == {2}
-    assert [a.state_seq for a in actuations[: len(states)]] == [s.seq for s in states]
+    # the last state of a run needs no answer
+    assert states[-1].final
+    assert [a.state_seq for a in actuations] == [s.seq for s in states[:-1]]
     assert {a.weights_version for a in actuations} == {actuations[0].weights_version} != {""}
     assert len(reader.select(TELEMETRY)) == len(actuations)
     kinds = [event.kind for event in reader.select(EVENT)]

@@ -11,10 +11,11 @@ from controller.interface import StepOutput
 
 CAR = get_car("orca")
 PLAN = np.column_stack([np.linspace(0.1, 0.9, 8), np.linspace(1.0, 4.5, 8)])
+STEP_S = 0.02
 
 
 def good() -> StepOutput:
-    return StepOutput(u=PLAN[0].copy(), plan_u=PLAN.copy())
+    return StepOutput(u=PLAN[0].copy(), plan_u=PLAN.copy(), plan_step_s=STEP_S)
 
 
 def bad() -> StepOutput:
@@ -22,17 +23,44 @@ def bad() -> StepOutput:
 
 
 def test_the_order_of_the_levels() -> None:
-    fallback = Fallback(CAR, FallbackSettings(shifted_cycles=2))
-    assert fallback.decide(good(), 2.0) == (0.1, 1.0, Level.SOLUTION)
+    fallback = Fallback(CAR, FallbackSettings(shifted_s=2 * STEP_S))
+    assert fallback.decide(good(), 2.0, 0.0) == (0.1, 1.0, Level.SOLUTION)
     for row in (1, 2):
-        assert fallback.decide(bad(), 2.0) == (*PLAN[row], Level.SHIFTED_PLAN)
+        assert fallback.decide(bad(), 2.0, row * STEP_S) == (*PLAN[row], Level.SHIFTED_PLAN)
     for row in range(3, 8):
-        assert fallback.decide(bad(), 2.0) == (CAR.d_min, PLAN[row, 1], Level.BRAKE)
-    assert fallback.decide(None, 2.0) == (CAR.d_min, 0.0, Level.STOP)
-    assert fallback.decide(None, 0.05) == (CAR.d_min / 2, 0.0, Level.STOP)
-    assert fallback.decide(None, 0.0)[:2] == (0.0, 0.0)
-    assert fallback.decide(good(), 0.0)[2] == Level.SOLUTION
-    assert fallback.counts == [2, 2, 5, 3]
+        expected = (CAR.d_min, PLAN[row, 1], Level.BRAKE)
+        assert fallback.decide(bad(), 2.0, row * STEP_S) == expected
+    assert fallback.decide(None, 2.0, 8 * STEP_S) == (CAR.d_min, 0.0, Level.BRAKE)
+    assert fallback.decide(None, 0.05, 9 * STEP_S) == (CAR.d_min / 2, 0.0, Level.STOP)
+    assert fallback.decide(None, 0.0, 10 * STEP_S)[:2] == (0.0, 0.0)
+    assert fallback.counts == [1, 2, 6, 2]
+
+
+def test_the_plan_goes_by_time_not_by_cycles() -> None:
+    """At 500 Hz a row lasts ten cycles; where cycles were skipped, rows are too."""
+    fallback = Fallback(CAR)
+    fallback.decide(good(), 2.0, 1.0)
+    for cycle in range(1, 10):
+        assert fallback.decide(bad(), 2.0, 1.0 + 0.002 * cycle)[:2] == tuple(PLAN[0])
+    assert fallback.decide(bad(), 2.0, 1.0 + 0.02)[:2] == tuple(PLAN[1])
+    assert fallback.decide(bad(), 2.0, 1.0 + 0.08)[:2] == tuple(PLAN[4])
+
+
+def test_a_late_solution_is_driven_where_it_has_got_to() -> None:
+    fallback = Fallback(CAR)
+    assert fallback.decide(good(), 2.0, 0.0, late_s=0.015)[2] == Level.SOLUTION
+    assert fallback.decide(good(), 2.0, 0.1, late_s=0.045) == (*PLAN[2], Level.SHIFTED_PLAN)
+    assert fallback.decide(good(), 2.0, 0.2, late_s=0.15)[2] == Level.BRAKE
+
+
+def test_one_good_solution_ends_the_shifted_plan_several_end_braking() -> None:
+    fallback = Fallback(CAR, FallbackSettings(shifted_s=STEP_S, recover_cycles=3))
+    levels = []
+    for cycle, output in enumerate([good(), bad(), good(), bad(), bad(), bad(), good(), good(),
+                                    bad(), good(), good(), good(), good()]):  # fmt: skip
+        levels.append(int(fallback.decide(output, 2.0, cycle * STEP_S)[2]))
+    #                  good after level 1: at once       after level 2: the third in a row
+    assert levels == [0, 1, 0, 1, 2, 2, 2, 2, 2, 2, 2, 0, 0]
 
 
 @pytest.mark.parametrize(
@@ -46,28 +74,36 @@ def test_the_order_of_the_levels() -> None:
 )
 def test_a_good_status_does_not_excuse_an_impossible_input(u: list[float]) -> None:
     fallback = Fallback(CAR)
-    fallback.decide(good(), 1.0)
-    assert fallback.decide(StepOutput(u=np.array(u)), 1.0)[2] == Level.SHIFTED_PLAN
+    fallback.decide(good(), 1.0, 0.0)
+    assert fallback.decide(StepOutput(u=np.array(u)), 1.0, STEP_S)[2] == Level.SHIFTED_PLAN
 
 
 def test_rounding_beyond_a_limit_is_clipped() -> None:
     output = StepOutput(u=np.array([CAR.d_max + 1e-9, 0.0]))
-    assert Fallback(CAR).decide(output, 1.0) == (CAR.d_max, 0.0, Level.SOLUTION)
+    assert Fallback(CAR).decide(output, 1.0, 0.0) == (CAR.d_max, 0.0, Level.SOLUTION)
 
 
 def test_a_new_run_does_not_drive_the_old_plan() -> None:
     fallback = Fallback(CAR)
-    fallback.decide(good(), 1.0)
+    fallback.decide(good(), 1.0, 0.0)
     fallback.reset()
-    assert fallback.decide(bad(), 1.0)[2] == Level.STOP
+    assert fallback.decide(bad(), 1.0, STEP_S) == (CAR.d_min, 0.0, Level.BRAKE)
 
 
 def test_the_kept_plan_is_a_copy() -> None:
     fallback = Fallback(CAR)
     output = good()
-    fallback.decide(output, 1.0)
+    fallback.decide(output, 1.0, 0.0)
     output.plan_u[:] = 7.0
-    assert fallback.decide(bad(), 1.0)[:2] == tuple(PLAN[1])
+    assert fallback.decide(bad(), 1.0, STEP_S)[:2] == tuple(PLAN[1])
+
+
+def test_a_halt_on_command_brakes_along_the_plan_and_counts_nothing() -> None:
+    fallback = Fallback(CAR)
+    fallback.decide(good(), 2.0, 0.0)
+    assert fallback.halt(2.0, STEP_S) == (CAR.d_min, PLAN[1, 1])
+    assert fallback.halt(0.0, 2 * STEP_S) == (0.0, 0.0)
+    assert sum(fallback.counts) == 1
 
 
 _any = st.floats(allow_nan=True, allow_infinity=True)
@@ -75,18 +111,25 @@ _any = st.floats(allow_nan=True, allow_infinity=True)
 
 @given(
     st.lists(
-        st.tuples(st.integers(0, 2), st.tuples(_any, _any), st.lists(_any, min_size=6, max_size=6)),
+        st.tuples(
+            st.integers(0, 2),
+            st.tuples(_any, _any),
+            st.lists(_any, min_size=6, max_size=6),
+            st.floats(0.0, 0.2),
+        ),
         max_size=20,
     ),
     _any,
 )
 def test_whatever_the_solver_says_the_input_is_finite_and_within_limits(
-    cycles: list[tuple[int, tuple[float, float], list[float]]], vx: float
+    cycles: list[tuple[int, tuple[float, float], list[float], float]], vx: float
 ) -> None:
     fallback = Fallback(CAR)
-    for status, u, plan in cycles:
+    time_s = 0.0
+    for status, u, plan, later_s in cycles:
+        time_s += later_s
         output = StepOutput(u=np.array(u), status=status, plan_u=np.array(plan).reshape(3, 2))
-        d, rate, _ = fallback.decide(output, vx)
+        d, rate, _ = fallback.decide(output, vx, time_s, late_s=later_s)
         assert CAR.d_min <= d <= CAR.d_max
         assert abs(rate) <= CAR.delta_rate_max_radps
     assert sum(fallback.counts) == len(cycles)

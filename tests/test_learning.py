@@ -1,5 +1,6 @@
 """Learning: samples, residual, likelihood, training, validation."""
 
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -117,16 +118,14 @@ def test_datasets_are_checked(driven: Dataset) -> None:
 
 
 def state(run: int, seq: int, x: Floats, u: Floats) -> State:
-    values: dict[str, Any] = {"seq": seq, "source_time_ns": 0, "run": run, "lap": 0}
     time_s = round(seq * STEP_S, 9)
-    return State(**values, time_s=time_s, x=tuple(x), u_applied=tuple(u), lockstep=True)
+    return State(seq, 0, 1, run, time_s, tuple(x), tuple(u), 0, True, (), False)
 
 
 def telemetry(run: int, state_seq: int, fallback: int) -> Telemetry:
-    zero = ("seq", "source_time_ns", "status", "iterations", "solve_us", "s_ref_m", "n_ref_m")
-    residuals = ("residual_dynamics", "residual_bounds", "residual_stationarity")
-    values: dict[str, Any] = dict.fromkeys(zero + residuals, 0) | {"plan_x": (), "plan_u": ()}
-    return Telemetry(**values, run=run, state_seq=state_seq, fallback=fallback)
+    values: dict[str, Any] = {field.name: 0 for field in fields(Telemetry)}
+    told = {"run": run, "state_seq": state_seq, "fallback": fallback, "plan_x": (), "plan_u": ()}
+    return Telemetry(**(values | told))
 
 
 def logged(data: Dataset, run: int) -> list[State]:

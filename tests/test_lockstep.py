@@ -55,7 +55,7 @@ sys.exit(main(ControllerSettings.model_validate_json(sys.argv[1]), line))
 FAILING = """
 class Failing(PurePursuit):
     count = 0
-    def step(self, x, u_previous):
+    def step(self, x, u_previous, elapsed_s, budget_s):
         self.count += 1
         if 50 < self.count <= 60:
             raise RuntimeError("no step today")

@@ -18,7 +18,7 @@ KEY = "bayesrace/orca/state"
 
 
 def state(seq: int) -> State:
-    return State(seq, 0, 1, 0.02 * seq, (0.0,) * 7, (0.0, 0.0), 0, True)
+    return State(seq, 0, 0, 1, 0.02 * seq, (0.0,) * 7, (0.0, 0.0), 0, True, (), False)
 
 
 def write(path: Path, count: int = 50) -> None:
@@ -126,7 +126,8 @@ with open_session(Endpoints(listen=(endpoint,))) as plant:
         Recorder(session, "orca", Path(sys.argv[1]))
         publisher = Publisher(plant, STATE, "orca")
         for seq in range(10**6):
-            publisher.put(State(seq, 0, 1, 0.0, (0.0,) * 7, (0.0, 0.0), 0, True), lockstep=True)
+            state = State(seq, 0, 0, 1, 0.0, (0.0,) * 7, (0.0, 0.0), 0, True, (), False)
+            publisher.put(state, lockstep=True)
             print(seq, flush=True)
             time.sleep(0.005)
 """

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from typing import Any, get_args, get_type_hints
+from typing import Any, get_type_hints
 
 import msgpack
 import pytest
@@ -19,16 +19,14 @@ from bayesrace.messages import (
     Decoder,
     Event,
     Message,
-    Reply,
     State,
-    Status,
     Telemetry,
     car_key,
     decode,
     encode,
     json_schema,
 )
-from bayesrace.messages.codec import peek_seq
+from bayesrace.messages.codec import LARGEST_BYTES, largest_bytes, peek_seq
 from bayesrace.messages.rules import (
     Choice,
     Flag,
@@ -38,15 +36,10 @@ from bayesrace.messages.rules import (
     Text,
     Vector,
 )
+from tests.mutations import KINDS, rules_of
 
-KINDS: list[type[Message]] = [
-    *(topic.message for topic in TOPICS),
-    *(service.request for service in SERVICES if service.request is not None),
-    Reply,
-    Status,
-]
-
-STATE = State(3, 10**9, 1, 0.5, (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 0.1), (0.1, 0.2), 0, True)
+X0 = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 0.1)
+STATE = State(3, 10**9, 8, 1, 0.5, X0, (0.1, 0.2), 0, True, (2.0, 4e-4, 1e-3), False)
 
 _text = st.text(st.characters(codec="utf-8"), max_size=30)
 _scalar = st.one_of(
@@ -79,9 +72,7 @@ def values(rule: Any) -> st.SearchStrategy[Any]:
 @st.composite
 def messages(draw: st.DrawFn) -> Message:
     kind = draw(st.sampled_from(KINDS))
-    hints = get_type_hints(kind, include_extras=True)
-    names = [name for name in hints if name != "SCHEMA"]
-    return kind(*[draw(values(get_args(hints[name])[1])) for name in names])
+    return kind(*[draw(values(rule)) for rule in rules_of(kind).values()])
 
 
 @settings(deadline=None)
@@ -122,6 +113,38 @@ def test_damaged_messages_decode_to_something_valid_or_are_refused(
     except InputError:
         return
     assert decode(type(message), encode(survivor)) == survivor
+
+
+def largest(rule: Any) -> Any:
+    """The acceptable value that takes most bytes."""
+    match rule:
+        case Text():
+            return "😀" * rule.longest
+        case Choice():
+            return max(rule.words, key=len)
+        case Scalars():
+            entries: dict[str, Any] = {f"{i:04}": 2**63 - 1 for i in range(rule.most)}
+            return entries | {f"{i:04}": "😀" * 1920 for i in range(10)}
+        case Vector():
+            return (rule.limit,) * rule.most
+        case Flag():
+            return True
+    return rule.high
+
+
+def test_every_kind_of_message_is_in_the_table() -> None:
+    assert {k.__name__ for k in KINDS} == {k.__name__ for k in Message.__subclasses__()}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_largest_message_passes_and_what_is_larger_is_not_read(kind: type[Message]) -> None:
+    message = kind(*map(largest, rules_of(kind).values()))
+    data = encode(message)
+    assert decode(kind, data) == message
+    assert len(data) <= largest_bytes(kind) <= LARGEST_BYTES
+    junk = bytes(largest_bytes(kind) + 1)
+    with pytest.raises(InputError, match=f"{len(junk)} bytes, at most {len(junk) - 1} allowed"):
+        decode(kind, junk)
 
 
 def _changed(**changes: Any) -> bytes:
@@ -177,6 +200,26 @@ def test_the_decoder_counts_drops_and_logs_at_a_limited_rate(
     silent = Decoder(State)
     assert silent(b"junk") is None
     assert "not a m" in silent.last_reason
+
+
+@pytest.mark.parametrize(
+    ("entries", "fault"),
+    [
+        ({"a": math.nan}, "'a' is not a finite number"),
+        ({"a\x1b[2J": -math.inf}, r"'a\\x1b\[2J' is not a finite"),
+        ({"a": 2**64 - 1}, "'a' is an integer beyond"),
+        ({"a": {"b": 1}}, "'a' is neither"),
+        ({"a": [1]}, "max_array_len"),
+        ({"a": "x" * 2001}, "'a' is neither"),
+        ({"x" * 101: 1}, "at most 100 characters"),
+        ({f"n{i}": "x" * 2000 for i in range(11)}, "22023 characters, at most 20000"),
+        ({f"n{i}": 1 for i in range(201)}, "201 entries|max_map_len"),
+    ],
+)
+def test_a_map_holds_few_finite_scalars(entries: dict[str, Any], fault: str) -> None:
+    """The name in the refusal is quoted: it comes from outside and may end on a terminal."""
+    with pytest.raises(InputError, match=fault):
+        decode(Event, encode(Event(0, 0, 0, "plant", "kind", "text", entries)))
 
 
 def test_maps_in_messages_are_read_only() -> None:

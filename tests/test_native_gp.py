@@ -17,7 +17,8 @@ from bayesrace.gp.weights import KERNELS, GpOutput, GpWeights, zero_weights
 from bayesrace.integrators import PERFECT, PREDICTION
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic, e_kinematic
-from controller.native_step import NativeStep, _Gp
+from controller.native_library import Gp
+from controller.native_step import NativeStep
 from controller.settings import MpcSettings
 from tests.conftest import LENGTH_SCALES, fit_weights, smooth_drive
 
@@ -237,7 +238,7 @@ def test_the_c_interface_refuses_spoiled_weights_and_keeps_the_old(
     """What the file format already refuses, once more at the boundary that C callers use."""
     n = 12
     lengths, inputs, alpha = np.ones(6), np.ones((n, 6)), np.ones(n)
-    outputs = (_Gp * 3)()
+    outputs = (Gp * 3)()
     for gp in outputs:
         gp.n, gp.scale = n, 1.0
         gp.length_scales, gp.inputs, gp.alpha = (a.ctypes.data for a in (lengths, inputs, alpha))

@@ -25,7 +25,7 @@ def oval(points: int = 200) -> tuple[Any, Any, Any]:
 
 
 def first_state(x0: tuple[float, ...]) -> State:
-    return State(0, 0, 0, 0.0, x0, (0.0, 0.0), 0, True)
+    return State(0, 0, 0, 0, 0.0, x0, (0.0, 0.0), 0, True, (), False)
 
 
 def drive(

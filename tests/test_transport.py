@@ -48,7 +48,7 @@ def pair() -> Iterator[tuple[Any, Any]]:
 
 
 def state(seq: int) -> State:
-    return State(seq, 0, 1, 0.0, (0.0,) * 7, (0.0, 0.0), 0, True)
+    return State(seq, 0, 0, 1, 0.0, (0.0,) * 7, (0.0, 0.0), 0, True, (), False)
 
 
 def take(inbox: Inbox, kind: Kind, timeout_s: float = 5.0) -> Item:
@@ -103,7 +103,7 @@ def test_requests_are_answered_and_silence_is_an_error(pair: tuple[Any, Any]) ->
     server.serve(WEIGHTS)
     server.serve(STOP)
     meet(server, client)
-    status = Status(0, 1, "plant", "idle", 0, "fine", "", {"late": 3})
+    status = Status(0, 1, "plant", "idle", 5, 0, "fine", "", 50.0, -1.0, 0.0, {"late": 3})
 
     def answer() -> None:
         take(server, Kind.REQUEST).value.answer(status)

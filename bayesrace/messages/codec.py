@@ -2,27 +2,42 @@
 
 Nothing here executes what it reads. :func:`decode` either returns a message whose every field has
 passed its rule or raises :class:`InputError`; no other exception and no non-finite value gets past.
+What is longer than the longest valid message of its kind is not read at all, so nonsense costs no
+more time and memory than sense.
 """
 
 import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from functools import partial
 from operator import attrgetter
 from typing import Any, Final, Generic, TypeVar, get_args, get_type_hints
 
 import msgpack
 
 from bayesrace.errors import InputError
-from bayesrace.messages.rules import Rule
+from bayesrace.messages.rules import Integer, Rule, Scalars, Text, Vector
 from bayesrace.messages.types import Message
 
-__all__ = ["LARGEST_BYTES", "Decoder", "decode", "encode", "json_schema", "peek_seq"]
+__all__ = [
+    "LARGEST_BYTES",
+    "Decoder",
+    "decode",
+    "encode",
+    "json_schema",
+    "largest_bytes",
+    "peek_seq",
+]
 
 M = TypeVar("M", bound=Message)
 
-LARGEST_BYTES: Final = 1 << 20
-"""Longer than any valid message; longer input is refused unread."""
+LARGEST_BYTES: Final = 1 << 17
+"""No valid message of any kind is longer; each has its own limit, :func:`largest_bytes`."""
+
+_NAME_HEAD_BYTES: Final = 5
+_UNKNOWN_NAMES: Final = 20
+"""More fields than a message has are still read, to be named in the refusal."""
 
 _MALFORMED: Final = (ValueError, TypeError, OverflowError, msgpack.UnpackException)
 
@@ -36,6 +51,9 @@ class _Spec:
     values_of: Callable[[Any], tuple[Any, ...]]
     checks: tuple[tuple[str, Callable[[Any], Any]], ...]
     rules: tuple[tuple[str, Rule], ...]
+    wire_bytes: int
+    """Most bytes of a valid message."""
+    unpack: Callable[[bytes], Any]
 
 
 _SPECS: dict[type[Message], _Spec] = {}
@@ -49,8 +67,35 @@ def _spec(kind: type[Message]) -> _Spec:
         rules = tuple((name, get_args(hints[name])[1]) for name in names)
         checks = tuple((name, rule.check) for name, rule in rules)
         keys = frozenset(("schema", *names))
-        spec = _SPECS[kind] = _Spec(names, keys, attrgetter(*names), checks, rules)
+        spec = _SPECS[kind] = _Spec(
+            names, keys, attrgetter(*names), checks, rules, _wire_bytes(rules), _unpacker(rules)
+        )
     return spec
+
+
+def _wire_bytes(rules: tuple[tuple[str, Rule], ...]) -> int:
+    """Most bytes of a map of these fields and the schema version."""
+    fields_and_schema = (("schema", Integer()), *rules)
+    entries = (_NAME_HEAD_BYTES + len(name) + rule.wire_bytes for name, rule in fields_and_schema)
+    return _NAME_HEAD_BYTES + sum(entries)
+
+
+def _unpacker(rules: tuple[tuple[str, Rule], ...]) -> Callable[[bytes], Any]:
+    """msgpack's reader with the limits of these fields; it does not even begin a larger thing."""
+    only = [rule for _, rule in rules]
+    return partial(
+        msgpack.unpackb,
+        object_pairs_hook=_distinct,
+        max_array_len=max((rule.most for rule in only if isinstance(rule, Vector)), default=0),
+        max_map_len=max(
+            [len(rules) + _UNKNOWN_NAMES, *(r.most for r in only if isinstance(r, Scalars))]
+        ),
+        max_str_len=max(
+            (rule.wire_bytes for rule in only if isinstance(rule, Text | Scalars)), default=100
+        ),
+        max_bin_len=0,
+        max_ext_len=0,
+    )
 
 
 def _plain(value: Any) -> Any:
@@ -83,10 +128,10 @@ def decode(kind: type[M], data: bytes) -> M:
     version, a missing, repeated or unknown field, a value of another type, length or range.
     """
     spec = _spec(kind)
-    if len(data) > LARGEST_BYTES:
-        raise InputError(f"{kind.__name__}: {len(data)} bytes, at most {LARGEST_BYTES} allowed")
+    if len(data) > spec.wire_bytes:
+        raise InputError(f"{kind.__name__}: {len(data)} bytes, at most {spec.wire_bytes} allowed")
     try:
-        content = msgpack.unpackb(data, object_pairs_hook=_distinct)
+        content = spec.unpack(data)
     except _MALFORMED as error:
         raise InputError(f"{kind.__name__}: not a message ({error or 'malformed'})") from None
     if type(content) is not dict or content.keys() != spec.keys:
@@ -101,6 +146,11 @@ def decode(kind: type[M], data: bytes) -> M:
         return kind(*[check(content[name]) for name, check in spec.checks])
     except ValueError:
         raise _explained(kind, content, spec) from None
+
+
+def largest_bytes(kind: type[Message]) -> int:
+    """Most bytes of a valid message of class ``kind``; longer input is refused unread."""
+    return _spec(kind).wire_bytes
 
 
 def _odd(content: Any, spec: _Spec) -> str:

@@ -2,6 +2,9 @@
 
 A rule's ``check`` returns the value as the dataclass keeps it or raises ``ValueError`` saying what
 is wrong; the codec adds message and field name. Comparisons are written so that NaN fails them.
+
+A rule also says how large its values get on the wire, in the widest form that msgpack has for them:
+what is larger is refused before anything is made of it.
 """
 
 from collections.abc import Mapping
@@ -17,6 +20,11 @@ Scalar = bool | int | float | str
 _INT64_MAX = 2**63 - 1
 _REAL_MAX = 1e12
 
+_NUMBER_BYTES = 9
+_HEAD_BYTES = 5
+"""Before the content of a text, array or map."""
+_CHARACTER_BYTES = 4
+
 
 class Rule(Protocol):
     """Checks one decoded value."""
@@ -26,6 +34,10 @@ class Rule(Protocol):
 
     def describe(self) -> dict[str, Any]:
         """The same rule as JSON schema, for logs that other tools read."""
+
+    @property
+    def wire_bytes(self) -> int:
+        """Most bytes that an acceptable value takes."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +59,11 @@ class Integer:
         """See :meth:`Rule.describe`."""
         return {"type": "integer", "minimum": self.low, "maximum": self.high}
 
+    @property
+    def wire_bytes(self) -> int:
+        """See :attr:`Rule.wire_bytes`."""
+        return _NUMBER_BYTES
+
 
 @dataclass(frozen=True)
 class Real:
@@ -67,6 +84,11 @@ class Real:
         """See :meth:`Rule.describe`."""
         return {"type": "number", "minimum": self.low, "maximum": self.high}
 
+    @property
+    def wire_bytes(self) -> int:
+        """See :attr:`Rule.wire_bytes`."""
+        return _NUMBER_BYTES
+
 
 @dataclass(frozen=True)
 class Flag:
@@ -81,6 +103,11 @@ class Flag:
     def describe(self) -> dict[str, Any]:
         """See :meth:`Rule.describe`."""
         return {"type": "boolean"}
+
+    @property
+    def wire_bytes(self) -> int:
+        """See :attr:`Rule.wire_bytes`."""
+        return 1
 
 
 @dataclass(frozen=True)
@@ -101,6 +128,11 @@ class Text:
         """See :meth:`Rule.describe`."""
         return {"type": "string", "maxLength": self.longest}
 
+    @property
+    def wire_bytes(self) -> int:
+        """See :attr:`Rule.wire_bytes`."""
+        return _HEAD_BYTES + _CHARACTER_BYTES * self.longest
+
 
 @dataclass(frozen=True)
 class Choice:
@@ -117,6 +149,11 @@ class Choice:
     def describe(self) -> dict[str, Any]:
         """See :meth:`Rule.describe`."""
         return {"type": "string", "enum": list(self.words)}
+
+    @property
+    def wire_bytes(self) -> int:
+        """See :attr:`Rule.wire_bytes`."""
+        return _HEAD_BYTES + _CHARACTER_BYTES * max(map(len, self.words))
 
 
 @dataclass(frozen=True)
@@ -149,9 +186,18 @@ class Vector:
     def describe(self) -> dict[str, Any]:
         """See :meth:`Rule.describe`."""
         numbers = {"type": "number", "minimum": -self.limit, "maximum": self.limit}
-        most = self.length if self.rows is None else self.length * self.rows
         least = self.length if self.rows is None else 0
-        return {"type": "array", "items": numbers, "minItems": least, "maxItems": most}
+        return {"type": "array", "items": numbers, "minItems": least, "maxItems": self.most}
+
+    @property
+    def most(self) -> int:
+        """Most numbers."""
+        return self.length if self.rows is None else self.length * self.rows
+
+    @property
+    def wire_bytes(self) -> int:
+        """See :attr:`Rule.wire_bytes`."""
+        return _HEAD_BYTES + _NUMBER_BYTES * self.most
 
 
 @dataclass(frozen=True)
@@ -159,6 +205,8 @@ class Scalars:
     """Flat map from short names to single values."""
 
     most: int = 200
+    characters: int = 20_000
+    """Most characters of all names and texts together."""
 
     def check(self, value: Any) -> Mapping[str, Scalar]:
         """See :meth:`Rule.check`."""
@@ -166,26 +214,42 @@ class Scalars:
             raise ValueError(f"expected a map, got {type(value).__name__}")
         if len(value) > self.most:
             raise ValueError(f"{len(value)} entries, at most {self.most} allowed")
+        characters = 0
         for name, scalar in value.items():
             if type(name) is not str or len(name) > 100:
                 raise ValueError("a name in the map is not text of at most 100 characters")
-            _check_scalar(name, scalar)
+            characters += len(name) + _check_scalar(name, scalar)
+        if characters > self.characters:
+            raise ValueError(f"{characters} characters, at most {self.characters} allowed")
         return MappingProxyType(value)
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Rule.describe`."""
         return {"type": "object", "maxProperties": self.most}
 
+    @property
+    def wire_bytes(self) -> int:
+        """See :attr:`Rule.wire_bytes`."""
+        return (
+            _HEAD_BYTES
+            + self.most * (_HEAD_BYTES + _NUMBER_BYTES)
+            + _CHARACTER_BYTES * self.characters
+        )
 
-def _check_scalar(name: str, value: Any) -> None:
+
+def _check_scalar(name: str, value: Any) -> int:
+    """Refuses what is no scalar; the number of characters, 0 unless it is a text."""
     kind = type(value)
     if kind is bool:
-        return
+        return 0
     if kind is int:
         if not -_INT64_MAX <= value <= _INT64_MAX:
-            raise ValueError(f"{name} is an integer beyond 64 bits")
-    elif kind is float:
+            raise ValueError(f"{name!r:.40} is an integer beyond 64 bits")
+        return 0
+    if kind is float:
         if not -_REAL_MAX <= value <= _REAL_MAX:
-            raise ValueError(f"{name} is not a finite number of sensible size")
-    elif kind is not str or len(value) > 2000:
-        raise ValueError(f"{name} is neither a number nor a short text")
+            raise ValueError(f"{name!r:.40} is not a finite number of sensible size")
+        return 0
+    if kind is not str or len(value) > 2000:
+        raise ValueError(f"{name!r:.40} is neither a number nor a short text")
+    return len(value)

@@ -7,6 +7,9 @@ from typing import Any, Final, Generic, Literal, TypeVar
 from bayesrace.errors import InputError
 from bayesrace.messages.types import (
     Actuation,
+    ClockReading,
+    ClockRequest,
+    Command,
     Event,
     Message,
     Reply,
@@ -21,7 +24,10 @@ from bayesrace.messages.types import (
 __all__ = [
     "ACTUATION",
     "ALIVE",
+    "CLOCK",
+    "COMMAND",
     "EVENT",
+    "HEARTBEAT",
     "RUN",
     "SERVICES",
     "STATE",
@@ -88,13 +94,13 @@ _REPORT: Final = Qos("data_low", express=False, reliable=True, wall_clock_blocks
 _NEWS: Final = Qos("data", express=True, reliable=True, wall_clock_blocks=True)
 
 STATE: Final = Topic(
-    "state", "bayesrace/{car}/state", State, ("plant",), "each period (50 Hz)", _CONTROL
+    "state", "bayesrace/{car}/state", State, ("plant",), "each period (50 Hz by default)", _CONTROL
 )
 ACTUATION: Final = Topic(
-    "actuation", "bayesrace/{car}/actuation", Actuation, ("controller",), "each state", _CONTROL
+    "actuation", "bayesrace/{car}/actuation", Actuation, ("controller",), "each cycle", _CONTROL
 )
 TELEMETRY: Final = Topic(
-    "telemetry", "bayesrace/{car}/telemetry", Telemetry, ("controller",), "each state", _REPORT
+    "telemetry", "bayesrace/{car}/telemetry", Telemetry, ("controller",), "each cycle", _REPORT
 )
 EVENT: Final = Topic(
     "event",
@@ -104,7 +110,15 @@ EVENT: Final = Topic(
     "when something happens",
     _NEWS,
 )
-TOPICS: Final[tuple[Topic[Any], ...]] = (STATE, ACTUATION, TELEMETRY, EVENT)
+HEARTBEAT: Final = Topic(
+    "heartbeat",
+    "bayesrace/{car}/status/{source}",
+    Status,
+    ("plant", "controller"),
+    "10 Hz",
+    _REPORT,
+)
+TOPICS: Final[tuple[Topic[Any], ...]] = (STATE, ACTUATION, TELEMETRY, EVENT, HEARTBEAT)
 
 RUN: Final = Service("run", "bayesrace/{car}/plant/run", RunRequest, Reply, 5.0)
 STOP: Final = Service("stop", "bayesrace/{car}/plant/stop", StopRequest, Reply, 5.0)
@@ -112,7 +126,9 @@ STATUS: Final = Service("status", "bayesrace/{car}/{source}/status", StatusReque
 WEIGHTS: Final[Service[Message, Reply]] = Service(
     "weights", "bayesrace/{car}/controller/weights", None, Reply, 10.0
 )
-SERVICES: Final[tuple[Service[Any, Any], ...]] = (RUN, STOP, STATUS, WEIGHTS)
+COMMAND: Final = Service("command", "bayesrace/{car}/controller/command", Command, Reply, 5.0)
+CLOCK: Final = Service("clock", "bayesrace/{car}/{source}/clock", ClockRequest, ClockReading, 2.0)
+SERVICES: Final[tuple[Service[Any, Any], ...]] = (RUN, STOP, STATUS, WEIGHTS, COMMAND, CLOCK)
 
 ALIVE: Final = "bayesrace/{car}/alive/{source}"
 """Liveliness token of a process."""

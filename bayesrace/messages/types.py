@@ -1,7 +1,8 @@
 """The messages: immutable, typed, each field with its rule.
 
 Clocks: ``source_time_ns`` is the sender's ``time.monotonic_ns()``; it is comparable only between
-processes of one machine. ``time_s`` is the plant's own time since the start of the run.
+processes of one machine. ``time_s`` is the plant's own time since the start of the run, and the
+only time in which the plant and its controller speak to each other of delays.
 """
 
 from collections.abc import Mapping
@@ -21,7 +22,11 @@ from bayesrace.messages.rules import (
 
 __all__ = [
     "END_REASONS",
+    "PHASES",
     "Actuation",
+    "ClockReading",
+    "ClockRequest",
+    "Command",
     "Event",
     "Message",
     "Reply",
@@ -39,11 +44,15 @@ END_REASONS: Final = (
 )  # fmt: skip
 """Why a run ended, in the ``kind="run_ended"`` event's data under ``reason``."""
 
+PHASES: Final = ("idle", "running", "waiting", "ready", "driving", "fallback", "stopped")
+"""Of a process, see :class:`Status`."""
+
 Count = Annotated[int, Integer()]
 Signed = Annotated[int, Integer(-(2**31), 2**31 - 1)]
 Seconds = Annotated[float, Real(0.0, 1e9)]
 Metre = Annotated[float, Real(-1e6, 1e6)]
 Width = Annotated[float, Real(0.0, 1e3)]
+Duration = Annotated[float, Real(0.0, 1e9)]
 Short = Annotated[str, Text(200)]
 Long = Annotated[str, Text(2000)]
 DataMap = Annotated[Mapping[str, Scalar], Scalars()]
@@ -64,8 +73,11 @@ class Message:
 
 @dataclass(frozen=True, slots=True)
 class State(Message):
-    """What the sensors tell: ``bayesrace/{car}/state``."""
+    """What the sensors tell: ``bayesrace/{car}/state``; ``source_time_ns`` is when they did."""
 
+    epoch: Count
+    """Random number of the plant's process: what answers another one's states is not for this one,
+    however its numbers look."""
     run: Count
     """Number of the run, from its request; it separates one run's messages from the next one's."""
     time_s: Seconds
@@ -78,15 +90,25 @@ class State(Message):
     """Start-line crossings so far, forwards minus backwards."""
     lockstep: Annotated[bool, Flag()]
     """True if the plant waits for the actuation that answers this very message."""
+    answers: Annotated[tuple[float, ...], Vector(3, limit=1e15, rows=64)]
+    """What was received since the state before, row by row: number of the state answered, time
+    from that state to the arrival of the answer [s], and from the answer's ``basis_s`` to its
+    acting [s] (-1: overtaken, it never acts). Empty in lockstep."""
+    final: Annotated[bool, Flag()]
+    """True in the last state of a run: nothing that answers it will act."""
 
 
 @dataclass(frozen=True, slots=True)
 class Actuation(Message):
     """The controller's answer to one state: ``bayesrace/{car}/actuation``."""
 
+    epoch: Count
     run: Count
     state_seq: Count
-    """``seq`` of the state that this answers."""
+    """``seq`` of the state that this answers; with epoch and run as in that state."""
+    basis_s: Seconds
+    """Plant time up to which the controller took the car's state as known: ``time_s`` of the state,
+    plus what had passed since its arrival if it is not a new one."""
     u: Annotated[tuple[float, ...], Vector(2, limit=1e3)]
     """d [-], delta_rate [rad/s]; the range here is sanity, the car's limits are the plant's."""
     weights_version: Short
@@ -105,8 +127,26 @@ class Telemetry(Message):
     fallback: Annotated[int, Integer(0, 9)]
     """0 solution, 1 shifted previous plan, 2 braking along the last safe steering, 3 stop."""
     iterations: Annotated[int, Integer(0, 100_000)]
-    solve_us: Annotated[float, Real(0.0, 1e9)]
-    """Execution time of the controller's step [us]."""
+    tick: Count
+    """Number of the cycle since the process started; what is missing among them was skipped."""
+    released_ns: Count
+    """Monotonic clock when the cycle began, the state at hand."""
+    received_ns: Count
+    """Monotonic clock when the state answered was taken from the network."""
+    missed: Annotated[bool, Flag()]
+    """The actuation was on its way only after the deadline, the next release."""
+    wake_us: Duration
+    """How late the loop woke from its sleep before this cycle (the rest also in us); 0 in
+    lockstep."""
+    decode_us: Duration
+    prepare_us: Duration
+    """Preparation phase of the step, done after the cycle before."""
+    solve_us: Duration
+    """Feedback phase: execution time of the controller's step."""
+    encode_us: Duration
+    """Making and sending the actuation."""
+    delay_s: Annotated[float, Real(0.0, 1e3)]
+    """Delay from ``basis_s`` to acting that the prediction of the state covers; 0 without."""
     plan_x: Annotated[tuple[float, ...], Vector(7, rows=501)]
     """Predicted states row by row, N + 1 rows of 7; empty without a prediction."""
     plan_u: Annotated[tuple[float, ...], Vector(2, rows=500)]
@@ -172,6 +212,29 @@ class StatusRequest(Message):
 
 
 @dataclass(frozen=True, slots=True)
+class Command(Message):
+    """Told to ``bayesrace/{car}/controller/command``; the answer is a :class:`Reply`."""
+
+    command: Annotated[str, Choice(("stop", "go"))]
+    """stop: brake to standstill and stay there; go: drive (again)."""
+    text: Long
+    """Why; it comes back in the controller's status."""
+
+
+@dataclass(frozen=True, slots=True)
+class ClockRequest(Message):
+    """Asked of ``bayesrace/{car}/plant/clock`` and ``…/controller/clock``."""
+
+
+@dataclass(frozen=True, slots=True)
+class ClockReading(Message):
+    """The clock of a process, ``source_time_ns``, read between request and answer."""
+
+    host: Short
+    """Of the process; for people."""
+
+
+@dataclass(frozen=True, slots=True)
 class Reply(Message):
     """Answer to a request that changes something."""
 
@@ -183,14 +246,23 @@ class Reply(Message):
 
 @dataclass(frozen=True, slots=True)
 class Status(Message):
-    """State of a process, answered on request."""
+    """State of a process: ``bayesrace/{car}/status/{source}`` at 10 Hz, and answered on request."""
 
     source: Annotated[str, Choice(("plant", "controller"))]
-    phase: Short
-    """plant: idle, running; controller: waiting, driving, fallback."""
+    phase: Annotated[str, Choice(PHASES)]
+    """plant: idle, running; controller: waiting (for a state), ready (for a go), driving, fallback,
+    stopped (on command)."""
+    epoch: Count
+    """The plant's, or that of the plant the controller follows; 0 without."""
     run: Count
     text: Long
     """The last thing worth saying, such as why the last run ended."""
     weights_version: Short
+    rate_hz: Annotated[float, Real(0.0, 1e5)]
+    """Of the loop, as set; 0 in lockstep."""
+    state_age_s: Annotated[float, Real(-1.0, 1e9)]
+    """Since the newest state was received (controller) or sent (plant); -1: none yet."""
+    delay_s: Annotated[float, Real(0.0, 1e3)]
+    """Controller: delay that it measures and predicts over; plant: the one it was told to add."""
     counters: DataMap
     """Everything counted since the process started."""

@@ -3,14 +3,17 @@
 from bayesrace.transport.client import Director, ask
 from bayesrace.transport.inbox import (
     LOCKSTEP_SPIN_S,
+    NEWEST,
     Inbox,
     Item,
     Kind,
     Request,
     decode_request,
 )
+from bayesrace.transport.numbering import Numbering
 from bayesrace.transport.session import (
     CONTROLLER_ENDPOINT,
+    HEARTBEAT_S,
     PLANT_ENDPOINT,
     Endpoints,
     Publisher,
@@ -20,13 +23,16 @@ from bayesrace.transport.session import (
 
 __all__ = [
     "CONTROLLER_ENDPOINT",
+    "HEARTBEAT_S",
     "LOCKSTEP_SPIN_S",
+    "NEWEST",
     "PLANT_ENDPOINT",
     "Director",
     "Endpoints",
     "Inbox",
     "Item",
     "Kind",
+    "Numbering",
     "Publisher",
     "Request",
     "ask",

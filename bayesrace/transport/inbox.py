@@ -10,10 +10,11 @@ queue, and a clock thread, wakes it with an empty message that never leaves the 
 import os
 import queue
 import signal
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from enum import Enum
 from types import FrameType
 from typing import Any, Final, NamedTuple
@@ -23,6 +24,8 @@ import zenoh
 from bayesrace.errors import InputError
 from bayesrace.messages import (
     ALIVE,
+    CLOCK,
+    ClockReading,
     Message,
     Service,
     Topic,
@@ -31,15 +34,23 @@ from bayesrace.messages import (
     encode,
 )
 
-__all__ = ["LOCKSTEP_SPIN_S", "Inbox", "Item", "Kind", "Request", "decode_request"]
+__all__ = ["LOCKSTEP_SPIN_S", "NEWEST", "Inbox", "Item", "Kind", "Request", "decode_request"]
 
 _CAPACITY: Final = 10_000
 """Items, and messages, waiting at most; a thread this far behind is broken, and memory must not
 follow it. A full channel holds back the senders: those of the wall clock drop, by the table."""
 
+NEWEST: Final = 1024
+"""Messages of the control path that wait at most: a thread this far behind wants the newest."""
+
 LOCKSTEP_SPIN_S: Final = 0.002
 """How long a lockstep peer looks for the answer before it sleeps. Waking an idle CPU takes longer
 than the answer: measured, the round trip falls from 270 to 90 us."""
+
+_POLL_S: Final = 5e-5
+"""Sleep between two looks of :meth:`Inbox.poll`, once it has spun for long enough."""
+
+_POLL_SPIN_NS: Final = 300_000
 
 _TICK_S: Final = 0.05
 """How late a time limit or a signal may be noticed by a waiting thread."""
@@ -117,13 +128,19 @@ class Inbox:
         self.spin_s = 0.0
         """How long :meth:`get` polls before it sleeps; 0 wherever others need the CPU."""
 
-    def subscribe(self, topic: Topic[Any], source: str = "*") -> None:
-        """Let the topic's messages arrive, as bytes, under the topic's name; one topic only."""
+    def subscribe(self, topic: Topic[Any], source: str = "*", newest: int | None = None) -> None:
+        """Let the topic's messages arrive, as bytes, under the topic's name; one topic only.
+
+        ``newest``: of those waiting, only so many are kept, the newest; the others are let go.
+        """
         if self._channel is not None:
             raise ValueError(f"this inbox has topic '{self._topic}' already")
         key = car_key(topic.key, self._car, source)
         self._topic = topic.name
-        subscriber = self._session.declare_subscriber(key, zenoh.handlers.FifoChannel(_CAPACITY))
+        channel: Any = zenoh.handlers.FifoChannel(_CAPACITY)
+        if newest is not None:
+            channel = zenoh.handlers.RingChannel(newest)
+        subscriber = self._session.declare_subscriber(key, channel)
         self._channel = subscriber.handler
         self._bell = self._session.declare_publisher(
             car_key(topic.key, self._car, source if source != "*" else "bell"),
@@ -139,6 +156,17 @@ class Inbox:
             self._putter(Kind.REQUEST, service.name, lambda query: Request(service, query))
         )
         self._declared.append(self._session.declare_queryable(key, handler))
+
+    def tell_time(self, source: str) -> None:
+        """Answer requests for this process's clock, at once in the transport's own thread."""
+        host = socket.gethostname()[:200]
+
+        def on_query(query: Any) -> None:
+            query.reply(query.key_expr, encode(ClockReading(0, time.monotonic_ns(), host)))
+            query.drop()
+
+        key = car_key(CLOCK.key, self._car, source)
+        self._declared.append(self._session.declare_queryable(key, _direct(on_query)))
 
     def announce(self, source: str) -> None:
         """Declare own liveliness token: last, when everything else is in place."""
@@ -198,6 +226,31 @@ class Inbox:
             if data:
                 return Item(Kind.MESSAGE, self._topic, data, time.monotonic_ns())
 
+    def poll(self, until_ns: int) -> Item | None:
+        """The next message, looked for until the monotonic clock says ``until_ns``.
+
+        For fixed-rate loops: wakes without another thread's help and to the tenth of a
+        millisecond, at the price of polling. Looks at least once.
+        """
+        begin_ns = time.monotonic_ns()
+        while True:
+            sample = self._channel.try_recv()
+            now_ns = time.monotonic_ns()
+            if sample is not None:
+                data: bytes = sample.payload.to_bytes()
+                if data:
+                    return Item(Kind.MESSAGE, self._topic, data, now_ns)
+            elif now_ns >= until_ns:
+                return None
+            elif now_ns - begin_ns < _POLL_SPIN_NS:
+                os.sched_yield()
+            else:
+                time.sleep(_POLL_S)
+
+    def other(self) -> Item | None:
+        """The next item that is no message, of those that are there; does not wait."""
+        return self._noted(self._from_queue(0.0))
+
     @contextmanager
     def stamped(self) -> Iterator[None]:
         """For the block, a thread takes the messages as they arrive, so that ``received_ns`` is
@@ -241,7 +294,8 @@ class Inbox:
         """From another thread: into the queue, and wake who waits at the channel."""
         self._enqueue(item)
         if self._waiting:
-            self._bell.put(b"")
+            with suppress(zenoh.ZError):  # the session has been closed meanwhile
+                self._bell.put(b"")
 
     def _tick(self) -> None:
         """Wakes a waiting thread often enough to see its time limit and its signals."""

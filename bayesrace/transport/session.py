@@ -1,17 +1,19 @@
 """Opening a Zenoh session with nothing left to defaults, and publishing by the table's rules.
 
 Topology of a run: the plant listens; the controller connects to the plant and listens itself; who
-records or directs connects to both, because peers do not forward for each other. Multicast and
-gossip are off, so a process talks to the endpoints it was given and to nobody else.
+records or directs connects to both, because peers do not forward for each other. Or all of them
+connect to a router, which does, between peers of different :data:`Role`. Multicast and gossip are
+off, so a process talks to the endpoints it was given and to nobody else.
 """
 
 import json
 import os
 import re
 import socket
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, Final, Generic, TypeVar
+from typing import Any, Final, Generic, Literal, TypeVar, get_args
 
 import zenoh
 from pydantic import BaseModel, ConfigDict, Field
@@ -21,20 +23,30 @@ from bayesrace.messages import Message, Topic, car_key, encode
 
 __all__ = [
     "CONTROLLER_ENDPOINT",
+    "HEARTBEAT_S",
     "PLANT_ENDPOINT",
     "Endpoints",
     "Publisher",
+    "Role",
     "free_endpoint",
     "open_session",
 ]
 
 M = TypeVar("M", bound=Message)
 
+Role = Literal["plant", "controller", "observer"]
+"""What a process is in the network: its Zenoh region. A router takes the peers of one region to be
+connected among themselves and forwards between regions only; that suits us, as no two plants, no
+two controllers and no two observers (whoever else) have anything to tell each other."""
+
 PLANT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 """Where a plant listens unless told otherwise: loopback only."""
 
 CONTROLLER_ENDPOINT: Final = "tcp/127.0.0.1:7448"
 """Where a controller listens unless told otherwise: loopback only."""
+
+HEARTBEAT_S: Final = 0.1
+"""Between two heartbeats of a process."""
 
 _PROTOCOLS: Final = ("tcp", "udp", "tls", "quic", "ws", "unixsock-stream")
 _ENDPOINT: Final = re.compile(rf"({'|'.join(_PROTOCOLS)})/[^\s#?]+([?#]\S*)?")
@@ -44,6 +56,14 @@ _INTERNET: Final = re.compile(r"[a-z]+/(\[[^\]]+\]|[^:/\s]+):(\d{1,5})([?#]\S*)?
 _RUNTIME: Final = "(rx: (worker_threads: 1))"
 _LEASE_MS: Final = 2000
 _RETRY: Final = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
+
+# Zenoh's own tools tell no region: they form one more, and clients another.
+_FILTERS: Final[list[dict[str, list[str]]]] = [
+    *({"modes": ["peer"], "region_names": [role]} for role in get_args(Role)),
+    {"modes": ["peer"]},
+    {"modes": ["client"]},
+]
+_ROUTER: Final = {"south": [{"filters": [one]} for one in _FILTERS]}
 
 
 class Endpoints(BaseModel):
@@ -65,6 +85,9 @@ class Endpoints(BaseModel):
     """A link is of this kind if both ends ask for it; other links of the process stay as they are.
     It saves two thread changes a message, but blocks where the table says drop, and carries at
     most 60 kB a message: not for free-running, and not for whoever sends weights."""
+    mode: Literal["peer", "router"] = Field(
+        default="peer", description="router: forward between those that connect to this process"
+    )
 
 
 def _check_endpoint(endpoint: str) -> None:
@@ -80,10 +103,11 @@ def _check_endpoint(endpoint: str) -> None:
         raise InputError(f"endpoint '{endpoint}' lacks a port from 0 to 65535: {PLANT_ENDPOINT}")
 
 
-def _config(endpoints: Endpoints) -> Any:
+def _config(endpoints: Endpoints, role: Role) -> Any:
     config = zenoh.Config()
     settings: dict[str, Any] = {
-        "mode": "peer",
+        "mode": endpoints.mode,
+        **({"gateway": _ROUTER} if endpoints.mode == "router" else {"region_name": role}),
         "listen/endpoints": list(endpoints.listen),
         "listen/exit_on_failure": True,
         "connect/endpoints": list(endpoints.connect),
@@ -106,7 +130,7 @@ def _config(endpoints: Endpoints) -> Any:
 
 
 @contextmanager
-def open_session(endpoints: Endpoints) -> Iterator[Any]:
+def open_session(endpoints: Endpoints, role: Role = "observer") -> Iterator[Any]:
     """A Zenoh session that is closed on the way out, whatever happens.
 
     Raises InputError if an endpoint is malformed or cannot be listened on. A peer that is absent
@@ -119,7 +143,7 @@ def open_session(endpoints: Endpoints) -> Iterator[Any]:
     for endpoint in endpoints.listen:
         _check_free(endpoint)
     try:
-        session = zenoh.open(_config(endpoints))
+        session = zenoh.open(_config(endpoints, role))
     except zenoh.ZError as error:
         where = ", ".join((*endpoints.listen, *endpoints.connect)) or "no endpoint"
         raise InputError(
@@ -174,12 +198,15 @@ class Publisher(Generic[M]):
         )
         self.next_seq = 0
         """``seq`` that the next message must carry."""
+        self.sent_ns: int | None = None
+        """Monotonic clock when the newest message had been sent."""
 
     def put(self, message: M, *, lockstep: bool) -> None:
         """Send; in lockstep waits rather than lose it, by the wall clock loses it rather than
         wait (unless the table says otherwise)."""
         (self._blocking if lockstep else self._dropping).put(encode(message))
         self.next_seq = message.seq + 1
+        self.sent_ns = time.monotonic_ns()
 
 
 def _declare(session: Any, key: str, topic: Topic[Any], *, blocking: bool) -> Any:

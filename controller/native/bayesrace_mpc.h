@@ -1,9 +1,16 @@
 /* BayesRace model predictive controller: public interface.
  *
  * One controller lives in one block of memory that the caller owns. After br_mpc_init nothing
- * here allocates, prints, locks, reads a clock or exits; every function is bounded in time by the
- * dimensions below and the iteration limit in br_mpc_parameters. Not re-entrant per object:
- * one thread at a time may call functions on the same br_mpc.
+ * here allocates, prints, locks, exits or reads a clock other than the one given to
+ * br_mpc_set_clock; every function is bounded in time by the dimensions below and the iteration
+ * limits in br_mpc_parameters. Not re-entrant per object: one thread at a time may call functions
+ * on the same br_mpc.
+ *
+ * A control period, with or without the preparation:
+ *
+ *   br_mpc_step(mpc, x, d, elapsed, budget, u, &status, &info);   the state has arrived
+ *   (send u)
+ *   br_mpc_prepare(mpc, period, budget);                          while waiting for the next one
  *
  * Two enums, after OSQP: br_mpc_error says what is wrong with a call, br_mpc_status what became
  * of the optimisation problem. The status is derived from residuals measured at the returned plan.
@@ -21,14 +28,16 @@
 extern "C" {
 #endif
 
-#define BR_ABI 1
+#define BR_ABI 2
 #define BR_NX 7
 #define BR_NU 2
 #define BR_NV (BR_NX + BR_NU)      /* stage variables v = [x; u] */
 #define BR_NZ 6                    /* GP features z = v[3..8] = [vx vy omega delta d delta_rate] */
 #define BR_NE 3                    /* GP outputs: vx, vy, omega */
+#define BR_BRAKE_FADE_MPS 0.1      /* below this speed d_min fades to 0: brakes drive no car back */
 #define BR_PATH_COLUMNS 7          /* see br_mpc_set_path */
 #define BR_PATH_CAPACITY 8192      /* points of the path table */
+#define BR_PREDICT_MAX_S 1.0       /* longest br_mpc_predict */
 
 #if defined(_WIN32)
 #define BR_API __declspec(dllexport)
@@ -45,7 +54,9 @@ typedef enum {
     BR_ERROR_PARAMETERS = 3,  /* a parameter is not finite or out of its range */
     BR_ERROR_PATH = 4,        /* path table: size, spacing or values */
     BR_ERROR_WEIGHTS = 5,     /* GP weights: size, kernel or values */
-    BR_ERROR_NOT_READY = 6    /* parameters or path have not been set */
+    BR_ERROR_NOT_READY = 6,   /* parameters or path have not been set */
+    BR_ERROR_TIME = 7,        /* a time is negative, not finite or too long */
+    BR_ERROR_STATE = 8        /* br_mpc_predict: not finite or absurd, on the way in or out */
 } br_mpc_error;
 
 typedef enum {
@@ -55,7 +66,8 @@ typedef enum {
     BR_INFEASIBLE = 3,    /* the QP has no solution */
     BR_QP_LIMIT = 4,      /* the QP solver hit its iteration limit or cycled */
     BR_NOT_FINITE = 5,    /* a number in the problem or its solution is not finite */
-    BR_BAD_STATE = 6      /* the measured state is not finite or absurd; nothing was solved */
+    BR_BAD_STATE = 6,     /* the measured state is not finite or absurd; nothing was solved */
+    BR_TIME_LIMIT = 7     /* the budget was used up before the plan was usable */
 } br_mpc_status;
 
 typedef enum {
@@ -79,9 +91,13 @@ typedef struct {
     double defect_max;       /* largest dynamics defect of an acceptable plan */
     double settle;           /* a step ends at this stationarity and tenth of the defect, or, warm,
                                 when they fall by less than half; 0: neither */
-    int iterations;          /* SQP iterations a step may use */
-    int iterations_cold;     /* the same for the first step after a reset */
+    int iterations;          /* SQP iterations a step without budget may use */
+    int iterations_cold;     /* the same for the first step after a reset; with a budget the larger
+                                of the two is the limit of every step */
 } br_mpc_parameters;
+
+/* Time in seconds since any fixed moment, never going backwards. */
+typedef double (*br_mpc_clock)(void *context);
 
 /* Posterior mean of one output: mean(z) = offset + scale * sum_i alpha_i k(r_i),
  * r_i = || (z - inputs_i) / length_scales ||. n = 0 gives offset alone. */
@@ -104,6 +120,10 @@ typedef struct {
     int qp_iterations;       /* active-set iterations, summed */
     int regularised;         /* iterations whose Hessian had to be made positive definite */
     int shortened;           /* steps that the line search halved */
+    int shifts;              /* stages by which the plan was shifted; -1: there was no plan */
+    int prepared;            /* 1: br_mpc_prepare had the linearisation and factorisation ready */
+    int prepared_iterations; /* SQP iterations of br_mpc_prepare since the step before */
+    int time_limited;        /* 1: the budget ended the iterations */
     double stationarity;     /* scaled infinity norms at the returned plan */
     double defect;
     double bound;
@@ -126,23 +146,68 @@ BR_API br_mpc_error br_mpc_set_path(br_mpc *mpc, const double *table, int n, dou
 /* Copies the weights; the next step uses them. About 10 us per 400 points and output. */
 BR_API br_mpc_error br_mpc_set_weights(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]);
 
+/* The reference moves along the line at most this fast [m/s], and at every stage by rate [m/s^2]
+ * times BR_TS less, down to standstill: for a stop on the line. INFINITY and 0, as after init, are
+ * no limit. For the control loop, too. BR_ERROR_PARAMETERS if negative or not a number. */
+BR_API br_mpc_error br_mpc_set_speed_limit(br_mpc *mpc, double limit_mps, double rate_mps2);
+
+/* The clock that budgets are measured with, NULL for none (then there are no budgets). It is read
+ * from within br_mpc_step, br_mpc_solve and br_mpc_prepare only, in their thread. */
+BR_API br_mpc_error br_mpc_set_clock(br_mpc *mpc, br_mpc_clock clock, void *context);
+
+/* A clock for hosts that have none of their own: the system's monotonic one. context is unused.
+ * Alone in br_clock.c, which a system without it leaves out. */
+BR_API double br_mpc_monotonic(void *context);
+
 /* --- the control loop ------------------------------------------------------------------------ */
 
 /* Forgets the previous plan, working set and position on the line. */
 BR_API void br_mpc_reset(br_mpc *mpc);
 
 /* One control step: projects the car on the racing line, makes the reference, solves, checks.
+ *
  * x: measured state. d_previous: duty cycle that acts now. u: first input of the plan; written
- * only for BR_CONVERGED and BR_ACCEPTABLE. info may be NULL. */
+ * only for BR_CONVERGED and BR_ACCEPTABLE. info may be NULL.
+ *
+ * elapsed_s: time from the state of the call before to this one, whether that was solved or not.
+ * The plan is shifted by whole stages as soon as it lags behind by half a stage, so that it is
+ * never more than that out of step: BR_TS shifts it once, a tenth of that every tenth time, a
+ * missed period twice. A plan older than the horizon is forgotten. BR_ERROR_TIME if negative or
+ * not finite.
+ *
+ * budget_s: time from the call within which it should return; needs a clock. The step then
+ * iterates until settled (settle 0: converged) or as long as another iteration, at the longest
+ * duration seen, fits, and returns the best usable plan. The first iteration is always done.
+ * Without a clock or with budget_s <= 0 the iteration limits alone count. Either way an iteration
+ * that fails does not take back a usable plan found before it. After BR_TIME_LIMIT the next step
+ * goes on from where this one stopped. */
 BR_API br_mpc_error br_mpc_step(br_mpc *mpc, const double x[BR_NX], double d_previous,
-                                double u[BR_NU], br_mpc_status *status, br_mpc_info *info);
+                                double elapsed_s, double budget_s, double u[BR_NU],
+                                br_mpc_status *status, br_mpc_info *info);
 
 /* The same with a reference of the caller's own planner, stages 1..BR_N. */
 BR_API br_mpc_error br_mpc_solve(br_mpc *mpc, const double x[BR_NX], double d_previous,
+                                 double elapsed_s, double budget_s,
                                  const br_mpc_reference reference[BR_N], double u[BR_NU],
                                  br_mpc_status *status, br_mpc_info *info);
 
-/* Plan of the last step, row major: x (BR_N + 1) x BR_NX, u BR_N x BR_NU. */
+/* The preparation phase of the next step, between two steps: shifts the plan for the elapsed_s
+ * that is expected, linearises there, and does what of the QP depends neither on the next state nor
+ * on its reference. With budget_s (and a clock) it iterates the last problem on first, towards
+ * tolerance, keeping what lowers the residuals. Never needed: with no budget, the step returns the
+ * same to the last bit without it, also if the real elapsed_s, the weights or the parameters turn
+ * out to be others. Does nothing if there is no plan. */
+BR_API br_mpc_error br_mpc_prepare(br_mpc *mpc, double elapsed_s, double budget_s);
+
+/* Where the corrected model takes x within duration_s (0 to BR_PREDICT_MAX_S) under input u, both
+ * held to their limits as the car does: whole stages by the map that the controller predicts with,
+ * the rest by the same scheme with the shorter step and that share of the residual. x_next may be
+ * x. Changes nothing in mpc. BR_ERROR_STATE: x_next is not written. */
+BR_API br_mpc_error br_mpc_predict(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
+                                   double duration_s, double x_next[BR_NX]);
+
+/* Plan of the last step, row major: x (BR_N + 1) x BR_NX, u BR_N x BR_NU. br_mpc_prepare does not
+ * change it. */
 BR_API br_mpc_error br_mpc_get_plan(const br_mpc *mpc, double *x, double *u);
 BR_API br_mpc_error br_mpc_get_reference(const br_mpc *mpc, br_mpc_reference reference[BR_N]);
 

@@ -12,6 +12,7 @@ br_mpc_error br_mpc_init(void *memory, size_t size, br_mpc **out) {
     br_mpc *mpc = memory;
     memset(mpc, 0, sizeof *mpc);
     br_qp_init(&mpc->qp);
+    mpc->path.speed_limit = INFINITY;
     *out = mpc;
     return BR_OK;
 }
@@ -31,6 +32,15 @@ br_mpc_error br_mpc_set_parameters(br_mpc *mpc, const br_mpc_parameters *paramet
     if (!valid(parameters)) return BR_ERROR_PARAMETERS;
     mpc->parameters = *parameters;
     mpc->has_parameters = 1;
+    mpc->qp.factorised = 0;
+    return BR_OK;
+}
+
+br_mpc_error br_mpc_set_speed_limit(br_mpc *mpc, double limit_mps, double rate_mps2) {
+    if (!mpc) return BR_ERROR_NULL;
+    if (!(limit_mps >= 0) || !(rate_mps2 >= 0) || !isfinite(rate_mps2)) return BR_ERROR_PARAMETERS;
+    mpc->path.speed_limit = limit_mps;
+    mpc->path.speed_limit_rate = rate_mps2;
     return BR_OK;
 }
 
@@ -44,7 +54,14 @@ br_mpc_error br_mpc_set_weights(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]) {
     const br_mpc_error error = br_gp_load(&mpc->gp[!mpc->gp_in_use], outputs);
     if (error) return error; /* the weights in use stay */
     mpc->gp_in_use = !mpc->gp_in_use;
-    mpc->linearised = 0;
+    br_undo_preparation(mpc); /* its new last stage was predicted with the weights before */
+    mpc->linearised = mpc->qp.factorised = 0;
+    return BR_OK;
+}
+
+br_mpc_error br_mpc_set_clock(br_mpc *mpc, br_mpc_clock clock, void *context) {
+    if (!mpc) return BR_ERROR_NULL;
+    mpc->timer = (br_timer){.clock = clock, .context = context};
     return BR_OK;
 }
 
@@ -52,13 +69,14 @@ void br_mpc_reset(br_mpc *mpc) {
     if (!mpc) return;
     mpc->warm = 0;
     mpc->linearised = 0;
+    mpc->ahead = mpc->prepared = mpc->prepared_iterations = 0;
     mpc->path.known = 0;
 }
 
 br_mpc_error br_mpc_get_plan(const br_mpc *mpc, double *x, double *u) {
     if (!mpc || !x || !u) return BR_ERROR_NULL;
-    memcpy(x, mpc->plan.x, sizeof mpc->plan.x);
-    memcpy(u, mpc->plan.u, sizeof mpc->plan.u);
+    memcpy(x, mpc->answer_x, sizeof mpc->answer_x);
+    memcpy(u, mpc->answer_u, sizeof mpc->answer_u);
     return BR_OK;
 }
 
@@ -89,6 +107,8 @@ const char *br_mpc_error_text(br_mpc_error error) {
     case BR_ERROR_PATH: return "path table is unusable";
     case BR_ERROR_WEIGHTS: return "GP weights are unusable";
     case BR_ERROR_NOT_READY: return "parameters or path have not been set";
+    case BR_ERROR_TIME: return "a time is negative, not finite or too long";
+    case BR_ERROR_STATE: return "a state or input is not finite or absurd";
     }
     return "unknown error";
 }
@@ -102,6 +122,7 @@ const char *br_mpc_status_text(br_mpc_status status) {
     case BR_QP_LIMIT: return "QP iteration limit";
     case BR_NOT_FINITE: return "not finite";
     case BR_BAD_STATE: return "bad state";
+    case BR_TIME_LIMIT: return "out of time before the plan was usable";
     }
     return "unknown status";
 }

@@ -11,6 +11,7 @@
 #define BR_MP (((BR_M + 7) / 8) * 8)             /* padded to whole vectors */
 #define BR_ROWS (BR_M + 2 * BR_N)                /* input bounds, steering angle, half-planes */
 #define BR_COLS ((((BR_ROWS + 1) + 7) / 8) * 8)  /* right-hand sides of one substitution */
+#define BR_HORIZON_S (BR_N * BR_TS)
 #define BR_LINE_SEARCH_TRIALS 5
 #define BR_GP_PADDED (((BR_GP_CAPACITY + 7) / 8) * 8)
 
@@ -41,9 +42,14 @@ typedef struct {
     double table[BR_PATH_CAPACITY][BR_PATH_COLUMNS];
     int known;     /* the projection of the step before is valid */
     double s;      /* arc length of the last projection */
+    double speed_limit, speed_limit_rate; /* see br_mpc_set_speed_limit */
+    double age;    /* time since then */
 } br_path;
 
 typedef struct {
+    int factorised;     /* g, h, and y, scale, m of the rows up to ROW_TRACK fit the linearisation */
+    int regularised;    /* the exact Hessian was not positive definite */
+    double curvature;   /* share of the second-order part that is in h */
     BR_ALIGNED double g[BR_N + 1][BR_NX][BR_MP]; /* sensitivity of stage k to all inputs */
     BR_ALIGNED double costate[2][BR_NX][BR_MP];
     BR_ALIGNED double h[BR_M][BR_MP];            /* condensed Hessian, then its Cholesky factor */
@@ -76,6 +82,23 @@ typedef struct {
     double multiplier[BR_ROWS];
 } br_plan;
 
+/* The best plan so far of the iterations at hand, with its residuals. */
+typedef struct {
+    br_plan plan;
+    br_mpc_info info;
+    br_mpc_status status;
+    double residual;
+} br_best;
+
+/* Time within a call, by the host's clock. */
+typedef struct {
+    br_mpc_clock clock; /* NULL: none */
+    void *context;
+    int limited;        /* there is a deadline */
+    double deadline;
+    double iteration, trial; /* longest seen, of the line search's trials too; 0: none yet */
+} br_timer;
+
 struct br_mpc {
     br_mpc_parameters parameters;
     int has_parameters;
@@ -84,13 +107,23 @@ struct br_mpc {
     int gp_in_use;
     /* the problem */
     double d_previous;
+    double d_lowest;     /* d_min, less where the car is slow: see BR_BRAKE_FADE_MPS */
     double x0[BR_NX];
     br_mpc_reference reference[BR_N];
     /* the plan, primal and dual */
     int warm;            /* a plan from the step before is there */
     int linearised;      /* stage[] belongs to the plan and the weights in use */
+    int unfinished;      /* iterations that BR_TIME_LIMIT has left without a usable plan */
+    double lag;          /* of the plan, without what br_mpc_prepare shifted, behind the last state */
+    int ahead;           /* shifts that br_mpc_prepare did */
+    int prepared, prepared_iterations;
     br_plan plan;
     br_plan before;      /* the plan that the iteration at hand started from */
+    br_best best;
+    br_plan kept;        /* the plan, and the QP's working set, before those shifts */
+    int kept_sense[BR_ROWS];
+    double answer_x[BR_N + 1][BR_NX], answer_u[BR_N][BR_NU]; /* plan of the last step */
+    br_timer timer;
     br_stage stage[BR_N];
     br_qp qp;
     double merit;        /* of the plan, see br_residuals */
@@ -110,19 +143,50 @@ void br_path_plan(br_path *path, const double x[BR_NX], br_mpc_reference referen
 /* br_stage.c */
 void br_stage_linearise(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
                         const double lambda[BR_NX], br_stage *stage);
+void br_stage_advance(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
+                      double duration, double x_next[BR_NX]);
 
 /* br_qp.c: condensing and the QP of one SQP iteration */
 void br_qp_init(br_qp *qp);
+void br_qp_factorise(br_mpc *mpc);
 br_mpc_status br_qp_condense(br_mpc *mpc);
 br_mpc_status br_qp_solve(br_mpc *mpc, int warm);
 void br_qp_shift_rows(void *rows, size_t size);
 void br_qp_forget_working_set(br_qp *qp);
+
+/* br_timer.c */
+void br_timer_start(br_timer *timer, double budget);
+double br_timer_now(const br_timer *timer);
+int br_timer_allows(const br_timer *timer, double now, double duration);
+void br_timer_note(const br_timer *timer, double begin, double *longest);
+
+/* br_sqp.c: the plan's start, shift and iteration */
+void br_sqp_linearise(br_mpc *mpc);
+void br_sqp_cold_start(br_mpc *mpc);
+void br_sqp_shift(br_mpc *mpc);
+br_mpc_status br_sqp_iterate(br_mpc *mpc, int warm, int any_step);
+
+/* br_prepare.c: in step with time */
+int br_plausible_state(const double x[BR_NX]);
+int br_shifts_due(double *lag);
+void br_align(br_mpc *mpc, int shifts);
+void br_undo_preparation(br_mpc *mpc);
+
+/* br_step.c */
+int br_iteration_limit(const br_mpc *mpc);
+
+/* br_best.c */
+void br_best_begin(br_mpc *mpc);
+void br_best_keep(br_mpc *mpc, br_mpc_status status, int lowest);
+br_mpc_status br_best_restore(br_mpc *mpc, br_mpc_status status);
 
 /* br_residuals.c */
 int br_all_finite(const double *values, int n);
 /* The larger one, and NaN if either is: fmax would lose a NaN and with it a bad solution. */
 static inline double br_worse(double a, double b) { return b > a || b != b ? b : a; }
 void br_residuals(br_mpc *mpc, double penalty);
+double br_residual(const br_mpc *mpc);
 br_mpc_status br_judge(const br_mpc *mpc);
+static inline int br_usable(br_mpc_status status) { return status <= BR_ACCEPTABLE; }
 
 #endif

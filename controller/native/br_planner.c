@@ -14,16 +14,21 @@ enum { X = 0, Y = 1, SPEED = 2, NORMAL_X = 3, NORMAL_Y = 4, LOWER = 5, UPPER = 6
 #define WINDOW_BACK_M 0.3
 #define WINDOW_AHEAD_M 0.5
 #define SPACING_MAX_M 0.1 /* the window must hold several rows */
+#define SPACING_MIN_M 1e-4 /* and few enough to count */
+#define FAR_M 1e4 /* as for measured states: sums of squares stay finite */
+#define SPEED_MAX_MPS 100
 
 br_mpc_error br_path_load(br_path *path, const double *table, int n, double spacing) {
-    if (n < 8 || n > BR_PATH_CAPACITY || !(spacing > 0 && spacing <= SPACING_MAX_M))
+    if (n < 8 || n > BR_PATH_CAPACITY || !(spacing >= SPACING_MIN_M && spacing <= SPACING_MAX_M))
         return BR_ERROR_PATH;
     if (!br_all_finite(table, n * BR_PATH_COLUMNS)) return BR_ERROR_PATH;
     for (int i = 0; i < n; ++i) {
         const double *row = &table[i * BR_PATH_COLUMNS];
         const double norm = hypot(row[NORMAL_X], row[NORMAL_Y]);
         const double *next = &table[(i + 1) % n * BR_PATH_COLUMNS];
-        if (row[SPEED] <= 0 || row[UPPER] <= row[LOWER] || fabs(norm - 1) > 1e-6) return BR_ERROR_PATH;
+        if (fabs(row[X]) > FAR_M || fabs(row[Y]) > FAR_M) return BR_ERROR_PATH;
+        if (row[SPEED] <= 0 || row[SPEED] > SPEED_MAX_MPS) return BR_ERROR_PATH;
+        if (row[UPPER] <= row[LOWER] || fabs(norm - 1) > 1e-6) return BR_ERROR_PATH;
         if (next[X] == row[X] && next[Y] == row[Y]) return BR_ERROR_PATH; /* no direction there */
     }
     memcpy(path->table, table, (size_t)n * sizeof path->table[0]);
@@ -118,6 +123,8 @@ static void project(const br_path *path, int i, const double x[BR_NX], double *s
 void br_path_plan(br_path *path, const double x[BR_NX], br_mpc_reference reference[BR_N],
                   double *lateral) {
     double s, row[BR_PATH_COLUMNS];
+    if (path->age * hypot(x[3], x[4]) > 0.8 * WINDOW_AHEAD_M) path->known = 0; /* may have left the window */
+    path->age = 0;
     project(path, path->known ? nearest_in_window(path, x) : nearest_anywhere(path, x), x, &s, lateral);
     path_at(path, s, row);
     if (path->known && fabs(*lateral) > row[UPPER] - row[LOWER]) /* lost: off by a track's width */
@@ -126,7 +133,8 @@ void br_path_plan(br_path *path, const double x[BR_NX], br_mpc_reference referen
     path->known = 1;
     for (int k = 0; k < BR_N; ++k) {
         path_at(path, s, row);
-        s += BR_TS * row[SPEED];
+        const double limit = path->speed_limit - k * BR_TS * path->speed_limit_rate;
+        s += BR_TS * fmax(fmin(row[SPEED], limit), 0);
         path_at(path, s, row);
         const double norm = hypot(row[NORMAL_X], row[NORMAL_Y]);
         reference[k] = (br_mpc_reference){

@@ -84,12 +84,12 @@ static void propagate_sensitivity(double (*restrict next)[BR_MP], double (*restr
     }
 }
 
-static void sensitivities(br_mpc *mpc) {
+/* Change of the states under dU = 0: the measured state and the defects. */
+static void propagate_state(br_mpc *mpc) {
     br_qp *qp = &mpc->qp;
     for (int i = 0; i < BR_NX; ++i) qp->xbar[0][i] = mpc->x0[i] - mpc->plan.x[0][i];
     for (int k = 0; k < BR_N; ++k) {
         const br_stage *stage = &mpc->stage[k];
-        propagate_sensitivity(qp->g[k + 1], qp->g[k], stage, k);
         for (int i = 0; i < BR_NX; ++i) {
             double sum = stage->f[i] - mpc->plan.x[k + 1][i];
             for (int j = 0; j < BR_NX; ++j) sum += stage->jacobian[i][j] * qp->xbar[k][j];
@@ -204,19 +204,71 @@ static int cholesky(br_qp *qp) {
     return 1;
 }
 
-/* With the exact Hessian if that is positive definite in the inputs; else with less and less of
- * its second-order part, down to Gauss-Newton, which always is. */
-br_mpc_status br_qp_condense(br_mpc *mpc) {
+/* Y = L^{-1} [A' | g]; the columns before ROW_TRACK belong to the inputs and steering angles. */
+static inline __attribute__((always_inline)) void substitute(br_qp *qp, const int first,
+                                                             const int last) {
+    for (int r = 0; r < BR_M; ++r) {
+        double *restrict y = qp->y[r];
+        for (int c = 0; c < r; ++c) {
+            const double l = qp->h[r][c];
+            const double *restrict solved = qp->y[c];
+            for (int i = first; i < last; ++i) y[i] -= l * solved[i];
+        }
+        for (int i = first; i < last; ++i) y[i] *= qp->diagonal[r];
+    }
+}
+
+/* Rows of DAQP's matrix. Hard ones are scaled to unit length; soft ones stay in metres because DAQP
+ * has one weight for all soft rows. */
+static inline __attribute__((always_inline)) void fill_rows(br_qp *qp, const int first,
+                                                            const int last) {
+    for (int i = first; i < last; ++i)
+        for (int r = 0; r < BR_M; ++r) qp->m[i * BR_M + r] = qp->scale[i] * qp->y[r][i];
+}
+
+/* What of the least-distance problem depends on the linearisation alone. */
+static void transform(br_qp *qp) {
+    BR_ALIGNED double norm2[BR_COLS] = {0};
+    for (int r = 0; r < BR_M; ++r) {
+        double *y = qp->y[r];
+        memset(y, 0, sizeof qp->y[r]);
+        y[r] = 1.0;
+        for (int k = r / BR_NU; k < BR_N; ++k) y[ROW_DELTA + k] = qp->g[k + 1][6][r];
+    }
+    substitute(qp, 0, ROW_TRACK);
+    for (int r = 0; r < BR_M; ++r)
+        for (int i = 0; i < ROW_TRACK; ++i) norm2[i] += qp->y[r][i] * qp->y[r][i];
+    for (int i = 0; i < BR_ROWS; ++i) qp->scale[i] = i < ROW_TRACK ? 1.0 / sqrt(norm2[i]) : 1.0;
+    fill_rows(qp, 0, ROW_TRACK);
+}
+
+/* All that needs neither the measured state nor the reference. With the exact Hessian if that is
+ * positive definite in the inputs; else with less and less of its second-order part, down to
+ * Gauss-Newton, which always is. */
+void br_qp_factorise(br_mpc *mpc) {
     static const double curvature[] = {1.0, 0.5, 0.25, 0.0};
-    sensitivities(mpc);
+    br_qp *qp = &mpc->qp;
+    qp->factorised = 0;
+    for (int k = 0; k < BR_N; ++k) propagate_sensitivity(qp->g[k + 1], qp->g[k], &mpc->stage[k], k);
     for (int attempt = 0; attempt < 4; ++attempt) {
         condense_hessian(mpc, curvature[attempt]);
-        if (!cholesky(&mpc->qp)) continue;
-        condense_gradient(mpc, curvature[attempt]);
-        mpc->info.regularised += attempt > 0;
-        return BR_CONVERGED;
+        if (!cholesky(qp)) continue;
+        qp->curvature = curvature[attempt];
+        qp->regularised = attempt > 0;
+        transform(qp);
+        qp->factorised = 1;
+        return;
     }
-    return BR_NOT_FINITE; /* Gauss-Newton is positive definite by construction */
+}
+
+br_mpc_status br_qp_condense(br_mpc *mpc) {
+    br_qp *qp = &mpc->qp;
+    if (!qp->factorised) br_qp_factorise(mpc);
+    if (!qp->factorised) return BR_NOT_FINITE; /* Gauss-Newton is positive definite by construction */
+    propagate_state(mpc);
+    condense_gradient(mpc, qp->curvature);
+    mpc->info.regularised += qp->regularised;
+    return BR_CONVERGED;
 }
 
 static void bounds(br_mpc *mpc) {
@@ -226,7 +278,7 @@ static void bounds(br_mpc *mpc) {
         const double *x = mpc->plan.x[k + 1], *dx = qp->xbar[k + 1];
         const br_mpc_reference *ref = &mpc->reference[k];
         const int d = BR_NU * k, rate = d + 1, delta = ROW_DELTA + k, track = ROW_TRACK + k;
-        qp->lower[d] = par->d_min - mpc->plan.u[k][0];
+        qp->lower[d] = mpc->d_lowest - mpc->plan.u[k][0];
         qp->upper[d] = par->d_max - mpc->plan.u[k][0];
         qp->lower[rate] = -par->delta_rate_max_radps - mpc->plan.u[k][1];
         qp->upper[rate] = par->delta_rate_max_radps - mpc->plan.u[k][1];
@@ -238,48 +290,29 @@ static void bounds(br_mpc *mpc) {
     }
 }
 
-/* Columns of A' and the gradient as right-hand sides, then Y = L^{-1} [A' | g]. */
-static void substitute(br_mpc *mpc) {
+/* The rest of the least-distance problem: half-planes and right-hand sides. */
+static void fill_least_distance(br_mpc *mpc, int rows) {
     br_qp *qp = &mpc->qp;
+    BR_ALIGNED double shift[BR_COLS] = {0};
     for (int r = 0; r < BR_M; ++r) {
-        double *restrict y = qp->y[r];
-        memset(y, 0, sizeof qp->y[r]);
-        y[r] = 1.0;
+        double *y = qp->y[r];
+        for (int i = ROW_TRACK; i < BR_COLS; ++i) y[i] = 0;
         for (int k = r / BR_NU; k < BR_N; ++k) {
             const br_mpc_reference *ref = &mpc->reference[k];
-            y[ROW_DELTA + k] = qp->g[k + 1][6][r];
             y[ROW_TRACK + k] = ref->normal_x * qp->g[k + 1][0][r] + ref->normal_y * qp->g[k + 1][1][r];
         }
         y[BR_ROWS] = qp->gradient[r];
-        for (int c = 0; c < r; ++c) {
-            const double l = qp->h[r][c];
-            const double *restrict solved = qp->y[c];
-            for (int i = 0; i < BR_COLS; ++i) y[i] -= l * solved[i];
-        }
-        for (int i = 0; i < BR_COLS; ++i) y[i] *= qp->diagonal[r];
     }
-}
-
-/* Fills DAQP's rows. Hard rows are scaled to unit length; soft ones stay in metres because DAQP
- * has one weight for all soft rows. */
-static void fill_least_distance(br_mpc *mpc, int rows) {
-    br_qp *qp = &mpc->qp;
-    BR_ALIGNED double norm2[BR_COLS] = {0}, shift[BR_COLS] = {0};
+    substitute(qp, ROW_TRACK, BR_COLS);
     for (int r = 0; r < BR_M; ++r) {
         const double *restrict y = qp->y[r], v = y[BR_ROWS];
-        for (int i = 0; i < BR_COLS; ++i) {
-            norm2[i] += y[i] * y[i];
-            shift[i] += y[i] * v;
-        }
+        for (int i = 0; i < BR_COLS; ++i) shift[i] += y[i] * v;
     }
     for (int i = 0; i < rows; ++i) {
-        const double scale = i < ROW_TRACK ? 1.0 / sqrt(norm2[i]) : 1.0;
-        qp->scale[i] = scale;
-        qp->dupper[i] = scale * (qp->upper[i] + shift[i]);
-        qp->dlower[i] = scale * (qp->lower[i] + shift[i]);
+        qp->dupper[i] = qp->scale[i] * (qp->upper[i] + shift[i]);
+        qp->dlower[i] = qp->scale[i] * (qp->lower[i] + shift[i]);
     }
-    for (int i = 0; i < rows; ++i)
-        for (int r = 0; r < BR_M; ++r) qp->m[i * BR_M + r] = qp->scale[i] * qp->y[r][i];
+    if (rows > ROW_TRACK) fill_rows(qp, ROW_TRACK, BR_ROWS);
 }
 
 static int run_daqp(br_qp *qp, int rows, double slack_weight) {
@@ -313,7 +346,6 @@ br_mpc_status br_qp_solve(br_mpc *mpc, int warm) {
     const double slack_weight = mpc->parameters.s_slack;
     const int rows = slack_weight > 0 ? BR_ROWS : ROW_TRACK;
     bounds(mpc);
-    substitute(mpc);
     fill_least_distance(mpc, rows);
     if (!br_all_finite(qp->dupper, rows) || !br_all_finite(qp->dlower, rows)) return BR_NOT_FINITE;
     if (!warm) br_qp_forget_working_set(qp);

@@ -32,7 +32,7 @@ static double stage_cost(br_mpc *mpc, int k) {
 static double bound_violation(const br_mpc *mpc, int k) {
     const br_mpc_parameters *par = &mpc->parameters;
     const double *u = mpc->plan.u[k - 1];
-    const double duty = fmax(par->d_min - u[0], u[0] - par->d_max);
+    const double duty = fmax(mpc->d_lowest - u[0], u[0] - par->d_max);
     const double steering = fmax(fabs(u[1]) - par->delta_rate_max_radps,
                                  fabs(mpc->plan.x[k][6]) - par->delta_max_rad);
     return br_worse(duty, steering);
@@ -89,6 +89,11 @@ void br_residuals(br_mpc *mpc, double penalty) {
     info->bound = bound;
     info->stationarity = stationarity(mpc);
     mpc->merit = info->cost + penalty * sum;
+}
+
+/* One number for a plan, from info: how far it is from a solution. */
+double br_residual(const br_mpc *mpc) {
+    return br_worse(mpc->info.stationarity, 0.1 * mpc->info.defect);
 }
 
 br_mpc_status br_judge(const br_mpc *mpc) {

@@ -1,4 +1,4 @@
-/* Real-time SQP: shift, plan the reference, iterate, judge by residuals.
+/* Real-time SQP: the plan's start, its shift, and one iteration.
  *
  * An iteration solves the QP at the linearisation in store, takes a step (the full one unless the
  * plan gets worse) and linearises at the new plan. That linearisation gives the residuals from which the status is derived, and,
@@ -9,12 +9,16 @@
 #include "br_internal.h"
 
 static void linearise(br_mpc *mpc, int first) {
+    mpc->qp.factorised = 0;
+    mpc->linearised = 1;
     for (int k = first; k < BR_N; ++k)
         br_stage_linearise(&mpc->gp[mpc->gp_in_use], mpc->plan.x[k], mpc->plan.u[k], mpc->plan.costate[k + 1], &mpc->stage[k]);
 }
 
+void br_sqp_linearise(br_mpc *mpc) { linearise(mpc, 0); }
+
 /* Without a plan from before: hold the steering, half throttle, see where that leads. */
-static void cold_start(br_mpc *mpc) {
+void br_sqp_cold_start(br_mpc *mpc) {
     memcpy(mpc->plan.x[0], mpc->x0, sizeof mpc->x0);
     memset(mpc->plan.costate, 0, sizeof mpc->plan.costate);
     memset(mpc->plan.multiplier, 0, sizeof mpc->plan.multiplier);
@@ -26,9 +30,11 @@ static void cold_start(br_mpc *mpc) {
     }
     br_qp_forget_working_set(&mpc->qp);
     mpc->linearised = 1;
+    mpc->qp.factorised = 0;
 }
 
-static void shift(br_mpc *mpc) {
+/* By one stage. */
+void br_sqp_shift(br_mpc *mpc) {
     const int last = BR_N - 1;
     memmove(mpc->plan.x, mpc->plan.x + 1, BR_N * sizeof mpc->plan.x[0]);
     memmove(mpc->plan.u, mpc->plan.u + 1, last * sizeof mpc->plan.u[0]);
@@ -40,7 +46,6 @@ static void shift(br_mpc *mpc) {
     mpc->plan.u[last][1] = 0;
     linearise(mpc, mpc->linearised ? last : 0);
     memcpy(mpc->plan.x[BR_N], mpc->stage[last].f, sizeof mpc->plan.x[BR_N]);
-    mpc->linearised = 1;
 }
 
 /* Changes of the states under the QP's inputs, and the costates from the QP's optimality:
@@ -107,8 +112,9 @@ static double penalty(const br_qp *qp) {
  * raise the merit near a solution, where the residuals tell the truth). The first iteration of a
  * warm step takes any usable full step: the reference has moved on since the plan was made, so
  * that what the plan is worth now is no measure (measured: half the time at the 99th percentile,
- * and a tenth of the first input's error). */
+ * and a tenth of the first input's error). Out of time, it leaves the plan at the trial done. */
 static void line_search(br_mpc *mpc, int first_of_warm) {
+    br_timer *timer = &mpc->timer;
     direction(mpc);
     const double weight = penalty(&mpc->qp);
     br_residuals(mpc, weight);
@@ -116,91 +122,29 @@ static void line_search(br_mpc *mpc, int first_of_warm) {
     mpc->before = mpc->plan;
     double t = 1.0;
     for (int trial = 0; trial < BR_LINE_SEARCH_TRIALS; ++trial, t *= 0.5) {
+        const double begin = br_timer_now(timer);
+        if (trial && !br_timer_allows(timer, begin, timer->trial)) return;
         move(mpc, t);
         br_residuals(mpc, weight);
+        br_timer_note(timer, begin, &timer->trial);
         if (first_of_warm && br_judge(mpc) <= BR_ACCEPTABLE) return;
         if (mpc->merit <= merit || br_worse(mpc->info.stationarity, mpc->info.defect) <= 0.9 * residual) return;
         mpc->info.shortened += 1;
     }
 }
 
-/* Another iteration would change little that matters until the next step, or, where the Hessian is
- * indefinite and convergence slow, cost more than it gives. settle = 0 means to go on regardless. */
-static int settled(const br_mpc *mpc, double *residual) {
-    const double before = *residual;
-    *residual = br_worse(mpc->info.stationarity, 0.1 * mpc->info.defect);
-    if (mpc->parameters.settle == 0) return 0;
-    return *residual <= mpc->parameters.settle || (mpc->warm && *residual > 0.5 * before);
-}
-
-static br_mpc_status optimise(br_mpc *mpc) {
-    const int cold = !mpc->warm;
-    const int limit = cold ? mpc->parameters.iterations_cold : mpc->parameters.iterations;
-    if (cold) cold_start(mpc);
-    else shift(mpc);
-    br_mpc_status status = BR_DEFECT;
-    double residual = INFINITY;
-    for (int i = 0; i < limit && (status == BR_ACCEPTABLE || status == BR_DEFECT); ++i) {
-        status = br_qp_condense(mpc);
-        if (status == BR_CONVERGED) status = br_qp_solve(mpc, i > 0 || !cold);
-        if (status != BR_CONVERGED) break;
-        line_search(mpc, i == 0 && !cold);
-        mpc->info.iterations = i + 1;
+/* One iteration from the plan and its linearisation. warm: the QP starts from the working set
+ * before. any_step: see line_search. The time it took is noted. */
+br_mpc_status br_sqp_iterate(br_mpc *mpc, int warm, int any_step) {
+    br_timer *timer = &mpc->timer;
+    const double begin = br_timer_now(timer);
+    br_mpc_status status = br_qp_condense(mpc);
+    if (status == BR_CONVERGED) status = br_qp_solve(mpc, warm);
+    if (status == BR_CONVERGED) {
+        line_search(mpc, any_step);
+        mpc->info.iterations += 1;
         status = br_judge(mpc);
-        if (status == BR_ACCEPTABLE && settled(mpc, &residual)) break;
     }
+    br_timer_note(timer, begin, &timer->iteration);
     return status;
-}
-
-static int plausible_state(const double x[BR_NX]) {
-    static const double limit[BR_NX] = {1e4, 1e4, 1e7, 100, 100, 1e3, 1.5};
-    for (int i = 0; i < BR_NX; ++i)
-        if (!(fabs(x[i]) <= limit[i])) return 0;
-    return 1;
-}
-
-static void solve(br_mpc *mpc, double u[BR_NU], br_mpc_status *status, br_mpc_info *info) {
-    *status = optimise(mpc);
-    const int good = *status == BR_CONVERGED || *status == BR_ACCEPTABLE;
-    if (good) memcpy(u, mpc->plan.u[0], sizeof mpc->plan.u[0]);
-    mpc->warm = good; /* a bad plan is no start for the next step */
-    if (info) *info = mpc->info;
-}
-
-static br_mpc_error begin(br_mpc *mpc, const double x[BR_NX], double d_previous, const double *u,
-                          br_mpc_status *status, br_mpc_info *info, int *plausible) {
-    if (!mpc || !x || !u || !status) return BR_ERROR_NULL;
-    *status = BR_BAD_STATE; /* until there is something better to say */
-    memset(&mpc->info, 0, sizeof mpc->info);
-    if (info) *info = mpc->info;
-    if (!mpc->has_parameters) return BR_ERROR_NOT_READY;
-    *plausible = plausible_state(x) && fabs(d_previous) <= 1e3;
-    if (*plausible) memcpy(mpc->x0, x, sizeof mpc->x0);
-    mpc->d_previous = d_previous;
-    return BR_OK;
-}
-
-br_mpc_error br_mpc_step(br_mpc *mpc, const double x[BR_NX], double d_previous, double u[BR_NU],
-                         br_mpc_status *status, br_mpc_info *info) {
-    int plausible;
-    const br_mpc_error error = begin(mpc, x, d_previous, u, status, info, &plausible);
-    if (error) return error;
-    if (!mpc->path.ready) return BR_ERROR_NOT_READY;
-    if (!plausible) return BR_OK;
-    br_path_plan(&mpc->path, x, mpc->reference, &mpc->info.lateral_m);
-    mpc->info.s_ref_m = mpc->path.s;
-    solve(mpc, u, status, info);
-    return BR_OK;
-}
-
-br_mpc_error br_mpc_solve(br_mpc *mpc, const double x[BR_NX], double d_previous,
-                          const br_mpc_reference reference[BR_N], double u[BR_NU],
-                          br_mpc_status *status, br_mpc_info *info) {
-    if (!reference) return BR_ERROR_NULL;
-    int plausible;
-    const br_mpc_error error = begin(mpc, x, d_previous, u, status, info, &plausible);
-    if (error || !plausible) return error;
-    memcpy(mpc->reference, reference, sizeof mpc->reference);
-    solve(mpc, u, status, info);
-    return BR_OK;
 }

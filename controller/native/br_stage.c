@@ -52,13 +52,18 @@ static void chain_hessian(br_stage *stage, double hessian[NW][NW], const double 
                     gradient[j][a] * weighted[j][b] + lambda_e[j] * curvature[j][a][b];
 }
 
+static void correction(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
+                       double mean[BR_NE], double gradient[BR_NE][BR_NZ],
+                       double curvature[BR_NE][BR_NZ][BR_NZ]) {
+    if (!gp->any) return;
+    const double z[BR_NZ] = {x[3], x[4], x[5], x[6], u[0], u[1]};
+    br_gp_evaluate(gp, z, mean, gradient, curvature);
+}
+
 void br_stage_linearise(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
                         const double lambda[BR_NX], br_stage *stage) {
     double mean[BR_NE] = {0}, gradient[BR_NE][BR_NZ], curvature[BR_NE][BR_NZ][BR_NZ];
-    if (gp->any) {
-        const double z[BR_NZ] = {x[3], x[4], x[5], x[6], u[0], u[1]};
-        br_gp_evaluate(gp, z, mean, gradient, curvature);
-    }
+    correction(gp, x, u, mean, gradient, curvature);
     double jacobian[BR_NX][NW], hessian[NW][NW];
     nominal(x, u, mean, lambda, stage->f, jacobian, hessian);
     for (int i = 0; i < BR_NX; ++i) memcpy(stage->jacobian[i], jacobian[i], sizeof stage->jacobian[i]);
@@ -70,4 +75,18 @@ void br_stage_linearise(const br_gp *gp, const double x[BR_NX], const double u[B
         for (int i = 0; i < BR_NX; ++i) lambda_e[j] += jacobian[i][BR_NV + j] * lambda[i];
     chain_jacobian(stage, jacobian, gradient);
     chain_hessian(stage, hessian, lambda_e, gradient, curvature);
+}
+
+/* Over part of a stage: the same scheme with the shorter step. The residual was learned per stage;
+ * to first order that part of it has come about. */
+void br_stage_advance(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
+                      double duration, double x_next[BR_NX]) {
+    double mean[BR_NE] = {0}, gradient[BR_NE][BR_NZ], curvature[BR_NE][BR_NZ][BR_NZ];
+    correction(gp, x, u, mean, gradient, curvature);
+    for (int j = 0; j < BR_NE; ++j) mean[j] *= duration / BR_TS;
+    const casadi_real *arg[br_advance_SZ_ARG] = {x, u, mean, &duration};
+    casadi_real *res[br_advance_SZ_RES] = {x_next};
+    casadi_int iw[br_advance_SZ_IW + 1];
+    casadi_real w[br_advance_SZ_W + 1];
+    br_advance(arg, res, iw, w, 0);
 }

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK
-from experiments.cli.options import Car, TrackName, writable
+from experiments.cli.options import Car, CarName, TrackName, writable
 
 __all__ = ["register"]
 
@@ -99,6 +99,7 @@ def drive(
         "run.mcap"
     ),
     car: Car = "orca",
+    name: CarName = "",
 ) -> None:
     """Start a run on a plant and a controller that are waiting elsewhere, and record it."""
     from bayesrace.log import Recorder
@@ -116,10 +117,11 @@ def drive(
 
     endpoints = Endpoints(connect=tuple(endpoint or (PLANT_ENDPOINT, CONTROLLER_ENDPOINT)))
     course = load_track(track)
-    with open_session(endpoints) as session, Recorder(session, car, log):
-        director = Director(session, car)
+    name = name or car
+    with open_session(endpoints) as session, Recorder(session, name, log):
+        director = Director(session, name)
         director.wait_for(("plant", "controller"), 10.0)
-        publisher: Publisher[Event] = Publisher(session, EVENT, car, "race")
+        publisher: Publisher[Event] = Publisher(session, EVENT, name, "race")
         number = director.status("plant").run + 1
         plan = RunPlan(number, "manual", laps, max_time, mode is Mode.lockstep)
         end = execute(director, publisher, course, plan)

@@ -9,6 +9,7 @@ from bayesrace.errors import InputError
 
 __all__ = [
     "Car",
+    "CarName",
     "LowLatency",
     "OutFile",
     "ParentPid",
@@ -18,6 +19,9 @@ __all__ = [
 ]
 
 Car = Annotated[str, typer.Option(help="Built-in car.")]
+CarName = Annotated[
+    str, typer.Option("--name", help="Name of the car in the network; the car's own without.")
+]
 TrackName = Annotated[str, typer.Option(help="Track: built-in name, random:SEED or CSV file.")]
 RaceLineFile = Annotated[
     Path, typer.Option("--raceline", help="Racing line file, as 'bayesrace raceline' writes it.")

@@ -6,30 +6,60 @@ from typing import Annotated
 import typer
 
 from bayesrace.clock import die_with_parent
-from experiments.cli.options import Car, LowLatency, ParentPid, RaceLineFile, TrackName
+from bayesrace.errors import InputError
+from experiments.cli.options import Car, CarName, LowLatency, ParentPid, RaceLineFile, TrackName
 
 __all__ = ["register"]
 
 _PLANT = "tcp/127.0.0.1:7447"
 _CONTROLLER = "tcp/127.0.0.1:7448"
 
+Rate = Annotated[float, typer.Option(min=1, max=500, help="Rate by the wall clock [Hz].")]
+Cpu = Annotated[int | None, typer.Option(min=0, help="CPU to bind the control thread to.")]
+Fifo = Annotated[
+    int | None,
+    typer.Option(min=1, max=99, help="SCHED_FIFO priority of the control thread alone."),
+]
+LockMemory = Annotated[bool, typer.Option(help="Keep the process's memory from being paged.")]
+
 
 def plant(
     car: Car = "orca",
+    name: CarName = "",
     endpoint: Annotated[str, typer.Option(help="Zenoh endpoint to listen on.")] = _PLANT,
     connect: Annotated[
         list[str] | None, typer.Option(help="Further endpoints to connect to.")
     ] = None,
+    rate: Rate = 50.0,
+    delay: Annotated[
+        float,
+        typer.Option(
+            min=0, max=1000, help="Delay of states and of actuations each, by the wall clock [ms]."
+        ),
+    ] = 0.0,
+    cpu: Cpu = None,
+    fifo: Fifo = None,
+    lock_memory: LockMemory = False,
     low_latency: LowLatency = False,
     parent_pid: ParentPid = None,
 ) -> None:
     """Play the car: waits for a run to be asked for ('bayesrace drive'), until Ctrl-C."""
     die_with_parent(parent_pid)
+    from bayesrace.realtime import RealtimeSettings
     from bayesrace.transport import Endpoints
     from plant.process import PlantSettings, main
 
-    endpoints = Endpoints(listen=(endpoint,), connect=tuple(connect or ()), low_latency=low_latency)
-    settings = PlantSettings(car=car, endpoints=endpoints, parent_pid=parent_pid)
+    settings = PlantSettings(
+        car=car,
+        name=name,
+        endpoints=Endpoints(
+            listen=(endpoint,), connect=tuple(connect or ()), low_latency=low_latency
+        ),
+        rate_hz=rate,
+        delay_s=delay * 1e-3,
+        realtime=RealtimeSettings(cpu=cpu, fifo=fifo, lock_memory=lock_memory),
+        parent_pid=parent_pid,
+    )
     raise typer.Exit(main(settings))
 
 
@@ -44,28 +74,65 @@ def controller(
         Path | None, typer.Option(help="OCP settings (JSON), see 'controller/settings.py'.")
     ] = None,
     car: Car = "orca",
+    name: CarName = "",
     endpoint: Annotated[
         list[str] | None, typer.Option(help=f"Zenoh endpoint of the plant [{_PLANT}].")
     ] = None,
     listen: Annotated[
         str, typer.Option(help="Zenoh endpoint to listen on, for who records or sends weights.")
     ] = _CONTROLLER,
+    rate: Rate = 50.0,
+    budget: Annotated[
+        float, typer.Option(min=0.05, max=1, help="Fraction of the period a cycle may take.")
+    ] = 0.8,
+    delay: Annotated[
+        str,
+        typer.Option(
+            help="Delay over which the state is predicted: measured, off, or milliseconds."
+        ),
+    ] = "measured",
+    hold: Annotated[bool, typer.Option(help="Do not drive before 'bayesrace go'.")] = False,
+    cpu: Cpu = None,
+    fifo: Fifo = None,
+    lock_memory: LockMemory = False,
     low_latency: LowLatency = False,
     parent_pid: ParentPid = None,
 ) -> None:
     """Drive the car of a plant process with the compiled controller, until Ctrl-C."""
     die_with_parent(parent_pid)
+    from bayesrace.realtime import RealtimeSettings
     from bayesrace.transport import Endpoints
     from bayesrace.vehicles import get_car
     from controller.assembly import predictive_controller
     from controller.process import ControllerSettings, main
 
-    endpoints = Endpoints(
-        listen=(listen,), connect=tuple(endpoint or (_PLANT,)), low_latency=low_latency
+    process = ControllerSettings(
+        car=car,
+        name=name,
+        endpoints=Endpoints(
+            listen=(listen,), connect=tuple(endpoint or (_PLANT,)), low_latency=low_latency
+        ),
+        rate_hz=rate,
+        budget=budget,
+        compensation=_compensation(delay),
+        hold=hold,
+        realtime=RealtimeSettings(cpu=cpu, fifo=fifo, lock_memory=lock_memory),
+        parent_pid=parent_pid,
     )
     driver = predictive_controller(artefact, get_car(car), track, raceline, settings, weights)
-    process = ControllerSettings(car=car, endpoints=endpoints, parent_pid=parent_pid)
     raise typer.Exit(main(process, driver))
+
+
+def _compensation(delay: str) -> dict[str, str | float]:
+    """The option's words as :class:`controller.compensation.CompensationSettings`."""
+    if delay in ("measured", "off"):
+        return {"mode": delay}
+    try:
+        return {"mode": "fixed", "delay_s": float(delay) * 1e-3}
+    except ValueError:
+        raise InputError(
+            f"--delay {delay}: give 'measured', 'off', or a number of milliseconds"
+        ) from None
 
 
 def register(app: typer.Typer) -> None:

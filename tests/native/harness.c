@@ -4,7 +4,8 @@
  *
  * PROBLEMS, all doubles: spacing, rows, table; the parameters; per GP output kernel, n, offset,
  * scale, 6 length scales, n x 6 inputs, n alphas; steps, then per step x (7) and d_previous.
- * RESULTS: per step error, status, u (2). With -DCOUNT_ALLOCATIONS and the linker's --wrap, any
+ * RESULTS: per step error, status, u (2). The first half goes one stage at a time, without budget;
+ * the second adds other times, budgets by a clock that counts its readings, and spoiled references. With -DCOUNT_ALLOCATIONS and the linker's --wrap, any
  * allocation after br_mpc_init ends the program with code 3. Code 1: a promise of the interface
  * is broken (the line says which).
  */
@@ -97,9 +98,12 @@ static void check_memory_errors(char *block, size_t size) {
 static void check_not_ready(br_mpc *mpc, const br_mpc_parameters *p) {
     double x[BR_NX] = {0}, u[BR_NU] = {7, 7};
     br_mpc_status status;
-    CHECK(br_mpc_step(mpc, x, 0, u, &status, NULL) == BR_ERROR_NOT_READY);
+    CHECK(br_mpc_step(mpc, x, 0, BR_TS, 0, u, &status, NULL) == BR_ERROR_NOT_READY);
+    CHECK(br_mpc_prepare(mpc, BR_TS, 0) == BR_ERROR_NOT_READY);
+    CHECK(br_mpc_predict(mpc, x, u, 0, x) == BR_ERROR_NOT_READY);
     CHECK(br_mpc_set_parameters(mpc, p) == BR_OK);
-    CHECK(br_mpc_step(mpc, x, 0, u, &status, NULL) == BR_ERROR_NOT_READY); /* no path */
+    CHECK(br_mpc_prepare(mpc, BR_TS, 0) == BR_OK); /* no plan yet: nothing to do */
+    CHECK(br_mpc_step(mpc, x, 0, BR_TS, 0, u, &status, NULL) == BR_ERROR_NOT_READY); /* no path */
     CHECK(u[0] == 7 && u[1] == 7);
 }
 
@@ -140,11 +144,17 @@ static void check_null(br_mpc *mpc, const double *table, int rows, double spacin
     CHECK(br_mpc_set_path(mpc, table, BR_PATH_CAPACITY + 1, spacing) == BR_ERROR_PATH);
     CHECK(br_mpc_set_weights(NULL, NULL) == BR_ERROR_NULL);
     CHECK(br_mpc_set_weights(mpc, NULL) == BR_ERROR_NULL);
-    CHECK(br_mpc_step(NULL, x, 0, u, &status, NULL) == BR_ERROR_NULL);
-    CHECK(br_mpc_step(mpc, NULL, 0, u, &status, NULL) == BR_ERROR_NULL);
-    CHECK(br_mpc_step(mpc, x, 0, NULL, &status, NULL) == BR_ERROR_NULL);
-    CHECK(br_mpc_step(mpc, x, 0, u, NULL, NULL) == BR_ERROR_NULL);
-    CHECK(br_mpc_solve(mpc, x, 0, NULL, u, &status, NULL) == BR_ERROR_NULL);
+    CHECK(br_mpc_step(NULL, x, 0, BR_TS, 0, u, &status, NULL) == BR_ERROR_NULL);
+    CHECK(br_mpc_step(mpc, NULL, 0, BR_TS, 0, u, &status, NULL) == BR_ERROR_NULL);
+    CHECK(br_mpc_step(mpc, x, 0, BR_TS, 0, NULL, &status, NULL) == BR_ERROR_NULL);
+    CHECK(br_mpc_step(mpc, x, 0, BR_TS, 0, u, NULL, NULL) == BR_ERROR_NULL);
+    CHECK(br_mpc_solve(mpc, x, 0, BR_TS, 0, NULL, u, &status, NULL) == BR_ERROR_NULL);
+    CHECK(br_mpc_prepare(NULL, BR_TS, 0) == BR_ERROR_NULL);
+    CHECK(br_mpc_set_clock(NULL, NULL, NULL) == BR_ERROR_NULL);
+    CHECK(br_mpc_predict(NULL, x, u, 0, x) == BR_ERROR_NULL);
+    CHECK(br_mpc_predict(mpc, NULL, u, 0, x) == BR_ERROR_NULL);
+    CHECK(br_mpc_predict(mpc, x, NULL, 0, x) == BR_ERROR_NULL);
+    CHECK(br_mpc_predict(mpc, x, u, 0, NULL) == BR_ERROR_NULL);
     CHECK(br_mpc_get_plan(mpc, NULL, plan_u) == BR_ERROR_NULL);
     CHECK(br_mpc_get_plan(mpc, plan_x, NULL) == BR_ERROR_NULL);
     CHECK(br_mpc_get_reference(NULL, reference) == BR_ERROR_NULL);
@@ -152,8 +162,21 @@ static void check_null(br_mpc *mpc, const double *table, int rows, double spacin
     br_mpc_reset(NULL);
 }
 
+static void check_times(br_mpc *mpc) {
+    static const double bad[] = {-1e-9, NAN, INFINITY, -INFINITY};
+    double x[BR_NX] = {0}, u[BR_NU] = {0};
+    br_mpc_status status;
+    for (size_t i = 0; i < sizeof bad / sizeof bad[0]; ++i) {
+        CHECK(br_mpc_step(mpc, x, 0, bad[i], 0, u, &status, NULL) == BR_ERROR_TIME);
+        CHECK(br_mpc_prepare(mpc, bad[i], 0) == BR_ERROR_TIME);
+        CHECK(br_mpc_predict(mpc, x, u, bad[i], x) == BR_ERROR_TIME);
+    }
+    CHECK(br_mpc_predict(mpc, x, u, 1.001 * BR_PREDICT_MAX_S, x) == BR_ERROR_TIME);
+    CHECK(br_mpc_monotonic(NULL) > 0 && br_mpc_monotonic(NULL) >= br_mpc_monotonic(NULL) - 60);
+}
+
 static void check_texts(void) {
-    for (int i = -1; i < 9; ++i) {
+    for (int i = -1; i < 10; ++i) {
         CHECK(strlen(br_mpc_error_text((br_mpc_error)i)) > 3);
         CHECK(strlen(br_mpc_status_text((br_mpc_status)i)) > 3);
     }
@@ -169,9 +192,30 @@ static void spoiled_solve(br_mpc *mpc, const double *x, double d, int what) {
     br_mpc_status status;
     CHECK(br_mpc_get_reference(mpc, reference) == BR_OK);
     (&reference[what % BR_N].x)[what % 6] = poison[what % 5];
-    CHECK(br_mpc_solve(mpc, x, d, reference, u, &status, NULL) == BR_OK);
+    CHECK(br_mpc_solve(mpc, x, d, BR_TS, 0, reference, u, &status, NULL) == BR_OK);
     CHECK(isfinite(u[0]) && isfinite(u[1]));
     if (status > BR_ACCEPTABLE) CHECK(u[0] == 0.5 && u[1] == 0.5);
+}
+
+/* Every reading takes 10 us. */
+static double counting_clock(void *context) { return *(double *)context += 1e-5; }
+
+/* x is given with what may be in it; a prediction that is no error is finite. */
+static void predict(const br_mpc *mpc, const double *x, const double *u, double duration) {
+    double after[BR_NX] = {-7};
+    const br_mpc_error error = br_mpc_predict(mpc, x, u, duration, after);
+    CHECK(error == BR_OK || error == BR_ERROR_STATE);
+    for (int i = 0; i < BR_NX; ++i) CHECK(isfinite(after[i]));
+    if (error) CHECK(after[0] == -7);
+}
+
+/* What may happen between two steps. */
+static void interlude(br_mpc *mpc, int i, int second_half, const br_mpc_gp *weights,
+                      const br_mpc_gp *none) {
+    if (i % 3 == 1) CHECK(br_mpc_prepare(mpc, BR_TS, second_half ? 2e-3 : 0) == BR_OK);
+    if (i % 7 == 6) CHECK(br_mpc_prepare(mpc, (i % 5) * BR_TS, 0) == BR_OK);
+    if (i % 50 == 40) CHECK(br_mpc_set_weights(mpc, i % 100 == 40 ? none : weights) == BR_OK);
+    if (i % 97 == 96) br_mpc_reset(mpc);
 }
 
 int main(int argc, char **argv) {
@@ -201,17 +245,23 @@ int main(int argc, char **argv) {
     check_not_ready(mpc, &parameters);
     check_parameters(mpc, &parameters);
     check_null(mpc, table, rows, spacing);
+    check_times(mpc);
     CHECK(br_mpc_set_path(mpc, table, rows, spacing) == BR_OK);
     CHECK(br_mpc_set_weights(mpc, weights) == BR_OK);
+    double now = 0;
+    CHECK(br_mpc_set_clock(mpc, counting_clock, &now) == BR_OK);
     for (int i = 0; i < steps; ++i) {
         const double *x = take(BR_NX), d = next();
         double u[BR_NU] = {-9, -9};
         br_mpc_status status;
         br_mpc_info info;
-        if (i % 50 == 40) CHECK(br_mpc_set_weights(mpc, i % 100 == 40 ? none : weights) == BR_OK);
-        if (i % 97 == 96) br_mpc_reset(mpc);
-        if (i >= steps / 2 && i % 9 == 8) spoiled_solve(mpc, x, d, i);
-        const br_mpc_error error = br_mpc_step(mpc, x, d, u, &status, &info);
+        const int second_half = i >= steps / 2;
+        const double elapsed = second_half ? (i % 4) * 0.7 * BR_TS : BR_TS;
+        const double budget = second_half ? (i % 6) * 1e-4 : 0;
+        interlude(mpc, i, second_half, weights, none);
+        if (second_half && i % 9 == 8) spoiled_solve(mpc, x, d, i);
+        const br_mpc_error error = br_mpc_step(mpc, x, d, elapsed, budget, u, &status, &info);
+        predict(mpc, x, u, (i % 10) * 0.01);
         if (status > BR_ACCEPTABLE) CHECK(u[0] == -9 && u[1] == -9);
         else CHECK(isfinite(u[0]) && isfinite(u[1]) && info.defect <= parameters.defect_max);
         const double row[] = {error, status, u[0], u[1]};

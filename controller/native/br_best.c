@@ -1,0 +1,35 @@
+/* The best plan of several iterations: one that fails later does not take it back. */
+#include "br_internal.h"
+
+void br_best_begin(br_mpc *mpc) { mpc->best.status = BR_NOT_FINITE; }
+
+/* Keeps the plan, whose residuals are in info. lowest: only if it is better than the one kept. Else
+ * the latest usable one, which is how iterations without a budget have always ended. */
+void br_best_keep(br_mpc *mpc, br_mpc_status status, int lowest) {
+    br_best *best = &mpc->best;
+    if (lowest ? status > BR_DEFECT : !br_usable(status)) return;
+    const double residual = br_residual(mpc);
+    if (lowest && (status > best->status || (status == best->status && !(residual < best->residual))))
+        return;
+    best->plan = mpc->plan;
+    best->info = mpc->info;
+    best->status = status;
+    best->residual = residual;
+}
+
+/* Puts the best plan and its residuals back. Returns its status, or the given one if it is not
+ * usable either. */
+br_mpc_status br_best_restore(br_mpc *mpc, br_mpc_status status) {
+    const br_best *best = &mpc->best;
+    if (best->status > BR_DEFECT) return status;
+    if (best->info.iterations != mpc->info.iterations) { /* else the plan at hand is it */
+        mpc->plan = best->plan;
+        mpc->linearised = mpc->qp.factorised = 0;
+        mpc->info.stationarity = best->info.stationarity;
+        mpc->info.defect = best->info.defect;
+        mpc->info.bound = best->info.bound;
+        mpc->info.cost = best->info.cost;
+        mpc->info.slack_max_m = best->info.slack_max_m;
+    }
+    return br_usable(best->status) ? best->status : status;
+}

@@ -1,0 +1,75 @@
+/* Keeping the plan in step with time, and the preparation phase between two steps. */
+#include <math.h>
+
+#include "br_internal.h"
+
+int br_plausible_state(const double x[BR_NX]) {
+    static const double limit[BR_NX] = {1e4, 1e4, 1e7, 100, 100, 1e3, 1.5};
+    for (int i = 0; i < BR_NX; ++i)
+        if (!(fabs(x[i]) <= limit[i])) return 0;
+    return 1;
+}
+
+/* Whole stages that a plan behind by *lag, which is below the horizon, has to be shifted; *lag is
+ * what remains, at most half a stage to either side. */
+int br_shifts_due(double *lag) {
+    int shifts = 0;
+    for (; *lag >= 0.5 * BR_TS; *lag -= BR_TS) ++shifts;
+    return shifts;
+}
+
+/* The plan, shifted that often since the step before and linearised. */
+void br_align(br_mpc *mpc, int shifts) {
+    if (shifts < mpc->ahead) br_undo_preparation(mpc); /* the step comes sooner than expected */
+    for (; mpc->ahead < shifts; mpc->ahead += 1) br_sqp_shift(mpc);
+    if (!mpc->linearised) br_sqp_linearise(mpc);
+}
+
+void br_undo_preparation(br_mpc *mpc) {
+    if (mpc->ahead) {
+        mpc->plan = mpc->kept;
+        memcpy(mpc->qp.sense, mpc->kept_sense, sizeof mpc->kept_sense);
+        mpc->linearised = mpc->qp.factorised = 0;
+    }
+    mpc->ahead = 0;
+}
+
+/* Further iterations at the last problem, towards tolerance. The time of a second iteration is
+ * left for what follows: restoring the best plan, shift and factorisation. */
+static void improve(br_mpc *mpc) {
+    const br_timer *timer = &mpc->timer;
+    if (!(timer->iteration > 0)) return; /* no step has shown yet how long that takes */
+    if (!br_timer_allows(timer, br_timer_now(timer), 2 * timer->iteration)) return;
+    if (!mpc->linearised) br_sqp_linearise(mpc);
+    memset(&mpc->info, 0, sizeof mpc->info);
+    br_residuals(mpc, 0);
+    br_mpc_status status = br_judge(mpc);
+    br_best_begin(mpc);
+    br_best_keep(mpc, status, 1);
+    const int limit = br_iteration_limit(mpc);
+    while (mpc->info.iterations < limit && (status == BR_ACCEPTABLE || status == BR_DEFECT) &&
+           br_timer_allows(timer, br_timer_now(timer), 2 * timer->iteration)) {
+        status = br_sqp_iterate(mpc, 1, 0);
+        br_best_keep(mpc, status, 1);
+    }
+    mpc->prepared_iterations += mpc->info.iterations;
+    br_best_restore(mpc, status);
+}
+
+br_mpc_error br_mpc_prepare(br_mpc *mpc, double elapsed_s, double budget_s) {
+    if (!mpc) return BR_ERROR_NULL;
+    br_timer_start(&mpc->timer, budget_s);
+    if (!mpc->has_parameters) return BR_ERROR_NOT_READY;
+    if (!(elapsed_s >= 0 && isfinite(elapsed_s))) return BR_ERROR_TIME;
+    double lag = mpc->lag + elapsed_s;
+    if (!mpc->warm || lag >= BR_HORIZON_S) return BR_OK;
+    if (!mpc->ahead && mpc->timer.limited) improve(mpc);
+    if (!mpc->ahead) {
+        mpc->kept = mpc->plan;
+        memcpy(mpc->kept_sense, mpc->qp.sense, sizeof mpc->kept_sense);
+    }
+    br_align(mpc, br_shifts_due(&lag));
+    if (!mpc->qp.factorised) br_qp_factorise(mpc);
+    mpc->prepared = mpc->qp.factorised;
+    return BR_OK;
+}

@@ -1,0 +1,126 @@
+/* The control step: what a call brings, the plan in step with it, iterations, the answer. */
+#include <math.h>
+
+#include "br_internal.h"
+
+/* With a budget, and in the preparation, time is the limit; this one is for slow convergence. */
+int br_iteration_limit(const br_mpc *mpc) {
+    const br_mpc_parameters *p = &mpc->parameters;
+    return p->iterations > p->iterations_cold ? p->iterations : p->iterations_cold;
+}
+
+/* The plan at the time of the measured state. Without one, or with one that is older than the
+ * horizon or has not become usable in as many iterations as a cold start may take, a new one. */
+static void begin_plan(br_mpc *mpc) {
+    if (mpc->lag >= BR_HORIZON_S || mpc->unfinished >= br_iteration_limit(mpc)) mpc->warm = 0;
+    if (mpc->warm) {
+        mpc->info.shifts = br_shifts_due(&mpc->lag);
+        br_align(mpc, mpc->info.shifts);
+        mpc->info.prepared = mpc->prepared && mpc->qp.factorised;
+    } else {
+        br_sqp_cold_start(mpc);
+        mpc->lag = mpc->unfinished = 0;
+        mpc->info.shifts = -1;
+    }
+    mpc->ahead = mpc->prepared = 0;
+}
+
+/* Another iteration would change little that matters until the next step, or, where the Hessian is
+ * indefinite and convergence slow, cost more than it gives, which only a budget can tell: with one
+ * it goes on. settle = 0 means to go on regardless. */
+static int settled(const br_mpc *mpc, double *residual) {
+    const double before = *residual, settle = mpc->parameters.settle;
+    *residual = br_residual(mpc);
+    if (settle == 0) return 0;
+    return *residual <= settle || (mpc->warm && !mpc->timer.limited && *residual > 0.5 * before);
+}
+
+static br_mpc_status optimise(br_mpc *mpc) {
+    begin_plan(mpc);
+    br_timer *timer = &mpc->timer;
+    const br_mpc_parameters *p = &mpc->parameters;
+    const int warm = mpc->warm, own_limit = warm ? p->iterations : p->iterations_cold;
+    const int limit = timer->limited ? br_iteration_limit(mpc) : own_limit;
+    br_mpc_status status = BR_DEFECT;
+    double residual = INFINITY;
+    br_best_begin(mpc);
+    timer->iteration = timer->trial = 0; /* one stall of the host must not be remembered for ever */
+    for (int i = 0; i < limit && (status == BR_ACCEPTABLE || status == BR_DEFECT); ++i) {
+        if (i && !br_timer_allows(timer, br_timer_now(timer), timer->iteration)) {
+            mpc->info.time_limited = 1;
+            break;
+        }
+        status = br_sqp_iterate(mpc, i > 0 || warm, i == 0 && warm);
+        br_best_keep(mpc, status, timer->limited);
+        if (status == BR_ACCEPTABLE && settled(mpc, &residual)) break;
+    }
+    status = br_best_restore(mpc, status);
+    return status == BR_DEFECT && mpc->info.time_limited ? BR_TIME_LIMIT : status;
+}
+
+static void solve(br_mpc *mpc, double u[BR_NU], br_mpc_status *status, br_mpc_info *info) {
+    *status = optimise(mpc);
+    const int good = br_usable(*status), unfinished = *status == BR_TIME_LIMIT;
+    if (good) memcpy(u, mpc->plan.u[0], sizeof mpc->plan.u[0]);
+    mpc->warm = good || unfinished; /* another bad plan is no start for the next step */
+    mpc->unfinished = unfinished ? mpc->unfinished + mpc->info.iterations : 0;
+    memcpy(mpc->answer_x, mpc->plan.x, sizeof mpc->answer_x);
+    memcpy(mpc->answer_u, mpc->plan.u, sizeof mpc->answer_u);
+    if (info) *info = mpc->info;
+}
+
+typedef struct {
+    const double *x;
+    double d_previous, elapsed_s, budget_s;
+    const double *u;
+    br_mpc_status *status;
+    br_mpc_info *info;
+} request;
+
+static br_mpc_error begin(br_mpc *mpc, const request *r, int *plausible) {
+    if (!mpc || !r->x || !r->u || !r->status) return BR_ERROR_NULL;
+    br_timer_start(&mpc->timer, r->budget_s);
+    *r->status = BR_BAD_STATE; /* until there is something better to say */
+    memset(&mpc->info, 0, sizeof mpc->info);
+    if (r->info) *r->info = mpc->info;
+    if (!mpc->has_parameters) return BR_ERROR_NOT_READY;
+    if (!(r->elapsed_s >= 0 && isfinite(r->elapsed_s))) return BR_ERROR_TIME;
+    mpc->lag += r->elapsed_s;
+    mpc->path.age += r->elapsed_s;
+    *plausible = br_plausible_state(r->x) && fabs(r->d_previous) <= 1e3;
+    if (!*plausible) return BR_OK;
+    memcpy(mpc->x0, r->x, sizeof mpc->x0);
+    mpc->d_previous = r->d_previous;
+    mpc->d_lowest = mpc->parameters.d_min * fmin(fmax(r->x[3] / BR_BRAKE_FADE_MPS, 0), 1);
+    mpc->info.prepared_iterations = mpc->prepared_iterations;
+    mpc->prepared_iterations = 0;
+    return BR_OK;
+}
+
+br_mpc_error br_mpc_step(br_mpc *mpc, const double x[BR_NX], double d_previous, double elapsed_s,
+                         double budget_s, double u[BR_NU], br_mpc_status *status,
+                         br_mpc_info *info) {
+    int plausible;
+    const request r = {x, d_previous, elapsed_s, budget_s, u, status, info};
+    const br_mpc_error error = begin(mpc, &r, &plausible);
+    if (error) return error;
+    if (!mpc->path.ready) return BR_ERROR_NOT_READY;
+    if (!plausible) return BR_OK;
+    br_path_plan(&mpc->path, x, mpc->reference, &mpc->info.lateral_m);
+    mpc->info.s_ref_m = mpc->path.s;
+    solve(mpc, u, status, info);
+    return BR_OK;
+}
+
+br_mpc_error br_mpc_solve(br_mpc *mpc, const double x[BR_NX], double d_previous, double elapsed_s,
+                          double budget_s, const br_mpc_reference reference[BR_N], double u[BR_NU],
+                          br_mpc_status *status, br_mpc_info *info) {
+    if (!reference) return BR_ERROR_NULL;
+    int plausible;
+    const request r = {x, d_previous, elapsed_s, budget_s, u, status, info};
+    const br_mpc_error error = begin(mpc, &r, &plausible);
+    if (error || !plausible) return error;
+    memcpy(mpc->reference, reference, sizeof mpc->reference);
+    solve(mpc, u, status, info);
+    return BR_OK;
+}

@@ -1,0 +1,158 @@
+"""What others may ask of a running controller: status, stop, go, new weights; and its heartbeat."""
+
+import logging
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from bayesrace.errors import InputError
+from bayesrace.messages import (
+    COMMAND,
+    EVENT,
+    HEARTBEAT,
+    STATUS,
+    WEIGHTS,
+    Event,
+    Reply,
+    Scalar,
+    Status,
+)
+from bayesrace.transport import HEARTBEAT_S, Inbox, Item, Kind, Publisher, Request, decode_request
+from controller.driver import Driver
+from controller.fallback import Level
+from controller.interface import Controller
+
+__all__ = ["Service"]
+
+_log = logging.getLogger("bayesrace.controller")
+
+
+class Service:
+    """Serves the inbox's other items between two cycles; for the control thread."""
+
+    def __init__(
+        self,
+        session: Any,
+        inbox: Inbox,
+        name: str,
+        rate_hz: float,
+        driver: Driver,
+        controller: Controller,
+        counters: Callable[[], dict[str, int]],
+    ) -> None:
+        """``counters``: what the loop has counted, asked for with each status."""
+        self._rate_hz = rate_hz
+        self._driver = driver
+        self._controller = controller
+        self._counters = counters
+        self._events = Publisher(session, EVENT, name, "controller")
+        self._heartbeats = Publisher(session, HEARTBEAT, name, "controller")
+        self._beat_due_ns = 0
+        self._text = "waiting for the plant"
+        self._weights_taken = self._weights_refused = 0
+        self.stopping = False
+        """The process has been told to end."""
+        self.plant_there = True
+        """Its liveliness token has not gone; where there never was one, its states tell."""
+        self.arrived_ns: int | None = None
+        """Monotonic clock when the newest state arrived."""
+        inbox.serve(STATUS, "controller")
+        inbox.serve(WEIGHTS)
+        inbox.serve(COMMAND)
+
+    def beat(self) -> None:
+        """Publishes the status, if it is time to."""
+        now_ns = time.monotonic_ns()
+        if now_ns >= self._beat_due_ns:
+            self._beat_due_ns = now_ns + round(HEARTBEAT_S * 1e9)
+            self._heartbeats.put(self.status(self._heartbeats.next_seq), lockstep=False)
+
+    def react(self, item: Item) -> None:
+        """Serves an item that is no message."""
+        if item.kind is Kind.SIGNAL:
+            self.stopping = True
+        elif item.kind is Kind.GONE:
+            self.plant_there = False
+            self._text = "the plant vanished: killed or unreachable"
+            _log.warning("%s; waiting for it", self._text)
+        elif item.kind is Kind.ALIVE:
+            self.plant_there = True
+            self._text = "the plant is there"
+        elif item.kind is Kind.REQUEST:
+            self._answer(item.value)
+
+    def status(self, seq: int = 0) -> Status:
+        """The process's state at this moment."""
+        driver, newest = self._driver, self._driver.states.newest
+        now_ns = time.monotonic_ns()
+        age_s = -1.0 if self.arrived_ns is None else (now_ns - self.arrived_ns) * 1e-9
+        lockstep = newest is not None and newest.lockstep
+        return Status(
+            seq,
+            now_ns,
+            "controller",
+            driver.phase.value,
+            0 if newest is None else newest.epoch,
+            0 if newest is None else newest.run,
+            (driver.last_error or self._text)[:2000],
+            self._controller.weights_version,
+            0.0 if lockstep else self._rate_hz,
+            age_s,
+            driver.delay_s,
+            self._count(),
+        )
+
+    def _answer(self, request: Request) -> None:
+        if request.service is STATUS:
+            request.answer(self.status())
+        elif request.service is COMMAND:
+            request.answer(self._command(request))
+        else:
+            request.answer(self._take_weights(request.payload))
+
+    def _command(self, request: Request) -> Reply:
+        command, why_not = decode_request(request)
+        if command is None:
+            return Reply(0, time.monotonic_ns(), False, why_not, {})
+        if command.command == "stop":
+            self._driver.stop()
+            self._text = f"stopped on request: {command.text}"
+        else:
+            self._driver.go()
+            self._text = f"driving on request: {command.text}"
+        self._publish_event(command.command, self._text, {})
+        return Reply(0, time.monotonic_ns(), True, self._text[:2000], {})
+
+    def _take_weights(self, data: bytes) -> Reply:
+        data_map: dict[str, Scalar] = {}
+        try:
+            version = self._controller.set_weights(data)
+        except InputError as error:
+            self._weights_refused += 1
+            accepted, text = False, str(error)[:2000]
+        else:
+            self._weights_taken += 1
+            accepted, text = True, f"weights {version} in use from the next step on"
+            data_map["version"] = version
+        self._publish_event("weights_accepted" if accepted else "weights_refused", text, data_map)
+        return Reply(0, time.monotonic_ns(), accepted, text, data_map)
+
+    def _publish_event(self, kind: str, text: str, data: Mapping[str, Scalar]) -> None:
+        now_ns = time.monotonic_ns()
+        newest = self._driver.states.newest
+        run = 0 if newest is None else newest.run
+        event = Event(self._events.next_seq, now_ns, run, "controller", kind, text[:2000], data)
+        self._events.put(event, lockstep=newest is None or newest.lockstep)
+
+    def _count(self) -> dict[str, Scalar]:
+        counts = self._driver.counts
+        return {
+            **self._counters(),
+            "solution": counts[Level.SOLUTION],
+            "shifted_plan": counts[Level.SHIFTED_PLAN],
+            "brake": counts[Level.BRAKE],
+            "stop": counts[Level.STOP],
+            "raised": self._driver.raised,
+            "weights_taken": self._weights_taken,
+            "weights_refused": self._weights_refused,
+        }

@@ -1,0 +1,83 @@
+"""How a cycle went, as a message."""
+
+import math
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from bayesrace.messages import State, Telemetry
+from controller.driver import Decision
+from controller.interface import NO_PLAN, Array, StepOutput
+
+__all__ = ["Timing", "telemetry_of"]
+
+_NO_OUTPUT = StepOutput(u=np.zeros(2), plan_u=NO_PLAN)
+
+
+@dataclass(slots=True)
+class Timing:
+    """Times of the cycle at hand, as in :class:`bayesrace.messages.Telemetry`, and the loop's
+    counters since the start."""
+
+    released_ns: int = 0
+    received_ns: int = 0
+    missed: bool = False
+    wake_us: float = 0.0
+    decode_us: float = 0.0
+    prepare_us: float = 0.0
+    solve_us: float = 0.0
+    encode_us: float = 0.0
+    ticks: int = 0
+    """Cycles."""
+    skipped: int = 0
+    """Releases passed over because a cycle before took too long."""
+    misses: int = 0
+    """Cycles whose actuation was on its way only after the deadline."""
+    overruns: int = 0
+    """Cycles that took more than their budget."""
+
+
+def telemetry_of(seq: int, state: State, decision: Decision, timing: Timing) -> Telemetry:
+    """The message of one cycle."""
+    output = decision.output or _NO_OUTPUT
+    return Telemetry(
+        seq,
+        time.monotonic_ns(),
+        state.run,
+        state.seq,
+        decision.status,
+        int(decision.level),
+        output.iterations,
+        timing.ticks + timing.skipped - 1,
+        timing.released_ns,
+        timing.received_ns,
+        timing.missed,
+        timing.wake_us,
+        timing.decode_us,
+        timing.prepare_us,
+        output.solve_us or timing.solve_us,
+        timing.encode_us,
+        decision.delay_s,
+        _finite(output.plan_x),
+        _finite(output.plan_u),
+        _known(output.residual_dynamics),
+        _known(output.residual_bounds),
+        _known(output.residual_stationarity),
+        output.s_ref_m if math.isfinite(output.s_ref_m) else 0.0,
+        output.n_ref_m if math.isfinite(output.n_ref_m) else 0.0,
+    )
+
+
+def _finite(plan: Array) -> tuple[float, ...]:
+    """The plan row by row; nothing of it if any of it is no number (receivers would refuse it)."""
+    if not len(plan):
+        return ()
+    flat = np.asarray(plan, dtype=np.float64).ravel()
+    if not (np.abs(flat) <= 1e6).all():
+        return ()
+    return tuple(flat.tolist())
+
+
+def _known(residual: float) -> float:
+    return float(residual) if 0.0 <= residual <= 1e12 else -1.0

@@ -1,0 +1,215 @@
+"""The controller between a state and an input: stop and go, and each level of the fallback by a
+real cause, with the compiled step."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from bayesrace.messages import State
+from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles.models import dynamic
+from controller.compensation import CompensationSettings
+from controller.driver import HALTED, NO_STATE, STEP_RAISED, Decision, Driver, Phase
+from controller.fallback import FallbackSettings, Level
+from controller.mpc import PredictiveController
+from controller.native_step import NativeStep, StepStatus
+from tests.conftest import SETTINGS, Circuit, discrete
+
+Floats = NDArray[np.float64]
+
+STEP_S = 0.02
+STALE_S = 0.06
+
+
+class Rig:
+    """A driver on the synthetic circuit, and the dynamic model as its plant."""
+
+    def __init__(self, native: NativeStep, circuit: Circuit, hold: bool = False) -> None:
+        self.controller = PredictiveController(native)
+        car = native_car(native)
+        self.driver = Driver(
+            self.controller,
+            car,
+            FallbackSettings(recover_cycles=3),
+            CompensationSettings(mode="fixed", delay_s=0.0),
+            STALE_S,
+            1.5,
+            hold,
+        )
+        self.plant = discrete(dynamic(car))
+        self.x = circuit.start(v_mps=1.5)
+        self.u = np.zeros(2)
+        self.seq = 0
+        self.epoch = 1
+
+    def state(self, **changes: Any) -> State:
+        values: dict[str, Any] = {
+            "source_time_ns": 0, "run": 1, "time_s": self.seq * STEP_S, "x": tuple(self.x),
+            "u_applied": tuple(self.u), "lap": 0, "lockstep": False, "answers": (), "final": False,
+        }  # fmt: skip
+        return State(seq=self.seq, epoch=self.epoch, **(values | changes))
+
+    def cycle(self, late_s: float = 0.0, budget_s: float = 0.0, **changes: Any) -> Decision:
+        """A state arrives, is answered, and the plant drives on."""
+        state = self.state(**changes)
+        self.driver.observe(state)
+        self.driver.decide(state, state.time_s, budget_s)
+        decision = self.driver.settle(late_s)
+        self.advance(decision)
+        return decision
+
+    def silent_cycle(self) -> Decision:
+        """No state arrives."""
+        newest = self.driver.states.newest
+        assert newest is not None
+        self.driver.decide(newest, self.seq * STEP_S)
+        decision = self.driver.settle()
+        self.advance(decision)
+        return decision
+
+    def advance(self, decision: Decision) -> None:
+        assert np.isfinite([decision.d, decision.delta_rate]).all()
+        self.u = np.array([decision.d, decision.delta_rate])
+        self.x = self.plant(self.x, self.u)
+        self.seq += 1
+
+
+def native_car(native: NativeStep) -> CarParameters:
+    from bayesrace.vehicles import get_car
+
+    return get_car(native.manifest.car)
+
+
+@pytest.fixture
+def rig(native: NativeStep, circuit: Circuit) -> Rig:
+    return Rig(native, circuit)
+
+
+def driving(rig: Rig, cycles: int = 20) -> Rig:
+    for _ in range(cycles):
+        assert rig.cycle().level is Level.SOLUTION
+    assert rig.driver.phase is Phase.DRIVING
+    return rig
+
+
+def test_it_drives(rig: Rig) -> None:
+    driving(rig, 100)
+    assert rig.driver.counts == [100, 0, 0, 0]
+
+
+def test_silence_goes_down_all_levels_and_ends_at_standstill(rig: Rig) -> None:
+    """Stale state: predicted forward at first, then the plan, braking, standing."""
+    driving(rig)
+    bridged = [rig.silent_cycle().level for _ in range(3)]
+    statuses = [rig.silent_cycle().status for _ in range(200)]
+    assert set(statuses) == {NO_STATE}
+    counts = rig.driver.counts
+    assert bridged == [Level.SOLUTION] * 3
+    assert counts[Level.SHIFTED_PLAN] >= 2
+    assert counts[Level.BRAKE] > 10
+    assert counts[Level.STOP] > 10
+    assert rig.driver.phase is Phase.FALLBACK
+    # by dead reckoning alone it has neither gone on nor been driven backwards
+    assert abs(rig.x[3]) < 0.15
+
+
+def test_states_that_come_back_drive_again_after_several_good_solutions(rig: Rig) -> None:
+    driving(rig)
+    for _ in range(12):
+        rig.silent_cycle()
+    levels = [rig.cycle().level for _ in range(4)]
+    assert levels == [Level.BRAKE, Level.BRAKE, Level.SOLUTION, Level.SOLUTION]
+
+
+def test_an_infeasible_problem_is_answered_by_the_plan_before(rig: Rig) -> None:
+    """Steered farther than a period at full rate can bring back within the limit."""
+    driving(rig)
+    plan = rig.controller.step(np.array(rig.x), rig.u, STEP_S).plan_u.copy()
+    x = rig.x.copy()
+    x[6] = 0.6
+    decision = rig.cycle(x=tuple(x))
+    assert decision.status == StepStatus.INFEASIBLE
+    assert decision.level is Level.SHIFTED_PLAN
+    assert len(plan)
+
+
+def test_a_state_that_is_no_number_is_not_driven_on(rig: Rig) -> None:
+    driving(rig)
+    x = rig.x.copy()
+    x[4] = np.nan
+    decision = rig.cycle(x=tuple(x))
+    assert decision.status == StepStatus.BAD_STATE
+    assert decision.level is Level.SHIFTED_PLAN
+    assert rig.cycle().level is Level.SOLUTION
+
+
+def test_a_budget_too_small_for_a_plan_steps_down(rig: Rig, native: NativeStep) -> None:
+    """The first step of a drive is cold: one iteration, which is always done, is not enough."""
+    strict = SETTINGS.model_copy(update={"defect_max": 1e-9})
+    native.set_parameters(native_car(native), strict)
+    decision = rig.cycle(budget_s=1e-9)
+    assert decision.status == StepStatus.TIME_LIMIT
+    assert decision.level is Level.BRAKE
+
+
+def test_a_late_solution_is_driven_from_where_it_has_got_to(rig: Rig) -> None:
+    driving(rig)
+    decision = rig.cycle(late_s=2.5 * STEP_S)
+    assert decision.output is not None
+    assert decision.level is Level.SHIFTED_PLAN
+    assert (decision.d, decision.delta_rate) == pytest.approx(tuple(decision.output.plan_u[2]))
+
+
+def test_a_step_that_raises_is_counted_and_stepped_down_from(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    driving(rig)
+
+    def broken(*_: Any) -> Any:
+        raise RuntimeError("no step today")
+
+    monkeypatch.setattr(rig.controller, "step", broken)
+    decision = rig.cycle()
+    assert (decision.status, decision.level) == (STEP_RAISED, Level.SHIFTED_PLAN)
+    assert (rig.driver.raised, "no step today" in rig.driver.last_error) == (1, True)
+
+
+def test_stop_and_go(rig: Rig) -> None:
+    driving(rig)
+    rig.driver.stop()
+    slowing = 0
+    while rig.cycle().status != HALTED:
+        assert rig.driver.phase is Phase.STOPPED
+        slowing += 1
+        assert slowing < 200
+    for _ in range(20):
+        assert rig.cycle().status == HALTED
+    assert abs(rig.x[3]) < 0.05
+    assert rig.driver.counts == [20 + slowing, 0, 0, 0]  # a stop on command is no fallback
+    rig.driver.go()
+    for _ in range(60):
+        assert rig.cycle().level is Level.SOLUTION
+    assert rig.x[3] > 0.5
+
+
+def test_on_hold_it_stands_until_go(native: NativeStep, circuit: Circuit) -> None:
+    rig = Rig(native, circuit, hold=True)
+    rig.x[3] = 0.0
+    for _ in range(10):
+        assert rig.cycle().status == HALTED
+    assert rig.driver.phase is Phase.READY
+    assert abs(rig.x[3]) < 1e-3
+    rig.driver.go()
+    assert rig.cycle().level is Level.SOLUTION
+
+
+def test_another_plant_begins_anew_and_its_forerunner_is_not_heard(rig: Rig) -> None:
+    driving(rig)
+    left_over = rig.state()
+    rig.epoch, rig.seq = 2, 0
+    assert rig.cycle().level is Level.SOLUTION
+    assert not rig.driver.observe(left_over)
+    assert rig.driver.states.stale == 1
+    assert rig.cycle().level is Level.SOLUTION

@@ -1,0 +1,190 @@
+"""The preparation phase: saves the step time, and changes nothing else."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bayesrace.gp.weights import GpWeights
+from bayesrace.vehicles import CarParameters
+from controller.native_step import NativeStep
+from controller.settings import MpcSettings
+from tests.conftest import SETTINGS, Circuit, Problem
+from tests.test_native_time import TS, Clock, Make, make, residual, solve
+
+__all__ = ["make"]  # the fixture
+
+DEFAULTS = {name: getattr(MpcSettings(), name) for name in ("settle", "iterations")}
+
+
+def result(step: NativeStep) -> bytes:
+    """All of the last step that is not about preparation."""
+    step.read_plan()
+    told = ("iterations", "qp_iterations", "regularised", "shortened", "shifts", "cost")
+    numbers = [float(getattr(step.info, name)) for name in (*told, "stationarity", "defect")]
+    parts = (step.u, step.plan_x, step.plan_u, np.array(numbers))
+    return b"".join(part.tobytes() for part in parts)
+
+
+@pytest.mark.parametrize("changes", [{}, DEFAULTS])
+def test_prepared_steps_are_the_same_to_the_bit(
+    make: Make, recorded: list[Problem], changes: dict[str, float]
+) -> None:
+    prepared, plain = make(**changes), make(**changes)
+    for k, p in enumerate(recorded[:150]):
+        assert solve(prepared, p) is solve(plain, p)
+        assert result(prepared) == result(plain)
+        assert (prepared.info.prepared, plain.info.prepared) == (int(k > 0), 0)
+        prepared.prepare()
+
+
+@pytest.mark.parametrize("expected", [0.0, 0.002, TS, 3 * TS, 0.39, 5.0])
+@pytest.mark.parametrize("elapsed", [0.0, 0.009, TS, 2 * TS, 5 * TS, 0.395, 1.0])
+def test_an_unexpected_time_is_corrected(
+    make: Make, recorded: list[Problem], expected: float, elapsed: float
+) -> None:
+    prepared, plain = make(), make()
+    for p in recorded[:8]:
+        assert solve(prepared, p) is solve(plain, p)
+    for p in recorded[8:11]:
+        prepared.prepare(expected)
+        assert solve(prepared, p, elapsed_s=elapsed) is solve(plain, p, elapsed_s=elapsed)
+        assert result(prepared) == result(plain)
+
+
+def test_preparing_again_counts_from_the_last_step(make: Make, recorded: list[Problem]) -> None:
+    prepared, plain = make(), make()
+    for p in recorded[:20]:
+        assert solve(prepared, p) is solve(plain, p)
+        assert result(prepared) == result(plain)
+        for expected in (TS, TS, 4 * TS, 0.0, TS):
+            prepared.prepare(expected)
+
+
+def change_weights(step: NativeStep, circuit: Circuit, car: CarParameters) -> None:
+    step.set_zero_weights()
+
+
+def change_parameters(step: NativeStep, circuit: Circuit, car: CarParameters) -> None:
+    heavier = SETTINGS.model_copy(update={"q_position": 2.0, "r_duty": 0.02, "margin_m": 0.02})
+    step.set_parameters(car, heavier)
+
+
+def drop_constraints(step: NativeStep, circuit: Circuit, car: CarParameters) -> None:
+    step.set_parameters(car, SETTINGS.model_copy(update={"constraints": False}))
+
+
+def reset(step: NativeStep, circuit: Circuit, car: CarParameters) -> None:
+    step.reset()
+
+
+def change_path(step: NativeStep, circuit: Circuit, car: CarParameters) -> None:
+    step.set_path(circuit.table)
+
+
+def bad_state(step: NativeStep, circuit: Circuit, car: CarParameters) -> None:
+    step.step(np.full(7, np.nan), 0.0)
+
+
+def predict(step: NativeStep, circuit: Circuit, car: CarParameters) -> None:
+    step.predict(circuit.start(), np.array([0.5, 1.0]), 0.05)
+
+
+Between = Callable[[NativeStep, Circuit, CarParameters], None]
+
+
+@pytest.mark.parametrize(
+    "between",
+    [change_weights, change_parameters, drop_constraints, reset, change_path, bad_state, predict],
+)
+def test_what_happens_in_between_is_seen(
+    make: Make, recorded: list[Problem], circuit: Circuit, car: CarParameters, between: Between
+) -> None:
+    prepared, plain = make(), make()
+    for one in (prepared, plain):
+        one.set_path(circuit.table)
+    for k, p in enumerate(recorded[:24]):
+        if k == 12:
+            for one in (prepared, plain):
+                between(one, circuit, car)
+        assert solve(prepared, p) is solve(plain, p)
+        assert result(prepared) == result(plain)
+        prepared.prepare()
+
+
+def test_the_plan_of_the_last_step_stays_readable(make: Make, recorded: list[Problem]) -> None:
+    step = make()
+    Clock(step, 1e-6)
+    for p in recorded[:5]:
+        solve(step, p)
+        x, u = (part.copy() for part in step.read_plan())
+        step.prepare(2 * TS, 1.0)
+        again_x, again_u = step.read_plan()
+        assert (x == again_x).all()
+        assert (u == again_u).all()
+
+
+def test_a_budget_converges_the_last_problem_first(make: Make, recorded: list[Problem]) -> None:
+    """The plan that the next step starts from solves the problem before."""
+    improved, plain = make(), make()
+    Clock(improved, 1e-6)
+    after, before, iterations = [], [], 0
+    for p in recorded[:120]:
+        solve(improved, p)
+        solve(plain, p)
+        after.append(residual(improved))
+        before.append(residual(plain))
+        iterations += improved.info.prepared_iterations
+        improved.prepare(TS, 1.0)
+        plain.prepare(TS)
+    assert iterations > 60
+    assert np.median(np.array(after[1:]) / np.array(before[1:])) < 0.8
+    # the problem itself, once more: nothing is left to do
+    solve(improved, recorded[119], elapsed_s=0.0)
+    improved.prepare(0.0, 1.0)
+    solve(improved, recorded[119], elapsed_s=0.0)
+    assert residual(improved) <= 1e-6
+
+
+def test_a_budget_never_makes_the_plan_worse(make: Make, recorded: list[Problem]) -> None:
+    """Also where the Hessian is indefinite and single iterations do."""
+    for k in range(10, 290, 20):
+        improved, plain = make(), make()
+        Clock(improved, 1e-6)
+        for step in (improved, plain):
+            for p in recorded[k - 3 : k + 1]:
+                solve(step, p)
+        improved.prepare(0.0, 1.0)
+        for step in (improved, plain):
+            solve(step, recorded[k], elapsed_s=0.0)
+        assert residual(improved) <= residual(plain) + 1e-12
+
+
+def test_the_preparation_ends_within_its_budget(make: Make, recorded: list[Problem]) -> None:
+    step = make(tolerance=1e-14)
+    clock = Clock(step, 1e-3)
+    done = []
+    for k, p in enumerate(recorded[:60]):
+        solve(step, p)
+        done.append(step.info.prepared_iterations)
+        begin_s, readings = clock.now_s, 1 + k % 20
+        step.prepare(TS, readings * 1e-3)
+        assert clock.now_s - begin_s <= (readings + 1.5) * 1e-3
+    assert max(done) >= 2
+    assert min(done) == 0
+
+
+def test_without_a_plan_there_is_nothing_to_prepare(
+    make: Make, kinematic_artefact: Path, car: CarParameters, weights: GpWeights,
+    recorded: list[Problem],
+) -> None:  # fmt: skip
+    step, fresh = make(), make()
+    step.prepare(TS, 1.0)
+    broken = recorded[0].x0.copy()
+    broken[6] = 0.6  # cannot be brought back: infeasible
+    step.solve(broken, 0.0, recorded[0].reference)
+    step.prepare(TS, 1.0)
+    assert solve(step, recorded[1]) is solve(fresh, recorded[1])
+    assert result(step) == result(fresh)
+    assert (step.info.shifts, step.info.prepared) == (-1, 0)

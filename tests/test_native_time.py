@@ -1,0 +1,299 @@
+"""The compiled step and time: the plan keeps in step with it, and a budget is used and kept."""
+
+import ctypes as ct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from bayesrace.errors import InputError
+from bayesrace.gp.weights import GpWeights
+from bayesrace.vehicles import CarParameters
+from controller.native_step import NativeStep, StepStatus
+from controller.settings import MpcSettings
+from tests.conftest import SETTINGS, Circuit, Problem
+
+Floats = NDArray[np.float64]
+Make = Callable[..., NativeStep]
+
+TS = 0.02
+
+
+@pytest.fixture
+def make(kinematic_artefact: Path, car: CarParameters, weights: GpWeights) -> Make:
+    """A controller with the given changes of the settings."""
+
+    def made(**changes: float) -> NativeStep:
+        step = NativeStep(kinematic_artefact, car, SETTINGS.model_copy(update=changes))
+        step.set_weights(weights)
+        return step
+
+    return made
+
+
+def solve(step: NativeStep, p: Problem, **times: float) -> StepStatus:
+    return step.solve(p.x0, p.d_previous, p.reference, **times)
+
+
+class Clock:
+    """A host's clock on which every reading takes ``tick_s``."""
+
+    def __init__(self, step: NativeStep, tick_s: float) -> None:
+        self.now_s = 0.0
+        self.tick_s = tick_s
+        prototype = ct.CFUNCTYPE(ct.c_double, ct.c_void_p)
+        self._callback = prototype(self._read)  # must outlive its use
+        pointer = ct.cast(self._callback, ct.c_void_p)
+        step._check(step._library.br_mpc_set_clock(step._mpc, pointer, None), "clock")
+
+    def _read(self, _: int | None) -> float:
+        self.now_s += self.tick_s
+        return self.now_s
+
+
+def residual(step: NativeStep) -> float:
+    return max(step.info.stationarity, 0.1 * step.info.defect)
+
+
+# --- the plan keeps in step --------------------------------------------------------------------
+
+
+def test_one_stage_is_the_default_and_one_shift(make: Make, recorded: list[Problem]) -> None:
+    told, untold = make(), make()
+    for k, p in enumerate(recorded[:40]):
+        assert solve(told, p, elapsed_s=TS, budget_s=0.0) is solve(untold, p)
+        assert told.u.tobytes() == untold.u.tobytes()
+        assert told.info.shifts == (1 if k else -1)
+
+
+@pytest.mark.parametrize(("elapsed_s", "every"), [(0.002, 10), (0.005, 4), (0.01, 2)])
+def test_a_faster_loop_shifts_when_the_plan_lags_half_a_stage(
+    make: Make, recorded: list[Problem], elapsed_s: float, every: int
+) -> None:
+    step, p, shifts = make(), recorded[30], []
+    solve(step, p)
+    for _ in range(10 * every):
+        assert solve(step, p, elapsed_s=elapsed_s).usable
+        shifts.append(step.info.shifts)
+    at = np.flatnonzero(shifts)
+    assert sum(shifts) == 10
+    assert set(np.diff(at)) == {every}
+    # half of the period from the first, but for rounding
+    assert abs(at[0] + 1 - every / 2) <= 1
+
+
+def test_a_missed_tick_shifts_twice_and_is_the_better_start(
+    make: Make, recorded: list[Problem]
+) -> None:
+    ratios = []
+    for k in range(20, 220, 20):
+        stationarity = []
+        for elapsed_s, shifts in ((2 * TS, 2), (TS, 1)):
+            step = make()
+            for p in recorded[k : k + 10]:
+                solve(step, p)
+            assert solve(step, recorded[k + 11], elapsed_s=elapsed_s).usable
+            assert step.info.shifts == shifts
+            stationarity.append(residual(step))
+        ratios.append(stationarity[0] / stationarity[1])
+    assert np.median(ratios) < 0.5
+
+
+def test_a_plan_older_than_the_horizon_is_forgotten(make: Make, recorded: list[Problem]) -> None:
+    step, fresh = make(), make()
+    solve(step, recorded[0])
+    step.solve(np.full(7, np.nan), 0.0, recorded[0].reference, elapsed_s=15 * TS)
+    assert solve(step, recorded[9], elapsed_s=6 * TS).usable
+    assert step.info.shifts == -1
+    solve(fresh, recorded[9])
+    assert step.u.tobytes() == fresh.u.tobytes()
+
+
+def test_time_goes_on_while_states_are_bad(make: Make, recorded: list[Problem]) -> None:
+    step, skipped = make(), make()
+    for one in (step, skipped):
+        for p in recorded[:10]:
+            solve(one, p)
+    for _ in range(2):
+        bad = step.solve(np.full(7, np.nan), 0.0, recorded[10].reference, elapsed_s=TS)
+        assert bad is StepStatus.BAD_STATE
+    assert solve(step, recorded[12], elapsed_s=TS).usable
+    assert step.info.shifts == 3
+    solve(skipped, recorded[12], elapsed_s=3 * TS)
+    assert step.u.tobytes() == skipped.u.tobytes()
+
+
+@pytest.mark.parametrize("elapsed_s", [-1e-9, np.nan, np.inf])
+def test_an_impossible_time_is_refused_and_not_counted(
+    make: Make, recorded: list[Problem], elapsed_s: float
+) -> None:
+    step = make()
+    solve(step, recorded[0])
+    for call in (lambda: solve(step, recorded[1], elapsed_s=elapsed_s), lambda: step.prepare(elapsed_s)):
+        with pytest.raises(InputError, match="time is negative"):
+            call()
+    assert solve(step, recorded[1], elapsed_s=TS).usable
+    assert step.info.shifts == 1
+
+
+def test_a_car_that_was_out_of_sight_is_found_on_the_line(
+    native: NativeStep, circuit: Circuit
+) -> None:
+    native.step(circuit.start(0.0, 2.0), 0.0)
+    native.step(circuit.start(2.5, 2.0), 0.0, elapsed_s=1.25)
+    assert native.info.s_ref_m == pytest.approx(2.5, abs=0.05)
+
+
+# --- the budget --------------------------------------------------------------------------------
+
+
+def test_with_a_budget_the_step_iterates_until_it_settles(
+    make: Make, recorded: list[Problem]
+) -> None:
+    step = make(settle=1e-7)
+    Clock(step, 1e-6)
+    settled = 0
+    for k, p in enumerate(recorded[:60]):
+        assert solve(step, p, budget_s=1.0).usable
+        settled += residual(step) <= 1e-7
+        assert step.info.time_limited == 0
+        assert step.info.iterations <= SETTINGS.iterations_cold
+        assert step.info.iterations > 1 or residual(step) <= 1e-7, k
+    assert settled >= 55  # not where the Hessian is indefinite
+
+
+def test_the_step_ends_within_its_budget(make: Make, recorded: list[Problem]) -> None:
+    limited = 0
+    for readings in (10, 15, 20, 30):
+        step = make(settle=1e-12)
+        clock = Clock(step, 1e-3)
+        for p in recorded[100:130]:
+            begin_s = clock.now_s
+            assert solve(step, p, budget_s=readings * 1e-3).usable
+            # the reading that starts the time is not within it
+            assert clock.now_s - begin_s <= (readings + 1.5) * 1e-3 or step.info.iterations == 1
+            limited += step.info.time_limited
+    assert limited > 60
+
+
+def test_a_larger_budget_never_gives_a_worse_plan(make: Make, recorded: list[Problem]) -> None:
+    for p in recorded[5::40]:
+        before = np.inf
+        for readings in (1, 4, 8, 16, 32, 64, 128):
+            step = make(settle=1e-12)
+            Clock(step, 1e-3)
+            if solve(step, p, budget_s=readings * 1e-3).usable:
+                # a line search that was cut short may have been at a plan a tenth better
+                assert residual(step) <= before / 0.9
+                before = residual(step)
+        assert before < np.inf
+
+
+def test_the_first_iteration_is_always_done(make: Make, recorded: list[Problem]) -> None:
+    hasty, plain = make(), make(iterations=1)
+    Clock(hasty, 1.0)
+    for one in (hasty, plain):
+        for p in recorded[:30]:
+            solve(one, p)
+    assert solve(hasty, recorded[30], budget_s=1e-9) is solve(plain, recorded[30])
+    assert hasty.u.tobytes() == plain.u.tobytes()
+    assert (hasty.info.iterations, hasty.info.time_limited) == (1, 1)
+
+
+@pytest.mark.parametrize("budget_s", [0.0, -1.0, np.nan])
+def test_no_budget_means_the_iteration_limits(
+    make: Make, recorded: list[Problem], budget_s: float
+) -> None:
+    step, plain = make(iterations=3, settle=1e-4), make(iterations=3, settle=1e-4)
+    Clock(step, 1e3)
+    for p in recorded[:30]:
+        assert solve(step, p, budget_s=budget_s) is solve(plain, p)
+        assert step.u.tobytes() == plain.u.tobytes()
+
+
+def test_without_a_clock_there_is_no_budget(make: Make, recorded: list[Problem]) -> None:
+    step, plain = make(), make()
+    step._check(step._library.br_mpc_set_clock(step._mpc, None, None), "clock")
+    for p in recorded[:20]:
+        assert solve(step, p, budget_s=1.0) is solve(plain, p)
+        assert step.u.tobytes() == plain.u.tobytes()
+
+
+@pytest.mark.parametrize("tick_s", [np.nan, -1e-3])
+def test_a_clock_that_is_broken_does_no_harm(
+    make: Make, recorded: list[Problem], tick_s: float
+) -> None:
+    step = make()
+    Clock(step, tick_s)
+    for p in recorded[:10]:
+        assert solve(step, p, budget_s=1e-3).usable
+        assert 1 <= step.info.iterations <= SETTINGS.iterations_cold
+        step.prepare(TS, 1e-3)
+
+
+def test_out_of_time_goes_on_in_the_next_step_until_usable(
+    make: Make, recorded: list[Problem]
+) -> None:
+    step = make(defect_max=1e-7)
+    Clock(step, 1e-3)
+    p, seen = recorded[50], []
+    step.u[:] = 0.125
+    while not seen or seen[-1] is StepStatus.TIME_LIMIT:
+        assert (step.u == 0.125).all()
+        seen.append(solve(step, p, elapsed_s=0.0, budget_s=1e-3))
+        assert step.info.shifts == (-1 if len(seen) == 1 else 0)
+    assert 2 <= len(seen) <= 10
+    assert seen[-1].usable
+
+
+def test_a_plan_that_never_becomes_usable_is_given_up(
+    make: Make, recorded: list[Problem]
+) -> None:
+    step, p, cold = make(defect_max=1e-300, iterations_cold=6), recorded[50], []
+    Clock(step, 1e-3)
+    for _ in range(20):
+        assert solve(step, p, elapsed_s=0.0, budget_s=1e-3) is StepStatus.TIME_LIMIT
+        cold.append(step.info.shifts == -1)
+    assert list(np.flatnonzero(cold)) == [0, 6, 12, 18]
+
+
+def test_more_iterations_do_not_take_back_a_usable_plan(
+    make: Make, recorded: list[Problem]
+) -> None:
+    """Steps that lower the cost may raise the defect beyond what is usable."""
+    kept = 0
+    for p in recorded[::10]:
+        usable = False
+        for iterations in range(1, 9):
+            step = make(defect_max=3e-3, iterations_cold=iterations)
+            status = solve(step, p)
+            assert status.usable or not usable
+            usable = status.usable
+            if usable:
+                assert step.info.defect <= 3e-3
+                kept += step.info.iterations > iterations
+                x, u = step.read_plan()
+                v = np.column_stack([x[:-1], u])
+                ends = np.array([step.evaluate(row, np.zeros(7))[0] for row in v])
+                scale = np.array([1, 1, 1, 1, 1, 10, 1])
+                gap = max(np.abs((ends - x[1:]) / scale).max(), np.abs(x[0] - p.x0).max())
+                assert step.info.defect == pytest.approx(gap, rel=1e-9, abs=1e-13)
+
+
+def test_the_systems_clock_runs(make: Make, recorded: list[Problem]) -> None:
+    """What NativeStep sets: with an hour's budget nothing is limited, with a nanosecond's all is."""
+    step = make(settle=1e-9)
+    solve(step, recorded[0])
+    assert solve(step, recorded[1], budget_s=3600.0).usable
+    assert step.info.time_limited == 0
+    assert step.info.iterations > 1
+    solve(step, recorded[2], budget_s=1e-9)
+    assert (step.info.time_limited, step.info.iterations) == (1, 1)
+
+
+def test_every_status_has_the_librarys_text(native: NativeStep) -> None:
+    for status in StepStatus:
+        assert native._library.br_mpc_status_text(status).decode() == status.text
+    assert native._library.br_mpc_status_text(len(StepStatus)) == b"unknown status"

@@ -1,0 +1,90 @@
+"""The loop keeps its rate, and its releases meet the states, without any clock being read."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from controller.schedule import Schedule
+
+MS = 1_000_000
+
+
+def locked(
+    schedule: Schedule, first_ns: float, interval_ns: float, jitter_ns: float, count: int
+) -> list[float]:
+    """Drives the schedule by states that are apart by an interval; their distances to a release."""
+    random = np.random.default_rng(1)
+    errors = []
+    arrival = first_ns
+    for _ in range(count):
+        observed = int(arrival + abs(random.normal()) * jitter_ns)
+        while schedule.release_ns < observed - schedule.period_ns / 2:
+            schedule.advance(schedule.release_ns)
+        schedule.observe(observed, interval_ns)
+        errors.append(schedule.release_ns - arrival)
+        arrival += interval_ns
+    return errors
+
+
+def test_releases_are_exactly_a_period_apart() -> None:
+    schedule = Schedule(500.0)
+    schedule.start(7)
+    for k in range(1, 1000):
+        assert schedule.advance(schedule.release_ns + MS) == 0
+        assert schedule.release_ns == 7 + k * 2 * MS
+
+
+def test_a_long_cycle_skips_releases_and_keeps_the_phase() -> None:
+    schedule = Schedule(50.0)
+    schedule.start(0)
+    # done at 39 ms: the release at 20 is late, but its deadline is at 40
+    assert schedule.advance(39 * MS) == 0
+    assert schedule.release_ns == 20 * MS
+    # done at 95 ms: those at 40 and 60 are over
+    assert schedule.advance(95 * MS) == 2
+    assert schedule.release_ns == 80 * MS
+
+
+@pytest.mark.parametrize("offset_ms", [0.5, 4.0, 9.0, -6.0])
+def test_the_phase_locks_to_the_states(offset_ms: float) -> None:
+    schedule = Schedule(50.0)
+    schedule.start(0)
+    errors = locked(schedule, offset_ms * MS, 20 * MS, 50e3, 600)
+    assert max(abs(e) for e in errors[-50:]) < 0.2 * MS
+
+
+def test_it_follows_a_plant_whose_clock_runs_fast() -> None:
+    schedule = Schedule(50.0)
+    schedule.start(0)
+    errors = locked(schedule, 0.0, 20 * MS * (1 - 200e-6), 20e3, 2000)
+    assert max(abs(e) for e in errors[-500:]) < 0.2 * MS
+
+
+@pytest.mark.parametrize(("rate_hz", "interval_ms"), [(500.0, 20), (50.0, 2), (100.0, 20)])
+def test_it_locks_where_one_period_is_a_multiple_of_the_other(
+    rate_hz: float, interval_ms: int
+) -> None:
+    schedule = Schedule(rate_hz)
+    schedule.start(0)
+    locked(schedule, 0.3 * MS, interval_ms * MS, 0.0, 3000)
+    grid = min(schedule.period_ns, interval_ms * MS)
+    away = (schedule.release_ns - 0.3 * MS + grid / 2) % grid - grid / 2
+    assert abs(away) < 0.02 * grid
+
+
+def test_there_is_no_lock_to_states_of_another_rhythm() -> None:
+    schedule = Schedule(50.0)
+    schedule.start(0)
+    schedule.observe(13 * MS, 17 * MS)
+    schedule.observe(13 * MS, 0.0)
+    assert schedule.release_ns == 0
+
+
+@given(st.floats(0, 1e9))
+def test_one_state_moves_a_release_by_half_a_percent_at_most(arrival_ns: float) -> None:
+    """A message held up on its way must not throw the loop out of its rate."""
+    schedule = Schedule(50.0)
+    schedule.start(0)
+    schedule.observe(int(arrival_ns), 20 * MS)
+    assert abs(schedule.release_ns) <= 0.005 * 20 * MS
