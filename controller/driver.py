@@ -223,7 +223,8 @@ class Driver:
         else:
             x, u_previous = self._compensation.at_acting(state, decision.basis_s)
         time_s = decision.basis_s + decision.delay_s
-        elapsed_s = 0.0 if self._stepped_s is None else time_s - self._stepped_s
+        # Where the delay measured has fallen, the moment of acting may even go back.
+        elapsed_s = 0.0 if self._stepped_s is None else max(time_s - self._stepped_s, 0.0)
         self._stepped_s = time_s
         try:
             output = controller.step(x, u_previous, elapsed_s, budget_s)
@@ -234,3 +235,4 @@ class Driver:
             decision.status = STEP_RAISED
         else:
             decision.output, decision.status = output, output.status
+            self.last_error = ""

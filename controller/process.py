@@ -310,7 +310,7 @@ def main(settings: ControllerSettings, controller: Controller) -> int:
     Call it from the main thread of a process: it takes over the signals.
     """
     die_with_parent(settings.parent_pid)
-    with open_session(settings.endpoints) as session:
+    with open_session(settings.endpoints, "controller") as session:
         process = ControllerProcess(session, settings, controller)
         for refusal in prepare_thread(settings.realtime):
             _log.warning("%s", refusal)

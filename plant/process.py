@@ -271,7 +271,7 @@ def main(settings: PlantSettings) -> int:
     Call it from the main thread of a process: it takes over the signals.
     """
     die_with_parent(settings.parent_pid)
-    with open_session(settings.endpoints) as session:
+    with open_session(settings.endpoints, "plant") as session:
         process = PlantProcess(session, settings)
         for refusal in prepare_thread(settings.realtime):
             _log.warning("%s", refusal)

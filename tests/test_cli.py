@@ -26,7 +26,7 @@ from tests.programs import finish, run, start, until
 
 SUBCOMMANDS = (
     "race", "drive", "report", "bench", "tracks", "raceline", "collect", "train", "build",
-    "plant", "controller",
+    "plant", "controller", "status", "stop", "go", "router", "latency",
 )  # fmt: skip
 
 

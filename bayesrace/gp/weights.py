@@ -62,6 +62,10 @@ MAX_POINTS: Final = 20_000
 MAX_BYTES: Final = 16 * 1024 * 1024
 """Encoded weights longer than this are refused before anything is parsed."""
 
+_MAX_PARTS: Final = 1000
+"""Maps and arrays in the encoded form at most; a file has some forty. Without a limit, 16 MB of
+empty arrays would take a second for every 2 MB, and 80 times their size in memory."""
+
 SCHEMA: Final = 1
 _MAGIC: Final = b"BRACEGP\n"
 _HEAD: Final = struct.Struct("<8sI")
@@ -297,8 +301,22 @@ def _unpack_body(data: bytes) -> Any:
     digest = hashlib.sha256(data[: _HEAD.size] + data[start:]).digest()
     if digest != data[_HEAD.size : start]:
         raise InputError("GP weights: checksum mismatch, the data are damaged; copy them again")
+    parts = iter(range(_MAX_PARTS))
+
+    def counted(part: Any) -> Any:
+        if next(parts, None) is None:
+            raise ValueError("too many parts")
+        return part
+
     try:
-        return msgpack.unpackb(data[start:], raw=False, strict_map_key=True)
+        return msgpack.unpackb(
+            data[start:],
+            object_hook=counted,
+            list_hook=counted,
+            max_array_len=_MAX_PARTS,
+            max_map_len=_MAX_PARTS,
+            max_ext_len=0,
+        )
     except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
         raise InputError("GP weights: the body cannot be decoded; train again") from error
 

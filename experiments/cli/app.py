@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from bayesrace import __version__
 from bayesrace.errors import InputError
 from bayesrace.interrupts import remembering_interrupts
-from experiments.cli import evaluation, parts, preparation
+from experiments.cli import evaluation, latency, operation, parts, preparation
 
 __all__ = ["app", "main"]
 
@@ -40,7 +40,7 @@ def _options(
     logging.basicConfig(level=logging.INFO, format="%(name)s: %(message)s", stream=sys.stderr)
 
 
-for group in (evaluation, preparation, parts):
+for group in (evaluation, latency, preparation, parts, operation):
     group.register(app)
 
 

@@ -1,0 +1,125 @@
+"""Laps with delays on states and actuations, with and without delay compensation.
+
+    python -m benchmarks.delay_compensation [--track NAME|FILE.csv] [--train-track …] [--laps 3]
+
+Plant and controller are processes of their own and run by the wall clock; the plant holds back each
+state and each actuation for the delay (``bayesrace plant --delay``), so the input acts twice the
+delay later, plus what messages and the step take. Prints a table in Markdown; some four minutes.
+"""
+
+import argparse
+import os
+import tempfile
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from bayesrace.log import LogReader, Recorder
+from bayesrace.messages import EVENT, STATE, TELEMETRY, Event
+from bayesrace.raceline import read_raceline
+from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK, Track, load_track
+from bayesrace.transport import Director, Endpoints, Publisher, free_endpoint, open_session
+from bayesrace.vehicles import get_car
+from experiments.analysis import time_laps
+from experiments.drive import RunPlan, execute, wait_for_both
+from experiments.preparation import PreparationSettings, Prepared, prepare
+from experiments.processes import child
+from experiments.progress import stages_on
+
+DELAYS_MS = (0, 10, 20, 40)
+CAR = "orca"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One drive."""
+
+    laps_s: tuple[float, ...]
+    off_track: int
+    off_track_max_m: float
+    samples: int
+    fallbacks: int
+    delay_ms: float
+    """Median of what the controller measured; 0 without compensation."""
+
+    def cells(self) -> list[str]:
+        """For the table."""
+        first = f"{self.laps_s[0]:.3f}" if self.laps_s else "does not finish"
+        flying = f"{min(self.laps_s[1:]):.3f}" if len(self.laps_s) > 1 else "–"
+        deepest = f"{1e3 * self.off_track_max_m:.0f}" if self.off_track else "–"
+        off = f"{self.off_track} of {self.samples}"
+        return [first, flying, off, deepest, str(self.fallbacks), f"{self.delay_ms:.1f}"]
+
+
+def drive(files: Prepared, track: Track, delay_ms: float, mode: str, laps: int) -> Outcome:
+    """Starts both processes, drives, analyses the log."""
+    plant_at, controller_at = free_endpoint(), free_endpoint()
+    parent = ["--parent-pid", str(os.getpid())]
+    plant = ["plant", "--endpoint", plant_at, "--delay", f"{delay_ms:g}", *parent]
+    controller = [
+        "controller", "--artefact", str(files.artefact), "--track", str(files.track),
+        "--raceline", str(files.raceline), "--weights", str(files.weights),
+        "--endpoint", plant_at, "--listen", controller_at, "--delay", mode, *parent,
+    ]  # fmt: skip
+    limit_s = 3.0 * read_raceline(files.raceline).lap_time_s * laps
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        children = [
+            stack.enter_context(child(plant, folder / "plant.log")),
+            stack.enter_context(child(controller, folder / "controller.log")),
+        ]
+        session = stack.enter_context(open_session(Endpoints(connect=(plant_at, controller_at))))
+        director = Director(session, CAR)
+        events: Publisher[Event] = Publisher(session, EVENT, CAR, "race")
+        with Recorder(session, CAR, folder / "run.mcap"):
+            wait_for_both(director, children, 20.0)
+            execute(director, events, track, RunPlan(1, mode, laps, limit_s, lockstep=False))
+        return analyse(folder / "run.mcap", track, laps)
+
+
+def analyse(log: Path, track: Track, laps: int) -> Outcome:
+    """Lap times, and samples off track until the last lap's end."""
+    reader = LogReader(log)
+    states = reader.select(STATE)
+    telemetry = reader.select(TELEMETRY)
+    xy = np.array([state.x[:2] for state in states])
+    time_s = np.array([state.time_s for state in states])
+    projection = track.project_path(xy)
+    found = time_laps(track, time_s, xy, projection.s_m)
+    off_m = projection.off_track_m[: found.after[-1] if len(found.after) >= laps else None]
+    return Outcome(
+        found.times_s[:laps],
+        int((off_m > 0).sum()),
+        float(off_m.max()),
+        len(off_m),
+        sum(message.fallback > 0 for message in telemetry),
+        1e3 * float(np.median([message.delay_s for message in telemetry])),
+    )
+
+
+def main() -> None:
+    """Prepares once, drives each case, prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--track", default=DEFAULT_RACE_TRACK)
+    parser.add_argument("--train-track", default=DEFAULT_TRAINING_TRACK)
+    parser.add_argument("--laps", type=int, default=3)
+    options = parser.parse_args()
+    track = load_track(options.track, get_car(CAR).width_m)
+    settings = PreparationSettings(track=options.track, train_track=options.train_track)
+    with stages_on(Console(stderr=True)) as stages:
+        files = prepare(settings, stages)
+    print("| delay each way ms | compensated | lap s | flying s | off track | deepest mm "
+          "| fallbacks | measured ms |")  # fmt: skip
+    print("|---|---|---|---|---|---|---|---|")
+    for delay_ms in DELAYS_MS:
+        for mode in ("off", "measured"):
+            outcome = drive(files, track, delay_ms, mode, options.laps)
+            word = "yes" if mode == "measured" else "no"
+            print("|", " | ".join([str(delay_ms), word, *outcome.cells()]), "|", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,93 @@
+"""``latency``: where a control cycle's time goes, by the wall clock."""
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bayesrace.errors import InputError
+from experiments.cli.options import Car, CarName, writable
+
+__all__ = ["register"]
+
+
+def latency(
+    rate: Annotated[float, typer.Option(min=1, max=500, help="Of plant and controller [Hz].")] = 50,
+    duration: Annotated[float, typer.Option(min=1, help="Time observed [s].")] = 20.0,
+    load: Annotated[int, typer.Option(min=0, max=1024, help="Busy processes beside.")] = 0,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder [runs/latency-DATE-TIME].")
+    ] = None,
+    json_file: Annotated[
+        Path | None,
+        typer.Option("--json", callback=writable, help="Write the numbers to this file as well."),
+    ] = None,
+    track: Annotated[
+        str | None,
+        typer.Option(
+            help="Track: built-in name, random:SEED or CSV file. Attached: the one that is driven."
+        ),
+    ] = None,
+    fifo: Annotated[
+        int | None,
+        typer.Option(min=1, max=99, help="SCHED_FIFO priority of the loops, the bare one too."),
+    ] = None,
+    lock_memory: Annotated[bool, typer.Option(help="Keep their memory from being paged.")] = False,
+    weights: Annotated[Path | None, typer.Option(help="GP weights [trained].")] = None,
+    artefact: Annotated[Path | None, typer.Option(help="Built controller [built].")] = None,
+    raceline: Annotated[Path | None, typer.Option(help="Racing line [computed].")] = None,
+    attach: Annotated[bool, typer.Option(help="Measure a run that is under way.")] = False,
+    endpoint: Annotated[
+        list[str] | None,
+        typer.Option(help="Attach: plant and controller, one each; the defaults of both without."),
+    ] = None,
+    car: Car = "orca",
+    name: CarName = "",
+) -> None:
+    """Measure where a control cycle's time goes, from sampling the state to acting.
+
+    Starts plant and controller as processes of their own and drives around the track by the wall
+    clock; beside them runs a loop that only sleeps, which tells the machine's stalls from the
+    program's. Leaves latency.json, a picture and HdrHistogram logs. docs/latency.md explains it.
+    """
+    if endpoint and not attach:
+        raise InputError("--endpoint is of a running system: add --attach, or leave it out")
+    if attach and (weights or artefact or raceline):
+        raise InputError("--weights, --artefact and --raceline are for what is started here")
+    from rich.console import Console
+
+    from bayesrace.realtime import RealtimeSettings
+    from bayesrace.tracks import DEFAULT_RACE_TRACK
+    from bayesrace.transport import CONTROLLER_ENDPOINT, PLANT_ENDPOINT
+    from experiments.latency.report import print_report
+    from experiments.latency.settings import LatencySettings
+    from experiments.progress import stages_on
+
+    ends = tuple(endpoint or (PLANT_ENDPOINT, CONTROLLER_ENDPOINT)) if attach else ()
+    settings = LatencySettings(
+        car=car, name=name, rate_hz=rate, duration_s=duration, load=load,
+        settle_s=1.0 if attach else 3.0,
+        track=track if track is not None else "" if attach else DEFAULT_RACE_TRACK,
+        realtime=RealtimeSettings(fifo=fifo, lock_memory=lock_memory),
+        weights=weights, artefact=artefact, raceline=raceline, attach=ends,
+    )  # fmt: skip
+    time = datetime.now(UTC).astimezone().strftime("%Y%m%d-%H%M%S")
+    out = out or Path("runs") / f"latency-{time}"
+    if attach:
+        from experiments.latency.attach import measure_attached as measure
+    else:
+        from experiments.latency.run import measure_latency as measure
+    console = Console()
+    with stages_on(console) as stages:
+        measured = measure(settings, out, stages)
+    print_report(measured.result, console)
+    if json_file:
+        json_file.write_text(measured.result.model_dump_json(indent=1) + "\n")
+    console.print(f"{out}", highlight=False, soft_wrap=True)
+    measured.raise_if_broken()
+
+
+def register(app: typer.Typer) -> None:
+    """Adds this module's subcommands."""
+    app.command()(latency)

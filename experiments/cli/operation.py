@@ -1,0 +1,208 @@
+"""``status``, ``stop``, ``go``, ``router``: looking after plants and controllers that run."""
+
+import contextlib
+import json
+import os
+import sys
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from bayesrace.clock import die_with_parent
+from bayesrace.errors import InputError
+from experiments.cli.options import ParentPid
+
+if TYPE_CHECKING:
+    from bayesrace.transport import Endpoints
+    from experiments.picture import Picture
+
+__all__ = ["register"]
+
+Name = Annotated[str, typer.Option(help="Name of the car.")]
+Endpoint = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Zenoh endpoint of a plant, a controller or a router; can be given several times "
+        "[tcp/127.0.0.1:7447 and :7448, the plant's and the controller's own].",
+        show_default=False,
+    ),
+]
+Timeout = Annotated[
+    float, typer.Option(min=0.1, max=60.0, help="Seconds to find the cars, and again to answer.")
+]
+Reason = Annotated[str, typer.Option(help="Why; it shows in the controller's status.")]
+
+_PERIOD_S = 0.2
+"""Between two pictures of ``status --watch``."""
+
+
+def status(
+    name: Name = "",
+    endpoint: Endpoint = None,
+    as_json: Annotated[
+        bool,
+        typer.Option(
+            "--json", help='Print {"cars": {NAME: {"plant": ..., "controller": ...}}} instead.'
+        ),
+    ] = False,
+    watch: Annotated[
+        bool, typer.Option(help="Go on until Ctrl-C; with --json a line for each heartbeat.")
+    ] = False,
+    timeout: Timeout = 2.0,
+) -> None:
+    """Show how plants and controllers are: state, rate, misses, fallbacks, counters.
+
+    Without --name: all cars that are found. A process that is there and does not answer is shown
+    as such; if none answers, that is an error.
+    """
+    from rich.console import Console
+
+    from bayesrace.transport import open_session
+    from experiments.operation import ask_statuses, find
+    from experiments.status_table import StatusTable
+
+    endpoints = _endpoints(endpoint)
+    with open_session(endpoints) as session, _until_nobody_reads():
+        picture = ask_statuses(session, find(session, endpoints, timeout, name), timeout)
+        if watch and as_json:
+            _watch_json(session, picture, name)
+        elif watch:
+            _watch(session, picture, name)
+        elif as_json:
+            _print_json(picture)
+        else:
+            Console().print(StatusTable(picture))
+    if not watch and not picture.answering:
+        raise InputError(
+            f"none of the processes found answers within {timeout:g} s; they hang, are of another "
+            "release, or the network is slow: --timeout"
+        )
+
+
+def _watch(session: object, picture: "Picture", name: str) -> None:
+    from rich.console import Console
+    from rich.live import Live
+
+    from experiments.operation import follow
+    from experiments.status_table import StatusTable
+
+    with Live(console=Console(), auto_refresh=False) as live:
+
+        def show(car: str | None) -> None:
+            if car is None:
+                live.update(StatusTable(picture, brief=True), refresh=True)
+
+        follow(session, picture, name, show, _PERIOD_S)
+
+
+def _watch_json(session: object, picture: "Picture", name: str) -> None:
+    from experiments.operation import follow
+
+    def show(car: str | None) -> None:
+        if car is not None:
+            _print_json(picture, car)
+
+    follow(session, picture, name, show, 1.0)
+
+
+def _print_json(picture: "Picture", car: str | None = None) -> None:
+    typer.echo(json.dumps(picture.as_json(car), allow_nan=False))
+
+
+@contextlib.contextmanager
+def _until_nobody_reads() -> Iterator[None]:
+    """A reader that has had enough (``| head -1``) is no error."""
+    try:
+        yield
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # What is left in the buffer must not fail once more at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _endpoints(given: list[str] | None) -> "Endpoints":
+    from bayesrace.transport import CONTROLLER_ENDPOINT, PLANT_ENDPOINT, Endpoints
+
+    return Endpoints(connect=tuple(given or (PLANT_ENDPOINT, CONTROLLER_ENDPOINT)))
+
+
+def stop(
+    name: Name = "",
+    endpoint: Endpoint = None,
+    reason: Reason = "",
+    everybody: Annotated[bool, typer.Option("--all", help="Stop all cars that are found.")] = False,
+    timeout: Timeout = 2.0,
+) -> None:
+    """Tell a controller to brake to standstill and stay there.
+
+    Without --name: the only car there is. Exit code 2 if it refuses or does not answer.
+    """
+    if name and everybody:
+        raise InputError("--name and --all contradict each other; give one of them")
+    _command("stop", name, endpoint, reason or "bayesrace stop", everybody, timeout)
+
+
+def go(
+    name: Name = "", endpoint: Endpoint = None, reason: Reason = "", timeout: Timeout = 2.0
+) -> None:
+    """Tell a controller that has been stopped to drive again.
+
+    Without --name: the only car there is. Exit code 2 if it refuses or does not answer.
+    """
+    _command("go", name, endpoint, reason or "bayesrace go", False, timeout)
+
+
+def _command(
+    word: Literal["stop", "go"],
+    name: str,
+    endpoint: list[str] | None,
+    reason: str,
+    everybody: bool,
+    timeout: float,
+) -> None:
+    from bayesrace.messages import Reply
+    from bayesrace.transport import open_session
+    from experiments.operation import command, find, pick
+    from experiments.picture import printable
+
+    endpoints = _endpoints(endpoint)
+    with open_session(endpoints) as session:
+        cars = pick(find(session, endpoints, timeout, name, ("controller",)), name, everybody)
+        answers = command(session, cars, word, reason, timeout)
+    failures = []
+    for car, answer in answers.items():
+        if isinstance(answer, Reply) and answer.accepted:
+            typer.echo(f"{car}: {printable(answer.text)}")
+        else:
+            why = f"refused: {answer.text}" if isinstance(answer, Reply) else answer
+            failures.append(f"{word} of car '{car}' {printable(why)}")
+    if failures:
+        raise InputError("; ".join(failures))
+
+
+def router(
+    listen: Annotated[
+        list[str], typer.Option(help="Zenoh endpoint to listen on; several allowed.")
+    ],
+    connect: Annotated[
+        list[str] | None, typer.Option(help="Endpoint of another router; several allowed.")
+    ] = None,
+    parent_pid: ParentPid = None,
+) -> None:
+    """Forward between cars and those who look after them, until Ctrl-C.
+
+    Plants, controllers and all others then need one endpoint only, this one: many cars on one
+    network, and machines that cannot reach each other directly.
+    """
+    die_with_parent(parent_pid)
+    from bayesrace.transport import Endpoints
+    from experiments.operation import route
+
+    route(Endpoints(listen=tuple(listen), connect=tuple(connect or ()), mode="router"))
+
+
+def register(app: typer.Typer) -> None:
+    """Adds this module's subcommands."""
+    for subcommand in (status, stop, go, router):
+        app.command()(subcommand)

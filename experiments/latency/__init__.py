@@ -1,0 +1,1 @@
+"""``bayesrace latency``: where a control cycle's time goes, measured from the messages."""
