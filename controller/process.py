@@ -244,7 +244,8 @@ class ControllerProcess:
             if state is not None:
                 fresh = state
         if fresh is not None:
-            schedule.observe(self._arrived_ns, self._driver.states.interval_s * 1e9)
+            interval_s = self._driver.states.interval_s
+            schedule.observe(self._arrived_ns, fresh.time_s, interval_s)
         return fresh
 
     def _state_due(self) -> bool:

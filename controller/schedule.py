@@ -1,14 +1,17 @@
 """Release times of a fixed-rate loop, locked in phase to the arrival of the states.
 
 A loop that runs free of its plant takes states that are up to a period old. This one keeps its
-rate, and moves its phase slowly until the states arrive at its releases: a first-order phase lock
-whose step is limited, so that a message held up on its way hardly moves it.
+rate, and moves its phase slowly until its releases meet the earliest arrivals. Earliest, because
+whatever holds up a message makes it later and never sooner: the smallest difference between arrival
+and the plant's own time, over the last second, is the one to trust (as in NTP's clock filter).
 """
 
+from collections import deque
 from typing import Final
 
 __all__ = ["Schedule"]
 
+_WINDOW_NS: Final = 1_000_000_000
 _GAIN: Final = 0.1
 _SLEW: Final = 0.005
 """Largest correction of a release, as a fraction of the period."""
@@ -20,6 +23,27 @@ _WHOLE: Final = 0.02
 """How far the ratio of the two periods may be from a whole number for a lock to be possible."""
 
 
+class _Smallest:
+    """Minimum over a sliding window of time, in constant time per value."""
+
+    def __init__(self, window_ns: int) -> None:
+        self._window_ns = window_ns
+        self._rising: deque[tuple[int, int]] = deque()
+
+    def clear(self) -> None:
+        self._rising.clear()
+
+    def add(self, at_ns: int, value: int) -> int:
+        """The minimum with the new value."""
+        rising = self._rising
+        while rising and rising[-1][1] >= value:
+            rising.pop()
+        rising.append((at_ns, value))
+        while rising[0][0] < at_ns - self._window_ns:
+            rising.popleft()
+        return rising[0][1]
+
+
 class Schedule:
     """Releases at a fixed rate on the monotonic clock [ns]."""
 
@@ -28,6 +52,7 @@ class Schedule:
         self.release_ns = 0
         """The next release; its deadline is the release after it."""
         self._lost = 0
+        self._offset = _Smallest(_WINDOW_NS)
 
     @property
     def deadline_ns(self) -> int:
@@ -38,6 +63,7 @@ class Schedule:
         """Begin with a release at this time."""
         self.release_ns = release_ns
         self._lost = 0
+        self._offset.clear()
 
     def advance(self, now_ns: int) -> int:
         """Go on to the next release whose deadline has not passed; how many were skipped."""
@@ -47,16 +73,20 @@ class Schedule:
         self.release_ns += skipped * self.period_ns
         return skipped
 
-    def observe(self, arrival_ns: int, interval_ns: float) -> None:
-        """A state has arrived; they are ``interval_ns`` apart (0: not known).
+    def observe(self, arrival_ns: int, time_s: float, interval_s: float) -> None:
+        """The state of plant time ``time_s`` has arrived; two are ``interval_s`` apart (0: not
+        known).
 
         Moves the releases only if one period is a whole multiple of the other: else there is no
         phase to keep.
         """
+        interval_ns = interval_s * 1e9
         if not self._lockable(interval_ns):
             return
+        time_ns = round(time_s * 1e9)
+        earliest_ns = self._offset.add(arrival_ns, arrival_ns - time_ns) + time_ns
         grid_ns = min(self.period_ns, interval_ns)
-        error_ns = (arrival_ns - self.release_ns + grid_ns / 2) % grid_ns - grid_ns / 2
+        error_ns = (earliest_ns - self.release_ns + grid_ns / 2) % grid_ns - grid_ns / 2
         if abs(error_ns) > _LOST * grid_ns:
             self._lost += 1
             if self._lost >= _LOST_FOR:

@@ -26,6 +26,7 @@ from bayesrace.messages import (
     RunRequest,
     Scalar,
     Status,
+    peek_seq,
 )
 from bayesrace.realtime import RealtimeSettings, prepare_thread
 from bayesrace.transport import (
@@ -116,7 +117,10 @@ class PlantProcess:
         while not self._stopping:
             self._beat()
             item = self.inbox.get(HEARTBEAT_S)
-            if item is None or item.kind is Kind.MESSAGE:
+            if item is None:
+                continue
+            if item.kind is Kind.MESSAGE:  # for nobody, but received
+                self._numbering.note(peek_seq(item.value) or 0)
                 continue
             if item.kind is Kind.REQUEST and item.name == RUN.name:
                 self._serve_run(item.value)

@@ -17,11 +17,14 @@ def locked(
     random = np.random.default_rng(1)
     errors = []
     arrival = first_ns
-    for _ in range(count):
-        observed = int(arrival + abs(random.normal()) * jitter_ns)
+    nominal_s = round(interval_ns, -6) * 1e-9
+    for k in range(count):
+        # one in ten is held up for long
+        held_up = 10.0 if random.random() < 0.1 else 1.0
+        observed = int(arrival + abs(random.normal()) * jitter_ns * held_up)
         while schedule.release_ns < observed - schedule.period_ns / 2:
             schedule.advance(schedule.release_ns)
-        schedule.observe(observed, interval_ns)
+        schedule.observe(observed, k * nominal_s, nominal_s)
         errors.append(schedule.release_ns - arrival)
         arrival += interval_ns
     return errors
@@ -51,7 +54,7 @@ def test_the_phase_locks_to_the_states(offset_ms: float) -> None:
     schedule = Schedule(50.0)
     schedule.start(0)
     errors = locked(schedule, offset_ms * MS, 20 * MS, 50e3, 600)
-    assert max(abs(e) for e in errors[-50:]) < 0.2 * MS
+    assert max(abs(e) for e in errors[-50:]) < 0.05 * MS
 
 
 def test_it_follows_a_plant_whose_clock_runs_fast() -> None:
@@ -59,6 +62,21 @@ def test_it_follows_a_plant_whose_clock_runs_fast() -> None:
     schedule.start(0)
     errors = locked(schedule, 0.0, 20 * MS * (1 - 200e-6), 20e3, 2000)
     assert max(abs(e) for e in errors[-500:]) < 0.2 * MS
+
+
+def test_messages_held_up_do_not_change_the_rate() -> None:
+    """Seen late they may look early for the release after: with a mean of arrivals, the loop ran
+    .2 % fast on a loaded machine."""
+    schedule = Schedule(500.0)
+    schedule.start(0)
+    random = np.random.default_rng(3)
+    count = 20_000
+    for k in range(count):
+        seen = k * 2 * MS + (1.9 * MS if random.random() < 0.3 else 0.05 * MS * random.random())
+        while schedule.release_ns < seen - MS:
+            schedule.advance(schedule.release_ns)
+        schedule.observe(int(seen), k * 0.002, 0.002)
+    assert schedule.release_ns == pytest.approx((count - 1) * 2 * MS, abs=0.1 * MS)
 
 
 @pytest.mark.parametrize(("rate_hz", "interval_ms"), [(500.0, 20), (50.0, 2), (100.0, 20)])
@@ -76,8 +94,8 @@ def test_it_locks_where_one_period_is_a_multiple_of_the_other(
 def test_there_is_no_lock_to_states_of_another_rhythm() -> None:
     schedule = Schedule(50.0)
     schedule.start(0)
-    schedule.observe(13 * MS, 17 * MS)
-    schedule.observe(13 * MS, 0.0)
+    schedule.observe(13 * MS, 0.0, 0.017)
+    schedule.observe(13 * MS, 0.02, 0.0)
     assert schedule.release_ns == 0
 
 
@@ -86,5 +104,5 @@ def test_one_state_moves_a_release_by_half_a_percent_at_most(arrival_ns: float) 
     """A message held up on its way must not throw the loop out of its rate."""
     schedule = Schedule(50.0)
     schedule.start(0)
-    schedule.observe(int(arrival_ns), 20 * MS)
+    schedule.observe(int(arrival_ns), 0.0, 0.02)
     assert abs(schedule.release_ns) <= 0.005 * 20 * MS

@@ -118,6 +118,9 @@ def _config(endpoints: Endpoints, role: Role) -> Any:
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/link/tx/lease": _LEASE_MS,
+        # Each message of the control path is a batch of its own: with the default of two, a
+        # receiver held up for two periods of 500 Hz loses states instead of getting them late.
+        "transport/link/tx/queue/size/real_time": 16,
         # Pays only above 3 kB, and leaves segments behind when a process is killed.
         "transport/shared_memory/enabled": False,
         # Zenoh has one or the other.

@@ -1,0 +1,127 @@
+"""The promises of free-running mode, each measured by ``bayesrace latency`` and judged.
+
+    python -m benchmarks.soak            about a quarter of an hour
+    python -m benchmarks.soak --share .1 a tenth of each run's length: whether it works at all
+
+1. 50 Hz for ten minutes: state to actuation median at most .6 ms; misses at most those of the bare
+   loop in the same run + 2; resident memory grows by less than 1 MB after the first minute; every
+   message sent was received or counted as lost.
+2. 500 Hz for one minute: mean period within .1 %.
+3. 50 Hz for one minute with all cores busy: a lap, and no sample off the track.
+
+Nothing else should be running. A stall of the machine longer than a period is seen by the bare
+loop too; a shorter one moves the maximum of a leg and no verdict. Leaves the folders of the runs,
+each with its picture, under runs/soak-DATE-TIME. The exit code is the number of broken promises.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+Result = dict[str, Any]
+
+
+class Promise(NamedTuple):
+    """Something to hold in a run."""
+
+    text: str
+    holds: Callable[[Result], bool]
+    measured: Callable[[Result], str]
+
+
+class Case(NamedTuple):
+    """One run and what is to hold in it."""
+
+    name: str
+    duration_s: float
+    options: tuple[str, ...]
+    promises: tuple[Promise, ...]
+
+
+def complete(result: Result) -> bool:
+    """Every message is accounted for, in each direction and altogether."""
+    altogether = result["sent"] == result["received"] + result["lost"]
+    return altogether and all(one["complete"] for one in result["traffic"].values())
+
+
+CASES = (
+    Case(
+        "50hz", 600.0, ("--rate", "50"),
+        (
+            Promise("state to actuation p50 <= 600 us",
+                    lambda r: r["state_to_actuation_us"]["p50"] <= 600,
+                    lambda r: f"{r['state_to_actuation_us']['p50']:.0f} us"),
+            Promise("deadline misses <= bare loop's + 2",
+                    lambda r: r["deadline_misses"] <= r["bare_loop_misses"] + 2,
+                    lambda r: f"{r['deadline_misses']}, bare loop {r['bare_loop_misses']}"),
+            Promise("resident memory grows < 1 MB",
+                    lambda r: r["rss_growth_bytes"] < 1_000_000,
+                    lambda r: f"{r['rss_growth_bytes'] / 1000:.0f} kB"),
+            Promise("sent = received + lost", complete,
+                    lambda r: f"{r['sent']} = {r['received']} + {r['lost']}"),
+        ),
+    ),
+    Case(
+        "500hz", 60.0, ("--rate", "500"),
+        (
+            Promise("mean period within .1 %",
+                    lambda r: abs(r["rate_error"]) <= 1e-3,
+                    lambda r: f"{r['rate_error']:+.3%}"),
+        ),
+    ),
+    Case(
+        "load", 60.0, ("--rate", "50", "--load", str(os.cpu_count() or 1)),
+        (
+            Promise("a lap under load", lambda r: r["laps"] >= 1, lambda r: f"{r['laps']}"),
+            Promise("no sample off track under load",
+                    lambda r: r["off_track_samples"] == 0,
+                    lambda r: f"{r['off_track_samples']} of {r['states']}"),
+        ),
+    ),
+)  # fmt: skip
+
+
+def measure(case: Case, share: float, folder: Path, further: list[str]) -> Result:
+    """Runs the case; what the command says goes to the terminal."""
+    line = [sys.executable, "-m", "experiments.cli", "latency", *case.options, *further]
+    duration_s = max(case.duration_s * share, 5.0)
+    line += ["--duration", f"{duration_s:g}", "--out", str(folder / case.name)]
+    subprocess.run(line, check=True)
+    content: Result = json.loads((folder / case.name / "latency.json").read_text())
+    return content
+
+
+def main() -> None:
+    """Measures all cases, or those named; prints a verdict per promise."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    names = [case.name for case in CASES]
+    parser.add_argument("cases", nargs="*", help=f"of {', '.join(names)} [all]")
+    parser.add_argument("--share", type=float, default=1.0, help="of the runs' length")
+    parser.add_argument("--realtime", action="store_true", help="with --fifo 50 --lock-memory")
+    given = parser.parse_args()
+    if unknown := set(given.cases) - set(names):
+        parser.error(f"no case {', '.join(sorted(unknown))}; there are {', '.join(names)}")
+    further = ["--fifo", "50", "--lock-memory"] if given.realtime else []
+    time = datetime.now(UTC).astimezone().strftime("%Y%m%d-%H%M%S")
+    folder = Path("runs") / f"soak-{time}"
+    verdicts = []
+    for case in CASES:
+        if given.cases and case.name not in given.cases:
+            continue
+        print(f"\n{case.name}", flush=True)
+        result = measure(case, given.share, folder, further)
+        verdicts += [(case.name, p, p.holds(result), p.measured(result)) for p in case.promises]
+    print()
+    for name, promise, holds, measured in verdicts:
+        print(f"{'holds ' if holds else 'BROKEN'}  {name:<6} {promise.text}: {measured}")
+    sys.exit(sum(not holds for _, _, holds, _ in verdicts))
+
+
+if __name__ == "__main__":
+    main()

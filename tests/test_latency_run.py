@@ -1,0 +1,314 @@
+"""``bayesrace latency`` as its users have it: real processes, real clocks; no time is judged."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hdrh.log import HistogramLogReader
+
+from bayesrace.tracks import Track, load_track
+from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
+from experiments.drive import RunPlan, run_request
+from experiments.latency.histograms import new_histogram
+from experiments.latency.legs import LEGS
+from experiments.preparation import PreparationSettings, Prepared, prepare
+from experiments.progress import stages_on
+from tests.programs import COMMAND, ROOT, environment, finish, leftovers, peanut, run, start, until
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
+    """Everything a controller needs on the shortest track."""
+    from rich.console import Console
+
+    track = peanut(tmp_path_factory.mktemp("track") / "peanut.csv")
+    with stages_on(Console(quiet=True)) as stages:
+        return prepare(PreparationSettings(track=str(track)), stages)
+
+
+def given(files: Prepared) -> list[str]:
+    return [
+        "--weights", str(files.weights), "--artefact", str(files.artefact),
+        "--raceline", str(files.raceline), "--track", str(files.track),
+    ]  # fmt: skip
+
+
+@dataclass
+class Run:
+    """One measurement."""
+
+    out: Path
+    pid: int
+    process: subprocess.CompletedProcess[str]
+
+    @property
+    def result(self) -> dict[str, Any]:
+        content: dict[str, Any] = json.loads((self.out / "latency.json").read_text())
+        return content
+
+
+@pytest.fixture(scope="module")
+def loaded(files: Prepared, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A short run with a busy process beside."""
+    out = tmp_path_factory.mktemp("latency")
+    process = start(
+        "latency", *given(files), "--duration", "4", "--load", "1", "--out", out / "run",
+        "--json", out / "copy.json",
+    )  # fmt: skip
+    done = finish(process)
+    assert done.returncode == 0, done.stderr
+    assert json.loads((out / "copy.json").read_text()) is not None
+    return Run(out / "run", process.pid, done)
+
+
+def test_every_leg_is_measured(loaded: Run) -> None:
+    result = loaded.result
+    assert set(result["legs_us"]) == {leg.name for leg in LEGS}
+    for name, leg in result["legs_us"].items():
+        assert leg["count"] > 50, name
+        assert leg["p50"] <= leg["p90"] <= leg["p99"] <= leg["p999"] <= leg["max"], name
+        assert leg["below_zero"] == 0, name
+    assert set(result["state_to_actuation_us"]) == {"p50", "p90", "p99", "p999", "max"}
+    assert result["bare_loop_us"]["count"] > 0
+    assert result["bare_loop_misses"] == result["bare_loop_us"]["misses"]
+
+
+def test_messages_sent_are_received_or_lost(loaded: Run) -> None:
+    result = loaded.result
+    assert all(one["complete"] for one in result["traffic"].values())
+    in_flight = sum(one["in_flight"] for one in result["traffic"].values())
+    assert result["sent"] == result["received"] + result["lost"] + in_flight
+    assert result["sent"] > 100
+
+
+def test_memory_laps_and_clocks_are_told(loaded: Run) -> None:
+    result = loaded.result
+    assert set(result["rss"]) == {"plant", "controller"}
+    assert result["rss_growth_bytes"] >= 0
+    assert result["clocks"]["shared"] is True
+    assert result["clocks"]["uncertainty_us"] == 0
+    assert result["states"] > 100
+    assert result["off_track_samples"] is not None
+    for words in ("state → actuation", "bare loop", "sent =", "one clock", str(loaded.out)):
+        assert words in loaded.process.stdout.replace("\n", " "), words
+
+
+def test_files_are_those_of_the_documentation(loaded: Run) -> None:
+    names = {path.name for path in loaded.out.iterdir()}
+    logs = {f"{leg.name}.hlog" for leg in LEGS} | {"bare_loop.hlog"}
+    assert logs | {"latency.json", "latency.png", "settings.json"} <= names
+    for name in logs:
+        reader = HistogramLogReader(str(loaded.out / name), new_histogram())
+        total = 0
+        while (interval := reader.get_next_interval_histogram()) is not None:
+            total += interval.get_total_count()
+        leg = loaded.result["legs_us"].get(name.removesuffix(".hlog"))
+        expected = loaded.result["bare_loop_us"] if leg is None else leg
+        assert total == expected["count"], name
+
+
+def test_nothing_outlives_it(loaded: Run) -> None:
+    """Plant, controller, bare loop and load carry its process number."""
+    assert not leftovers(loaded.pid)
+    assert not _with_parent(loaded.pid)
+
+
+def _with_parent(pid: int) -> list[str]:
+    found = []
+    for entry in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            words = entry.read_bytes().decode(errors="replace").split("\0")
+        except OSError:
+            continue
+        if "--parent-pid" in words and words[words.index("--parent-pid") + 1] == str(pid):
+            found.append(" ".join(words))
+    return found
+
+
+def _child_pid(parent: int, word: str) -> int | None:
+    for entry in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            words = entry.read_bytes().decode(errors="replace").split("\0")
+        except OSError:
+            continue
+        if word in words and "--parent-pid" in words and str(parent) in words:
+            return int(entry.parent.name)
+    return None
+
+
+def _observing(out: Path) -> bool:
+    log = out / "state_age.hlog"
+    return log.is_file()
+
+
+def test_killed_controller_ends_it_with_a_reason_and_a_report(
+    files: Prepared, tmp_path: Path
+) -> None:
+    process = start("latency", *given(files), "--duration", "60", "--out", tmp_path / "run")
+    until(lambda: _observing(tmp_path / "run"), "time observed")
+    controller = _child_pid(process.pid, "controller")
+    assert controller is not None
+    os.kill(controller, signal.SIGKILL)
+    done = finish(process)
+    assert done.returncode == 1
+    assert "controller" in done.stderr
+    assert "killed by signal 9" in done.stderr
+    notes = json.loads((tmp_path / "run" / "latency.json").read_text())["notes"]
+    assert any("ended early" in note for note in notes)
+    assert not leftovers(process.pid)
+
+
+def test_interrupt_leaves_a_report_and_no_process(files: Prepared, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    process = start("latency", *given(files), "--duration", "60", "--load", "1", "--out", out)
+    until(lambda: _observing(out), "time observed")
+    time.sleep(1.0)
+    process.send_signal(signal.SIGINT)
+    done = finish(process)
+    assert done.returncode == 130, done.stderr
+    assert json.loads((out / "latency.json").read_text())["ticks"] > 0
+    until(lambda: not _with_parent(process.pid), "children ended", 20.0)
+
+
+def test_killed_measurement_takes_its_children_along(files: Prepared, tmp_path: Path) -> None:
+    """The busy processes above all: nobody would look for them."""
+    out = tmp_path / "run"
+    process = start("latency", *given(files), "--duration", "60", "--load", "2", "--out", out)
+    until(lambda: _observing(out), "time observed")
+    assert len(_with_parent(process.pid)) == 5
+    process.kill()
+    finish(process)
+    until(lambda: not _with_parent(process.pid), "children ended", 20.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--endpoint", "tcp/127.0.0.1:7447"], "--attach"),
+        (["--attach", "--weights", "w.bin"], "started here"),
+        (["--rate", "0"], "--rate"),
+        (["--json", "/no/such/folder/x.json"], "no folder"),
+        (["--track", "nowhere"], "nowhere"),
+    ],
+)
+def test_bad_options_get_one_line(arguments: list[str], words: str, tmp_path: Path) -> None:
+    done = run("latency", "--out", tmp_path / "run", *arguments)
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+# Attached --------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _process(line: list[str]) -> Iterator[None]:
+    process = subprocess.Popen(
+        line, stdin=subprocess.DEVNULL, cwd=ROOT, env=environment(), start_new_session=True
+    )  # fmt: skip
+    try:
+        yield
+    finally:
+        os.killpg(process.pid, signal.SIGTERM)
+        try:
+            process.wait(10)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+@contextmanager
+def _driving(files: Prepared, track: Track, prefix: list[str]) -> Iterator[list[str]]:
+    """A system that somebody else has started, the plant by way of ``prefix``; its endpoints."""
+    plant, controller = free_endpoint(), free_endpoint()
+    with ExitStack() as stack:
+        stack.enter_context(
+            _process([*prefix, *COMMAND, "plant", "--endpoint", plant, "--name", "other"])
+        )
+        stack.enter_context(
+            _process([
+                *COMMAND, "controller", "--artefact", str(files.artefact),
+                "--track", str(files.track), "--raceline", str(files.raceline),
+                "--weights", str(files.weights), "--endpoint", plant, "--listen", controller,
+                "--name", "other",
+            ])
+        )  # fmt: skip
+        session = stack.enter_context(open_session(Endpoints(connect=(plant, controller))))
+        director = Director(session, "other")
+        director.wait_for(("plant", "controller"), 60.0)
+        director.start(run_request(track, RunPlan(1, "test", 0, 1e5, lockstep=False)))
+        yield [plant, controller]
+
+
+def _attached(endpoints: list[str], out: Path) -> dict[str, Any]:
+    ends = [word for endpoint in endpoints for word in ("--endpoint", endpoint)]
+    done = run("latency", "--attach", *ends, "--name", "other", "--duration", "4", "--out", out)
+    assert done.returncode == 0, done.stderr
+    content: dict[str, Any] = json.loads((out / "latency.json").read_text())
+    return content
+
+
+def test_a_running_system_is_measured_and_left_running(files: Prepared, tmp_path: Path) -> None:
+    with _driving(files, load_track(files.track), []) as endpoints:
+        first = _attached(endpoints, tmp_path / "first")
+        second = _attached(endpoints, tmp_path / "second")
+    for result in (first, second):
+        assert result["attached"] is True
+        assert result["clocks"]["shared"] is True
+        assert set(result["legs_us"]) == {leg.name for leg in LEGS}
+        assert result["rss_growth_bytes"] is None
+        assert result["off_track_samples"] is None
+        assert result["ticks"] > 50
+
+
+def test_nothing_under_way_is_told(tmp_path: Path) -> None:
+    done = run("latency", "--attach", "--endpoint", free_endpoint(), "--out", tmp_path / "run")
+    assert done.returncode == 2
+    assert "no controller and no plant" in done.stderr
+
+
+def _time_namespaces() -> str:
+    """Why a process cannot be given another monotonic clock here, or ""."""
+    try:
+        done = subprocess.run(
+            ["unshare", "--time", "--monotonic=1000", "--fork", sys.executable, "-c", ""],
+            capture_output=True, text=True, timeout=30, check=False,
+        )  # fmt: skip
+    except OSError as error:
+        return f"no unshare: {error}"
+    return done.stderr.strip()[:200] if done.returncode else ""
+
+
+def test_clock_of_another_host_is_found_and_corrected(files: Prepared, tmp_path: Path) -> None:
+    """The plant in a time namespace: its monotonic clock is 1000 s ahead of everybody else's."""
+    if why_not := _time_namespaces():
+        pytest.skip(f"time namespaces are not allowed here: {why_not}")
+    prefix = ["unshare", "--time", "--monotonic=1000", "--fork", "--kill-child"]
+    with _driving(files, load_track(files.track), prefix) as endpoints:
+        result = _attached(endpoints, tmp_path / "run")
+    clocks = result["clocks"]
+    assert clocks["shared"] is False
+    for name, offset_us in (("plant", 1e9), ("controller", 0.0)):
+        found = clocks[name]
+        assert abs(found["offset_us"] - offset_us) <= found["uncertainty_us"], name
+        assert found["exchanges"] > 20
+    margin_us = clocks["uncertainty_us"]
+    assert 0 < margin_us < 1e5
+    for name in ("state_transport", "state_age", "actuation_transport"):
+        leg = result["legs_us"][name]
+        assert leg["uncertainty_us"] == margin_us
+        assert -margin_us <= leg["min"]
+        assert leg["p50"] <= result["state_to_actuation_us"]["p50"] + margin_us, name
+    for name in ("state_to_actuation", "feedback"):
+        assert result["legs_us"][name]["uncertainty_us"] == 0
