@@ -283,6 +283,7 @@ int main(int argc, char **argv) {
         at += 10 + 7 * n;
     }
     if (br_mpc_set_parameters(mpc, &p) || br_mpc_set_weights(mpc, outputs)) return 1;
+    mpc->d_lowest = p.d_min; /* as for a car that is rolling */
     set_up_hpipm();
     FILE *out = fopen(argv[2], "wb");
     if (!out) return 1;

@@ -1,5 +1,6 @@
 """The artefact's C without Python: under sanitizers, without allocations, to the same bits."""
 
+import platform
 import shutil
 import subprocess
 from pathlib import Path
@@ -70,11 +71,11 @@ def compiled(artefact: Path, folder: Path, *flags: str) -> Path:
     return out
 
 
-def run(program: Path, problems: Path, folder: Path) -> Floats:
+def run(program: Path, problems: Path, folder: Path, *under: str) -> Floats:
+    """The harness' results; "under" another program, such as valgrind."""
     results = folder / "results.bin"
-    done = subprocess.run(
-        [program, problems, results], capture_output=True, text=True, check=False, timeout=90
-    )
+    line: list[str | Path] = [*under, program, problems, results]
+    done = subprocess.run(line, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stderr[-4000:]
     return np.fromfile(results).reshape(STEPS, 4)
 
@@ -137,6 +138,20 @@ def test_no_sanitizer_finds_anything(
     flags = ("-O1", "-g", "-std=gnu11", "-march=native", "-fno-omit-frame-pointer")
     sanitize = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
     results = run(compiled(folder, tmp_path, *flags, *sanitize), problems, tmp_path)
+    assert (results[:, 0] == 0).all()
+
+
+@pytest.mark.slow
+def test_valgrind_finds_nothing(kinematic_artefact: Path, problems: Path, tmp_path: Path) -> None:
+    """No use of what was never written, no access outside, nothing left at the end."""
+    valgrind = shutil.which("valgrind")
+    if valgrind is None:
+        pytest.skip("valgrind is not installed")
+    # not for this very CPU, whose instructions valgrind may not know
+    march = ("-march=x86-64-v2",) if platform.machine() == "x86_64" else ()
+    program = compiled(kinematic_artefact, tmp_path, "-O1", "-g", "-std=gnu11", *march, *STRICT)
+    line = [valgrind, "-q", "--leak-check=full", "--error-exitcode=9", "--track-origins=yes"]
+    results = run(program, problems, tmp_path, *line)
     assert (results[:, 0] == 0).all()
 
 

@@ -170,8 +170,11 @@ def test_the_reference_runs_on_across_the_start_line(
 
 @pytest.mark.parametrize(
     "spoil",
-    ["few", "nan", "speed", "bounds", "normal", "spacing", "spacing nan", "many", "repeated"],
-)
+    [
+        "few", "nan", "speed", "fast", "far", "bounds", "normal", "spacing", "spacing nan",
+        "spacing tiny", "many", "repeated",
+    ],
+)  # fmt: skip
 def test_an_unusable_table_is_an_input_error_and_the_old_one_stays(
     kinematic_artefact: Path, car: CarParameters, circuit: Circuit, spoil: str
 ) -> None:
@@ -187,6 +190,10 @@ def test_an_unusable_table_is_an_input_error_and_the_old_one_stays(
         rows[-1, 6] = np.nan
     elif spoil == "speed":
         rows[3, 2] = 0.0
+    elif spoil == "fast":
+        rows[3, 2] = 1e3
+    elif spoil == "far":
+        rows[3, 0] = 1e200
     elif spoil == "bounds":
         rows[3, 5] = rows[3, 6]
     elif spoil == "repeated":
@@ -194,7 +201,7 @@ def test_an_unusable_table_is_an_input_error_and_the_old_one_stays(
     elif spoil == "normal":
         rows[3, 3:5] *= 1.01
     else:
-        spacing = np.nan if spoil.endswith("nan") else 0.0
+        spacing = {"spacing": 0.0, "spacing nan": np.nan, "spacing tiny": 1e-300}[spoil]
     with pytest.raises(InputError, match="path"):
         step.set_path(PathTable(rows, spacing))
     step.reset()

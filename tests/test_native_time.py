@@ -12,7 +12,6 @@ from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
 from bayesrace.vehicles import CarParameters
 from controller.native_step import NativeStep, StepStatus
-from controller.settings import MpcSettings
 from tests.conftest import SETTINGS, Circuit, Problem
 
 Floats = NDArray[np.float64]
@@ -37,6 +36,9 @@ def solve(step: NativeStep, p: Problem, **times: float) -> StepStatus:
     return step.solve(p.x0, p.d_previous, p.reference, **times)
 
 
+_CLOCKS: list["Clock"] = []
+
+
 class Clock:
     """A host's clock on which every reading takes ``tick_s``."""
 
@@ -44,7 +46,8 @@ class Clock:
         self.now_s = 0.0
         self.tick_s = tick_s
         prototype = ct.CFUNCTYPE(ct.c_double, ct.c_void_p)
-        self._callback = prototype(self._read)  # must outlive its use
+        self._callback = prototype(self._read)
+        _CLOCKS.append(self)  # the library calls it as long as the controller is used
         pointer = ct.cast(self._callback, ct.c_void_p)
         step._check(step._library.br_mpc_set_clock(step._mpc, pointer, None), "clock")
 
@@ -87,18 +90,18 @@ def test_a_faster_loop_shifts_when_the_plan_lags_half_a_stage(
 def test_a_missed_tick_shifts_twice_and_is_the_better_start(
     make: Make, recorded: list[Problem]
 ) -> None:
-    ratios = []
-    for k in range(20, 220, 20):
-        stationarity = []
-        for elapsed_s, shifts in ((2 * TS, 2), (TS, 1)):
-            step = make()
+    used: dict[int, list[float]] = {1: [], 2: []}
+    for k in range(20, 220, 10):
+        exact = make(iterations=60, iterations_cold=60)
+        solve(exact, recorded[k + 11])
+        for shifts, error in used.items():
+            step = make(iterations=2)
             for p in recorded[k : k + 10]:
                 solve(step, p)
-            assert solve(step, recorded[k + 11], elapsed_s=elapsed_s).usable
+            assert solve(step, recorded[k + 11], elapsed_s=shifts * TS).usable
             assert step.info.shifts == shifts
-            stationarity.append(residual(step))
-        ratios.append(stationarity[0] / stationarity[1])
-    assert np.median(ratios) < 0.5
+            error.append(np.abs(step.read_plan()[1] - exact.read_plan()[1]).max())
+    assert np.median(used[2]) < 0.5 * np.median(used[1])
 
 
 def test_a_plan_older_than_the_horizon_is_forgotten(make: Make, recorded: list[Problem]) -> None:
@@ -131,19 +134,24 @@ def test_an_impossible_time_is_refused_and_not_counted(
 ) -> None:
     step = make()
     solve(step, recorded[0])
-    for call in (lambda: solve(step, recorded[1], elapsed_s=elapsed_s), lambda: step.prepare(elapsed_s)):
+    for call in (
+        lambda: solve(step, recorded[1], elapsed_s=elapsed_s),
+        lambda: step.prepare(elapsed_s),
+    ):
         with pytest.raises(InputError, match="time is negative"):
             call()
     assert solve(step, recorded[1], elapsed_s=TS).usable
     assert step.info.shifts == 1
 
 
+@pytest.mark.parametrize("ahead_m", [0.2, 0.7, 2.5])
 def test_a_car_that_was_out_of_sight_is_found_on_the_line(
-    native: NativeStep, circuit: Circuit
+    native: NativeStep, circuit: Circuit, ahead_m: float
 ) -> None:
+    """Also beyond the window in which a car that is seen every stage is looked for."""
     native.step(circuit.start(0.0, 2.0), 0.0)
-    native.step(circuit.start(2.5, 2.0), 0.0, elapsed_s=1.25)
-    assert native.info.s_ref_m == pytest.approx(2.5, abs=0.05)
+    native.step(circuit.start(ahead_m, 2.0), 0.0, elapsed_s=ahead_m / 2.0)
+    assert native.info.s_ref_m == pytest.approx(ahead_m, abs=0.02)
 
 
 # --- the budget --------------------------------------------------------------------------------
@@ -152,43 +160,51 @@ def test_a_car_that_was_out_of_sight_is_found_on_the_line(
 def test_with_a_budget_the_step_iterates_until_it_settles(
     make: Make, recorded: list[Problem]
 ) -> None:
-    step = make(settle=1e-7)
+    step, settled = make(settle=1e-7, tolerance=1e-12), 0
     Clock(step, 1e-6)
-    settled = 0
-    for k, p in enumerate(recorded[:60]):
+    for p in recorded[:60]:
         assert solve(step, p, budget_s=1.0).usable
         settled += residual(step) <= 1e-7
         assert step.info.time_limited == 0
-        assert step.info.iterations <= SETTINGS.iterations_cold
-        assert step.info.iterations > 1 or residual(step) <= 1e-7, k
+        assert residual(step) <= 1e-7 or step.info.iterations == SETTINGS.iterations_cold
     assert settled >= 55  # not where the Hessian is indefinite
 
 
-def test_the_step_ends_within_its_budget(make: Make, recorded: list[Problem]) -> None:
-    limited = 0
-    for readings in (10, 15, 20, 30):
-        step = make(settle=1e-12)
+@pytest.mark.parametrize("warm", [False, True])
+def test_the_step_ends_within_its_budget(make: Make, recorded: list[Problem], warm: bool) -> None:
+    """But for the first trial of all, which is always done and takes six readings, and for those
+    after the last check: here they alone take time."""
+    iterations, limited = set(), 0
+    for readings in (2, 6, 8, 10, 13, 20, 30):
+        step = make(settle=1e-12, tolerance=1e-12)
         clock = Clock(step, 1e-3)
-        for p in recorded[100:130]:
+        for p in recorded[100:200:3]:
+            if not warm:
+                step.reset()
             begin_s = clock.now_s
-            assert solve(step, p, budget_s=readings * 1e-3).usable
-            # the reading that starts the time is not within it
-            assert clock.now_s - begin_s <= (readings + 1.5) * 1e-3 or step.info.iterations == 1
+            solve(step, p, budget_s=readings * 1e-3)
+            assert clock.now_s - begin_s <= (max(readings, 6) + 4.5) * 1e-3
             limited += step.info.time_limited
-    assert limited > 60
+            iterations.add(step.info.iterations)
+    assert limited >= 40
+    assert len(iterations) >= 4
 
 
-def test_a_larger_budget_never_gives_a_worse_plan(make: Make, recorded: list[Problem]) -> None:
-    for p in recorded[5::40]:
-        before = np.inf
-        for readings in (1, 4, 8, 16, 32, 64, 128):
-            step = make(settle=1e-12)
-            Clock(step, 1e-3)
-            if solve(step, p, budget_s=readings * 1e-3).usable:
-                # a line search that was cut short may have been at a plan a tenth better
-                assert residual(step) <= before / 0.9
-                before = residual(step)
-        assert before < np.inf
+def test_with_a_budget_the_best_iterate_is_returned(make: Make, recorded: list[Problem]) -> None:
+    """Not the last: where the Hessian is indefinite, an iteration may make things worse."""
+    worse = 0
+    for p in recorded[::5]:
+        iterates = []
+        for iterations in range(1, 7):
+            step = make(iterations_cold=iterations)
+            if solve(step, p).usable:
+                iterates.append(residual(step))
+        step = make(iterations_cold=6)
+        Clock(step, 1e-3)
+        assert solve(step, p, budget_s=1e3).usable
+        assert residual(step) == min(iterates)
+        worse += residual(step) < iterates[-1]
+    assert worse >= 1
 
 
 def test_the_first_iteration_is_always_done(make: Make, recorded: list[Problem]) -> None:
@@ -227,10 +243,12 @@ def test_a_clock_that_is_broken_does_no_harm(
 ) -> None:
     step = make()
     Clock(step, tick_s)
-    for p in recorded[:10]:
-        assert solve(step, p, budget_s=1e-3).usable
+    usable = []
+    for p in recorded[:20]:
+        usable.append(solve(step, p, budget_s=1e-3).usable)
         assert 1 <= step.info.iterations <= SETTINGS.iterations_cold
         step.prepare(TS, 1e-3)
+    assert all(usable[5:])
 
 
 def test_out_of_time_goes_on_in_the_next_step_until_usable(
@@ -238,7 +256,8 @@ def test_out_of_time_goes_on_in_the_next_step_until_usable(
 ) -> None:
     step = make(defect_max=1e-7)
     Clock(step, 1e-3)
-    p, seen = recorded[50], []
+    p = recorded[50]
+    seen: list[StepStatus] = []
     step.u[:] = 0.125
     while not seen or seen[-1] is StepStatus.TIME_LIMIT:
         assert (step.u == 0.125).all()
@@ -248,9 +267,7 @@ def test_out_of_time_goes_on_in_the_next_step_until_usable(
     assert seen[-1].usable
 
 
-def test_a_plan_that_never_becomes_usable_is_given_up(
-    make: Make, recorded: list[Problem]
-) -> None:
+def test_a_plan_that_never_becomes_usable_is_given_up(make: Make, recorded: list[Problem]) -> None:
     step, p, cold = make(defect_max=1e-300, iterations_cold=6), recorded[50], []
     Clock(step, 1e-3)
     for _ in range(20):
@@ -263,7 +280,6 @@ def test_more_iterations_do_not_take_back_a_usable_plan(
     make: Make, recorded: list[Problem]
 ) -> None:
     """Steps that lower the cost may raise the defect beyond what is usable."""
-    kept = 0
     for p in recorded[::10]:
         usable = False
         for iterations in range(1, 9):
@@ -273,7 +289,6 @@ def test_more_iterations_do_not_take_back_a_usable_plan(
             usable = status.usable
             if usable:
                 assert step.info.defect <= 3e-3
-                kept += step.info.iterations > iterations
                 x, u = step.read_plan()
                 v = np.column_stack([x[:-1], u])
                 ends = np.array([step.evaluate(row, np.zeros(7))[0] for row in v])
@@ -283,7 +298,7 @@ def test_more_iterations_do_not_take_back_a_usable_plan(
 
 
 def test_the_systems_clock_runs(make: Make, recorded: list[Problem]) -> None:
-    """What NativeStep sets: with an hour's budget nothing is limited, with a nanosecond's all is."""
+    """NativeStep sets it: an hour limits nothing, a nanosecond everything."""
     step = make(settle=1e-9)
     solve(step, recorded[0])
     assert solve(step, recorded[1], budget_s=3600.0).usable

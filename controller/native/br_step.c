@@ -91,7 +91,8 @@ static br_mpc_error begin(br_mpc *mpc, const request *r, int *plausible) {
     if (!*plausible) return BR_OK;
     memcpy(mpc->x0, r->x, sizeof mpc->x0);
     mpc->d_previous = r->d_previous;
-    mpc->d_lowest = mpc->parameters.d_min * fmin(fmax(r->x[3] / BR_BRAKE_FADE_MPS, 0), 1);
+    mpc->d_lowest = mpc->parameters.d_min;
+    if (mpc->d_lowest < 0) mpc->d_lowest *= fmin(fmax(r->x[3] / BR_BRAKE_FADE_MPS, 0), 1);
     mpc->info.prepared_iterations = mpc->prepared_iterations;
     mpc->prepared_iterations = 0;
     return BR_OK;

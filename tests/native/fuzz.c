@@ -119,6 +119,14 @@ static void set_path(controller *c, int count) {
     }
 }
 
+static void set_speed_limit(controller *c, int count) {
+    const double limit = number(1, 1), rate = number(0, 5);
+    for (int i = 0; i < count; ++i) {
+        const br_mpc_error error = br_mpc_set_speed_limit(c[i].mpc, limit, rate);
+        CHECK(error == BR_OK || error == BR_ERROR_PARAMETERS);
+    }
+}
+
 static void set_weights(controller *c, int count) {
     static double scales[BR_NE][BR_NZ], inputs[BR_NE][POINTS][BR_NZ], alpha[BR_NE][POINTS];
     br_mpc_gp outputs[BR_NE];
@@ -234,7 +242,10 @@ static void call(controller *c, int count) {
         if (what < 0x40)
             for (int i = 0; i < count; ++i) br_mpc_reset(c[i].mpc);
         break;
-    case 4: c->tick = number(1e-4, 1e-4); break;
+    case 4:
+        if (what & 0x40) set_speed_limit(c, count);
+        else c->tick = number(1e-4, 1e-4);
+        break;
     case 5: CHECK(br_mpc_set_clock(c->mpc, what & 0x40 ? ticking : NULL, c) == BR_OK); break;
     case 6: case 7: predict(c); break;
     case 8: evaluate(c); break;

@@ -6,6 +6,7 @@
  * Compile the code under test with -fsanitize-coverage=trace-pc, this file without. Inputs that
  * reach a new part of the code become parents of others. The same seed gives the same inputs.
  */
+#include <signal.h>
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -18,7 +19,8 @@
 
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
 void __sanitizer_cov_trace_pc(void);
-void __sanitizer_set_death_callback(void (*callback)(void));
+const char *__asan_default_options(void);
+const char *__ubsan_default_options(void);
 
 typedef struct {
     size_t size;
@@ -39,12 +41,19 @@ void __sanitizer_cov_trace_pc(void) {
     before = here >> 1;
 }
 
-static void failed(void) {
+const char *__asan_default_options(void) { return "abort_on_error=1"; }
+const char *__ubsan_default_options(void) { return "abort_on_error=1"; }
+
+/* Where every finding ends: a broken promise or a sanitizer's. */
+static void failed(int signal_number) {
+    (void)signal_number;
     fprintf(stderr, "fuzz: input %ld failed\n", number);
     FILE *file = crash_file ? fopen(crash_file, "wb") : NULL;
-    if (!file) return;
-    fwrite(trial.bytes, 1, trial.size, file);
-    fclose(file);
+    if (file) {
+        fwrite(trial.bytes, 1, trial.size, file);
+        fclose(file);
+    }
+    _Exit(1);
 }
 
 static uint64_t random_state;
@@ -94,7 +103,7 @@ int main(int argc, char **argv) {
     const long count = atol(argv[1]);
     random_state = argc > 2 ? strtoull(argv[2], NULL, 10) : 1;
     crash_file = argc > 3 ? argv[3] : NULL;
-    __sanitizer_set_death_callback(failed);
+    signal(SIGABRT, failed);
     size_t kept = 0;
     const clock_t begin = clock();
     for (number = 0; number < count; ++number) {
