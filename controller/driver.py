@@ -231,8 +231,7 @@ class Driver:
         except Exception as error:
             # Whatever it is, the car must not be left without an answer.
             self.raised += 1
-            self.last_error = f"the step raised {type(error).__name__}: {error}"
+            self.last_error = f"{type(error).__name__}: {error}"
             decision.status = STEP_RAISED
         else:
             decision.output, decision.status = output, output.status
-            self.last_error = ""

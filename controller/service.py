@@ -94,13 +94,19 @@ class Service:
             driver.phase.value,
             0 if newest is None else newest.epoch,
             0 if newest is None else newest.run,
-            (driver.last_error or self._text)[:2000],
+            self._words()[:2000],
             self._controller.weights_version,
             0.0 if lockstep else self._rate_hz,
             age_s,
             driver.delay_s,
             self._count(),
         )
+
+    def _words(self) -> str:
+        raised = self._driver.raised
+        if not raised:
+            return self._text
+        return f"{self._text}; {raised} step(s) raised, the last {self._driver.last_error}"
 
     def _answer(self, request: Request) -> None:
         if request.service is STATUS:

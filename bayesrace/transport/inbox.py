@@ -147,7 +147,8 @@ class Inbox:
             allowed_destination=zenoh.Locality.SESSION_LOCAL,
         )
         self._declared += [subscriber, self._bell]
-        threading.Thread(target=self._tick, name="inbox-clock", daemon=True).start()
+        # No daemon: one that is inside Zenoh when the interpreter ends takes the process down.
+        threading.Thread(target=self._tick, name="inbox-clock").start()
 
     def serve(self, service: Service[Any, Any], source: str = "") -> None:
         """Let the service's requests arrive."""
@@ -298,14 +299,14 @@ class Inbox:
                 self._bell.put(b"")
 
     def _tick(self) -> None:
-        """Wakes a waiting thread often enough to see its time limit and its signals."""
-        while True:
-            time.sleep(_TICK_S)
-            if self._waiting:
-                try:
+        """Wakes a waiting thread often enough to see its time limit and its signals; ends with the
+        session."""
+        # RuntimeError: asked while the session is being closed.
+        with suppress(zenoh.ZError, RuntimeError):
+            while not self._session.is_closed():
+                time.sleep(_TICK_S)
+                if self._waiting:
                     self._bell.put(b"")
-                except zenoh.ZError:  # the session is closed
-                    return
 
     def _putter(self, kind: Kind, name: str, convert: Callable[[Any], Any]) -> Any:
         def on_arrival(thing: Any) -> None:
