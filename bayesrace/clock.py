@@ -8,19 +8,37 @@ import os
 import signal
 import sys
 import time
-from typing import Final
+from typing import Any, Final
 
 __all__ = ["die_with_parent", "sleep_until_ns"]
 
 _PR_SET_PDEATHSIG: Final = 1
+_CLOCK_MONOTONIC: Final = 1
+_TIMER_ABSTIME: Final = 1
+
+
+class _Timespec(ctypes.Structure):
+    _fields_ = [("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long)]
+
+
+def _find_nanosleep() -> Any:
+    return ctypes.CDLL(None).clock_nanosleep if sys.platform.startswith("linux") else None
+
+
+_nanosleep: Final = _find_nanosleep()
 
 
 def sleep_until_ns(deadline_ns: int) -> None:
     """Sleep until ``time.monotonic_ns()`` reaches the deadline; at once if it has passed.
 
-    From Python 3.11 on ``time.sleep`` is ``clock_nanosleep`` to an absolute time, so what lies
-    between reading the clock and sleeping is not added.
+    Absolute where the system can (``clock_nanosleep``): a thread that is held up between reading
+    the clock and sleeping wakes in time all the same. A signal ends the sleep, as it must.
     """
+    if _nanosleep is not None:
+        if deadline_ns > time.monotonic_ns():
+            until = _Timespec(*divmod(deadline_ns, 1_000_000_000))
+            _nanosleep(_CLOCK_MONOTONIC, _TIMER_ABSTIME, ctypes.byref(until), None)
+        return
     left_ns = deadline_ns - time.monotonic_ns()
     if left_ns > 0:
         time.sleep(left_ns * 1e-9)

@@ -5,11 +5,13 @@ plant's unless they say otherwise, so lockstep and free-running mode are the sam
 """
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
 
+from bayesrace.errors import InputError
 from bayesrace.messages import State
 from bayesrace.vehicles.parameters import CarParameters
 from controller.compensation import CompensationSettings, DelayCompensator
@@ -17,13 +19,16 @@ from controller.fallback import Fallback, FallbackSettings, Level
 from controller.interface import Controller, StepOutput
 from controller.states import StateStream
 
-__all__ = ["STEP_RAISED", "Decision", "Driver", "Phase"]
+__all__ = ["HALTED", "NO_STATE", "STEP_RAISED", "UNPREDICTABLE", "Decision", "Driver", "Phase"]
 
 STEP_RAISED = 255
 """Status of a cycle whose step raised an exception."""
 
 NO_STATE = 254
 """Status of a cycle without a step: the newest state is too old."""
+
+UNPREDICTABLE = 252
+"""Status of a cycle without a step: the state cannot be predicted to the moment of acting."""
 
 HALTED = 253
 """Status of a cycle without a step: the car is not to be driven."""
@@ -85,7 +90,8 @@ class Driver:
         self._stale_s = stale_s
         self._stop_mps2 = stop_mps2
         self._stopping_from: tuple[float, float] | None = None
-        self._decision = Decision()
+        self.decision = Decision()
+        """Of the newest cycle."""
         self._stepped_s: float | None = None
         self._vx_mps = 0.0
         self._standing = False
@@ -119,8 +125,9 @@ class Driver:
         self._controller.limit_speed(math.inf, 0.0)
 
     def lost(self) -> None:
-        """The plant has gone, or fallen silent."""
+        """The plant has gone, or fallen silent: any other may follow."""
         self.phase = Phase.WAITING
+        self.states.forget()
 
     def observe(self, state: State) -> bool:
         """Takes a state that has arrived; False if it is an old one."""
@@ -131,7 +138,7 @@ class Driver:
             self._fallback.reset()
             self._compensation.reset()
             self._controller.reset(state)
-            self._stepped_s = None
+            self._stepped_s = self._stopping_from = self._reckoned_s = None
         if not state.lockstep:
             self._compensation.observe(state)
         return True
@@ -141,14 +148,15 @@ class Driver:
 
         ``budget_s``: how long the step may take; 0 is no limit but its own.
         """
-        compensation, decision = self._compensation, self._decision
+        compensation, decision = self._compensation, self.decision
         decision.basis_s = basis_s
         decision.output = None
         decision.delay_s = 0.0 if state.lockstep else compensation.delay_s
         self._standing = self._halted is not None and not self._slowing(state, basis_s)
         if self._standing:
             return self._halt(state, decision)
-        if basis_s - state.time_s > self._stale_s:
+        # Where states come seldom, the next one is no sooner to be had.
+        if basis_s - state.time_s > max(self._stale_s, 2 * self.states.interval_s):
             decision.status = NO_STATE
             self._reckon(state, basis_s)
         else:
@@ -159,7 +167,7 @@ class Driver:
 
     def settle(self, late_s: float = 0.0) -> Decision:
         """Ends the cycle: what is sent after all, ``late_s`` after it should have been."""
-        decision = self._decision
+        decision = self.decision
         time_s = decision.basis_s + decision.delay_s
         if not self._standing:
             chosen = self._fallback.decide(decision.output, self._vx_mps, time_s, late_s)
@@ -174,21 +182,33 @@ class Driver:
         if self._stepped_s is not None and not self._standing:
             self._controller.prepare(period_s, budget_s)
 
+    def rehearse(self) -> None:
+        """Walks the way of a cycle without effect, so that its code and data are in the caches."""
+        state = self.states.newest
+        if self._stepped_s is None or self._standing or state is None:
+            return
+        with suppress(InputError):  # a state that cannot be predicted from
+            self._compensation.at_acting(state, self.decision.basis_s)
+        self._controller.rehearse()
+        self._fallback.rehearse(self.decision.output)
+
     def _slowing(self, state: State, basis_s: float) -> bool:
         """Whether a stop on command is still under way; sets the speed that it has got to.
 
         Driven to standstill, the car stays on the line and points along it, fit to go on.
         """
-        if self._halted is not Phase.STOPPED or (
-            self._stepped_s is None and self._stopping_from is None
-        ):
+        rolling = abs(state.x[3]) > _STANDING_MPS
+        if self._stopping_from is None and not rolling:
             return False
-        if self._stopping_from is None:
+        if self._stopping_from is None:  # just told, or a rolling car taken over on hold
             self._stopping_from = basis_s, max(float(state.x[3]), 0.0)
         since_s, speed_mps = self._stopping_from
         limit_mps = max(speed_mps - self._stop_mps2 * (basis_s - since_s), 0.0)
         self._controller.limit_speed(limit_mps, self._stop_mps2)
-        return limit_mps > 0 or abs(state.x[3]) > _STANDING_MPS
+        if limit_mps > 0 or rolling:
+            return True
+        self._stopping_from = None
+        return False
 
     def _halt(self, state: State, decision: Decision) -> Decision:
         """Not to be driven: braked. The next step will be the first of a new drive."""
@@ -206,22 +226,29 @@ class Driver:
 
         A duty cycle that brakes a rolling car drives a standing one backwards.
         """
-        if self._reckoned_s is None:
-            self._reckoned[:], _ = self._compensation.at_acting(state, state.time_s + self._stale_s)
-            self._reckoned_s = basis_s
-        decision = self._decision
+        decision = self.decision
         self._u_sent[:] = decision.d, decision.delta_rate
-        duration_s = min(max(basis_s - self._reckoned_s, 0.0), _LONGEST_S)
-        self._reckoned[:] = self._controller.predict(self._reckoned, self._u_sent, duration_s)
+        try:
+            if self._reckoned_s is None:
+                self._reckoned_s = state.time_s + self._stale_s
+                self._reckoned[:], _ = self._compensation.at_acting(state, self._reckoned_s)
+            duration_s = min(max(basis_s - self._reckoned_s, 0.0), _LONGEST_S)
+            self._reckoned[:] = self._controller.predict(self._reckoned, self._u_sent, duration_s)
+        except InputError:
+            return  # what the model cannot follow: the speed stays the last one known
         self._reckoned_s = basis_s
         self._vx_mps = float(self._reckoned[3])
 
     def _step(self, state: State, budget_s: float) -> None:
-        controller, decision = self._controller, self._decision
+        controller, decision = self._controller, self.decision
         if state.lockstep:
             x, u_previous = self._compensation.as_measured(state)
         else:
-            x, u_previous = self._compensation.at_acting(state, decision.basis_s)
+            try:
+                x, u_previous = self._compensation.at_acting(state, decision.basis_s)
+            except InputError:  # no model predicts from such a state
+                decision.status = UNPREDICTABLE
+                return
         time_s = decision.basis_s + decision.delay_s
         # Where the delay measured has fallen, the moment of acting may even go back.
         elapsed_s = 0.0 if self._stepped_s is None else max(time_s - self._stepped_s, 0.0)

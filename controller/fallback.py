@@ -88,6 +88,11 @@ class Fallback:
         """Braking to standstill on command: along the plan's steering, not counted."""
         return self._braking(vx_mps, time_s)[:2]
 
+    def rehearse(self, output: StepOutput | None) -> None:
+        """The checks of :meth:`decide`, without effect."""
+        if output is not None and self._usable(output):
+            self._fit(output)
+
     def _usable(self, output: StepOutput) -> bool:
         if output.status != 0:
             return False
@@ -102,10 +107,7 @@ class Fallback:
         self, output: StepOutput, vx_mps: float, time_s: float, late_s: float
     ) -> tuple[float, float, Level]:
         # The plan is kept only from solutions that were fit to be driven.
-        if len(output.plan_u) and np.isfinite(output.plan_u).all():
-            self._plan = output.plan_u.copy()
-        else:
-            self._plan = NO_PLAN
+        self._plan = self._fit(output)
         self._plan_s, self._row_s = time_s, output.plan_step_s
         if self._to_recover > 1:
             self._to_recover -= 1
@@ -114,6 +116,12 @@ class Fallback:
         if self._row(time_s + late_s) > 0:
             return self._step_down(vx_mps, time_s + late_s)
         return *self._limited(float(output.u[0]), float(output.u[1])), Level.SOLUTION
+
+    @staticmethod
+    def _fit(output: StepOutput) -> Array:
+        """A copy of the plan, or none if any of it is no number."""
+        plan = output.plan_u
+        return plan.copy() if len(plan) and np.isfinite(plan).all() else NO_PLAN
 
     def _row(self, time_s: float) -> int:
         """Row of the plan that is due."""

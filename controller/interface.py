@@ -72,6 +72,9 @@ class Controller(Protocol):
         is used up by now.
         """
 
+    def rehearse(self) -> None:
+        """Use what :meth:`step` will use, without any effect: the caches are then warm for it."""
+
     def predict(self, x: Array, u: Array, duration_s: float) -> Array:
         """State (7,) after ``duration_s`` (at most 1 s) with input ``u`` (2,) held.
 

@@ -49,6 +49,10 @@ class PredictiveController:
         """Iterates on until converged if there is a budget, then shifts and condenses."""
         self._step.prepare(elapsed_s, budget_s)
 
+    def rehearse(self) -> None:
+        """The preparation once more."""
+        self._step.rehearse()
+
     def predict(self, x: Array, u: Array, duration_s: float) -> Array:
         """By the model the OCP predicts with, corrected by the weights in use."""
         return self._step.predict(x, u, duration_s)

@@ -176,6 +176,7 @@ def _declare(library: ct.CDLL) -> None:
         "step": [pointer, pointer, real, real, real, *[pointer] * 3],
         "solve": [pointer, pointer, real, real, real, *[pointer] * 4],
         "prepare": [pointer, real, real],
+        "rehearse": [pointer],
         "predict": [pointer, pointer, pointer, real, pointer],
         "get_plan": [pointer] * 3,
         "get_reference": [pointer] * 2,

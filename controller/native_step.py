@@ -67,6 +67,7 @@ class NativeStep:
         self._step = self._library.br_mpc_step
         self._prepare = self._library.br_mpc_prepare
         self._predict = self._library.br_mpc_predict
+        self._rehearse = self._library.br_mpc_rehearse
         self._set_clock()
         self.set_parameters(car, settings)
         self.set_zero_weights()
@@ -223,6 +224,10 @@ class NativeStep:
         """
         elapsed = self._step_s if elapsed_s is None else elapsed_s
         self._check(self._prepare(self._mpc, elapsed, budget_s), "prepare")
+
+    def rehearse(self) -> None:
+        """Does the preparation over, to the same bits, so that the step finds its caches warm."""
+        self._check(self._rehearse(self._mpc), "rehearse")
 
     def predict(
         self, x: _DOUBLES, u: _DOUBLES, duration_s: float, out: _DOUBLES | None = None

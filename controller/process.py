@@ -14,7 +14,16 @@ from typing import Any, Final
 from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.clock import die_with_parent, sleep_until_ns
-from bayesrace.messages import ACTUATION, STATE, TELEMETRY, Actuation, Decoder, State
+from bayesrace.messages import (
+    ACTUATION,
+    STATE,
+    TELEMETRY,
+    Actuation,
+    Decoder,
+    State,
+    decode,
+    encode,
+)
 from bayesrace.realtime import RealtimeSettings, prepare_thread
 from bayesrace.transport import (
     CONTROLLER_ENDPOINT,
@@ -50,12 +59,21 @@ _LEAD: Final = 0.1
 _LEAD_NS: Final = 300_000
 """... and at most: wake-up error and jitter of the arrival."""
 
+_REHEARSAL_NS: Final = 700_000
+"""How much sooner it wakes to rehearse a cycle: as long as one takes when everything is cold."""
+_COLD_NS: Final = 5_000_000
+"""Periods from which on caches are cold at each release; at higher rates there is no rehearsal."""
+
+_SPIN: Final = 0.05
+"""How long after a release the loop spins for the state before it sleeps between two looks
+(fraction of the period)."""
+
 _GRACE: Final = 0.25
 """How long after a release the loop still waits for the state that is due (fraction of the
 period)."""
 
 _LEAST_BUDGET: Final = 0.1
-"""What a step gets however late its cycle began (fraction of the period)."""
+"""What a step gets however late its cycle began (fraction of the budget)."""
 
 
 class ControllerSettings(BaseModel):
@@ -105,6 +123,8 @@ class ControllerProcess:
         self._schedule = Schedule(settings.rate_hz)
         self._timing = Timing()
         self._arrived_ns = 0
+        self._payload = b""
+        self._told = False
         inbox = self.inbox = Inbox(session, self.name)
         inbox.subscribe(STATE, newest=NEWEST)
         self._service = Service(
@@ -128,11 +148,14 @@ class ControllerProcess:
     # Waiting -----------------------------------------------------------------------------------
 
     def _wait(self) -> State | None:
-        """Waits a little for a first state; serves whatever else happens."""
+        """Waits a little for a first state; serves whatever else happens, and logs it."""
         self._service.beat()
         item = self.inbox.get(HEARTBEAT_S)
         if item is None:
             self._decoder.report(_log)
+            if not self._service.plant_there and not self._told:
+                _log.warning("the plant vanished: killed or unreachable; waiting for it")
+            self._told = not self._service.plant_there
             return None
         return self._take(item)
 
@@ -147,6 +170,7 @@ class ControllerProcess:
         if state is None or not self._driver.observe(state):
             return None
         self._arrived_ns = item.received_ns
+        self._payload = item.value
         self._service.arrived_ns = item.received_ns
         return state
 
@@ -189,6 +213,7 @@ class ControllerProcess:
         """Keeps the rate, until a state comes that is not to be driven on, or none for long."""
         schedule = self._schedule
         schedule.start(self._arrived_ns)
+        schedule.observe(self._arrived_ns, first.time_s, 0.0)
         self._timing.wake_us = 0.0
         state, fresh = first, True
         while not self._service.stopping:
@@ -212,9 +237,11 @@ class ControllerProcess:
         timing.released_ns = time.monotonic_ns()
         budget_s = self._settings.budget * schedule.period_ns * 1e-9
         spent_s = (timing.released_ns - schedule.release_ns) * 1e-9
-        basis_s = state.time_s + (timing.released_ns - self._arrived_ns) * 1e-9
+        # What has held up a state on its way is part of its age: hence the schedule's plant time,
+        # not the time since this state's own arrival.
+        basis_s = max(schedule.plant_time_s(timing.released_ns), state.time_s)
         driver.decide(state, basis_s, max(budget_s - spent_s, _LEAST_BUDGET * budget_s))
-        late_s = (time.monotonic_ns() - timing.released_ns) * 1e-9 - budget_s
+        late_s = (time.monotonic_ns() - schedule.release_ns) * 1e-9 - budget_s
         timing.overruns += late_s > 0
         self._send(state, driver.settle(max(late_s, 0.0)))
         timing.missed = time.monotonic_ns() > schedule.deadline_ns
@@ -222,10 +249,10 @@ class ControllerProcess:
 
     def _rest(self) -> None:
         """The time until the next release: what has happened meanwhile, and the preparation."""
-        while (item := self.inbox.other()) is not None:
+        end_ns = self._schedule.release_ns + round(self._settings.budget * self._schedule.period_ns)
+        while time.monotonic_ns() < end_ns and (item := self.inbox.other()) is not None:
             self._service.react(item)
         self._service.beat()
-        end_ns = self._schedule.release_ns + round(self._settings.budget * self._schedule.period_ns)
         left_s = (end_ns - time.monotonic_ns()) * 1e-9
         if left_s > 0:
             self._prepare(self._schedule.period_ns * 1e-9, left_s)
@@ -234,19 +261,41 @@ class ControllerProcess:
         """Sleeps until shortly before the release, then looks for the state that is due."""
         schedule, period_ns = self._schedule, self._schedule.period_ns
         release_ns = schedule.release_ns
+        rehearses = period_ns >= _COLD_NS
         wake_ns = release_ns - min(round(_LEAD * period_ns), _LEAD_NS)
+        wake_ns -= _REHEARSAL_NS if rehearses else 0
         sleep_until_ns(wake_ns)
         self._timing.wake_us = max(time.monotonic_ns() - wake_ns, 0) * 1e-3
+        if rehearses:
+            self._rehearse()
         fresh: State | None = None
+        newest = self._driver.states.newest
+        run = newest.run if newest is not None else None
         until_ns = release_ns + (round(_GRACE * period_ns) if self._state_due() else 0)
-        while (item := self.inbox.poll(0 if fresh else until_ns)) is not None:
-            state = self._take(item)
-            if state is not None:
-                fresh = state
+        # Normal threads bring the message: one of real-time priority must not spin before them.
+        spin_ns = 0 if self._settings.realtime.fifo else release_ns + round(_SPIN * period_ns)
+        for _ in range(NEWEST):  # what came while the loop was held up, but no flood
+            item = self.inbox.poll(0 if fresh else until_ns, spin_ns)
+            if item is None:
+                break
+            fresh = self._take(item) or fresh
         if fresh is not None:
-            interval_s = self._driver.states.interval_s
-            schedule.observe(self._arrived_ns, fresh.time_s, interval_s)
+            if fresh.run != run:
+                schedule.start(self._arrived_ns)
+            schedule.observe(self._arrived_ns, fresh.time_s, self._driver.states.interval_s)
         return fresh
+
+    def _rehearse(self) -> None:
+        """Uses what the cycle will use, without effect.
+
+        After 20 ms of other work the code and data of a cycle are cold, and everything in it takes
+        two to four times as long (docs/decisions/).
+        """
+        state = self._driver.states.newest
+        if state is not None:
+            decode(State, self._payload)
+            self._driver.rehearse()
+            encode(self._actuation(state, self._driver.decision))
 
     def _state_due(self) -> bool:
         """Whether a state is due at the next release: they may come less often than releases."""
@@ -267,26 +316,25 @@ class ControllerProcess:
         """The actuation, then how it came about."""
         timing = self._timing
         begin_ns = time.perf_counter_ns()
-        now_ns = time.monotonic_ns()
-        self._actuations.put(
-            Actuation(
-                self._actuations.next_seq,
-                now_ns,
-                state.epoch,
-                state.run,
-                state.seq,
-                decision.basis_s,
-                (decision.d, decision.delta_rate),
-                self._controller.weights_version,
-                decision.status,
-            ),
-            lockstep=state.lockstep,
-        )
+        self._actuations.put(self._actuation(state, decision), lockstep=state.lockstep)
         timing.encode_us = (time.perf_counter_ns() - begin_ns) * 1e-3
         timing.ticks += 1
         timing.received_ns = self._arrived_ns
         message = telemetry_of(self._telemetry.next_seq, state, decision, timing)
         self._telemetry.put(message, lockstep=state.lockstep)
+
+    def _actuation(self, state: State, decision: Decision) -> Actuation:
+        return Actuation(
+            self._actuations.next_seq,
+            time.monotonic_ns(),
+            state.epoch,
+            state.run,
+            state.seq,
+            decision.basis_s,
+            (decision.d, decision.delta_rate),
+            self._controller.weights_version,
+            decision.status,
+        )
 
     def _counters(self) -> dict[str, int]:
         """What the loop has counted, by name."""

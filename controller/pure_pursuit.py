@@ -106,6 +106,9 @@ class PurePursuit:
     def prepare(self, elapsed_s: float, budget_s: float = 0.0) -> None:
         """Nothing can be done ahead."""
 
+    def rehearse(self) -> None:
+        """It is small."""
+
     def predict(self, x: Array, u: Array, duration_s: float) -> Array:
         """Dead reckoning: the velocities stay, the steering goes on at its rate."""
         after = self._predicted

@@ -52,6 +52,7 @@ class Schedule:
         self.release_ns = 0
         """The next release; its deadline is the release after it."""
         self._lost = 0
+        self._offset_ns = 0
         self._offset = _Smallest(_WINDOW_NS)
 
     @property
@@ -81,10 +82,11 @@ class Schedule:
         phase to keep.
         """
         interval_ns = interval_s * 1e9
+        time_ns = round(time_s * 1e9)
+        self._offset_ns = self._offset.add(arrival_ns, arrival_ns - time_ns)
         if not self._lockable(interval_ns):
             return
-        time_ns = round(time_s * 1e9)
-        earliest_ns = self._offset.add(arrival_ns, arrival_ns - time_ns) + time_ns
+        earliest_ns = self._offset_ns + time_ns
         grid_ns = min(self.period_ns, interval_ns)
         error_ns = (earliest_ns - self.release_ns + grid_ns / 2) % grid_ns - grid_ns / 2
         if abs(error_ns) > _LOST * grid_ns:
@@ -97,6 +99,10 @@ class Schedule:
             self._lost = 0
         limit_ns = _SLEW * grid_ns
         self.release_ns += round(min(max(_GAIN * error_ns, -limit_ns), limit_ns))
+
+    def plant_time_s(self, at_ns: int) -> float:
+        """Plant time whose state would have arrived by then, had nothing held it up."""
+        return (at_ns - self._offset_ns) * 1e-9
 
     def _lockable(self, interval_ns: float) -> bool:
         if interval_ns <= 0:

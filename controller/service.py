@@ -1,6 +1,5 @@
 """What others may ask of a running controller: status, stop, go, new weights; and its heartbeat."""
 
-import logging
 import time
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -9,7 +8,6 @@ from bayesrace.errors import InputError
 from bayesrace.messages import (
     COMMAND,
     EVENT,
-    HEARTBEAT,
     STATUS,
     WEIGHTS,
     Event,
@@ -17,14 +15,12 @@ from bayesrace.messages import (
     Scalar,
     Status,
 )
-from bayesrace.transport import HEARTBEAT_S, Inbox, Item, Kind, Publisher, Request, decode_request
+from bayesrace.transport import Heartbeat, Inbox, Item, Kind, Publisher, Request, decode_request
 from controller.driver import Driver
 from controller.fallback import Level
 from controller.interface import Controller
 
 __all__ = ["Service"]
-
-_log = logging.getLogger("bayesrace.controller")
 
 
 class Service:
@@ -45,9 +41,8 @@ class Service:
         self._driver = driver
         self._controller = controller
         self._counters = counters
-        self._events = Publisher(session, EVENT, name, "controller")
-        self._heartbeats = Publisher(session, HEARTBEAT, name, "controller")
-        self._beat_due_ns = 0
+        self._events = Publisher(session, EVENT, name, "controller", waits=False)
+        self._heartbeat = Heartbeat(session, name, "controller")
         self._text = "waiting for the plant"
         self._weights_taken = self._weights_refused = 0
         self.stopping = False
@@ -62,10 +57,7 @@ class Service:
 
     def beat(self) -> None:
         """Publishes the status, if it is time to."""
-        now_ns = time.monotonic_ns()
-        if now_ns >= self._beat_due_ns:
-            self._beat_due_ns = now_ns + round(HEARTBEAT_S * 1e9)
-            self._heartbeats.put(self.status(self._heartbeats.next_seq), lockstep=False)
+        self._heartbeat.beat(self.status)
 
     def react(self, item: Item) -> None:
         """Serves an item that is no message."""
@@ -74,7 +66,6 @@ class Service:
         elif item.kind is Kind.GONE:
             self.plant_there = False
             self._text = "the plant vanished: killed or unreachable"
-            _log.warning("%s; waiting for it", self._text)
         elif item.kind is Kind.ALIVE:
             self.plant_there = True
             self._text = "the plant is there"

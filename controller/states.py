@@ -37,10 +37,12 @@ class StateStream:
     def accept(self, state: State) -> bool:
         """Whether this is now the newest state."""
         newest = self.newest
-        self._numbering.note(state.seq)
         if state.epoch in self._replaced:
             self.stale += 1
             return False
+        if newest is not None and state.epoch != newest.epoch:
+            self._numbering.restart()
+        self._numbering.note(state.seq)
         if newest is not None and state.epoch == newest.epoch:
             if state.seq <= newest.seq:
                 self.stale += 1
@@ -54,5 +56,6 @@ class StateStream:
         return True
 
     def forget(self) -> None:
-        """The plant has gone: whatever comes next is new, unless it is left from before."""
+        """Nothing has come for long, so nothing is left over: any plant may be the next."""
+        self._replaced.clear()
         self.interval_s = 0.0

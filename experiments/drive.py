@@ -13,6 +13,10 @@ from experiments.processes import Child, endings
 
 __all__ = ["RunPlan", "execute", "run_request", "wait_for_both"]
 
+_ABSENCE_S = 10.0
+"""By the wall clock a process may be away for so long: a link comes back, a controller is started
+again, and the car waits at standstill."""
+
 _REGULAR = ("laps", "max_time", "left_world")
 """Ends of a run that the car's driving, not a fault, has brought about."""
 
@@ -87,7 +91,8 @@ def execute(director: Director, publisher: Publisher[Event], track: Track, plan:
     director.start(run_request(track, plan))
     try:
         # In lockstep simulated time passes faster than the clock's, but nobody promises it.
-        end = director.wait_for_end(plan.run, 30.0 + 3.0 * plan.max_time_s)
+        absence_s = 1.0 if plan.lockstep else _ABSENCE_S
+        end = director.wait_for_end(plan.run, 30.0 + 3.0 * plan.max_time_s, absence_s)
     except (InputError, KeyboardInterrupt):
         with suppress(InputError):  # a car must not drive on when nobody watches it
             director.stop("who started the run has left")

@@ -132,7 +132,7 @@ def _ask_all(
             target=zenoh.QueryTarget.ALL,
             # Two processes under one name would otherwise be one answer.
             consolidation=zenoh.ConsolidationMode.NONE,
-            congestion_control=zenoh.CongestionControl.BLOCK,
+            congestion_control=zenoh.CongestionControl.DROP,
         )
         for key in keys
     }

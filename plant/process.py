@@ -14,7 +14,6 @@ from bayesrace.errors import InputError
 from bayesrace.messages import (
     ACTUATION,
     EVENT,
-    HEARTBEAT,
     RUN,
     STATE,
     STATUS,
@@ -34,6 +33,7 @@ from bayesrace.transport import (
     NEWEST,
     PLANT_ENDPOINT,
     Endpoints,
+    Heartbeat,
     Inbox,
     Item,
     Kind,
@@ -92,8 +92,7 @@ class PlantProcess:
         # Two processes started in one nanosecond on two machines must differ too.
         self._epoch = secrets.randbits(62)
         self._numbering = Numbering()
-        self._heartbeats = Publisher(session, HEARTBEAT, self.name, "plant")
-        self._beat_due_ns = 0
+        self._heartbeat = Heartbeat(session, self.name, "plant")
         self._states = Publisher(session, STATE, self.name)
         self._events = Publisher(session, EVENT, self.name, "plant")
         self._decoder: Decoder[Actuation] = Decoder(Actuation, _log)
@@ -120,7 +119,7 @@ class PlantProcess:
             if item is None:
                 continue
             if item.kind is Kind.MESSAGE:  # for nobody, but received
-                self._numbering.note(peek_seq(item.value) or 0)
+                self._overheard(item)
                 continue
             if item.kind is Kind.REQUEST and item.name == RUN.name:
                 self._serve_run(item.value)
@@ -170,6 +169,12 @@ class PlantProcess:
         self._runs += 1
         return ""
 
+    def _overheard(self, item: Item) -> None:
+        """An actuation when nothing is driven: received, and no more."""
+        seq = peek_seq(item.value)
+        if seq is not None:
+            self._numbering.note(seq)
+
     def _controller_there(self) -> bool:
         deadline = time.monotonic() + self._settings.controller_wait_s
         while "controller" not in self.inbox.alive:
@@ -177,7 +182,9 @@ class PlantProcess:
             if left_s <= 0 or self._stopping:
                 return False
             item = self.inbox.get(left_s)
-            if item is not None and item.kind in (Kind.REQUEST, Kind.SIGNAL):
+            if item is not None and item.kind is Kind.MESSAGE:
+                self._overheard(item)
+            elif item is not None and item.kind in (Kind.REQUEST, Kind.SIGNAL):
                 self._react(item)
         return True
 
@@ -245,10 +252,7 @@ class PlantProcess:
 
     def _beat(self) -> None:
         """Publishes the status, if it is time to."""
-        now_ns = time.monotonic_ns()
-        if now_ns >= self._beat_due_ns:
-            self._beat_due_ns = now_ns + round(HEARTBEAT_S * 1e9)
-            self._heartbeats.put(self._status(self._heartbeats.next_seq), lockstep=False)
+        self._heartbeat.beat(self._status)
 
     def _status(self, seq: int = 0) -> Status:
         phase = "idle" if self._run is None else "running"

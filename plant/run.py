@@ -20,6 +20,10 @@ _WORLD_M: Final = 1e4
 _REMEMBERED: Final = 1024
 """States whose answers are taken; what answers an older one is stale."""
 
+_LINGER_NS: Final = 1_000_000
+"""How long the plant stays awake for the answer to a state that it has just sent (less at rates
+where this is more than a quarter of the period): a device would have nothing else to do."""
+
 _MOST_ANSWERS: Final = 64
 """Rows that one state message has room for."""
 
@@ -98,6 +102,7 @@ class Run:
             request.line_right_m,
         )
         # Running by the wall clock:
+        self._linger_ns = min(_LINGER_NS, round(0.25e9 * simulator.step_s))
         self._outbox: deque[tuple[int, State]] = deque()
         self._sampled_ns: dict[int, int] = {}
         self._waiting: list[_Waiting] = []
@@ -244,6 +249,7 @@ class Run:
             due_ns, state = outbox.popleft()
             sleep_until_ns(due_ns)
             self._publisher.put(state, lockstep=False)
+            self._inbox.linger(time.monotonic_ns() + self._linger_ns)
         sleep_until_ns(until_ns)
 
     def _receive(self) -> End | None:
@@ -255,7 +261,9 @@ class Run:
                     continue
                 self._numbering.note(actuation.seq)
                 mine = (actuation.epoch, actuation.run) == (self._epoch, self.request.run)
-                if not mine or actuation.state_seq not in self._sampled_ns:
+                # one from the future would never grow old, and every later one would be overtaken
+                ahead = actuation.basis_s > self._simulator.time_s + 2 * self._simulator.step_s
+                if not mine or ahead or actuation.state_seq not in self._sampled_ns:
                     self._counters.stale += 1
                     continue
                 waiting = _Waiting(

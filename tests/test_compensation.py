@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from bayesrace.messages import State
+from bayesrace.transport import Numbering
 from controller.compensation import CompensationSettings, DelayCompensator
 from controller.states import StateStream
 
@@ -129,3 +130,24 @@ def test_old_numbers_after_a_restart_are_new_and_new_ones_from_before_are_old() 
     assert stream.accept(state(1, *zero, epoch=2))
     assert stream.newest.epoch == 2
     assert stream.interval_s == pytest.approx(STEP_S)
+
+
+def test_a_stray_plant_locks_the_real_one_out_no_longer_than_it_is_heard() -> None:
+    stream = StateStream()
+    zero = np.zeros(7), np.zeros(2)
+    assert stream.accept(state(100, *zero, epoch=1))
+    assert stream.accept(state(0, *zero, epoch=2))
+    assert not stream.accept(state(101, *zero, epoch=1))
+    stream.forget()  # silence
+    assert stream.accept(state(102, *zero, epoch=1))
+
+
+def test_losses_are_told_also_when_the_first_message_of_a_restarted_sender_is_lost() -> None:
+    numbering = Numbering()
+    for seq in (0, 1, 2, 5000, 5001, 3, 4, 6):
+        numbering.note(seq)
+    assert (numbering.received, numbering.lost) == (8, 4997 + 1)
+    overtaken = Numbering()
+    for seq in (0, 1, 3, 2, 4):
+        overtaken.note(seq)
+    assert (overtaken.received, overtaken.lost) == (5, 0)

@@ -11,7 +11,7 @@ from bayesrace.messages import State
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
 from controller.compensation import CompensationSettings
-from controller.driver import HALTED, NO_STATE, STEP_RAISED, Decision, Driver, Phase
+from controller.driver import HALTED, NO_STATE, STEP_RAISED, UNPREDICTABLE, Decision, Driver, Phase
 from controller.fallback import FallbackSettings, Level
 from controller.mpc import PredictiveController
 from controller.native_step import NativeStep, StepStatus
@@ -26,14 +26,16 @@ STALE_S = 0.06
 class Rig:
     """A driver on the synthetic circuit, and the dynamic model as its plant."""
 
-    def __init__(self, native: NativeStep, circuit: Circuit, hold: bool = False) -> None:
+    def __init__(
+        self, native: NativeStep, circuit: Circuit, hold: bool = False, delay_s: float = 0.0
+    ) -> None:
         self.controller = PredictiveController(native)
         car = native_car(native)
         self.driver = Driver(
             self.controller,
             car,
             FallbackSettings(recover_cycles=3),
-            CompensationSettings(mode="fixed", delay_s=0.0),
+            CompensationSettings(mode="fixed", delay_s=delay_s),
             STALE_S,
             1.5,
             hold,
@@ -145,6 +147,32 @@ def test_a_state_that_is_no_number_is_not_driven_on(rig: Rig) -> None:
     assert rig.cycle().level is Level.SOLUTION
 
 
+@pytest.mark.parametrize("number", [np.nan, 1e5])
+def test_a_state_that_cannot_be_predicted_from_is_not_driven_on(
+    native: NativeStep, circuit: Circuit, number: float
+) -> None:
+    """With a delay to predict over, the model is asked before the step is."""
+    rig = driving(Rig(native, circuit, delay_s=0.02))
+    x = rig.x.copy()
+    x[4] = number
+    decision = rig.cycle(x=tuple(x))
+    assert (decision.status, decision.level) == (UNPREDICTABLE, Level.SHIFTED_PLAN)
+    rig.driver.rehearse()
+    assert rig.cycle().level is Level.SOLUTION
+
+
+def test_silence_after_such_a_state_ends_at_a_level_too(
+    native: NativeStep, circuit: Circuit
+) -> None:
+    rig = driving(Rig(native, circuit, delay_s=0.02))
+    x = rig.x.copy()
+    x[4] = np.nan
+    rig.cycle(x=tuple(x))
+    for _ in range(20):
+        rig.silent_cycle()
+    assert rig.driver.phase is Phase.FALLBACK
+
+
 def test_a_budget_too_small_for_a_plan_steps_down(rig: Rig, native: NativeStep) -> None:
     """The first step of a drive is cold: one iteration, which is always done, is not enough."""
     strict = SETTINGS.model_copy(update={"defect_max": 1e-9})
@@ -192,6 +220,37 @@ def test_stop_and_go(rig: Rig) -> None:
     for _ in range(60):
         assert rig.cycle().level is Level.SOLUTION
     assert rig.x[3] > 0.5
+
+
+@pytest.mark.parametrize("change", [{"run": 2}, {"epoch": 2}])
+def test_a_stopped_car_stays_stopped_in_the_next_run(rig: Rig, change: dict[str, int]) -> None:
+    """Plant time begins anew there: by the old one the speed allowed would be beyond all bounds."""
+    driving(rig, 60)
+    rig.driver.stop()
+    while rig.cycle().status != HALTED:
+        pass
+    rig.seq, rig.epoch = 0, change.get("epoch", 1)
+    rig.seq += 1000 * (rig.epoch == 1)
+    for _ in range(50):
+        decision = rig.cycle(
+            run=change.get("run", 1), time_s=0.02 * rig.seq - 20 * (rig.epoch == 1)
+        )
+        assert decision.status == HALTED
+        assert abs(decision.d) < 0.02
+    assert rig.driver.phase is Phase.STOPPED
+
+
+def test_a_rolling_car_taken_over_on_hold_slows_down_along_the_line(
+    native: NativeStep, circuit: Circuit
+) -> None:
+    rig = Rig(native, circuit, hold=True)
+    count = 0
+    while rig.cycle().status != HALTED:
+        count += 1
+        assert count < 200
+    assert count > 10
+    assert abs(rig.x[3]) < 0.15
+    assert rig.driver.phase is Phase.READY
 
 
 def test_on_hold_it_stands_until_go(native: NativeStep, circuit: Circuit) -> None:

@@ -194,7 +194,7 @@ def test_a_free_running_car_brakes_when_its_controller_dies(tmp_path: Path) -> N
         )
         time.sleep(1.0)
         rig.controller.kill()
-        end = rig.director.wait_for_end(1, 10.0, without_controller_s=10.0)
+        end = rig.director.wait_for_end(1, 10.0, absence_s=10.0)
     assert end.data["reason"] == "max_time"
     states = LogReader(tmp_path / "log").select(STATE)
     assert max(state.x[3] for state in states) > 0.5

@@ -1,6 +1,7 @@
 """Zenoh, wrapped thinly: sessions with explicit endpoints, publishers, one inbox per thread."""
 
 from bayesrace.transport.client import Director, ask
+from bayesrace.transport.heartbeat import HEARTBEAT_S, Heartbeat
 from bayesrace.transport.inbox import (
     LOCKSTEP_SPIN_S,
     NEWEST,
@@ -13,7 +14,6 @@ from bayesrace.transport.inbox import (
 from bayesrace.transport.numbering import Numbering
 from bayesrace.transport.session import (
     CONTROLLER_ENDPOINT,
-    HEARTBEAT_S,
     PLANT_ENDPOINT,
     Endpoints,
     Publisher,
@@ -29,6 +29,7 @@ __all__ = [
     "PLANT_ENDPOINT",
     "Director",
     "Endpoints",
+    "Heartbeat",
     "Inbox",
     "Item",
     "Kind",

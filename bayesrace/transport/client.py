@@ -41,13 +41,16 @@ def ask(
     Raises InputError if nobody answers in time or the answer is not a valid one.
     """
     key = car_key(service.key, car, source)
+    control = zenoh.CongestionControl
     payload = request if isinstance(request, bytes) else encode(request)
     replies = session.get(
         key,
         payload=payload,
         timeout=service.timeout_s,
         target=zenoh.QueryTarget.ALL,
-        congestion_control=zenoh.CongestionControl.BLOCK,
+        # An answer travels as the question does: who asks must not make a control loop wait.
+        # Weights are long, and half of them is none.
+        congestion_control=control.BLOCK if service.request is None else control.DROP,
     )
     for reply in replies:
         if reply.ok is not None:
@@ -110,33 +113,34 @@ class Director:
         reply = self._accepted("weights", ask(self._session, WEIGHTS, self._car, data))
         return str(reply.data.get("version", ""))
 
-    def wait_for_end(self, run: int, timeout_s: float, without_controller_s: float = 1.0) -> Event:
+    def wait_for_end(self, run: int, timeout_s: float, absence_s: float = 1.0) -> Event:
         """The ``run_ended`` event of a run.
 
         In lockstep the plant ends the run itself when the controller vanishes; by the wall clock
-        it brakes and goes on, which is allowed for ``without_controller_s``. Raises InputError if
-        a process vanishes or the time is over; KeyboardInterrupt on a signal.
+        it brakes and goes on. A process, or the link to it, may be away for ``absence_s``. Raises
+        InputError if one is for longer or the time is over; KeyboardInterrupt on a signal.
         """
         deadline = last = time.monotonic() + timeout_s
-        lost = ""
+        lost: dict[str, str] = {}
         with self.inbox.catching_signals():
             while (left_s := deadline - time.monotonic()) > 0:
                 item = self.inbox.get(min(left_s, 1.0))
                 if item is None:
                     continue
                 self._raise_on_signal(item)
-                if item.kind is Kind.GONE and item.name == "plant":
-                    raise InputError(f"the plant of car '{self._car}' vanished during run {run}")
-                if item.kind is Kind.GONE and item.name == "controller":
-                    lost = f"the controller of car '{self._car}' vanished during run {run}"
-                    deadline = min(deadline, time.monotonic() + without_controller_s)
-                if item.kind is Kind.ALIVE and item.name == "controller" and lost:
-                    lost, deadline = "", last
+                if item.kind is Kind.GONE:
+                    lost[item.name] = f"the {item.name} of car '{self._car}' vanished"
+                    deadline = min(deadline, time.monotonic() + absence_s)
+                if item.kind is Kind.ALIVE and item.name in lost:
+                    del lost[item.name]
+                    deadline = deadline if lost else last
                 if item.kind is Kind.MESSAGE:
                     event = self._decode(item.value)
                     if event is not None and event.run == run and event.kind == "run_ended":
                         return event
-        raise InputError(lost or f"run {run} of car '{self._car}' did not end in {timeout_s:g} s")
+        if lost:
+            raise InputError(f"{' and '.join(lost.values())} during run {run}")
+        raise InputError(f"run {run} of car '{self._car}' did not end in {timeout_s:g} s")
 
     @staticmethod
     def _accepted(what: str, reply: Reply) -> Reply:

@@ -50,8 +50,6 @@ than the answer: measured, the round trip falls from 270 to 90 us."""
 _POLL_S: Final = 5e-5
 """Sleep between two looks of :meth:`Inbox.poll`, once it has spun for long enough."""
 
-_POLL_SPIN_NS: Final = 300_000
-
 _TICK_S: Final = 0.05
 """How late a time limit or a signal may be noticed by a waiting thread."""
 
@@ -116,11 +114,11 @@ class Inbox:
         self._car = car
         self._items: queue.SimpleQueue[Item] = queue.SimpleQueue()
         self._declared: list[Any] = []
-        self._topic = ""
+        self._topic = self._key = ""
         self._channel: Any = None
         self._bell: Any = None
         self._waiting = False
-        self._pumping = False
+        self._stamping = False
         self.alive: set[str] = set()
         """Sources whose liveliness token is there, as of the items taken so far."""
         self.overflowed = 0
@@ -136,7 +134,7 @@ class Inbox:
         if self._channel is not None:
             raise ValueError(f"this inbox has topic '{self._topic}' already")
         key = car_key(topic.key, self._car, source)
-        self._topic = topic.name
+        self._topic, self._key = topic.name, key
         channel: Any = zenoh.handlers.FifoChannel(_CAPACITY)
         if newest is not None:
             channel = zenoh.handlers.RingChannel(newest)
@@ -205,7 +203,7 @@ class Inbox:
 
     def get(self, timeout_s: float = 0.0) -> Item | None:
         """The next item; None if nothing arrives in time."""
-        if self._channel is None or self._pumping:
+        if self._channel is None or self._stamping:
             return self._noted(self._from_queue(timeout_s))
         now = time.monotonic()
         deadline, spin_until = now + timeout_s, now + min(self.spin_s, timeout_s)
@@ -227,13 +225,12 @@ class Inbox:
             if data:
                 return Item(Kind.MESSAGE, self._topic, data, time.monotonic_ns())
 
-    def poll(self, until_ns: int) -> Item | None:
+    def poll(self, until_ns: int, spin_until_ns: int) -> Item | None:
         """The next message, looked for until the monotonic clock says ``until_ns``.
 
-        For fixed-rate loops: wakes without another thread's help and to the tenth of a
-        millisecond, at the price of polling. Looks at least once.
+        For fixed-rate loops: wakes without another thread's help, at once as long as it spins and
+        to the tenth of a millisecond from then on. Looks at least once.
         """
-        begin_ns = time.monotonic_ns()
         while True:
             sample = self._channel.try_recv()
             now_ns = time.monotonic_ns()
@@ -243,7 +240,7 @@ class Inbox:
                     return Item(Kind.MESSAGE, self._topic, data, now_ns)
             elif now_ns >= until_ns:
                 return None
-            elif now_ns - begin_ns < _POLL_SPIN_NS:
+            elif now_ns < spin_until_ns:
                 os.sched_yield()
             else:
                 time.sleep(_POLL_S)
@@ -254,23 +251,32 @@ class Inbox:
 
     @contextmanager
     def stamped(self) -> Iterator[None]:
-        """For the block, a thread takes the messages as they arrive, so that ``received_ns`` is
-        right even if the owner sleeps meanwhile."""
-        self._pumping = True
-        pump = threading.Thread(target=self._pump, name="inbox-pump", daemon=True)
-        pump.start()
+        """For the block, the transport's own thread takes the messages as they arrive, so that
+        ``received_ns`` is right even if the owner sleeps meanwhile."""
+
+        def on_sample(sample: Any) -> None:
+            data: bytes = sample.payload.to_bytes()
+            if data:
+                self._enqueue(Item(Kind.MESSAGE, self._topic, data, time.monotonic_ns()))
+
+        self._stamping = True
+        subscriber = self._session.declare_subscriber(self._key, _direct(on_sample))
         try:
             yield
         finally:
-            self._pumping = False
-            self._bell.put(b"")
-            pump.join()
+            subscriber.undeclare()
+            while self._channel.try_recv() is not None:  # the same messages, once more
+                pass
+            self._stamping = False
 
-    def _pump(self) -> None:
-        while self._pumping:
-            data: bytes = self._channel.recv().payload.to_bytes()
-            if data:
-                self._enqueue(Item(Kind.MESSAGE, self._topic, data, time.monotonic_ns()))
+    def linger(self, until_ns: int) -> None:
+        """Within :meth:`stamped`: stay awake until something arrives or the clock says so.
+
+        A CPU that is kept from going idle takes the message that it waits for sooner.
+        """
+        while self._items.empty() and time.monotonic_ns() < until_ns:
+            os.sched_yield()  # the transport's threads may need this CPU,
+            time.sleep(0)  # and the interpreter
 
     def _from_queue(self, timeout_s: float) -> Item | None:
         try:

@@ -23,7 +23,6 @@ from bayesrace.messages import Message, Topic, car_key, encode
 
 __all__ = [
     "CONTROLLER_ENDPOINT",
-    "HEARTBEAT_S",
     "PLANT_ENDPOINT",
     "Endpoints",
     "Publisher",
@@ -44,9 +43,6 @@ PLANT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 
 CONTROLLER_ENDPOINT: Final = "tcp/127.0.0.1:7448"
 """Where a controller listens unless told otherwise: loopback only."""
-
-HEARTBEAT_S: Final = 0.1
-"""Between two heartbeats of a process."""
 
 _PROTOCOLS: Final = ("tcp", "udp", "tls", "quic", "ws", "unixsock-stream")
 _ENDPOINT: Final = re.compile(rf"({'|'.join(_PROTOCOLS)})/[^\s#?]+([?#]\S*)?")
@@ -191,12 +187,16 @@ def free_endpoint() -> str:
 class Publisher(Generic[M]):
     """Sends one topic's messages with the table's quality of service, and numbers them."""
 
-    def __init__(self, session: Any, topic: Topic[M], car: str, source: str = "") -> None:
+    def __init__(
+        self, session: Any, topic: Topic[M], car: str, source: str = "", *, waits: bool = True
+    ) -> None:
+        """``waits`` False: by the wall clock never wait, whatever the table says: for a control
+        loop."""
         key = car_key(topic.key, car, source)
         self._blocking = _declare(session, key, topic, blocking=True)
         self._dropping = (
             self._blocking
-            if topic.qos.wall_clock_blocks
+            if topic.qos.wall_clock_blocks and waits
             else _declare(session, key, topic, blocking=False)
         )
         self.next_seq = 0

@@ -28,7 +28,7 @@
 extern "C" {
 #endif
 
-#define BR_ABI 2
+#define BR_ABI 3
 #define BR_NX 7
 #define BR_NU 2
 #define BR_NV (BR_NX + BR_NU)      /* stage variables v = [x; u] */
@@ -205,6 +205,11 @@ BR_API br_mpc_error br_mpc_prepare(br_mpc *mpc, double elapsed_s, double budget_
  * x. Changes nothing in mpc. BR_ERROR_STATE: x_next is not written. */
 BR_API br_mpc_error br_mpc_predict(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
                                    double duration_s, double x_next[BR_NX]);
+
+/* Does over what br_mpc_prepare has done, to the same bits, so that caches and branch predictors are
+ * warm when the state arrives: after 20 ms of other work a step takes half as long again. Nothing
+ * if nothing is prepared. */
+BR_API br_mpc_error br_mpc_rehearse(br_mpc *mpc);
 
 /* Plan of the last step, row major: x (BR_N + 1) x BR_NX, u BR_N x BR_NU. br_mpc_prepare does not
  * change it. */

@@ -73,3 +73,11 @@ br_mpc_error br_mpc_prepare(br_mpc *mpc, double elapsed_s, double budget_s) {
     mpc->prepared = mpc->qp.factorised;
     return BR_OK;
 }
+
+br_mpc_error br_mpc_rehearse(br_mpc *mpc) {
+    if (!mpc) return BR_ERROR_NULL;
+    if (!mpc->prepared || !mpc->qp.factorised) return BR_OK;
+    br_sqp_linearise(mpc);
+    br_qp_factorise(mpc);
+    return BR_OK;
+}

@@ -1,0 +1,128 @@
+"""The plant by the wall clock, with what arrives given: it guards itself against its controller."""
+
+import contextlib
+import time
+from collections import deque
+from collections.abc import Iterator
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from bayesrace.messages import Actuation, Decoder, RunRequest, State, encode
+from bayesrace.transport import Inbox, Item, Kind, Numbering, Publisher
+from bayesrace.vehicles.models import dynamic
+from bayesrace.vehicles.parameters import get_car
+from plant.run import Run, RunCounters
+from plant.simulator import Simulator
+
+EPOCH = 7
+
+
+class Controller:
+    """Answers each state with what ``answer`` makes of it; inbox and publisher in one."""
+
+    def __init__(self, answer: Any) -> None:
+        self._answer = answer
+        self._items: deque[Item] = deque()
+        self.states: list[State] = []
+
+    @property
+    def next_seq(self) -> int:
+        return len(self.states)
+
+    def put(self, state: State, *, lockstep: bool) -> None:
+        assert not lockstep
+        self.states.append(state)
+        for changes in self._answer(state):
+            values = {
+                "seq": len(self.states) - 1, "source_time_ns": 0, "epoch": state.epoch,
+                "run": state.run, "state_seq": state.seq, "basis_s": state.time_s,
+                "u": (1.0, 0.0), "weights_version": "", "status": 0,
+            }  # fmt: skip
+            data = encode(Actuation(**(values | changes)))
+            self._items.append(Item(Kind.MESSAGE, "actuation", data, time.monotonic_ns()))
+
+    def get(self) -> Item | None:
+        return self._items.popleft() if self._items else None
+
+    @contextlib.contextmanager
+    def stamped(self) -> Iterator[None]:
+        yield
+
+    def linger(self, until_ns: int) -> None:
+        pass
+
+
+def execute(answer: Any, delay_s: float = 0.0) -> tuple[list[State], RunCounters, Simulator]:
+    """A run of .3 s in which a state is answered by actuations with these changes."""
+    controller, counters = Controller(answer), RunCounters()
+    simulator = Simulator(dynamic(get_car("orca")))
+    start = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+    line = {"line_x_m": 0.0, "line_y_m": 0.0, "line_heading_rad": 0.0}
+    request = RunRequest(
+        0, 0, 1, False, start, **line, line_left_m=1.0, line_right_m=1.0, laps=0,
+        max_time_s=0.3, actuation_timeout_s=0.1,
+    )  # fmt: skip
+    run = Run(
+        request, simulator, cast(Inbox, controller), cast(Publisher[State], controller),
+        Decoder(Actuation), counters, Numbering(), lambda _: None, lambda: None, EPOCH, delay_s,
+    )  # fmt: skip
+    run.execute()
+    return controller.states, counters, simulator
+
+
+def test_an_answered_car_drives_and_the_delays_are_told() -> None:
+    states, counters, simulator = execute(lambda _: [{}])
+    assert counters.stale == 0
+    assert simulator.guard.counters.braked < 8
+    assert states[-1].final
+    assert states[-1].x[3] > 1.0
+    rows = np.array([row for state in states for row in state.answers]).reshape(-1, 3)
+    assert rows[:, 0].tolist() == list(range(len(rows)))
+    assert (rows[:, 1] >= 0).all()
+    assert (rows[:, 2] > rows[:, 1] - 1e-3).all()  # it acts from the next substep on
+
+
+def test_an_injected_delay_comes_on_both_ways() -> None:
+    states, _, _ = execute(lambda _: [{}], delay_s=0.03)
+    rows = np.array([row for state in states for row in state.answers]).reshape(-1, 3)
+    assert len(rows) > 3
+    assert (rows[:, 1] >= 0.06).all()
+    assert (rows[:, 2] >= 0.06).all()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"epoch": EPOCH + 1},  # an answer to the plant before a restart, its numbers plausible
+        {"run": 2},
+        {"state_seq": 10**6},
+        {"basis_s": 1e6},  # it would never grow old, and overtake all that follow
+    ],
+)
+def test_what_is_not_for_this_run_does_not_act(changes: dict[str, Any]) -> None:
+    _, counters, simulator = execute(lambda _: [changes])
+    assert counters.stale > 5
+    assert simulator.guard.counters.braked > 12
+    # and what is, does, whatever came before it
+    _, counters, simulator = execute(lambda _: [changes, {}])
+    assert counters.stale > 5
+    assert simulator.guard.counters.braked < 8
+
+
+def test_an_overtaken_answer_is_told_and_does_not_act() -> None:
+    def late_copy(state: State) -> list[dict[str, Any]]:
+        old = {"u": (-0.1, 0.0), "basis_s": max(state.time_s - 0.02, 0.0)}
+        return [{}, old] if state.seq else [{}]
+
+    states, counters, _ = execute(late_copy)
+    rows = np.array([row for state in states for row in state.answers]).reshape(-1, 3)
+    assert (rows[:, 2] == -1).sum() == counters.stale > 5
+    assert states[-1].x[3] > 1.0
+
+
+def test_without_fresh_answers_the_plant_brakes() -> None:
+    states, _, simulator = execute(lambda state: [{}] if state.seq < 3 else [])
+    assert simulator.guard.counters.braked > 4
+    assert states[-1].x[3] < max(state.x[3] for state in states)
