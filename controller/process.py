@@ -64,10 +64,6 @@ _REHEARSAL_NS: Final = 700_000
 _COLD_NS: Final = 5_000_000
 """Periods from which on caches are cold at each release; at higher rates there is no rehearsal."""
 
-_SPIN: Final = 0.05
-"""How long after a release the loop spins for the state before it sleeps between two looks
-(fraction of the period)."""
-
 _GRACE: Final = 0.25
 """How long after a release the loop still waits for the state that is due (fraction of the
 period)."""
@@ -272,10 +268,8 @@ class ControllerProcess:
         newest = self._driver.states.newest
         run = newest.run if newest is not None else None
         until_ns = release_ns + (round(_GRACE * period_ns) if self._state_due() else 0)
-        # Normal threads bring the message: one of real-time priority must not spin before them.
-        spin_ns = 0 if self._settings.realtime.fifo else release_ns + round(_SPIN * period_ns)
         for _ in range(NEWEST):  # what came while the loop was held up, but no flood
-            item = self.inbox.poll(0 if fresh else until_ns, spin_ns)
+            item = self.inbox.poll(0 if fresh else until_ns)
             if item is None:
                 break
             fresh = self._take(item) or fresh

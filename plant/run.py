@@ -20,10 +20,6 @@ _WORLD_M: Final = 1e4
 _REMEMBERED: Final = 1024
 """States whose answers are taken; what answers an older one is stale."""
 
-_LINGER_NS: Final = 1_000_000
-"""How long the plant stays awake for the answer to a state that it has just sent (less at rates
-where this is more than a quarter of the period): a device would have nothing else to do."""
-
 _MOST_ANSWERS: Final = 64
 """Rows that one state message has room for."""
 
@@ -102,7 +98,6 @@ class Run:
             request.line_right_m,
         )
         # Running by the wall clock:
-        self._linger_ns = min(_LINGER_NS, round(0.25e9 * simulator.step_s))
         self._outbox: deque[tuple[int, State]] = deque()
         self._sampled_ns: dict[int, int] = {}
         self._waiting: list[_Waiting] = []
@@ -249,7 +244,6 @@ class Run:
             due_ns, state = outbox.popleft()
             sleep_until_ns(due_ns)
             self._publisher.put(state, lockstep=False)
-            self._inbox.linger(time.monotonic_ns() + self._linger_ns)
         sleep_until_ns(until_ns)
 
     def _receive(self) -> End | None:

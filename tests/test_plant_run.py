@@ -50,9 +50,6 @@ class Controller:
     def stamped(self) -> Iterator[None]:
         yield
 
-    def linger(self, until_ns: int) -> None:
-        pass
-
 
 def execute(answer: Any, delay_s: float = 0.0) -> tuple[list[State], RunCounters, Simulator]:
     """A run of .3 s in which a state is answered by actuations with these changes."""

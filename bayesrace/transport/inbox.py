@@ -48,7 +48,7 @@ LOCKSTEP_SPIN_S: Final = 0.002
 than the answer: measured, the round trip falls from 270 to 90 us."""
 
 _POLL_S: Final = 5e-5
-"""Sleep between two looks of :meth:`Inbox.poll`, once it has spun for long enough."""
+"""Sleep between two looks of :meth:`Inbox.poll`."""
 
 _TICK_S: Final = 0.05
 """How late a time limit or a signal may be noticed by a waiting thread."""
@@ -225,11 +225,11 @@ class Inbox:
             if data:
                 return Item(Kind.MESSAGE, self._topic, data, time.monotonic_ns())
 
-    def poll(self, until_ns: int, spin_until_ns: int) -> Item | None:
+    def poll(self, until_ns: int) -> Item | None:
         """The next message, looked for until the monotonic clock says ``until_ns``.
 
-        For fixed-rate loops: wakes without another thread's help, at once as long as it spins and
-        to the tenth of a millisecond from then on. Looks at least once.
+        For fixed-rate loops: wakes to the tenth of a millisecond without another thread's help, and
+        leaves the CPU to the thread that brings the message (docs/decisions/). Looks at least once.
         """
         while True:
             sample = self._channel.try_recv()
@@ -240,8 +240,6 @@ class Inbox:
                     return Item(Kind.MESSAGE, self._topic, data, now_ns)
             elif now_ns >= until_ns:
                 return None
-            elif now_ns < spin_until_ns:
-                os.sched_yield()
             else:
                 time.sleep(_POLL_S)
 
@@ -268,15 +266,6 @@ class Inbox:
             while self._channel.try_recv() is not None:  # the same messages, once more
                 pass
             self._stamping = False
-
-    def linger(self, until_ns: int) -> None:
-        """Within :meth:`stamped`: stay awake until something arrives or the clock says so.
-
-        A CPU that is kept from going idle takes the message that it waits for sooner.
-        """
-        while self._items.empty() and time.monotonic_ns() < until_ns:
-            os.sched_yield()  # the transport's threads may need this CPU,
-            time.sleep(0)  # and the interpreter
 
     def _from_queue(self, timeout_s: float) -> Item | None:
         try:
