@@ -6,7 +6,7 @@
 1. 50 Hz for ten minutes: state to actuation median at most .6 ms; misses at most those of the bare
    loop in the same run + 2; resident memory grows by less than 1 MB after the first minute; every
    message sent was received or counted as lost.
-2. 500 Hz for one minute: mean period within .1 %.
+2. 500 Hz for one minute: mean period within .1 % (of the bare loop's, where that skipped too).
 3. 50 Hz for one minute with all cores busy: a lap, and no sample off the track.
 
 Nothing else should be running. A stall of the machine longer than a period is seen by the bare
@@ -50,6 +50,17 @@ def complete(result: Result) -> bool:
     return altogether and all(one["complete"] for one in result["traffic"].values())
 
 
+def bare(result: Result) -> float:
+    """By how much the bare loop's mean period was too long."""
+    return float(result["bare_loop_us"]["mean_period_us"] * result["rate_hz"] * 1e-6 - 1.0)
+
+
+def keeps_rate(result: Result) -> bool:
+    """Mean period within .1 %; where the machine's stalls made the bare loop skip, of its own."""
+    error = result["rate_error"]
+    return bool(abs(error) <= 1e-3 or abs(error - bare(result)) <= 1e-3)
+
+
 CASES = (
     Case(
         "50hz", 600.0, ("--rate", "50"),
@@ -58,7 +69,8 @@ CASES = (
                     lambda r: r["state_to_actuation_us"]["p50"] <= 600,
                     lambda r: f"{r['state_to_actuation_us']['p50']:.0f} us"),
             Promise("deadline misses <= bare loop's + 2",
-                    lambda r: r["deadline_misses"] <= r["bare_loop_misses"] + 2,
+                    lambda r: r["bare_loop_misses"] is not None
+                    and r["deadline_misses"] <= r["bare_loop_misses"] + 2,
                     lambda r: f"{r['deadline_misses']}, bare loop {r['bare_loop_misses']}"),
             Promise("resident memory grows < 1 MB",
                     lambda r: r["rss_growth_bytes"] < 1_000_000,
@@ -70,9 +82,8 @@ CASES = (
     Case(
         "500hz", 60.0, ("--rate", "500"),
         (
-            Promise("mean period within .1 %",
-                    lambda r: abs(r["rate_error"]) <= 1e-3,
-                    lambda r: f"{r['rate_error']:+.3%}"),
+            Promise("mean period within .1 %, of the bare loop's if the machine did not give more",
+                    keeps_rate, lambda r: f"{r['rate_error']:+.3%}, bare loop {bare(r):+.3%}"),
         ),
     ),
     Case(

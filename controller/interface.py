@@ -1,7 +1,7 @@
 """What the controller process drives: any object with these methods."""
 
 from dataclasses import dataclass, field
-from typing import Any, Final, Protocol
+from typing import Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -92,6 +92,3 @@ class Controller(Protocol):
 
         Returns their version; InputError says why they are refused, and the old ones stay.
         """
-
-    def describe(self) -> dict[str, Any]:
-        """Name and settings for the log: flat, numbers and short texts."""

@@ -1,7 +1,6 @@
 """The predictive controller as the process drives it: native step, weights, telemetry."""
 
 import time
-from typing import Any
 
 from bayesrace.gp.weights import decode_weights
 from bayesrace.messages import State
@@ -40,10 +39,6 @@ class PredictiveController:
         self._step.set_weights(weights)
         self._version = weights.version
         return weights.version
-
-    def describe(self) -> dict[str, Any]:
-        """Identity of the artefact."""
-        return {"controller": "mpc", **self._step.manifest.model_dump(exclude={"flags"})}
 
     def prepare(self, elapsed_s: float, budget_s: float = 0.0) -> None:
         """Iterates on until converged if there is a budget, then shifts and condenses."""

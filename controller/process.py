@@ -191,7 +191,7 @@ class ControllerProcess:
                 if state.final or not state.lockstep:
                     break
                 timing.released_ns = time.monotonic_ns()
-                self._driver.decide(state, state.time_s)
+                self._decide(state, state.time_s, 0.0)
                 self._send(state, self._driver.settle())
                 self._prepare(self._driver.states.interval_s, 0.0)
             elif self._silent() or not self._service.plant_there:
@@ -236,7 +236,7 @@ class ControllerProcess:
         # What has held up a state on its way is part of its age: hence the schedule's plant time,
         # not the time since this state's own arrival.
         basis_s = max(schedule.plant_time_s(timing.released_ns), state.time_s)
-        driver.decide(state, basis_s, max(budget_s - spent_s, _LEAST_BUDGET * budget_s))
+        self._decide(state, basis_s, max(budget_s - spent_s, _LEAST_BUDGET * budget_s))
         late_s = (time.monotonic_ns() - schedule.release_ns) * 1e-9 - budget_s
         timing.overruns += late_s > 0
         self._send(state, driver.settle(max(late_s, 0.0)))
@@ -300,6 +300,11 @@ class ControllerProcess:
         return abs(away_ns) < schedule.period_ns / 2 or interval_ns < schedule.period_ns
 
     # Both --------------------------------------------------------------------------------------
+
+    def _decide(self, state: State, basis_s: float, budget_s: float) -> None:
+        begin_ns = time.perf_counter_ns()
+        self._driver.decide(state, basis_s, budget_s)
+        self._timing.solve_us = (time.perf_counter_ns() - begin_ns) * 1e-3
 
     def _prepare(self, period_s: float, budget_s: float) -> None:
         begin_ns = time.perf_counter_ns()

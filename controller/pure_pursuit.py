@@ -8,7 +8,6 @@ learning from.
 """
 
 import math
-from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -98,10 +97,6 @@ class PurePursuit:
     def set_weights(self, data: bytes) -> str:
         """Always refused."""
         raise InputError("pure pursuit takes no weights; send them to the predictive controller")
-
-    def describe(self) -> dict[str, Any]:
-        """Name and settings."""
-        return {"controller": "pure-pursuit", **self._settings.model_dump()}
 
     def prepare(self, elapsed_s: float, budget_s: float = 0.0) -> None:
         """Nothing can be done ahead."""

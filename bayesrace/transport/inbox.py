@@ -203,6 +203,8 @@ class Inbox:
 
     def get(self, timeout_s: float = 0.0) -> Item | None:
         """The next item; None if nothing arrives in time."""
+        if self._stamping:
+            self._empty_channel()
         if self._channel is None or self._stamping:
             return self._noted(self._from_queue(timeout_s))
         now = time.monotonic()
@@ -263,9 +265,13 @@ class Inbox:
             yield
         finally:
             subscriber.undeclare()
-            while self._channel.try_recv() is not None:  # the same messages, once more
-                pass
+            self._empty_channel()
             self._stamping = False
+
+    def _empty_channel(self) -> None:
+        """Lets go of what was stamped: each message there keeps a buffer of the transport's."""
+        while self._channel.try_recv() is not None:
+            pass
 
     def _from_queue(self, timeout_s: float) -> Item | None:
         try:

@@ -55,7 +55,7 @@ def outcome(
         deadline_misses=controller["deadline_misses"],
         overruns=controller["overruns"],
         fallbacks=sum(controller[name] for name in ("shifted_plan", "brake", "stop")),
-        bare_loop_misses=0 if bare is None else bare.misses,
+        bare_loop_misses=None if bare is None else bare.misses,
         bare_loop_us=bare_result,
         mean_period_us=period_us,
         rate_error=None if period_us is None else period_us * measured.rate_hz * 1e-6 - 1.0,

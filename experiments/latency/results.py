@@ -121,7 +121,7 @@ class LatencyResult(_Frozen):
     deadline_misses: int = Field(description="actuations sent after the next release")
     overruns: int = Field(description="cycles that took more than their budget")
     fallbacks: int = Field(description="cycles that the fallback drove")
-    bare_loop_misses: int
+    bare_loop_misses: int | None = Field(description="null if there was no bare loop")
     bare_loop_us: BareLoop | None
     mean_period_us: float | None
     rate_error: float | None = Field(description="mean period over the nominal one, less 1")

@@ -1,0 +1,66 @@
+"""What a log tells about a drive, on the clock of the machine that all processes share."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bayesrace.log import LogReader
+from bayesrace.messages import (
+    ACTUATION,
+    HEARTBEAT,
+    STATE,
+    TELEMETRY,
+    Actuation,
+    Message,
+    State,
+    Status,
+    Telemetry,
+)
+from bayesrace.tracks import Track
+
+__all__ = ["STANDING_MPS", "Journey"]
+
+STANDING_MPS = 0.05
+"""Speed below which a car counts as standing."""
+
+
+class Journey:
+    """The messages of a log in the order of arrival."""
+
+    def __init__(self, log: Path, track: Track) -> None:
+        reader = LogReader(log)
+        self._track = track
+        self.states: list[State] = []
+        self.actuations: list[Actuation] = []
+        self.telemetry: list[Telemetry] = []
+        self.heartbeats: list[Status] = []
+        lists: dict[type[Message], list[Any]] = {
+            State: self.states,
+            Actuation: self.actuations,
+            Telemetry: self.telemetry,
+            Status: self.heartbeats,
+        }
+        for entry in reader.messages((STATE, ACTUATION, TELEMETRY, HEARTBEAT)):
+            lists[type(entry.message)].append(entry.message)
+        assert reader.refused == 0, reader.last_reason
+        assert not reader.truncated
+
+    def between(self, begin_ns: int, end_ns: int) -> list[State]:
+        """States sampled in this interval."""
+        return [one for one in self.states if begin_ns <= one.source_time_ns < end_ns]
+
+    def off_track_m(self, states: Sequence[State] | None = None) -> float:
+        """How far outside of the track the car got at most (all states); negative inside."""
+        chosen = self.states if states is None else states
+        xy = np.array([state.x[:2] for state in chosen])
+        return float(self._track.off_track_m(self._track.project_path(xy)).max())
+
+    def phases(self, begin_ns: int, end_ns: int) -> set[str]:
+        """What the controller said of itself in this interval."""
+        return {
+            one.phase
+            for one in self.heartbeats
+            if one.source == "controller" and begin_ns <= one.source_time_ns < end_ns
+        }

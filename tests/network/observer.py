@@ -1,0 +1,195 @@
+"""Who starts runs, follows and records them: in the test's own process, or on another host.
+
+    python -m tests.network.observer NAME TRACK LOG ENDPOINT...
+
+obeys lines on stdin (``start``, ``state``, ``status SOURCE``, ``stop``) and answers each with a
+line of JSON; the end of stdin ends it, and the run under way.
+"""
+
+import dataclasses
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Any, Protocol
+
+import zenoh
+
+from bayesrace.errors import InputError
+from bayesrace.log import Recorder
+from bayesrace.messages import STATE, State, car_key, decode
+from bayesrace.tracks import Track, load_track
+from bayesrace.transport import Director, Endpoints, open_session
+from experiments.drive import RunPlan, run_request
+from tests.network.hosts import Host
+from tests.programs import PATIENCE_S, ROOT, environment
+
+__all__ = ["Follower", "Observer", "Remote", "observing", "observing_from"]
+
+_ENDLESS_S = 1e5
+
+
+class Follower(Protocol):
+    """What tests need of either kind."""
+
+    def start(self, run: int) -> int:
+        """Starts a run without end; its number."""
+
+    def state(self) -> dict[str, Any]:
+        """Fields of the newest state; empty before the first."""
+
+    def status(self, source: str) -> dict[str, Any]:
+        """Fields of a process's status; ``error`` if it does not answer."""
+
+    def stop(self) -> None:
+        """Ends the run."""
+
+
+def _fields(message: Any) -> dict[str, Any]:
+    return {field.name: getattr(message, field.name) for field in dataclasses.fields(message)}
+
+
+class Observer:
+    """Follows one car over an open session."""
+
+    def __init__(self, session: Any, name: str, track: Track) -> None:
+        self.director = Director(session, name)
+        self._track = track
+        self._newest = b""
+        self._subscriber = session.declare_subscriber(
+            car_key(STATE.key, name), zenoh.handlers.Callback(self._hear, indirect=False)
+        )
+
+    def _hear(self, sample: Any) -> None:
+        self._newest = sample.payload.to_bytes() or self._newest
+
+    def start(self, run: int) -> int:
+        """Starts a run without end, by the wall clock, once both processes are there."""
+        self.director.wait_for(("plant", "controller"), PATIENCE_S)
+        plan = RunPlan(run, "test", 1, _ENDLESS_S, lockstep=False)
+        request = dataclasses.replace(run_request(self._track, plan), laps=0)
+        self.director.start(request)
+        return run
+
+    def newest(self) -> State | None:
+        """The newest state; None before the first."""
+        return decode(STATE.message, self._newest) if self._newest else None
+
+    def state(self) -> dict[str, Any]:
+        """Its fields."""
+        newest = self.newest()
+        return {} if newest is None else _fields(newest)
+
+    def status(self, source: str) -> dict[str, Any]:
+        """Fields of the status."""
+        try:
+            return _fields(self.director.status(source))
+        except InputError as error:
+            return {"error": str(error)}
+
+    def stop(self) -> None:
+        """Ends the run."""
+        self.director.stop("the test is over")
+
+
+@contextmanager
+def observing(endpoints: Sequence[str], name: str, track: Track, log: Path) -> Iterator[Observer]:
+    """Follows and records from this process."""
+    connect = Endpoints(connect=tuple(endpoints))
+    with open_session(connect) as session, Recorder(session, name, log):
+        yield Observer(session, name, track)
+
+
+class Remote:
+    """An observer on another host; the same methods."""
+
+    def __init__(self, process: "subprocess.Popen[str]") -> None:
+        self._process = process
+
+    def _ask(self, line: str) -> Any:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(f"{line}\n")
+        answer = self._process.stdout.readline()
+        assert answer, f"the observer ended with code {self._process.wait()}"
+        return json.loads(answer)
+
+    def start(self, run: int) -> int:
+        """Starts a run without end."""
+        answer = self._ask(f"start {run}")
+        assert answer == run, answer
+        return run
+
+    def state(self) -> dict[str, Any]:
+        """Fields of the newest state."""
+        fields: dict[str, Any] = self._ask("state")
+        return fields
+
+    def status(self, source: str) -> dict[str, Any]:
+        """Fields of the status."""
+        fields: dict[str, Any] = self._ask(f"status {source}")
+        return fields
+
+    def stop(self) -> None:
+        """Ends the run."""
+        self._ask("stop")
+
+
+@contextmanager
+def observing_from(
+    host: Host, endpoints: Sequence[str], name: str, track: Path, log: Path
+) -> Iterator[Remote]:
+    """Follows and records on that host; the log is whole after the block."""
+    with log.with_suffix(".txt").open("ab") as errors:
+        process = subprocess.Popen(
+            host.command(sys.executable, "-m", __name__, name, track, log, *endpoints),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            text=True,
+            bufsize=1,
+            cwd=ROOT,
+            env=environment(),
+        )
+    with ExitStack() as cleanup:
+        cleanup.callback(process.wait)
+        cleanup.callback(process.kill)
+        yield Remote(process)
+        assert process.stdin is not None
+        process.stdin.close()
+        assert process.wait(PATIENCE_S) == 0, log.with_suffix(".txt").read_text()
+
+
+def _obey(observer: Observer, line: str) -> Any:
+    match line.split():
+        case ["start", run]:
+            return observer.start(int(run))
+        case ["state"]:
+            return observer.state()
+        case ["status", source]:
+            return observer.status(source)
+        case ["stop"]:
+            return observer.stop()
+    raise InputError(f"'{line}' is no command")
+
+
+def main(name: str, track: str, log: str, *endpoints: str) -> None:
+    """The program."""
+    with observing(endpoints, name, load_track(track), Path(log)) as observer:
+        for line in sys.stdin:
+            try:
+                answer = _obey(observer, line)
+            except InputError as error:
+                answer = {"error": str(error)}
+            sys.stdout.write(f"{json.dumps(answer, default=dict)}\n")
+            sys.stdout.flush()
+        with suppress(InputError):
+            observer.stop()
+        time.sleep(0.2)  # the plant's last word
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

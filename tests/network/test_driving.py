@@ -1,0 +1,215 @@
+"""Plant and controller on two hosts with a bad link between them: slow down, stop, go on.
+
+The messages of control travel by TCP, as everything does by default: what the link loses arrives
+late and holds up what comes after it, so an actuation can be 0.2 s late, and Zenoh's qualities of
+service change nothing about it. By UDP a loss is a loss and nobody waits; but Zenoh sends its own
+declarations over it once as well, so a connection that is made over a bad link may be deaf. That
+is why the drive by UDP begins on a good one.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bayesrace.log import LogReader
+from bayesrace.messages import STATE
+from tests.network.cars import Course, Program, gentle_course, start_controller, start_plant
+from tests.network.hosts import CONTROLLER_IP, PLANT_IP, Network
+from tests.network.journey import STANDING_MPS, Journey
+from tests.network.observer import Remote, observing_from
+from tests.programs import PATIENCE_S, until
+
+pytestmark = pytest.mark.slow
+
+NAME = "orca"
+
+
+@dataclass
+class Rig:
+    """A car on its way over a link."""
+
+    net: Network
+    course: Course
+    plant: Program
+    controller: Program
+    observer: Remote
+    log: Path
+    _cleanup: ExitStack
+
+    def drive_laps(self, count: int) -> None:
+        """Waits until the car has done so many more."""
+        goal = self.observer.state().get("lap", 0) + count
+        until(lambda: self.observer.state().get("lap", 0) >= goal, f"lap {goal}")
+
+    def partition(self, seconds: float, direction: str = "") -> tuple[int, int, dict[str, Any]]:
+        """Cuts the link for a while: when it began and ended [ns], and the last state in it."""
+        self.net.link.cut(direction)
+        begin_ns = time.monotonic_ns()
+        time.sleep(seconds)
+        last = self.observer.state()
+        end_ns = time.monotonic_ns()
+        self.net.link.join(direction)
+        return begin_ns, end_ns, last
+
+    def finish(self) -> tuple[Journey, dict[str, int], dict[str, int]]:
+        """Ends everything in order: the log, and the counters of plant and controller."""
+        self.observer.stop()
+        until(lambda: self.observer.status("controller").get("phase") == "waiting", "a quiet end")
+        plant, controller = (
+            self.observer.status(source)["counters"] for source in ("plant", "controller")
+        )
+        self.controller.end()
+        self.plant.end()
+        self._cleanup.close()
+        return Journey(self.log, self.course.track), plant, controller
+
+
+Start = Callable[..., Rig]
+
+
+@pytest.fixture(scope="module")
+def course(tmp_path_factory: pytest.TempPathFactory) -> Course:
+    return gentle_course(tmp_path_factory.mktemp("course"))
+
+
+@pytest.fixture
+def start(net: Network, course: Course, tmp_path: Path) -> Iterator[Start]:
+    """Starts a plant, a controller and a run without end."""
+    with ExitStack() as cleanup:
+
+        def begin(protocol: str = "tcp") -> Rig:
+            plant_at, controller_at = (
+                f"{protocol}/{PLANT_IP}:7447",
+                f"{protocol}/{CONTROLLER_IP}:7448",
+            )
+            plant = start_plant(tmp_path, plant_at, host=net.plant)
+            cleanup.enter_context(plant)
+            controller = start_controller(
+                tmp_path, course, plant_at, controller_at, host=net.controller
+            )
+            cleanup.enter_context(controller)
+            log = tmp_path / "run.mcap"
+            following = ExitStack()
+            observer = following.enter_context(
+                observing_from(net.plant, (plant_at, controller_at), NAME, course.track_file, log)
+            )
+            cleanup.push(following)
+            observer.start(1)
+            return Rig(net, course, plant, controller, observer, log, following)
+
+        yield begin
+
+
+def assert_nothing_was_broken(plant: dict[str, int], controller: dict[str, int]) -> None:
+    """Late and lost is one thing; refused, raised or rejected would be another."""
+    for name in ("refused", "overflowed", "rejected"):
+        assert plant[name] == 0, (name, plant)
+    for name in ("refused", "raised", "states_stale"):
+        assert controller[name] == 0, (name, controller)
+
+
+def assert_all_is_accounted_for(plant: dict[str, int], controller: dict[str, int]) -> None:
+    """Sent is received or counted as lost, but for what is sent around the end of the run: the
+    plant no longer listens, and the controller falls silent a second later."""
+    missing = plant["states_sent"] - controller["states_received"] - controller["states_lost"]
+    assert 0 <= missing < 100, (plant, controller)
+    missing = (
+        controller["actuations_sent"] - plant["actuations_received"] - plant["actuations_lost"]
+    )
+    assert 0 <= missing < 100, (plant, controller)
+
+
+def test_a_car_stops_in_a_partition_and_goes_on(net: Network, start: Start) -> None:
+    """20 ms delay, 5 ms jitter, 5 % loss, from before the connection on; 2 s of nothing."""
+    net.link.set(delay=0.02, jitter=0.005, loss=0.05)
+    rig = start()
+    rig.drive_laps(1)
+    begin_ns, end_ns, last = rig.partition(2.0)
+    rig.drive_laps(1)
+    journey, plant, controller = rig.finish()
+
+    assert journey.off_track_m() < 0.0
+    cut = journey.between(begin_ns, end_ns)
+    assert cut[0].x[3] > 0.3
+    assert abs(last["x"][3]) < STANDING_MPS
+    assert abs(cut[-1].x[3]) < STANDING_MPS
+    # what was under way arrives, nothing else: the plant alone has stopped the car
+    assert plant["braked"] > 0
+    assert_nothing_was_broken(plant, controller)
+    assert_all_is_accounted_for(plant, controller)
+    counts = net.link.counts()
+    assert all(counts[way]["lost"] > 0 and counts[way]["cut"] > 0 for way in ("forth", "back"))
+
+
+def test_a_drive_from_the_command_line_outlasts_a_short_partition(
+    net: Network, course: Course, tmp_path: Path
+) -> None:
+    """As a person does it: plant, controller, drive. A second is less than Zenoh's lease, so the
+    connections stay; TCP has to get going again."""
+    net.link.set(delay=0.02, jitter=0.005, loss=0.05)
+    plant_at, controller_at = f"tcp/{PLANT_IP}:7447", f"tcp/{CONTROLLER_IP}:7448"
+    log = tmp_path / "run.mcap"
+    where = ("--track", course.track_file, "--endpoint", plant_at, "--endpoint", controller_at)
+    options = ("--mode", "realtime", "--laps", "2", "--max-time", "200", "--log", log)
+    with (
+        start_plant(tmp_path, plant_at, host=net.plant) as plant,
+        start_controller(
+            tmp_path, course, plant_at, controller_at, host=net.controller
+        ) as controller,
+        Program(tmp_path / "drive.txt", "drive", *where, *options, host=net.plant) as drive,
+    ):
+        until(lambda: log.exists() and _laps(log) >= 1, "a lap")
+        begin_ns = time.monotonic_ns()
+        net.link.cut()
+        time.sleep(1.0)
+        end_ns = time.monotonic_ns()
+        net.link.join()
+        assert drive.process.wait(PATIENCE_S) == 0, drive.said()
+        assert "2 lap(s) done" in drive.said()
+        controller.end()
+        plant.end()
+    journey = Journey(log, course.track)
+    assert journey.off_track_m() < 0.0
+    meanwhile = [state.x[3] for state in journey.between(begin_ns, end_ns)]
+    assert meanwhile[-1] < 0.2 * meanwhile[0]
+    assert journey.states[-1].lap == 2
+
+
+def _laps(log: Path) -> int:
+    return max((state.lap for state in LogReader(log).select(STATE)), default=0)
+
+
+@pytest.mark.parametrize("direction", ["forth", "back"])
+def test_a_link_that_fails_one_way(net: Network, start: Start, direction: str) -> None:
+    """forth: the controller is blind, brakes and falls silent. back: the car hears nothing."""
+    net.link.set(delay=0.01)
+    rig = start()
+    rig.drive_laps(1)
+    _, _, last = rig.partition(1.5, direction)
+    rig.drive_laps(1)
+    journey, plant, controller = rig.finish()
+    assert abs(last["x"][3]) < STANDING_MPS
+    assert journey.off_track_m() < 0.0
+    if direction == "forth":
+        assert controller["brake"] + controller["stop"] > 0
+    assert plant["braked"] > 0
+    assert_nothing_was_broken(plant, controller)
+
+
+def test_losses_by_udp_are_counted_and_hold_up_nobody(net: Network, start: Start) -> None:
+    rig = start("udp")
+    rig.drive_laps(0)
+    net.link.set(delay=0.02, jitter=0.005, loss=0.05)
+    rig.drive_laps(2)
+    net.link.set()
+    journey, plant, controller = rig.finish()
+    assert journey.off_track_m() < 0.0
+    assert controller["states_lost"] > 0
+    assert plant["actuations_lost"] > 0
+    assert_nothing_was_broken(plant, controller)
+    assert_all_is_accounted_for(plant, controller)

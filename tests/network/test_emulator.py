@@ -1,0 +1,197 @@
+"""The link emulator does to frames what it says, before anything is concluded from tests over it.
+
+Bounds are generous where they are about time: nothing arrives early, and the rest is statistics.
+"""
+
+import json
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.network.emulator import Emulator
+from tests.network.hosts import CONTROLLER_IP, PLANT_IP, Network, network, why_not_here
+from tests.programs import ROOT
+
+PORT = 5000
+
+
+def namespaces_of(pid: int) -> list[str]:
+    listed = subprocess.run(["ip", "netns", "list"], capture_output=True, text=True, check=True)
+    return [name for name in listed.stdout.split() if name.startswith(f"bayesrace-{pid}-")]
+
+
+class Pair:
+    """A datagram socket on either host."""
+
+    def __init__(self, net: Network) -> None:
+        self.plant, self.controller = (
+            host.socket(socket.SOCK_DGRAM) for host in (net.plant, net.controller)
+        )
+        self.plant.bind((PLANT_IP, PORT))
+        self.controller.bind((CONTROLLER_IP, PORT))
+
+    def __enter__(self) -> "Pair":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.plant.close()
+        self.controller.close()
+
+    def flood(self, count: int) -> tuple[list[int], list[float]]:
+        """Numbered datagrams to the controller: those that arrived, and how long each took [s]."""
+        sent_s: list[float] = []
+        numbers: list[int] = []
+        took_s: list[float] = []
+
+        def receive(timeout_s: float) -> bool:
+            if not select.select([self.controller], [], [], timeout_s)[0]:
+                return False
+            number = int(self.controller.recv(100))
+            numbers.append(number)
+            took_s.append(time.monotonic() - sent_s[number])
+            return True
+
+        for number in range(count):
+            sent_s.append(time.monotonic())
+            self.plant.sendto(b"%d" % number, (CONTROLLER_IP, PORT))
+            while receive(0.001):
+                pass
+        while receive(0.5):
+            pass
+        return numbers, took_s
+
+
+def test_a_perfect_link_loses_and_reorders_nothing(net: Network) -> None:
+    with Pair(net) as pair:
+        numbers, _ = pair.flood(200)
+    assert numbers == list(range(200))
+    assert net.link.counts()["forth"] == {"forwarded": 200, "lost": 0, "cut": 0, "overflowed": 0}
+
+
+def test_loss_is_as_likely_as_asked_for_and_counted(net: Network) -> None:
+    net.link.set(loss=0.2)
+    with Pair(net) as pair:
+        numbers, _ = pair.flood(1000)
+    counts = net.link.counts()["forth"]
+    assert counts["forwarded"] == len(numbers)
+    assert counts["lost"] == 1000 - len(numbers)
+    # six standard deviations of a thousand draws
+    assert 124 < counts["lost"] < 276
+
+
+@pytest.mark.parametrize("reorder", [False, True])
+def test_delay_and_jitter(net: Network, reorder: bool) -> None:
+    net.link.set(delay=0.02, jitter=0.005, reorder=reorder)
+    with Pair(net) as pair:
+        numbers, took_s = pair.flood(300)
+    assert sorted(numbers) == list(range(300))
+    assert (numbers == sorted(numbers)) is not reorder
+    assert min(took_s) >= 0.015
+    if reorder:  # uniform: some of three hundred in the lower half (certain to 1e-90)
+        assert min(took_s) < 0.02
+        assert sorted(took_s)[150] >= 0.018
+
+
+def test_delay_of_one_direction_is_not_that_of_the_other(net: Network) -> None:
+    net.link.set(delay=0.2, direction="back")
+    with Pair(net) as pair:
+        begin = time.monotonic()
+        pair.plant.sendto(b"to", (CONTROLLER_IP, PORT))
+        pair.controller.recv(100)
+        turn = time.monotonic()
+        pair.controller.sendto(b"fro", (PLANT_IP, PORT))
+        pair.plant.recv(100)
+        fro_s = time.monotonic() - turn
+    assert fro_s >= 0.2
+    assert turn - begin < fro_s
+
+
+def test_a_partition_lets_nothing_through_and_ends(net: Network) -> None:
+    with Pair(net) as pair:
+        net.link.cut("forth")
+        assert pair.flood(20)[0] == []
+        pair.controller.sendto(b"fro", (PLANT_IP, PORT))
+        assert pair.plant.recv(100) == b"fro"
+        assert net.link.counts()["forth"]["cut"] == 20
+        net.link.join()
+        assert pair.flood(20)[0] == list(range(20))
+
+
+def test_a_stream_gets_through_a_bad_link_whole(net: Network) -> None:
+    """TCP, so checksums and segment sizes are those of a real wire."""
+    sent = os.urandom(300_000)
+    net.link.set(delay=0.005, jitter=0.001, loss=0.05)
+    server = net.plant.socket(socket.SOCK_STREAM)
+    client = net.controller.socket(socket.SOCK_STREAM)
+    with server, client:
+        server.bind((PLANT_IP, PORT))
+        server.listen()
+        client.settimeout(60.0)
+        client.connect((PLANT_IP, PORT))
+        stream, _ = server.accept()
+        with stream:
+            stream.setblocking(False)
+            left, heard = memoryview(sent), bytearray()
+            while len(heard) < len(sent):
+                readable, writable, _ = select.select([client], [stream] if left else [], [], 60.0)
+                assert readable or writable, "the stream stands still"
+                if writable:
+                    left = left[stream.send(left) :]
+                if readable:
+                    heard += client.recv(1 << 16)
+    assert bytes(heard) == sent
+    assert net.link.counts()["forth"]["lost"] > 0
+
+
+@pytest.mark.slow
+def test_a_seed_repeats_the_same_losses(namespaces: None) -> None:
+    arrived = []
+    for seed in (1, 1, 2):
+        with network(seed) as net, Pair(net) as pair:
+            net.link.set(loss=0.3)
+            arrived.append(pair.flood(100)[0])
+    assert arrived[0] == arrived[1] != arrived[2]
+
+
+@pytest.mark.parametrize("line", ["", "set", "set delay", "set speed 1", "set delay x", "cut up"])
+def test_what_the_emulator_does_not_understand(line: str) -> None:
+    emulator = Emulator()
+    answer = json.loads(emulator.obey(line))
+    assert ("error" in answer) is (line != "set")
+    assert not any(one.is_cut for one in emulator.directions.values())
+
+
+def test_nothing_is_left_behind(namespaces: None) -> None:
+    with network():
+        assert len(namespaces_of(os.getpid())) == 3
+    assert namespaces_of(os.getpid()) == []
+
+
+def test_what_a_killed_process_left_is_removed_by_the_next(namespaces: None) -> None:
+    code = (
+        "import sys, time; from tests.network.hosts import network\n"
+        "with network():\n"
+        "    print('up', flush=True); time.sleep(600)"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, cwd=ROOT) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == b"up\n"
+        assert len(namespaces_of(child.pid)) == 3
+        child.send_signal(signal.SIGKILL)
+    with network():
+        assert namespaces_of(child.pid) == []
+
+
+def test_a_machine_without_namespaces_is_told_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    assert "root" in why_not_here() or "Linux" in why_not_here()
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    monkeypatch.setenv("PATH", str(Path(__file__).parent))
+    assert "iproute2" in why_not_here() or "Linux" in why_not_here()

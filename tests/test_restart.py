@@ -1,0 +1,288 @@
+"""Each part of a driving car dies and comes back, and so does the way between them.
+
+Promises guarded: a controller started again takes over the car that its forerunner left; a plant
+started again is found by the controller that waits for it, and what was meant for its forerunner
+does not act on it; a connection that breaks, or a router that dies, is made again. Meanwhile the
+car brakes, and stays on its track.
+"""
+
+import logging
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Literal
+
+import pytest
+
+from bayesrace.messages import ACTUATION, Actuation, State
+from bayesrace.transport import Endpoints, Publisher, free_endpoint, open_session
+from tests.network.cars import (
+    Course,
+    Program,
+    gentle_course,
+    start_controller,
+    start_plant,
+    start_router,
+)
+from tests.network.journey import Journey
+from tests.network.observer import Observer, observing
+from tests.network.proxy import Proxy
+from tests.programs import until
+
+pytestmark = pytest.mark.slow
+
+_log = logging.getLogger(__name__)
+
+
+@pytest.fixture(scope="module")
+def course(tmp_path_factory: pytest.TempPathFactory) -> Course:
+    return gentle_course(tmp_path_factory.mktemp("course"))
+
+
+@dataclass
+class Rig:
+    """How to start each part, and who watches."""
+
+    start_plant: Callable[[], Program]
+    start_controller: Callable[[], Program]
+    start_router: Callable[[], Program]
+    proxy: Proxy
+    observer: Observer
+    plant_at: str
+    log: Path
+    course: Course
+    _following: ExitStack
+
+    def state(self) -> State:
+        """The newest one."""
+        until(lambda: self.observer.newest() is not None, "a first state")
+        newest = self.observer.newest()
+        assert newest is not None
+        return newest
+
+    def drive_laps(self, count: int) -> None:
+        """Waits until the car has done so many more."""
+        goal = self.state().lap + count
+        until(lambda: self.state().lap >= goal, f"lap {goal}")
+
+    def journey(self) -> Journey:
+        """What has been recorded, after the end."""
+        self._following.close()
+        return Journey(self.log, self.course.track)
+
+
+@contextmanager
+def rigged(
+    tmp_path: Path, course: Course, way: Literal["direct", "proxy", "router"] = "direct"
+) -> Iterator[Rig]:
+    """``way``: between plant and controller; with a router it is all that anybody knows."""
+    plant_at, controller_at, router_at = free_endpoint(), free_endpoint(), free_endpoint()
+    log = tmp_path / "run.mcap"
+    with ExitStack() as programs, Proxy(plant_at) as proxy:
+
+        def a_plant() -> Program:
+            connect = [router_at] if way == "router" else []
+            return programs.enter_context(start_plant(tmp_path, plant_at, connect=connect))
+
+        def a_controller() -> Program:
+            connect = {"direct": plant_at, "proxy": proxy.endpoint, "router": router_at}[way]
+            program = start_controller(tmp_path, course, connect, controller_at)
+            return programs.enter_context(program)
+
+        def a_router() -> Program:
+            return programs.enter_context(start_router(tmp_path, router_at))
+
+        watched = [router_at] if way == "router" else [plant_at, controller_at]
+        following = programs.enter_context(ExitStack())
+        observer = following.enter_context(observing(watched, "orca", course.track, log))
+        yield Rig(
+            a_plant, a_controller, a_router, proxy, observer, plant_at, log, course, following
+        )
+
+
+@pytest.fixture
+def rig(tmp_path: Path, course: Course) -> Iterator[Rig]:
+    with rigged(tmp_path, course) as made:
+        yield made
+
+
+def test_a_controller_started_again_takes_over_the_car(tmp_path: Path) -> None:
+    """A larger and faster course, so that the car still rolls a second after it began to brake.
+
+    How long it really took is logged: ``pytest --log-cli-level=INFO``.
+    """
+    course = gentle_course(tmp_path, speed_mps=1.5, scale=3.0)
+    with rigged(tmp_path, course) as rig:
+        _take_over(rig)
+
+
+def _take_over(rig: Rig) -> None:
+    plant, controller = rig.start_plant(), rig.start_controller()
+    rig.observer.start(1)
+    rig.drive_laps(1)
+    controller.kill()
+    killed_ns, last = time.monotonic_ns(), rig.state()
+    successor = rig.start_controller()
+    until(lambda: rig.state().lap > last.lap, "a lap by the successor")
+    plant_counters, counters = (
+        rig.observer.status(source)["counters"] for source in ("plant", "controller")
+    )
+    rig.observer.stop()
+    successor.end()
+    plant.end()
+
+    journey = rig.journey()
+    assert journey.off_track_m() < 0.0
+    acted = next(state for state in journey.states if _answers_since(state, last.seq + 1))
+    waited_s = (acted.source_time_ns - killed_ns) * 1e-9
+    _log.info("taken over after %.2f s, at %.2f m/s", waited_s, acted.x[3])
+    speeds = [one.x[3] for one in journey.between(killed_ns, acted.source_time_ns)]
+    assert speeds[-1] < 0.8 * speeds[0]
+    assert waited_s < 5.0
+    assert plant_counters["braked"] > 0
+    assert plant_counters["refused"] == plant_counters["rejected"] == 0
+    # It takes the car as it finds it.
+    assert counters["raised"] == counters["states_stale"] == counters["refused"] == 0
+    assert counters["solution"] > 0.9 * counters["ticks"]
+
+
+def _answers_since(state: State, seq: int) -> bool:
+    """Whether the state tells that an answer to a state after ``seq`` has acted."""
+    rows = zip(state.answers[::3], state.answers[2::3], strict=True)
+    return any(answered > seq and acting_s >= 0 for answered, acting_s in rows)
+
+
+def test_a_plant_started_again_is_found(rig: Rig) -> None:
+    plant, controller = rig.start_plant(), rig.start_controller()
+    rig.observer.start(1)
+    rig.drive_laps(1)
+    before = rig.state()
+    plant.kill()
+    until(
+        lambda: rig.observer.status("controller").get("phase") == "waiting",
+        "a controller that waits",
+    )
+    plant = rig.start_plant()
+    until(
+        lambda: rig.observer.status("plant").get("epoch", before.epoch) != before.epoch,
+        "the new plant",
+    )
+    rig.observer.start(1)  # the same number: the epoch alone tells one from the other
+    until(lambda: rig.state().epoch != before.epoch, "a state of the new plant")
+    rig.drive_laps(1)
+    status = rig.observer.status("controller")
+    assert status["phase"] == "driving"
+    assert status["epoch"] == rig.state().epoch
+    assert status["counters"]["states_stale"] == 0
+    rig.observer.stop()
+    controller.end()
+    plant.end()
+
+    journey = rig.journey()
+    assert {state.run for state in journey.states} == {1}
+    for epoch in (before.epoch, status["epoch"]):
+        assert journey.off_track_m([s for s in journey.states if s.epoch == epoch]) < 0.0
+
+
+def test_an_actuation_for_another_plant_does_not_act(rig: Rig) -> None:
+    """A forgery with the right run, state and time acts; with another epoch it is stale."""
+    plant, controller = rig.start_plant(), rig.start_controller()
+    rig.observer.start(1)
+    rig.drive_laps(1)
+    marks_ns, stale = [], []
+    with open_session(Endpoints(connect=(rig.plant_at,)), "controller") as session:
+        publisher = Publisher(session, ACTUATION, "orca")
+        until(lambda: _stale_after(rig, publisher, 1, 1) > 0, "a plant that hears the forger")
+        for epoch_shift in (1, 0):
+            marks_ns.append(time.monotonic_ns())
+            stale.append(_stale_after(rig, publisher, epoch_shift, 100))
+    marks_ns.append(time.monotonic_ns())
+    rig.observer.stop()
+    controller.end()
+    plant.end()
+
+    journey = rig.journey()
+    surplus = []  # of answers that acted, over the controller's own: one to each state
+    for begin_ns, end_ns in pairwise(marks_ns):
+        states = journey.between(begin_ns, end_ns)
+        acted = [acting_s for state in states for acting_s in state.answers[2::3] if acting_s >= 0]
+        surplus.append(len(acted) - len(states))
+    assert stale[0] >= 100
+    assert surplus[1] > surplus[0] + 20
+
+
+def _stale_after(rig: Rig, publisher: Publisher[Actuation], epoch_shift: int, count: int) -> int:
+    """Sends forgeries that fit the newest state; by how much the plant's counter has risen."""
+    before = rig.observer.status("plant")["counters"]["stale"]
+    for _ in range(count):
+        state = rig.state()
+        now_ns = time.monotonic_ns()
+        # as new as can be without coming from the future
+        basis_s = state.time_s + (now_ns - state.source_time_ns) * 1e-9 - 1e-3
+        forgery = Actuation(
+            publisher.next_seq, now_ns, state.epoch + epoch_shift, state.run, state.seq, basis_s,
+            (0.3, 0.0), "forged", 0,
+        )  # fmt: skip
+        publisher.put(forgery, lockstep=False)
+        time.sleep(0.01)
+    time.sleep(0.1)
+    after = rig.observer.status("plant")["counters"]["stale"]
+    return int(after) - int(before)
+
+
+def _assert_went_on(
+    rig: Rig, broken_ns: int, joined_ns: int, programs: tuple[Program, ...]
+) -> None:
+    """After the break the car has slowed down, then driven another lap, all of it on the track."""
+    rig.drive_laps(1)
+    assert rig.observer.status("controller")["phase"] == "driving"
+    counters = rig.observer.status("plant")["counters"]
+    rig.observer.stop()
+    for program in programs:
+        program.end()
+    assert counters["braked"] > 0
+    assert counters["refused"] == counters["rejected"] == 0
+    journey = rig.journey()
+    meanwhile = journey.between(broken_ns, joined_ns)
+    assert meanwhile[-1].x[3] < 0.5 * meanwhile[0].x[3]
+    assert journey.off_track_m() < 0.0
+    after = journey.states[-1].source_time_ns
+    assert "driving" in journey.phases(joined_ns, after)
+
+
+def test_a_broken_connection_is_made_again(tmp_path: Path, course: Course) -> None:
+    with rigged(tmp_path, course, "proxy") as rig:
+        plant, controller = rig.start_plant(), rig.start_controller()
+        rig.observer.start(1)
+        rig.drive_laps(1)
+        rig.proxy.cut()
+        broken_ns = time.monotonic_ns()
+        time.sleep(1.0)
+        joined_ns = time.monotonic_ns()
+        rig.proxy.join()
+        _assert_went_on(rig, broken_ns, joined_ns, (controller, plant))
+
+
+def test_a_router_started_again_is_found_by_both(tmp_path: Path, course: Course) -> None:
+    with rigged(tmp_path, course, "router") as rig:
+        router, plant, controller = rig.start_router(), rig.start_plant(), rig.start_controller()
+        rig.observer.start(1)
+        rig.drive_laps(1)
+        router.kill()
+        broken_ns = time.monotonic_ns()
+        time.sleep(1.0)
+        router = rig.start_router()
+        seen = rig.state().seq
+        until(lambda: rig.state().seq > seen, "a state through the new router")
+        rig.drive_laps(1)
+        assert rig.observer.status("controller")["phase"] == "driving"
+        rig.observer.stop()
+        for program in (controller, plant, router):
+            program.end()
+        journey = rig.journey()
+        assert journey.off_track_m() < 0.0
+        after = [state for state in journey.states if state.source_time_ns > broken_ns]
+        assert {state.epoch for state in after} == {journey.states[0].epoch}
