@@ -114,7 +114,7 @@ def test_a_controller_started_again_takes_over_the_car(tmp_path: Path) -> None:
 
     How long it really took is logged: ``pytest --log-cli-level=INFO``.
     """
-    course = gentle_course(tmp_path, speed_mps=1.5, scale=3.0)
+    course = gentle_course(tmp_path, speed_mps=2.0, scale=3.0)
     with rigged(tmp_path, course) as rig:
         _take_over(rig)
 

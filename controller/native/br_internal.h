@@ -12,6 +12,8 @@
 #define BR_ROWS (BR_M + 2 * BR_N)                /* input bounds, steering angle, half-planes */
 #define BR_COLS ((((BR_ROWS + 1) + 7) / 8) * 8)  /* right-hand sides of one substitution */
 #define BR_HORIZON_S (BR_N * BR_TS)
+#define BR_SLOW_MPS 0.2       /* below this speed, and pointing farther away from the reference than */
+#define BR_MISALIGNED_RAD 0.5 /* this, the first guess steers towards it */
 #define BR_LINE_SEARCH_TRIALS 5
 #define BR_GP_PADDED (((BR_GP_CAPACITY + 7) / 8) * 8)
 

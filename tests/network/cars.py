@@ -1,5 +1,6 @@
 """What the tests of several processes drive on, and the programs as a person would start them."""
 
+import functools
 import os
 import signal
 import subprocess
@@ -10,11 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from bayesrace.gp.weights import GpWeights, write_weights
 from bayesrace.raceline.line import RaceLine, write_raceline
 from bayesrace.tracks import Track, write_track
+from bayesrace.vehicles import get_car
 from codegen.build import build
 from codegen.settings import BuildSettings
-from tests.conftest import offset_line
+from tests.conftest import fit_weights, offset_line
 from tests.network.hosts import Host
 from tests.programs import COMMAND, PATIENCE_S, ROOT, environment
 
@@ -35,6 +38,7 @@ class Course:
     line: RaceLine
     track_file: Path
     line_file: Path
+    weights_file: Path
     artefact: Path
 
     @property
@@ -42,6 +46,7 @@ class Course:
         """What a controller is to drive."""
         return (
             "--artefact", self.artefact, "--track", self.track_file, "--raceline", self.line_file,
+            "--weights", self.weights_file,
         )  # fmt: skip
 
 
@@ -56,10 +61,17 @@ def gentle_course(
     oval = scale * np.column_stack([np.cos(angle), 0.75 * np.sin(angle)])
     track = Track.from_points("oval", oval + np.array(centre_m), 0.2 * scale, 0.2 * scale)
     line = offset_line(track, offset_m=0.02, lateral_mps2=3.0, v_max=speed_mps)
-    track_file, line_file = folder / "track.csv", folder / "line.csv"
-    write_track(track_file, track)
-    write_raceline(line_file, line)
-    return Course(track, line, track_file, line_file, build(BuildSettings())[0])
+    files = folder / "track.csv", folder / "line.csv", folder / "weights.bin"
+    write_track(files[0], track)
+    write_raceline(files[1], line)
+    write_weights(files[2], _weights())
+    return Course(track, line, *files, build(BuildSettings())[0])
+
+
+@functools.cache
+def _weights() -> GpWeights:
+    """Without, the car would snake from 1.4 m/s on."""
+    return fit_weights(get_car("orca"), ("rbf", "matern25", "matern15"))
 
 
 class Program:
