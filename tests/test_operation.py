@@ -4,6 +4,7 @@ import json
 import os
 import signal
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -44,7 +45,7 @@ from experiments.operation import ask_statuses, command, find, pick
 from experiments.picture import Picture, Process
 from experiments.status_table import COUNTERS_SHOWN, StatusTable
 from tests.conftest import Circuit
-from tests.programs import environment, finish, run, start, until
+from tests.programs import ROOT, environment, finish, run, start, until
 
 PATIENCE_S = 5.0
 COUNTERS = {"deadline_misses": 3, "shifted_plan": 4, "brake": 5, "stop": 6, "refused": 7,
@@ -281,8 +282,8 @@ def test_watching_on_a_terminal_redraws_and_sees_coming_and_going(fakes: Fakes) 
     controlling, terminal = os.openpty()
     env = {**environment(), "TERM": "xterm", "COLUMNS": "150", "LINES": "40"}
     process = subprocess.Popen(
-        ["python", "-m", "experiments.cli", "status", "--watch", *options(one)],
-        stdin=terminal, stdout=terminal, stderr=terminal, env=env,
+        [sys.executable, "-m", "experiments.cli", "status", "--watch", *options(one)],
+        stdin=terminal, stdout=terminal, stderr=terminal, env=env, cwd=ROOT,
     )  # fmt: skip
     os.close(terminal)
     seen = bytearray()

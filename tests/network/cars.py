@@ -59,7 +59,7 @@ def gentle_course(
     """A wide oval of 5.5 m at a speed at which the network, not the tyres, is what is tested."""
     angle = np.linspace(0, 2 * np.pi, 160, endpoint=False)
     oval = scale * np.column_stack([np.cos(angle), 0.75 * np.sin(angle)])
-    track = Track.from_points("oval", oval + np.array(centre_m), 0.2 * scale, 0.2 * scale)
+    track = Track.from_points("oval", oval + np.array(centre_m), 0.35 * scale, 0.35 * scale)
     line = offset_line(track, offset_m=0.02, lateral_mps2=3.0, v_max=speed_mps)
     files = folder / "track.csv", folder / "line.csv", folder / "weights.bin"
     write_track(files[0], track)
