@@ -132,7 +132,7 @@ def _ask_all(
             target=zenoh.QueryTarget.ALL,
             # Two processes under one name would otherwise be one answer.
             consolidation=zenoh.ConsolidationMode.NONE,
-            congestion_control=zenoh.CongestionControl.DROP,
+            congestion_control=zenoh.CongestionControl.BLOCK,
         )
         for key in keys
     }
