@@ -47,7 +47,7 @@ def ask(
         payload=payload,
         timeout=service.timeout_s,
         target=zenoh.QueryTarget.ALL,
-        # Dropped, a question is never answered: on a loaded machine that ended one race in ten.
+        # Dropped, a question is never answered: on a loaded machine that ended a race.
         congestion_control=zenoh.CongestionControl.BLOCK,
     )
     for reply in replies:
