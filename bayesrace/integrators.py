@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["PERFECT", "PREDICTION", "SCHEMES", "Discretisation"]
 
 Rate = Callable[[Any], Any]
+Ode = Callable[[Any, Any], Any]
 
 
 def _euler(f: Rate, x: Any, h: float) -> Any:
@@ -68,11 +69,13 @@ def _pose_from_velocities(x: Any, velocities: Any, h: float) -> Any:
     return ca.vertcat(x[:2] + change, psi_end)
 
 
-def _symbols(model: "Model") -> tuple[Any, Any, Any]:
+def _symbols(model: "Model") -> tuple[Any, Any, Any, Any]:
+    """x, u, e and h: scalar expressions, or matrices for an ode that is a black box (an FMU)."""
     import casadi as ca
 
+    kind = ca.SX if model.ode.is_a("SXFunction") else ca.MX
     n, m = len(model.states), len(model.inputs)
-    return ca.SX.sym("x", n), ca.SX.sym("u", m), ca.SX.sym("e", 3)
+    return kind.sym("x", n), kind.sym("u", m), kind.sym("e", 3), kind.sym("h")
 
 
 class Discretisation(BaseModel):
@@ -95,12 +98,11 @@ class Discretisation(BaseModel):
     )
 
     def discretise(self, model: "Model") -> "ca.Function":
-        """F: (x, u) -> x_next for the given model, as a CasADi SX function."""
+        """F: (x, u) -> x_next for the given model, as a CasADi function (SX if its ode is)."""
         import casadi as ca
 
         corrected = self.corrected(model)
-        x = ca.SX.sym("x", len(model.states))
-        u = ca.SX.sym("u", len(model.inputs))
+        x, u, _, _ = _symbols(model)
         x_next = corrected(x, u, 0)
         return ca.Function(f"F_{model.name}", [x, u], [x_next], ["x", "u"], ["x_next"])
 
@@ -112,9 +114,24 @@ class Discretisation(BaseModel):
         """
         import casadi as ca
 
-        x, u, e = _symbols(model)
-        x_next = self._advanced(model, x, u, e, self.step_s)
+        x, u, e, _ = _symbols(model)
+        x_next = self._advanced(model.ode, x, u, e, self.step_s)
         return ca.Function(f"F_{model.name}", [x, u, e], [x_next], ["x", "u", "e"], ["x_next"])
+
+    def for_any_car(self, model: "Model") -> "ca.Function":
+        """(x, u, p) -> x_next of ``model.any_car``, p its car's parameters.
+
+        Numbers that are no constants cannot be folded: the same operations in the same order as
+        the C code of the car's FMU, and so the same bits. :meth:`discretise` differs by rounding.
+        """
+        import casadi as ca
+
+        ode = model.any_car
+        if ode is None:
+            raise ValueError(f"model '{model.name}' is written for one car only")
+        x, u, p = (ca.SX.sym(name, ode.size1_in(i)) for i, name in enumerate("xup"))
+        x_next = self._advanced(lambda s, v: ode(s, v, p), x, u, 0, self.step_s)
+        return ca.Function(f"F_{model.name}", [x, u, p], [x_next], ["x", "u", "p"], ["x_next"])
 
     def over(self, model: "Model") -> "ca.Function":
         """(x, u, e, h) -> x_next: :meth:`corrected` with the step h [s] instead of ``step_s``.
@@ -124,18 +141,17 @@ class Discretisation(BaseModel):
         """
         import casadi as ca
 
-        x, u, e = _symbols(model)
-        h = ca.SX.sym("h")
-        x_next = self._advanced(model, x, u, e, h)
+        x, u, e, h = _symbols(model)
+        x_next = self._advanced(model.ode, x, u, e, h)
         names = ["x", "u", "e", "h"]
         return ca.Function(f"F_{model.name}_over", [x, u, e, h], [x_next], names, ["x_next"])
 
-    def _advanced(self, model: "Model", x: Any, u: Any, e: Any, step_s: Any) -> Any:
+    def _advanced(self, ode: Ode, x: Any, u: Any, e: Any, step_s: Any) -> Any:
         _, step = SCHEMES[self.scheme]
         x_next = x
         for _ in range(self.substeps):
-            x_next = step(lambda s: model.ode(s, u), x_next, step_s / self.substeps)
-        if len(model.states) == 7:
+            x_next = step(lambda s: ode(s, u), x_next, step_s / self.substeps)
+        if x.size1() == 7:  # a model with velocities
             x_next[3:6] += e
             if self.pose == "interpolated":
                 x_next[:3] = _pose_from_velocities(x, x_next[3:6], step_s)

@@ -12,7 +12,7 @@ from enum import IntEnum
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parameters import BRAKE_FADE_MPS, CarParameters
 from controller.interface import NO_PLAN, Array, StepOutput
 
 __all__ = ["Fallback", "FallbackSettings", "Level"]
@@ -45,7 +45,9 @@ class FallbackSettings(BaseModel):
         default=1e-3, ge=0, le=0.1, description="excess over a limit that is clipped, not refused"
     )
     brake_fade_mps: float = Field(
-        default=0.1, gt=0, description="speed below which braking fades to none at standstill"
+        default=BRAKE_FADE_MPS,
+        gt=0,
+        description="speed below which braking fades to none at standstill",
     )
 
 

@@ -20,12 +20,15 @@ from bayesrace.vehicles.parameters import CarParameters, Pacejka
 
 __all__ = [
     "BLEND_SPEED_MPS",
+    "DYNAMIC_PARAMETERS",
     "INPUTS",
     "MODELS",
     "ROLL_SPEED_MPS",
     "STATES",
     "Model",
+    "car_value",
     "dynamic",
+    "dynamic_with_parameters",
     "e_kinematic",
     "kinematic",
     "longitudinal_force",
@@ -34,6 +37,13 @@ __all__ = [
 
 STATES: Final = ("x", "y", "psi", "vx", "vy", "omega", "delta")
 INPUTS: Final = ("d", "delta_rate")
+
+DYNAMIC_PARAMETERS: Final = (
+    *("lf_m", "lr_m", "mass_kg", "inertia_kgm2"),
+    *("front_b", "front_c", "front_d", "rear_b", "rear_c", "rear_d"),
+    *("cm1", "cm2", "cr0", "cr2"),
+)
+"""What the dynamic model depends on; ``front_b`` is ``car.front.b``."""
 
 BLEND_SPEED_MPS: Final = 0.1
 """Slip angles are those of the paper above this speed and fade with the speed below it."""
@@ -51,6 +61,10 @@ class Model:
     ode: ca.Function
     states: tuple[str, ...] = STATES
     inputs: tuple[str, ...] = INPUTS
+    any_car: ca.Function | None = None
+    """The same equations for any car, (x, u, p) -> xdot, where there are such."""
+    parameters: tuple[float, ...] = ()
+    """This car's p."""
 
 
 def _smooth_abs(v: Any, corner: float) -> Any:
@@ -116,19 +130,50 @@ def _function(name: str, x: Any, u: Any, xdot: list[Any]) -> ca.Function:
 def dynamic(car: CarParameters) -> Model:
     """Dynamic bicycle model with Pacejka tyres and DC motor (paper table 1, middle column)."""
     x, u = ca.SX.sym("x", 7), ca.SX.sym("u", 2)
+    ode = _function("dynamic", x, u, _dynamic_rates(car, x, u))
+    parameters = tuple(car_value(car, name) for name in DYNAMIC_PARAMETERS)
+    return Model("dynamic", car, ode, any_car=dynamic_with_parameters(), parameters=parameters)
+
+
+def car_value(car: CarParameters, name: str) -> float:
+    """A number of a car by its flat name, as in :data:`DYNAMIC_PARAMETERS`."""
+    axle, _, coefficient = name.partition("_")
+    if axle in ("front", "rear"):
+        return float(getattr(getattr(car, axle), coefficient))
+    return float(getattr(car, name))
+
+
+def dynamic_with_parameters() -> ca.Function:
+    """The dynamic model for any car: (x, u, p) -> xdot with p as :data:`DYNAMIC_PARAMETERS`.
+
+    With the numbers of a car it is :func:`dynamic` but for the rounding of folded constants.
+    """
+    x, u = ca.SX.sym("x", 7), ca.SX.sym("u", 2)
+    p = ca.SX.sym("p", len(DYNAMIC_PARAMETERS))
+    symbol: dict[str, Any] = dict(zip(DYNAMIC_PARAMETERS, ca.vertsplit(p), strict=True))
+    tyres: dict[str, Any] = {
+        axle: Pacejka.model_construct(**{c: symbol.pop(f"{axle}_{c}") for c in ("b", "c", "d")})
+        for axle in ("front", "rear")
+    }
+    car = CarParameters.model_construct(name="any", **tyres, **symbol)
+    xdot = ca.vertcat(*_dynamic_rates(car, x, u))
+    return ca.Function("dynamic", [x, u, p], [xdot], ["x", "u", "p"], ["xdot"])
+
+
+def _dynamic_rates(car: CarParameters, x: Any, u: Any) -> list[Any]:
+    """The equations; the car's values may be numbers or symbols."""
     vx, vy, omega, delta = x[3], x[4], x[5], x[6]
     alpha_f, alpha_r = _slip_angles(car, x)
     f_front, f_rear = _lateral_force(car.front, alpha_f), _lateral_force(car.rear, alpha_r)
     f_drive = longitudinal_force(car, vx, u[0])
     m = car.mass_kg
-    xdot = [
+    return [
         *_pose_rates(x),
         (f_drive - f_front * ca.sin(delta) + m * vy * omega) / m,
         (f_rear + f_front * ca.cos(delta) - m * vx * omega) / m,
         (f_front * car.lf_m * ca.cos(delta) - f_rear * car.lr_m) / car.inertia_kgm2,
         u[1],
     ]
-    return Model("dynamic", car, _function("dynamic", x, u, xdot))
 
 
 def e_kinematic(car: CarParameters) -> Model:

@@ -12,9 +12,13 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.errors import InputError
 
-__all__ = ["CARS", "CarParameters", "Pacejka", "get_car"]
+__all__ = ["BRAKE_FADE_MPS", "CARS", "CarParameters", "Pacejka", "get_car"]
 
 GRAVITY_MPS2: Final = 9.81
+
+BRAKE_FADE_MPS: Final = 0.1
+"""Below this speed braking fades linearly to none, so that a car stops and stays: brakes do not
+drive a car back. The native controller's BR_BRAKE_FADE_MPS is the same number."""
 
 
 class _Frozen(BaseModel):
@@ -35,7 +39,7 @@ class CarParameters(_Frozen):
     name: str
     lf_m: float = Field(gt=0, description="centre of gravity to front axle")
     lr_m: float = Field(gt=0, description="centre of gravity to rear axle")
-    mass_kg: float = Field(gt=0)
+    mass_kg: float = Field(gt=0, description="mass")
     inertia_kgm2: float = Field(gt=0, description="yaw moment of inertia Iz")
     front: Pacejka
     rear: Pacejka
