@@ -6,7 +6,7 @@ the car brakes.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Final
 
@@ -16,14 +16,15 @@ import numpy.typing as npt
 from bayesrace.errors import InputError
 from bayesrace.integrators import Discretisation
 from bayesrace.vehicles.models import Model
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parameters import BRAKE_FADE_MPS, CarParameters
 
 __all__ = [
-    "BRAKE_FADE_MPS",
     "PLANT",
     "GuardCounters",
     "PlantGuard",
     "Simulator",
+    "checked_start",
+    "hold_in_turn",
     "plant_discretisation",
 ]
 
@@ -48,9 +49,6 @@ def plant_discretisation(rate_hz: float = 50.0) -> Discretisation:
 
 
 PLANT: Final = plant_discretisation()
-
-BRAKE_FADE_MPS: Final = 0.1
-"""Below this speed the guard's braking fades linearly to none, so that a car stops and stays."""
 
 _CLIP_TOLERANCE: Final = 1e-9
 """Excess that is rounding of the sender's arithmetic: corrected, not counted as clipped."""
@@ -112,19 +110,55 @@ class PlantGuard:
         return min(max(delta_rad + duration_s * rate, -self._delta_max), self._delta_max)
 
 
+def checked_start(x0: Sequence[float], car: CarParameters) -> Array:
+    """The start state (7,) of a run; InputError if ``car`` cannot be in it."""
+    start = np.asarray(x0, dtype=np.float64)
+    if start.shape != (7,) or not np.isfinite(start).all():
+        raise InputError(f"start state needs 7 finite numbers, got {x0!r}")
+    if abs(start[6]) > car.delta_max_rad:
+        raise InputError(
+            f"start state has a steering angle of {start[6]:.3f} rad; "
+            f"{car.name} steers within ±{car.delta_max_rad} rad"
+        )
+    return start
+
+
+def hold_in_turn(
+    commands: Sequence[tuple[int, Sequence[float] | None]],
+    substeps: int,
+    hold: Callable[[Sequence[float] | None, int], tuple[float, float]],
+) -> tuple[float, float]:
+    """One period of (substeps, command) in order of time; the mean of what acted.
+
+    ``hold`` applies one command for a number of substeps and says what acted.
+    """
+    if sum(count for count, _ in commands) != substeps:
+        raise ValueError(f"the commands must last {substeps} substeps together")
+    d_sum = rate_sum = 0.0
+    for count, u in commands:
+        if count == 0:
+            continue
+        d, rate = hold(u, count)
+        d_sum += count * d
+        rate_sum += count * rate
+    return d_sum / substeps, rate_sum / substeps
+
+
 class _Map:
-    """A CasADi map x_next = F(x, u) called in place on preallocated buffers.
+    """A CasADi map x_next = F(x, u, p) called in place on preallocated buffers.
 
     An ordinary call converts to and from DM, which costs more than the integration itself.
     """
 
-    def __init__(self, function: Any, x: Array, u: Array) -> None:
+    def __init__(self, function: Any, x: Array, u: Array, p: Array) -> None:
         self._x = x
+        self._p = p  # nor does it keep its arguments
         self._x_next: Array = np.zeros_like(x)
         self._function = function  # the buffer does not keep it alive
         self._buffer, self._evaluate = function.buffer()
         self._buffer.set_arg(0, x.data)
         self._buffer.set_arg(1, u.data)
+        self._buffer.set_arg(2, p.data)
         self._buffer.set_res(0, self._x_next.data)
 
     def advance(self) -> None:
@@ -151,8 +185,11 @@ class Simulator:
         substep = Discretisation(
             scheme=discretisation.scheme, step_s=self.step_s / self.substeps, substeps=1
         )
-        self._period = _Map(discretisation.discretise(model), self.x, self._u)
-        self._substep = _Map(substep.discretise(model), self.x, self._u)
+        parameters = np.array(model.parameters, dtype=np.float64)
+        self._period, self._substep = (
+            _Map(steps.for_any_car(model), self.x, self._u, parameters)
+            for steps in (discretisation, substep)
+        )
 
     @property
     def time_s(self) -> float:
@@ -161,15 +198,7 @@ class Simulator:
 
     def reset(self, x0: Sequence[float]) -> None:
         """Put the car into state ``x0`` at time zero; InputError if it cannot be in it."""
-        start = np.asarray(x0, dtype=np.float64)
-        if start.shape != self.x.shape or not np.isfinite(start).all():
-            raise InputError(f"start state needs {self.x.size} finite numbers, got {x0!r}")
-        if abs(start[6]) > self.car.delta_max_rad:
-            raise InputError(
-                f"start state has a steering angle of {start[6]:.3f} rad; "
-                f"{self.car.name} steers within ±{self.car.delta_max_rad} rad"
-            )
-        self.x[:] = start
+        self.x[:] = checked_start(x0, self.car)
         self.u_applied = (0.0, 0.0)
         self.steps = 0
 
@@ -183,20 +212,14 @@ class Simulator:
 
         The substeps must add up to :attr:`substeps`.
         """
-        if sum(count for count, _ in commands) != self.substeps:
-            raise ValueError(f"the commands must last {self.substeps} substeps together")
-        if len(commands) == 1:
+        if len(commands) == 1 and commands[0][0] == self.substeps:
             self.step(commands[0][1])
             return
-        d_sum = rate_sum = 0.0
-        for count, u in commands:
-            if count == 0:
-                continue
-            d, rate = self._hold(u, self._substep, count, self.step_s * count / self.substeps)
-            d_sum += count * d
-            rate_sum += count * rate
-        self.u_applied = (d_sum / self.substeps, rate_sum / self.substeps)
+        self.u_applied = hold_in_turn(commands, self.substeps, self._hold_part)
         self.steps += 1
+
+    def _hold_part(self, u: Sequence[float] | None, count: int) -> tuple[float, float]:
+        return self._hold(u, self._substep, count, self.step_s * count / self.substeps)
 
     def _hold(
         self, u: Sequence[float] | None, advance: _Map, times: int, duration_s: float

@@ -1,0 +1,90 @@
+"""The car's FMUs for tests: each made once, and driven beside the built-in plant."""
+
+import atexit
+import shutil
+import tempfile
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from fmpy import extract
+from numpy.typing import NDArray
+
+from bayesrace.vehicles import get_car
+from bayesrace.vehicles.models import STATES, dynamic
+from bayesrace.vehicles.parameters import CarParameters
+from codegen.fmu import pack
+from plant.fmu.export import car_fmu
+from plant.simulator import Simulator, plant_discretisation
+from tests.fmu_master import Slave
+
+__all__ = ["Commands", "built_in", "commands", "driven", "exported", "extracted", "slave"]
+
+Floats = NDArray[np.float64]
+Commands = Sequence[tuple[float, float]]
+Version = Literal[2, 3]
+Kind = Literal["cs", "me"]
+
+
+@cache
+def _folder() -> Path:
+    folder = tempfile.mkdtemp(prefix="fmu-tests-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return Path(folder)
+
+
+@cache
+def exported(version: Version = 3, kind: Kind = "cs") -> Path:
+    """The car's FMU for this platform."""
+    return pack(car_fmu(get_car("orca"), version, kind), _folder() / f"car-{version}-{kind}.fmu")
+
+
+@cache
+def extracted(version: Version = 3, kind: Kind = "cs") -> Path:
+    """The folder of the car's FMU."""
+    folder = _folder() / f"car-{version}-{kind}"
+    extract(str(exported(version, kind)), unzipdir=str(folder))
+    return folder
+
+
+def slave(version: Version = 3) -> Slave:
+    """A new instance of the Co-Simulation FMU."""
+    return Slave(exported(version), extracted(version))
+
+
+def commands(count: int, seed: int = 0, bad: bool = True) -> list[tuple[float, float]]:
+    """Drives with turns and stops, beyond all limits; ``bad``: also some that are not finite."""
+    random = np.random.default_rng(seed)
+    rows: list[tuple[float, float]] = []
+    while len(rows) < count:
+        d, rate = random.uniform(-0.4, 1.3), random.uniform(-9, 9)
+        row = [(d, rate), (d, -rate), (0.4, rate / 9), (-1.0, 0.0)][random.integers(4)]
+        rows += [row] * int(random.integers(1, 40))
+        if bad and random.random() < 0.3:
+            rows.append([(np.nan, 1.0), (0.5, np.inf), (-np.inf, np.nan)][random.integers(3)])
+    return rows[:count]
+
+
+def driven(car: Slave, inputs: Commands, h: float = 0.02) -> Floats:
+    """State and applied input after each step of an initialised instance, (n, 9)."""
+    rows = np.zeros((len(inputs), 9))
+    for row, (d, rate) in zip(rows, inputs, strict=True):
+        car.set({"d": d, "delta_rate": rate})
+        car.step(h)
+        row[:] = car.get(*STATES, "d_applied", "delta_rate_applied")
+    return rows
+
+
+def built_in(
+    car: CarParameters, inputs: Commands, h: float = 0.02, x0: Sequence[float] = (0.0,) * 7
+) -> Floats:
+    """The same from the built-in plant."""
+    simulator = Simulator(dynamic(car), plant_discretisation(1 / h))
+    simulator.reset(x0)
+    rows = np.zeros((len(inputs), 9))
+    for row, u in zip(rows, inputs, strict=True):
+        simulator.step(u)
+        row[:] = [*simulator.x, *simulator.u_applied]
+    return rows

@@ -1,0 +1,296 @@
+"""The car as a Co-Simulation FMU is the built-in plant: trajectory, guard, parameters."""
+
+import re
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import fmpy
+import numpy as np
+import pytest
+from fmpy.fmi1 import FMICallException
+from fmpy.validation import validate_fmu
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bayesrace.errors import InputError
+from bayesrace.vehicles import CarParameters, get_car
+from bayesrace.vehicles.models import STATES, dynamic
+from bayesrace.vehicles.parameters import BRAKE_FADE_MPS
+from codegen.fmu import FmuDefinition, Variable, pack
+from plant.fmu.export import car_fmu, car_values
+from plant.simulator import PlantGuard
+from tests.fmu_exports import (
+    Kind,
+    Version,
+    built_in,
+    commands,
+    driven,
+    exported,
+    extracted,
+    slave,
+)
+
+etree: Any = pytest.importorskip("lxml.etree")
+
+ALL = [(2, "cs"), (3, "cs"), (3, "me")]
+START = {"x": 1.0, "y": -2.0, "psi": 0.5, "vx": 1.2, "vy": 0.1, "omega": -0.4, "delta": 0.1}
+
+
+def with_values(car: CarParameters, values: dict[str, float]) -> CarParameters:
+    """The car with these FMU parameters."""
+    data = car.model_dump()
+    for name, value in values.items():
+        axle, _, coefficient = name.partition("_")
+        if axle in ("front", "rear"):
+            data[axle][coefficient] = value
+        else:
+            data[name] = value
+    return CarParameters.model_validate(data)
+
+
+@pytest.mark.parametrize(("version", "kind"), ALL)
+def test_fmpy_validates_without_a_finding(version: Version, kind: Kind) -> None:
+    assert validate_fmu(str(exported(version, kind))) == []
+
+
+def test_the_other_xml_files_of_fmi_3_fit_their_schemas() -> None:
+    schemas = Path(fmpy.__file__).parent / "schema" / "fmi3"
+    for schema, name in (
+        ("fmi3BuildDescription.xsd", "sources/buildDescription.xml"),
+        ("fmi3TerminalsAndIcons.xsd", "terminalsAndIcons/terminalsAndIcons.xml"),
+    ):
+        document = etree.parse(str(extracted(3) / name))
+        etree.XMLSchema(file=str(schemas / schema)).assertValid(document)
+
+
+@pytest.mark.parametrize(("version", "kind"), ALL)
+def test_the_archive_has_what_people_look_for(version: Version, kind: Kind) -> None:
+    with zipfile.ZipFile(exported(version, kind)) as archive:
+        names = set(archive.namelist())
+        page = archive.read("documentation/index.html").decode()
+        description = etree.fromstring(archive.read("modelDescription.xml"))
+        icon = "model.png" if version == 2 else "terminalsAndIcons/icon.png"
+        assert archive.read(icon).startswith(b"\x89PNG")
+    assert {"sources/car.c", "sources/car_model.c", "sources/README.txt"} <= names
+    assert "cc -std=gnu11" in page
+    assert "mass_kg" in page
+    experiment = description.find("DefaultExperiment")
+    assert experiment is not None
+    assert float(experiment.attrib["stepSize"]) == 0.02
+    variables = description.find("ModelVariables")
+    assert variables is not None
+    for variable in variables:
+        typed = variable[0] if version == 2 else variable
+        assert typed.attrib["unit"], variable.attrib["name"]
+        assert variable.attrib["name"] == "time" or variable.attrib["description"]
+
+
+def test_the_same_export_is_the_same_file(tmp_path: Path, car: CarParameters) -> None:
+    again = pack(car_fmu(car, 3, "cs"), tmp_path / "again.fmu")
+    assert again.read_bytes() == exported(3).read_bytes()
+
+
+def test_another_car_has_another_token(car: CarParameters) -> None:
+    tokens = set()
+    for fmu in (exported(2), exported(3), exported(3, "me")):
+        text = zipfile.ZipFile(fmu).read("modelDescription.xml").decode()
+        tokens |= set(re.findall(r'(?:guid|instantiationToken)="([^"]+)"', text))
+    assert len(tokens) == 3
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_both_versions_drive_like_the_built_in_plant(car: CarParameters, seed: int) -> None:
+    """Design: same trajectory as the built-in plant to 1e-9; FMI 2.0 and 3.0 to the last bit."""
+    inputs = commands(600, seed)
+    expected = built_in(car, inputs)
+    rows = []
+    for version in (2, 3):
+        one = slave(version)
+        one.initialise()
+        rows.append(driven(one, inputs))
+        one.close()
+    np.testing.assert_array_equal(rows[0], rows[1])
+    np.testing.assert_allclose(rows[0], expected, rtol=0, atol=1e-9)
+    assert np.abs(expected[:, 3]).max() > 1
+    assert (expected[:, 3] < 1e-3).any()  # it also stood
+
+
+@pytest.mark.parametrize("h", [0.002, 0.005, 0.01, 0.1, 0.5])
+def test_any_communication_step_is_a_period_of_that_length(car: CarParameters, h: float) -> None:
+    inputs = commands(100, 7)
+    one = slave()
+    one.initialise(START)
+    rows = driven(one, inputs, h)
+    one.close()
+    expected = built_in(car, inputs, h, [START[name] for name in STATES])
+    np.testing.assert_allclose(rows, expected, rtol=0, atol=1e-9)
+
+
+def test_an_odd_communication_step_is_divided_into_parts_of_at_most_a_millisecond() -> None:
+    one, other = slave(), slave()
+    for car in (one, other):
+        car.initialise(START)
+        car.set({"d": 0.5, "delta_rate": -1.0})
+    one.step(0.0123)  # 13 parts
+    other.step(0.0123 - 0.005)
+    other.step(0.005)
+    np.testing.assert_allclose(one.get(*STATES), other.get(*STATES), rtol=0, atol=1e-6)
+    assert one.get("time") == [pytest.approx(0.0123)]
+
+
+def test_a_standing_car_stays_when_its_command_is_lost() -> None:
+    one = slave()
+    one.initialise({"vx": 0.3, "psi": 0.7})
+    rows = driven(one, [(np.nan, 0.0)] * 400)
+    one.close()
+    assert rows[0, 7] == -0.1
+    assert (rows[1:, 3] <= rows[:-1, 3]).all()
+    assert 0 <= rows[-1, 3] < 1e-3
+    assert rows[-1, 7] == pytest.approx(-0.1 * rows[-2, 3] / BRAKE_FADE_MPS)
+
+
+numbers = st.floats(-20, 20) | st.sampled_from([np.nan, np.inf, -np.inf, 0.0, -0.0])
+
+
+@settings(deadline=None, max_examples=300)
+@given(
+    d=numbers,
+    rate=numbers,
+    vx=st.floats(-1, 3),
+    share=st.floats(-1, 1),
+    h=st.sampled_from([0.001, 0.003, 0.02, 0.05]),
+    limits=st.tuples(st.floats(-1, -0.01), st.floats(0.05, 1), st.floats(0.05, 1), st.floats(1, 9)),
+)
+def test_the_guard_in_c_is_the_plants(
+    d: float,
+    rate: float,
+    vx: float,
+    share: float,
+    h: float,
+    limits: tuple[float, float, float, float],
+) -> None:
+    values = dict(
+        zip(("d_min", "d_max", "delta_max_rad", "delta_rate_max_radps"), limits, strict=True)
+    )
+    delta = share * limits[2]
+    guard = PlantGuard(with_values(get_car("orca"), values))
+    expected = guard.apply((d, rate), vx, delta, h)
+    one = slave()
+    one.initialise({**values, "vx": vx, "delta": delta})
+    one.set({"d": d, "delta_rate": rate})
+    one.step(h)
+    assert one.get("d_applied", "delta_rate_applied") == list(expected)
+    assert one.get("delta") == [guard.angle_after(delta, expected[1], h)]
+    one.close()
+
+
+@pytest.mark.parametrize("name", sorted(car_values(get_car("orca"))))
+def test_every_parameter_acts_as_in_a_car_with_it(car: CarParameters, name: str) -> None:
+    inputs = [(1.3, 8.0)] * 5 + commands(150, 3)  # first beyond the limits
+    value = car_values(car)[name] * 1.25
+    one = slave()
+    one.initialise({name: value})
+    rows = driven(one, inputs)
+    one.close()
+    np.testing.assert_allclose(
+        rows, built_in(with_values(car, {name: value}), inputs), rtol=0, atol=1e-9
+    )
+    assert np.abs(rows - built_in(car, inputs)).max() > 1e-6
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("mass_kg", 0.0, "mass_kg"),
+        ("mass_kg", -1.0, "mass_kg"),
+        ("inertia_kgm2", np.nan, "inertia_kgm2"),
+        ("front_d", np.inf, "front_d"),
+        ("cr0", -1e-9, "cr0"),
+        ("d_min", 0.1, "d_min"),
+        ("delta", np.nan, "delta"),
+    ],
+)
+@pytest.mark.parametrize("version", [2, 3])
+def test_an_impossible_value_is_refused_by_name(
+    version: Version, name: str, value: float, words: str
+) -> None:
+    one = slave(version)
+    before = one.get(name)
+    with pytest.raises(FMICallException):
+        one.set({name: value})
+    assert words in one.messages[-1]
+    assert one.get(name) == before
+    one.initialise()
+    one.step(0.02)
+    one.close()
+
+
+def test_a_start_angle_beyond_the_limit_is_refused_at_the_end_of_initialisation() -> None:
+    one = slave()
+    with pytest.raises(FMICallException):
+        one.initialise({"delta": 0.5})
+    assert "delta_max_rad" in one.messages[-1]
+    one.set({"delta_max_rad": 0.6})  # still in initialisation: it can be mended
+    one.fmu.exitInitializationMode()
+    one.step(0.02)
+    assert one.get("delta") == [0.5]
+    one.close()
+
+
+def test_a_step_that_ends_at_infinity_is_undone_and_said() -> None:
+    one = slave()
+    one.initialise({"mass_kg": 1e-300, "vx": 1.0})
+    before = one.get(*STATES)
+    with pytest.raises(FMICallException):
+        one.step(0.02)
+    assert "not finite" in one.messages[-1]
+    assert one.get(*STATES) == before
+    with pytest.raises(FMICallException):
+        one.step(0.02)
+    assert "failed" in one.messages[-1]
+    one.reset()
+    one.initialise()
+    one.step(0.02)
+    one.close()
+
+
+def test_model_exchange_in_fmi_2_is_refused(car: CarParameters) -> None:
+    with pytest.raises(InputError, match="--version 3"):
+        car_fmu(car, 2, "me")
+
+
+def test_a_definition_that_cannot_work_is_refused(car: CarParameters, tmp_path: Path) -> None:
+    definition = car_fmu(car)
+    with pytest.raises(InputError, match="unknown platform 'amiga'"):
+        pack(definition, tmp_path / "x.fmu", ["amiga"])
+    with pytest.raises(InputError, match="cannot write"):
+        pack(definition, Path("/proc/none/x.fmu"))
+    twice = (*definition.variables, definition.variables[0])
+    with pytest.raises(InputError, match="two variables"):
+        FmuDefinition("a", "a", "", 3, "cs", twice, ())
+    with pytest.raises(InputError, match="furlong"):
+        Variable("a", "input", "", unit="furlong", start=0.0)
+    with pytest.raises(InputError, match="start value"):
+        Variable("a", "input", "")
+
+
+def test_the_native_controller_fades_braking_at_the_same_speed() -> None:
+    header = Path(__file__).parents[1] / "controller" / "native" / "bayesrace_mpc.h"
+    found = re.search(r"#define BR_BRAKE_FADE_MPS (\S+)", header.read_text())
+    assert found is not None
+    assert float(found[1]) == BRAKE_FADE_MPS
+
+
+def test_symbolic_parameters_give_the_same_equations(car: CarParameters) -> None:
+    from bayesrace.vehicles.models import DYNAMIC_PARAMETERS, dynamic_with_parameters
+
+    random = np.random.default_rng(0)
+    values = car_values(car)
+    p = [values[name] for name in DYNAMIC_PARAMETERS]
+    numeric, parametric = dynamic(car).ode, dynamic_with_parameters()
+    for x in random.uniform(-2, 2, (100, 7)):
+        u = random.uniform(-1, 1, 2)
+        np.testing.assert_allclose(
+            np.asarray(parametric(x, u, p)), np.asarray(numeric(x, u)), rtol=1e-12, atol=1e-10
+        )

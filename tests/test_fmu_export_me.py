@@ -1,0 +1,234 @@
+"""The car as a Model Exchange FMU: the dynamic model's values and derivatives, for any tool."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from fmpy import instantiate_fmu, read_model_description, simulate_fmu
+from fmpy.fmi1 import FMICallException
+from numpy.typing import NDArray
+
+from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles.models import (
+    DYNAMIC_PARAMETERS,
+    INPUTS,
+    STATES,
+    dynamic,
+    dynamic_with_parameters,
+)
+from plant.fmu.export import car_values
+from plant.simulator import Simulator
+from tests.fmu_exports import exported, extracted
+
+Floats = NDArray[np.float64]
+
+KNOWN = (*STATES, *INPUTS, *DYNAMIC_PARAMETERS)
+DERIVATIVES = tuple(f"der_{name}" for name in STATES)
+
+
+class Instance:
+    """One instance in continuous-time mode."""
+
+    def __init__(self) -> None:
+        description = read_model_description(str(extracted(3, "me")))
+        self.reference = {v.name: v.valueReference for v in description.modelVariables}
+        self.messages: list[str] = []
+        self.fmu: Any = instantiate_fmu(
+            str(extracted(3, "me")),
+            description,
+            "ModelExchange",
+            logger=lambda _, status, category, text: self.messages.append(text.decode()),
+        )
+        self.fmu.enterInitializationMode(startTime=0.0)
+        self.fmu.exitInitializationMode()
+        self.fmu.updateDiscreteStates()
+        self.fmu.enterContinuousTimeMode()
+
+    def references(self, names: tuple[str, ...]) -> list[int]:
+        return [self.reference[name] for name in names]
+
+    def put(self, x: Floats, u: Floats) -> None:
+        self.fmu.setFloat64(self.references(INPUTS), list(u))
+        self.fmu.setFloat64(self.references(STATES), list(x))
+
+    def rates(self) -> Floats:
+        return np.array(self.fmu.getFloat64(self.references(DERIVATIVES)))
+
+    def directional(self, seed: Floats) -> Floats:
+        """d rates / d KNOWN * seed."""
+        unknown, known = self.references(DERIVATIVES), self.references(KNOWN)
+        return np.array(self.fmu.getDirectionalDerivative(unknown, known, list(seed)))
+
+    def adjoint(self, seed: Floats) -> Floats:
+        unknown, known = self.references(DERIVATIVES), self.references(KNOWN)
+        count = len(KNOWN)  # fmpy assumes as many as unknowns
+        return np.array(self.fmu.getAdjointDerivative(unknown, known, list(seed), count))
+
+
+@pytest.fixture
+def instance() -> Iterator[Instance]:
+    one = Instance()
+    yield one
+    one.fmu.terminate()
+    one.fmu.freeInstance()
+
+
+def points(count: int, seed: int = 0) -> list[tuple[Floats, Floats]]:
+    """States and inputs of a car at speed, standing, and rolling back."""
+    random = np.random.default_rng(seed)
+    low = np.array([-5, -5, -7, -0.5, -0.6, -6, -0.35, -0.1, -5])
+    rows = random.uniform(low, [5, 5, 7, 4, 0.6, 6, 0.35, 1, 5], (count, 9))
+    rows[::7, 3] = 0.0
+    rows[::11, 3:6] = 0.0
+    return [(row[:7], row[7:]) for row in rows]
+
+
+def jacobian(car: CarParameters) -> Any:
+    """(x, u) -> d xdot / d KNOWN of the symbolic equations at this car's parameters."""
+    ode = dynamic_with_parameters()
+    x, u, p = ca.SX.sym("x", 7), ca.SX.sym("u", 2), ca.SX.sym("p", len(DYNAMIC_PARAMETERS))
+    full = ca.jacobian(ode(x, u, p), ca.vertcat(x, u, p))
+    function = ca.Function("J", [x, u, p], [ca.densify(full)])
+    values = car_values(car)
+    return lambda a, b: np.asarray(function(a, b, [values[name] for name in DYNAMIC_PARAMETERS]))
+
+
+def test_derivatives_are_the_dynamic_models(instance: Instance, car: CarParameters) -> None:
+    ode = dynamic(car).ode
+    for x, u in points(200):
+        instance.put(x, u)
+        expected = np.asarray(ode(x, u)).ravel()
+        np.testing.assert_allclose(instance.rates(), expected, rtol=1e-12, atol=1e-10)
+
+
+def test_directional_and_adjoint_derivatives_are_exact(
+    instance: Instance, car: CarParameters
+) -> None:
+    exact = jacobian(car)
+    random = np.random.default_rng(1)
+    for x, u in points(60, 1):
+        instance.put(x, u)
+        expected = exact(x, u)
+        seed, weights = random.normal(size=len(KNOWN)), random.normal(size=7)
+        scale = np.abs(expected).max()
+        forward, reverse = instance.directional(seed), instance.adjoint(weights)
+        np.testing.assert_allclose(forward, expected @ seed, rtol=1e-11, atol=1e-12 * scale)
+        np.testing.assert_allclose(reverse, weights @ expected, rtol=1e-11, atol=1e-12 * scale)
+
+
+def test_directional_derivatives_agree_with_differences(instance: Instance) -> None:
+    random = np.random.default_rng(2)
+    for x, u in points(40, 2):
+        if abs(x[3]) < 0.2:
+            continue  # differences straddle the blend
+        seed = np.zeros(len(KNOWN))
+        seed[:9] = random.normal(size=9)
+        step = 1e-6
+
+        def moved(by: float, x: Floats = x, u: Floats = u, seed: Floats = seed) -> Floats:
+            instance.put(x + by * seed[:7], u + by * seed[7:9])
+            return instance.rates()
+
+        difference = (moved(step) - moved(-step)) / (2 * step)
+        instance.put(x, u)
+        scale = 1 + np.abs(difference).max()
+        np.testing.assert_allclose(
+            instance.directional(seed) / scale, difference / scale, atol=1e-6
+        )
+
+
+def test_a_state_is_an_output_whose_derivative_is_one(instance: Instance) -> None:
+    both = instance.references(("x", "delta", "der_delta"))
+    known = instance.references(("x", "delta", "delta_rate"))
+    out = instance.fmu.getDirectionalDerivative(both, known, [2.0, 3.0, 5.0])
+    assert list(out) == [2.0, 3.0, 5.0]
+    assert list(instance.fmu.getAdjointDerivative(both, known, [2.0, 3.0, 5.0])) == [2.0, 3.0, 5.0]
+
+
+def test_misuse_is_refused(instance: Instance) -> None:
+    with pytest.raises(FMICallException):
+        instance.fmu.setFloat64([instance.reference["mass_kg"]], [1.0])
+    assert "mass_kg" in instance.messages[-1]
+    with pytest.raises(FMICallException):
+        instance.fmu.getDirectionalDerivative([instance.reference["d"]], [0], [1.0])
+    assert "'d'" in instance.messages[-1]
+
+
+def test_a_state_without_finite_derivatives_is_discarded(instance: Instance) -> None:
+    instance.put(np.array([0, 0, 0, np.nan, 0, 0, 0.0]), np.zeros(2))
+    with pytest.raises(FMICallException, match="discard"):
+        instance.rates()
+    instance.put(np.zeros(7), np.zeros(2))
+    assert instance.rates().tolist() == [0.0] * 7
+
+
+@pytest.mark.parametrize(("d", "rate"), [(0.6, 0.3), (0.3, -0.2)])
+def test_a_solver_of_variable_step_drives_like_the_plant(
+    car: CarParameters, d: float, rate: float
+) -> None:
+    start = {"x": 1.0, "psi": 0.3, "vx": 1.0, "d": d, "delta_rate": rate}
+    result = simulate_fmu(
+        str(exported(3, "me")),
+        fmi_type="ModelExchange",
+        solver="CVode",
+        relative_tolerance=1e-10,
+        stop_time=1.0,
+        output_interval=0.02,
+        start_values=start,
+        output=list(STATES),
+    )
+    simulator = Simulator(dynamic(car))
+    simulator.reset([start.get(name, 0.0) for name in STATES])
+    for _ in range(50):
+        simulator.step((d, rate))
+    assert result["time"][-1] == pytest.approx(1.0)
+    last = [result[name][-1] for name in STATES]
+    np.testing.assert_allclose(last, simulator.x, rtol=0, atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def imported() -> Any:
+    """The FMU as CasADi's function (x, u) -> xdot."""
+    builder = ca.DaeBuilder("car", str(extracted(3, "me")))
+    return builder.create("f", ["x", "u"], ["ode"])
+
+
+def test_casadi_imports_values_and_jacobians(imported: Any, car: CarParameters) -> None:
+    x, u = ca.MX.sym("x", 7), ca.MX.sym("u", 2)
+    function = ca.Function(
+        "f", [x, u], [imported(x, u), ca.jacobian(imported(x, u), ca.vertcat(x, u))]
+    )
+    exact, ode = jacobian(car), dynamic(car).ode
+    for a, b in points(60, 3):
+        value, slope = (np.asarray(ca.densify(out)) for out in function(a, b))
+        np.testing.assert_allclose(value, np.asarray(ode(a, b)), rtol=1e-12, atol=1e-10)
+        expected = exact(a, b)[:, :9]
+        np.testing.assert_allclose(slope, expected, atol=1e-12 * np.abs(expected).max())
+
+
+def test_casadi_knows_the_sparsity_from_the_model_structure(
+    imported: Any, car: CarParameters
+) -> None:
+    ode = dynamic(car).ode
+    for i in range(2):
+        assert imported.sparsity_jac(i, 0) == ode.sparsity_jac(i, 0)
+
+
+def test_casadi_takes_second_derivatives(imported: Any, car: CarParameters) -> None:
+    """By differences of the directional ones: good enough for a Hessian of an OCP."""
+    weights = ca.DM(np.random.default_rng(4).normal(size=7))
+
+    def hessian(function: Any, kind: Any) -> Any:
+        z = kind.sym("z", 9)
+        return ca.Function("H", [z], [ca.hessian(ca.dot(weights, function(z[:7], z[7:])), z)[0]])
+
+    approximate, exact = hessian(imported, ca.MX), hessian(dynamic(car).ode, ca.SX)
+    for x, u in points(20, 5):
+        if abs(x[3]) < 0.2:
+            continue
+        point = np.concatenate([x, u])
+        expected = np.asarray(ca.densify(exact(point)))
+        got = np.asarray(ca.densify(approximate(point)))
+        np.testing.assert_allclose(got, expected, atol=1e-5 * np.abs(expected).max())

@@ -1,0 +1,252 @@
+"""The FMI layers: saved states to the last bit, and a message instead of a crash for misuse."""
+
+import ctypes
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fmpy.fmi1 import FMICallException
+
+from bayesrace.vehicles import CarParameters
+from codegen.fmu import write_sources
+from plant.fmu.export import car_fmu
+from tests.fmu_exports import Kind, Version, commands, driven, exported, extracted, slave
+from tests.fmu_master import Slave
+
+VERSIONS = pytest.mark.parametrize("version", [2, 3])
+
+
+def stepping(version: Version = 3, vx: float = 1.0) -> Slave:
+    one = slave(version)
+    one.initialise({"vx": vx})
+    return one
+
+
+def save(one: Slave) -> Any:
+    return one.fmu.getFMUState()
+
+
+def refused(one: Slave, call: Callable[[], object], words: str) -> None:
+    """The call fails, and the importer's log says why."""
+    count = len(one.messages)
+    with pytest.raises(FMICallException):
+        call()
+    assert len(one.messages) == count + 1
+    assert words in one.messages[-1]
+
+
+@VERSIONS
+def test_a_rolled_back_step_is_repeated_to_the_last_bit(version: Version) -> None:
+    inputs = commands(200)
+    one = stepping(version)
+    driven(one, inputs[:100])
+    state, time = save(one), one.time
+    first = driven(one, inputs[100:])
+    for _ in range(2):
+        one.fmu.setFMUState(state)
+        one.time = time
+        np.testing.assert_array_equal(driven(one, inputs[100:]), first)
+    one.fmu.freeFMUState(state)
+    one.close()
+
+
+@VERSIONS
+def test_a_serialised_state_goes_on_in_another_instance(version: Version) -> None:
+    inputs = commands(200)
+    one = slave(version)
+    one.initialise({"vx": 1.0, "mass_kg": 0.05})
+    driven(one, inputs[:100])
+    state = save(one)
+    data = bytes(one.fmu.serializeFMUState(state))
+    expected = driven(one, inputs[100:])
+    other = slave(version)  # not even initialised
+    copy = other.fmu.deserializeFMUState(data)
+    other.fmu.setFMUState(copy)
+    other.time = 100 * 0.02
+    assert other.get("mass_kg") == [0.05]
+    np.testing.assert_array_equal(driven(other, inputs[100:]), expected)
+    other.fmu.freeFMUState(copy)
+    other.close()
+    one.close()  # with a state that was not freed
+
+
+@VERSIONS
+def test_damaged_or_foreign_bytes_are_no_state(version: Version) -> None:
+    one = stepping(version)
+    data = bytearray(bytes(one.fmu.serializeFMUState(save(one))))
+    random = np.random.default_rng(0)
+    for _ in range(100):
+        damaged = bytearray(data)
+        damaged[random.integers(len(data))] ^= 1 << int(random.integers(8))
+        refused(one, lambda d=damaged: one.fmu.deserializeFMUState(bytes(d)), "no state")  # type: ignore[misc]
+    refused(one, lambda: one.fmu.deserializeFMUState(bytes(data[:-1])), "no state")
+    refused(one, lambda: one.fmu.deserializeFMUState(b"x"), "no state")
+    one.fmu.setFMUState(one.fmu.deserializeFMUState(bytes(data)))
+    one.close()
+
+
+@VERSIONS
+def test_a_state_of_another_instance_or_of_none_is_refused(version: Version) -> None:
+    one, other = stepping(version), stepping(version)
+    refused(one, lambda: one.fmu.setFMUState(save(other)), "not made by this instance")
+    state = save(one)
+    stale = type(state)(state.value)
+    one.fmu.freeFMUState(state)
+    refused(one, lambda: one.fmu.setFMUState(stale), "freed")
+    refused(one, lambda: one.fmu.freeFMUState(stale), "freed")
+    refused(one, lambda: one.fmu.setFMUState(type(state)()), "NULL")
+    one.close()
+    other.close()
+
+
+@VERSIONS
+def test_calls_out_of_their_phase_are_refused(version: Version) -> None:
+    one = slave(version)
+    refused(one, lambda: one.step(0.02), "not allowed in phase 'instantiated'")
+    refused(one, one.fmu.exitInitializationMode, "phase 'instantiated'")
+    refused(one, one.fmu.terminate, "phase 'instantiated'")
+    one.initialise()
+    refused(one, lambda: one.set({"mass_kg": 1.0}), "'mass_kg' cannot be set in phase 'stepping'")
+    refused(one, lambda: one.set({"vx": 1.0}), "'vx' cannot be set")
+    refused(one, lambda: one.set({"d_applied": 1.0}), "'d_applied' cannot be set")
+    refused(one, one.fmu.enterInitializationMode, "phase 'stepping'")
+    one.step(0.02)
+    one.fmu.terminate()
+    refused(one, lambda: one.step(0.02), "phase 'terminated'")
+    refused(one, lambda: one.set({"d": 1.0}), "phase 'terminated'")
+    assert one.get("time") == [0.02]
+    one.reset()
+    one.initialise({"mass_kg": 1.0})
+    one.step(0.02)
+    one.close()
+
+
+@VERSIONS
+@pytest.mark.parametrize("h", [0.0, -0.02, np.nan, np.inf, -np.inf])
+def test_a_step_that_is_none_is_refused_and_changes_nothing(version: Version, h: float) -> None:
+    one = stepping(version)
+    before = one.get("x", "vx", "time")
+    refused(one, lambda: one.fmu.doStep(0.0, h), "must be positive")
+    refused(one, lambda: one.fmu.doStep(1.0, 0.02), "asked to continue at 1")
+    refused(one, lambda: one.fmu.doStep(np.nan, 0.02), "asked to continue")
+    assert one.get("x", "vx", "time") == before
+    one.step(0.02)
+    one.close()
+
+
+@VERSIONS
+def test_a_step_beyond_the_stop_time_is_refused(version: Version) -> None:
+    one = slave(version)
+    if version == 2:
+        one.fmu.setupExperiment(startTime=1.0, stopTime=1.04)
+        one.fmu.enterInitializationMode()
+    else:
+        one.fmu.enterInitializationMode(startTime=1.0, stopTime=1.04)
+    one.fmu.exitInitializationMode()
+    one.time = 1.0
+    one.step(0.02)
+    one.step(0.02)
+    refused(one, lambda: one.step(0.02), "stop time")
+    one.close()
+
+
+@VERSIONS
+def test_unknown_and_mistyped_variables_are_refused(version: Version) -> None:
+    one = stepping(version)
+    get = one.fmu.getReal if version == 2 else one.fmu.getFloat64
+    put = one.fmu.setReal if version == 2 else one.fmu.setFloat64
+    integer = one.fmu.getInteger if version == 2 else one.fmu.getInt32
+    refused(one, lambda: get([12345]), "unknown value reference 12345")
+    refused(one, lambda: put([2**32 - 1], [1.0]), "unknown value reference")
+    refused(one, lambda: integer([0]), "'x'")
+    before = one.get("d")
+    refused(one, lambda: put([one.references["d"], 12345], [0.3, 1.0]), "unknown")
+    assert one.get("d") == before  # all or none
+    refused(one, lambda: put([one.references["time"]], [1.0]), "unknown value reference")
+    one.close()
+
+
+def test_numbers_of_values_that_do_not_fit_are_refused() -> None:
+    one = stepping()
+    values, reference = (ctypes.c_double * 2)(), (ctypes.c_uint32 * 1)()
+    call = one.fmu.fmi3GetFloat64
+    refused(one, lambda: call(one.fmu.component, reference, 1, values, 2), "1 scalar")
+    refused(one, lambda: call(one.fmu.component, None, 1, values, 1), "NULL")
+    one.close()
+
+
+@VERSIONS
+def test_the_token_of_another_fmu_gives_no_instance(version: Version) -> None:
+    other = slave(version)
+    other.description.guid = "{0}"
+    with pytest.raises(Exception, match="instantiate"):
+        Slave.__init__(*_with_token(other, version, "{00000000-0000-0000-0000-000000000000}"))
+    other.fmu.freeInstance()
+
+
+def _with_token(one: Slave, version: Version, token: str) -> tuple[Slave, Path, Path]:
+    """Arguments of an instance whose description has another token."""
+    folder = extracted(version).with_name(f"foreign-{version}")
+    shutil.copytree(extracted(version), folder, dirs_exist_ok=True)
+    path = folder / "modelDescription.xml"
+    text = path.read_text()
+    start = text.index("{")
+    path.write_text(text[:start] + token + text[text.index("}") + 1 :])
+    return one, exported(version), folder
+
+
+def test_instances_do_not_know_each_other() -> None:
+    inputs = commands(100), commands(100, 1)
+    alone = []
+    for rows in inputs:
+        one = stepping()
+        alone.append(driven(one, rows))
+        one.close()
+    pair = stepping(), stepping()
+    for k in range(100):
+        for one, rows, expected in zip(pair, inputs, alone, strict=True):
+            np.testing.assert_array_equal(driven(one, rows[k : k + 1])[0], expected[k])
+    for one in pair:
+        one.close()
+
+
+@VERSIONS
+def test_reset_is_as_new(version: Version) -> None:
+    inputs = commands(50)
+    one = slave(version)
+    one.initialise()
+    expected = driven(one, inputs)
+    one.reset()
+    one.initialise({"mass_kg": 0.1, "x": 3.0})
+    driven(one, inputs)
+    one.reset()
+    one.initialise()
+    np.testing.assert_array_equal(driven(one, inputs), expected)
+    one.close()
+
+
+@pytest.mark.parametrize(("version", "kind"), [(2, "cs"), (3, "cs"), (3, "me")])
+def test_misuse_under_sanitizers(
+    version: Version, kind: Kind, car: CarParameters, tmp_path: Path
+) -> None:
+    """tests/native/fmi*_misuse.c: NULL, wrong sizes, wrong phases, damaged bytes, stale states."""
+    gcc = shutil.which("gcc")
+    if gcc is None:
+        pytest.skip("gcc is not installed")
+    sources = write_sources(car_fmu(car, version, kind), tmp_path)
+    program = Path(__file__).parent / "native" / f"fmi{version}_misuse.c"
+    flags = ["-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-Wall"]
+    line = [gcc, *flags, "-Werror", "-I.", *sources, str(program), "-lm", "-o", "misuse"]
+    done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=False)
+    if "cannot find -lasan" in done.stderr or "cannot find -lubsan" in done.stderr:
+        pytest.skip("gcc's sanitizer libraries are not installed")
+    assert done.returncode == 0, done.stderr[-3000:]
+    ran = subprocess.run(
+        [str(tmp_path / "misuse")], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert ran.returncode == 0, ran.stderr[-3000:]
+    assert ran.stdout.endswith("fine\n")

@@ -1,0 +1,184 @@
+"""Binaries of an FMU: rebuilt from its own sources, and for processors and systems not this one."""
+
+import importlib.util
+import shlex
+import shutil
+import struct
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fmpy import extract
+from numpy.typing import NDArray
+
+from bayesrace.errors import InputError
+from bayesrace.vehicles import CarParameters
+from codegen.compiler import find_compiler
+from codegen.fmu import host_platform, pack, write_sources
+from codegen.fmu.platforms import get_platform
+from plant.fmu.export import car_fmu
+from tests.fmu_exports import Kind, Version, built_in, commands, driven, exported, slave
+from tests.fmu_master import Slave
+
+HERE = Path(__file__).parent
+
+linux = pytest.mark.skipif(sys.platform != "linux", reason="the line in the archive is for Linux")
+zig = pytest.mark.skipif(importlib.util.find_spec("ziglang") is None, reason="ziglang is missing")
+
+
+def readme_line(sources: Path) -> list[str]:
+    """The command that the archive states, with the compiler that was found here for cc."""
+    text = (sources / "README.txt").read_text()
+    (line,) = [row for row in text.splitlines() if row.strip().startswith("cc ")]
+    return [*find_compiler().command, *shlex.split(line)[1:]]
+
+
+@linux
+@pytest.mark.parametrize("version", [2, 3])
+def test_the_sources_rebuild_the_binary_with_the_line_they_state(
+    version: Version, tmp_path: Path
+) -> None:
+    inputs = commands(200)
+    one = slave(version)
+    one.initialise()
+    expected = driven(one, inputs)
+    one.close()
+    folder = tmp_path / "fmu"
+    extract(str(exported(version)), unzipdir=str(folder))
+    (binary,) = (folder / "binaries").glob("*/*")
+    binary.unlink()
+    sources = folder / "sources"
+    subprocess.run(readme_line(sources), cwd=sources, check=True)
+    shutil.move(sources / binary.name, binary)
+    again = Slave(exported(version), folder)
+    again.initialise()
+    np.testing.assert_array_equal(driven(again, inputs), expected)
+    again.close()
+
+
+def test_another_platform_needs_ziglang(
+    car: CarParameters, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("codegen.fmu.platforms.find_spec", lambda name: None)
+    host = host_platform().name
+    other = "aarch64-linux" if host == "x86_64-linux" else "x86_64-linux"
+    with pytest.raises(InputError, match=f"{other}.*pip install ziglang"):
+        pack(car_fmu(car), tmp_path / "x.fmu", [host, other])
+    assert not (tmp_path / "x.fmu").exists()
+
+
+def test_names_of_platforms() -> None:
+    assert get_platform("linux64").name == "x86_64-linux"
+    assert get_platform("win64").folder(2) == "win64"
+    assert get_platform("x86_64-windows").folder(3) == "x86_64-windows"
+
+
+def elf_exports(data: bytes, folder: Path) -> set[str]:
+    """Names that a Linux library offers."""
+    if shutil.which("readelf") is None:
+        pytest.skip("readelf is not installed")
+    path = folder / "library.so"
+    path.write_bytes(data)
+    line = ["readelf", "--dyn-syms", "--wide", str(path)]
+    text = subprocess.run(line, capture_output=True, text=True, check=True).stdout
+    rows = [row.split() for row in text.splitlines()]
+    return {row[7] for row in rows if len(row) == 8 and row[4] == "GLOBAL" and row[6] != "UND"}
+
+
+def pe_exports(data: bytes) -> set[str]:
+    """Names that a Windows library offers, from its export directory."""
+    (header,) = struct.unpack_from("<I", data, 0x3C)
+    sections, optional_size = struct.unpack_from("<2xH12xH", data, header + 4)
+    optional = header + 24
+    assert struct.unpack_from("<H", data, optional)[0] == 0x20B  # PE32+
+
+    def offset(address: int) -> int:
+        for i in range(sections):
+            at = optional + optional_size + 40 * i
+            size, start, _, raw = struct.unpack_from("<IIII", data, at + 8)
+            if start <= address < start + size:
+                return int(address - start + raw)
+        raise AssertionError(f"address {address:#x} is in no section")
+
+    (directory,) = struct.unpack_from("<I", data, optional + 112)
+    count, _, names = struct.unpack_from("<III", data, offset(directory) + 24)
+    found = set()
+    for i in range(count):
+        (name,) = struct.unpack_from("<I", data, offset(names) + 4 * i)
+        at = offset(name)
+        found.add(data[at : data.index(b"\0", at)].decode())
+    return found
+
+
+@zig
+@pytest.mark.slow
+@pytest.mark.timeout(1500)  # ziglang builds a C library per target the first time
+@pytest.mark.parametrize(("version", "kind"), [(2, "cs"), (3, "cs"), (3, "me")])
+def test_cross_compiled_binaries_are_for_their_platform_and_offer_fmi(
+    version: Version, kind: Kind, car: CarParameters, tmp_path: Path
+) -> None:
+    names = ["x86_64-linux", "aarch64-linux", "x86_64-windows"]
+    definition = car_fmu(car, version, kind)
+    fmu = pack(definition, tmp_path / "all.fmu", names)
+    offered = {}
+    with zipfile.ZipFile(fmu) as archive:
+        for name in names:
+            target = get_platform(name)
+            folder = f"binaries/{target.folder(version)}"
+            data = archive.read(f"{folder}/{definition.identifier}{target.suffix}")
+            if name.endswith("linux"):
+                machine = {"x86_64-linux": 62, "aarch64-linux": 183}[name]
+                assert data[:5] == b"\x7fELF\x02"
+                assert struct.unpack_from("<H", data, 18) == (machine,)
+                offered[name] = elf_exports(data, tmp_path)
+            else:
+                (header,) = struct.unpack_from("<I", data, 0x3C)
+                assert data[header : header + 4] == b"PE\0\0"
+                assert struct.unpack_from("<H", data, header + 4) == (0x8664,)
+                offered[name] = pe_exports(data)
+    assert f"fmi{version}GetVersion" in offered["x86_64-linux"]
+    assert len(offered["x86_64-linux"]) > 30
+    assert all(name.startswith(f"fmi{version}") for name in offered["x86_64-linux"])
+    assert offered["aarch64-linux"] == offered["x86_64-linux"]
+    assert offered["x86_64-windows"] == offered["x86_64-linux"]
+    again = pack(definition, tmp_path / "again.fmu", names)
+    assert again.read_bytes() == fmu.read_bytes()
+
+
+def cross_built(folder: Path, sources: list[str], target: str) -> Path:
+    """tests/native/fmi3_drive.c with the FMU's sources, linked statically."""
+    program = folder / target
+    line = [sys.executable, "-m", "ziglang", "cc", "-target", target, "-static", "-std=gnu11"]
+    line += ["-O2", "-ffp-contract=off", "-I.", *sources, str(HERE / "native" / "fmi3_drive.c")]
+    subprocess.run([*line, "-lm", "-o", str(program)], cwd=folder, check=True)
+    return program
+
+
+@zig
+@linux
+@pytest.mark.slow
+@pytest.mark.timeout(1500)
+def test_another_processor_drives_to_the_last_bit(car: CarParameters, tmp_path: Path) -> None:
+    """With the same C library; another one's sine may differ in its last bit."""
+    qemu = shutil.which("qemu-aarch64") or shutil.which("qemu-aarch64-static")
+    if qemu is None:
+        pytest.skip("qemu-user is not installed")
+    if host_platform().name != "x86_64-linux":
+        pytest.skip("this machine is not the other processor's opposite")
+    sources = write_sources(car_fmu(car, 3, "cs"), tmp_path)
+    inputs = np.array(commands(400))
+
+    def rows(target: str, *under: str) -> NDArray[np.float64]:
+        program = cross_built(tmp_path, sources, target)
+        line = [*under, str(program)]
+        done = subprocess.run(line, input=inputs.tobytes(), capture_output=True, check=True)
+        return np.frombuffer(done.stdout).reshape(-1, 7)
+
+    here, there = rows("x86_64-linux-musl"), rows("aarch64-linux-musl", qemu)
+    assert len(here) == 400
+    np.testing.assert_array_equal(here, there)
+    expected = built_in(car, [(d, rate) for d, rate in inputs])[:, :7]
+    np.testing.assert_allclose(here, expected, rtol=0, atol=1e-9)
