@@ -192,7 +192,10 @@ def _sort_in(runs: dict[int, RunRecord], message: Any) -> None:
         return
     record = runs.setdefault(message.run, RunRecord(PlannedRun(message.run, "", "")))
     if isinstance(message, State):
-        record.states.append(message)
+        states = record.states
+        # A fault of the plant repeats the last state: no time has passed.
+        if not (message.final and states and message.time_s == states[-1].time_s):
+            states.append(message)
     elif isinstance(message, Actuation):
         record.actuations.append(message)
     elif isinstance(message, Telemetry):

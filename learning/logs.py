@@ -34,8 +34,8 @@ def dataset_from_messages(
     x, u, x_next, driven = [], [], [], []
     gaps = 0
     for now, after in itertools.pairwise(wanted):
-        if now.run != after.run:
-            continue
+        if now.run != after.run or (after.final and after.time_s == now.time_s):
+            continue  # a fault of the plant repeats the last state: no time has passed
         if after.seq != now.seq + 1 or abs(after.time_s - now.time_s - step_s) > 1e-6:
             gaps += 1
             continue

@@ -5,6 +5,7 @@ import logging
 import secrets
 import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -43,10 +44,10 @@ from bayesrace.transport import (
     decode_request,
     open_session,
 )
-from bayesrace.vehicles.models import dynamic
 from bayesrace.vehicles.parameters import get_car
+from plant.fmu.faults import FmuFault
 from plant.run import End, Run, RunCounters
-from plant.simulator import Simulator, plant_discretisation
+from plant.vehicle import Vehicle, open_vehicle
 
 __all__ = ["PlantProcess", "PlantSettings", "main"]
 
@@ -70,6 +71,12 @@ class PlantSettings(BaseModel):
         le=1,
         description="delay put on states and actuations each, when running by the wall clock",
     )
+    fmu: Path | None = Field(
+        None, description="Co-Simulation FMU that plays the car, instead of the built-in equations"
+    )
+    fmu_map: Path | None = Field(
+        None, description="TOML file that names the FMU's variables; none: they have our names"
+    )
     realtime: RealtimeSettings = RealtimeSettings()
     controller_wait_s: float = Field(
         default=2.0,
@@ -83,12 +90,10 @@ class PlantSettings(BaseModel):
 class PlantProcess:
     """Serves one car's runs over an open session."""
 
-    def __init__(self, session: Any, settings: PlantSettings) -> None:
+    def __init__(self, session: Any, settings: PlantSettings, vehicle: Vehicle) -> None:
         self._settings = settings
         self.name = settings.name or settings.car
-        self._simulator = Simulator(
-            dynamic(get_car(settings.car)), plant_discretisation(settings.rate_hz)
-        )
+        self._simulator = vehicle
         # Two processes started in one nanosecond on two machines must differ too.
         self._epoch = secrets.randbits(62)
         self._numbering = Numbering()
@@ -100,7 +105,7 @@ class PlantProcess:
         self._run: Run | None = None
         self._run_number = 0
         self._runs = 0
-        self._text = "no run so far"
+        self._text = f"no run so far with {_played_by(settings)}"
         self._stopping = False
         inbox = self.inbox = Inbox(session, self.name)
         inbox.subscribe(ACTUATION, newest=NEWEST)
@@ -163,7 +168,7 @@ class PlantProcess:
                 self._epoch,
                 self._settings.delay_s,
             )
-        except InputError as error:
+        except (InputError, FmuFault) as error:
             return str(error)
         self._run_number = message.run
         self._runs += 1
@@ -194,7 +199,9 @@ class PlantProcess:
         if run is None:
             return
         self._text = f"run {message.run} ended after {run.time_s:.2f} s: {end.text}"
-        _log.info("%s", self._text)
+        # A fault is the FMU's, and its last words are in the text.
+        level = logging.ERROR if end.reason == "plant_fault" else logging.INFO
+        _log.log(level, "%s", self._text)
         data: dict[str, Scalar] = {
             "reason": end.reason,
             "time_s": run.time_s,
@@ -273,17 +280,23 @@ class PlantProcess:
         )
 
 
+def _played_by(settings: PlantSettings) -> str:
+    return "the built-in car" if settings.fmu is None else f"FMU {settings.fmu.name}"
+
+
 def main(settings: PlantSettings) -> int:
     """Run a plant until SIGINT or SIGTERM; returns the exit code. Raises InputError at a bad start.
 
     Call it from the main thread of a process: it takes over the signals.
     """
     die_with_parent(settings.parent_pid)
-    with open_session(settings.endpoints, "plant") as session:
-        process = PlantProcess(session, settings)
+    vehicles = open_vehicle(get_car(settings.car), settings.fmu, settings.fmu_map, settings.rate_hz)
+    with vehicles as vehicle, open_session(settings.endpoints, "plant") as session:
+        process = PlantProcess(session, settings, vehicle)
         for refusal in prepare_thread(settings.realtime):
             _log.warning("%s", refusal)
-        _log.info("plant of car '%s' on %s", process.name, ", ".join(settings.endpoints.listen))
+        where = ", ".join(settings.endpoints.listen)
+        _log.info("plant of car '%s', %s, on %s", process.name, _played_by(settings), where)
         with process.inbox.catching_signals():
             process.serve()
     return 0

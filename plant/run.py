@@ -10,8 +10,9 @@ from typing import Final, NamedTuple
 from bayesrace.clock import sleep_until_ns
 from bayesrace.messages import Actuation, Decoder, RunRequest, State
 from bayesrace.transport import LOCKSTEP_SPIN_S, Inbox, Item, Kind, Numbering, Publisher
+from plant.fmu.faults import FmuFault
 from plant.laps import LineCounter
-from plant.simulator import Simulator
+from plant.vehicle import Vehicle
 
 __all__ = ["End", "Run", "RunCounters"]
 
@@ -48,6 +49,10 @@ class End:
     text: str
 
 
+def _fault(fault: FmuFault) -> End:
+    return End("plant_fault", str(fault))
+
+
 class _Waiting(NamedTuple):
     """An actuation that has arrived; the order is that of acting."""
 
@@ -67,7 +72,7 @@ class Run:
     def __init__(
         self,
         request: RunRequest,
-        simulator: Simulator,
+        simulator: Vehicle,
         inbox: Inbox,
         publisher: Publisher[State],
         decoder: Decoder[Actuation],
@@ -170,7 +175,11 @@ class Run:
             if isinstance(answer, End):
                 return answer
             self._beat()
-            self._simulator.step(answer)
+            try:
+                self._simulator.step(answer)
+            except FmuFault as fault:
+                end = _fault(fault)  # the state before is the last there is: once more, as final
+                continue
             end = self._finished()
             if end is not None and end.reason == "left_world":
                 return end  # no message could carry this state
@@ -218,8 +227,8 @@ class Run:
             end = self._receive()
             if end is not None:
                 return end
-            answers = self._drive_period(begin_ns, begin_ns + period_ns, seq)
-            end = self._finished()
+            answers, end = self._drive_period(begin_ns, begin_ns + period_ns, seq)
+            end = end or self._finished()
             if end is not None and end.reason == "left_world":
                 return end  # no message could carry this state
             seq += 1
@@ -268,8 +277,10 @@ class Run:
                 return end
         return None
 
-    def _drive_period(self, begin_ns: int, end_ns: int, seq: int) -> tuple[float, ...]:
-        """One period of zero-order hold, to the substep; returns ``State.answers``."""
+    def _drive_period(
+        self, begin_ns: int, end_ns: int, seq: int
+    ) -> tuple[tuple[float, ...], End | None]:
+        """One period of zero-order hold, to the substep; ``State.answers``, and a fault if any."""
         simulator = self._simulator
         substep_ns = simulator.step_s * 1e9 / simulator.substeps
         commands: list[tuple[int, tuple[float, ...] | None]] = []
@@ -291,10 +302,14 @@ class Run:
             answers += (float(new.state_seq), arrival_s, acting_s)
         if done < simulator.substeps:
             commands.append((simulator.substeps - done, self._fresh(done)))
-        simulator.step_switched(commands)
+        end: End | None = None
+        try:
+            simulator.step_switched(commands)
+        except FmuFault as fault:
+            end = _fault(fault)
         if self._held is None or self._held.state_seq < seq:
             self._counters.late += 1
-        return tuple(answers[: 3 * _MOST_ANSWERS])
+        return tuple(answers[: 3 * _MOST_ANSWERS]), end
 
     def _fresh(self, substep: int) -> tuple[float, ...] | None:
         """The held command, or None (brake) if what it was made from is too old."""

@@ -2,7 +2,7 @@
 
 Promises guarded: two lockstep runs with one seed are identical to the byte; nothing is lost in
 lockstep; a killed plant or controller and Ctrl-C end the run with a clear message, a readable log
-and no process left over.
+and no process left over. All of it with the built-in car, and with an FMU in its place.
 """
 
 import contextlib
@@ -28,8 +28,12 @@ from bayesrace.errors import InputError
 from bayesrace.log import LogReader, Recorder
 from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY, Event, RunRequest
 from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
+from tests.car_fmu import packed_car
 
 ROOT = Path(__file__).resolve().parents[1]
+
+CAR: dict[str, str] = {}
+"""Plant settings that say what plays the car."""
 
 PLANT = """
 import json, sys
@@ -66,6 +70,12 @@ class Failing(PurePursuit):
         return output
 PurePursuit = Failing
 """
+
+
+@pytest.fixture(params=["built-in car", "FMU"], autouse=True)
+def _played_by(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = {"fmu": str(packed_car())} if request.param == "FMU" else {}
+    monkeypatch.setattr(sys.modules[__name__], "CAR", settings)
 
 
 @dataclass
@@ -105,7 +115,7 @@ def running_rig(
 ) -> Iterator[Rig]:
     at_plant, at_controller = free_endpoint(), free_endpoint()
     ends: dict[str, Any] = {"listen": [at_plant], "low_latency": low_latency}
-    plant = start(PLANT, json.dumps({"endpoints": ends, "parent_pid": os.getpid()}))
+    plant = start(PLANT, json.dumps({"endpoints": ends, "parent_pid": os.getpid(), **CAR}))
     ends = {"listen": [at_controller], "connect": [at_plant], "low_latency": low_latency}
     controller = start(
         controller_code, json.dumps({"endpoints": ends, "parent_pid": os.getpid()}), str(seed)
@@ -297,12 +307,13 @@ def test_processes_do_not_outlive_who_started_them(after_s: float) -> None:
     starter = (
         "import os, subprocess, sys, time, json\n"
         "from bayesrace.transport import free_endpoint\n"
-        "s = json.dumps({'endpoints': {'listen': [free_endpoint()]}, 'parent_pid': os.getpid()})\n"
+        "s = {'endpoints': {'listen': [free_endpoint()]}, 'parent_pid': os.getpid()}\n"
+        "s = json.dumps(s | json.loads(sys.argv[2]))\n"
         "p = subprocess.Popen([sys.executable, '-c', sys.argv[1], s])\n"
         "print(p.pid, flush=True)\n"
         "time.sleep(60)\n"
     )
-    parent = start(starter, PLANT)
+    parent = start(starter, PLANT, json.dumps(CAR))
     assert parent.stdout is not None
     assert parent.stdout.readline().strip().isdigit()
     time.sleep(after_s)

@@ -1,6 +1,7 @@
 """The plant by the wall clock, with what arrives given: it guards itself against its controller."""
 
 import contextlib
+import sys
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -11,12 +12,16 @@ import pytest
 
 from bayesrace.messages import Actuation, Decoder, RunRequest, State, encode
 from bayesrace.transport import Inbox, Item, Kind, Numbering, Publisher
-from bayesrace.vehicles.models import dynamic
 from bayesrace.vehicles.parameters import get_car
 from plant.run import Run, RunCounters
-from plant.simulator import Simulator
+from plant.simulator import GuardCounters
+from plant.vehicle import Vehicle, open_vehicle
+from tests.car_fmu import packed_car
 
 EPOCH = 7
+
+VEHICLE = cast(Vehicle, None)
+"""What plays the car, in the test under way."""
 
 
 class Controller:
@@ -51,10 +56,19 @@ class Controller:
         yield
 
 
-def execute(answer: Any, delay_s: float = 0.0) -> tuple[list[State], RunCounters, Simulator]:
+@pytest.fixture(params=["built-in car", "FMU"], autouse=True)
+def _played_by(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Every promise holds whatever plays the car."""
+    fmu = packed_car() if request.param == "FMU" else None
+    with open_vehicle(get_car("orca"), fmu) as vehicle:
+        monkeypatch.setattr(sys.modules[__name__], "VEHICLE", vehicle)
+        yield
+
+
+def execute(answer: Any, delay_s: float = 0.0) -> tuple[list[State], RunCounters, GuardCounters]:
     """A run of .3 s in which a state is answered by actuations with these changes."""
-    controller, counters = Controller(answer), RunCounters()
-    simulator = Simulator(dynamic(get_car("orca")))
+    controller, counters, simulator = Controller(answer), RunCounters(), VEHICLE
+    simulator.guard.counters = GuardCounters()
     start = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
     line = {"line_x_m": 0.0, "line_y_m": 0.0, "line_heading_rad": 0.0}
     request = RunRequest(
@@ -66,13 +80,13 @@ def execute(answer: Any, delay_s: float = 0.0) -> tuple[list[State], RunCounters
         Decoder(Actuation), counters, Numbering(), lambda _: None, lambda: None, EPOCH, delay_s,
     )  # fmt: skip
     run.execute()
-    return controller.states, counters, simulator
+    return controller.states, counters, simulator.guard.counters
 
 
 def test_an_answered_car_drives_and_the_delays_are_told() -> None:
-    states, counters, simulator = execute(lambda _: [{}])
+    states, counters, guarded = execute(lambda _: [{}])
     assert counters.stale == 0
-    assert simulator.guard.counters.braked < 8
+    assert guarded.braked < 8
     assert states[-1].final
     assert states[-1].x[3] > 1.0
     rows = np.array([row for state in states for row in state.answers]).reshape(-1, 3)
@@ -99,13 +113,13 @@ def test_an_injected_delay_comes_on_both_ways() -> None:
     ],
 )
 def test_what_is_not_for_this_run_does_not_act(changes: dict[str, Any]) -> None:
-    _, counters, simulator = execute(lambda _: [changes])
+    _, counters, guarded = execute(lambda _: [changes])
     assert counters.stale > 5
-    assert simulator.guard.counters.braked > 12
+    assert guarded.braked > 12
     # and what is, does, whatever came before it
-    _, counters, simulator = execute(lambda _: [changes, {}])
+    _, counters, guarded = execute(lambda _: [changes, {}])
     assert counters.stale > 5
-    assert simulator.guard.counters.braked < 8
+    assert guarded.braked < 8
 
 
 def test_an_overtaken_answer_is_told_and_does_not_act() -> None:
@@ -120,6 +134,6 @@ def test_an_overtaken_answer_is_told_and_does_not_act() -> None:
 
 
 def test_without_fresh_answers_the_plant_brakes() -> None:
-    states, _, simulator = execute(lambda state: [{}] if state.seq < 3 else [])
-    assert simulator.guard.counters.braked > 4
+    states, _, guarded = execute(lambda state: [{}] if state.seq < 3 else [])
+    assert guarded.braked > 4
     assert states[-1].x[3] < max(state.x[3] for state in states)

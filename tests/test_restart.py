@@ -3,10 +3,12 @@
 Promises guarded: a controller started again takes over the car that its forerunner left; a plant
 started again is found by the controller that waits for it, and what was meant for its forerunner
 does not act on it; a connection that breaks, or a router that dies, is made again. Meanwhile the
-car brakes, and stays on its track.
+car brakes, and stays on its track. What plays the car, the built-in equations or an FMU, is no
+matter.
 """
 
 import logging
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -19,6 +21,7 @@ import pytest
 
 from bayesrace.messages import ACTUATION, Actuation, State
 from bayesrace.transport import Endpoints, Publisher, free_endpoint, open_session
+from tests.car_fmu import packed_car
 from tests.network.cars import (
     Course,
     Program,
@@ -35,6 +38,16 @@ from tests.programs import until
 pytestmark = pytest.mark.slow
 
 _log = logging.getLogger(__name__)
+
+
+CAR: tuple[str, ...] = ()
+"""Options of a plant that say what plays the car."""
+
+
+@pytest.fixture(params=["built-in car", "FMU"], autouse=True)
+def _played_by(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    options = ("--fmu", str(packed_car())) if request.param == "FMU" else ()
+    monkeypatch.setattr(sys.modules[__name__], "CAR", options)
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +98,7 @@ def rigged(
 
         def a_plant() -> Program:
             connect = [router_at] if way == "router" else []
-            return programs.enter_context(start_plant(tmp_path, plant_at, connect=connect))
+            return programs.enter_context(start_plant(tmp_path, plant_at, *CAR, connect=connect))
 
         def a_controller() -> Program:
             connect = {"direct": plant_at, "proxy": proxy.endpoint, "router": router_at}[way]

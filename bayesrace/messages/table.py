@@ -120,7 +120,7 @@ HEARTBEAT: Final = Topic(
 )
 TOPICS: Final[tuple[Topic[Any], ...]] = (STATE, ACTUATION, TELEMETRY, EVENT, HEARTBEAT)
 
-RUN: Final = Service("run", "bayesrace/{car}/plant/run", RunRequest, Reply, 5.0)
+RUN: Final = Service("run", "bayesrace/{car}/plant/run", RunRequest, Reply, 20.0)
 STOP: Final = Service("stop", "bayesrace/{car}/plant/stop", StopRequest, Reply, 5.0)
 STATUS: Final = Service("status", "bayesrace/{car}/{source}/status", StatusRequest, Status, 5.0)
 WEIGHTS: Final[Service[Message, Reply]] = Service(

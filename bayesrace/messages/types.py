@@ -40,9 +40,10 @@ __all__ = [
 
 END_REASONS: Final = (
     "laps", "max_time", "stopped", "controller_lost", "actuation_timeout", "left_world",
-    "interrupted",
+    "interrupted", "plant_fault",
 )  # fmt: skip
-"""Why a run ended, in the ``kind="run_ended"`` event's data under ``reason``."""
+"""Why a run ended, in the ``kind="run_ended"`` event's data under ``reason``; plant_fault: what
+plays the car has failed, and its last good state is sent once more as the final one."""
 
 PHASES: Final = ("idle", "running", "waiting", "ready", "driving", "fallback", "stopped")
 """Of a process, see :class:`Status`."""
@@ -95,7 +96,8 @@ class State(Message):
     from that state to the arrival of the answer [s], and from the answer's ``basis_s`` to its
     acting [s] (-1: overtaken, it never acts). Empty in lockstep."""
     final: Annotated[bool, Flag()]
-    """True in the last state of a run: nothing that answers it will act."""
+    """True in the last state of a run: nothing that answers it will act. After a fault of the plant
+    it repeats the state before, time included."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,8 @@ from bayesrace.errors import InputError
 __all__ = [
     "Car",
     "CarName",
+    "FmuFile",
+    "FmuMap",
     "LowLatency",
     "OutFile",
     "ParentPid",
@@ -38,6 +40,13 @@ def writable(path: Path | None) -> Path | None:
 
 
 OutFile = Annotated[Path, typer.Option("--out", "-o", callback=writable, help="File to write.")]
+FmuFile = Annotated[
+    Path | None, typer.Option(help="Co-Simulation FMU (2.0, 3.0) that plays the car.")
+]
+FmuMap = Annotated[
+    Path | None,
+    typer.Option("--map", help="What the FMU's variables mean (TOML), see 'bayesrace fmu'."),
+]
 LowLatency = Annotated[
     bool,
     typer.Option(

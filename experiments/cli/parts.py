@@ -7,7 +7,16 @@ import typer
 
 from bayesrace.clock import die_with_parent
 from bayesrace.errors import InputError
-from experiments.cli.options import Car, CarName, LowLatency, ParentPid, RaceLineFile, TrackName
+from experiments.cli.options import (
+    Car,
+    CarName,
+    FmuFile,
+    FmuMap,
+    LowLatency,
+    ParentPid,
+    RaceLineFile,
+    TrackName,
+)
 
 __all__ = ["register"]
 
@@ -31,6 +40,8 @@ def plant(
         list[str] | None, typer.Option(help="Further endpoints to connect to.")
     ] = None,
     rate: Rate = 50.0,
+    fmu: FmuFile = None,
+    fmu_map: FmuMap = None,
     delay: Annotated[
         float,
         typer.Option(
@@ -57,6 +68,8 @@ def plant(
         ),
         rate_hz=rate,
         delay_s=delay * 1e-3,
+        fmu=fmu,
+        fmu_map=fmu_map,
         realtime=RealtimeSettings(cpu=cpu, fifo=fifo, lock_memory=lock_memory),
         parent_pid=parent_pid,
     )

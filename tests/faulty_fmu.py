@@ -1,0 +1,139 @@
+"""Builds the FMU of ``tests/native/faulty_fmu.c``: a simple car with any fault asked for."""
+
+import inspect
+import re
+import subprocess
+import zipfile
+from enum import IntEnum
+from pathlib import Path
+from typing import Final
+
+import fmpy
+from fmpy.fmi2 import FMU2Slave
+from fmpy.fmi3 import FMU3Slave
+
+from codegen.compiler import find_compiler
+
+__all__ = ["Mode", "faulty_fmu", "faulty_library"]
+
+SOURCE: Final = Path(__file__).parent / "native" / "faulty_fmu.c"
+HEADERS: Final = Path(fmpy.__file__).parent / "c-code"
+STATES: Final = ("x", "y", "psi", "vx", "vy", "omega", "delta")
+
+Mode = IntEnum(
+    "Mode",
+    "GOOD ABORT SEGFAULT EXIT HANG NOT_A_NUMBER FAIL REFUSE FLOOD_LOG FLOOD_STDOUT SLOW TERMINATE "
+    "INIT_FAILS INIT_HANGS INIT_ABORTS HUGE_VALUE CLOSE_ALL EARLY STUCK SAY WORST SCRIBBLE",
+    start=0,
+)
+"""As in the C file."""
+
+
+def faulty_library(version: int, out: Path) -> Path:
+    """Compiles the library; functions that the C file lacks answer "error"."""
+    source = SOURCE.read_text()
+    slave = FMU3Slave if version == 3 else FMU2Slave
+    called = [name for name, _ in inspect.getmembers(slave) if name.startswith(f"fmi{version}")]
+    types = re.findall(r"^ACCESS\((\w+),", source, re.MULTILINE)
+    there = {f"fmi{version}{macro}{kind}" for macro in ("Get", "Set") for kind in types}
+    there |= set(re.findall(r"\b(fmi[23]\w+)\(", source))
+    there |= {f"fmi{version}{name}" for name in re.findall(r"F\((\w+)\)\(", source)}
+    stubs = "".join(
+        f'__attribute__((visibility("default"))) int {name}(void) {{ return 3; }}\n'
+        for name in called
+        if name not in there
+    )
+    text = out.with_suffix(".c")
+    text.write_text('#include "' + str(SOURCE) + f'"\n{stubs}')
+    command = [
+        *find_compiler().command, "-shared", "-fPIC", "-O1", f"-DFMI={version}", f"-I{HEADERS}",
+        str(text), "-lm", "-o", str(out),
+    ]  # fmt: skip
+    subprocess.run(command, check=True, capture_output=True, timeout=120)
+    return out
+
+
+def faulty_fmu(
+    library: Path,
+    out: Path,
+    version: int = 2,
+    *,
+    guid: str = "good",
+    attributes: str = 'canHandleVariableCommunicationStepSize="true"',
+    platform: str = "",
+) -> Path:
+    """Packs the library into an FMU; the parameters ``mode`` and ``at_s`` say what goes wrong."""
+    describe = _description_3 if version == 3 else _description_2
+    folder = platform or (fmpy.platform_tuple if version == 3 else fmpy.platform)
+    with zipfile.ZipFile(out, "w") as archive:
+        archive.writestr("modelDescription.xml", describe(guid, attributes))
+        archive.write(library, f"binaries/{folder}/faulty{fmpy.sharedLibraryExtension}")
+    return out
+
+
+def _description_2(guid: str, attributes: str) -> str:
+    fixed = 'causality="parameter" variability="fixed"'
+    discrete = 'variability="discrete"'
+    variables = [
+        ("d", 'causality="input"', '<Real start="0"/>'),
+        ("delta_rate", 'causality="input"', '<Real start="0" unit="rad/s"/>'),
+        *((name, 'causality="output" initial="exact"', '<Real start="0"/>') for name in STATES),
+        ("at_s", fixed, '<Real start="0"/>'),
+        ("mode", fixed, '<Real start="0"/>'),
+        ("gear", f'causality="input" {discrete}', '<Integer start="0"/>'),
+        ("light", f'causality="input" {discrete}', '<Boolean start="false"/>'),
+        ("gear_told", f'causality="output" {discrete}', "<Integer/>"),
+        ("light_told", f'causality="output" {discrete}', "<Boolean/>"),
+        ("label", fixed, '<String start=""/>'),
+        ("label_length", f'causality="output" {discrete}', "<Integer/>"),
+        ("instances", f'causality="output" {discrete}', "<Integer/>"),
+    ]
+    lines = "\n".join(
+        f'<ScalarVariable name="{name}" valueReference="{reference}" {how}>{kind}</ScalarVariable>'
+        for reference, (name, how, kind) in enumerate(variables)
+    )
+    return f"""<?xml version="1.0" encoding="UTF-8"?>
+<fmiModelDescription fmiVersion="2.0" modelName="faulty" guid="{guid}">
+<CoSimulation modelIdentifier="faulty" {attributes}/>
+<ModelVariables>
+{lines}
+</ModelVariables>
+<ModelStructure/>
+</fmiModelDescription>
+"""
+
+
+def _description_3(guid: str, attributes: str) -> str:
+    variables = [
+        ("Float64", "d", 'causality="input" start="0"'),
+        ("Float64", "delta_rate", 'causality="input" start="0"'),
+        *(("Float64", name, 'causality="output" initial="exact" start="0"') for name in STATES),
+        ("Float64", "at_s", 'causality="parameter" start="0"'),
+        ("Float64", "mode", 'causality="parameter" start="0"'),
+        ("UInt8", "gear", 'causality="input" start="0"'),
+        ("Boolean", "light", 'causality="input" start="false"'),
+        ("UInt8", "gear_told", 'causality="output"'),
+        ("Boolean", "light_told", 'causality="output"'),
+        ("String", "label", 'causality="parameter"'),
+        ("UInt64", "label_length", 'causality="output"'),
+        ("Int32", "instances", 'causality="output"'),
+        ("Float32", "soft", 'causality="parameter" start="1"'),
+        ("UInt8", "small", 'causality="parameter" start="1"'),
+        ("UInt64", "rows", 'causality="structuralParameter" start="1"'),
+    ]
+    lines = "\n".join(
+        f'<{kind} name="{name}" valueReference="{reference}" {how}/>'
+        if kind != "String"
+        else f'<{kind} name="{name}" valueReference="{reference}" {how}><Start value=""/></{kind}>'
+        for reference, (kind, name, how) in enumerate(variables)
+    )
+    return f"""<?xml version="1.0" encoding="UTF-8"?>
+<fmiModelDescription fmiVersion="3.0" modelName="faulty" instantiationToken="{guid}">
+<CoSimulation modelIdentifier="faulty" {attributes}/>
+<ModelVariables>
+<Float64 name="time" valueReference="99" causality="independent"/>
+{lines}
+</ModelVariables>
+<ModelStructure/>
+</fmiModelDescription>
+"""

@@ -1,0 +1,271 @@
+/* A Co-Simulation FMU for tests, FMI 2.0 (or 3.0 with -DFMI=3): a car so simple that it can be
+ * checked by hand, with every fault that an FMU can have. `mode` chooses the fault, which strikes
+ * in the step that reaches `at_s` (or at initialisation); the instantiation token chooses those
+ * that come before any parameter. */
+#include <math.h>
+#include <signal.h>
+#include <stdarg.h>
+#include <stdbool.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <unistd.h>
+
+#ifndef FMI
+#define FMI 2
+#endif
+#if FMI == 3
+#include "fmi3FunctionTypes.h"
+typedef fmi3Float64 Real;
+typedef fmi3Status Status;
+#define F(name) fmi3##name
+#else
+#include "fmi2FunctionTypes.h"
+typedef fmi2Real Real;
+typedef fmi2Status Status;
+#define F(name) fmi2##name
+#endif
+
+#define EXPORT __attribute__((visibility("default")))
+
+enum { OK, WARNING, DISCARD, ERROR, FATAL };
+
+enum { /* value references */
+    D, DELTA_RATE, X, Y, PSI, VX, VY, OMEGA, DELTA, AT_S, MODE, GEAR, LIGHT, GEAR_TOLD, LIGHT_TOLD,
+    LABEL, LABEL_LENGTH, INSTANCES, SOFT, SMALL, ROWS, VALUES
+};
+
+enum { /* modes; the numbers are those in tests/faulty_fmu.py */
+    GOOD, ABORT, SEGFAULT, EXIT, HANG, NOT_A_NUMBER, FAIL, REFUSE, FLOOD_LOG, FLOOD_STDOUT, SLOW,
+    TERMINATE, INIT_FAILS, INIT_HANGS, INIT_ABORTS, HUGE_VALUE, CLOSE_ALL, EARLY, STUCK, SAY, WORST, SCRIBBLE
+};
+
+typedef struct {
+    double value[VALUES];
+    double time;
+    bool ended;
+#if FMI == 3
+    fmi3LogMessageCallback log;
+    fmi3InstanceEnvironment environment;
+#else
+    const fmi2CallbackFunctions *callbacks;
+#endif
+} Car;
+
+static int instances;
+
+static void say(Car *car, int status, const char *text) {
+#if FMI == 3
+    car->log(car->environment, (fmi3Status)status, "faulty", text);
+#else
+    car->callbacks->logger(car->callbacks->componentEnvironment, "car", (fmi2Status)status,
+                           "faulty", "%s", text);
+#endif
+}
+
+static void wait_for_ever(void) {
+    for (;;) sleep(1);
+}
+
+static Car *make(const char *token) {
+    if (strcmp(token, "refuse") == 0 || (strcmp(token, "once") == 0 && instances > 0)) return NULL;
+    if (strcmp(token, "abort") == 0) {
+        fprintf(stderr, "no licence\n");
+        abort();
+    }
+    Car *car = calloc(1, sizeof *car);
+    car->value[INSTANCES] = ++instances;
+    return car;
+}
+
+static Status initialise(Car *car) {
+    switch ((int)car->value[MODE]) {
+    case INIT_FAILS:
+        say(car, ERROR, "this car has no wheels");
+        return (Status)ERROR;
+    case INIT_HANGS: wait_for_ever();
+    case INIT_ABORTS: abort();
+    }
+    return (Status)OK;
+}
+
+static Status strike(Car *car) {
+    switch ((int)car->value[MODE]) {
+    case ABORT:
+        say(car, ERROR, "the engine is on fire");
+        abort();
+    case SEGFAULT: raise(SIGSEGV); break;
+    case EXIT: exit(3);
+    case HANG: wait_for_ever();
+    case NOT_A_NUMBER: car->value[VX] = NAN; break;
+    case HUGE_VALUE: car->value[VX] = 1e9; break;
+    case FAIL:
+        say(car, ERROR, "a wheel came off");
+        return (Status)ERROR;
+    case WORST: return (Status)FATAL;
+    case REFUSE: return (Status)DISCARD;
+    case FLOOD_LOG:
+        for (int i = 0; i < 20000; i++) say(car, i % 2 ? WARNING : OK, "all is well, as always");
+        break;
+    case FLOOD_STDOUT:
+        for (int i = 0; i < 200000; i++) puts("all is well, as always, and as it will ever be");
+        fflush(stdout);
+        break;
+    case SAY:
+        fprintf(stderr, "assertion failed: wheels == 4\n");
+        _exit(7);
+    case SLOW: usleep(60000); break;
+    case TERMINATE: car->ended = true; break;
+    case SCRIBBLE:
+        for (int fd = 3; fd < 64; fd++)
+            if (write(fd, "all work and no play makes a dull car", 37) < 0) continue;
+        break;
+    case CLOSE_ALL:
+        for (int fd = 0; fd < 64; fd++) close(fd);
+        break;
+    }
+    return (Status)OK;
+}
+
+static Status drive(Car *car, double t, double h) {
+    double *v = car->value;
+    if (fabs(t - car->time) > 1e-12) {
+        say(car, ERROR, "steps do not follow each other");
+        return (Status)ERROR;
+    }
+    v[X] += h * v[VX] * cos(v[PSI]);
+    v[Y] += h * v[VX] * sin(v[PSI]);
+    v[OMEGA] = v[VX] * v[DELTA] / 0.062;
+    v[PSI] += h * v[OMEGA];
+    v[VX] += h * (7.0 * v[D] - v[VX]);
+    v[DELTA] += h * v[DELTA_RATE];
+    v[GEAR_TOLD] = v[GEAR];
+    v[LIGHT_TOLD] = v[LIGHT];
+    car->time = t + h;
+    return car->time >= v[AT_S] - 1e-9 ? strike(car) : (Status)OK;
+}
+
+#if FMI == 3
+EXPORT fmi3Instance fmi3InstantiateCoSimulation(
+    fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible, fmi3Boolean logging,
+    fmi3Boolean events, fmi3Boolean early, const fmi3ValueReference required[], size_t count,
+    fmi3InstanceEnvironment environment, fmi3LogMessageCallback log,
+    fmi3IntermediateUpdateCallback update) {
+    (void)name, (void)resources, (void)visible, (void)logging, (void)events, (void)early;
+    (void)required, (void)count, (void)update;
+    Car *car = make(token);
+    if (car) car->environment = environment, car->log = log;
+    return car;
+}
+
+EXPORT Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean d, fmi3Float64 tolerance,
+                                          fmi3Float64 start, fmi3Boolean s, fmi3Float64 stop) {
+    (void)c, (void)d, (void)tolerance, (void)start, (void)s, (void)stop;
+    return (Status)OK;
+}
+
+EXPORT Status fmi3EnterConfigurationMode(fmi3Instance c) { return (void)c, (Status)OK; }
+EXPORT Status fmi3ExitConfigurationMode(fmi3Instance c) { return (void)c, (Status)OK; }
+
+#define ACCESS(Name, Type)                                                                        \
+    EXPORT Status fmi3Set##Name(fmi3Instance c, const fmi3ValueReference vr[], size_t n,          \
+                                const Type values[], size_t nv) {                                 \
+        (void)nv;                                                                                 \
+        for (size_t i = 0; i < n; i++) ((Car *)c)->value[vr[i]] = (double)values[i];              \
+        return (Status)OK;                                                                        \
+    }                                                                                             \
+    EXPORT Status fmi3Get##Name(fmi3Instance c, const fmi3ValueReference vr[], size_t n,          \
+                                Type values[], size_t nv) {                                       \
+        (void)nv;                                                                                 \
+        for (size_t i = 0; i < n; i++) values[i] = (Type)((Car *)c)->value[vr[i]];                \
+        return (Status)OK;                                                                        \
+    }
+ACCESS(Float64, fmi3Float64)
+ACCESS(Float32, fmi3Float32)
+ACCESS(Int32, fmi3Int32)
+ACCESS(UInt8, fmi3UInt8)
+ACCESS(UInt64, fmi3UInt64)
+ACCESS(Boolean, fmi3Boolean)
+
+EXPORT Status fmi3SetString(fmi3Instance c, const fmi3ValueReference vr[], size_t n,
+                            const fmi3String values[], size_t nv) {
+    (void)vr, (void)n, (void)nv;
+    ((Car *)c)->value[LABEL_LENGTH] = (double)strlen(values[0]);
+    return (Status)OK;
+}
+
+EXPORT Status fmi3DoStep(fmi3Instance c, fmi3Float64 t, fmi3Float64 h, fmi3Boolean none,
+                         fmi3Boolean *event, fmi3Boolean *terminate, fmi3Boolean *early,
+                         fmi3Float64 *last) {
+    Car *car = c;
+    (void)none;
+    bool halfway = car->value[MODE] == EARLY && h > 1e-3;
+    Status status = drive(car, t, halfway ? h / 2 : h);
+    if (car->value[MODE] == STUCK) car->time = t;
+    *event = false;
+    *terminate = car->ended;
+    *early = halfway || car->value[MODE] == STUCK;
+    *last = car->time;
+    return status;
+}
+#else
+EXPORT fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String token,
+                                     fmi2String resources, const fmi2CallbackFunctions *callbacks,
+                                     fmi2Boolean visible, fmi2Boolean logging) {
+    (void)name, (void)type, (void)resources, (void)visible, (void)logging;
+    Car *car = make(token);
+    if (car) car->callbacks = callbacks;
+    return car;
+}
+
+EXPORT Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean d, Real tolerance, Real start,
+                                  fmi2Boolean s, Real stop) {
+    (void)c, (void)d, (void)tolerance, (void)start, (void)s, (void)stop;
+    return (Status)OK;
+}
+
+EXPORT Status fmi2EnterInitializationMode(fmi2Component c) { return (void)c, (Status)OK; }
+
+#define ACCESS(Name, Type)                                                                        \
+    EXPORT Status fmi2Set##Name(fmi2Component c, const fmi2ValueReference vr[], size_t n,         \
+                                const Type values[]) {                                            \
+        for (size_t i = 0; i < n; i++) ((Car *)c)->value[vr[i]] = values[i];                      \
+        return (Status)OK;                                                                        \
+    }                                                                                             \
+    EXPORT Status fmi2Get##Name(fmi2Component c, const fmi2ValueReference vr[], size_t n,         \
+                                Type values[]) {                                                  \
+        for (size_t i = 0; i < n; i++) values[i] = (Type)((Car *)c)->value[vr[i]];                \
+        return (Status)OK;                                                                        \
+    }
+ACCESS(Real, fmi2Real)
+ACCESS(Integer, fmi2Integer)
+ACCESS(Boolean, fmi2Boolean)
+
+EXPORT Status fmi2SetString(fmi2Component c, const fmi2ValueReference vr[], size_t n,
+                            const fmi2String values[]) {
+    (void)vr, (void)n;
+    ((Car *)c)->value[LABEL_LENGTH] = (double)strlen(values[0]);
+    return (Status)OK;
+}
+
+EXPORT Status fmi2DoStep(fmi2Component c, Real t, Real h, fmi2Boolean none) {
+    (void)none;
+    Status status = drive(c, t, h);
+    return ((Car *)c)->ended ? (Status)DISCARD : status;
+}
+
+EXPORT Status fmi2GetBooleanStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Boolean *told) {
+    *told = kind == fmi2Terminated && ((Car *)c)->ended;
+    return (Status)OK;
+}
+
+EXPORT Status fmi2GetRealStatus(fmi2Component c, const fmi2StatusKind kind, Real *told) {
+    (void)kind;
+    *told = ((Car *)c)->time;
+    return (Status)OK;
+}
+#endif
+
+EXPORT Status F(ExitInitializationMode)(void *c) { return initialise(c); }
+EXPORT Status F(Terminate)(void *c) { return (void)c, (Status)OK; }
+EXPORT void F(FreeInstance)(void *c) { free(c); }

@@ -1,0 +1,236 @@
+"""A plant process that an FMU drives: what the FMU does ends the run, and nothing but the run.
+
+One plant and controller for all faults: the map sets the fault from the start state's yaw rate,
+which this car forgets in its first step.
+"""
+
+import contextlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bayesrace.errors import InputError
+from bayesrace.log import LogReader
+from bayesrace.messages import STATE, TELEMETRY, State
+from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
+from bayesrace.vehicles.parameters import get_car
+from experiments.recording import PlannedRun, RunRecord, _sort_in
+from learning.logs import dataset_from_messages
+from tests.faulty_fmu import Mode, faulty_fmu, faulty_library
+from tests.programs import until
+from tests.test_lockstep import CONTROLLER, PLANT, Rig, drive, request, start
+
+AT_S = 0.4
+"""When the faults strike."""
+
+MAP = f"""
+[fmu]
+timeout_s = 0.5
+[parameters]
+at_s = {AT_S}
+[start]
+mode = {{ from = "omega", scale = 1.0 }}
+"""
+
+FAULTS = {
+    Mode.ABORT: r"crashed \(SIGABRT\); its last words: the engine is on fire",
+    Mode.EXIT: "exit code 3",
+    Mode.HANG: r"did not answer within 0.5 s",
+    Mode.NOT_A_NUMBER: "gave vx = nan",
+    Mode.FAIL: r"failed \(error\); its last words: a wheel came off",
+    Mode.TERMINATE: "the FMU ended the simulation",
+    Mode.HUGE_VALUE: r"vx = 1e\+09",
+}
+
+
+@pytest.fixture(scope="module")
+def car_fmu(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("fmu")
+    (folder / "map.toml").write_text(MAP)
+    return faulty_fmu(faulty_library(2, folder / "faulty.so"), folder / "faulty.fmu")
+
+
+def settings_of(car_fmu: Path, endpoint: str) -> str:
+    return json.dumps(
+        {
+            "endpoints": {"listen": [endpoint], "low_latency": True},
+            "parent_pid": os.getpid(),
+            "fmu": str(car_fmu),
+            "fmu_map": str(car_fmu.with_name("map.toml")),
+        }
+    )
+
+
+@contextlib.contextmanager
+def running_rig(car_fmu: Path) -> Iterator[Rig]:
+    at_plant, at_controller = free_endpoint(), free_endpoint()
+    plant = start(PLANT, settings_of(car_fmu, at_plant))
+    ends = {"listen": [at_controller], "connect": [at_plant], "low_latency": True}
+    controller = start(CONTROLLER, json.dumps({"endpoints": ends, "parent_pid": os.getpid()}), "1")
+    try:
+        with open_session(Endpoints(connect=(at_plant, at_controller))) as session:
+            director = Director(session, "orca")
+            director.wait_for(("plant", "controller"), 20.0)
+            yield Rig(plant, controller, session, director)
+    finally:
+        for process in (controller, plant):
+            process.send_signal(signal.SIGTERM)
+        for process in (controller, plant):
+            output, _ = process.communicate(timeout=10)
+            assert "Traceback" not in output, output
+
+
+@pytest.fixture(scope="module")
+def rig(car_fmu: Path) -> Iterator[Rig]:
+    with running_rig(car_fmu) as rig:
+        yield rig
+
+
+def with_fault(mode: Mode) -> dict[str, Any]:
+    return {"x0": (2.0, 0.0, np.pi / 2, 0.1, 0.0, float(mode), 0.0)}
+
+
+RUN = iter(range(1, 1000))
+
+
+@pytest.mark.parametrize(
+    ("mode", "lockstep"),
+    [(mode, True) for mode in FAULTS]
+    + [(mode, False) for mode in (Mode.ABORT, Mode.HANG, Mode.NOT_A_NUMBER)],
+)
+def test_a_fault_ends_the_run_and_nothing_else(
+    mode: Mode, lockstep: bool, rig: Rig, tmp_path: Path
+) -> None:
+    run = next(RUN)
+    log = tmp_path / "log.mcap"
+    end = drive(rig, log, run, lockstep=lockstep, laps=0, **with_fault(mode))
+    assert end.data["reason"] == "plant_fault"
+    assert re.search(FAULTS[mode], end.text)
+    reader = LogReader(log)
+    assert not reader.truncated
+    states = reader.select(STATE)
+    before, last = states[-2:]
+    assert last.final
+    assert not before.final
+    assert (last.seq, last.time_s, last.x) == (before.seq + 1, before.time_s, before.x)
+    assert (last.u_applied, last.lap) == (before.u_applied, before.lap)
+    assert last.time_s == end.data["time_s"] == pytest.approx(AT_S - 0.02)
+    answered = {telemetry.state_seq for telemetry in reader.select(TELEMETRY)}
+    assert last.seq not in answered
+    status = rig.director.status("plant")
+    assert status.phase == "idle"
+    assert re.search(FAULTS[mode], status.text)
+    controller = rig.director.status("controller")
+    assert controller.phase == "waiting"
+
+
+def test_after_all_that_it_drives_a_lap(rig: Rig, tmp_path: Path) -> None:
+    digests = []
+    for _ in range(2):
+        run = next(RUN)
+        end = drive(rig, tmp_path / f"{run}.mcap", run, **with_fault(Mode.GOOD))
+        assert end.data["reason"] == "laps", end.text
+        states = LogReader(tmp_path / f"{run}.mcap").select(STATE)
+        digests.append([(state.time_s, state.x) for state in states])
+    assert digests[0] == digests[1]
+    assert rig.plant.poll() is None
+
+
+def test_a_failed_start_is_a_refused_run(rig: Rig) -> None:
+    with pytest.raises(InputError, match=r"while it was initialised: .*this car has no wheels"):
+        rig.director.start(request(next(RUN), **with_fault(Mode.INIT_FAILS)))
+    assert rig.director.status("plant").phase == "idle"
+
+
+def test_talk_does_not_end_a_run(rig: Rig, tmp_path: Path) -> None:
+    changes = with_fault(Mode.FLOOD_LOG) | {"max_time_s": AT_S + 0.1}
+    end = drive(rig, tmp_path / "log", next(RUN), laps=0, **changes)
+    assert end.data["reason"] == "max_time"
+
+
+def test_a_slow_fmu_counts_as_overruns(rig: Rig, tmp_path: Path) -> None:
+    """60 ms for a period of 20 ms."""
+    before = int(rig.director.status("plant").counters["overruns"])
+    changes = with_fault(Mode.SLOW) | {"max_time_s": AT_S + 0.2}
+    end = drive(rig, tmp_path / "log", next(RUN), lockstep=False, laps=0, **changes)
+    assert end.data["reason"] == "max_time"
+    assert int(end.data["overruns"]) - before >= 5
+
+
+def workers_of(plant: int) -> dict[int, Path]:
+    """Process number to folder of what runs an FMU for that plant."""
+    found = {}
+    for entry in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError, ValueError):
+            words = (entry / "cmdline").read_bytes().decode().split("\0")
+            if "plant.fmu.worker" in words:
+                told = json.loads(words[3])
+                if told["parent"] == plant:
+                    found[int(entry.name)] = Path(told["folder"])
+    return found
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="finds processes in /proc")
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_nothing_outlives_the_plant(how: signal.Signals, car_fmu: Path, tmp_path: Path) -> None:
+    """However it ends, and were the FMU hanging at that moment."""
+    at_plant = free_endpoint()
+    (tmp_path / "map.toml").write_text(MAP.replace("0.5", "60.0"))
+    fmu = tmp_path / car_fmu.name
+    fmu.symlink_to(car_fmu)
+    plant = start(PLANT, settings_of(fmu, at_plant))
+    with open_session(Endpoints(connect=(at_plant,))) as session:
+        director = Director(session, "orca")
+        director.wait_for(("plant",), 20.0)
+        [(worker, folder)] = workers_of(plant.pid).items()
+        mode = Mode.HANG if how is signal.SIGKILL else Mode.GOOD
+        director.start(request(1, lockstep=False, laps=0, max_time_s=1e5, **with_fault(mode)))
+        time.sleep(2 * AT_S)
+        plant.send_signal(how)
+        plant.communicate(timeout=10)
+    until(lambda: not (folder.exists() or Path(f"/proc/{worker}").exists()), "no leftovers", 10.0)
+    assert not workers_of(plant.pid)
+
+
+def test_the_command_refuses_an_unusable_fmu_in_one_line(car_fmu: Path, tmp_path: Path) -> None:
+    folder = car_fmu.parent
+    (tmp_path / "map.toml").write_text('[outputs]\nvx = { variable = "speed" }\n')
+    foreign = faulty_fmu(folder / "faulty.so", tmp_path / "foreign.fmu", platform="win64")
+    for options, why in (
+        (("--fmu", foreign), "is for win64"),
+        (("--fmu", car_fmu, "--map", tmp_path / "map.toml"), "speed"),
+        (("--map", tmp_path / "map.toml"), "without an FMU"),
+    ):
+        done = subprocess.run(
+            [sys.executable, "-m", "experiments.cli", "plant", *map(str, options)],
+            capture_output=True, text=True, timeout=60, check=False,
+        )  # fmt: skip
+        assert done.returncode == 2
+        [line] = done.stderr.strip().splitlines()
+        assert why in line
+
+
+def test_a_repeated_last_state_is_no_gap_and_no_sample() -> None:
+    def state(seq: int, time_s: float, *, final: bool = False) -> State:
+        x = (0.02 * seq, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+        return State(seq, seq, 1, 1, time_s, x, (0.1, 0.0), 0, True, (), final)
+
+    states = [state(0, 0.0), state(1, 0.02), state(2, 0.04), state(3, 0.04, final=True)]
+    record = RunRecord(PlannedRun(1, "somebody", ""))
+    runs = {1: record}
+    for message in states:
+        _sort_in(runs, message)
+    assert [one.seq for one in record.states] == [0, 1, 2]
+    assert record.gaps == 0
+    data = dataset_from_messages(states, [], get_car("orca"), 0.02)
+    assert (len(data), data.dropped.get("gap", 0)) == (2, 0)

@@ -1,0 +1,221 @@
+"""What drives an FMU's inputs, what is set before it starts, and where it then is."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given as those
+from hypothesis import strategies as st
+
+from bayesrace.errors import InputError
+from plant.fmu.map import parse_map, wire
+from plant.fmu.wiring import Wiring
+from tests.fmu_variables import (
+    STATE,
+    Array,
+    U,
+    assert_same,
+    description,
+    given,
+    our_names,
+    own_fmu,
+    read,
+    replacing,
+    taken,
+    values,
+    variable,
+)
+from tests.foreign_fmu import FOREIGN_MAP
+
+# -- inputs ---------------------------------------------------------------------------------------
+
+
+def inputs(text: str, *theirs: Any, without: tuple[str, ...] = ("d", "delta_rate")) -> Wiring:
+    return wire(own_fmu(*theirs, without=without), parse_map(text))
+
+
+def test_throttle_in_percent_and_a_separate_brake_pedal() -> None:
+    wiring = inputs(
+        '[inputs]\ngas = { from = "throttle", unit = "%" }\nbrk = { from = "brake", scale = 10 }',
+        *(taken("gas", highest=100.0), taken("brk")),
+        without=("d",),
+    )
+    assert wiring.to_inputs((0.4, 0), 0, 0.02) == pytest.approx([40.0, 0.0, 0.0])
+    assert wiring.to_inputs((-0.1, 0), 0, 0.02) == pytest.approx([0.0, 1.0, 0.0])
+
+
+def test_an_input_stays_within_its_declared_range() -> None:
+    wiring = inputs('[inputs]\ngas = "d"', taken("gas", lowest=0.0, highest=0.8), without=("d",))
+    sent = [wiring.to_inputs((d, 0), 0, 0.02)[0] for d in (-0.1, 0.5, 1)]
+    assert sent == [0.0, 0.5, 0.8]
+
+
+def test_steering_angle_at_the_end_of_the_hold_in_degrees_to_the_right() -> None:
+    wiring = inputs(
+        '[inputs]\nsteer = { from = "delta", sign = -1 }',
+        *(taken("steer", "deg"), taken("d")),
+        without=("d", "delta_rate"),
+    )
+    assert wiring.to_inputs(U, 0.2, 0.02)[0] == pytest.approx(-math.degrees(0.2 - 0.04), rel=1e-14)
+    assert wiring.start_values(STATE)["steer"] == pytest.approx(-math.degrees(0.2), rel=1e-14)
+
+
+def test_steering_wheel_with_a_ratio() -> None:
+    """16 degrees of the wheel are one of the road wheels; it comes back the same way."""
+    ratio = 16 * 180 / math.pi
+    text = f'[inputs]\nswa = {{ from = "delta", scale = {ratio!r}, offset = 0.5 }}\n'
+    text += f"[outputs]\ndelta = {{ variable = 'wheel', scale = {1 / ratio!r} }}"
+    fmu = own_fmu(taken("swa", "deg"), given("wheel", "deg"), without=("delta_rate", "delta"))
+    wiring = wire(fmu, parse_map(text))
+    sent = dict(zip(wiring.inputs, wiring.to_inputs((0, 1.0), 0.1, 0.02), strict=True))
+    assert sent["swa"] == pytest.approx(16 * math.degrees(0.12) + 0.5, rel=1e-14)
+    say = replacing("delta", wheel=lambda s: 16 * math.degrees(s["delta"]))
+    assert_same(read(wiring, say, STATE), STATE)
+
+
+def test_constant_inputs_are_set_once_in_their_own_type() -> None:
+    enable = taken("enable", kind="boolean", fmi_type="Boolean", start="false")
+    also = taken("abs", kind="boolean", fmi_type="Boolean", start=None)
+    gear = taken("gear", kind="integer", fmi_type="Int32", start=None)
+    mode = taken("mode", kind="enumeration", fmi_type="Enumeration", items={"Eco": 1, "Race": 2})
+    wind = taken("wind", "m/s", start=None)
+    text = '[inputs]\nenable = true\nabs = 1.0\ngear = 1.0\nmode = "Race"\nwind = "36 km/h"'
+    wiring = inputs(text, enable, also, gear, mode, wind, without=())
+    start = wiring.start_values(STATE)
+    chosen = {name: start[name] for name in ("enable", "abs", "gear", "mode", "wind")}
+    assert chosen == {"enable": True, "abs": True, "gear": 1, "mode": 2, "wind": 10.0}
+    assert [type(value) for value in chosen.values()] == [bool, bool, int, int, float]
+    assert wiring.inputs == ("d", "delta_rate")
+
+
+# -- where it starts ------------------------------------------------------------------------------
+
+
+def test_start_values_in_the_models_own_terms() -> None:
+    names = {"x0": "cm", "hdg0": "deg", "v0": "km/h", "beta0": "deg", "qw0": None, "qz0": None}
+    parameters = [variable(name, "parameter", unit) for name, unit in names.items()]
+    parameters.append(variable("vn0", "parameter"))
+    text = (
+        '[start]\nx0 = "x"\nhdg0 = { from = "psi", sign = -1, offset = "90 deg" }\n'
+        'v0 = "speed"\nbeta0 = "slip"\nqw0 = "qw"\nqz0 = "qz"\nvn0 = "world_vy"'
+    )
+    start = wire(own_fmu(*parameters), parse_map(text)).start_values(STATE)
+    _, _, psi, vx, vy, _, _ = STATE
+    assert [start[one.name] for one in parameters] == pytest.approx(
+        [
+            *(150.0, 90 - math.degrees(psi), 3.6 * math.hypot(vx, vy)),
+            *(math.degrees(math.atan2(vy, vx)), math.cos(psi / 2), math.sin(psi / 2)),
+            math.sin(psi) * vx + math.cos(psi) * vy,
+        ],
+        rel=1e-14,
+    )
+
+
+@those(psi=st.floats(-20, 20))
+def test_a_start_heading_is_turned_into_the_declared_range(psi: float) -> None:
+    hdg0 = variable("hdg0", "parameter", "deg", lowest=0.0, highest=360.0)
+    text = '[start]\nhdg0 = { from = "psi", sign = -1, offset = "90 deg" }'
+    x0 = STATE.copy()
+    x0[2] = psi
+    start = wire(own_fmu(hdg0), parse_map(text)).start_values(x0)["hdg0"]
+    assert isinstance(start, float)
+    assert 0.0 <= start <= 360.0
+    assert math.remainder(start - (90 - math.degrees(psi)), 360.0) == pytest.approx(0, abs=1e-11)
+
+
+def test_a_start_value_out_of_range_is_refused() -> None:
+    v0 = variable("v0", "parameter", "m/s", highest=1.0)
+    wiring = wire(own_fmu(v0), parse_map('[start]\nv0 = "vx"'))
+    with pytest.raises(InputError, match=r"cannot start with v0 = 1\.8"):
+        wiring.start_values(STATE)
+
+
+def test_an_fmu_that_starts_elsewhere_is_refused_unless_placed() -> None:
+    wiring = wire(own_fmu())
+    with pytest.raises(InputError, match="placed = true"):
+        wiring.begin(values(wiring, our_names(np.zeros(7))), STATE)
+
+
+@those(
+    pose=st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.floats(-10, 10)),
+    asked=st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.floats(-10, 10)),
+    distance=st.floats(0, 5),
+)
+def test_a_placed_fmu_drives_the_same_way_from_the_asked_pose(
+    pose: tuple[float, float, float], asked: tuple[float, float, float], distance: float
+) -> None:
+    """Ahead of its own start is ahead of the asked one; velocities are the car's, unchanged."""
+    text = '[fmu]\nplaced = true\n[derive]\nvelocity = { world_x = "ve", world_y = "vn" }'
+    fmu = own_fmu(given("ve"), given("vn"), without=("vx", "vy"))
+    wiring = wire(fmu, parse_map(text))
+    say = replacing(
+        *("vx", "vy"),
+        ve=lambda s: math.cos(s["psi"]) * s["vx"] - math.sin(s["psi"]) * s["vy"],
+        vn=lambda s: math.sin(s["psi"]) * s["vx"] + math.cos(s["psi"]) * s["vy"],
+    )
+
+    def after(start: tuple[float, float, float]) -> tuple[Array, Array]:
+        """The state there and the one ``distance`` ahead and a quarter turn to the left."""
+        first, later = STATE.copy(), STATE.copy()
+        x, y, psi = start
+        first[:3] = start
+        later[:3] = x + distance * math.cos(psi), y + distance * math.sin(psi), psi + math.pi / 2
+        return first, later
+
+    (theirs, theirs_later), (ours, ours_later) = after(pose), after(asked)
+    assert_same(wiring.begin(values(wiring, say(theirs)), ours), ours)
+    got = wiring.state(values(wiring, say(theirs_later)), U, 0.02)
+    assert np.abs(got - ours_later).max() < 1e-11
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_what_is_not_finite_comes_through_as_such(bad: float) -> None:
+    """Whoever looks at the state must see it; nothing on the way may raise."""
+    for text, without, theirs in (
+        ("", (), ()),
+        ('[derive]\nvelocity = { world_x = "a", world_y = "b" }', ("vx", "vy"), ("a", "b")),
+        ('[derive]\nvelocity = { speed = "a", slip = "b" }', ("vx", "vy"), ("a", "b")),
+        ('[derive]\npsi = { cos = "a", sin = "b" }', ("psi",), ("a", "b")),
+    ):
+        fmu = own_fmu(*map(given, theirs), without=without)
+        wiring = wire(fmu, parse_map(text))
+        wiring.begin([bad] * len(wiring.outputs), STATE)
+        assert not np.isfinite(wiring.state([bad] * len(wiring.outputs), U, 0.02)).all()
+
+
+def test_a_quaternion_of_zeros_is_no_heading() -> None:
+    fmu = own_fmu(*(given(name) for name in "wijk"), without=("psi",))
+    rule = '[derive]\npsi = { quaternion = { w = "w", x = "i", y = "j", z = "k" } }'
+    wiring = wire(fmu, parse_map(rule))
+    state = wiring.begin([0.0] * len(wiring.outputs), STATE)
+    assert math.isnan(state[2])
+
+
+def test_a_foreign_vehicle_altogether() -> None:
+    """The names, units and signs of a model that nobody made for us."""
+    fmu = description(
+        *(taken("PedalPercent", "%"), taken("SteerAngleCmd", "deg")),
+        *(given("posEast", "cm"), given("posNorth", "cm"), given("compass", "deg")),
+        *(given("velEast", "km/h"), given("velNorth", "km/h"), given("turnRate", "deg/s")),
+    )
+    text = FOREIGN_MAP[: FOREIGN_MAP.index("[start]")]
+    wiring = wire(fmu, parse_map(text))
+
+    def say(state: Array) -> dict[str, float]:
+        x, y, psi, vx, vy, omega, _ = state
+        return {
+            "posEast": 100 * x,
+            "posNorth": 100 * y,
+            "compass": (90 - math.degrees(psi)) % 360,
+            "velEast": 3.6 * (math.cos(psi) * vx - math.sin(psi) * vy),
+            "velNorth": 3.6 * (math.sin(psi) * vx + math.cos(psi) * vy),
+            "turnRate": -math.degrees(omega),
+        }
+
+    start = STATE.copy()
+    start[6] -= 0.02 * U[1]
+    assert_same(wiring.begin(values(wiring, say(start)), start), start)
+    sent = dict(zip(wiring.inputs, wiring.to_inputs(U, start[6], 0.02), strict=True))
+    assert sent == pytest.approx({"PedalPercent": 40.0, "SteerAngleCmd": -math.degrees(STATE[6])})
+    assert_same(wiring.state(values(wiring, say(STATE)), U, 0.02), STATE)
