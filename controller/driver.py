@@ -235,7 +235,7 @@ class Driver:
         standing = abs(self._vx_mps) < _STANDING_MPS / 2 and self._halted is None
         if not standing or self._standing_s is None or basis_s < self._standing_s:
             self._standing_s = basis_s if standing else None
-        elif basis_s - self._standing_s > _STUCK_S:
+        elif basis_s - self._standing_s > _STUCK_S + 1e-6:
             self._standing_s = basis_s
             self._controller.reset(state)
             self._stepped_s = None

@@ -1,0 +1,159 @@
+/* See controller_resources.h. Bytes are put together one by one, so that the host's byte order and
+ * alignment do not matter. */
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "controller_resources.h"
+
+#define HEAD_BYTES 32
+#define SCHEMA 1
+#define GP_HEAD_BYTES (2 * 4 + (2 + BR_NZ) * 8)
+#define PATH_BYTES_MAX (8 + (size_t)BR_PATH_CAPACITY * BR_PATH_COLUMNS * 8)
+#define WEIGHTS_BYTES_MAX \
+    (RESOURCE_IDENTITY_BYTES + BR_NE * (GP_HEAD_BYTES + (size_t)BR_GP_CAPACITY * (BR_NZ + 1) * 8))
+
+/* A file being read, and what is left of it. */
+typedef struct {
+    const char *name;
+    unsigned char *data; /* owned */
+    const unsigned char *at;
+    size_t left;
+    char *text; /* for the sentence that says what is wrong */
+    size_t text_size;
+} reader;
+
+static int wrong(const reader *r, const char *what, const char *remedy) {
+    snprintf(r->text, r->text_size, "resources/%s %s: %s", r->name, what, remedy);
+    return -1;
+}
+
+static const char *const ANEW = "export the FMU again, or put the file back";
+
+static uint64_t read_integer(reader *r, int bytes) {
+    uint64_t value = 0;
+    for (int i = 0; i < bytes; ++i) value |= (uint64_t)r->at[i] << (8 * i);
+    r->at += bytes;
+    r->left -= (size_t)bytes;
+    return value;
+}
+
+static double read_double(reader *r) {
+    const uint64_t bits = read_integer(r, 8);
+    double value;
+    memcpy(&value, &bits, sizeof value);
+    return value;
+}
+
+static void read_doubles(reader *r, double *values, size_t n) {
+    for (size_t i = 0; i < n; ++i) values[i] = read_double(r);
+}
+
+static uint64_t fnv1a(const unsigned char *data, size_t n) {
+    uint64_t hash = 14695981039346656037u;
+    for (size_t i = 0; i < n; ++i) hash = (hash ^ data[i]) * 1099511628211u;
+    return hash;
+}
+
+/* The whole file in memory, at most this long, head checked and passed. */
+static int open_file(reader *r, const char *folder, const char *magic, size_t body_max) {
+    const size_t length = strlen(folder) + strlen(r->name) + 2;
+    char *path = malloc(length);
+    const size_t most = HEAD_BYTES + body_max + 1;
+    r->data = malloc(most);
+    if (!path || !r->data) {
+        free(path);
+        return wrong(r, "does not fit into memory", "close other programs");
+    }
+    snprintf(path, length, "%s/%s", folder, r->name);
+    FILE *file = fopen(path, "rb");
+    free(path);
+    if (!file) return wrong(r, "is missing or cannot be read", ANEW);
+    const size_t size = fread(r->data, 1, most, file);
+    const int failed = ferror(file);
+    fclose(file);
+    if (failed) return wrong(r, "cannot be read", ANEW);
+    if (size < HEAD_BYTES || size == most) return wrong(r, "has an impossible length", ANEW);
+    r->at = r->data;
+    r->left = size;
+    if (memcmp(r->at, magic, 8)) return wrong(r, "is a file of another kind", ANEW);
+    r->at += 8, r->left -= 8;
+    if (read_integer(r, 4) != SCHEMA) return wrong(r, "has another schema", "export the FMU again");
+    const uint64_t body = read_integer(r, 4), hash = read_integer(r, 8);
+    (void)read_integer(r, 8);
+    if (body != r->left) return wrong(r, "is cut off or too long", ANEW);
+    if (hash != fnv1a(r->at, r->left)) return wrong(r, "is damaged (checksum)", ANEW);
+    return 0;
+}
+
+static int load_path(reader *r, br_mpc *mpc) {
+    const size_t row = BR_PATH_COLUMNS * 8;
+    if (r->left < 8 + row || (r->left - 8) % row)
+        return wrong(r, "does not hold whole rows", "write it with codegen.fmu.resources");
+    const double spacing = read_double(r);
+    const size_t count = r->left / row;
+    double *table = malloc(count * row);
+    if (!table) return wrong(r, "does not fit into memory", "close other programs");
+    read_doubles(r, table, count * BR_PATH_COLUMNS);
+    const br_mpc_error error = br_mpc_set_path(mpc, table, (int)count, spacing);
+    free(table);
+    return error ? wrong(r, br_mpc_error_text(error), "export the FMU again") : 0;
+}
+
+/* One output; its arrays follow each other in numbers. */
+static int load_output(reader *r, br_mpc_gp *gp, double *numbers) {
+    if (r->left < GP_HEAD_BYTES) return wrong(r, "is cut off", ANEW);
+    const uint64_t kernel = read_integer(r, 4), n = read_integer(r, 4);
+    if (kernel > BR_KERNEL_MATERN25) return wrong(r, "has an unknown kernel", "train again");
+    if (n > BR_GP_CAPACITY)
+        return wrong(r, "has more training points than this controller has room for",
+                     "train with fewer points or export with a larger capacity");
+    gp->kernel = (int)kernel;
+    gp->n = (int)n;
+    gp->offset = read_double(r);
+    gp->scale = read_double(r);
+    const size_t count = BR_NZ + (size_t)n * (BR_NZ + 1);
+    if (r->left < count * 8) return wrong(r, "is cut off", ANEW);
+    read_doubles(r, numbers, count);
+    gp->length_scales = numbers;
+    gp->inputs = numbers + BR_NZ;
+    gp->alpha = gp->inputs + (size_t)n * BR_NZ;
+    return 0;
+}
+
+static int load_weights(reader *r, br_mpc *mpc, const char *identity) {
+    if (r->left < RESOURCE_IDENTITY_BYTES) return wrong(r, "is cut off", ANEW);
+    if (strncmp((const char *)r->at, identity, RESOURCE_IDENTITY_BYTES))
+        return wrong(r, "was learned for another model, car or time step",
+                     "train with those of this controller");
+    r->at += RESOURCE_IDENTITY_BYTES;
+    r->left -= RESOURCE_IDENTITY_BYTES;
+    const size_t each = BR_NZ + (size_t)BR_GP_CAPACITY * (BR_NZ + 1);
+    double *numbers = malloc(BR_NE * each * sizeof *numbers);
+    if (!numbers) return wrong(r, "does not fit into memory", "close other programs");
+    br_mpc_gp outputs[BR_NE];
+    int failed = 0;
+    for (int j = 0; j < BR_NE && !failed; ++j)
+        failed = load_output(r, &outputs[j], numbers + (size_t)j * each);
+    if (!failed && r->left) failed = wrong(r, "is too long", ANEW);
+    if (!failed) {
+        const br_mpc_error error = br_mpc_set_weights(mpc, outputs);
+        if (error) failed = wrong(r, br_mpc_error_text(error), "train again");
+    }
+    free(numbers);
+    return failed;
+}
+
+int resources_load(br_mpc *mpc, const char *folder, const char *identity, char *text,
+                   size_t size) {
+    reader path = {.name = RESOURCE_PATH, .text = text, .text_size = size};
+    reader weights = {.name = RESOURCE_WEIGHTS, .text = text, .text_size = size};
+    int failed = open_file(&path, folder, "BRFMPATH", PATH_BYTES_MAX) || load_path(&path, mpc);
+    free(path.data);
+    if (failed) return -1;
+    failed = open_file(&weights, folder, "BRFMGPWT", WEIGHTS_BYTES_MAX) ||
+             load_weights(&weights, mpc, identity);
+    free(weights.data);
+    return failed ? -1 : 0;
+}

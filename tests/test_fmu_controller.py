@@ -1,0 +1,225 @@
+"""The controller as an FMU in a plain FMI master: the lap of the lockstep run, no bad input."""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pytest
+from fmpy.validation import validate_fmu
+from numpy.typing import NDArray
+
+from bayesrace.gp.weights import GpWeights
+from bayesrace.vehicles import CarParameters, get_car
+from controller.fallback import Level
+from controller.native_step import StepStatus
+from tests.conftest import Circuit
+from tests.fmu_lockstep import (
+    RACING,
+    STEP_S,
+    STEPS,
+    Exported,
+    Lockstep,
+    answers,
+    make_exported,
+    make_lockstep,
+    same,
+    strewn,
+    versions,
+)
+from tests.fmu_master import STATES, drive
+
+Floats = NDArray[np.float64]
+
+
+@pytest.fixture(scope="module")
+def exported(
+    tmp_path_factory: pytest.TempPathFactory,
+    kinematic_artefact: Path,
+    car: CarParameters,
+    circuit: Circuit,
+    weights: GpWeights,
+) -> Exported:
+    folder = tmp_path_factory.getbasetemp() / "controller"
+    return make_exported(folder, kinematic_artefact, car, circuit, weights)
+
+
+@pytest.fixture
+def lockstep(
+    kinematic_artefact: Path, car: CarParameters, circuit: Circuit, weights: GpWeights
+) -> Callable[..., Lockstep]:
+    return partial(make_lockstep, kinematic_artefact, car, circuit, weights)
+
+
+@versions
+def test_fmpy_has_no_finding(exported: Exported, version: Literal[2, 3]) -> None:
+    assert validate_fmu(str(exported.fmu(version))) == []
+
+
+@versions
+def test_a_plain_master_drives_the_lockstep_run(
+    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit, version: Literal[2, 3]
+) -> None:
+    """With the host's CPU flags the controller gives the same bits; the car differs by rounding."""
+    start = circuit.start(v_mps=0.1)
+    run = lockstep().run(start, STEPS)
+    laps = (run.x[-1][2] - run.x[0][2]) / (2 * np.pi)
+    assert laps > 3
+    controller = exported.slave(exported.fmu(version))
+    same(answers(controller, run.x), run)
+    controller.reset()
+    controller.initialise()
+    car = exported.slave(exported.plant(version), dict(zip(STATES, start, strict=True)))
+    states, inputs = drive(car, controller, STEPS)
+    np.testing.assert_allclose(states, run.x, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(inputs, run.u, rtol=0, atol=1e-7)
+    controller.close()
+    car.close()
+
+
+def test_a_portable_binary_drives_the_same_lap_but_for_rounding(
+    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit
+) -> None:
+    start = circuit.start(v_mps=0.1)
+    run = lockstep().run(start, STEPS)
+    controller = exported.slave(exported.fmu(3, "portable"))
+    assert not np.array_equal(answers(controller, run.x)[:, :2], run.u)  # else this tests nothing
+    controller.reset()
+    controller.initialise()
+    car = exported.slave(exported.plant(3), dict(zip(STATES, start, strict=True)))
+    states, _ = drive(car, controller, STEPS)
+    np.testing.assert_allclose(states, run.x, rtol=0, atol=1e-7)
+
+
+def test_a_master_that_steps_side_by_side_is_compensated_for(
+    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit
+) -> None:
+    """The car gets each input a step later, and the controller knows."""
+    start = circuit.start(v_mps=0.1)
+    run = lockstep(delay_s=STEP_S).run(start, STEPS)
+    controller = exported.slave(exported.fmu(3), {"delay": STEP_S})
+    same(answers(controller, run.x), run)
+    assert max(level for _, level in run.said) == Level.SOLUTION
+    controller.reset()
+    controller.initialise({"delay": STEP_S})
+    car = exported.slave(exported.plant(3), dict(zip(STATES, start, strict=True)))
+    states, _ = drive(car, controller, STEPS, parallel=True)
+    np.testing.assert_allclose(states, run.x, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("turned_rad", [-1.1, 1.1])
+def test_a_car_that_stands_and_points_away_finds_its_way_as_in_lockstep(
+    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit, turned_rad: float
+) -> None:
+    start = circuit.start(1.0, 0.0)
+    start[2] += turned_rad
+    start[6] = 0.35 * np.sign(turned_rad)
+    run = lockstep().run(start, 150)
+    assert run.x[-1][3] > 0.5
+    same(answers(exported.slave(exported.fmu(2)), run.x), run)
+
+
+def test_a_stuck_car_begins_anew_every_half_second(
+    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit
+) -> None:
+    """A car that is held by something, and does not move whatever is sent."""
+    run = lockstep()
+    for k in range(80):
+        d, delta_rate = run.answer(k, circuit.start(0.5, 0.0))
+        run.plant.u_applied = (float(d), float(delta_rate))
+    u = np.array(run.u)
+    assert any(not np.array_equal(a, b) for a, b in zip(u[20:], u[19:-1], strict=True))
+    same(answers(exported.slave(exported.fmu(3)), run.x), run)
+
+
+@versions
+def test_bad_states_are_answered_as_in_lockstep_and_nothing_bad_comes_out(
+    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit, version: Literal[2, 3]
+) -> None:
+    run = lockstep().run(circuit.start(v_mps=1.0), 320, strewn)
+    statuses, levels = ({said[i] for said in run.said} for i in (0, 1))
+    assert statuses >= {0, StepStatus.INFEASIBLE, StepStatus.BAD_STATE}
+    assert levels == set(Level)
+    controller = exported.slave(exported.fmu(version))
+    same(answers(controller, run.x), run)
+    controller.reset()
+    controller.initialise({"d_applied_connected": 1.0, "delay": 0.03})
+    outputs = [v.name for v in controller.description.modelVariables if v.causality == "output"]
+    limits = np.array([get_car("orca").d_max, get_car("orca").delta_rate_max_radps])
+    poison = (np.nan, np.inf, -np.inf, -1.0, 1e300)
+    for k, x in enumerate(run.x):
+        inputs = dict(zip(STATES, x, strict=True))
+        names = ("d_applied", "speed_limit", "speed_limit_rate")
+        inputs[names[k % 3]] = poison[k // 3 % 5] if k % 4 else 0.5
+        controller.set(inputs)
+        controller.step(STEP_S)
+        assert np.isfinite(controller.get(*outputs)).all()
+        assert (np.abs(controller.get("d", "delta_rate")) <= limits).all()
+    assert controller.messages == []
+
+
+def test_parameters_act_and_limits_can_be_tuned_during_the_run(
+    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit
+) -> None:
+    start = circuit.start(v_mps=0.1)
+    run = lockstep()
+    other = RACING.model_copy(update={"r_duty": 0.05, "margin_m": 0.03})
+    run.native.set_parameters(run.car, other)
+    run.run(start, 100)
+    controller = exported.slave(exported.fmu(3), {"r_duty": 0.05, "margin_m": 0.03})
+    same(answers(controller, run.x), run)
+    controller.set({"d_max": 0.2, "delta_rate_max_radps": 1.0})
+    tuned = answers(controller, run.x)
+    assert tuned[:, 0].max() == 0.2
+    assert np.abs(tuned[:, 1]).max() == 1.0
+    assert (tuned[1:, 3] == Level.SOLUTION).all()  # the first has the car jump back
+
+
+def test_a_speed_limit_slows_down_along_the_line_to_standstill(
+    exported: Exported, circuit: Circuit
+) -> None:
+    start = circuit.start(v_mps=1.5)
+    controller = exported.slave(exported.fmu(3))
+    car = exported.slave(exported.plant(3), dict(zip(STATES, start, strict=True)))
+    drive(car, controller, 50)
+    controller.set({"speed_limit": 0.8})
+    states, _ = drive(car, controller, 100)
+    assert states[50:, 3].max() < 1.0
+    for k in range(100):
+        controller.set({"speed_limit": max(0.8 - 1.5 * STEP_S * k, 0.0), "speed_limit_rate": 1.5})
+        states, _ = drive(car, controller, 1)
+    assert abs(states[0, 3]) < 0.05
+    assert controller.get("fallback_level") == [Level.SOLUTION]
+    assert abs(controller.get("lateral_m")[0]) < 0.1
+
+
+@pytest.mark.parametrize("h", [0.001, 0.005])
+def test_a_short_communication_step_holds_the_outputs_for_a_period(
+    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit, h: float
+) -> None:
+    run = lockstep().run(circuit.start(v_mps=1.0), 60)
+    times = round(STEP_S / h)
+    controller = exported.slave(exported.fmu(3))
+    rows = answers(controller, [x for x in run.x for _ in range(times)], h)
+    for offset in range(times):
+        same(rows[offset::times], run)
+    free = exported.slave(exported.fmu(3), {"period": 0.0}, "free")
+    first = answers(free, [run.x[0]] * times, h)
+    assert len({tuple(row[:2]) for row in first}) > 1
+
+
+def test_what_acts_may_be_connected(
+    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit
+) -> None:
+    """By default it is what was sent; a car that does something else says so."""
+    run = lockstep().run(circuit.start(v_mps=1.0), 50)
+    connected = exported.slave(exported.fmu(3), {"d_applied_connected": 1.0})
+    rows = []
+    for k, x in enumerate(run.x):
+        connected.set({"d_applied": run.u[k - 1][0] if k else 0.0})
+        rows.append(answers(connected, [x])[0])
+    same(np.array(rows), run)
+    connected.set({"d_applied": -0.1})
+    changed = answers(connected, [run.x[-1]])
+    assert changed[0, 0] < rows[-1][0] - 0.01

@@ -1,0 +1,228 @@
+"""The controller's FMU among other tools: instances, saved states, misuse, exchanged weights."""
+
+import shutil
+import subprocess
+import zipfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pytest
+from fmpy.validation import validate_fmu
+from numpy.typing import NDArray
+
+from bayesrace.errors import InputError
+from bayesrace.gp.weights import GpWeights, zero_weights
+from bayesrace.vehicles import CarParameters
+from codegen.fmu import pack, write_sources
+from codegen.fmu.resources import WEIGHTS_FILE, exchange_weights, path_resource
+from tests.conftest import Circuit, fit_weights
+from tests.fmu_lockstep import (
+    Exported,
+    Lockstep,
+    answers,
+    make_exported,
+    make_lockstep,
+    same,
+    strewn,
+    versions,
+)
+from tests.fmu_master import Slave
+
+Floats = NDArray[np.float64]
+
+
+@pytest.fixture(scope="module")
+def exported(
+    tmp_path_factory: pytest.TempPathFactory,
+    kinematic_artefact: Path,
+    car: CarParameters,
+    circuit: Circuit,
+    weights: GpWeights,
+) -> Exported:
+    folder = tmp_path_factory.getbasetemp() / "controller"
+    return make_exported(folder, kinematic_artefact, car, circuit, weights)
+
+
+@pytest.fixture
+def lockstep(
+    kinematic_artefact: Path, car: CarParameters, circuit: Circuit, weights: GpWeights
+) -> Callable[..., Lockstep]:
+    return partial(make_lockstep, kinematic_artefact, car, circuit, weights)
+
+
+def test_two_instances_do_not_know_each_other_and_reset_begins_the_same_run_again(
+    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit
+) -> None:
+    one_run = lockstep().run(circuit.start(v_mps=0.1), 80)
+    two_run = lockstep().run(circuit.start(2.0, 1.5), 80)
+    one, two = (exported.slave(exported.fmu(3), name=name) for name in ("one", "two"))
+    for _ in range(2):
+        rows = [
+            np.r_[answers(one, [a]), answers(two, [b])]
+            for a, b in zip(one_run.x, two_run.x, strict=True)
+        ]
+        same(np.array(rows)[:, 0], one_run)
+        same(np.array(rows)[:, 1], two_run)
+        one.set({"r_duty": 0.07})
+        for slave in (one, two):
+            slave.reset()
+            slave.initialise()
+
+
+@versions
+def test_a_tool_can_roll_back(
+    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit, version: Literal[2, 3]
+) -> None:
+    run = lockstep().run(circuit.start(v_mps=1.0), 60)
+    controller = exported.slave(exported.fmu(version))
+    answers(controller, run.x[:30])
+    get, put, free = (
+        getattr(controller.fmu, f"{what}{'FMUstate' if version == 2 else 'FMUState'}")
+        for what in ("get", "set", "free")
+    )
+    state, time = get(), controller.time
+    ahead = answers(controller, run.x[30:])
+    put(state)
+    controller.time = time
+    np.testing.assert_array_equal(answers(controller, run.x[30:]), ahead)
+    free(state)
+
+
+@pytest.mark.slow
+def test_no_sanitizer_finds_anything_and_c_sees_what_the_master_sees(
+    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit, tmp_path: Path
+) -> None:
+    """A drive with bad states strewn in, saved and restored states, resets, missing resources."""
+    gcc = shutil.which("gcc")
+    if gcc is None:
+        pytest.skip("gcc is not installed")
+    run = lockstep().run(circuit.start(v_mps=1.0), 280, strewn)
+    definition = exported.define(version=3)
+    linked = write_sources(definition, tmp_path)
+    flags = ["-O1", "-g", "-std=gnu11", "-Wall", "-Wextra", "-march=native", "-ffp-contract=fast"]
+    flags += ["-Wno-unused-parameter", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    main = Path(__file__).parent / "native" / "fmu_controller.c"
+    line = [gcc, *flags, "-I.", str(main), *linked, "-lm", "-o", "drive"]
+    done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, timeout=280)
+    if "cannot find -lasan" in done.stderr or "cannot find -lubsan" in done.stderr:
+        pytest.skip("gcc's sanitizer libraries are not installed")
+    assert done.returncode == 0, done.stderr[-4000:]
+    assert not [line for line in done.stderr.splitlines() if "controller" in line], done.stderr
+    resources = tmp_path / "resources"
+    resources.mkdir()
+    for name, content in definition.resources.items():
+        (resources / name).write_bytes(content)
+    np.array(run.x).tofile(tmp_path / "states.bin")
+    done = subprocess.run(
+        [tmp_path / "drive", resources, tmp_path / "states.bin", tmp_path / "results.bin"],
+        capture_output=True, text=True, timeout=280,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-4000:]
+    results = np.fromfile(tmp_path / "results.bin").reshape(-1, 2)
+    np.testing.assert_allclose(results, np.array(run.u), rtol=0, atol=1e-6)
+
+
+# Misuse ------------------------------------------------------------------------------------------
+
+
+@versions
+def test_wrong_parameters_are_refused_and_named(
+    exported: Exported, circuit: Circuit, version: Literal[2, 3]
+) -> None:
+    controller = exported.slave(exported.fmu(version))
+    for name, value in (("q_position", 0.0), ("r_duty", np.nan), ("iterations", 0), ("delay", 0.1)):
+        with pytest.raises(Exception, match="fmi"):
+            controller.set({name: value})
+        assert name in controller.messages[-1]
+    answers(controller, [circuit.start()])
+    controller.set({"d_max": 0.0, "d_min": 0.0})  # each within its own bounds
+    with pytest.raises(Exception, match="fmi"):
+        answers(controller, [circuit.start()])
+    assert "d_min must be below d_max" in controller.messages[-1]
+    assert controller.get("status") == [255]
+    assert np.isfinite(controller.get("d", "delta_rate")).all()
+    controller.reset()
+    with pytest.raises(Exception, match="fmi"):
+        controller.initialise({"d_max": 0.0, "d_min": 0.0})
+
+
+@versions
+def test_missing_and_damaged_resources_are_refused_and_named(
+    exported: Exported, tmp_path: Path, version: Literal[2, 3]
+) -> None:
+    fmu = exported.fmu(version)
+    damaged = tmp_path / "damaged"
+    with zipfile.ZipFile(fmu) as archive:
+        archive.extractall(damaged)
+    weights = damaged / "resources" / WEIGHTS_FILE
+    data = weights.read_bytes()
+
+    said: list[str] = []
+
+    class Told(Slave):
+        def _told(self, text: bytes) -> None:
+            said.append(text.decode())
+
+    for change, words in (
+        (lambda: weights.write_bytes(data[:-8]), "cut off"),
+        (lambda: weights.write_bytes(data[:500] + b"\xff" + data[501:]), "damaged (checksum)"),
+        (weights.unlink, "missing"),
+        (lambda: shutil.rmtree(damaged / "resources"), "resources/path.bin is missing"),
+    ):
+        change()
+        with pytest.raises(Exception, match="instantiate"):
+            Told(fmu, damaged)
+        assert words in said[-1], said
+
+
+def test_weights_are_exchanged_without_compiling(
+    exported: Exported,
+    lockstep: Callable[..., Lockstep],
+    circuit: Circuit,
+    car: CarParameters,
+    weights: GpWeights,
+    tmp_path: Path,
+) -> None:
+    other = fit_weights(car, ("matern25", "rbf", "rbf"), count=90, seed=4)
+    out = tmp_path / "other.fmu"
+    exchange_weights(exported.fmu(3), other, out)
+    assert validate_fmu(str(out)) == []
+    run = lockstep()
+    run.native.set_weights(other)
+    run.run(circuit.start(v_mps=1.0), 60)
+    same(answers(exported.slave(out), run.x), run)
+    exchange_weights(out, None, out)  # in place
+    worst = lockstep()
+    worst.native.set_zero_weights()
+    worst.run(circuit.start(v_mps=1.0), 60)
+    controller = Slave(out, tmp_path / "worst")
+    controller.initialise()
+    same(answers(controller, worst.x), worst)
+    with pytest.raises(InputError, match="learned for"):
+        exchange_weights(out, zero_weights("orca", "another"), out)
+    with pytest.raises(InputError, match="not a controller's FMU"):
+        exchange_weights(exported.plant(3), weights, out)
+    with pytest.raises(InputError, match="cannot be read"):
+        exchange_weights(tmp_path / "none.fmu", weights, out)
+
+
+def test_what_does_not_fit_together_is_not_exported(
+    exported: Exported, circuit: Circuit, car: CarParameters
+) -> None:
+    heavier = car.model_copy(update={"mass_kg": 0.05})
+    with pytest.raises(InputError, match="built for car"):
+        exported.define(car=heavier)
+    with pytest.raises(InputError, match="learned for"):
+        exported.define(weights=zero_weights("orca", "another"))
+    with pytest.raises(InputError, match="lack 'q_position'"):
+        exported.define(settings={})
+    with pytest.raises(InputError, match="path table"):
+        exported.define(rows=circuit.table.rows[:4])
+    with pytest.raises(InputError, match="is not a CPU"):
+        exported.define(cpu="-O0 evil")
+    with pytest.raises(InputError, match="export it there"):
+        pack(exported.define(), exported.folder / "no.fmu", ["x86_64-linux", "x86_64-windows"])
+    assert len(path_resource(circuit.table.rows, circuit.table.spacing_m)) % 8 == 0
