@@ -22,6 +22,7 @@ from experiments.collect import drive_samples
 from experiments.settings import RaceSettings
 from learning.dataset import Dataset, filter_dataset
 from plant.simulator import Simulator
+from plant.vehicle import Vehicle
 
 __all__ = ["Drive", "drive", "pursue"]
 
@@ -61,9 +62,13 @@ def drive(
     line: RaceLine,
     weights: GpWeights | None = None,
     laps: int = 2,
+    vehicle: Vehicle | None = None,
 ) -> Drive:
-    """Drives from the start line until the laps are done or time is up."""
-    step, simulator = NativeStep(artefact, car, MpcSettings()), Simulator(dynamic(car))
+    """Drives from the start line until the laps are done or time is up.
+
+    ``vehicle``: what plays the car; the built-in equations without.
+    """
+    step, simulator = NativeStep(artefact, car, MpcSettings()), vehicle or Simulator(dynamic(car))
     step.set_path(make_path_table(track, line))
     if weights is not None:
         step.set_weights(weights)

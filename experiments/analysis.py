@@ -267,6 +267,7 @@ def _summary(settings: dict[str, Any]) -> SettingsSummary:
         seed=int(settings.get("seed", 0)),
         laps=int(settings.get("laps", 0)),
         constraints=bool(mpc.get("constraints", True)) if isinstance(mpc, dict) else True,
+        fmu=Path(str(settings.get("fmu") or "")).name,
     )
 
 

@@ -14,6 +14,7 @@ from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
 from controller.pure_pursuit import PurePursuit, PurePursuitSettings
 from plant.simulator import Simulator
+from plant.vehicle import Vehicle
 
 __all__ = ["collect", "drive_samples"]
 
@@ -27,13 +28,15 @@ def drive_samples(
     duration_s: float,
     settings: PurePursuitSettings,
     start_speed_mps: float = 0.1,
+    vehicle: Vehicle | None = None,
 ) -> tuple[Floats, Floats]:
     """Drives for ``duration_s``: states (n + 1, 7), inputs that acted (n, 2).
 
     Driver and car take turns in one process, which is lockstep without a transport. The same
-    settings give the same drive to the bit.
+    settings give the same drive to the bit. ``vehicle``: what plays the car; the built-in
+    equations without.
     """
-    simulator = Simulator(dynamic(car))
+    simulator = vehicle or Simulator(dynamic(car))
     x, y, psi = track.start_pose()
     simulator.reset([x, y, psi, start_speed_mps, 0.0, 0.0, 0.0])
     driver = PurePursuit(car, line.x_m, line.y_m, line.vx_mps, settings)
@@ -62,12 +65,13 @@ def collect(
     duration_s: float,
     settings: PurePursuitSettings,
     start_speed_mps: float = 0.1,
+    vehicle: Vehicle | None = None,
 ) -> int:
     """Drives and writes states and actuations to the log at ``path``; the number of samples.
 
     Pure pursuit saturates its commands as the car does: what it asked for is what acted.
     """
-    states, inputs = drive_samples(track, line, car, duration_s, settings, start_speed_mps)
+    states, inputs = drive_samples(track, line, car, duration_s, settings, start_speed_mps, vehicle)
     start_line, lap = StartLine(track), 0
     state_key, actuation_key = (car_key(topic.key, car.name) for topic in (STATE, ACTUATION))
     log = LogWriter(path, {"collect": {"track": track.name, "car": car.name}})

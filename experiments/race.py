@@ -5,6 +5,7 @@ directs, records everything that is said on the network, and hands over weights.
 """
 
 import os
+import shutil
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -30,6 +31,9 @@ from experiments.settings import RaceSettings
 from learning.dataset import Dataset, concatenate
 from learning.logs import dataset_from_log
 from learning.training import TrainingSettings, train
+from plant.fmu.faults import FmuFault
+from plant.simulator import PLANT
+from plant.vehicle import Vehicle, open_vehicle
 
 __all__ = ["FILES", "RaceError", "race"]
 
@@ -51,6 +55,8 @@ class _Files:
     weights: str = "weights-bayesrace.bin"
     weights_updated: str = "weights-updated.bin"
     mpc: str = "mpc.json"
+    fmu: str = "car.fmu"
+    fmu_map: str = "car-map.toml"
 
 
 FILES: Final = _Files()
@@ -86,11 +92,39 @@ class _Race:
         """Drives the training track by pure pursuit and reads the samples from the log."""
         settings = self.settings
         log = self.out / FILES.collect_log
-        collect(
-            course.track, course.line, self.car, log, settings.collect_s, settings.pursuit,
-            settings.start_speed_mps,
-        )  # fmt: skip
+        with self.vehicle() as vehicle:
+            collect(
+                course.track, course.line, self.car, log, settings.collect_s, settings.pursuit,
+                settings.start_speed_mps, vehicle,
+            )  # fmt: skip
         return dataset_from_log(log, self.car, settings.discretisation.step_s)
+
+    @contextmanager
+    def vehicle(self) -> Iterator[Vehicle]:
+        """What plays the car where no plant process is needed."""
+        try:
+            with open_vehicle(self.car, *self.fmu_files, 1 / PLANT.step_s) as vehicle:
+                yield vehicle
+        except FmuFault as fault:
+            raise RaceError(str(fault)) from fault
+
+    def keep_fmu(self) -> None:
+        """Copies FMU and map, if there are any, into the run directory, and tries them."""
+        settings = self.settings
+        for source, target in zip((settings.fmu, settings.fmu_map), self.fmu_files, strict=True):
+            if source is not None and target is not None:
+                shutil.copyfile(source, target)
+        with self.vehicle():  # an FMU that cannot be the car is told now, not in half a minute
+            pass
+
+    @property
+    def fmu_files(self) -> tuple[Path | None, Path | None]:
+        """FMU and map in the run directory; None for what there is not."""
+        settings = self.settings
+        return (
+            None if settings.fmu is None else self.out / FILES.fmu,
+            None if settings.fmu_map is None else self.out / FILES.fmu_map,
+        )
 
     def train(
         self, dataset: Dataset, name: str, stage: Stage, initial: GpWeights | None = None
@@ -162,6 +196,8 @@ class _Paddock:
 
     def _plant(self) -> Any:
         arguments = ["plant", "--car", self._race.car.name, "--endpoint", self._plant_endpoint]
+        for option, file in zip(("--fmu", "--map"), self._race.fmu_files, strict=True):
+            arguments += [option, str(file)] if file is not None else []
         return child([*arguments, *self._flags()], self._race.out / "plant.log")
 
     def _stop_children(self) -> None:
@@ -213,6 +249,7 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
         load_track(name, this.car.width_m) for name in (settings.train_track, settings.track)
     )
     out.mkdir(parents=True, exist_ok=True)
+    this.keep_fmu()
     (out / FILES.settings).write_text(settings.model_dump_json(indent=1) + "\n")
     with stages.stage("racing line, training track"):
         training = this.course(train_track, "train")

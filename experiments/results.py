@@ -74,6 +74,7 @@ class SettingsSummary(_Frozen):
     seed: int
     laps: int
     constraints: bool
+    fmu: str = Field("", description="FMU that played the car; empty for the built-in equations")
 
 
 class RaceResult(_Frozen):

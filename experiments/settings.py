@@ -1,5 +1,6 @@
 """Everything a race can be told, as one resolved object that goes into the run directory."""
 
+from pathlib import Path
 from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -26,6 +27,8 @@ class RaceSettings(BaseModel):
         2, ge=1, le=100, description="laps a controller drives: one from standstill, then flying"
     )
     mode: Literal["lockstep", "realtime"] = Field("lockstep", description="time mode of the runs")
+    fmu: Path | None = Field(None, description="FMU that plays the car; the built-in car without")
+    fmu_map: Path | None = Field(None, description="how the FMU's variables are ours (TOML)")
     seed: int = Field(0, ge=0, description="of the training drive and of the GP's starts")
     start_speed_mps: float = Field(0.1, ge=0, le=5, description="speed at the start line")
     time_limit: float = Field(
@@ -41,6 +44,8 @@ class RaceSettings(BaseModel):
     @model_validator(mode="after")
     def _resolve(self) -> Self:
         """One seed and one sampling time hold for all parts; the plant's time is not to choose."""
+        if self.fmu is None and self.fmu_map is not None:
+            raise ValueError(f"map {self.fmu_map} without an FMU to apply it to: add --fmu")
         steps = {self.discretisation.step_s, self.pursuit.step_s, PLANT.step_s}
         if len(steps) > 1:
             raise ValueError(f"all parts must share the plant's period of {PLANT.step_s} s")

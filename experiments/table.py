@@ -106,7 +106,8 @@ def print_table(result: RaceResult, console: Console) -> None:
         Text(
             f"{summary.track} · {summary.car} · {summary.mode} · seed {summary.seed}"
             f" · trained on {summary.train_track}"
-            f" · track constraints {'on' if summary.constraints else 'off'}",
+            f" · track constraints {'on' if summary.constraints else 'off'}"
+            + (f" · car played by {summary.fmu}" if summary.fmu else ""),
             style="bold",
         )
     )

@@ -3,6 +3,7 @@
 The races run once a module, some at the same time: lockstep does not care how fast the machine is.
 """
 
+import json
 import re
 import shutil
 import sys
@@ -15,6 +16,8 @@ import pytest
 from bayesrace.log import LogReader
 from bayesrace.messages import STATE
 from experiments.results import RaceResult, read_result
+from tests.car_fmu import packed_car
+from tests.foreign_fmu import FOREIGN_MAP, build_foreign_fmu
 from tests.programs import Race, leftovers, peanut, run
 from tests.reference import reference_file
 
@@ -58,6 +61,13 @@ def twins(tmp_path_factory: pytest.TempPathFactory) -> tuple[Race, Race]:
 def builtin(twins: tuple[Race, Race]) -> Race:
     """A race with all defaults."""
     return twins[0]
+
+
+@pytest.fixture(scope="module")
+def played_by_fmu(tmp_path_factory: pytest.TempPathFactory) -> Race:
+    """The race by default, but for an FMU as the car."""
+    out = tmp_path_factory.mktemp("race") / "fmu"
+    return Race.running(out, "--fmu", packed_car())()
 
 
 @pytest.fixture(scope="module")
@@ -162,6 +172,50 @@ def test_one_seed_gives_one_race_to_the_bit(twins: tuple[Race, Race]) -> None:
     assert first.result["gp_updated"] == second.result["gp_updated"]
     for name in ("race.csv", "race_raceline.csv", "settings.json"):
         assert (first.out / name).read_bytes() == (second.out / name).read_bytes()
+
+
+def test_the_car_as_an_fmu_gives_the_same_race_to_the_bit(
+    builtin: Race, played_by_fmu: Race
+) -> None:
+    for name in CONTROLLERS:
+        mine, other = builtin.lap(name), played_by_fmu.lap(name)
+        assert mine["trajectory_sha256"] == other["trajectory_sha256"]
+        assert mine["weights_version"] == other["weights_version"]
+    assert played_by_fmu.result["settings"]["fmu"] == packed_car().name
+    assert (played_by_fmu.out / "car.fmu").read_bytes() == packed_car().read_bytes()
+    assert f"car played by {packed_car().name}" in played_by_fmu.process.stdout
+    assert leftovers(played_by_fmu.pid) == {}
+
+
+def test_the_car_as_an_fmu_gives_the_published_lap_to_the_bit(
+    published: Race, tmp_path: Path
+) -> None:
+    """FMI 2.0 here, FMI 3.0 above."""
+    settings = json.loads((published.out / "settings.json").read_text())
+    tracks = ("--track", settings["track"], "--train-track", settings["train_track"])
+    race = Race.running(tmp_path / "fmi2", *tracks, "--fmu", packed_car(2))()
+    for name in CONTROLLERS:
+        mine, other = published.lap(name), race.lap(name)
+        assert mine["trajectory_sha256"] == other["trajectory_sha256"]
+
+
+def test_a_foreign_fmu_laps_through_a_map(builtin: Race, tmp_path: Path) -> None:
+    """Percent, degrees to the right, compass headings, km/h and cm, from another tool."""
+    fmu, fmu_map = build_foreign_fmu(tmp_path), tmp_path / "map.toml"
+    fmu_map.write_text(FOREIGN_MAP)
+    race = Race.running(tmp_path / "out", "--laps", "1", "--fmu", fmu, "--map", fmu_map)()
+    assert (race.out / "car-map.toml").read_text() == FOREIGN_MAP
+    for name in ("bayesrace", "bayesrace-updated", "bestcase"):
+        lap = race.lap(name)
+        assert lap["finished"], lap
+        assert abs(lap["lap_time_s"] - builtin.lap(name)["lap_time_s"]) < 0.3
+
+
+def test_a_map_without_an_fmu_is_refused_at_once(tmp_path: Path) -> None:
+    done = run("race", "--map", "car.toml", "--out", tmp_path / "out")
+    assert done.returncode == 2
+    assert "map car.toml without an FMU" in done.stderr
+    assert not (tmp_path / "out").exists()
 
 
 def test_another_seed_gives_another_race(builtin: Race, others: tuple[Race, Race]) -> None:

@@ -10,11 +10,12 @@ from pydantic import ValidationError
 from bayesrace import __version__
 from bayesrace.errors import InputError
 from bayesrace.interrupts import remembering_interrupts
-from experiments.cli import evaluation, latency, operation, parts, preparation
+from experiments.cli import evaluation, fmu, latency, operation, parts, preparation
 
 __all__ = ["app", "main"]
 
 _INTERRUPTED: Final = 130
+_OUR_OWN: Final = ("bayesrace", "codegen", "experiments", "plant")
 
 app = typer.Typer(
     name="bayesrace",
@@ -40,7 +41,7 @@ def _options(
     logging.basicConfig(level=logging.INFO, format="%(name)s: %(message)s", stream=sys.stderr)
 
 
-for group in (evaluation, latency, preparation, parts, operation):
+for group in (evaluation, latency, preparation, parts, operation, fmu):
     group.register(app)
 
 
@@ -67,8 +68,8 @@ def main() -> None:
     except (typer.Abort, KeyboardInterrupt):
         _fail("interrupted", _INTERRUPTED)
     except RuntimeError as error:
-        # our own: RaceError, RaceLineError, CompileError
-        if type(error).__module__.split(".")[0] not in ("bayesrace", "codegen", "experiments"):
+        # our own: RaceError, RaceLineError, CompileError, FmuFault
+        if type(error).__module__.split(".")[0] not in _OUR_OWN:
             raise
         _fail(str(error), 1)
     except Exception as error:

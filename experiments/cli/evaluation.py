@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK
-from experiments.cli.options import Car, CarName, TrackName, writable
+from experiments.cli.options import Car, CarName, FmuFile, FmuMap, TrackName, writable
 
 __all__ = ["register"]
 
@@ -35,6 +35,8 @@ def race(
         Path | None, typer.Option("--out", "-o", help="Run directory [runs/DATE-TIME].")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the training drive and the GP.")] = 0,
+    fmu: FmuFile = None,
+    fmu_map: FmuMap = None,
 ) -> None:
     """Drive the paper's comparison: WorstCase, BayesRace, BayesRace-updated, BestCase.
 
@@ -53,8 +55,9 @@ def race(
     from experiments.table import print_table
 
     settings = RaceSettings(
-        car=car, track=track, train_track=train_track, laps=laps, mode=mode.value, seed=seed
-    )
+        car=car, track=track, train_track=train_track, laps=laps, mode=mode.value, seed=seed,
+        fmu=fmu, fmu_map=fmu_map,
+    )  # fmt: skip
     mpc = settings.mpc.model_copy(update={"constraints": constraints})
     settings = settings.model_copy(update={"mpc": mpc})
     out = out or Path("runs") / datetime.now(UTC).astimezone().strftime("%Y%m%d-%H%M%S")
@@ -118,7 +121,10 @@ def drive(
     endpoints = Endpoints(connect=tuple(endpoint or (PLANT_ENDPOINT, CONTROLLER_ENDPOINT)))
     course = load_track(track)
     name = name or car
-    with open_session(endpoints) as session, Recorder(session, name, log):
+    with (
+        open_session(endpoints) as session,
+        Recorder(session, name, log, {"drive": {"car": car, "track": course.name}}),
+    ):
         director = Director(session, name)
         director.wait_for(("plant", "controller"), 10.0)
         publisher: Publisher[Event] = Publisher(session, EVENT, name, "race")

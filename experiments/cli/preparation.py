@@ -7,7 +7,15 @@ from typing import Annotated
 
 import typer
 
-from experiments.cli.options import Car, OutFile, RaceLineFile, TrackName, writable
+from experiments.cli.options import (
+    Car,
+    FmuFile,
+    FmuMap,
+    OutFile,
+    RaceLineFile,
+    TrackName,
+    writable,
+)
 
 __all__ = ["register"]
 
@@ -80,6 +88,8 @@ def collect(
     out: OutFile = Path("collect.mcap"),
     duration: Annotated[float, typer.Option(min=1, help="Length of the drive [s].")] = 12.0,
     seed: Annotated[int, typer.Option(min=0, help="Of the excitation.")] = 0,
+    fmu: FmuFile = None,
+    fmu_map: FmuMap = None,
     car: Car = "orca",
 ) -> None:
     """Drive a track by pure pursuit and log it: training data."""
@@ -88,10 +98,14 @@ def collect(
     from bayesrace.vehicles import get_car
     from controller.pure_pursuit import PurePursuitSettings
     from experiments.collect import collect as drive
+    from plant.vehicle import open_vehicle
 
     settings = PurePursuitSettings(seed=seed)
     line = read_raceline(raceline)
-    samples = drive(load_track(track), line, get_car(car), out, duration, settings)
+    with open_vehicle(get_car(car), fmu, fmu_map) as vehicle:
+        samples = drive(
+            load_track(track), line, get_car(car), out, duration, settings, vehicle=vehicle
+        )
     typer.echo(f"{samples} samples: {out}")
 
 

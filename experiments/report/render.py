@@ -110,7 +110,7 @@ def _facts(analysis: RaceAnalysis, result: RaceResult) -> list[tuple[str, str]]:
     started_ns = analysis.recording.started_ns
     facts = [
         ("driven", "–" if started_ns is None else _calendar(started_ns)),
-        ("car", summary.car),
+        ("car", f"{summary.car}, played by {summary.fmu}" if summary.fmu else summary.car),
         ("trained on", summary.train_track),
         ("mode", summary.mode),
         ("seed", str(summary.seed)),
