@@ -111,6 +111,8 @@ def _compile(settings: BuildSettings, compiler: Compiler, folder: Path) -> None:
     for path in NATIVE.glob("*.[ch]"):
         shutil.copy(path, folder)
     shutil.copytree(include / "daqp", folder / "daqp")
+    # its licence wants to go where its code goes
+    shutil.copy(include / "licenses" / "daqp-external" / "LICENSE", folder / "daqp")
     shutil.copy(daqp, folder)
     compiler.shared_library(
         sorted(folder.glob("*.c")), [folder], [folder / daqp.name], folder / LIBRARY

@@ -1,5 +1,6 @@
 """An FMU in a process of its own: whatever it does there, the plant gets an answer or a reason."""
 
+import contextlib
 import math
 import os
 import tempfile
@@ -47,6 +48,17 @@ def hosts(
 def worker_of(host: FmuHost) -> int:
     assert host._process is not None
     return host._process._popen.pid
+
+
+def processes_of(session: int) -> list[str]:
+    """What lives of a session: what an FMU has started, beside its own process (Linux)."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):  # gone meanwhile
+            state, _, _, its_session = entry.read_text().rpartition(")")[2].split()[:4]
+            if int(its_session) == session and state != "Z":
+                found.append(entry.parent.name)
+    return found
 
 
 @pytest.mark.parametrize("version", [2, 3])
@@ -124,6 +136,7 @@ FAULTS = {
     Mode.TERMINATE: "the FMU ended the simulation",
     Mode.CLOSE_ALL: "exit code|closed its connection",
     Mode.SCRIBBLE: "wrote to its process's connection|exit code",
+    Mode.ORPHAN: r"crashed \(SIGABRT\)",
 }
 
 
@@ -143,6 +156,7 @@ def test_a_fault_is_told_with_time_and_last_words(
     assert "faulty" in str(caught.value)
     assert f"at t = {0.04 if mode is Mode.NOT_A_NUMBER else 0.02} s" in str(caught.value)
     assert not Path(f"/proc/{worker}").exists()
+    assert processes_of(session=worker) == []
     with pytest.raises(FmuFault, match="no new run"):
         host.step((0.1, 0.0), 0.02)
     host.start({})

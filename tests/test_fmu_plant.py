@@ -202,22 +202,24 @@ def test_nothing_outlives_the_plant(how: signal.Signals, car_fmu: Path, tmp_path
     assert not workers_of(plant.pid)
 
 
-def test_the_command_refuses_an_unusable_fmu_in_one_line(car_fmu: Path, tmp_path: Path) -> None:
+def test_the_command_refuses_an_unusable_fmu_in_a_line_a_fault(
+    car_fmu: Path, tmp_path: Path
+) -> None:
     folder = car_fmu.parent
     (tmp_path / "map.toml").write_text('[outputs]\nvx = { variable = "speed" }\n')
     foreign = faulty_fmu(folder / "faulty.so", tmp_path / "foreign.fmu", platform="win64")
-    for options, why in (
-        (("--fmu", foreign), "is for win64"),
-        (("--fmu", car_fmu, "--map", tmp_path / "map.toml"), "speed"),
-        (("--map", tmp_path / "map.toml"), "without an FMU"),
+    for options, why, lines in (
+        (("--fmu", foreign), "is for win64", 1),
+        (("--fmu", car_fmu, "--map", tmp_path / "map.toml"), "\n  - [outputs] vx: ", 3),
+        (("--map", tmp_path / "map.toml"), "without an FMU", 1),
     ):
         done = subprocess.run(
             [sys.executable, "-m", "experiments.cli", "plant", *map(str, options)],
             capture_output=True, text=True, timeout=60, check=False,
         )  # fmt: skip
         assert done.returncode == 2
-        [line] = done.stderr.strip().splitlines()
-        assert why in line
+        assert len(done.stderr.strip().splitlines()) == lines
+        assert why in done.stderr
 
 
 def test_a_repeated_last_state_is_no_gap_and_no_sample() -> None:

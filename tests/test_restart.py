@@ -291,7 +291,7 @@ def test_a_router_started_again_is_found_by_both(tmp_path: Path, course: Course)
         seen = rig.state().seq
         until(lambda: rig.state().seq > seen, "a state through the new router")
         rig.drive_laps(1)
-        assert rig.observer.status("controller")["phase"] == "driving"
+        until(lambda: rig.observer.status("controller")["phase"] == "driving", "it to drive again")
         rig.observer.stop()
         for program in (controller, plant, router):
             program.end()

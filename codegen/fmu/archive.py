@@ -80,7 +80,7 @@ def _contents(definition: FmuDefinition) -> tuple[dict[str, bytes], list[str]]:
     token = _token(definition, files, compiled)
     files["fmu_config.h"] = config_header(definition, token).encode()
     files["README.txt"] = readme(definition, linked).encode()
-    icon = definition.icon or car_icon()
+    icon = car_icon()
     contents = {
         "modelDescription.xml": model_description(definition, token, compiled),
         "documentation/index.html": documentation_page(definition, linked).encode(),

@@ -47,6 +47,7 @@ _STATE: Final = (
 )
 
 _NO_LIMIT_MPS: Final = 100.0
+"""NO_SPEED_LIMIT in C: the racing line knows no higher speed."""
 
 _SETTINGS: Final = (
     ("q_position", "1/m2", True, "weight of the squared position error"),
@@ -110,7 +111,10 @@ def controller_fmu(
         trees={"daqp": artefact / "daqp"},
         archives=(artefact / "libdaqpstat.a",),
         flags=_flags(cpu),
-        constants={"CONTROLLER_IDENTITY": manifest.discretisation},
+        constants={
+            "CONTROLLER_IDENTITY": manifest.discretisation,
+            "NO_SPEED_LIMIT": _NO_LIMIT_MPS,
+        },
         resources={
             PATH_FILE: path_resource(rows, spacing_m),
             WEIGHTS_FILE: weights_resource(weights, manifest.discretisation, manifest.gp_capacity),

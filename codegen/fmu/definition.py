@@ -49,18 +49,12 @@ class FmuDefinition:
     """Files of the ``resources/`` folder: relative path to content."""
     documentation: str = ""
     """Body of the documentation page, HTML; the table of variables is added."""
-    icon: bytes | None = None
-    """PNG."""
     default_step_s: float = 0.02
-    default_stop_s: float = 10.0
     internal_step_s: float | None = None
     """Co-Simulation: step of the internal integration, if it is fixed."""
-    variable_step: bool = True
-    """Co-Simulation: any communication step; False: only ``default_step_s``."""
     saves: Literal["none", "instance", "serialised"] = "serialised"
     """State get and set: not at all; within an instance (model memory may hold pointers into
     itself); or also as bytes for another instance (model memory holds no pointers)."""
-    once_per_process: bool = False
     derivatives: bool = False
     """Model Exchange: directional and adjoint derivatives exist."""
 

@@ -15,6 +15,8 @@ _FMI2_TYPES: Final = {"real": "Real", "integer": "Integer", "boolean": "Boolean"
 _FMI3_TYPES: Final = {"real": "Float64", "integer": "Int32", "boolean": "Boolean"}
 _LOG: Final = ("logStatusError", "Why a call was refused or a step failed")
 
+_STOP_S: Final = 10.0
+
 Attributes = dict[str, str]
 
 
@@ -77,7 +79,7 @@ def _log_and_experiment(parent: ET.Element, definition: FmuDefinition) -> None:
         parent,
         "DefaultExperiment",
         startTime="0",
-        stopTime=repr(definition.default_stop_s),
+        stopTime=repr(_STOP_S),
         stepSize=repr(definition.default_step_s),
     )
 
@@ -109,8 +111,8 @@ def _fmi2(definition: FmuDefinition, token: str, sources: list[str]) -> ET.Eleme
         root,
         "CoSimulation",
         modelIdentifier=definition.identifier,
-        canHandleVariableCommunicationStepSize=_flag(definition.variable_step),
-        canBeInstantiatedOnlyOncePerProcess=_flag(definition.once_per_process),
+        canHandleVariableCommunicationStepSize="true",
+        canBeInstantiatedOnlyOncePerProcess="false",
         canNotUseMemoryManagementFunctions="true",
         canGetAndSetFMUstate=_flag(saves != "none"),
         canSerializeFMUstate=_flag(saves == "serialised"),
@@ -168,7 +170,7 @@ def _fmi2_structure(root: ET.Element, definition: FmuDefinition) -> None:
 def _fmi3_kind(definition: FmuDefinition) -> tuple[str, Attributes]:
     attributes = {
         "modelIdentifier": definition.identifier,
-        "canBeInstantiatedOnlyOncePerProcess": _flag(definition.once_per_process),
+        "canBeInstantiatedOnlyOncePerProcess": "false",
         "canGetAndSetFMUState": _flag(definition.saves != "none"),
         "canSerializeFMUState": _flag(definition.saves == "serialised"),
     }
@@ -176,7 +178,7 @@ def _fmi3_kind(definition: FmuDefinition) -> tuple[str, Attributes]:
         attributes["providesDirectionalDerivatives"] = _flag(definition.derivatives)
         attributes["providesAdjointDerivatives"] = _flag(definition.derivatives)
         return "ModelExchange", attributes
-    attributes["canHandleVariableCommunicationStepSize"] = _flag(definition.variable_step)
+    attributes["canHandleVariableCommunicationStepSize"] = "true"
     if definition.internal_step_s is not None:
         attributes["fixedInternalStepSize"] = repr(definition.internal_step_s)
     return "CoSimulation", attributes

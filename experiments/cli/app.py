@@ -80,7 +80,9 @@ def main() -> None:
 
 
 def _fail(text: str, code: int = 2) -> None:
-    line = "; ".join(filter(None, map(str.strip, text.splitlines())))
+    lines = list(filter(None, map(str.strip, text.splitlines())))
+    several = any(line.startswith("- ") for line in lines)  # faults, as of a map: a line each
+    line = ("\n  " if several else "; ").join(lines)
     if not line:  # no command given: the help has been shown
         sys.exit(code)
     typer.secho(f"bayesrace: {line}", err=True, fg=typer.colors.RED)

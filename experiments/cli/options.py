@@ -45,7 +45,9 @@ FmuFile = Annotated[
 ]
 FmuMap = Annotated[
     Path | None,
-    typer.Option("--map", help="What the FMU's variables mean (TOML), see 'bayesrace fmu'."),
+    typer.Option(
+        "--map", help="What the FMU's variables mean (TOML); 'bayesrace fmu inspect' writes one."
+    ),
 ]
 LowLatency = Annotated[
     bool,

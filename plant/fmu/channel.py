@@ -65,7 +65,7 @@ class Channel:
         self._have = 0
 
     def send(self, kind: int, payload: bytes | memoryview, deadline: float | None = None) -> None:
-        """Send a frame; ``deadline`` as in :meth:`receive`."""
+        """Send a frame; TimeoutError if it is not taken before ``deadline`` (time.monotonic)."""
         data = memoryview(_HEAD.pack(kind, len(payload)) + payload)
         while data:
             try:

@@ -118,11 +118,9 @@ class _Process:
                 left_s = deadline - time.monotonic()
                 if left_s <= 0:
                     raise TimeoutError
-                for descriptor, event in self._poll.poll(left_s * 1e3):
+                for descriptor, _ in self._poll.poll(left_s * 1e3):
                     if descriptor == self._printing and not self.output.pump():
                         self._poll.unregister(descriptor)
-                    elif event & ~select.POLLIN and descriptor != self._printing:
-                        pass  # its end is read as such
         except Closed:
             raise _Died from None
         return answer
@@ -155,7 +153,7 @@ class _Process:
 
     def kill(self) -> None:
         """End it now, with what it has started in its session."""
-        if self._popen.poll() is None:
+        with suppress(ProcessLookupError, PermissionError):  # it may have gone and left some behind
             os.killpg(self._popen.pid, signal.SIGKILL)
         self._popen.wait()
         self.output.close()
@@ -296,7 +294,10 @@ class FmuHost:
         try:
             answer, data = process.ask(kind, payload, timeout_s)
         except TimeoutError:
-            raise self.fault(f"did not answer within {timeout_s:g} s", when) from None
+            # What it has started may hold its end of the connection open.
+            ended = "" if process.running else process.ended()
+            silent = f"did not answer within {timeout_s:g} s (timeout_s in the map's [fmu])"
+            raise self.fault(ended or silent, when) from None
         except _Died:
             raise self.fault(process.ended(), when) from None
         except ProtocolError:

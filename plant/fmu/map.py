@@ -89,7 +89,7 @@ class _Matching:
     def _report(self, *, given: bool) -> str:
         name = self._fmu.model_name
         said = f"the map does not fit the FMU '{name}'" if given else (
-            f"the FMU '{name}' does not have our names and no map says what its own mean"
+            f"the FMU '{name}' does not have our names and units, and no map says what its own are"
         )  # fmt: skip
         problems = "".join(f"\n  - {problem}" for problem in self._checks.problems)
         return f"{said}:{problems}\n`bayesrace fmu inspect` lists its variables and writes a map"

@@ -83,6 +83,8 @@ def library(path: Path, folder: Path, description: Any) -> Path:
     InputError that says which platforms the FMU is for, if it is not for this one.
     """
     name: str = description.coSimulation.modelIdentifier + sharedLibraryExtension
+    if "/" in name or "\\" in name:
+        raise InputError(f"{path} names '{name[:200]}' as its library, which is no file name")
     # FMI 2.0 names Intel's platforms alone; where else, the names of 3.0 are in use.
     fits = (platform_tuple,) if description.fmiVersion.startswith("3.") else (
         (platform, platform_tuple) if platform_tuple.startswith("x86") else (

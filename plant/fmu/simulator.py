@@ -67,8 +67,9 @@ def communication_step(description: Any, wanted_s: float | None, period_s: float
     interface, experiment = description.coSimulation, description.defaultExperiment
     internal_s = _number(interface.fixedInternalStepSize)
     if interface.canHandleVariableCommunicationStepSize:
-        fits = internal_s is None or _divides(internal_s, _STEP_S)
-        return _STEP_S if fits or not _divides(internal_s or 0.0, period_s) else internal_s or 0.0
+        if internal_s is None or _divides(internal_s, _STEP_S):
+            return _STEP_S
+        return internal_s if _divides(internal_s, period_s) else _STEP_S
     for step_s in (internal_s, _number(experiment.stepSize) if experiment else None):
         if step_s is not None and _divides(step_s, period_s):
             return step_s

@@ -15,7 +15,7 @@ import sys
 import threading
 from array import array
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from bayesrace.clock import die_with_parent
 from plant.fmu.channel import (
@@ -204,14 +204,28 @@ def _leash(folder: str, parent: int) -> None:
 
     def watch() -> None:
         os.read(told, 1)
-        shutil.rmtree(folder, ignore_errors=True)
-        os._exit(128 + signal.SIGTERM)
+        _end(folder)
 
     threading.Thread(target=watch, name="leash", daemon=True).start()
     # Python's own handler waits for the call under way; the number in the pipe does not.
     signal.signal(signal.SIGTERM, lambda *_: None)
     signal.set_wakeup_fd(tell, warn_on_full_buffer=False)
     die_with_parent(parent)
+
+
+_ENDING: Final = threading.Lock()
+
+
+def _end(folder: str) -> NoReturn:
+    """Ends this process and asks what the FMU has started to end; removes what was unpacked.
+
+    The signal and the closed channel come at once, to two threads: the first does it.
+    """
+    with _ENDING:
+        shutil.rmtree(folder, ignore_errors=True)
+        with suppress(ProcessLookupError):  # no session of its own; ours has been told already
+            os.killpg(os.getpid(), signal.SIGTERM)
+        os._exit(128 + signal.SIGTERM)
 
 
 def _ordinary(cpus: list[int]) -> None:
@@ -228,12 +242,14 @@ def main(arguments: list[str]) -> int:
     _leash(folder, told["parent"])
     _ordinary(told["cpus"])
     os.chdir(folder)  # what an FMU writes beside itself goes when it goes
+    for descriptor in (told["socket"], told["words"]):
+        os.set_inheritable(descriptor, False)  # what the FMU starts has no business with them
     words = _Words(mmap.mmap(told["words"], WORDS_BYTES))
     channel = Channel(told["socket"], blocking=True)
     try:
         _Server(channel, words).serve()
     except Closed:
-        shutil.rmtree(folder, ignore_errors=True)
+        _end(folder)
     return 0
 
 

@@ -37,7 +37,8 @@ enum { /* value references */
 
 enum { /* modes; the numbers are those in tests/faulty_fmu.py */
     GOOD, ABORT, SEGFAULT, EXIT, HANG, NOT_A_NUMBER, FAIL, REFUSE, FLOOD_LOG, FLOOD_STDOUT, SLOW,
-    TERMINATE, INIT_FAILS, INIT_HANGS, INIT_ABORTS, HUGE_VALUE, CLOSE_ALL, EARLY, STUCK, SAY, WORST, SCRIBBLE
+    TERMINATE, INIT_FAILS, INIT_HANGS, INIT_ABORTS, HUGE_VALUE, CLOSE_ALL, EARLY, STUCK, SAY, WORST, SCRIBBLE,
+    ORPHAN
 };
 
 typedef struct {
@@ -116,6 +117,9 @@ static Status strike(Car *car) {
         _exit(7);
     case SLOW: usleep(60000); break;
     case TERMINATE: car->ended = true; break;
+    case ORPHAN: /* leaves a process behind */
+        if (fork() == 0) pause();
+        abort();
     case SCRIBBLE:
         for (int fd = 3; fd < 64; fd++)
             if (write(fd, "all work and no play makes a dull car", 37) < 0) continue;

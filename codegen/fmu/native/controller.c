@@ -17,7 +17,6 @@
 #define STANDING_MPS 0.05 /* a car that is to be driven and stands ... */
 #define STUCK_S 0.5       /* ... for that long begins anew */
 #define HISTORY 256       /* inputs under way: the longest delay at 500 Hz */
-#define NO_SPEED_LIMIT 100.0 /* the racing line knows no higher speed */
 
 /* Beyond those of br_mpc_status, as in controller/driver.py. */
 enum { STATUS_UNPREDICTABLE = 252, STATUS_NO_STEP = 253, STATUS_REFUSED = 255 };

@@ -73,23 +73,21 @@ const char *fmi2GetVersion(void)
 
 fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean on, size_t n, const fmi2String names[])
 {
-    INSTANCE;
-    (void)n, (void)names;
-    instance->logging = on;
-    return fmi2OK;
+    (void)on, (void)n, (void)names; /* there are errors only, always passed on */
+    return c ? fmi2OK : fmi2Error;
 }
 
 fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, fmi2String resources,
                               const fmi2CallbackFunctions *functions, fmi2Boolean visible,
                               fmi2Boolean logging)
 {
-    (void)visible;
+    (void)visible, (void)logging;
     char path[4096];
     void *logger = NULL;
     if (!functions || type != fmi2CoSimulation) return NULL;
     memcpy(&logger, &functions->logger, sizeof logger);
     return fmu_new(name, guid, plain_path(resources, path, sizeof path), logger,
-                   functions->componentEnvironment, logging);
+                   functions->componentEnvironment);
 }
 
 void fmi2FreeInstance(fmi2Component c)

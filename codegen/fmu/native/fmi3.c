@@ -45,20 +45,18 @@ const char *fmi3GetVersion(void)
 
 fmi3Status fmi3SetDebugLogging(fmi3Instance c, fmi3Boolean on, size_t n, const fmi3String names[])
 {
-    INSTANCE;
-    (void)n, (void)names;
-    instance->logging = on;
-    return fmi3OK;
+    (void)on, (void)n, (void)names; /* there are errors only, always passed on */
+    return c ? fmi3OK : fmi3Error;
 }
 
 /* ---- instances ---- */
 
 static fmi3Instance make(int offered, fmi3String name, fmi3String token, fmi3String resources,
-                         fmi3Boolean logging, void *environment, fmi3LogMessageCallback log)
+                         void *environment, fmi3LogMessageCallback log)
 {
     void *logger = NULL;
     memcpy(&logger, &log, sizeof logger);
-    if (offered) return fmu_new(name, token, resources, logger, environment, logging);
+    if (offered) return fmu_new(name, token, resources, logger, environment);
     if (log) log(environment, fmi3Error, "logStatusError", "this FMU is of another kind");
     return NULL;
 }
@@ -68,8 +66,8 @@ fmi3Instance fmi3InstantiateModelExchange(fmi3String name, fmi3String token, fmi
                                           fmi3InstanceEnvironment environment,
                                           fmi3LogMessageCallback log)
 {
-    (void)visible;
-    return make(FMU_ME, name, token, resources, logging, environment, log);
+    (void)visible, (void)logging;
+    return make(FMU_ME, name, token, resources, environment, log);
 }
 
 fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3String resources,
@@ -80,14 +78,14 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3
                                          fmi3LogMessageCallback log,
                                          fmi3IntermediateUpdateCallback update)
 {
-    (void)visible, (void)early_return, (void)intermediate, (void)update;
+    (void)visible, (void)logging, (void)early_return, (void)intermediate, (void)update;
     if (events || n_intermediate) {
         if (log)
             log(environment, fmi3Error, "logStatusError",
                 "this FMU has neither event mode nor intermediate variables");
         return NULL;
     }
-    return make(FMU_CS, name, token, resources, logging, environment, log);
+    return make(FMU_CS, name, token, resources, environment, log);
 }
 
 void fmi3FreeInstance(fmi3Instance c)

@@ -55,7 +55,7 @@ static char *copy_folder(const char *path)
 }
 
 fmu_instance *fmu_new(const char *name, const char *token, const char *plain, void *logger,
-                      void *environment, int logging)
+                      void *environment)
 {
     size_t before = (sizeof(fmu_instance) + ALIGNMENT - 1) / ALIGNMENT * ALIGNMENT;
     char *block = calloc(1, before + fmu_model_size() + ALIGNMENT);
@@ -65,7 +65,6 @@ fmu_instance *fmu_new(const char *name, const char *token, const char *plain, vo
     instance->block = block;
     instance->logger = logger;
     instance->environment = environment;
-    instance->logging = logging;
     instance->name = copy_text(name && name[0] ? name : FMU_IDENTIFIER);
     instance->resources = plain ? copy_folder(plain) : NULL;
     if (fmu_model_size()) instance->model = (char *)instance + before;
@@ -83,7 +82,9 @@ fmu_instance *fmu_new(const char *name, const char *token, const char *plain, vo
 
 int fmu_reset(fmu_instance *instance)
 {
-    return create(instance);
+    if (create(instance) == FMU_FINE) return FMU_FINE;
+    instance->phase = FMU_FAILED; /* until a reset that succeeds */
+    return FMU_REFUSED;
 }
 
 /* ---- phases ---- */

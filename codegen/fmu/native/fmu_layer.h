@@ -37,7 +37,7 @@ void fmu_emit(const fmu_instance *instance, const char *text);
 /* NULL after a message if the token is not ours, memory is short or the model refuses. `plain`
  * is a folder path, with or without a separator at its end, or NULL. */
 fmu_instance *fmu_new(const char *name, const char *token, const char *plain, void *logger,
-                      void *environment, int logging);
+                      void *environment);
 void fmu_delete(fmu_instance *instance);
 int fmu_reset(fmu_instance *instance);
 

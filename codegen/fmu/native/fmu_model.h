@@ -39,7 +39,6 @@ typedef struct fmu_instance {
     double start_time, stop_time; /* stop_time: infinity where none was given */
     fmu_saved *saved;             /* the states made by this instance that still live */
     void *logger, *environment;   /* the importer's */
-    int logging;                  /* debug messages wanted; errors are always passed on */
 } fmu_instance;
 
 /* Bytes of memory that one instance of the model needs beyond the values. */
