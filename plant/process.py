@@ -149,6 +149,12 @@ class PlantProcess:
 
     def _prepare(self, message: RunRequest) -> str:
         """Make the run; returns why it cannot be, or ""."""
+        if self._settings.endpoints.low_latency and not message.lockstep:
+            # Without priorities a message that Zenoh drops may be the last of its kind on a link.
+            return (
+                "this plant was started for lockstep (--low-latency): "
+                "start it without to drive by the wall clock"
+            )
         if message.lockstep and not self._controller_there():
             return (
                 f"no controller for car '{self.name}': start one that connects to this plant "

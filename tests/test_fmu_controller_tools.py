@@ -99,7 +99,7 @@ def test_no_sanitizer_finds_anything_and_c_sees_what_the_master_sees(
     gcc = shutil.which("gcc")
     if gcc is None:
         pytest.skip("gcc is not installed")
-    run = lockstep().run(circuit.start(v_mps=1.0), 280, strewn)
+    run = lockstep().run(circuit.start(v_mps=1.0), 120, strewn)
     definition = exported.define(version=3)
     linked = write_sources(definition, tmp_path)
     flags = ["-O1", "-g", "-std=gnu11", "-Wall", "-Wextra", "-march=native", "-ffp-contract=fast"]

@@ -39,7 +39,7 @@ def hosts(
     folder, opened = tmp_path_factory.mktemp("fmu"), {}
     for version, library in libraries.items():
         path = faulty_fmu(library, folder / f"faulty{version}.fmu", version)
-        opened[version] = FmuHost(path, COMMANDS, STATES, timeout_s=1.0)
+        opened[version] = FmuHost(path, COMMANDS, STATES, timeout_s=1.0, startup_s=4.0)
     yield opened
     for host in opened.values():
         host.close()

@@ -143,21 +143,21 @@ def test_best_case_with_the_fmu_has_the_solution_of_the_built_in_equations(
 def test_it_drives(
     ocp: RacingOcp, best_case: NativeStep, truth: Model, car: CarParameters, circuit: Circuit
 ) -> None:
-    """A second and a half with the FMU as plant and in the OCP: where the built-in ones go."""
+    """Some .6 s with the FMU as plant and in the OCP: where the built-in ones go."""
     with_fmu, built_in = PERFECT.discretise(truth), PERFECT.discretise(dynamic(car))
     start = circuit.start(v_mps=1.0)
     x, d = start, 0.0
-    for _ in range(75):
+    for _ in range(30):
         assert best_case.step(x, d).usable
         solution = ocp.solve(x, d, best_case.read_reference(), WEIGHTS, best_case.read_plan())
         assert solution.success, solution.status
         d, x = float(solution.u[0, 0]), np.asarray(with_fmu(x, solution.u[0])).ravel()
     best_case.reset()
     own, d = start, 0.0
-    for _ in range(75):
+    for _ in range(30):
         assert best_case.step(own, d).usable
         d, own = float(best_case.u[0]), np.asarray(built_in(own, best_case.u)).ravel()
-    assert best_case.info.s_ref_m > 1.0
+    assert best_case.info.s_ref_m > 0.5
     np.testing.assert_allclose(x, own, rtol=0, atol=1e-5)
 
 

@@ -60,10 +60,10 @@ def car_fmu(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return faulty_fmu(faulty_library(2, folder / "faulty.so"), folder / "faulty.fmu")
 
 
-def settings_of(car_fmu: Path, endpoint: str) -> str:
+def settings_of(car_fmu: Path, endpoint: str, low_latency: bool = True) -> str:
     return json.dumps(
         {
-            "endpoints": {"listen": [endpoint], "low_latency": True},
+            "endpoints": {"listen": [endpoint], "low_latency": low_latency},
             "parent_pid": os.getpid(),
             "fmu": str(car_fmu),
             "fmu_map": str(car_fmu.with_name("map.toml")),
@@ -72,10 +72,10 @@ def settings_of(car_fmu: Path, endpoint: str) -> str:
 
 
 @contextlib.contextmanager
-def running_rig(car_fmu: Path) -> Iterator[Rig]:
+def running_rig(car_fmu: Path, low_latency: bool = True) -> Iterator[Rig]:
     at_plant, at_controller = free_endpoint(), free_endpoint()
-    plant = start(PLANT, settings_of(car_fmu, at_plant))
-    ends = {"listen": [at_controller], "connect": [at_plant], "low_latency": True}
+    plant = start(PLANT, settings_of(car_fmu, at_plant, low_latency))
+    ends = {"listen": [at_controller], "connect": [at_plant], "low_latency": low_latency}
     controller = start(CONTROLLER, json.dumps({"endpoints": ends, "parent_pid": os.getpid()}), "1")
     try:
         with open_session(Endpoints(connect=(at_plant, at_controller))) as session:
@@ -96,6 +96,12 @@ def rig(car_fmu: Path) -> Iterator[Rig]:
         yield rig
 
 
+@pytest.fixture(scope="module")
+def wall_clock_rig(car_fmu: Path) -> Iterator[Rig]:
+    with running_rig(car_fmu, low_latency=False) as rig:
+        yield rig
+
+
 def with_fault(mode: Mode) -> dict[str, Any]:
     return {"x0": (2.0, 0.0, np.pi / 2, 0.1, 0.0, float(mode), 0.0)}
 
@@ -109,8 +115,9 @@ RUN = iter(range(1, 1000))
     + [(mode, False) for mode in (Mode.ABORT, Mode.HANG, Mode.NOT_A_NUMBER)],
 )
 def test_a_fault_ends_the_run_and_nothing_else(
-    mode: Mode, lockstep: bool, rig: Rig, tmp_path: Path
+    mode: Mode, lockstep: bool, request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
+    rig: Rig = request.getfixturevalue("rig" if lockstep else "wall_clock_rig")
     run = next(RUN)
     log = tmp_path / "log.mcap"
     end = drive(rig, log, run, lockstep=lockstep, laps=0, **with_fault(mode))
@@ -158,11 +165,12 @@ def test_talk_does_not_end_a_run(rig: Rig, tmp_path: Path) -> None:
     assert end.data["reason"] == "max_time"
 
 
-def test_a_slow_fmu_counts_as_overruns(rig: Rig, tmp_path: Path) -> None:
+def test_a_slow_fmu_counts_as_overruns(wall_clock_rig: Rig, tmp_path: Path) -> None:
     """60 ms for a period of 20 ms."""
-    before = int(rig.director.status("plant").counters["overruns"])
+    before = int(wall_clock_rig.director.status("plant").counters["overruns"])
     changes = with_fault(Mode.SLOW) | {"max_time_s": AT_S + 0.2}
-    end = drive(rig, tmp_path / "log", next(RUN), lockstep=False, laps=0, **changes)
+    run = next(RUN)
+    end = drive(wall_clock_rig, tmp_path / "log", run, lockstep=False, laps=0, **changes)
     assert end.data["reason"] == "max_time"
     assert int(end.data["overruns"]) - before >= 5
 
@@ -188,7 +196,7 @@ def test_nothing_outlives_the_plant(how: signal.Signals, car_fmu: Path, tmp_path
     (tmp_path / "map.toml").write_text(MAP.replace("0.5", "60.0"))
     fmu = tmp_path / car_fmu.name
     fmu.symlink_to(car_fmu)
-    plant = start(PLANT, settings_of(fmu, at_plant))
+    plant = start(PLANT, settings_of(fmu, at_plant, low_latency=False))
     with open_session(Endpoints(connect=(at_plant,))) as session:
         director = Director(session, "orca")
         director.wait_for(("plant",), 20.0)

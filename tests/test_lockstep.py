@@ -186,13 +186,19 @@ def test_the_log_of_a_lockstep_run_is_complete(rig: Rig, tmp_path: Path) -> None
     assert [e.kind for e in log.select(EVENT)] == ["run_started", "run_ended"]
 
 
-def test_free_running_drives_by_the_wall_clock(rig: Rig, tmp_path: Path) -> None:
+def test_free_running_drives_by_the_wall_clock(tmp_path: Path) -> None:
     begin = time.monotonic()
-    end = drive(rig, tmp_path / "log.mcap", 1, lockstep=False, laps=0, max_time_s=1.5)
+    with running_rig(low_latency=False) as rig:
+        end = drive(rig, tmp_path / "log.mcap", 1, lockstep=False, laps=0, max_time_s=1.5)
     assert end.data["reason"] == "max_time"
     assert time.monotonic() - begin > 1.5
     last = LogReader(tmp_path / "log.mcap").select(STATE)[-1]
     assert np.hypot(last.x[0] - 2.0, last.x[1]) > 0.5, "the car has not been driven"
+
+
+def test_a_plant_for_lockstep_refuses_to_run_by_the_wall_clock(rig: Rig) -> None:
+    with pytest.raises(InputError, match=r"started for lockstep \(--low-latency\)"):
+        rig.director.start(request(1, lockstep=False))
 
 
 def test_a_free_running_car_brakes_when_its_controller_dies(tmp_path: Path) -> None:

@@ -3,12 +3,10 @@
 Promises guarded: a controller started again takes over the car that its forerunner left; a plant
 started again is found by the controller that waits for it, and what was meant for its forerunner
 does not act on it; a connection that breaks, or a router that dies, is made again. Meanwhile the
-car brakes, and stays on its track. What plays the car, the built-in equations or an FMU, is no
-matter.
+car brakes, and stays on its track.
 """
 
 import logging
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -40,16 +38,6 @@ pytestmark = pytest.mark.slow
 _log = logging.getLogger(__name__)
 
 
-CAR: tuple[str, ...] = ()
-"""Options of a plant that say what plays the car."""
-
-
-@pytest.fixture(params=["built-in car", "FMU"], autouse=True)
-def _played_by(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    options = ("--fmu", str(packed_car())) if request.param == "FMU" else ()
-    monkeypatch.setattr(sys.modules[__name__], "CAR", options)
-
-
 @pytest.fixture(scope="module")
 def course(tmp_path_factory: pytest.TempPathFactory) -> Course:
     return gentle_course(tmp_path_factory.mktemp("course"))
@@ -59,7 +47,7 @@ def course(tmp_path_factory: pytest.TempPathFactory) -> Course:
 class Rig:
     """How to start each part, and who watches."""
 
-    start_plant: Callable[[], Program]
+    start_plant: Callable[..., Program]
     start_controller: Callable[[], Program]
     start_router: Callable[[], Program]
     proxy: Proxy
@@ -96,9 +84,11 @@ def rigged(
     log = tmp_path / "run.mcap"
     with ExitStack() as programs, Proxy(plant_at) as proxy:
 
-        def a_plant() -> Program:
+        def a_plant(*options: str) -> Program:
             connect = [router_at] if way == "router" else []
-            return programs.enter_context(start_plant(tmp_path, plant_at, *CAR, connect=connect))
+            return programs.enter_context(
+                start_plant(tmp_path, plant_at, *options, connect=connect)
+            )
 
         def a_controller() -> Program:
             connect = {"direct": plant_at, "proxy": proxy.endpoint, "router": router_at}[way]
@@ -168,8 +158,10 @@ def _answers_since(state: State, seq: int) -> bool:
     return any(answered > seq and acting_s >= 0 for answered, acting_s in rows)
 
 
-def test_a_plant_started_again_is_found(rig: Rig) -> None:
-    plant, controller = rig.start_plant(), rig.start_controller()
+@pytest.mark.parametrize("fmu", [False, True])
+def test_a_plant_started_again_is_found(rig: Rig, fmu: bool) -> None:
+    options = ("--fmu", str(packed_car())) if fmu else ()
+    plant, controller = rig.start_plant(*options), rig.start_controller()
     rig.observer.start(1)
     rig.drive_laps(1)
     before = rig.state()
@@ -178,7 +170,7 @@ def test_a_plant_started_again_is_found(rig: Rig) -> None:
         lambda: rig.observer.status("controller").get("phase") == "waiting",
         "a controller that waits",
     )
-    plant = rig.start_plant()
+    plant = rig.start_plant(*options)
     until(
         lambda: rig.observer.status("plant").get("epoch", before.epoch) != before.epoch,
         "the new plant",

@@ -5,6 +5,7 @@ import os
 import tempfile
 import zipfile
 from collections.abc import Iterator, Sequence
+from importlib.metadata import distribution
 from pathlib import Path
 from typing import Final
 
@@ -63,7 +64,7 @@ def _fixed_sources(definition: FmuDefinition) -> dict[str, bytes]:
 
 
 def _token(definition: FmuDefinition, files: dict[str, bytes], compiled: list[str]) -> str:
-    """Instantiation token: the same if and only if everything it is made from is."""
+    """Instantiation token: names what was compiled and the resources it was exported with."""
     digest = hashlib.sha256(model_description(definition, "", compiled))
     digest.update(config_header(definition, "").encode())
     for name, content in sorted((files | dict(definition.resources)).items()):
@@ -85,6 +86,8 @@ def _contents(definition: FmuDefinition) -> tuple[dict[str, bytes], list[str]]:
         "modelDescription.xml": model_description(definition, token, compiled),
         "documentation/index.html": documentation_page(definition, linked).encode(),
     }
+    if licence := distribution("bayesrace").read_text("licenses/LICENSE"):
+        contents["documentation/licenses/license.txt"] = licence.encode()
     if definition.version == 2:
         contents["model.png"] = icon
     else:

@@ -50,8 +50,6 @@ class FmuDefinition:
     documentation: str = ""
     """Body of the documentation page, HTML; the table of variables is added."""
     default_step_s: float = 0.02
-    internal_step_s: float | None = None
-    """Co-Simulation: step of the internal integration, if it is fixed."""
     saves: Literal["none", "instance", "serialised"] = "serialised"
     """State get and set: not at all; within an instance (model memory may hold pointers into
     itself); or also as bytes for another instance (model memory holds no pointers)."""

@@ -179,8 +179,6 @@ def _fmi3_kind(definition: FmuDefinition) -> tuple[str, Attributes]:
         attributes["providesAdjointDerivatives"] = _flag(definition.derivatives)
         return "ModelExchange", attributes
     attributes["canHandleVariableCommunicationStepSize"] = "true"
-    if definition.internal_step_s is not None:
-        attributes["fixedInternalStepSize"] = repr(definition.internal_step_s)
     return "CoSimulation", attributes
 
 

@@ -253,6 +253,5 @@ def car_fmu(
         constants=constants if kind == "cs" else {},
         documentation=_PAGE.format(car=car.name, kind=_KIND_PAGE[kind]),
         default_step_s=PLANT.step_s,
-        internal_step_s=1 / SUBSTEP_HZ if kind == "cs" else None,
         derivatives=kind == "me",
     )

@@ -45,9 +45,9 @@ __all__ = ["FmuHost", "Value"]
 
 Value = float | int | bool | str
 
-_STARTUP_S: Final = 10.0
-"""For the process to start, and the FMU to be loaded and instantiated; tools behind it may have to
-start too."""
+_STARTUP_S: Final = 8.0
+"""For the process to start and the FMU to be loaded, and for each initialisation; tools behind it
+may have to start too. Both together are less than who asks for a run waits."""
 
 _GOODBYE_S: Final = 0.5
 """For the FMU to free what it holds, when it is not needed any more."""
@@ -164,7 +164,8 @@ class FmuHost:
     """A Co-Simulation FMU, ready to run; close it when done.
 
     ``inputs`` and ``outputs`` name its variables (numbers, no arrays) in the order in which values
-    are passed. ``timeout_s``: how long it may take for an initialisation or a step.
+    are passed. ``timeout_s``: how long it may take for a step; ``startup_s``: for loading,
+    and for an initialisation.
 
     Raises InputError if the file is no such FMU, is not for this computer, or cannot be loaded
     and instantiated. On Linux the FMU ends with the thread that started it: use one that stays.
@@ -176,6 +177,7 @@ class FmuHost:
         inputs: Sequence[str],
         outputs: Sequence[str],
         timeout_s: float = 2.0,
+        startup_s: float = _STARTUP_S,
     ) -> None:
         self.path = Path(path)
         if os.name != "posix":
@@ -191,6 +193,7 @@ class FmuHost:
         self._outputs = [self._numeric(name) for name in outputs]
         self._names = tuple(outputs)
         self.timeout_s = timeout_s
+        self.startup_s = startup_s
         self.time_s = 0.0
         """Time that the FMU has reached."""
         self._cpus = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
@@ -224,7 +227,7 @@ class FmuHost:
         self._process_now.output.restart()
         self._used = True
         self.time_s = 0.0
-        return self._values(START, told, self.timeout_s, "while it was initialised")
+        return self._values(START, told, self.startup_s, "while it was initialised")
 
     def step(self, inputs: Sequence[float], step_s: float, count: int = 1) -> list[float]:
         """Its outputs after ``count`` communication steps of ``step_s``.
@@ -277,8 +280,7 @@ class FmuHost:
         }
         self._process = _Process(self._folder, self._cpus)
         self._used = False
-        startup_s = max(_STARTUP_S, self.timeout_s)
-        self._asked(LOAD, json.dumps(told).encode(), startup_s, "while it was loaded")
+        self._asked(LOAD, json.dumps(told).encode(), self.startup_s, "while it was loaded")
 
     def _values(self, kind: int, payload: bytes, timeout_s: float, when: str) -> list[float]:
         """The outputs that come as an answer, all of them finite."""
@@ -296,7 +298,8 @@ class FmuHost:
         except TimeoutError:
             # What it has started may hold its end of the connection open.
             ended = "" if process.running else process.ended()
-            silent = f"did not answer within {timeout_s:g} s (timeout_s in the map's [fmu])"
+            which = "timeout_s" if kind == STEP else "startup_s"
+            silent = f"did not answer within {timeout_s:g} s ({which} in the map's [fmu])"
             raise self.fault(ended or silent, when) from None
         except _Died:
             raise self.fault(process.ended(), when) from None

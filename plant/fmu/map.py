@@ -83,6 +83,7 @@ class _Matching:
             fixed=fixed | constants,
             step_s=section.step_s,
             timeout_s=section.timeout_s,
+            startup_s=section.startup_s,
             placed=section.placed,
         )
 

@@ -116,6 +116,9 @@ class FmuSection(_Section):
 
     step_s: float | None = Field(None, gt=0, description="communication step; must divide a period")
     timeout_s: float = Field(2.0, gt=0, description="an FMU that takes longer for a step hangs")
+    startup_s: float = Field(
+        8.0, gt=0, description="the same for loading it, and for each initialisation"
+    )
     placed: bool = Field(
         False, description="move the FMU's world so that its own start is the asked start pose"
     )

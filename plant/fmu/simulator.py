@@ -37,6 +37,7 @@ class Connection(Protocol):
     outputs: tuple[str, ...]
     step_s: float | None
     timeout_s: float
+    startup_s: float
 
     def start_values(self, x0: Sequence[float]) -> dict[str, Value]:
         """What to set before initialisation."""
@@ -199,7 +200,7 @@ def open_fmu(
     """
     map_ = None if map_path is None else read_map(Path(map_path))
     wiring = wire(read_description(path), map_)
-    host = FmuHost(path, wiring.inputs, wiring.outputs, wiring.timeout_s)
+    host = FmuHost(path, wiring.inputs, wiring.outputs, wiring.timeout_s, wiring.startup_s)
     try:
         return FmuSimulator(car, host, wiring, rate_hz)
     except BaseException:

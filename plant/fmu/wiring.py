@@ -239,8 +239,8 @@ class Wiring:
     ``inputs`` and ``outputs`` are the FMU's variables, all real, in the order in which values are
     passed; ``fixed`` are parameters and inputs that are set once, before initialisation;
     ``step_s`` is the communication step that the map asks for, None if it leaves that open;
-    ``timeout_s`` how long the FMU may take for a step; ``placed``: the FMU starts where it likes
-    and its world is moved so that it starts at the asked pose.
+    ``timeout_s`` how long the FMU may take for a step, ``startup_s`` for its start; ``placed``: the
+    FMU starts where it likes and its world is moved so that it starts at the asked pose.
     """
 
     def __init__(
@@ -253,6 +253,7 @@ class Wiring:
         fixed: Mapping[str, Value] | None = None,
         step_s: float | None = None,
         timeout_s: float = 2.0,
+        startup_s: float = 8.0,
         placed: bool = False,
     ) -> None:
         self.inputs: tuple[str, ...] = tuple(link.variable for link in inputs)
@@ -260,6 +261,7 @@ class Wiring:
         self.fixed: dict[str, Value] = dict(fixed or {})
         self.step_s = step_s
         self.timeout_s = timeout_s
+        self.startup_s = startup_s
         self.placed = placed
         self._inputs = tuple(inputs)
         self._starts = tuple(starts)

@@ -145,7 +145,7 @@ class _Server:
         self._state = "made"
 
     def _free(self) -> None:
-        if self._instance is not None and self._state == "running":
+        if self._instance is not None and self._state in ("made", "running"):
             self._state = "none"
             with suppress(CallFailed):  # it has served; the next one is another
                 self._instance.free()
