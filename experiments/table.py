@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from experiments.published import SOURCE, compare_gp, compare_laps
 from experiments.results import GpMetrics, LapResult, RaceResult
 
 __all__ = ["COLUMNS", "Column", "print_table"]
@@ -128,9 +129,36 @@ def print_table(result: RaceResult, console: Console) -> None:
     _print_notes(result, console)
 
 
+def _print_published(result: RaceResult, console: Console) -> None:
+    """The paper's numbers beside ours, on its track."""
+    laps, outputs = compare_laps(result), compare_gp(result)
+    if not laps:
+        return
+    console.print(Text(f"Beside the paper ({SOURCE})"))
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False)
+    table.add_column("controller")
+    for title in ("paper\nlap s", "here\nlap s", "paper\noff / m", "here\noff / m"):
+        table.add_column(title, justify="right", no_wrap=True)
+    for lap in laps:
+        table.add_row(lap.controller, lap.paper_lap, lap.our_lap, lap.paper_off, lap.our_off)
+    console.print(table)
+    if not outputs:
+        return
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False)
+    table.add_column("GP")
+    table.add_column("weights")
+    for title in ("paper\nRMSE (raw) · R²", "here\nRMSE (raw) · R²"):
+        table.add_column(title, justify="right", no_wrap=True)
+    for row in outputs:
+        table.add_row(row.output, "bayesrace", row.paper, row.ours)
+        table.add_row("", "updated", row.paper_updated, row.ours_updated)
+    console.print(table)
+
+
 def _print_notes(result: RaceResult, console: Console) -> None:
     if result.gp or result.gp_updated:
         console.print(_gp_table(result))
+    _print_published(result, console)
     if result.real_time_factor is not None:
         console.print(Text(f"lockstep at {result.real_time_factor:.1f} × real time"))
     for lap in result.laps:

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from bayesrace.gp.weights import FEATURES
-from learning.likelihood import MarginalLikelihood
+from learning.likelihood import MarginalLikelihood, PairDistances
 
-__all__ = ["BOUNDS", "NOISE_FLOOR", "Fit", "best", "maximise", "starts"]
+__all__ = ["BOUNDS", "NOISE_FLOOR", "TOLERANCE", "Fit", "best", "maximise", "starts"]
 
 Floats = NDArray[np.float64]
 
@@ -33,6 +33,9 @@ NOISE_FLOOR: Final = 1e-6
 
 BOUNDS: Final = np.log([(1e-2, 25.0)] + [(1e-1, 1e2)] * len(FEATURES) + [(NOISE_FLOOR, 1.0)])
 """Lower and upper bound of theta, (8, 2)."""
+
+TOLERANCE: Final = 1e-7
+"""Relative gain of the likelihood per iteration at which the optimiser stops."""
 
 _FIRST: Final = np.log([10.0] + [3.0] * len(FEATURES) + [1e-3])
 _WORST: Final = 1e25
@@ -57,7 +60,14 @@ def starts(restarts: int, seed: int) -> list[Floats]:
     return [_FIRST] + [random.uniform(low, high) for _ in range(restarts)]
 
 
-def maximise(kind: str, z: Floats, y: Floats, start: Floats, iterations: int) -> Fit:
+def maximise(
+    kind: str,
+    z: Floats | PairDistances,
+    y: Floats,
+    start: Floats,
+    iterations: int,
+    tolerance: float = TOLERANCE,
+) -> Fit:
     """L-BFGS-B from ``start`` within :data:`BOUNDS`, at most ``iterations`` iterations."""
     likelihood = MarginalLikelihood(kind, z, y)
     # Per sample, so that the optimiser's tolerances do not depend on how many there are.
@@ -75,7 +85,7 @@ def maximise(kind: str, z: Floats, y: Floats, start: Floats, iterations: int) ->
         jac=True,
         bounds=BOUNDS,
         method="L-BFGS-B",
-        options={"maxiter": iterations, "ftol": 1e-7, "gtol": 1e-5},
+        options={"maxiter": iterations, "ftol": tolerance, "gtol": 1e-5},
     )
     return Fit(kind, np.asarray(result.x), float(-result.fun / scale), int(result.nfev))
 

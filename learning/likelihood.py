@@ -6,7 +6,9 @@
 theta = [signal variance, length scales, noise variance], which is also how scikit-learn orders the
 hyperparameters of ConstantKernel * RBF + WhiteKernel. Unlike scikit-learn this never forms the
 n x n x 8 tensor of kernel derivatives: all length scales share dk/d(r^2), which CasADi derives from
-the kernel's one definition, so an evaluation costs little more than one Cholesky factorisation.
+the kernel's one definition, so an evaluation costs little more than one factorisation and inverse.
+The squared distances per feature are the same for all outputs, kernels and starts: they are made
+once (:class:`PairDistances`).
 """
 
 import math
@@ -18,22 +20,36 @@ from scipy.linalg import blas, lapack
 
 from bayesrace.gp.expression import bind, kernel
 
-__all__ = ["MarginalLikelihood"]
+__all__ = ["MarginalLikelihood", "PairDistances"]
 
 Floats = NDArray[np.float64]
 
 
-class MarginalLikelihood:
-    """log p(y | z, theta) for scaled features ``z`` (n, p) and scaled targets ``y`` (n,)."""
+class PairDistances:
+    """Squared distances per feature of all pairs of ``z`` (n, p), read by any number of threads."""
 
-    def __init__(self, kind: str, z: Floats, y: Floats) -> None:
+    def __init__(self, z: Floats) -> None:
+        self.count = len(z)
+        rows, columns = np.tril_indices(self.count, -1)
+        self.rows, self.columns = rows, columns
+        self.flat = columns * self.count + rows
+        """Where a pair below the diagonal is in a matrix by columns."""
+        self.squares = np.ascontiguousarray(((z[rows] - z[columns]) ** 2).T)
+        """(p, n (n - 1) / 2)."""
+
+
+class MarginalLikelihood:
+    """log p(y | z, theta) for scaled features ``z`` (n, p) and scaled targets ``y`` (n,).
+
+    ``z`` may be given as its :class:`PairDistances`. One thread only: it works in its own memory.
+    """
+
+    def __init__(self, kind: str, z: Floats | PairDistances, y: Floats) -> None:
+        self._pairs = z if isinstance(z, PairDistances) else PairDistances(z)
         self._y = np.ascontiguousarray(y, dtype=np.float64)
-        self._lower = np.tril_indices(len(y), -1)
-        rows, columns = self._lower
-        # Squared distances per feature, pairs below the diagonal only: (p, n (n - 1) / 2).
-        self._squares = np.ascontiguousarray(((z[rows] - z[columns]) ** 2).T)
-        pairs = self._squares.shape[1]
-        self._r2, self._k, self._slope = (np.zeros(pairs) for _ in range(3))
+        n, pairs = self._pairs.count, len(self._pairs.rows)
+        self._r2, self._k, self._slope, self._weight = (np.zeros(pairs) for _ in range(4))
+        self._matrix = np.zeros((n, n), order="F")
         r2 = ca.MX.sym("r2", pairs)
         k = kernel(kind, r2)
         slope = ca.gradient(ca.sum1(k), r2)
@@ -42,9 +58,10 @@ class MarginalLikelihood:
 
     def __call__(self, theta: Floats) -> tuple[float, Floats]:
         """Value and gradient (p + 2,); -inf and zeros where K is numerically singular."""
+        pairs, weight = self._pairs, self._weight
         signal, noise = math.exp(theta[0]), math.exp(theta[-1])
         precision = np.exp(-2 * theta[1:-1])
-        np.matmul(precision, self._squares, out=self._r2)
+        np.matmul(precision, pairs.squares, out=self._r2)
         self._evaluate()
         inverse, log_det = self._factorise(signal, noise)
         if inverse is None:
@@ -53,20 +70,20 @@ class MarginalLikelihood:
         n = len(alpha)
         value = -0.5 * (self._y @ alpha + log_det + n * math.log(2 * math.pi))
         # d log p / d theta = 1/2 tr((alpha alpha' - K^-1) dK/dtheta); pairs count twice.
-        rows, columns = self._lower
-        weight = alpha[rows] * alpha[columns] - inverse[self._lower]
+        np.multiply(alpha[pairs.rows], alpha[pairs.columns], out=weight)
+        weight -= inverse.ravel(order="F")[pairs.flat]
         diagonal = float(alpha @ alpha - np.trace(inverse))
         gradient = np.empty_like(theta)
         gradient[0] = signal * (weight @ self._k + 0.5 * diagonal)
-        gradient[1:-1] = -2 * signal * precision * (self._squares @ (weight * self._slope))
+        weight *= self._slope
+        gradient[1:-1] = -2 * signal * precision * (pairs.squares @ weight)
         gradient[-1] = 0.5 * noise * diagonal
         return value, gradient
 
     def _factorise(self, signal: float, noise: float) -> tuple[Floats | None, float]:
-        """Lower triangle of K^-1 (upper triangle undefined) and log |K|."""
-        n = len(self._y)
-        matrix = np.zeros((n, n), order="F")
-        matrix[self._lower] = signal * self._k
+        """Lower triangle of K^-1 (upper triangle undefined) and log |K|, in place."""
+        matrix = self._matrix
+        matrix.reshape(-1, order="F")[self._pairs.flat] = signal * self._k
         np.fill_diagonal(matrix, signal + noise)
         factor, failed = lapack.dpotrf(matrix, lower=1, overwrite_a=1, clean=0)
         if failed:

@@ -1,19 +1,52 @@
 """Datasets from run logs and from logged messages."""
 
 import itertools
+import json
 import os
 from collections.abc import Collection, Iterable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from bayesrace.errors import InputError
+from bayesrace.integrators import Discretisation
 from bayesrace.log import LogReader
 from bayesrace.messages import STATE, TELEMETRY, State, Telemetry, car_key
 from bayesrace.vehicles.parameters import CarParameters
 from learning.dataset import Dataset, FilterSettings, filter_dataset
 
-__all__ = ["dataset_from_log", "dataset_from_messages"]
+__all__ = ["LogFacts", "dataset_from_log", "dataset_from_messages", "log_facts"]
+
+
+@dataclass(frozen=True)
+class LogFacts:
+    """What a log says about itself."""
+
+    names: tuple[str, ...]
+    """Cars in the network whose states it holds, by the keys."""
+    car: str
+    """The car that drove, by who recorded it; empty if that is not told."""
+    discretisation: Discretisation | None
+    """With which its controller predicted; None if that is not told."""
+
+
+def log_facts(path: str | os.PathLike[str]) -> LogFacts:
+    """Reads what there is about the car; InputError if it is no log or its metadata are damaged."""
+    reader = LogReader(Path(path))
+    names = {entry.key.split("/")[1]: None for entry in reader.messages((STATE,))}
+    metadata = reader.metadata()
+    told: dict[str, Any] = dict(metadata.get("collect") or metadata.get("drive") or {})
+    try:
+        if "race" in metadata:
+            told = json.loads(metadata["race"].get("settings", "{}"))
+        given = told.get("discretisation")
+        discretisation = None if given is None else Discretisation.model_validate(given)
+        return LogFacts(tuple(names), str(told.get("car", "")), discretisation)
+    except (ValueError, AttributeError, ValidationError) as error:
+        raise InputError(f"{path}: its settings cannot be read ({error})") from error
 
 
 def dataset_from_messages(
@@ -44,7 +77,13 @@ def dataset_from_messages(
         x_next.append(after.x)
         driven.append((now.run, now.seq) not in fallback)
     if not x:
-        raise InputError("the log has no two consecutive states; was the car driven?")
+        steps = [b.time_s - a.time_s for a, b in itertools.pairwise(wanted) if a.run == b.run]
+        if not steps:
+            raise InputError("the log has no two consecutive states; was the car driven?")
+        raise InputError(
+            f"no two states are {step_s:g} s apart, but {float(np.median(steps)):g} s; learn with "
+            "the step that was driven with"
+        )
     dropped = {"gap": gaps} if gaps else {}
     samples = Dataset(car, step_s, np.array(x), np.array(u), np.array(x_next), dropped)
     return filter_dataset(samples.select(np.array(driven), "fallback"), settings)
@@ -56,13 +95,15 @@ def dataset_from_log(
     step_s: float,
     runs: Collection[int] | None = None,
     settings: FilterSettings | None = None,
+    name: str = "",
 ) -> Dataset:
     """Filtered samples of ``car`` from a run's MCAP log; see :func:`dataset_from_messages`.
 
-    InputError if it is no log or holds no driving of this car.
+    ``name``: its name in the network, if that is another one than its own. InputError if it is no
+    log or holds no driving of this car.
     """
     reader = LogReader(Path(path))
-    keys = {car_key(topic.key, car.name) for topic in (STATE, TELEMETRY)}
+    keys = {car_key(topic.key, name or car.name) for topic in (STATE, TELEMETRY)}
     states: list[State] = []
     telemetry: list[Telemetry] = []
     for entry in reader.messages((STATE, TELEMETRY)):

@@ -1,15 +1,20 @@
 """The one-step error of the discretised nominal model: what the GP learns."""
 
+import re
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import OUTPUTS
 from bayesrace.integrators import Discretisation
 from bayesrace.vehicles.models import STATES, e_kinematic
+from bayesrace.vehicles.parameters import CarParameters
 from learning.dataset import Dataset
 
-__all__ = ["NOMINAL", "identity", "residual"]
+__all__ = ["NOMINAL", "discretisation_of", "identity", "residual"]
 
 NOMINAL = e_kinematic
 """The model that is corrected."""
@@ -20,6 +25,29 @@ _ROWS = [STATES.index(name) for name in OUTPUTS]
 def identity(dataset: Dataset, discretisation: Discretisation) -> str:
     """Identity of the discretised nominal model of the dataset's car."""
     return discretisation.identity(NOMINAL(dataset.car).name, dataset.car)
+
+
+_IDENTITY: Final = re.compile(
+    r"[^/]+/(?P<scheme>\w+)x(?P<substeps>\d{1,4})-(?P<pose>\w+)/(?P<step_s>[\d.e-]{1,16})s/[^/]+"
+)
+
+
+def discretisation_of(name: str, car: CarParameters) -> Discretisation:
+    """The discretisation that an identity names, such as a manifest's or that of weights.
+
+    InputError if it is not one of the nominal model of ``car``: other parameters, another model.
+    """
+    found = _IDENTITY.fullmatch(name)
+    try:
+        discretisation = Discretisation.model_validate_strings(found.groupdict() if found else name)
+    except ValidationError:
+        raise InputError(f"'{name}' names no discretised model; train again") from None
+    if discretisation.identity(NOMINAL(car).name, car) != name:
+        raise InputError(
+            f"'{name}' is not the {NOMINAL(car).name} model of the car '{car.name}' as this "
+            "program knows it; train again, or name its car"
+        )
+    return discretisation
 
 
 def residual(dataset: Dataset, discretisation: Discretisation) -> NDArray[np.float64]:

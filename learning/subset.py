@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from bayesrace.gp.expression import kernel_matrix
 
-__all__ = ["evenly", "most_informative"]
+__all__ = ["at_random", "evenly", "most_informative"]
 
 Floats = NDArray[np.float64]
 
@@ -15,6 +15,12 @@ def evenly(count: int, wanted: int) -> NDArray[np.int64]:
     if count <= wanted:
         return np.arange(count)
     return np.floor((np.arange(wanted) + 0.5) * count / wanted).astype(np.int64)
+
+
+def at_random(count: int, wanted: int, seed: int) -> NDArray[np.int64]:
+    """``wanted`` of ``count`` indices by chance, sorted: what a choice has to beat."""
+    random = np.random.default_rng(seed)
+    return np.sort(random.choice(count, min(count, wanted), replace=False)).astype(np.int64)
 
 
 def most_informative(

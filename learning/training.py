@@ -22,26 +22,34 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.linalg import cho_solve
-from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
 from threadpoolctl import threadpool_limits
 
+from bayesrace import __version__
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import OUTPUTS, GpOutput, GpWeights, encode_weights
+from bayesrace.gp.weights import FEATURES, OUTPUTS, GpOutput, GpWeights, encode_weights
 from bayesrace.integrators import Discretisation
-from learning.crossvalidation import HeldOut, held_out
+from learning.assessment import TESTS, ChoiceScore, KernelScore, choice_scores, held_out_metrics
 from learning.dataset import Dataset
-from learning.hyperparameters import Fit, best, maximise, starts
+from learning.hyperparameters import TOLERANCE, Fit, best, maximise, starts
+from learning.likelihood import PairDistances
+from learning.regression import Scaling, held_out_blocks, predicted_blocks, regressor, scaling_of
 from learning.residual import identity, residual
 from learning.subset import evenly, most_informative
 
-__all__ = ["MIN_SAMPLES", "Progress", "TrainingSettings", "regressor", "train"]
+__all__ = [
+    "MAX_SAMPLES",
+    "MIN_SAMPLES",
+    "Progress",
+    "Training",
+    "TrainingSettings",
+    "fit",
+    "train",
+]
 
 Floats = NDArray[np.float64]
 Kernel = Literal["rbf", "matern05", "matern15", "matern25"]
@@ -51,7 +59,11 @@ Progress = Callable[[float, str], None]
 
 MIN_SAMPLES: Final = 20
 
-_NU: Final = {"matern05": 0.5, "matern15": 1.5, "matern25": 2.5}
+_CONSTANT: Final = 1e-9
+"""A column whose standard deviation is below this share of its size never changes."""
+
+MAX_SAMPLES: Final = 100_000
+"""Choosing among more would take gigabytes."""
 
 
 class TrainingSettings(BaseModel):
@@ -72,6 +84,9 @@ class TrainingSettings(BaseModel):
         ge=MIN_SAMPLES,
         description="samples that hyperparameters are found with at most",
     )
+    tolerance: float = Field(
+        default=TOLERANCE, gt=0, lt=1, description="relative gain at which the optimiser stops"
+    )
     iterations: int = Field(default=100, ge=1, description="optimiser iterations per start")
     warm_iterations: int = Field(
         default=30, ge=1, description="the same, starting from given weights"
@@ -80,52 +95,7 @@ class TrainingSettings(BaseModel):
     threads: int = Field(default=0, ge=0, description="parallel fits; 0 is one per core")
 
 
-@dataclass(frozen=True)
-class _Scaling:
-    """Features and one output in units of their standard deviation about their mean."""
-
-    z_mean: Floats
-    z_scale: Floats
-    y_mean: float
-    y_scale: float
-
-    def features(self, z: Floats) -> Floats:
-        scaled: Floats = (z - self.z_mean) / self.z_scale
-        return scaled
-
-    def targets(self, y: Floats) -> Floats:
-        scaled: Floats = (y - self.y_mean) / self.y_scale
-        return scaled
-
-
-def _scaling(z: Floats, y: Floats) -> _Scaling:
-    z_scale, y_scale = z.std(axis=0), float(y.std())
-    # A column that never changes carries nothing; dividing by one leaves it at zero.
-    z_scale = np.where(z_scale > 1e-12, z_scale, 1.0)
-    return _Scaling(z.mean(axis=0), z_scale, float(y.mean()), y_scale if y_scale > 1e-12 else 1.0)
-
-
-def _sklearn_kernel(kind: str, theta: Floats) -> Any:
-    signal, lengths, noise = math.exp(theta[0]), np.exp(theta[1:-1]), math.exp(theta[-1])
-    base = RBF(lengths) if kind == "rbf" else Matern(lengths, nu=_NU[kind])
-    return ConstantKernel(signal) * base + WhiteKernel(noise)
-
-
-def regressor(kind: str, theta: Floats, z: Floats, y: Floats) -> GaussianProcessRegressor:
-    """scikit-learn's GP, hyperparameters fixed, fitted to scaled ``z`` (n, 6) and ``y`` (n,)."""
-    gp = GaussianProcessRegressor(_sklearn_kernel(kind, theta), alpha=0.0, optimizer=None)
-    try:
-        return gp.fit(z, y)
-    except np.linalg.LinAlgError as error:
-        raise InputError("GP training: covariance is singular; are samples repeated?") from error
-
-
-def _held_out(gp: GaussianProcessRegressor, y: Floats, blocks: int) -> HeldOut:
-    inverse = cho_solve((gp.L_, True), np.eye(len(y)))
-    return held_out(0.5 * (inverse + inverse.T), y, blocks)
-
-
-def _theta_of(output: GpOutput, scaling: _Scaling) -> Floats:
+def _theta_of(output: GpOutput, scaling: Scaling) -> Floats:
     """Hyperparameters of earlier weights in the units of new scaling."""
     ratio = (output.y_scale / scaling.y_scale) ** 2
     lengths = output.length_scales / scaling.z_scale
@@ -144,7 +114,7 @@ class _Task:
 
 
 def _tasks(
-    settings: TrainingSettings, scalings: Sequence[_Scaling], initial: GpWeights | None
+    settings: TrainingSettings, scalings: Sequence[Scaling], initial: GpWeights | None
 ) -> list[_Task]:
     if initial is None or not all(initial.counts):
         guesses = starts(settings.restarts, settings.seed)
@@ -166,14 +136,22 @@ def _tasks(
 
 
 def _run(
-    tasks: Sequence[_Task], z: Floats, targets: Sequence[Floats], threads: int, report: Progress
+    tasks: Sequence[_Task],
+    z: Floats,
+    targets: Sequence[Floats],
+    settings: TrainingSettings,
+    report: Progress,
 ) -> list[Fit]:
     """All optimisations, several at once, results in the order of the tasks."""
-    with ThreadPoolExecutor(threads) as pool:
+    pairs = PairDistances(z)
+    with ThreadPoolExecutor(settings.threads or os.cpu_count() or 1) as pool:
         futures = [
-            pool.submit(maximise, t.kind, z, targets[t.output], t.start, t.iterations)
+            pool.submit(
+                maximise, t.kind, pairs, targets[t.output], t.start, t.iterations,
+                settings.tolerance,
+            )
             for t in tasks
-        ]
+        ]  # fmt: skip
         for done, future in enumerate(as_completed(futures), start=1):
             task = tasks[futures.index(future)]
             report(0.9 * done / len(tasks), f"{OUTPUTS[task.output]}: {task.kind}")
@@ -181,26 +159,36 @@ def _run(
     return [future.result() for future in futures]
 
 
-def _choose(fits: Sequence[Fit], z: Floats, y: Floats, blocks: int) -> Fit:
+def _choose(
+    output: str, fits: Sequence[Fit], z: Floats, y: Floats, blocks: int, scale: float
+) -> tuple[Fit, list[KernelScore]]:
     """Best start per kernel by likelihood, then best kernel by held-out log density."""
     kinds = list(dict.fromkeys(fit.kind for fit in fits))
     candidates = [best([fit for fit in fits if fit.kind == kind]) for kind in kinds]
-    if len(candidates) == 1:
-        return candidates[0]
-    scores = [_held_out(regressor(c.kind, c.theta, z, y), y, blocks) for c in candidates]
-    return max(zip(candidates, scores, strict=True), key=lambda pair: pair[1].log_density)[0]
+    held = [held_out_blocks(regressor(c.kind, c.theta, z, y), y, blocks) for c in candidates]
+    chosen = max(range(len(candidates)), key=lambda i: held[i].log_density)
+    scores = [
+        KernelScore.of(output, candidate, errors, scale, i == chosen)
+        for i, (candidate, errors) in enumerate(zip(candidates, held, strict=True))
+    ]
+    return candidates[chosen], scores
 
 
 def _finish(
-    fit: Fit, scaling: _Scaling, z_raw: Floats, y: Floats, settings: TrainingSettings
-) -> tuple[GpOutput, dict[str, float]]:
-    """Factorises with the chosen hyperparameters and calibrates the variance."""
+    name: str,
+    fit: Fit,
+    scaling: Scaling,
+    z_raw: Floats,
+    y: Floats,
+    settings: TrainingSettings,
+    compare: bool,
+) -> tuple[GpOutput, dict[str, dict[str, float]], list[ChoiceScore]]:
+    """Factorises with the chosen hyperparameters, calibrates the variance, judges the result."""
     signal, noise = math.exp(fit.theta[0]), math.exp(fit.theta[-1])
     z, lengths = scaling.features(z_raw), np.exp(fit.theta[1:-1])
     rows = most_informative(fit.kind, z, lengths, noise / signal, settings.capacity)
     gp = regressor(fit.kind, fit.theta, z[rows], y[rows])
-    check = _held_out(gp, y[rows], settings.blocks)
-    scale = max(1.0, check.variance_scale)
+    scale = max(1.0, held_out_blocks(gp, y[rows], settings.blocks).variance_scale)
     output = GpOutput(
         kernel=fit.kind,
         length_scales=lengths * scaling.z_scale,
@@ -211,15 +199,63 @@ def _finish(
         y_mean=scaling.y_mean,
         y_scale=scaling.y_scale,
     )
+    tests = evenly(len(y), TESTS)
+    held = predicted_blocks(fit.kind, fit.theta, z, y, rows, tests, settings.blocks)
+    held = replace(held, sigma=held.sigma * math.sqrt(scale))
     metrics = {
-        "log_likelihood": fit.log_likelihood,
-        "held_out_rmse": check.rmse * scaling.y_scale,
-        "held_out_log_density": check.log_density - math.log(scaling.y_scale),
-        "held_out_coverage": check.coverage,
-        "variance_scale": scale,
-        "points": float(len(rows)),
+        name: held_out_metrics(held, y[tests], scaling.y_mean, scaling.y_scale),
+        f"training {name}": {
+            "log_likelihood": fit.log_likelihood,
+            "variance_scale": scale,
+            "samples": float(len(y)),
+            "points": float(len(rows)),
+        },
     }
-    return output, metrics
+    choices = []
+    if compare and len(rows) < len(y):
+        numbers = (settings.blocks, settings.seed, scaling.y_scale)
+        choices = choice_scores(name, fit, z, y, rows, *numbers)
+    return output, metrics, choices
+
+
+def _check(dataset: Dataset) -> None:
+    """InputError for samples that nothing can be learned from."""
+    count = len(dataset)
+    if not MIN_SAMPLES <= count <= MAX_SAMPLES:
+        left_out = ", ".join(f"{n} {why}" for why, n in dataset.dropped.items()) or "none"
+        few = count < MIN_SAMPLES
+        needed = f"at least {MIN_SAMPLES} are needed" if few else f"{MAX_SAMPLES} are the most"
+        remedy = "drive longer" if few else "give fewer logs"
+        raise InputError(f"GP training: {count} samples, {needed} (left out: {left_out}); {remedy}")
+    _check_columns(dataset.features, FEATURES, "{} is {:g} in every sample; vary it while driving")
+
+
+def _check_columns(columns: Floats, names: Sequence[str], text: str) -> None:
+    for name, column in zip(names, columns.T, strict=True):
+        if column.std() <= _CONSTANT * max(1.0, float(np.abs(column).max())):
+            raise InputError("GP training: " + text.format(name, float(column[0])))
+
+
+def _named(weights: GpWeights) -> GpWeights:
+    """Named by content: the same samples and settings give the same version, whoever trains."""
+    digest = hashlib.sha256(encode_weights(weights)).hexdigest()
+    return replace(
+        weights,
+        version=f"{weights.car}-{digest[:10]}",
+        created_utc_ns=time.time_ns(),
+        program=f"bayesrace {__version__}",
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Training:
+    """Weights, and how they came about."""
+
+    weights: GpWeights
+    kernels: tuple[KernelScore, ...]
+    """Every candidate of every output, on the samples that hyperparameters are found with."""
+    choices: tuple[ChoiceScore, ...]
+    """What choosing samples costs; empty if all fit, or if nobody asked."""
 
 
 def train(
@@ -229,44 +265,60 @@ def train(
     initial: GpWeights | None = None,
     progress: Progress | None = None,
 ) -> GpWeights:
+    """The weights of :func:`fit`."""
+    return fit(dataset, discretisation, settings, initial, progress).weights
+
+
+def fit(
+    dataset: Dataset,
+    discretisation: Discretisation,
+    settings: TrainingSettings | None = None,
+    initial: GpWeights | None = None,
+    progress: Progress | None = None,
+    compare: bool = False,
+) -> Training:
     """Weights that correct the discretised nominal model of the dataset's car.
 
     ``initial``: earlier weights of the same car and discretisation, for the model update: their
     hyperparameters are refined instead of searched anew, and other candidate kernels start once.
-    InputError for too few samples or weights of another model.
+    ``compare``: also measure what it costs to learn from chosen samples instead of all.
+    InputError for too few or too many samples, a column that never changes, or weights of another
+    model.
     """
     settings, report = settings or TrainingSettings(), progress or (lambda share, text: None)
     name = identity(dataset, discretisation)
-    if len(dataset) < MIN_SAMPLES:
-        left_out = ", ".join(f"{n} {why}" for why, n in dataset.dropped.items()) or "none"
-        raise InputError(
-            f"GP training: {len(dataset)} samples, at least {MIN_SAMPLES} are needed "
-            f"(left out: {left_out}); drive longer"
-        )
+    _check(dataset)
     if initial is not None and initial.discretisation != name:
         raise InputError(
             f"GP training: cannot start from weights for {initial.discretisation}, this is {name}"
         )
     z, y = dataset.features, residual(dataset, discretisation)
-    scalings = [_scaling(z, column) for column in y.T]
+    _check_columns(y, OUTPUTS, "the residual of {} is {:g} in every sample: nothing to learn")
+    scalings = [scaling_of(z, column) for column in y.T]
     targets = [s.targets(column) for s, column in zip(scalings, y.T, strict=True)]
-    scaled = scalings[0].features(z)
     rows = evenly(len(z), settings.hyper_points)
-    subset, subset_targets = scaled[rows], [column[rows] for column in targets]
+    subset, subset_targets = scalings[0].features(z)[rows], [column[rows] for column in targets]
     tasks = _tasks(settings, scalings, initial)
+    outputs: list[GpOutput] = []
+    kernels: list[KernelScore] = []
+    choices: list[ChoiceScore] = []
+    metrics: dict[str, dict[str, float]] = {}
     # One BLAS thread per fit: the matrices are small, and the fits run side by side.
     with threadpool_limits(1, "blas"):
-        threads = settings.threads or os.cpu_count() or 1
-        fits = _run(tasks, subset, subset_targets, threads, report)
-        outputs, metrics = [], {}
+        fits = _run(tasks, subset, subset_targets, settings, report)
         for i, label in enumerate(OUTPUTS):
             own = [fit for fit, task in zip(fits, tasks, strict=True) if task.output == i]
-            fit = _choose(own, subset, subset_targets[i], settings.blocks)
-            output, metrics[f"training {label}"] = _finish(
-                fit, scalings[i], z, targets[i], settings
+            chosen, scores = _choose(
+                label, own, subset, subset_targets[i], settings.blocks, scalings[i].y_scale
+            )
+            output, measured, costs = _finish(
+                label, chosen, scalings[i], z, targets[i], settings, compare
             )
             outputs.append(output)
-            report(0.9 + 0.1 * (i + 1) / len(OUTPUTS), f"{label}: {fit.kind} chosen")
+            kernels += scores
+            choices += costs
+            metrics |= measured
+            report(0.9 + 0.1 * (i + 1) / len(OUTPUTS), f"{label}: {chosen.kind} chosen")
     weights = GpWeights(
         version="unnamed",
         car=dataset.car.name,
@@ -275,7 +327,4 @@ def train(
         dataset_digest=dataset.digest(),
         metrics=metrics,
     )
-    # Named by content: the same samples and settings give the same version.
-    digest = hashlib.sha256(encode_weights(weights)).hexdigest()
-    version = f"{dataset.car.name}-{digest[:10]}"
-    return replace(weights, version=version, created_utc_ns=time.time_ns())
+    return Training(_named(weights), tuple(kernels), tuple(choices))

@@ -46,7 +46,8 @@ def make_output(seed: int = 0, count: int = 5, kernel: str = "rbf", **changes: A
 def make_weights(count: int = 5, kernels: tuple[str, ...] = KERNELS[:3]) -> GpWeights:
     vx, vy, omega = (make_output(i, count + i, kernel) for i, kernel in enumerate(kernels))
     metrics = {"vx": {"rmse": 0.1}, "training vx": {"points": 5.0}}
-    return GpWeights("v1", "orca", "model/rk4", (vx, vy, omega), "digest", 17, metrics)
+    about = ("digest", 17, metrics, "bayesrace 1.2.3")
+    return GpWeights("v1", "orca", "model/rk4", (vx, vy, omega), *about)
 
 
 def reseal(data: bytes) -> bytes:
@@ -135,6 +136,8 @@ def test_any_bytes_decode_or_are_refused(noise: bytes) -> None:
     "change",
     [
         lambda body: body.pop("car"),
+        lambda body: body.pop("program"),
+        lambda body: body.update(program="a\nb"),
         lambda body: body.update(extra=1),
         lambda body: body.update(version=""),
         lambda body: body.update(car=7),
@@ -170,7 +173,7 @@ def test_unchanged_content_is_accepted() -> None:
 def test_other_schema_and_foreign_files_say_so() -> None:
     good = encode_weights(make_weights())
     newer = good[:8] + struct.pack("<I", module.SCHEMA + 1) + good[HEAD:]
-    with pytest.raises(InputError, match="schema 2"):
+    with pytest.raises(InputError, match=f"schema {module.SCHEMA + 1}"):
         decode_weights(newer)
     with pytest.raises(InputError, match="not a weights file"):
         decode_weights(b"PK\x03\x04" + bytes(100))

@@ -1,6 +1,5 @@
 """Learning: samples, residual, likelihood, training, validation."""
 
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +13,9 @@ from bayesrace.errors import InputError
 from bayesrace.gp.expression import evaluate_mean
 from bayesrace.gp.weights import FEATURES, OUTPUTS, GpOutput, GpWeights, zero_weights
 from bayesrace.integrators import PREDICTION, Discretisation
-from bayesrace.messages import State, Telemetry
-from bayesrace.vehicles import get_car
-from bayesrace.vehicles.models import Model, dynamic, e_kinematic
+from bayesrace.vehicles.models import dynamic, e_kinematic
 from learning.crossvalidation import held_out
-from learning.dataset import Dataset, concatenate, dataset_from_arrays, filter_dataset
+from learning.dataset import Dataset, concatenate, filter_dataset
 from learning.hyperparameters import BOUNDS, maximise, starts
 from learning.likelihood import MarginalLikelihood
 from learning.logs import dataset_from_log, dataset_from_messages
@@ -27,29 +24,11 @@ from learning.residual import identity, residual
 from learning.subset import evenly, most_informative
 from learning.training import TrainingSettings, train
 from learning.validation import predictive_sigma, validate, with_metrics
+from tests.driven import CAR, QUICK, STEP_S, drive, logged, telemetry
 
 Floats = NDArray[np.float64]
 
-CAR = get_car("orca")
-STEP_S = PREDICTION.step_s
 NU = {"matern05": 0.5, "matern15": 1.5, "matern25": 2.5}
-QUICK = TrainingSettings(kernels=("rbf",), restarts=0, hyper_points=100, iterations=25)
-
-
-def drive(model: Model, count: int, seed: int, substeps: int = 10, vx: float = 1.5) -> Dataset:
-    """Random smooth inputs within the limits, one unbroken drive."""
-    random = np.random.default_rng(seed)
-    step = Discretisation(scheme="rk4", step_s=STEP_S, substeps=substeps).discretise(model)
-    phase = random.uniform(0, 2 * np.pi, 3)
-    x = [np.array([0, 0, 0, vx, 0, 0, 0.0])]
-    u = []
-    for k in range(count):
-        target = 0.25 * np.sin(0.13 * k + phase[0]) + 0.05 * np.sin(0.71 * k + phase[1])
-        rate = np.clip((target - x[-1][6]) / STEP_S, -5, 5)
-        duty = np.clip(0.35 + 0.3 * np.sin(0.05 * k + phase[2]), -0.1, 1)
-        u.append([duty, rate])
-        x.append(np.array(step(x[-1], u[-1]))[:, 0])
-    return dataset_from_arrays(CAR, STEP_S, np.array(x), np.array(u))
 
 
 @pytest.fixture(scope="module")
@@ -115,24 +94,6 @@ def test_datasets_are_checked(driven: Dataset) -> None:
     assert both.digest() != driven.digest()
     assert driven.select(slice(None)).digest() == driven.digest()
     assert driven.features.shape == (len(driven), len(FEATURES))
-
-
-def state(run: int, seq: int, x: Floats, u: Floats) -> State:
-    time_s = round(seq * STEP_S, 9)
-    return State(seq, 0, 1, run, time_s, tuple(x), tuple(u), 0, True, (), False)
-
-
-def telemetry(run: int, state_seq: int, fallback: int) -> Telemetry:
-    values: dict[str, Any] = {field.name: 0 for field in fields(Telemetry)}
-    told = {"run": run, "state_seq": state_seq, "fallback": fallback, "plan_x": (), "plan_u": ()}
-    return Telemetry(**(values | told))
-
-
-def logged(data: Dataset, run: int) -> list[State]:
-    """The states a plant would publish: each tells the input of the period before."""
-    x = np.vstack((data.x, data.x_next[-1:]))
-    u = np.vstack((np.zeros(2), data.u))
-    return [state(run, k, x[k], u[k]) for k in range(len(x))]
 
 
 def test_messages_become_the_samples_that_were_driven(driven: Dataset) -> None:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from experiments.analysis import analyse, read_race
+from experiments.published import compare_gp, compare_laps
 from experiments.report import render_report
-from experiments.report.published import compare_gp, compare_laps
 from experiments.results import RaceResult
 from experiments.table import COLUMNS
 from tests.synthetic_race import Drive, circle, write_race

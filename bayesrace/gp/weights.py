@@ -66,7 +66,9 @@ _MAX_PARTS: Final = 1000
 """Maps and arrays in the encoded form at most; a file has some forty. Without a limit, 16 MB of
 empty arrays would take a second for every 2 MB, and 80 times their size in memory."""
 
-SCHEMA: Final = 1
+SCHEMA: Final = 2
+"""Version of the encoded form; any other one is refused, also an older one: train again."""
+
 _MAGIC: Final = b"BRACEGP\n"
 _HEAD: Final = struct.Struct("<8sI")
 _DIGEST_BYTES: Final = 32
@@ -165,8 +167,10 @@ class GpWeights:
 
     ``discretisation`` is :meth:`bayesrace.integrators.Discretisation.identity` of the model that
     the residual was made with: a controller that predicts otherwise must refuse these weights.
-    ``metrics`` maps a group (an output, or "training") to named numbers. Two objects are equal if
-    they encode to the same bytes.
+    ``metrics`` maps a group to named numbers: an output's name to what was measured on samples that
+    were not learned from (rmse, r2, coverage, log_density, …), "training vx" and so on to how it
+    was learned. ``program`` is the version of what made them. Two objects are equal if they encode
+    to the same bytes.
     """
 
     version: str
@@ -176,11 +180,13 @@ class GpWeights:
     dataset_digest: str = ""
     created_utc_ns: int = 0
     metrics: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    program: str = ""
 
     def __post_init__(self) -> None:
         for name in ("version", "car", "discretisation"):
             _text(name, getattr(self, name))
-        _text("dataset_digest", self.dataset_digest, empty=True)
+        for name in ("dataset_digest", "program"):
+            _text(name, getattr(self, name), empty=True)
         created = self.created_utc_ns
         if isinstance(created, bool) or not isinstance(created, int) or not 0 <= created < 2**63:
             raise InputError("GP weights: created_utc_ns must be nanoseconds since 1970")
@@ -247,6 +253,7 @@ _HEADERS: Final = (
     "dataset_digest",
     "created_utc_ns",
     "metrics",
+    "program",
 )
 
 

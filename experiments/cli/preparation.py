@@ -7,8 +7,10 @@ from typing import Annotated
 
 import typer
 
+from bayesrace.errors import InputError
 from experiments.cli.options import (
     Car,
+    CarName,
     FmuFile,
     FmuMap,
     OutFile,
@@ -27,6 +29,16 @@ class PredictionModel(StrEnum):
     dynamic = "dynamic"
 
 
+class KernelChoice(StrEnum):
+    """Kernels by name, and the choice among them."""
+
+    rbf = "rbf"
+    matern05 = "matern05"
+    matern15 = "matern15"
+    matern25 = "matern25"
+    auto = "auto"
+
+
 def tracks(
     name: Annotated[
         str | None, typer.Argument(help="Built-in name, random:SEED or CSV file; all without.")
@@ -40,7 +52,6 @@ def tracks(
     from rich.console import Console
     from rich.table import Table
 
-    from bayesrace.errors import InputError
     from bayesrace.tracks import builtin_tracks, load_track, write_track
 
     if out is not None and name is None:
@@ -110,37 +121,90 @@ def collect(
 
 
 def train(
-    logs: Annotated[list[Path], typer.Argument(help="Run logs (MCAP).")],
+    logs: Annotated[list[Path] | None, typer.Argument(help="Run logs (MCAP).")] = None,
+    data: Annotated[
+        list[Path] | None, typer.Option(help="Samples in plain arrays (.npz); repeatable.")
+    ] = None,
+    kernel: Annotated[
+        KernelChoice, typer.Option(help="Kernel; auto: the best one per output.")
+    ] = KernelChoice.auto,
     out: OutFile = Path("weights.bin"),
     points: Annotated[int, typer.Option(min=20, max=20000, help="Points per output.")] = 400,
+    restarts: Annotated[
+        int, typer.Option(min=0, max=100, help="Further starts of the optimiser per kernel.")
+    ] = 2,
+    plot: Annotated[
+        Path | None,
+        typer.Option(callback=writable, help="Draw error against the kernel's smoothness (PNG)."),
+    ] = None,
+    artefact: Annotated[
+        Path | None, typer.Option(help="Built controller to learn for; the default one without.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the optimiser's starts.")] = 0,
-    car: Car = "orca",
+    car: Annotated[str, typer.Option(help="Built-in car, where the files do not name it.")] = "",
+    name: CarName = "",
 ) -> None:
-    """Train the three GPs on the residual that run logs show."""
+    """Train the three GPs on the residual that run logs or plain arrays show.
+
+    Beyond --points, samples are chosen one by one where the GP knows least; what that costs is
+    printed beside a choice by chance.
+    """
     from rich.console import Console
 
     from bayesrace.gp.weights import write_weights
-    from bayesrace.integrators import PREDICTION
+    from bayesrace.manifest import read_manifest
     from bayesrace.vehicles import get_car
+    from experiments.learning_table import print_choices, print_kernels
     from experiments.progress import stages_on
-    from learning.dataset import concatenate
-    from learning.logs import dataset_from_log
-    from learning.training import TrainingSettings
-    from learning.training import train as fit
+    from learning.residual import discretisation_of
+    from learning.sources import read_samples
+    from learning.training import TrainingSettings, fit
 
-    parameters = get_car(car)
-    samples = concatenate([dataset_from_log(log, parameters, PREDICTION.step_s) for log in logs])
+    wanted = None
+    if artefact is not None:
+        manifest = read_manifest(artefact)
+        car = car or manifest.car
+        wanted = discretisation_of(manifest.discretisation, get_car(manifest.car))
+        _check_capacity(points, manifest.gp_capacity)
+    samples = read_samples([*(logs or []), *(data or [])], car, name, wanted)
     console = Console()
+    every = tuple(one.value for one in KernelChoice if one is not KernelChoice.auto)
+    settings = TrainingSettings(
+        kernels=every if kernel is KernelChoice.auto else (kernel.value,),
+        capacity=points,
+        restarts=restarts,
+        seed=seed,
+    )
     with stages_on(console) as stages, stages.stage("train the residual") as stage:
-        settings = TrainingSettings(capacity=points, seed=seed)
-        weights = fit(samples, PREDICTION, settings, progress=stage.update)
+        training = fit(
+            samples.dataset, samples.discretisation, settings, progress=stage.update, compare=True
+        )
+    weights = training.weights
     write_weights(out, weights)
-    dropped = ", ".join(f"{n} {why}" for why, n in samples.dropped.items()) or "none"
+    print_kernels(training.kernels, console)
+    print_choices(training.choices, console)
+    if plot is not None:
+        from experiments.report.canvas import write_png
+        from experiments.report.style import figure_style
+        from experiments.report.training import kernel_figure
+
+        with figure_style():
+            write_png(kernel_figure(training.kernels), plot)
+    dropped = ", ".join(f"{n} {why}" for why, n in samples.dataset.dropped.items()) or "none"
     console.print(
-        f"{weights.version}: {len(samples)} samples (left out: {dropped}), "
+        f"{weights.version}: {len(samples.dataset)} samples (left out: {dropped}), "
         f"kernels {', '.join(weights.kernels)}: {out}",
         highlight=False,
+        soft_wrap=True,
     )
+
+
+def _check_capacity(points: int, capacity: int) -> None:
+    if points > capacity:
+        raise InputError(
+            f"--points {points} are more than this controller has room for ({capacity}); give "
+            "fewer, or build one with --gp-capacity"
+        )
 
 
 def build(

@@ -13,10 +13,10 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from bayesrace.vehicles import get_car
 from experiments.analysis import RaceAnalysis, read_race
+from experiments.published import LIMIT, SOURCE, compare_gp, compare_laps
 from experiments.report.canvas import inline_svg, write_png
 from experiments.report.learning import UNCERTAIN, gp_figure, solve_figure, uncertain
 from experiments.report.maps import laps_on_track
-from experiments.report.published import LIMIT, SOURCE, compare_gp, compare_laps
 from experiments.report.style import figure_style, look
 from experiments.report.traces import deviation_figure, inputs_figure, speed_figure
 from experiments.results import LapResult, RaceResult

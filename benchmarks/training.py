@@ -1,0 +1,106 @@
+"""Training against scikit-learn: the same samples, kernel, starts and bounds.
+
+    python benchmarks/training.py [--points 800] [--restarts 4] [--kernel rbf] [--seed 0]
+
+scikit-learn's ``GaussianProcessRegressor`` optimises one start after another with its own L-BFGS-B
+and tolerances, on as many BLAS threads as it likes. Ours is all of ``learning.training.fit``:
+optimisation, factorisation, cross-validation. Both start from the same points within the same
+bounds; the best log marginal likelihood per output is compared. Takes minutes, nearly all of them
+scikit-learn's. The samples are those of the pure-pursuit drive that every race begins with.
+"""
+
+import argparse
+import math
+import os
+import time
+import warnings
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
+
+from bayesrace.gp.weights import OUTPUTS
+from bayesrace.integrators import PREDICTION
+from bayesrace.tracks import DEFAULT_TRAINING_TRACK, load_track
+from bayesrace.vehicles import get_car
+from experiments.preparation import training_samples
+from learning.hyperparameters import BOUNDS, starts
+from learning.regression import scaling_of
+from learning.residual import residual
+from learning.training import TrainingSettings, fit
+
+Floats = NDArray[np.float64]
+
+NU = {"matern05": 0.5, "matern15": 1.5, "matern25": 2.5}
+SLACK = 1e-3
+"""Log marginal likelihoods closer than this are the same optimum."""
+
+
+def theirs(kind: str, start: Floats, z: Floats, y: Floats) -> float:
+    """scikit-learn's log marginal likelihood from one start."""
+    low, high = np.exp(BOUNDS).T
+    theta = np.exp(np.clip(start, BOUNDS[:, 0], BOUNDS[:, 1]))
+    lengths = {"length_scale": theta[1:-1], "length_scale_bounds": np.exp(BOUNDS[1:-1])}
+    base = RBF(**lengths) if kind == "rbf" else Matern(nu=NU[kind], **lengths)
+    signal = ConstantKernel(theta[0], (low[0], high[0]))
+    kernel = signal * base + WhiteKernel(theta[-1], (low[-1], high[-1]))
+    gp = GaussianProcessRegressor(kernel, alpha=0.0, optimizer="fmin_l_bfgs_b")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)  # that a parameter ends at its bound
+        return float(gp.fit(z, y).log_marginal_likelihood_value_)
+
+
+def main() -> None:
+    """Runs both and prints times, optima and the ratio."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--points", type=int, default=800)
+    parser.add_argument("--restarts", type=int, default=4)
+    parser.add_argument("--kernel", choices=("rbf", *NU), default="rbf")
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    points, kind = arguments.points, arguments.kernel
+
+    car = get_car("orca")
+    track = load_track(DEFAULT_TRAINING_TRACK, car.width_m)
+    duration_s = (points + 5) * PREDICTION.step_s
+    samples = training_samples(track, car, duration_s, arguments.seed).select(slice(points))
+    assert len(samples) == points, f"{len(samples)} samples are left of {points}"
+    settings = TrainingSettings(
+        kernels=(kind,),
+        restarts=arguments.restarts,
+        seed=arguments.seed,
+        hyper_points=points,
+        capacity=max(points, 1024),
+        iterations=1000,
+    )
+    guesses = starts(arguments.restarts, arguments.seed)
+    print(
+        f"{points} samples, {kind}, {len(guesses)} starts, {len(OUTPUTS)} outputs, "
+        f"{os.cpu_count()} cores"
+    )
+    began = time.perf_counter()
+    weights = fit(samples, PREDICTION, settings).weights
+    ours_s = time.perf_counter() - began
+    ours = [weights.metrics[f"training {output}"]["log_likelihood"] for output in OUTPUTS]
+    print(f"ours, all of training: {ours_s:.2f} s")
+
+    z, y = samples.features, residual(samples, PREDICTION)
+    theirs_s, same = 0.0, True
+    for i, output in enumerate(OUTPUTS):
+        scaling = scaling_of(z, y[:, i])
+        scaled, target = scaling.features(z), scaling.targets(y[:, i])
+        found = -math.inf
+        began = time.perf_counter()
+        for guess in guesses:
+            found = max(found, theirs(kind, guess, scaled, target))
+        theirs_s += time.perf_counter() - began
+        same &= abs(ours[i] - found) <= SLACK
+        print(f"{output:6} ours {ours[i]:.5f}, scikit-learn {found:.5f}: {ours[i] - found:+.1e}")
+    print(f"scikit-learn, optimisation alone: {theirs_s:.2f} s")
+    print(f"{theirs_s / ours_s:.1f} times as fast; {'the same optima' if same else 'OTHER OPTIMA'}")
+
+
+if __name__ == "__main__":
+    main()

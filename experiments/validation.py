@@ -1,0 +1,176 @@
+"""``bayesrace validate``: weights judged on drives that they were not learned from."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+from threadpoolctl import threadpool_limits
+
+from bayesrace.errors import InputError
+from bayesrace.gp.weights import GpWeights
+from bayesrace.vehicles import get_car
+from learning.dataset import Dataset
+from learning.horizon import HORIZON, Mismatch, mismatch
+from learning.residual import discretisation_of
+from learning.sources import read_samples
+from learning.validation import Validation, validate
+
+__all__ = [
+    "Drift",
+    "HorizonResult",
+    "OutputMetrics",
+    "Spread",
+    "Validated",
+    "ValidationResult",
+    "validate_weights",
+]
+
+Floats = NDArray[np.float64]
+
+UNCERTAIN = 0.25
+"""The paper marks where the largest of the three standard deviations is above this."""
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class OutputMetrics(_Frozen):
+    """How well one output's GP predicts the residual, SI units."""
+
+    rmse: float
+    uncorrected_rmse: float = Field(description="without the GP")
+    r2: float
+    coverage: float = Field(description="share of the residuals in the 95 % interval")
+    log_density: float = Field(description="mean log predictive density")
+
+
+class Spread(_Frozen):
+    """Of absolute errors over all predictions."""
+
+    mean: float
+    p95: float
+    max: float
+
+    @classmethod
+    def of(cls, errors: Floats) -> "Spread":
+        """From errors (m,), m at least 1."""
+        size = np.abs(errors)
+        return cls(
+            mean=float(size.mean()), p95=float(np.percentile(size, 95)), max=float(size.max())
+        )
+
+
+class Drift(_Frozen):
+    """Driven against predicted at the end of a horizon."""
+
+    position_m: Spread
+    heading_rad: Spread
+    vx_mps: Spread
+    vy_mps: Spread
+    omega_radps: Spread
+
+    @classmethod
+    def of(cls, errors: Mismatch) -> "Drift":
+        """From at least one prediction."""
+        vx, vy, omega = errors.velocities.T
+        return cls(
+            position_m=Spread.of(errors.position_m),
+            heading_rad=Spread.of(errors.heading_rad),
+            vx_mps=Spread.of(vx),
+            vy_mps=Spread.of(vy),
+            omega_radps=Spread.of(omega),
+        )
+
+
+class HorizonResult(_Frozen):
+    """Open-loop predictions over some steps, without and with the correction."""
+
+    steps: int
+    predictions: int
+    nominal: Drift
+    corrected: Drift
+
+
+class ValidationResult(_Frozen):
+    """What ``--json`` writes."""
+
+    vx: OutputMetrics
+    vy: OutputMetrics
+    omega: OutputMetrics
+    one_step: HorizonResult | None
+    horizon: HorizonResult | None = Field(description="null if no drive is long enough")
+    weights_version: str
+    car: str
+    discretisation: str
+    samples: int
+    dropped: dict[str, int] = Field(description="samples left out, by reason")
+    threshold: float
+    uncertain: int = Field(description="samples whose largest sigma is above the threshold")
+    learned_from: bool = Field(description="these are the samples that the weights learned from")
+
+
+@dataclass(frozen=True, eq=False)
+class Validated:
+    """The numbers, and what they are made of."""
+
+    result: ValidationResult
+    validation: Validation
+    dataset: Dataset
+
+
+def validate_weights(
+    weights: GpWeights,
+    drives: list[Path],
+    name: str = "",
+    runs: tuple[int, ...] | None = None,
+    threshold: float = UNCERTAIN,
+) -> Validated:
+    """Judges weights on logs (MCAP) or arrays (``.npz``), filtered as for training.
+
+    The discretisation is the one that the weights were learned with. InputError for drives of
+    another car or step, or without samples.
+    """
+    discretisation = discretisation_of(weights.discretisation, get_car(weights.car))
+    samples = read_samples(drives, weights.car, name, discretisation, runs=runs)
+    data = samples.dataset
+    if len(data) == 0:
+        left_out = ", ".join(f"{n} {why}" for why, n in data.dropped.items()) or "none"
+        raise InputError(f"validation: no samples left (left out: {left_out}); drive longer")
+    # On a busy machine the threads of BLAS wait for each other longer than they work.
+    with threadpool_limits(1):
+        validation = validate(weights, data, discretisation)
+
+    def over(steps: int) -> HorizonResult | None:
+        plain, corrected = (mismatch(data, discretisation, w, steps) for w in (None, weights))
+        if len(plain) == 0:
+            return None
+        return HorizonResult(
+            steps=steps,
+            predictions=len(plain),
+            nominal=Drift.of(plain),
+            corrected=Drift.of(corrected),
+        )
+
+    metrics = {
+        output: OutputMetrics.model_validate(dict(numbers))
+        for output, numbers in validation.metrics.items()
+    }
+    result = ValidationResult(
+        vx=metrics["vx"],
+        vy=metrics["vy"],
+        omega=metrics["omega"],
+        one_step=over(1),
+        horizon=over(HORIZON),
+        weights_version=weights.version,
+        car=weights.car,
+        discretisation=weights.discretisation,
+        samples=len(data),
+        dropped=dict(data.dropped),
+        threshold=threshold,
+        uncertain=int((validation.sigma.max(axis=1) > threshold).sum()),
+        learned_from=bool(weights.dataset_digest) and weights.dataset_digest == data.digest(),
+    )
+    return Validated(result, validation, data)

@@ -1,0 +1,73 @@
+"""Driven samples that need no track: smooth random inputs, as arrays, messages and log files."""
+
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesrace.integrators import PREDICTION, Discretisation
+from bayesrace.log import LogWriter
+from bayesrace.messages import State, Telemetry, encode
+from bayesrace.vehicles import get_car
+from bayesrace.vehicles.models import Model
+from learning.dataset import Dataset, dataset_from_arrays
+from learning.training import TrainingSettings
+
+__all__ = ["CAR", "QUICK", "STEP_S", "drive", "logged", "state", "telemetry", "write_log"]
+
+Floats = NDArray[np.float64]
+
+CAR = get_car("orca")
+STEP_S = PREDICTION.step_s
+QUICK = TrainingSettings(kernels=("rbf",), restarts=0, hyper_points=100, iterations=25)
+
+
+def drive(model: Model, count: int, seed: int, substeps: int = 10, vx: float = 1.5) -> Dataset:
+    """Random smooth inputs within the limits, one unbroken drive."""
+    random = np.random.default_rng(seed)
+    step = Discretisation(scheme="rk4", step_s=STEP_S, substeps=substeps).discretise(model)
+    phase = random.uniform(0, 2 * np.pi, 3)
+    x = [np.array([0, 0, 0, vx, 0, 0, 0.0])]
+    u = []
+    for k in range(count):
+        target = 0.25 * np.sin(0.13 * k + phase[0]) + 0.05 * np.sin(0.71 * k + phase[1])
+        rate = np.clip((target - x[-1][6]) / STEP_S, -5, 5)
+        duty = np.clip(0.35 + 0.3 * np.sin(0.05 * k + phase[2]), -0.1, 1)
+        u.append([duty, rate])
+        x.append(np.array(step(x[-1], u[-1]))[:, 0])
+    return dataset_from_arrays(CAR, STEP_S, np.array(x), np.array(u))
+
+
+def state(run: int, seq: int, x: Floats, u: Floats) -> State:
+    time_s = round(seq * STEP_S, 9)
+    return State(seq, 0, 1, run, time_s, tuple(x), tuple(u), 0, True, (), False)
+
+
+def telemetry(run: int, state_seq: int, fallback: int) -> Telemetry:
+    values: dict[str, Any] = {field.name: 0 for field in fields(Telemetry)}
+    told = {"run": run, "state_seq": state_seq, "fallback": fallback, "plan_x": (), "plan_u": ()}
+    return Telemetry(**(values | told))
+
+
+def logged(data: Dataset, run: int) -> list[State]:
+    """The states a plant would publish: each tells the input of the period before."""
+    x = np.vstack((data.x, data.x_next[-1:]))
+    u = np.vstack((np.zeros(2), data.u))
+    return [state(run, k, x[k], u[k]) for k in range(len(x))]
+
+
+def write_log(
+    path: Path,
+    data: Dataset,
+    name: str = "orca",
+    metadata: Mapping[str, Mapping[str, str]] | None = None,
+) -> Path:
+    """A log of one unbroken drive, as a plant's states."""
+    log = LogWriter(path, metadata)
+    for one in logged(data, 0):
+        log.write(f"bayesrace/{name}/state", encode(one), 1 + one.seq, one.seq)
+    log.close()
+    return path

@@ -1,0 +1,232 @@
+"""Training beyond the fit: kernels by smoothness, chosen samples, what is carried, what is refused.
+
+That training is faster than scikit-learn is ``benchmarks/training.py``'s to say.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+
+from bayesrace import __version__
+from bayesrace.errors import InputError
+from bayesrace.gp.expression import evaluate_mean
+from bayesrace.gp.weights import OUTPUTS, decode_weights, encode_weights
+from bayesrace.integrators import PREDICTION, Discretisation
+from bayesrace.vehicles.models import dynamic, e_kinematic
+from learning.dataset import Dataset
+from learning.hyperparameters import BOUNDS, best, maximise, starts
+from learning.likelihood import MarginalLikelihood, PairDistances
+from learning.regression import held_out_blocks, predicted_blocks, regressor, scaling_of
+from learning.residual import discretisation_of, identity, residual
+from learning.subset import at_random
+from learning.training import MAX_SAMPLES, Training, TrainingSettings, fit, train
+from learning.validation import predictive_sigma
+from tests.driven import CAR, QUICK, drive
+
+ALL = ("rbf", "matern05", "matern15", "matern25")
+
+
+@pytest.fixture(scope="module")
+def driven() -> Dataset:
+    return drive(dynamic(CAR), 160, seed=1)
+
+
+@pytest.fixture(scope="module")
+def chosen(driven: Dataset) -> Training:
+    """Every kernel, a third of the samples."""
+    settings = QUICK.model_copy(update={"kernels": ALL, "capacity": 50})
+    return fit(driven, PREDICTION, settings, compare=True)
+
+
+# Optimum ---------------------------------------------------------------------------------------
+
+
+def test_the_optimum_is_scikit_learns() -> None:
+    """Same starts, same bounds: the best log marginal likelihoods agree within 1e-3."""
+    data = drive(dynamic(CAR), 70, seed=3)
+    z, y = data.features, residual(data, PREDICTION)
+    low, high = np.exp(BOUNDS).T
+    for column in y.T[1:]:
+        scaling = scaling_of(z, column)
+        scaled, target = scaling.features(z), scaling.targets(column)
+        pairs, found = PairDistances(scaled), []
+        guesses = starts(1, seed=0)
+        for guess in guesses:
+            theta = np.exp(guess)
+            kernel = ConstantKernel(theta[0], (low[0], high[0])) * RBF(
+                theta[1:-1], np.exp(BOUNDS[1:-1])
+            ) + WhiteKernel(theta[-1], (low[-1], high[-1]))
+            gp = GaussianProcessRegressor(kernel, alpha=0.0)
+            with pytest.warns():  # that noise and some length scales end at their bounds
+                found.append(gp.fit(scaled, target).log_marginal_likelihood_value_)
+        ours = best([maximise("rbf", pairs, target, guess, 300, 1e-9) for guess in guesses])
+        assert ours.log_likelihood == pytest.approx(max(found), abs=1e-3)
+
+
+def test_shared_distances_change_nothing() -> None:
+    random = np.random.default_rng(0)
+    z, y = random.normal(size=(30, 6)), random.normal(size=(2, 30))
+    pairs, theta = PairDistances(z), starts(1, 0)[1]
+    for target in y:
+        alone, shared = MarginalLikelihood("rbf", z, target), MarginalLikelihood(
+            "rbf", pairs, target
+        )  # fmt: skip
+        for _ in range(2):  # the second call finds the memory as the first one left it
+            value, gradient = alone(theta)
+            other, other_gradient = shared(theta)
+            assert value == other
+            assert np.array_equal(gradient, other_gradient)
+
+
+# Choice of kernel and samples --------------------------------------------------------------------
+
+
+def test_every_kernel_is_scored_and_the_best_density_is_chosen(chosen: Training) -> None:
+    for i, output in enumerate(OUTPUTS):
+        own = [score for score in chosen.kernels if score.output == output]
+        assert [score.kernel for score in own] == list(ALL)
+        winner = max(own, key=lambda score: score.log_density)
+        assert [score.kernel for score in own if score.chosen] == [winner.kernel]
+        assert chosen.weights.kernels[i] == winner.kernel
+        rough = next(score for score in own if score.kernel == "matern05")
+        assert winner.rmse < rough.rmse  # smooth dynamics
+
+
+def test_the_cost_of_choosing_is_told(chosen: Training, driven: Dataset) -> None:
+    assert chosen.weights.counts == (50, 50, 50)
+    for output in OUTPUTS:
+        everything, greedy, random = (s for s in chosen.choices if s.output == output)
+        assert (everything.choice, greedy.choice, random.choice) == ("all", "greedy", "random")
+        assert (everything.points, greedy.points, random.points) == (len(driven), 50, 50)
+        assert everything.log_density > greedy.log_density
+        carried = chosen.weights.metrics[output]
+        assert carried["rmse"] == pytest.approx(greedy.rmse)
+
+
+def test_nothing_is_chosen_where_all_fit(driven: Dataset) -> None:
+    assert fit(driven, PREDICTION, QUICK, compare=True).choices == ()
+
+
+def test_prediction_by_stretches_leaves_the_stretch_out(driven: Dataset) -> None:
+    z, y = driven.features, residual(driven, PREDICTION)[:, 1]
+    scaling = scaling_of(z, y)
+    scaled, target = scaling.features(z), scaling.targets(y)
+    theta = np.log([2.0] + [1.5] * 6 + [0.02])
+    rows = np.arange(len(y))
+    judged = predicted_blocks("matern25", theta, scaled, target, rows, rows, 4)
+    closed = held_out_blocks(regressor("matern25", theta, scaled, target), target, 4)
+    assert judged.error == pytest.approx(closed.error, abs=1e-8)
+    assert judged.sigma == pytest.approx(closed.sigma, abs=1e-8)
+    few, tests = rows[:30], np.array([5, 100])
+    without = predicted_blocks("matern25", theta, scaled, target, few, tests, 4)
+    # The first stretch, rows 0 to 39, holds all that is known: there is nothing but the prior.
+    assert without.error[0] == target[5]
+    assert without.sigma[0] == pytest.approx(np.sqrt(2.02))
+    assert without.sigma[1] < without.sigma[0]
+
+
+def test_choice_by_chance_is_seeded_and_without_repetition() -> None:
+    rows = at_random(100, 30, seed=4)
+    assert len(set(rows.tolist())) == 30
+    assert list(rows) == sorted(rows)
+    assert np.array_equal(rows, at_random(100, 30, seed=4))
+    assert len(at_random(10, 30, seed=0)) == 10
+
+
+# What the weights carry --------------------------------------------------------------------------
+
+
+def test_weights_carry_what_they_were_made_from_and_how_good_they_are(
+    chosen: Training, driven: Dataset
+) -> None:
+    weights = decode_weights(encode_weights(chosen.weights))
+    assert weights.program == f"bayesrace {__version__}"
+    assert weights.created_utc_ns > 1_700_000_000 * 10**9
+    assert weights.dataset_digest == driven.digest()
+    assert weights.discretisation == identity(driven, PREDICTION)
+    for output in OUTPUTS:
+        held = weights.metrics[output]
+        assert {"rmse", "r2", "coverage", "log_density", "uncorrected_rmse"} == set(held)
+        assert 0 < held["rmse"] < held["uncorrected_rmse"]
+        assert held["r2"] < 1
+        assert weights.metrics[f"training {output}"]["points"] == 50
+        assert weights.metrics[f"training {output}"]["samples"] == len(driven)
+
+
+def test_the_metrics_carried_are_those_of_samples_not_learned_from(driven: Dataset) -> None:
+    """The error on the samples themselves is far smaller: nobody may be told that one."""
+    weights = train(driven, PREDICTION, QUICK)
+    y = residual(driven, PREDICTION)
+    own = np.sqrt(np.mean((y - evaluate_mean(weights, driven.features)) ** 2, axis=0))
+    for i, output in enumerate(OUTPUTS):
+        assert weights.metrics[output]["rmse"] > 2 * own[i]
+    assert np.all(predictive_sigma(weights, driven.features) > 0)
+
+
+def test_the_name_does_not_depend_on_who_trained_when(
+    driven: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = train(driven, PREDICTION, QUICK)
+    monkeypatch.setattr("learning.training.__version__", "9.9")
+    second = train(driven, PREDICTION, QUICK)
+    assert second.program == "bayesrace 9.9"
+    assert second.version == first.version
+
+
+# Refusals ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("column", "name"), [(0, "d"), (1, "delta_rate")])
+def test_an_input_that_never_changes_is_refused(driven: Dataset, column: int, name: str) -> None:
+    u = driven.u.copy()
+    u[:, column] = 0.4
+    with pytest.raises(InputError, match=rf"{name} is 0\.4 in every sample"):
+        train(replace(driven, u=u), PREDICTION, QUICK)
+
+
+def test_a_residual_that_never_changes_is_refused() -> None:
+    data = drive(e_kinematic(CAR), 60, seed=0, substeps=PREDICTION.substeps)
+    with pytest.raises(InputError, match="nothing to learn"):
+        train(data, PREDICTION, QUICK)
+
+
+def test_too_few_and_too_many_samples_are_refused_with_the_number(driven: Dataset) -> None:
+    with pytest.raises(InputError, match="19 samples, at least 20"):
+        train(driven.select(slice(19)), PREDICTION, QUICK)
+    many = driven.select(np.zeros(MAX_SAMPLES + 1, dtype=np.int64))
+    with pytest.raises(InputError, match="fewer logs"):
+        train(many, PREDICTION, QUICK)
+
+
+def test_settings_out_of_range_are_refused() -> None:
+    with pytest.raises(ValueError, match="kernels"):
+        TrainingSettings(kernels=())
+    with pytest.raises(ValueError, match="tolerance"):
+        TrainingSettings(tolerance=0)
+
+
+@pytest.mark.parametrize(
+    "discretisation",
+    [
+        PREDICTION,
+        Discretisation(scheme="euler", step_s=0.005, substeps=3),
+        Discretisation(scheme="heun", step_s=1 / 3, substeps=1, pose="interpolated"),
+    ],
+)
+def test_an_identity_names_its_discretisation(discretisation: Discretisation) -> None:
+    name = discretisation.identity(e_kinematic(CAR).name, CAR)
+    again = discretisation_of(name, CAR)
+    assert again.identity(e_kinematic(CAR).name, CAR) == name
+    assert again.step_s == pytest.approx(discretisation.step_s, rel=1e-8)
+
+
+@pytest.mark.parametrize("name", ["", "a/b/c/d", "e_kinematic/rk4x1-interpolated/0.02s/orca-00"])
+def test_other_names_are_no_discretisation(name: str) -> None:
+    with pytest.raises(InputError):
+        discretisation_of(name, CAR)
+    perfect = PREDICTION.identity("dynamic", CAR)
+    with pytest.raises(InputError, match="e_kinematic"):
+        discretisation_of(perfect, CAR)

@@ -1,0 +1,299 @@
+"""``train`` and ``validate`` from the command line, the horizon's mismatch, tables and pictures."""
+
+import io
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from bayesrace.errors import InputError
+from bayesrace.gp.corrected import corrected_function
+from bayesrace.gp.weights import OUTPUTS, GpWeights, read_weights, write_weights, zero_weights
+from bayesrace.integrators import PREDICTION, Discretisation
+from bayesrace.vehicles.models import dynamic, e_kinematic
+from experiments.cli import main
+from experiments.learning_table import print_choices, print_kernels, print_validation
+from experiments.validation import ValidationResult, validate_weights
+from learning.arrays import write_npz
+from learning.assessment import ChoiceScore, KernelScore
+from learning.dataset import Dataset, concatenate
+from learning.horizon import mismatch, unbroken
+from learning.residual import identity
+from learning.training import train
+from learning.validation import validate
+from tests.driven import CAR, QUICK, STEP_S, drive, write_log
+
+Program = Callable[..., int]
+
+
+@pytest.fixture(scope="module")
+def driven() -> Dataset:
+    return drive(dynamic(CAR), 160, seed=1)
+
+
+@pytest.fixture(scope="module")
+def fresh() -> Dataset:
+    return drive(dynamic(CAR), 90, seed=2)
+
+
+@pytest.fixture(scope="module")
+def weights(driven: Dataset) -> GpWeights:
+    return train(driven, PREDICTION, QUICK)
+
+
+@pytest.fixture
+def files(tmp_path: Path, weights: GpWeights, driven: Dataset, fresh: Dataset) -> Path:
+    """A folder with weights.bin, driven.mcap and fresh.npz."""
+    write_weights(tmp_path / "weights.bin", weights)
+    write_log(tmp_path / "driven.mcap", driven)
+    write_npz(tmp_path / "fresh.npz", fresh)
+    return tmp_path
+
+
+@pytest.fixture
+def program(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Program:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "80")
+
+    def call(*arguments: str | Path) -> int:
+        monkeypatch.setattr(sys, "argv", ["bayesrace", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            main()
+        return int(end.value.code or 0)
+
+    return call
+
+
+# Horizon -----------------------------------------------------------------------------------------
+
+
+def test_a_horizon_starts_only_where_the_drive_is_unbroken(driven: Dataset) -> None:
+    count = len(driven)
+    assert list(unbroken(driven, 1)) == list(range(count))
+    assert list(unbroken(driven, 20)) == list(range(count - 19))
+    assert len(unbroken(driven, count)) == 1
+    assert len(unbroken(driven, count + 1)) == 0
+    torn = driven.select(np.arange(count) != 50)
+    starts = unbroken(torn, 20)
+    assert not set(starts) & set(range(31, 50))
+    assert {30, 50} <= set(starts)
+    two = concatenate([driven, drive(dynamic(CAR), 30, seed=9)])
+    assert len(unbroken(two, 20)) == count - 19 + 30 - 19
+
+
+def test_the_model_that_drove_has_no_mismatch() -> None:
+    data = drive(e_kinematic(CAR), 60, seed=0, substeps=PREDICTION.substeps)
+    integrated = Discretisation(scheme="rk4", step_s=STEP_S, substeps=PREDICTION.substeps)
+    found = mismatch(data, integrated, None)
+    assert len(found) == 41
+    assert found.position_m.max() < 1e-12
+    assert np.abs(found.velocities).max() < 1e-12
+
+
+def test_mismatch_is_the_open_loop_prediction_of_the_corrected_map(
+    weights: GpWeights, fresh: Dataset
+) -> None:
+    step = corrected_function(e_kinematic(CAR), PREDICTION, weights)
+    found, start = mismatch(fresh, PREDICTION, weights, 20), 7
+    x = fresh.x[start]
+    for u in fresh.u[start : start + 20]:
+        x = np.asarray(step(x, u))[:, 0]
+    error = fresh.x_next[start + 19] - x
+    assert found.position_m[start] == pytest.approx(np.hypot(*error[:2]), abs=1e-12)
+    assert found.heading_rad[start] == pytest.approx(error[2], abs=1e-12)
+    assert found.velocities[start] == pytest.approx(error[3:6], abs=1e-11)
+
+
+def test_one_step_mismatch_of_the_velocities_is_the_residual(
+    weights: GpWeights, fresh: Dataset
+) -> None:
+    checked = validate(weights, fresh, PREDICTION)
+    plain, corrected = (mismatch(fresh, PREDICTION, w, 1) for w in (None, weights))
+    assert plain.velocities == pytest.approx(checked.residual, abs=1e-11)
+    assert corrected.velocities == pytest.approx(checked.error, abs=1e-11)
+
+
+def test_mismatch_of_other_weights_is_refused(fresh: Dataset) -> None:
+    with pytest.raises(InputError, match="another"):
+        mismatch(fresh, PREDICTION, zero_weights("orca", "another model"))
+
+
+# validate ----------------------------------------------------------------------------------------
+
+
+def test_validate_writes_what_it_prints(
+    files: Path, program: Program, capfd: pytest.CaptureFixture[str], fresh: Dataset
+) -> None:
+    arguments = ("--on", "fresh.npz", "--json", "v.json", "--out", "all", "--plot", "band.png")
+    assert program("validate", "weights.bin", *arguments) == 0
+    said = capfd.readouterr().out
+    assert "…" not in said
+    assert max(map(len, said.splitlines())) <= 80
+    content = json.loads((files / "v.json").read_text())
+    result = ValidationResult.model_validate(content)
+    checked = validate(read_weights(files / "weights.bin"), fresh, PREDICTION)
+    for output in OUTPUTS:
+        assert content[output] == dict(checked.metrics[output])
+        assert {"rmse", "r2", "coverage", "log_density"} <= set(content[output])
+        assert f"{content[output]['rmse']:.3g}" in said
+    assert (result.samples, result.learned_from) == (len(fresh), False)
+    assert result.one_step is not None
+    assert result.horizon is not None
+    assert (result.one_step.predictions, result.horizon.predictions) == (90, 71)
+    drift = result.horizon
+    assert drift.corrected.position_m.max < 0.3 * drift.nominal.position_m.max
+    for picture in ("band.png", "all/error.png", "all/track.png"):
+        assert (files / picture).read_bytes().startswith(b"\x89PNG")
+    assert (files / "all/validation.json").read_text() == (files / "v.json").read_text()
+
+
+def test_validate_says_when_the_samples_were_learned_from(
+    files: Path, program: Program, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert program("validate", "weights.bin", "--on", "driven.mcap") == 0
+    assert "learned from" in capfd.readouterr().out
+
+
+def test_weights_are_judged_by_the_discretisation_that_they_were_learned_with(
+    tmp_path: Path, fresh: Dataset
+) -> None:
+    euler = Discretisation(scheme="euler", step_s=STEP_S)
+    write_npz(tmp_path / "fresh.npz", fresh)
+    judged = validate_weights(
+        zero_weights("orca", identity(fresh, euler)), [tmp_path / "fresh.npz"]
+    )
+    usual = validate(zero_weights("orca", identity(fresh, PREDICTION)), fresh, PREDICTION)
+    assert judged.result.vy.rmse != pytest.approx(usual.metrics["vy"]["rmse"], rel=1e-3)
+
+
+def test_a_drive_shorter_than_the_horizon_has_no_horizon(
+    tmp_path: Path, weights: GpWeights, fresh: Dataset
+) -> None:
+    write_npz(tmp_path / "short.npz", fresh.select(slice(12)))
+    result = validate_weights(weights, [tmp_path / "short.npz"]).result
+    assert result.horizon is None
+    text = io.StringIO()
+    print_validation(result, Console(file=text, width=80))
+    assert "no stretch is long enough" in text.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("missing.bin", "--on", "fresh.npz"), "missing.bin"),
+        (("fresh.npz", "--on", "fresh.npz"), "weights file"),
+        (("weights.bin", "--on", "missing.mcap"), "missing.mcap"),
+        (("weights.bin", "--on", "weights.bin"), "MCAP"),
+        (("weights.bin", "--on", "driven.mcap", "--run", "7"), "driven"),
+        (("weights.bin", "--on", "fresh.npz", "--track", "nowhere"), "nowhere"),
+        (("weights.bin", "--on", "fresh.npz", "--json", "no/where.json"), "where.json"),
+        (("weights.bin",), "--on"),
+        (("foreign.bin", "--on", "fresh.npz"), "names no discretised model"),
+        (("weights.bin", "--on", "still.npz"), "standstill"),
+    ],
+)
+def test_validate_refuses_in_one_line(
+    files: Path,
+    program: Program,
+    capfd: pytest.CaptureFixture[str],
+    fresh: Dataset,
+    arguments: tuple[str, ...],
+    words: str,
+) -> None:
+    write_weights(files / "foreign.bin", zero_weights("orca", "another model"))
+    x = fresh.x.copy()
+    x[:, 3] = 0
+    write_npz(files / "still.npz", Dataset(CAR, STEP_S, x, fresh.u, fresh.x_next))
+    assert program("validate", *arguments) == 2
+    error = capfd.readouterr().err.strip()
+    assert len(error.splitlines()) == 1
+    assert words in error
+
+
+# train -------------------------------------------------------------------------------------------
+
+
+def test_train_chooses_the_kernel_and_prints_why(
+    files: Path, program: Program, capfd: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ("--data", "fresh.npz", "--restarts", "0", "--points", "60", "--plot", "k.png")
+    assert program("train", "driven.mcap", *arguments, "--out", "new.bin") == 0
+    said = capfd.readouterr().out
+    assert "…" not in said.replace("residual …", "")
+    for word in ("matern05", "matern15", "matern25", "rbf", "greedy", "random", "250 samples"):
+        assert word in said
+    weights = read_weights(files / "new.bin")
+    assert weights.counts == (60, 60, 60)
+    assert weights.version in said
+    assert (files / "k.png").read_bytes().startswith(b"\x89PNG")
+    assert program("validate", "new.bin", "--on", "fresh.npz") == 0
+
+
+def test_train_takes_one_kernel(files: Path, program: Program) -> None:
+    arguments = ("--kernel", "matern15", "--restarts", "0")
+    assert program("train", "--data", "fresh.npz", *arguments) == 0
+    assert set(read_weights(files / "weights.bin").kernels) == {"matern15"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((), "at least one log"),
+        (("driven.mcap", "--kernel", "cubic"), "cubic"),
+        (("driven.mcap", "--points", "30000"), "20000"),
+        (("driven.mcap", "driven.mcap"), "same samples"),
+        (("driven.mcap", "--car", "lorry"), "lorry"),
+        (("driven.mcap", "--artefact", "nowhere"), "bayesrace build"),
+        (("driven.mcap", "--plot", "no/where.png"), "where.png"),
+        (("--data", "short.npz"), "at least 20"),
+        (("--data", "constant.npz"), "d is 0.5 in every sample"),
+    ],
+)
+def test_train_refuses_in_one_line(
+    files: Path,
+    program: Program,
+    capfd: pytest.CaptureFixture[str],
+    fresh: Dataset,
+    arguments: tuple[str, ...],
+    words: str,
+) -> None:
+    write_npz(files / "short.npz", fresh.select(slice(10)))
+    u = fresh.u.copy()
+    u[:, 0] = 0.5
+    write_npz(files / "constant.npz", Dataset(CAR, STEP_S, fresh.x, u, fresh.x_next))
+    assert program("train", *arguments) == 2
+    error = capfd.readouterr().err.strip()
+    assert len(error.splitlines()) == 1
+    assert words in error
+
+
+def test_train_keeps_to_the_controllers_room(
+    files: Path, program: Program, kinematic_artefact: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ("--artefact", kinematic_artefact, "--points", "20000")
+    assert program("train", "driven.mcap", *arguments) == 2
+    assert "room for" in capfd.readouterr().err
+
+
+def test_tables_of_training_fit_a_terminal() -> None:
+    kernels = [
+        KernelScore(output, kernel, 1.0, 0.000123456, -12.345, 0.95, kernel == "rbf")
+        for output in OUTPUTS
+        for kernel in ("matern05", "matern15", "matern25", "rbf")
+    ]
+    choices = [
+        ChoiceScore(output, choice, 1024, 0.000123456, -12.345)
+        for output in OUTPUTS
+        for choice in ("all", "greedy", "random")
+    ]
+    text = io.StringIO()
+    console = Console(file=text, width=80)
+    print_kernels(kernels, console)
+    print_choices(choices, console)
+    assert "…" not in text.getvalue()
+    assert text.getvalue().count("✓") == 3
+    print_choices([], console)
