@@ -13,7 +13,7 @@ from bayesrace.errors import InputError
 
 __all__ = ["ABI", "LIBRARY", "MANIFEST", "Manifest", "read_manifest"]
 
-ABI: Final = 3
+ABI: Final = 4
 """Version of the C interface in controller/native/bayesrace_mpc.h."""
 
 LIBRARY: Final = "libmpc.so"

@@ -5,14 +5,16 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import read_weights
+from bayesrace.gp.weights import decode_weights, encode_weights, read_weights
 from bayesrace.raceline.line import read_raceline
 from bayesrace.tracks import load_track
 from bayesrace.vehicles import CarParameters
+from controller.gate.store import Accepted, Store
 from controller.mpc import PredictiveController
 from controller.native_step import NativeStep
 from controller.path_table import make_path_table
 from controller.settings import MpcSettings
+from controller.takeover import WeightsPort
 
 __all__ = ["predictive_controller", "read_settings"]
 
@@ -39,15 +41,31 @@ def predictive_controller(
     raceline: Path,
     settings: Path | None = None,
     weights: Path | None = None,
+    store: Path | None = None,
 ) -> PredictiveController:
     """The compiled controller of ``artefact`` on a track, ready to drive.
 
-    Raises InputError naming the file that cannot be used.
+    ``store``: folder of the weights that it accepts; the newest of an earlier life are in use from
+    the start, whatever ``weights`` are. Raises InputError naming the file that cannot be used.
     """
     step = NativeStep(artefact, car, read_settings(settings))
     step.set_path(make_path_table(load_track(track, car.width_m), read_raceline(raceline)))
-    if weights is None:
-        return PredictiveController(step)
-    loaded = read_weights(weights)
-    step.set_weights(loaded)
-    return PredictiveController(step, loaded.version)
+    first = Accepted(0, "", b"", proven=True)
+    if weights is not None:
+        loaded = read_weights(weights)
+        step.set_weights(loaded)
+        first = Accepted(0, loaded.version, encode_weights(loaded), proven=True)
+    port = WeightsPort(artefact.resolve(), step, [first])
+    if store is not None:
+        _restore(port, Store(store, step.manifest.discretisation))
+        port.store = store
+    return PredictiveController(step, port.history[-1].version, port)
+
+
+def _restore(port: WeightsPort, store: Store) -> None:
+    """Takes up what an earlier controller has accepted."""
+    kept = store.load()
+    port.history += kept
+    port.next_number, port.withdrawn = store.next_number, list(store.withdrawn)
+    if kept:
+        port.step.set_weights(decode_weights(kept[-1].data))

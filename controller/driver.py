@@ -119,6 +119,15 @@ class Driver:
         """Cycles so far by level of the fallback; those on command are not among them."""
         return self._fallback.counts
 
+    @property
+    def fallen_back(self) -> bool | None:
+        """Whether the newest input was the fallback's for want of a solution; None: the car is
+        not driven, or its state is not known."""
+        decision = self.decision
+        if self._standing or decision.status in (HALTED, NO_STATE):
+            return None
+        return decision.level is not Level.SOLUTION
+
     def stop(self) -> None:
         """From the next cycle on slow down along the line to standstill, and stay."""
         self._halted = Phase.STOPPED

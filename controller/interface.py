@@ -1,12 +1,15 @@
 """What the controller process drives: any object with these methods."""
 
 from dataclasses import dataclass, field
-from typing import Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from bayesrace.messages import State
+
+if TYPE_CHECKING:
+    from controller.takeover import WeightsPort
 
 __all__ = ["NO_PLAN", "Array", "Controller", "StepOutput"]
 
@@ -86,6 +89,13 @@ class Controller(Protocol):
 
         ``math.inf`` and 0: no limit.
         """
+
+    @property
+    def port(self) -> "WeightsPort | None":
+        """Where a process stages weights that are checked; None: :meth:`set_weights` is asked."""
+
+    def adopt_weights(self, version: str) -> None:
+        """Use what has been staged at :attr:`port` from the next step on: within microseconds."""
 
     def set_weights(self, data: bytes) -> str:
         """Take over weights (``bayesrace.gp.weights`` file content) from the next step on.

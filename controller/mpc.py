@@ -6,6 +6,7 @@ from bayesrace.gp.weights import decode_weights
 from bayesrace.messages import State
 from controller.interface import Array, StepOutput
 from controller.native_step import NativeStep
+from controller.takeover import WeightsPort
 
 __all__ = ["PredictiveController"]
 
@@ -13,9 +14,13 @@ __all__ = ["PredictiveController"]
 class PredictiveController:
     """See :class:`controller.interface.Controller`; BestCase, WorstCase and BayesRace alike."""
 
-    def __init__(self, step: NativeStep, weights_version: str = "") -> None:
-        """``step``: with parameters and path set. ``weights_version``: of what it holds already."""
+    def __init__(
+        self, step: NativeStep, weights_version: str = "", port: WeightsPort | None = None
+    ) -> None:
+        """``step``: with parameters and path set. ``weights_version``: of what it holds already.
+        ``port``: how a process takes over new ones; without, :meth:`set_weights` does."""
         self._step = step
+        self.port = port
         self._version = weights_version
         self._output = StepOutput(
             u=step.u,
@@ -39,6 +44,11 @@ class PredictiveController:
         self._step.set_weights(weights)
         self._version = weights.version
         return weights.version
+
+    def adopt_weights(self, version: str) -> None:
+        """What is staged is used from the next step on; the plan goes on."""
+        self._step.adopt_weights()
+        self._version = version
 
     def prepare(self, elapsed_s: float, budget_s: float = 0.0) -> None:
         """Iterates on until converged if there is a budget, then shifts and condenses."""

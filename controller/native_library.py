@@ -170,6 +170,7 @@ def _declare(library: ct.CDLL) -> None:
         "set_parameters": [pointer] * 2,
         "set_path": [pointer, pointer, ct.c_int, real],
         "set_weights": [pointer] * 2,
+        "stage_weights": [pointer] * 2,
         "set_clock": [pointer] * 3,
         "set_speed_limit": [pointer, ct.c_double, ct.c_double],
         "reset": [pointer],

@@ -32,7 +32,7 @@ def _address(array: _DOUBLES) -> int:
 
 
 class NativeStep:
-    """The compiled control step. Not thread-safe.
+    """The compiled control step. Not thread-safe, but for :meth:`stage_weights`.
 
     ``u`` (2,), ``info`` and the plan arrays are overwritten by each step. Times are in seconds;
     budgets are measured by the system's monotonic clock.
@@ -68,6 +68,9 @@ class NativeStep:
         self._prepare = self._library.br_mpc_prepare
         self._predict = self._library.br_mpc_predict
         self._rehearse = self._library.br_mpc_rehearse
+        # Holds on to the interpreter's lock, which is not to be had back within a microsecond.
+        self._adopt = ct.PyDLL(self._library._name).br_mpc_adopt_weights
+        self._adopt.argtypes = [ct.c_void_p]
         self._set_clock()
         self.set_parameters(car, settings)
         self.set_zero_weights()
@@ -148,6 +151,18 @@ class NativeStep:
             target.inputs = _address(output.inputs)
             target.alpha = _address(output.alpha)
         self._check(self._library.br_mpc_set_weights(self._mpc, outputs), "weights")
+
+    def stage_weights(self, outputs: "ct.Array[Gp]") -> None:
+        """Copies the three outputs beside those in use, for :meth:`adopt_weights`.
+
+        The one method that another thread may call; the interpreter goes on meanwhile. InputError
+        if they are unusable; they are not compared with the manifest.
+        """
+        self._check(self._library.br_mpc_stage_weights(self._mpc, outputs), "weights")
+
+    def adopt_weights(self) -> None:
+        """Puts what is staged into use, between two steps; InputError if there is nothing."""
+        self._check(self._adopt(self._mpc), "weights")
 
     def set_zero_weights(self) -> None:
         """No correction: WorstCase with the e-kinematic model, BestCase with the dynamic one."""

@@ -8,10 +8,9 @@ for no one and logs nothing while it drives.
 
 import gc
 import logging
+import sys
 import time
 from typing import Any, Final
-
-from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.clock import die_with_parent, sleep_until_ns
 from bayesrace.messages import (
@@ -20,18 +19,16 @@ from bayesrace.messages import (
     TELEMETRY,
     Actuation,
     Decoder,
+    Scalar,
     State,
     decode,
     encode,
 )
-from bayesrace.realtime import RealtimeSettings, prepare_thread
+from bayesrace.realtime import prepare_thread
 from bayesrace.transport import (
-    CONTROLLER_ENDPOINT,
     HEARTBEAT_S,
     LOCKSTEP_SPIN_S,
     NEWEST,
-    PLANT_ENDPOINT,
-    Endpoints,
     Inbox,
     Item,
     Kind,
@@ -39,12 +36,13 @@ from bayesrace.transport import (
     open_session,
 )
 from bayesrace.vehicles.parameters import get_car
-from controller.compensation import CompensationSettings
+from controller.courier import Courier
 from controller.driver import Decision, Driver
-from controller.fallback import FallbackSettings
 from controller.interface import Controller
+from controller.process_settings import ControllerSettings
 from controller.schedule import Schedule
 from controller.service import Service
+from controller.takeover import Takeover
 from controller.telemetry import Timing, telemetry_of
 
 __all__ = ["ControllerProcess", "ControllerSettings", "main"]
@@ -68,33 +66,10 @@ _GRACE: Final = 0.25
 """How long after a release the loop still waits for the state that is due (fraction of the
 period)."""
 
+_SWITCH_S: Final = 1e-4
+
 _LEAST_BUDGET: Final = 0.1
 """What a step gets however late its cycle began (fraction of the budget)."""
-
-
-class ControllerSettings(BaseModel):
-    """How a controller process is started; what it drives is made by the caller."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    car: str = Field(default="orca", description="car whose limits hold")
-    name: str = Field(default="", description="name in message keys; the car's own if empty")
-    endpoints: Endpoints = Endpoints(listen=(CONTROLLER_ENDPOINT,), connect=(PLANT_ENDPOINT,))
-    rate_hz: float = Field(50.0, ge=1, le=500, description="of the loop by the wall clock")
-    budget: float = Field(
-        0.8, gt=0, le=1, description="fraction of the period that a cycle may take, step included"
-    )
-    compensation: CompensationSettings = CompensationSettings()
-    fallback: FallbackSettings = FallbackSettings()
-    stale_s: float = Field(
-        default=0.06, gt=0, le=60, description="age from which a state is not predicted forward"
-    )
-    stop_mps2: float = Field(
-        1.5, gt=0, le=100, description="deceleration along the line of a stop on command"
-    )
-    hold: bool = Field(False, description="wait for 'go' before driving")
-    realtime: RealtimeSettings = RealtimeSettings()
-    parent_pid: int | None = Field(None, description="end when this process, the parent, ends")
 
 
 class ControllerProcess:
@@ -124,11 +99,26 @@ class ControllerProcess:
         inbox = self.inbox = Inbox(session, self.name)
         inbox.subscribe(STATE, newest=NEWEST)
         self._service = Service(
-            session, inbox, self.name, settings.rate_hz, self._driver, controller, self._counters
-        )
+            session, inbox, self.name, settings.rate_hz, self._driver, controller, self._counters,
+            self._words, controller.port is not None,
+        )  # fmt: skip
+        self._courier: Courier | None = None
+        self._takeover: Takeover | None = None
+        if controller.port is not None:
+            self._courier = Courier(
+                session, self.name, controller.port, settings.gate, controller.adopt_weights,
+                self._service.announce,
+            )  # fmt: skip
+            self._takeover = self._courier.takeover
+            self._courier.start()
         inbox.tell_time("controller")
         inbox.watch("plant")
         inbox.announce("controller")
+
+    def close(self) -> None:
+        """Ends what the process has started."""
+        if self._courier is not None:
+            self._courier.stop()
 
     def serve(self) -> None:
         """Until SIGINT or SIGTERM."""
@@ -147,6 +137,8 @@ class ControllerProcess:
         """Waits a little for a first state; serves whatever else happens, and logs it."""
         self._service.beat()
         item = self.inbox.get(HEARTBEAT_S)
+        if self._takeover is not None:
+            self._takeover.between_cycles(self._next_cycle)
         if item is None:
             self._decoder.report(_log)
             if not self._service.plant_there and not self._told:
@@ -165,6 +157,8 @@ class ControllerProcess:
         self._timing.decode_us = (time.perf_counter_ns() - begin_ns) * 1e-3
         if state is None or not self._driver.observe(state):
             return None
+        if self._takeover is not None:
+            self._takeover.note(state, self._driver.fallen_back)
         self._arrived_ns = item.received_ns
         self._payload = item.value
         self._service.arrived_ns = item.received_ns
@@ -193,6 +187,8 @@ class ControllerProcess:
                 timing.released_ns = time.monotonic_ns()
                 self._decide(state, state.time_s, 0.0)
                 self._send(state, self._driver.settle())
+                if self._takeover is not None:
+                    self._takeover.in_lockstep(self._next_cycle)
                 self._prepare(self._driver.states.interval_s, 0.0)
             elif self._silent() or not self._service.plant_there:
                 break
@@ -246,6 +242,8 @@ class ControllerProcess:
     def _rest(self) -> None:
         """The time until the next release: what has happened meanwhile, and the preparation."""
         end_ns = self._schedule.release_ns + round(self._settings.budget * self._schedule.period_ns)
+        if self._takeover is not None:
+            self._takeover.between_cycles(self._next_cycle)
         while time.monotonic_ns() < end_ns and (item := self.inbox.other()) is not None:
             self._service.react(item)
         self._service.beat()
@@ -335,7 +333,15 @@ class ControllerProcess:
             decision.status,
         )
 
-    def _counters(self) -> dict[str, int]:
+    @property
+    def _next_cycle(self) -> int:
+        """``tick`` of the next cycle, unless its release is passed over."""
+        return self._timing.ticks + self._timing.skipped
+
+    def _words(self) -> str:
+        return "" if self._courier is None else self._courier.text
+
+    def _counters(self) -> dict[str, Scalar]:
         """What the loop has counted, by name."""
         timing, states = self._timing, self._driver.states
         return {
@@ -348,6 +354,7 @@ class ControllerProcess:
             "states_stale": states.stale,
             "refused": self._decoder.refused,
             "overflowed": self.inbox.overflowed,
+            **({} if self._courier is None else self._courier.status()),
             "actuations_sent": self._actuations.next_seq,
         }
 
@@ -360,13 +367,18 @@ def main(settings: ControllerSettings, controller: Controller) -> int:
     die_with_parent(settings.parent_pid)
     with open_session(settings.endpoints, "controller") as session:
         process = ControllerProcess(session, settings, controller)
-        for refusal in prepare_thread(settings.realtime):
-            _log.warning("%s", refusal)
-        _log.info(
-            "controller of car '%s', plant at %s",
-            process.name,
-            ", ".join(settings.endpoints.connect) or "(connects to us)",
-        )
-        with process.inbox.catching_signals():
-            process.serve()
+        # A control thread that wants the interpreter's lock back has it this soon, whoever has it.
+        sys.setswitchinterval(_SWITCH_S)
+        try:
+            for refusal in prepare_thread(settings.realtime):
+                _log.warning("%s", refusal)
+            _log.info(
+                "controller of car '%s', plant at %s",
+                process.name,
+                ", ".join(settings.endpoints.connect) or "(connects to us)",
+            )
+            with process.inbox.catching_signals():
+                process.serve()
+        finally:
+            process.close()
     return 0

@@ -98,6 +98,13 @@ class PurePursuit:
         """Always refused."""
         raise InputError("pure pursuit takes no weights; send them to the predictive controller")
 
+    port = None
+    """It has nowhere to put weights."""
+
+    def adopt_weights(self, version: str) -> None:
+        """Never asked."""
+        raise InputError("pure pursuit takes no weights")
+
     def prepare(self, elapsed_s: float, budget_s: float = 0.0) -> None:
         """Nothing can be done ahead."""
 

@@ -1,5 +1,6 @@
 """What others may ask of a running controller: status, stop, go, new weights; and its heartbeat."""
 
+import threading
 import time
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -8,6 +9,7 @@ from bayesrace.errors import InputError
 from bayesrace.messages import (
     COMMAND,
     EVENT,
+    ROLLBACK,
     STATUS,
     WEIGHTS,
     Event,
@@ -34,17 +36,23 @@ class Service:
         rate_hz: float,
         driver: Driver,
         controller: Controller,
-        counters: Callable[[], dict[str, int]],
+        counters: Callable[[], Mapping[str, Scalar]],
+        words: Callable[[], str],
+        takes_weights: bool,
     ) -> None:
-        """``counters``: what the loop has counted, asked for with each status."""
+        """``counters``: what the loop has counted, asked for with each status; ``words``: what
+        else there is to say. ``takes_weights``: another one serves these requests."""
         self._rate_hz = rate_hz
         self._driver = driver
         self._controller = controller
         self._counters = counters
+        self._own_words = words
         self._events = Publisher(session, EVENT, name, "controller", waits=False)
         self._heartbeat = Heartbeat(session, name, "controller")
         self._text = "waiting for the plant"
-        self._weights_taken = self._weights_refused = 0
+        self._publishing = threading.Lock()
+        self._weights_refused = 0
+        self._takes_weights = takes_weights
         self.stopping = False
         """The process has been told to end."""
         self.plant_there = True
@@ -52,8 +60,10 @@ class Service:
         self.arrived_ns: int | None = None
         """Monotonic clock when the newest state arrived."""
         inbox.serve(STATUS, "controller")
-        inbox.serve(WEIGHTS)
         inbox.serve(COMMAND)
+        if not takes_weights:
+            inbox.serve(WEIGHTS)
+            inbox.serve(ROLLBACK)
 
     def beat(self) -> None:
         """Publishes the status, if it is time to."""
@@ -94,16 +104,21 @@ class Service:
         )
 
     def _words(self) -> str:
-        raised = self._driver.raised
-        if not raised:
-            return self._text
-        return f"{self._text}; {raised} step(s) raised, the last {self._driver.last_error}"
+        words, raised = [self._text], self._driver.raised
+        if raised:
+            words.append(f"{raised} step(s) raised, the last {self._driver.last_error}")
+        if more := self._own_words():
+            words.append(more)
+        return "; ".join(words)
 
     def _answer(self, request: Request) -> None:
         if request.service is STATUS:
             request.answer(self.status())
         elif request.service is COMMAND:
             request.answer(self._command(request))
+        elif request.service is ROLLBACK:
+            text = "this controller has no weights to go back to"
+            request.answer(Reply(0, time.monotonic_ns(), False, text, {}))
         else:
             request.answer(self._take_weights(request.payload))
 
@@ -117,7 +132,7 @@ class Service:
         else:
             self._driver.go()
             self._text = f"driving on request: {command.text}"
-        self._publish_event(command.command, self._text, {})
+        self.announce(command.command, self._text, {})
         return Reply(0, time.monotonic_ns(), True, self._text[:2000], {})
 
     def _take_weights(self, data: bytes) -> Reply:
@@ -128,18 +143,20 @@ class Service:
             self._weights_refused += 1
             accepted, text = False, str(error)[:2000]
         else:
-            self._weights_taken += 1
             accepted, text = True, f"weights {version} in use from the next step on"
             data_map["version"] = version
-        self._publish_event("weights_accepted" if accepted else "weights_refused", text, data_map)
+        self.announce("weights_accepted" if accepted else "weights_refused", text, data_map)
         return Reply(0, time.monotonic_ns(), accepted, text, data_map)
 
-    def _publish_event(self, kind: str, text: str, data: Mapping[str, Scalar]) -> None:
+    def announce(self, kind: str, text: str, data: Mapping[str, Scalar]) -> None:
+        """Publishes an event; from any thread."""
         now_ns = time.monotonic_ns()
         newest = self._driver.states.newest
         run = 0 if newest is None else newest.run
-        event = Event(self._events.next_seq, now_ns, run, "controller", kind, text[:2000], data)
-        self._events.put(event, lockstep=newest is None or newest.lockstep)
+        with self._publishing:
+            seq = self._events.next_seq
+            event = Event(seq, now_ns, run, "controller", kind, text[:2000], dict(data))
+            self._events.put(event, lockstep=newest is None or newest.lockstep)
 
     def _count(self) -> dict[str, Scalar]:
         counts = self._driver.counts
@@ -150,6 +167,5 @@ class Service:
             "brake": counts[Level.BRAKE],
             "stop": counts[Level.STOP],
             "raised": self._driver.raised,
-            "weights_taken": self._weights_taken,
-            "weights_refused": self._weights_refused,
+            **({} if self._takes_weights else {"weights_refused": self._weights_refused}),
         }

@@ -3,12 +3,14 @@
 from bayesrace.messages.codec import LARGEST_BYTES, Decoder, decode, encode, json_schema, peek_seq
 from bayesrace.messages.rules import Scalar
 from bayesrace.messages.table import (
+    ACCEPTED,
     ACTUATION,
     ALIVE,
     CLOCK,
     COMMAND,
     EVENT,
     HEARTBEAT,
+    ROLLBACK,
     RUN,
     SERVICES,
     STATE,
@@ -32,6 +34,7 @@ from bayesrace.messages.types import (
     Event,
     Message,
     Reply,
+    RollbackRequest,
     RunRequest,
     State,
     Status,
@@ -41,6 +44,7 @@ from bayesrace.messages.types import (
 )
 
 __all__ = [
+    "ACCEPTED",
     "ACTUATION",
     "ALIVE",
     "CLOCK",
@@ -50,6 +54,7 @@ __all__ = [
     "HEARTBEAT",
     "LARGEST_BYTES",
     "PHASES",
+    "ROLLBACK",
     "RUN",
     "SERVICES",
     "STATE",
@@ -67,6 +72,7 @@ __all__ = [
     "Message",
     "Qos",
     "Reply",
+    "RollbackRequest",
     "RunRequest",
     "Scalar",
     "Service",

@@ -13,6 +13,7 @@ from bayesrace.messages.types import (
     Event,
     Message,
     Reply,
+    RollbackRequest,
     RunRequest,
     State,
     Status,
@@ -22,12 +23,14 @@ from bayesrace.messages.types import (
 )
 
 __all__ = [
+    "ACCEPTED",
     "ACTUATION",
     "ALIVE",
     "CLOCK",
     "COMMAND",
     "EVENT",
     "HEARTBEAT",
+    "ROLLBACK",
     "RUN",
     "SERVICES",
     "STATE",
@@ -80,12 +83,13 @@ class Topic(Generic[M]):
 
 @dataclass(frozen=True)
 class Service(Generic[M, A]):
-    """One row of the table of requests. ``request`` None: the payload is not a message."""
+    """One row of the table of requests. ``request`` or ``answer`` None: the payload is no message,
+    but a weights file."""
 
     name: str
     key: str
     request: type[M] | None
-    answer: type[A]
+    answer: type[A] | None
     timeout_s: float
 
 
@@ -124,11 +128,23 @@ RUN: Final = Service("run", "bayesrace/{car}/plant/run", RunRequest, Reply, 20.0
 STOP: Final = Service("stop", "bayesrace/{car}/plant/stop", StopRequest, Reply, 5.0)
 STATUS: Final = Service("status", "bayesrace/{car}/{source}/status", StatusRequest, Status, 5.0)
 WEIGHTS: Final[Service[Message, Reply]] = Service(
-    "weights", "bayesrace/{car}/controller/weights", None, Reply, 10.0
+    "weights", "bayesrace/{car}/controller/weights", None, Reply, 20.0
 )
+"""The payload is a weights file (:mod:`bayesrace.gp.weights`). Answered once it is in use, or
+refused; waits for a first cycle, for others that sent theirs before, and for the checks."""
+ROLLBACK: Final = Service(
+    "rollback", "bayesrace/{car}/controller/rollback", RollbackRequest, Reply, 20.0
+)
+ACCEPTED: Final[Service[Message, Message]] = Service(
+    "accepted", "bayesrace/{car}/controller/accepted", None, None, 2.0
+)
+"""Asked without payload, for who joins late. The answer is the file of the weights in use, empty if
+the controller has accepted none since its start."""
 COMMAND: Final = Service("command", "bayesrace/{car}/controller/command", Command, Reply, 5.0)
 CLOCK: Final = Service("clock", "bayesrace/{car}/{source}/clock", ClockRequest, ClockReading, 2.0)
-SERVICES: Final[tuple[Service[Any, Any], ...]] = (RUN, STOP, STATUS, WEIGHTS, COMMAND, CLOCK)
+SERVICES: Final[tuple[Service[Any, Any], ...]] = (
+    RUN, STOP, STATUS, WEIGHTS, ROLLBACK, ACCEPTED, COMMAND, CLOCK
+)  # fmt: skip
 
 ALIVE: Final = "bayesrace/{car}/alive/{source}"
 """Liveliness token of a process."""

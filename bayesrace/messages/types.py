@@ -30,6 +30,7 @@ __all__ = [
     "Event",
     "Message",
     "Reply",
+    "RollbackRequest",
     "RunRequest",
     "State",
     "Status",
@@ -211,6 +212,15 @@ class StopRequest(Message):
 @dataclass(frozen=True, slots=True)
 class StatusRequest(Message):
     """Asked of ``bayesrace/{car}/plant/status`` and ``…/controller/status``."""
+
+
+@dataclass(frozen=True, slots=True)
+class RollbackRequest(Message):
+    """Go back to the weights before those in use: asked of ``bayesrace/{car}/controller/rollback``;
+    the answer is a :class:`Reply`."""
+
+    text: Long
+    """Why; it comes back in the event."""
 
 
 @dataclass(frozen=True, slots=True)

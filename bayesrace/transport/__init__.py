@@ -1,6 +1,6 @@
 """Zenoh, wrapped thinly: sessions with explicit endpoints, publishers, one inbox per thread."""
 
-from bayesrace.transport.client import Director, ask
+from bayesrace.transport.client import Director, RefusedError, ask, fetch
 from bayesrace.transport.heartbeat import HEARTBEAT_S, Heartbeat
 from bayesrace.transport.inbox import (
     LOCKSTEP_SPIN_S,
@@ -9,6 +9,7 @@ from bayesrace.transport.inbox import (
     Item,
     Kind,
     Request,
+    declare_service,
     decode_request,
 )
 from bayesrace.transport.numbering import Numbering
@@ -35,9 +36,12 @@ __all__ = [
     "Kind",
     "Numbering",
     "Publisher",
+    "RefusedError",
     "Request",
     "ask",
+    "declare_service",
     "decode_request",
+    "fetch",
     "free_endpoint",
     "open_session",
 ]

@@ -1,7 +1,7 @@
 """Asking other processes, and following a run from outside."""
 
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from typing import Any, TypeVar
 
 import zenoh
@@ -9,6 +9,7 @@ import zenoh
 from bayesrace.errors import InputError
 from bayesrace.messages import (
     EVENT,
+    ROLLBACK,
     RUN,
     STATUS,
     STOP,
@@ -17,6 +18,7 @@ from bayesrace.messages import (
     Event,
     Message,
     Reply,
+    RollbackRequest,
     RunRequest,
     Service,
     Status,
@@ -28,9 +30,18 @@ from bayesrace.messages import (
 )
 from bayesrace.transport.inbox import Inbox, Kind
 
-__all__ = ["Director", "ask"]
+__all__ = ["Director", "RefusedError", "ask", "fetch"]
 
 A = TypeVar("A", bound=Message)
+
+
+class RefusedError(InputError):
+    """A process has answered no."""
+
+    def __init__(self, what: str, reply: Reply) -> None:
+        super().__init__(f"{what} refused: {reply.text}")
+        self.reply = reply
+        """With the numbers that the text is about in its data."""
 
 
 def ask(
@@ -40,8 +51,28 @@ def ask(
 
     Raises InputError if nobody answers in time or the answer is not a valid one.
     """
+    if service.answer is None:
+        raise TypeError(f"the answer of '{service.name}' is not a message; fetch it")
     key = car_key(service.key, car, source)
     payload = request if isinstance(request, bytes) else encode(request)
+    answer = next(_answers(session, service, key, payload, zenoh.Locality.ANY), None)
+    if answer is not None:
+        return decode(service.answer, answer)
+    raise InputError(
+        f"nobody answered on {key}; is the process for car '{car}' running, and its endpoint "
+        "among those to connect to?"
+    )
+
+
+def fetch(session: Any, service: Service[Any, Any], car: str) -> bytes:
+    """The longest answer of other processes that is no message; empty if nobody has one."""
+    key = car_key(service.key, car)
+    return max(_answers(session, service, key, b"", zenoh.Locality.REMOTE), key=len, default=b"")
+
+
+def _answers(
+    session: Any, service: Service[Any, Any], key: str, payload: bytes, where: zenoh.Locality
+) -> Iterator[bytes]:
     replies = session.get(
         key,
         payload=payload,
@@ -49,14 +80,11 @@ def ask(
         target=zenoh.QueryTarget.ALL,
         # Dropped, a question is never answered: on a loaded machine that ended a race.
         congestion_control=zenoh.CongestionControl.BLOCK,
+        allowed_destination=where,
     )
     for reply in replies:
         if reply.ok is not None:
-            return decode(service.answer, reply.ok.payload.to_bytes())
-    raise InputError(
-        f"nobody answered on {key}; is the process for car '{car}' running, and its endpoint "
-        "among those to connect to?"
-    )
+            yield reply.ok.payload.to_bytes()
 
 
 class Director:
@@ -106,10 +134,26 @@ class Director:
         """End the run under way."""
         return ask(self._session, STOP, self._car, StopRequest(0, time.monotonic_ns(), text))
 
-    def send_weights(self, data: bytes) -> str:
-        """Hand new weights to the running controller; their version, or InputError if refused."""
-        reply = self._accepted("weights", ask(self._session, WEIGHTS, self._car, data))
-        return str(reply.data.get("version", ""))
+    def send_weights(self, data: bytes) -> Reply:
+        """Hand new weights (the file's bytes) to the running controller, which drives with them
+        when this returns; RefusedError with its reasons if it does not.
+
+        ``data`` of the answer: ``version``, ``number`` (of acceptance, rising), ``cycle`` (tick of
+        the first cycle that they drive), ``probation`` (too few samples to compare), and what was
+        compared: ``samples``, ``error_new_vx``, ``error_old_vx``, ``error_nominal_vx`` and so on,
+        one-step prediction errors (RMSE) of the new weights, those before, and the uncorrected
+        model.
+        """
+        return self._accepted("weights", ask(self._session, WEIGHTS, self._car, data))
+
+    def rollback(self, text: str) -> Reply:
+        """Back to the weights before those in use; ``text``: why. RefusedError if there are none.
+
+        ``data`` of the answer: ``version`` and ``number`` of those in use from ``cycle`` on,
+        ``from_version`` and ``from_number`` of those given up.
+        """
+        request = RollbackRequest(0, time.monotonic_ns(), text[:2000])
+        return self._accepted("rollback", ask(self._session, ROLLBACK, self._car, request))
 
     def wait_for_end(self, run: int, timeout_s: float, absence_s: float = 1.0) -> Event:
         """The ``run_ended`` event of a run.
@@ -143,7 +187,7 @@ class Director:
     @staticmethod
     def _accepted(what: str, reply: Reply) -> Reply:
         if not reply.accepted:
-            raise InputError(f"{what} refused: {reply.text}")
+            raise RefusedError(what, reply)
         return reply
 
     @staticmethod

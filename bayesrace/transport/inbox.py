@@ -34,7 +34,16 @@ from bayesrace.messages import (
     encode,
 )
 
-__all__ = ["LOCKSTEP_SPIN_S", "NEWEST", "Inbox", "Item", "Kind", "Request", "decode_request"]
+__all__ = [
+    "LOCKSTEP_SPIN_S",
+    "NEWEST",
+    "Inbox",
+    "Item",
+    "Kind",
+    "Request",
+    "declare_service",
+    "decode_request",
+]
 
 _CAPACITY: Final = 10_000
 """Items, and messages, waiting at most; a thread this far behind is broken, and memory must not
@@ -67,11 +76,17 @@ class Kind(Enum):
 class Request:
     """A request under way; answer it once."""
 
-    def __init__(self, service: Service[Any, Any], query: Any) -> None:
+    def __init__(
+        self, service: Service[Any, Any], query: Any, most_bytes: int | None = None
+    ) -> None:
+        """``most_bytes``: a longer payload is not copied, which would hold up other threads."""
         self.service = service
         self._query = query
         payload = query.payload
-        self.payload: bytes = b"" if payload is None else payload.to_bytes()
+        self.size = 0 if payload is None else len(payload)
+        """Bytes that were sent."""
+        fits = most_bytes is None or self.size <= most_bytes
+        self.payload: bytes = payload.to_bytes() if payload is not None and fits else b""
 
     def message(self) -> Any:
         """The decoded request; InputError if it is not a valid one."""
@@ -81,9 +96,13 @@ class Request:
 
     def answer(self, message: Message) -> None:
         """Send the answer; one that nobody waits for any more is dropped."""
+        self.answer_raw(encode(message))
+
+    def answer_raw(self, data: bytes) -> None:
+        """The same where the answer is not a message."""
         query, self._query = self._query, None
         try:
-            query.reply(query.key_expr, encode(message))
+            query.reply(query.key_expr, data)
         except zenoh.ZError:
             pass
         finally:
@@ -150,11 +169,10 @@ class Inbox:
 
     def serve(self, service: Service[Any, Any], source: str = "") -> None:
         """Let the service's requests arrive."""
-        key = car_key(service.key, self._car, source)
-        handler = _direct(
-            self._putter(Kind.REQUEST, service.name, lambda query: Request(service, query))
+        arrived = self._putter(Kind.REQUEST, service.name, lambda request: request)
+        self._declared.append(
+            declare_service(self._session, service, self._car, arrived, source=source)
         )
-        self._declared.append(self._session.declare_queryable(key, handler))
 
     def tell_time(self, source: str) -> None:
         """Answer requests for this process's clock, at once in the transport's own thread."""
@@ -319,6 +337,25 @@ class Inbox:
 def _direct(callback: Callable[[Any], None]) -> Any:
     """Run on the receiving thread: a second hand-over would cost as much as the network."""
     return zenoh.handlers.Callback(callback, indirect=False)
+
+
+def declare_service(
+    session: Any,
+    service: Service[Any, Any],
+    car: str,
+    on_request: Callable[[Request], None],
+    most_bytes: int | None = None,
+    source: str = "",
+) -> Any:
+    """Calls ``on_request`` with each request in the transport's own thread, so it must be quick.
+
+    For a thread that has no inbox. Keep what is returned; ``most_bytes`` as in :class:`Request`.
+    """
+
+    def on_query(query: Any) -> None:
+        on_request(Request(service, query, most_bytes))
+
+    return session.declare_queryable(car_key(service.key, car, source), _direct(on_query))
 
 
 def decode_request(request: Request) -> tuple[Any, str]:

@@ -4,7 +4,7 @@
  * here allocates, prints, locks, exits or reads a clock other than the one given to
  * br_mpc_set_clock; every function is bounded in time by the dimensions below and the iteration
  * limits in br_mpc_parameters. Not re-entrant per object: one thread at a time may call functions
- * on the same br_mpc.
+ * on the same br_mpc, but for br_mpc_stage_weights, which one other thread may call meanwhile.
  *
  * A control period, with or without the preparation:
  *
@@ -28,7 +28,7 @@
 extern "C" {
 #endif
 
-#define BR_ABI 3
+#define BR_ABI 4
 #define BR_NX 7
 #define BR_NU 2
 #define BR_NV (BR_NX + BR_NU)      /* stage variables v = [x; u] */
@@ -56,7 +56,9 @@ typedef enum {
     BR_ERROR_WEIGHTS = 5,     /* GP weights: size, kernel or values */
     BR_ERROR_NOT_READY = 6,   /* parameters or path have not been set */
     BR_ERROR_TIME = 7,        /* a time is negative, not finite or too long */
-    BR_ERROR_STATE = 8        /* br_mpc_predict: not finite or absurd, on the way in or out */
+    BR_ERROR_STATE = 8,       /* br_mpc_predict: not finite or absurd, on the way in or out */
+    BR_ERROR_BUSY = 9,        /* another thread is staging weights at this moment */
+    BR_ERROR_NOT_STAGED = 10  /* there are no weights to adopt */
 } br_mpc_error;
 
 typedef enum {
@@ -133,7 +135,7 @@ typedef struct {
     double lateral_m;        /* distance of the car from the racing line, positive left */
 } br_mpc_info;
 
-/* --- set-up; none of these is for the control loop except br_mpc_set_weights ---------------- */
+/* --- set-up; none is for the control loop but where it says so ------------------------------ */
 
 BR_API size_t br_mpc_memory_size(void);
 BR_API br_mpc_error br_mpc_init(void *memory, size_t size, br_mpc **out);
@@ -143,8 +145,22 @@ BR_API br_mpc_error br_mpc_set_parameters(br_mpc *mpc, const br_mpc_parameters *
  * x, y, speed, left unit normal of the centreline (2), lower and upper bound of normal . p. */
 BR_API br_mpc_error br_mpc_set_path(br_mpc *mpc, const double *table, int n, double spacing_m);
 
-/* Copies the weights; the next step uses them. About 10 us per 400 points and output. */
+/* Copies the weights; the next step uses them. About 10 us per 400 points and output. What is staged
+ * is forgotten. BR_ERROR_BUSY while another thread stages. */
 BR_API br_mpc_error br_mpc_set_weights(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]);
+
+/* The same in two parts, for a control loop that has no time to copy. br_mpc_stage_weights copies
+ * into a second buffer, while steps go on with the weights in use: the one function that another
+ * thread may call beside the one that calls all others. Staged again before they are adopted, the
+ * newer ones count. BR_ERROR_BUSY: two threads stage, or the other adopts, at this very moment; call
+ * again. After an error nothing is staged.
+ *
+ * br_mpc_adopt_weights, between two steps, puts what is staged into use: an exchange of buffers,
+ * about a microsecond. Then as after br_mpc_set_weights: plan and multipliers stay, and a
+ * br_mpc_prepare before the next step does the linearisation anew. BR_ERROR_NOT_STAGED if there is
+ * nothing; never waits. */
+BR_API br_mpc_error br_mpc_stage_weights(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]);
+BR_API br_mpc_error br_mpc_adopt_weights(br_mpc *mpc);
 
 /* The reference moves along the line at most this fast [m/s], and at every stage by rate [m/s^2]
  * times BR_TS less, down to standstill: for a stop on the line. INFINITY and 0, as after init, are

@@ -1,4 +1,4 @@
-/* Memory, parameters, weights, texts: everything of the interface that is not the control step. */
+/* Memory, parameters, texts: everything of the interface that is not the control step. */
 #include <math.h>
 
 #include "br_internal.h"
@@ -12,6 +12,7 @@ br_mpc_error br_mpc_init(void *memory, size_t size, br_mpc **out) {
     br_mpc *mpc = memory;
     memset(mpc, 0, sizeof *mpc);
     br_qp_init(&mpc->qp);
+    br_weights_init(mpc);
     mpc->path.speed_limit = INFINITY;
     *out = mpc;
     return BR_OK;
@@ -47,16 +48,6 @@ br_mpc_error br_mpc_set_speed_limit(br_mpc *mpc, double limit_mps, double rate_m
 br_mpc_error br_mpc_set_path(br_mpc *mpc, const double *table, int n, double spacing_m) {
     if (!mpc || !table) return BR_ERROR_NULL;
     return br_path_load(&mpc->path, table, n, spacing_m);
-}
-
-br_mpc_error br_mpc_set_weights(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]) {
-    if (!mpc || !outputs) return BR_ERROR_NULL;
-    const br_mpc_error error = br_gp_load(&mpc->gp[!mpc->gp_in_use], outputs);
-    if (error) return error; /* the weights in use stay */
-    mpc->gp_in_use = !mpc->gp_in_use;
-    br_undo_preparation(mpc); /* its new last stage was predicted with the weights before */
-    mpc->linearised = mpc->qp.factorised = 0;
-    return BR_OK;
 }
 
 br_mpc_error br_mpc_set_clock(br_mpc *mpc, br_mpc_clock clock, void *context) {
@@ -109,6 +100,8 @@ const char *br_mpc_error_text(br_mpc_error error) {
     case BR_ERROR_NOT_READY: return "parameters or path have not been set";
     case BR_ERROR_TIME: return "a time is negative, not finite or too long";
     case BR_ERROR_STATE: return "a state or input is not finite or absurd";
+    case BR_ERROR_BUSY: return "another thread is staging weights";
+    case BR_ERROR_NOT_STAGED: return "no weights are staged";
     }
     return "unknown error";
 }

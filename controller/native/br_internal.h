@@ -3,6 +3,7 @@
 #define BR_INTERNAL_H
 
 #include <daqp/types.h>
+#include <stdatomic.h>
 
 #include "bayesrace_mpc.h"
 #include "br_vector.h"
@@ -101,12 +102,20 @@ typedef struct {
     double iteration, trial; /* longest seen, of the line search's trials too; 0: none yet */
 } br_timer;
 
+/* The spare one of the two weight buffers, and whose it is. */
+enum {
+    BR_SPARE_FREE = 0, /* nobody's */
+    BR_SPARE_TAKEN,    /* one thread writes it, or exchanges the two */
+    BR_SPARE_STAGED    /* complete, to be adopted */
+};
+
 struct br_mpc {
     br_mpc_parameters parameters;
     int has_parameters;
     br_path path;
     br_gp gp[2];
-    int gp_in_use;
+    int gp_in_use;       /* written by who has taken the spare buffer, in the control thread */
+    atomic_int spare;
     /* the problem */
     double d_previous;
     double d_lowest;     /* d_min, less where the car is slow: see BR_BRAKE_FADE_MPS */
@@ -136,6 +145,9 @@ struct br_mpc {
 void br_gp_evaluate(const br_gp *gp, const double z[BR_NZ], double mean[BR_NE],
                     double gradient[BR_NE][BR_NZ], double hessian[BR_NE][BR_NZ][BR_NZ]);
 br_mpc_error br_gp_load(br_gp *gp, const br_mpc_gp outputs[BR_NE]);
+
+/* br_weights.c */
+void br_weights_init(br_mpc *mpc);
 
 /* br_planner.c */
 br_mpc_error br_path_load(br_path *path, const double *table, int n, double spacing);

@@ -86,6 +86,10 @@ def controller(
     settings: Annotated[
         Path | None, typer.Option(help="OCP settings (JSON), see 'controller/settings.py'.")
     ] = None,
+    store: Annotated[
+        Path | None,
+        typer.Option(help="Folder that keeps accepted weights for the next start."),
+    ] = None,
     car: Car = "orca",
     name: CarName = "",
     endpoint: Annotated[
@@ -132,7 +136,9 @@ def controller(
         realtime=RealtimeSettings(cpu=cpu, fifo=fifo, lock_memory=lock_memory),
         parent_pid=parent_pid,
     )
-    driver = predictive_controller(artefact, get_car(car), track, raceline, settings, weights)
+    driver = predictive_controller(
+        artefact, get_car(car), track, raceline, settings, weights, store
+    )
     raise typer.Exit(main(process, driver))
 
 

@@ -1,0 +1,84 @@
+"""The controller's end of the gatekeeper: starting it, talking to it, ending it."""
+
+import os
+import signal
+import socket
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from bayesrace.manifest import Manifest
+from controller.gate.channel import Channel, Message
+from controller.gate.launch import ended, spawn
+from controller.gate.memory import Memory
+from controller.gate.settings import GateSettings
+from controller.gate.store import Accepted
+
+__all__ = ["Link"]
+
+_MODULE = "controller.gatekeeper"
+
+
+class Link:
+    """One gatekeeper process, from its start to its end."""
+
+    def __init__(self, memory: Memory) -> None:
+        """Starts it; InputError if the system does not."""
+        own, its = socket.socketpair()
+        for fd in (its.fileno(), memory.fd):
+            os.set_inheritable(fd, True)
+        try:
+            arguments = (its.fileno(), memory.fd, memory.capacity)
+            self._pid = spawn(_MODULE, [str(number) for number in arguments])
+        except BaseException:
+            own.close()
+            raise
+        finally:
+            its.close()
+            os.set_inheritable(memory.fd, False)
+        self._channel = Channel(own)
+
+    def fileno(self) -> int:
+        """For ``poll``."""
+        return self._channel.fileno()
+
+    def begin(
+        self,
+        settings: GateSettings,
+        artefact: Path,
+        manifest: Manifest,
+        history: Sequence[Accepted],
+        next_number: int,
+        withdrawn: Sequence[str],
+        store: Path | None,
+        watch_from: int,
+    ) -> None:
+        """Tells it where things stand."""
+        self.tell(
+            "start",
+            b"".join(one.data for one in history),
+            settings=settings.model_dump(),
+            artefact=str(artefact),
+            car=manifest.car,
+            discretisation=manifest.discretisation,
+            history=[(one.number, one.version, one.proven, len(one.data)) for one in history],
+            next_number=next_number,
+            withdrawn=list(withdrawn),
+            store=None if store is None else str(store.resolve()),
+            watch_from=watch_from,
+        )
+
+    def tell(self, kind: str, payload: bytes = b"", **fields: Any) -> None:
+        """If it is gone, hearing tells."""
+        self._channel.send(kind, payload, **fields)
+
+    def hear(self) -> Message | None:
+        """What it says; None if it is gone."""
+        return self._channel.receive()
+
+    def close(self) -> None:
+        """Ends it, and waits for that a little."""
+        self._channel.close()
+        if not ended(self._pid, 1.0):
+            os.kill(self._pid, signal.SIGKILL)
+            ended(self._pid, 1.0)

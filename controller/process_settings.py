@@ -1,0 +1,37 @@
+"""How a controller process is started."""
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from bayesrace.realtime import RealtimeSettings
+from bayesrace.transport import CONTROLLER_ENDPOINT, PLANT_ENDPOINT, Endpoints
+from controller.compensation import CompensationSettings
+from controller.fallback import FallbackSettings
+from controller.gate.settings import GateSettings
+
+__all__ = ["ControllerSettings"]
+
+
+class ControllerSettings(BaseModel):
+    """How a controller process is started; what it drives is made by the caller."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    car: str = Field(default="orca", description="car whose limits hold")
+    name: str = Field(default="", description="name in message keys; the car's own if empty")
+    endpoints: Endpoints = Endpoints(listen=(CONTROLLER_ENDPOINT,), connect=(PLANT_ENDPOINT,))
+    rate_hz: float = Field(50.0, ge=1, le=500, description="of the loop by the wall clock")
+    budget: float = Field(
+        0.8, gt=0, le=1, description="fraction of the period that a cycle may take, step included"
+    )
+    compensation: CompensationSettings = CompensationSettings()
+    fallback: FallbackSettings = FallbackSettings()
+    stale_s: float = Field(
+        default=0.06, gt=0, le=60, description="age from which a state is not predicted forward"
+    )
+    stop_mps2: float = Field(
+        1.5, gt=0, le=100, description="deceleration along the line of a stop on command"
+    )
+    hold: bool = Field(False, description="wait for 'go' before driving")
+    gate: GateSettings = GateSettings()
+    realtime: RealtimeSettings = RealtimeSettings()
+    parent_pid: int | None = Field(None, description="end when this process, the parent, ends")

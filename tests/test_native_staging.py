@@ -1,0 +1,173 @@
+"""Weights in two parts: staged by any thread while steps go on, adopted between two of them."""
+
+import ctypes as ct
+import platform
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from bayesrace.errors import InputError
+from bayesrace.gp.weights import GpWeights
+from bayesrace.vehicles import CarParameters
+from codegen.build import casadi_includes
+from controller.gate.memory import Memory
+from controller.native_library import Gp
+from controller.native_step import NativeStep
+from tests.conftest import SETTINGS, Circuit, Problem, fit_weights, mirrored_weights
+
+PROGRAM = Path(__file__).parent / "native" / "staging.c"
+
+
+def compiled(artefact: Path, folder: Path, *flags: str) -> Path:
+    gcc = shutil.which("gcc")
+    if gcc is None:
+        pytest.skip("gcc is not installed")
+    include, daqp = casadi_includes()
+    out = folder / "staging"
+    files = [*sorted(artefact.glob("*.c")), PROGRAM, daqp]
+    line = [gcc, *flags, f"-I{artefact}", "-isystem", include, *files, "-lm", "-pthread", "-o", out]
+    done = subprocess.run([str(word) for word in line], capture_output=True, text=True, check=False)
+    if "cannot find -ltsan" in done.stderr or "libtsan" in done.stderr:
+        pytest.skip("gcc's thread sanitizer is not installed")
+    assert done.returncode == 0, done.stderr[-4000:]
+    return out
+
+
+def run(line: Sequence[str | Path]) -> None:
+    done = subprocess.run(line, capture_output=True, text=True, check=False, timeout=120)
+    if "unexpected memory mapping" in done.stderr:
+        pytest.skip("the thread sanitizer does not know this system's memory layout")
+    assert done.returncode == 0, done.stderr[-4000:]
+    assert "taken over" in done.stdout
+
+
+def test_no_data_race_and_no_mixture(kinematic_artefact: Path, tmp_path: Path) -> None:
+    flags = ("-O1", "-g", "-std=gnu11", "-march=native", "-fsanitize=thread")
+    # some kernels spread memory farther than the sanitizer expects
+    flat = shutil.which("setarch")
+    under = [flat, platform.machine(), "-R"] if flat else []
+    run([*under, compiled(kinematic_artefact, tmp_path, *flags)])
+
+
+def test_no_mixture_at_full_speed(kinematic_artefact: Path, tmp_path: Path) -> None:
+    run([compiled(kinematic_artefact, tmp_path, "-O3", "-std=gnu11", "-march=native")])
+
+
+Lay = Callable[[GpWeights], "ct.Array[Gp]"]
+
+
+@pytest.fixture
+def laid() -> Iterator[Lay]:
+    """Lays weights down as a gatekeeper does, in memory of their own."""
+    memories = []
+
+    def lay(weights: GpWeights) -> "ct.Array[Gp]":
+        memories.append(Memory(1024))
+        memories[-1].lay(weights)
+        return memories[-1].outputs()
+
+    yield lay
+    memories.clear()
+
+
+def drive(
+    native: NativeStep, recorded: list[Problem], takeovers: dict[int, "ct.Array[Gp]"]
+) -> NDArray[np.float64]:
+    """Inputs over a recorded drive; the sets are taken over before the steps of these numbers."""
+    inputs = []
+    for k, problem in enumerate(recorded[:100]):
+        if k in takeovers:
+            native.stage_weights(takeovers[k])
+            native.adopt_weights()
+        native.prepare()
+        native.step(problem.x0, problem.d_previous)
+        inputs.append(native.u.copy())
+    return np.array(inputs)
+
+
+def fresh(artefact: Path, car: CarParameters, circuit: Circuit, weights: GpWeights) -> NativeStep:
+    step = NativeStep(artefact, car, SETTINGS)
+    step.set_path(circuit.table)
+    step.set_weights(weights)
+    return step
+
+
+def test_taking_over_the_same_weights_changes_no_bit(
+    laid: Lay,
+    kinematic_artefact: Path,
+    car: CarParameters,
+    circuit: Circuit,
+    weights: GpWeights,
+    recorded: list[Problem],
+) -> None:
+    same = laid(weights)
+    calm, busy = (fresh(kinematic_artefact, car, circuit, weights) for _ in range(2))
+    expected = drive(calm, recorded, {})
+    assert drive(busy, recorded, dict.fromkeys(range(0, 100, 7), same)).tobytes() == (
+        expected.tobytes()
+    )
+
+
+def test_adopted_weights_are_those_that_were_staged(
+    laid: Lay,
+    kinematic_artefact: Path,
+    car: CarParameters,
+    circuit: Circuit,
+    weights: GpWeights,
+    recorded: list[Problem],
+) -> None:
+    """Through the shared memory's layout: to the same bits as set directly."""
+    other = mirrored_weights(weights)
+    staged, direct = (fresh(kinematic_artefact, car, circuit, weights) for _ in range(2))
+    direct.set_weights(other)
+    inputs = drive(staged, recorded, {0: laid(other)})
+    assert inputs.tobytes() == drive(direct, recorded, {}).tobytes()
+
+
+def test_staging_changes_nothing_before_the_adoption(
+    laid: Lay, native: NativeStep, weights: GpWeights, recorded: list[Problem]
+) -> None:
+    x, u = recorded[50].x0, np.array([0.5, 0.1])
+    before = native.predict(x, u, 0.02)
+    native.stage_weights(laid(mirrored_weights(weights)))
+    assert native.predict(x, u, 0.02).tobytes() == before.tobytes()
+    native.adopt_weights()
+    assert native.predict(x, u, 0.02).tobytes() != before.tobytes()
+    with pytest.raises(InputError, match="no weights are staged"):
+        native.adopt_weights()
+
+
+def test_unusable_weights_are_not_staged(laid: Lay, native: NativeStep, weights: GpWeights) -> None:
+    outputs = laid(weights)
+    outputs[1].scale = float("inf")
+    with pytest.raises(InputError, match="unusable"):
+        native.stage_weights(outputs)
+    with pytest.raises(InputError, match="no weights are staged"):
+        native.adopt_weights()
+
+
+def test_inputs_jump_only_as_far_as_the_new_model_explains(
+    kinematic_artefact: Path,
+    car: CarParameters,
+    circuit: Circuit,
+    weights: GpWeights,
+    laid: Lay,
+    recorded: list[Problem],
+) -> None:
+    """The very next input is what a controller would give that had the new weights all along."""
+    thorough = SETTINGS.model_copy(update={"iterations": 20})
+    other = fit_weights(car, ("matern25", "matern25", "matern25"), seed=4)
+    old, changed, new = (fresh(kinematic_artefact, car, circuit, weights) for _ in range(3))
+    new.set_weights(other)
+    for step in (old, changed, new):
+        step.set_parameters(car, thorough)
+    before, after = drive(old, recorded, {}), drive(new, recorded, {})
+    inputs = drive(changed, recorded, {50: laid(other)})
+    assert inputs[:50].tobytes() == before[:50].tobytes()
+    assert np.abs(inputs[50:] - after[50:]).max() < 1e-4
+    assert np.abs(before[50:] - after[50:]).max() > 1e-2

@@ -1,0 +1,234 @@
+"""New weights for a running controller, with real processes: taken over, refused, given up again.
+
+Promises guarded: the car stays on its track whatever weights are sent; taking over the same weights
+changes no bit; who is told that weights are accepted finds them in use.
+"""
+
+import itertools
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bayesrace.gp.weights import GpWeights, encode_weights, read_weights
+from bayesrace.messages import (
+    ACTUATION,
+    TELEMETRY,
+)
+from bayesrace.transport import (
+    Director,
+    RefusedError,
+)
+from tests.network.cars import Course
+from tests.programs import until
+from tests.spoilt_weights import SPOILT, spoilt
+from tests.takeover_rig import DRIVEN_S, Rig, digest, make_course, rigged
+
+
+@pytest.fixture(scope="module")
+def course(tmp_path_factory: pytest.TempPathFactory) -> Course:
+    return make_course(tmp_path_factory.mktemp("course"))
+
+
+@pytest.fixture(scope="module")
+def good(course: Course) -> GpWeights:
+    """What the controllers are started with."""
+    return read_weights(course.weights_file)
+
+
+@pytest.fixture
+def rig(tmp_path: Path, course: Course) -> Iterator[Rig]:
+    with rigged(tmp_path, course) as made:
+        yield made
+
+
+# Lockstep ------------------------------------------------------------------------------------
+
+
+def test_taking_over_the_same_weights_changes_no_bit(rig: Rig, good: GpWeights) -> None:
+    rig.drive(1)
+    for number in range(1, 4):
+        answer = rig.send(good)
+        assert answer["number"] == number
+        assert answer["cycle"] == rig.counters()["ticks"]
+    rig.drive(2)  # watched, for which the controller waits
+    rig.start(3)
+    for _ in range(5):
+        rig.send(good)
+    rig.director.wait_for_end(3, 60.0)
+    first, *others = (digest(rig.states(run)) for run in (1, 2, 3))
+    assert others == [first, first]
+    assert rig.counters()["weights_taken"] == 8
+    assert rig.counters()["watch_missed"] == 0
+
+
+QUICK = ("flip all", "swap vy omega")
+
+
+@pytest.mark.parametrize(
+    "what",
+    [*QUICK, *(pytest.param(one, marks=pytest.mark.slow) for one in SPOILT if one not in QUICK)],
+)
+def test_spoilt_weights_never_take_the_car_off_its_track(
+    rig: Rig, good: GpWeights, what: str
+) -> None:
+    """Without a sample they are taken, and given up; with samples they are refused."""
+    absurd = what == "swap vy omega"  # one of them is ten times the other
+    if absurd:
+        assert "absurd" in rig.refusal(encode_weights(spoilt(good, what)))
+    else:
+        answer = rig.send(spoilt(good, what))
+        assert (answer["probation"], answer["samples"]) == (True, 0)
+    end = rig.drive(1)
+    assert end.data["reason"] == "max_time"
+    assert rig.off_track_m(1) < 0.0
+    rolled_back = rig.events("weights_rolled_back")
+    if not absurd:
+        assert [event.data["by"] for event in rolled_back] == ["watch"]
+        assert rolled_back[0].data["version"] == good.version
+        assert "worse" in rolled_back[0].text
+        assert "given up before" in rig.refusal(encode_weights(spoilt(good, what)))
+    again = replace(spoilt(good, what), version="again")
+    reason = "absurd" if absurd else "worse than those in use"
+    assert reason in rig.refusal(encode_weights(again))
+    rig.drive(2)
+    assert rig.off_track_m(2) < 0.0
+    assert rig.status().weights_version == good.version
+
+
+@pytest.mark.slow
+def test_two_rollbacks_by_the_watch_are_equal_to_the_bit(
+    tmp_path: Path, course: Course, good: GpWeights
+) -> None:
+    found = []
+    for _ in range(2):
+        with rigged(tmp_path, course) as rig:
+            rig.send(spoilt(good, "flip vy"))
+            rig.drive(1)
+            event = rig.events("weights_rolled_back")[0]
+            found.append((digest(rig.states(1)), event.data["cycle"], event.data["driven"]))
+    assert found[0] == found[1]
+
+
+def test_what_is_no_weights_file_is_refused(rig: Rig, good: GpWeights) -> None:
+    data = encode_weights(good)
+    spoilt_at = len(data) // 2
+    corrupt = data[:spoilt_at] + bytes([data[spoilt_at] ^ 1]) + data[spoilt_at + 1 :]
+    reasons = {
+        b"": "not the size of a weights file",
+        data[:-100]: "checksum mismatch",
+        corrupt: "checksum mismatch",
+        b"x" * 1000: "not a weights file",
+        bytes(1_000_000): "1000000 bytes are more than any weights that would fit",
+    }
+    for bad, reason in reasons.items():
+        assert reason in rig.refusal(bad)
+    other = replace(good, discretisation="dynamic/rk4x4/0.02s/orca-0")
+    assert "were learned for" in rig.refusal(encode_weights(other))
+    assert "'rover'" in rig.refusal(encode_weights(replace(good, car="rover")))
+    counters = rig.counters()
+    assert (counters["weights_refused"], counters["weights_taken"]) == (7, 0)
+    assert len(rig.events("weights_refused")) == 7
+    assert rig.status().weights_version == good.version
+
+
+def test_stale_weights_are_refused(rig: Rig, good: GpWeights) -> None:
+    rig.send(replace(good, version="b", created_utc_ns=2_000_000_000))
+    assert "stale" in rig.refusal(
+        encode_weights(replace(good, version="a", created_utc_ns=1_000_000_000))
+    )
+
+
+def test_back_and_back_to_the_start(rig: Rig, good: GpWeights) -> None:
+    for version in ("one", "two"):
+        rig.send(replace(good, version=version))
+    data = rig.director.rollback("the test says so").data
+    assert (data["version"], data["number"], data["by"]) == ("one", 1, "request")
+    assert (data["from_version"], data["from_number"]) == ("two", 2)
+    assert rig.send(replace(good, version="three"))["number"] == 3
+    for expected in ("one", good.version):
+        assert rig.director.rollback("further").data["version"] == expected
+        assert rig.status().weights_version == expected
+    with pytest.raises(RefusedError, match="no weights before those in use"):
+        rig.director.rollback("too far")
+    assert [event.data["version"] for event in rig.events("weights_rolled_back")] == [
+        "one", "one", good.version
+    ]  # fmt: skip
+    rig.drive(1)
+    assert {one.weights_version for one in rig.reader().select(ACTUATION)} == {good.version}
+
+
+# Free-running --------------------------------------------------------------------------------
+
+
+def test_each_cycle_names_its_weights_and_the_inputs_do_not_jump(rig: Rig, good: GpWeights) -> None:
+    """Ten takeovers in some two laps: versions change at the cycles that were told, and inputs by
+    no more than between other cycles. What they cost in time: benchmarks/takeover.py.
+    """
+    rig.ready()
+    rig.start(1, lockstep=False, seconds=20.0)
+    until(lambda: rig.counters()["ticks"] > 150, "three seconds of driving")
+    told = {}
+    for number in range(10):
+        answer = rig.send(replace(good, version=f"v{number}"))
+        told[answer["version"]] = answer["cycle"]
+        time.sleep(0.2)
+    after = rig.counters()
+    rig.director.stop("enough")
+    rig.director.wait_for_end(1, 10.0)
+    ticks = {t.state_seq: t for t in rig.reader().select(TELEMETRY)}
+    cycles = sorted(t.tick for t in ticks.values())
+    versions: dict[str, int] = {}
+    for actuation in rig.reader().select(ACTUATION):
+        if actuation.state_seq in ticks:
+            versions.setdefault(actuation.weights_version, ticks[actuation.state_seq].tick)
+    for version, cycle in told.items():
+        due = next(tick for tick in cycles if tick >= cycle)
+        assert abs(versions[version] - due) <= 1  # two cycles may answer one state
+    assert after["weights_taken"] == 10
+    assert rig.off_track_m(1) < 0.0
+    sent = rig.reader().select(ACTUATION)
+    changes = np.abs(np.diff([one.u for one in sent], axis=0))
+    at_takeover = [a.weights_version != b.weights_version for a, b in itertools.pairwise(sent)]
+    assert sum(at_takeover) == 10
+    calm = changes[10:][~np.array(at_takeover[10:])]
+    assert (changes[at_takeover] <= calm.max(axis=0)).all()
+
+
+def test_spoilt_weights_are_given_up_by_the_wall_clock(rig: Rig, good: GpWeights) -> None:
+    rig.ready()
+    rig.send(spoilt(good, "flip all"))
+    rig.start(1, lockstep=False, seconds=DRIVEN_S)
+    rig.director.wait_for_end(1, 30.0)
+    assert rig.status().weights_version == good.version
+    assert rig.counters()["weights_rolled_back"] == 1
+    assert rig.off_track_m(1) < 0.0
+
+
+def test_two_publishers_at_once_leave_one_order(rig: Rig, good: GpWeights) -> None:
+    rig.start(1, lockstep=False, seconds=DRIVEN_S)
+    answers: list[dict[str, Any]] = []
+
+    def publish(name: str) -> None:
+        director = Director(rig.session, "orca")
+        for number in range(5):
+            data = encode_weights(replace(good, version=f"{name}{number}"))
+            answers.append(dict(director.send_weights(data).data))
+
+    threads = [threading.Thread(target=publish, args=(name,)) for name in "ab"]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    by_number = {answer["number"]: answer["version"] for answer in answers}
+    assert sorted(by_number) == list(range(1, 11))
+    assert rig.status().weights_version == by_number[10]
+    for name in "ab":
+        mine = [by_number[n] for n in sorted(by_number) if by_number[n].startswith(name)]
+        assert mine == [f"{name}{number}" for number in range(5)]
+    rig.director.wait_for_end(1, 30.0)
