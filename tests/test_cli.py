@@ -29,6 +29,7 @@ SUBCOMMANDS = (
     "race", "drive", "report", "bench", "tracks", "raceline", "collect", "train", "build",
     "plant", "controller", "status", "stop", "go", "router", "latency",
     "fmu export", "fmu inspect", "fmu weights",
+    "validate", "publish", "rollback", "learn",
 )  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from bayesrace import __version__
 from bayesrace.errors import InputError
 from bayesrace.interrupts import remembering_interrupts
-from experiments.cli import evaluation, fmu, latency, operation, parts, preparation
+from experiments.cli import evaluation, fmu, latency, learning, operation, parts, preparation
 
 __all__ = ["app", "main"]
 
@@ -41,7 +41,7 @@ def _options(
     logging.basicConfig(level=logging.INFO, format="%(name)s: %(message)s", stream=sys.stderr)
 
 
-for group in (evaluation, latency, preparation, parts, operation, fmu):
+for group in (evaluation, latency, preparation, learning, parts, operation, fmu):
     group.register(app)
 
 

@@ -1,0 +1,141 @@
+"""Laps and samples as the learning job makes them of messages: the same as from the log."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bayesrace.messages import Actuation, State
+from bayesrace.tracks import Track
+from bayesrace.vehicles.models import dynamic
+from experiments.learn import collector
+from experiments.learn.collector import Collector, Driven
+from learning.dataset import Dataset
+from learning.logs import dataset_from_messages
+from tests.driven import CAR, STEP_S, drive, logged, telemetry
+
+
+@pytest.fixture(scope="module")
+def states() -> list[State]:
+    """A drive of 200 periods in which the plant counts a lap at the 61st and at the 161st."""
+    messages = logged(drive(dynamic(CAR), 200, seed=4), run=7)
+    return [replace(one, lap=(one.seq >= 61) + (one.seq >= 161)) for one in messages]
+
+
+def fed(
+    states: list[State], fallbacks: tuple[int, ...] = (), track: Track | None = None
+) -> tuple[list[Driven], list[Driven]]:
+    """What is given out as it arrives, and at the end."""
+    made, taken = Collector(CAR, STEP_S, track), []
+    for one in states:
+        made.state(one)
+        made.actuation(
+            Actuation(one.seq, 0, 1, one.run, one.seq, 0.0, (0.0, 0.0), f"v{one.seq // 100}", 0)
+        )
+        made.telemetry(telemetry(one.run, one.seq, int(one.seq in fallbacks)))
+        taken += made.take()
+    return taken, made.end()
+
+
+def samples(driven: list[Driven]) -> Dataset:
+    sets = [one.samples for one in driven if one.samples is not None]
+    rows = [np.hstack((one.x, one.u, one.x_next)) for one in sets]
+    every = np.vstack(rows)
+    return Dataset(CAR, STEP_S, every[:, :7], every[:, 7:9], every[:, 9:])
+
+
+def test_samples_are_those_of_the_log(states: list[State]) -> None:
+    """Each pair once, over the ends of laps too; fallback cycles and gaps are left out."""
+    lossy = [one for one in states if one.seq not in (30, 31, 120)]
+    fallbacks = (10, 60, 61, 199)
+    taken, rest = fed(lossy, fallbacks)
+    log = dataset_from_messages(lossy, [telemetry(7, k, 1) for k in fallbacks], CAR, STEP_S)
+    got = samples(taken + rest)
+    np.testing.assert_array_equal(got.x, log.x)
+    np.testing.assert_array_equal(got.u, log.u)
+    np.testing.assert_array_equal(got.x_next, log.x_next)
+
+
+def test_laps_are_timed_from_crossing_to_crossing(states: list[State]) -> None:
+    taken, rest = fed(states, (10, 60, 61, 62))
+    laps = [one.lap for one in taken]
+    assert [one.lap for one in rest] == [None]
+    assert laps[0] is not None
+    assert laps[1] is not None
+    assert (laps[0].run, laps[0].flying, laps[1].flying) == (7, False, True)
+    assert laps[0].time_s == pytest.approx(61 * STEP_S)
+    assert laps[1].time_s == pytest.approx(100 * STEP_S)
+    assert (laps[0].fallbacks, laps[1].fallbacks) == (2, 2)
+    assert laps[0].versions == ("v0",)
+    assert laps[1].versions == ("v0", "v1")
+
+
+def test_with_the_track_crossings_are_interpolated() -> None:
+    """A car at 1.5 m/s on a circle crosses the line between two samples, as geometry says."""
+    angle = 2 * np.pi * np.arange(128) / 128
+    track = Track.from_points("circle", np.column_stack([np.cos(angle), np.sin(angle)]), 0.2, 0.2)
+    speed, count = 1.5, 450
+    at = speed * STEP_S * np.arange(count) + 1e-6
+    x = np.zeros((count, 7))
+    x[:, 0], x[:, 1], x[:, 3] = np.cos(at), np.sin(at), speed
+    lap = np.floor(at / (2 * np.pi)).astype(int)
+    states = [
+        State(k, 0, 1, 0, k * STEP_S, tuple(x[k]), (0.0, 0.0), int(lap[k]), True, (), False)
+        for k in range(count)
+    ]
+    taken, _ = fed(states, track=track)
+    times = [one.lap.time_s for one in taken if one.lap is not None]
+    assert times == pytest.approx([2 * np.pi / speed] * 2, abs=2e-3)
+    assert all(one.lap is not None and one.lap.off_track_m == 0.0 for one in taken)
+    far = [replace(one, x=(1.3 * one.x[0], 1.3 * one.x[1], *one.x[2:])) for one in states]
+    taken, _ = fed(far, track=track)
+    assert taken[0].lap is not None
+    assert taken[0].lap.off_track_m == pytest.approx(0.1, abs=1e-3)
+
+
+def test_who_comes_late_times_the_next_lap(states: list[State]) -> None:
+    taken, _ = fed([one for one in states if one.seq >= 20])
+    assert [one.lap and one.lap.time_s for one in taken] == [None, pytest.approx(100 * STEP_S)]
+
+
+def test_a_lap_whose_end_was_lost_has_no_time(states: list[State]) -> None:
+    taken, _ = fed([one for one in states if not 55 <= one.seq < 70])
+    assert [one.lap and one.lap.time_s for one in taken] == [None, None]
+
+
+def test_another_plant_with_the_same_run_is_another_run(states: list[State]) -> None:
+    """Its numbers begin anew, and no pair reaches over."""
+    first, second = states[:100], [replace(one, epoch=2) for one in states[:50]]
+    taken, rest = fed(first + second)
+    assert len(samples(taken + rest)) == 99 + 49
+
+
+def test_a_lap_waits_for_its_telemetry_but_not_for_ever(
+    states: list[State], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = Collector(CAR, STEP_S)
+    for one in states[:70]:
+        made.state(one)
+    assert made.take() == []
+    made.telemetry(telemetry(7, 59, 1))
+    assert made.take() == []
+    made.telemetry(telemetry(7, 60, 1))
+    assert len(made.take()) == 1
+    made = Collector(CAR, STEP_S)
+    for one in states[:70]:
+        made.state(one)
+    monkeypatch.setattr(collector, "_PATIENCE_S", 0.0)
+    assert len(made.take()) == 1
+
+
+def test_memory_does_not_follow_a_car_that_stands(
+    states: list[State], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Stretches are cut, no sample is lost by it, and the lap keeps its time."""
+    monkeypatch.setattr(collector, "MOST_STATES", 25)
+    taken, rest = fed(states)
+    sizes = [len(one.samples) for one in taken + rest if one.samples is not None]
+    assert max(sizes) <= 25
+    assert sum(sizes) == 200
+    times = [one.lap.time_s for one in taken if one.lap is not None]
+    assert times == pytest.approx([61 * STEP_S, 100 * STEP_S])

@@ -1,0 +1,127 @@
+"""What is kept from lap to lap stays bounded and useful; weights can be had back as samples."""
+
+import dataclasses
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bayesrace.gp.expression import evaluate_mean
+from bayesrace.gp.weights import GpWeights, write_weights, zero_weights
+from bayesrace.integrators import PREDICTION
+from bayesrace.vehicles.models import dynamic
+from learning.arrays import dataset_from_npz, write_npz
+from learning.dataset import Dataset, concatenate
+from learning.pool import MOST_NEW, bounded, recalled
+from learning.residual import residual
+from learning.training import TrainingSettings, train
+from learning.worker import Task, perform
+from tests.driven import CAR, QUICK, drive
+
+SMALL = TrainingSettings(**{**QUICK.model_dump(), "capacity": 60})
+
+
+@pytest.fixture(scope="module")
+def driven() -> Dataset:
+    return drive(dynamic(CAR), 300, seed=1)
+
+
+@pytest.fixture(scope="module")
+def learned(driven: Dataset) -> GpWeights:
+    return train(driven, PREDICTION, SMALL)
+
+
+def test_what_fits_is_kept_as_it_is(driven: Dataset) -> None:
+    assert bounded(driven, len(driven)) is driven
+
+
+def test_the_newest_and_the_most_informative_are_kept(driven: Dataset, learned: GpWeights) -> None:
+    """One sample unlike all others, long ago, among hundreds of one kind, is not let go."""
+    same = driven.select(np.full(400, 7))
+    x, x_next = same.x.copy(), same.x_next.copy()
+    x[3, 5] += 4.0
+    x_next[3, 5] += 4.0
+    kept = bounded(dataclasses.replace(same, x=x, x_next=x_next), 40, learned)
+    assert len(kept) == 40
+    assert kept.x[:, 5].max() == x[3, 5]
+    both = concatenate([same, driven])
+    kept = bounded(both, 100, learned)
+    assert len(kept) == 100
+    np.testing.assert_array_equal(kept.x[-25:], driven.x[-25:])
+    spread = [np.ptp(one.features, axis=0) for one in (kept, driven)]
+    assert (spread[0] > 0.8 * spread[1]).all(), "the wealth of the drive is lost"
+
+
+def test_without_weights_they_are_evenly_spread(driven: Dataset) -> None:
+    assert len(bounded(driven, 100)) == 100
+
+
+def test_laps_without_end_need_no_more_memory(learned: GpWeights) -> None:
+    """The bound that is stated: samples times a quarter of what is kept, in doubles, and little."""
+    wanted, kept = 200, drive(dynamic(CAR), 100, seed=2)
+    lap = drive(dynamic(CAR), 300, seed=3)
+    tracemalloc.start()
+    for _ in range(10):
+        kept = bounded(concatenate([kept, lap]), wanted, learned)
+        assert len(kept) == wanted
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 8 * (wanted + 300) * wanted / 4 + 2e6
+
+
+def test_of_too_many_at_once_evenly_spread_ones_are_looked_at(driven: Dataset) -> None:
+    many = driven.select(np.arange(MOST_NEW + 5000) % len(driven))
+    assert len(bounded(many, 50)) == 50
+
+
+def test_recalled_samples_teach_what_the_weights_know(driven: Dataset, learned: GpWeights) -> None:
+    samples = recalled(learned)
+    known = residual(samples, PREDICTION)
+    np.testing.assert_allclose(known, evaluate_mean(learned, samples.features), atol=1e-12)
+    again = train(samples, PREDICTION, SMALL)
+    z = driven.features[::7]
+    truth, before, after = (
+        residual(driven, PREDICTION)[::7], evaluate_mean(learned, z), evaluate_mean(again, z)
+    )  # fmt: skip
+    rms = [np.sqrt(np.mean((one - truth) ** 2, axis=0)) for one in (before, after)]
+    assert (rms[1] < 2 * rms[0] + 0.1 * truth.std(axis=0)).all()
+
+
+def test_weights_that_know_nothing_recall_nothing() -> None:
+    name = PREDICTION.identity("e_kinematic", CAR)
+    assert len(recalled(zero_weights(CAR.name, name))) == 0
+
+
+def _task(folder: Path, **changes: object) -> Task:
+    values: dict[str, object] = {
+        "number": 4, "car": CAR.name, "discretisation": PREDICTION, "training": SMALL,
+        "keep": 150, "weights": folder / "w.bin", "kept": folder / "kept.npz",
+    }  # fmt: skip
+    return Task.model_validate(values | changes)
+
+
+def test_a_task_learns_from_old_and_new(
+    tmp_path: Path, driven: Dataset, learned: GpWeights
+) -> None:
+    write_npz(tmp_path / "old.npz", driven.select(slice(0, 150)))
+    write_npz(tmp_path / "new.npz", driven.select(slice(150, None)))
+    write_weights(tmp_path / "first.bin", learned)
+    outcome = perform(
+        _task(
+            tmp_path, old=tmp_path / "old.npz", new=(tmp_path / "new.npz",),
+            initial=tmp_path / "first.bin",
+        )
+    )  # fmt: skip
+    assert (outcome.number, outcome.error) == (4, "")
+    assert (outcome.samples, outcome.kept, outcome.points) == (300, 150, 60)
+    assert set(outcome.metrics) == {"vx", "vy", "omega"}
+    assert len(dataset_from_npz(tmp_path / "kept.npz")) == 150
+
+
+def test_what_cannot_be_learned_from_is_kept_all_the_same(tmp_path: Path, driven: Dataset) -> None:
+    write_npz(tmp_path / "new.npz", driven.select(slice(0, 5)))
+    outcome = perform(_task(tmp_path, new=(tmp_path / "new.npz",)))
+    assert "5 samples" in outcome.error
+    assert not (tmp_path / "w.bin").exists()
+    assert len(dataset_from_npz(tmp_path / "kept.npz")) == 5
