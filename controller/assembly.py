@@ -1,8 +1,9 @@
 """Puts a predictive controller together from the files that describe it."""
 
 from pathlib import Path
+from typing import TypeVar
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import decode_weights, encode_weights, read_weights
@@ -18,20 +19,23 @@ from controller.takeover import WeightsPort
 
 __all__ = ["predictive_controller", "read_settings"]
 
+Settings = TypeVar("Settings", bound=BaseModel)
 
-def read_settings(path: Path | None) -> MpcSettings:
-    """OCP settings from a JSON file; the defaults without one."""
+
+def read_settings(path: Path | None, form: type[Settings]) -> Settings:
+    """Settings of that form from a JSON file; the defaults without one."""
     if path is None:
-        return MpcSettings()
+        return form()
     try:
-        return MpcSettings.model_validate_json(path.read_text())
+        return form.model_validate_json(path.read_text())
     except OSError as error:
         raise InputError(f"cannot read the settings {path}: {error.strerror}") from None
     except ValidationError as error:
         faults = "; ".join(
             f"{'.'.join(str(part) for part in one['loc'])}: {one['msg']}" for one in error.errors()
         )
-        raise InputError(f"{path}: {faults}; controller/settings.py has the form") from None
+        where = form.__module__.replace(".", "/")
+        raise InputError(f"{path}: {faults}; {where}.py has the form") from None
 
 
 def predictive_controller(
@@ -48,7 +52,7 @@ def predictive_controller(
     ``store``: folder of the weights that it accepts; the newest of an earlier life are in use from
     the start, whatever ``weights`` are. Raises InputError naming the file that cannot be used.
     """
-    step = NativeStep(artefact, car, read_settings(settings))
+    step = NativeStep(artefact, car, read_settings(settings, MpcSettings))
     step.set_path(make_path_table(load_track(track, car.width_m), read_raceline(raceline)))
     first = Accepted(0, "", b"", proven=True)
     if weights is not None:

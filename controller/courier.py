@@ -40,7 +40,12 @@ _START_S: Final = 15.0
 """Until then a gatekeeper is there or something is wrong."""
 
 _RESTART_S: Final = 1.0
-"""Between two starts: one that ends at once must not keep a CPU busy."""
+_LONGEST_PAUSE_S: Final = 30.0
+"""From an end to the next start, doubled for each that ends before it was ready: one that cannot
+start must not keep a CPU busy beside the control loop."""
+
+_MOST_REQUESTS: Final = 32
+"""That wait; each may hold a file."""
 
 _FILE_BYTES: Final = 100_000
 """Of a weights file, beyond its arrays."""
@@ -77,7 +82,8 @@ class Courier:
             "gatekeeper_starts": 0,
         }  # fmt: skip
         self._link: Link | None = None
-        self._started_s = 0.0
+        self._started_s = self._ended_s = 0.0
+        self._pause_s = _RESTART_S
         self._requests: deque[Request] = deque()
         self._job: Job | None = None
         self._watched_from = 0
@@ -127,6 +133,9 @@ class Courier:
 
     def _arrive(self, request: Request) -> None:
         """In the transport's thread."""
+        if len(self._requests) >= _MOST_REQUESTS:
+            self._reply(request, False, f"{_MOST_REQUESTS} requests wait already: try later", {})
+            return
         self._requests.append(request)
         self._rouse()
 
@@ -136,19 +145,28 @@ class Courier:
 
     def _run(self) -> None:
         while not self._stopping:
-            self._wait()
-            while self.takeover.taken:
-                self._taken(self.takeover.taken.popleft())
-            self._expire()
-            while self._requests and self._job is None and not self._stopping:
-                if not self._begin(self._requests[0]):
-                    break
-                self._requests.popleft()
-            if self._latecomer.asking:
-                self._ask_others()
+            try:
+                self._turn()
+            except Exception:
+                # Without this thread nobody could send weights, and bad ones would not be given up.
+                _log.exception("weights: a fault of the controller's own")
+                self._bereaved()
         for request in [*self._requests, *([self._job.request] if self._job else [])]:
             if request is not None:
                 self._reply(request, False, "the controller ends", {})
+
+    def _turn(self) -> None:
+        """Waits, and does what there is to do."""
+        self._wait()
+        while self.takeover.taken:
+            self._taken(self.takeover.taken.popleft())
+        self._expire()
+        while self._requests and self._job is None and not self._stopping:
+            if not self._begin(self._requests[0]):
+                break
+            self._requests.popleft()
+        if self._latecomer.asking:
+            self._ask_others()
 
     def _wait(self) -> None:
         """Until something has happened, or may have to be done; reads what the gatekeeper says."""
@@ -168,15 +186,19 @@ class Courier:
 
     def _expire(self) -> None:
         now_s, job = time.monotonic(), self._job
-        if self._link is None and now_s - self._started_s > _RESTART_S:
-            self._spawn()
+        if self._link is None:
+            # What is offered has to be settled first: the next one is told where things stand.
+            if not self._offered and now_s - self._ended_s > self._pause_s:
+                self._spawn()
+        elif not self.takeover.gatekeeper and now_s - self._started_s > _START_S:
+            self._bereaved()
         if job is None or now_s < job.until_s:
             return
         if job.answer:
             self._settled()
             return
-        if job.offer is None:
-            self._refuse(f"the gatekeeper has not answered within {_START_S:g} s", {})
+        if job.offer is None:  # it hangs: what it would say later is for a request long answered
+            self._bereaved()
             return
         with contextlib.suppress(ValueError):  # taken at this moment: then it counts
             self.takeover.offers.remove(job.offer)
@@ -191,8 +213,9 @@ class Courier:
         self._started_s = time.monotonic()
         try:
             self._link = Link(self._memory)
-        except InputError as error:
-            self._say("gatekeeper_ended", str(error))
+        except (InputError, OSError) as error:
+            self._pause()
+            self._say("gatekeeper_ended", f"the gatekeeper cannot be started: {error}")
             return
         self.counters["gatekeeper_starts"] += 1
         port = self._port
@@ -214,6 +237,7 @@ class Courier:
         match fields["kind"]:
             case "ready":
                 self.takeover.gatekeeper = True
+                self._pause_s = _RESTART_S
                 self.text = ""
             case "refused":
                 self._refuse(fields["text"], fields["data"])
@@ -231,19 +255,25 @@ class Courier:
 
     def _bereaved(self) -> None:
         """The gatekeeper is gone; the car is driven on with what is in use."""
+        if not self.takeover.gatekeeper:
+            self._pause_s = min(2 * self._pause_s, _LONGEST_PAUSE_S)
+        self._pause()
         self.takeover.gatekeeper = False
         if self._link is not None:
             self._link.close()
             self._link = None
         self._say(
             "gatekeeper_ended",
-            "the gatekeeper ended (killed, or by a fault): weights in use stay and are not watched "
-            "until it is there again",
+            "the gatekeeper ended or hung (killed, or by a fault): weights in use stay and are not "
+            "watched until it is there again",
         )
         if self._job is not None and self._job.answer:
             self._settled()
         elif self._job is not None and self._job.offer is None:
             self._refuse(f"{self.text}; send them again in a moment", {})
+
+    def _pause(self) -> None:
+        self._ended_s = time.monotonic()
 
     def _say(self, kind: str, text: str) -> None:
         self.text = text
@@ -287,7 +317,7 @@ class Courier:
             return
         until_s = time.monotonic() + _START_S
         self._job = Job("previous", b"", request, message.text, until_s)
-        self._tell("previous")
+        self._tell("previous", number=self._ledger.newest.number)
 
     def _ask_others(self) -> None:
         if self._ledger.before is not None:
@@ -333,7 +363,11 @@ class Courier:
         if job is None:  # has been refused meanwhile: it took too long
             self._tell("dropped")
             return
-        if job.kind == "previous" and before is not None:
+        if job.kind == "previous":
+            if before is None:
+                self._tell("dropped")
+                self._refuse("there are no weights before those in use any more", {})
+                return
             offer = Offer(before.version, before.number, "previous", not before.proven)
         else:
             version, watched = str(fields["data"]["version"]), self._settings.watch_s > 0
@@ -359,7 +393,10 @@ class Courier:
         self._offered -= 1
         if offer.cycle < 0:
             self._tell("dropped")
-            self._refuse(offer.text, {})
+            if offer.kind == "give_up":
+                self._say("weights_refused", f"going back was not possible: {offer.text}")
+            else:
+                self._refuse(offer.text, {})
             return
         self._watched_from = offer.noted
         if offer.kind == "give_up":

@@ -62,6 +62,8 @@ class Gatekeeper:
             return
         self._start(*first)
         self._channel.send("ready")
+        if self._store is not None:  # one that died may not have come to it
+            self._keep()
         while True:
             if self._watch is not None:
                 self._look()
@@ -74,7 +76,7 @@ class Gatekeeper:
             if fields["kind"] == "check":
                 self._check(int(fields["number"]), data)
             elif fields["kind"] == "previous":
-                self._previous()
+                self._previous(int(fields["number"]))
 
     # Beginning -----------------------------------------------------------------------------------
 
@@ -137,7 +139,8 @@ class Gatekeeper:
 
     def _check(self, number: int, data: bytes) -> None:
         """Answers; offers what is good, and waits for what becomes of it."""
-        self._update()
+        if self._watch is None:  # else it has just looked, and nothing may pass it by
+            self._update()
         verdict = self._judged(data)
         if not verdict.accepted:
             self._channel.send("refused", text=verdict.text, data=verdict.data)
@@ -179,8 +182,11 @@ class Gatekeeper:
         oldest_ns = time.monotonic_ns() - round(self._gate.settings.recent_s * 1e9)
         return [sample for sample in self._recent if sample.at_ns > oldest_ns]
 
-    def _previous(self) -> None:
-        """Offers the weights before those in use."""
+    def _previous(self, number: int) -> None:
+        """Offers the weights before those in use, if these are still the ones that are meant."""
+        if len(self._incumbents) < 2 or self._incumbents[-1].number != number:
+            self._channel.send("refused", text="the watch has gone back meanwhile", data={})
+            return
         before = self._incumbents[-2]
         self._memory.lay(before.weights)
         self._memory.tell_watched(ALL_SEEN if before.proven else 0, go_back=False)

@@ -1,5 +1,6 @@
 """The checks: before weights are taken over, and while they are watched. No input or output."""
 
+import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -23,6 +24,9 @@ _Floats = npt.NDArray[np.float64]
 
 _HOPELESS: Final = 0.8
 """Share of cycles without a solution with which nobody can drive."""
+
+_CLOCKS_APART_S: Final = 3600.0
+"""By which the clock of who trains may be ahead."""
 
 _UNITS: Final = ("m/s", "m/s", "rad/s")
 
@@ -171,6 +175,12 @@ class Gate:
         return self.model(weights)
 
     def _check_age(self, weights: GpWeights, in_use: Incumbent) -> None:
+        ahead_s = (weights.created_utc_ns - time.time_ns()) * 1e-9
+        if ahead_s > _CLOCKS_APART_S:
+            raise InputError(
+                f"weights '{weights.version}' were made {ahead_s:.3g} s from now, and all others "
+                "would be stale beside them; set the clocks, and train again"
+            )
         if in_use.weights is None or not weights.created_utc_ns:
             return
         older_s = (in_use.weights.created_utc_ns - weights.created_utc_ns) * 1e-9

@@ -18,6 +18,9 @@ __all__ = ["Link"]
 
 _MODULE = "controller.gatekeeper"
 
+_PATIENCE_S = 5.0
+"""One that is stopped reads nothing, and a file may fill the connection."""
+
 
 class Link:
     """One gatekeeper process, from its start to its end."""
@@ -36,6 +39,7 @@ class Link:
         finally:
             its.close()
             os.set_inheritable(memory.fd, False)
+        own.settimeout(_PATIENCE_S)
         self._channel = Channel(own)
 
     def fileno(self) -> int:
@@ -69,8 +73,9 @@ class Link:
         )
 
     def tell(self, kind: str, payload: bytes = b"", **fields: Any) -> None:
-        """If it is gone, hearing tells."""
-        self._channel.send(kind, payload, **fields)
+        """If it is gone, or does not read, hearing tells."""
+        if not self._channel.send(kind, payload, **fields):
+            self._channel.shut()
 
     def hear(self) -> Message | None:
         """What it says; None if it is gone."""

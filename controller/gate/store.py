@@ -8,6 +8,7 @@ import hashlib
 import os
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Protocol, TypeVar
@@ -151,7 +152,8 @@ class Store:
         )
         self._write_index()
         for name in before - {entry.file for entry in entries}:
-            (self._folder / name).unlink(missing_ok=True)
+            with suppress(OSError):  # it is in nobody's way
+                (self._folder / name).unlink(missing_ok=True)
 
     def _written(self, one: Accepted) -> _Entry:
         digest = digest_of(one.data)

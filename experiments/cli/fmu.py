@@ -124,6 +124,7 @@ def _controller(
     from controller.assembly import read_settings
     from controller.fallback import FallbackSettings
     from controller.path_table import make_path_table
+    from controller.settings import MpcSettings
 
     parameters = get_car(car)
     course = load_track(track, parameters.width_m)
@@ -134,7 +135,7 @@ def _controller(
         parameters,
         table.rows,
         table.spacing_m,
-        read_settings(settings).model_dump(),
+        read_settings(settings, MpcSettings).model_dump(),
         FallbackSettings().model_dump(),
         None if weights is None else read_weights(weights),
         version,

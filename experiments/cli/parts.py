@@ -108,6 +108,10 @@ def controller(
             help="Delay over which the state is predicted: measured, off, or milliseconds."
         ),
     ] = "measured",
+    gate: Annotated[
+        Path | None,
+        typer.Option(help="Thresholds for new weights (JSON), see 'controller/gate/settings.py'."),
+    ] = None,
     hold: Annotated[bool, typer.Option(help="Do not drive before 'bayesrace go'.")] = False,
     cpu: Cpu = None,
     fifo: Fifo = None,
@@ -120,7 +124,8 @@ def controller(
     from bayesrace.realtime import RealtimeSettings
     from bayesrace.transport import Endpoints
     from bayesrace.vehicles import get_car
-    from controller.assembly import predictive_controller
+    from controller.assembly import predictive_controller, read_settings
+    from controller.gate.settings import GateSettings
     from controller.process import ControllerSettings, main
 
     process = ControllerSettings(
@@ -133,6 +138,7 @@ def controller(
         budget=budget,
         compensation=_compensation(delay),
         hold=hold,
+        gate=read_settings(gate, GateSettings),
         realtime=RealtimeSettings(cpu=cpu, fifo=fifo, lock_memory=lock_memory),
         parent_pid=parent_pid,
     )
