@@ -137,7 +137,7 @@ def test_validate_writes_what_it_prints(
     result = ValidationResult.model_validate(content)
     checked = validate(read_weights(files / "weights.bin"), fresh, PREDICTION)
     for output in OUTPUTS:
-        assert content[output] == dict(checked.metrics[output])
+        assert content[output] == pytest.approx(dict(checked.metrics[output]), rel=1e-6)
         assert {"rmse", "r2", "coverage", "log_density"} <= set(content[output])
         assert f"{content[output]['rmse']:.3g}" in said
     assert (result.samples, result.learned_from) == (len(fresh), False)
