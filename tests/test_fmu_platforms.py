@@ -1,29 +1,35 @@
 """Binaries of an FMU: rebuilt from its own sources, and for processors and systems not this one."""
 
 import importlib.util
+import os
 import shlex
 import shutil
 import struct
 import subprocess
 import sys
-import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 from fmpy import extract
-from numpy.typing import NDArray
 
 from bayesrace.errors import InputError
 from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles.parameters import get_car
 from codegen.compiler import find_compiler
-from codegen.fmu import host_platform, pack, write_sources
+from codegen.fmu import host_platform, pack
 from codegen.fmu.platforms import get_platform
 from plant.fmu.export import car_fmu
 from tests.fmu_exports import Version, built_in, commands, driven, exported, slave
 from tests.fmu_master import Slave
 
 HERE = Path(__file__).parent
+
+WINDOWS = "x86_64-windows"
+EVERYWHERE = ("x86_64-linux", "aarch64-linux", WINDOWS)
+
+ARM_LIBRARIES = Path("/usr/aarch64-linux-gnu")
+"""Where Debian's libc6-arm64-cross lies."""
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="the line in the archive is for Linux")
 zig = pytest.mark.skipif(importlib.util.find_spec("ziglang") is None, reason="ziglang is missing")
@@ -113,68 +119,93 @@ def pe_exports(data: bytes) -> set[str]:
     return found
 
 
+@pytest.fixture(scope="module", params=[2, 3])
+def everywhere(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The car's FMU with binaries for all platforms that can be built for, unpacked."""
+    version: Version = request.param
+    folder = tmp_path_factory.mktemp("everywhere")
+    fmu = pack(car_fmu(get_car("orca"), version), folder / "all.fmu", list(EVERYWHERE))
+    extract(str(fmu), unzipdir=str(folder / str(version)))
+    return folder / str(version)
+
+
+def binary(unpacked: Path, name: str) -> Path:
+    """The only file of the platform's folder."""
+    (found,) = (unpacked / "binaries" / get_platform(name).folder(int(unpacked.name))).iterdir()
+    return found
+
+
 @zig
 @pytest.mark.slow
 @pytest.mark.timeout(1500)  # ziglang builds a C library per target the first time
-@pytest.mark.parametrize("version", [2, 3])
 def test_cross_compiled_binaries_are_for_their_platform_and_offer_fmi(
-    version: Version, car: CarParameters, tmp_path: Path
+    everywhere: Path, tmp_path: Path
 ) -> None:
-    names = ["x86_64-linux", "aarch64-linux", "x86_64-windows"]
-    definition = car_fmu(car, version)
-    fmu = pack(definition, tmp_path / "all.fmu", names)
     offered = {}
-    with zipfile.ZipFile(fmu) as archive:
-        for name in names:
-            target = get_platform(name)
-            folder = f"binaries/{target.folder(version)}"
-            data = archive.read(f"{folder}/{definition.identifier}{target.suffix}")
-            if name.endswith("linux"):
-                machine = {"x86_64-linux": 62, "aarch64-linux": 183}[name]
-                assert data[:5] == b"\x7fELF\x02"
-                assert struct.unpack_from("<H", data, 18) == (machine,)
-                offered[name] = elf_exports(data, tmp_path)
-            else:
-                (header,) = struct.unpack_from("<I", data, 0x3C)
-                assert data[header : header + 4] == b"PE\0\0"
-                assert struct.unpack_from("<H", data, header + 4) == (0x8664,)
-                offered[name] = pe_exports(data)
-    assert f"fmi{version}GetVersion" in offered["x86_64-linux"]
+    for name in EVERYWHERE:
+        data = binary(everywhere, name).read_bytes()
+        if name.endswith("linux"):
+            machine = {"x86_64-linux": 62, "aarch64-linux": 183}[name]
+            assert data[:5] == b"\x7fELF\x02"
+            assert struct.unpack_from("<H", data, 18) == (machine,)
+            offered[name] = elf_exports(data, tmp_path)
+        else:
+            (header,) = struct.unpack_from("<I", data, 0x3C)
+            assert data[header : header + 4] == b"PE\0\0"
+            assert struct.unpack_from("<H", data, header + 4) == (0x8664,)
+            offered[name] = pe_exports(data)
+    fmi = f"fmi{everywhere.name}"
+    assert f"{fmi}GetVersion" in offered["x86_64-linux"]
     assert len(offered["x86_64-linux"]) > 30
-    assert all(name.startswith(f"fmi{version}") for name in offered["x86_64-linux"])
+    assert all(name.startswith(fmi) for name in offered["x86_64-linux"])
     assert offered["aarch64-linux"] == offered["x86_64-linux"]
     assert offered["x86_64-windows"] == offered["x86_64-linux"]
 
 
-def cross_built(folder: Path, sources: list[str], target: str) -> Path:
-    """tests/native/fmi3_drive.c with the FMU's sources, linked statically."""
-    program = folder / target
-    line = [sys.executable, "-m", "ziglang", "cc", "-target", target, "-static", "-std=gnu11"]
-    line += ["-O2", "-ffp-contract=off", "-I.", *sources, str(HERE / "native" / "fmi3_drive.c")]
-    subprocess.run([*line, "-lm", "-o", str(program)], cwd=folder, check=True)
-    return program
+def emulator(platform: str) -> list[str]:
+    """What stands before the name of a program for this platform to run it here."""
+    commands = {"aarch64-linux": ("qemu-aarch64", "-L", str(ARM_LIBRARIES)), WINDOWS: ("wine",)}
+    command, *arguments = commands[platform]
+    if platform != WINDOWS and not (ARM_LIBRARIES / "lib").is_dir():
+        pytest.skip("libc6-arm64-cross is not installed")
+    if shutil.which(command) is None:
+        pytest.skip(f"{command} is not installed")
+    return [command, *arguments]
+
+
+def drive_program(platform: str, sources: Path, program: Path) -> None:
+    """tests/native/fmi3_drive.c for a platform."""
+    target = get_platform(platform).zig
+    assert target is not None
+    line = [sys.executable, "-m", "ziglang", "cc", "-target", target, "-O2", f"-I{sources}"]
+    line += [str(HERE / "native" / "fmi3_drive.c"), *([] if platform == WINDOWS else ["-ldl"])]
+    subprocess.run([*line, "-o", str(program)], check=True)
 
 
 @zig
 @linux
 @pytest.mark.slow
 @pytest.mark.timeout(1500)
-def test_another_processor_drives_alike(car: CarParameters, tmp_path: Path) -> None:
+@pytest.mark.parametrize("everywhere", [3], indirect=True)
+@pytest.mark.parametrize("platform", ["aarch64-linux", WINDOWS])
+def test_on_other_platforms_the_same_binary_drives_alike(
+    platform: str, everywhere: Path, car: CarParameters, tmp_path: Path
+) -> None:
     """But for the C library, whose sine may differ in its last bit."""
-    qemu = shutil.which("qemu-aarch64") or shutil.which("qemu-aarch64-static")
-    if qemu is None:
-        pytest.skip("qemu-user is not installed")
     if host_platform().name != "x86_64-linux":
-        pytest.skip("this machine is not the other processor's opposite")
-    sources = write_sources(car_fmu(car, 3, "cs"), tmp_path)
+        pytest.skip("the emulators are for x86_64-linux")
+    under = emulator(platform)
+    program = tmp_path / "drive.exe"
+    drive_program(platform, everywhere / "sources", program)
     inputs = np.array(commands(400))
-
-    def rows(target: str, *under: str) -> NDArray[np.float64]:
-        program = cross_built(tmp_path, sources, target)
-        line = [*under, str(program)]
-        done = subprocess.run(line, input=inputs.tobytes(), capture_output=True, check=True)
-        return np.frombuffer(done.stdout).reshape(-1, 7)
-
-    there = rows("aarch64-linux-musl", qemu)
+    quiet = {"WINEDEBUG": "-all", "WINEDLLOVERRIDES": "mscoree,mshtml="}
+    done = subprocess.run(
+        [*under, str(program), str(binary(everywhere, platform))],
+        input=inputs.tobytes(),
+        capture_output=True,
+        check=True,
+        env={**os.environ, "WINEPREFIX": str(tmp_path / "wine"), **quiet},
+    )
+    states = np.frombuffer(done.stdout).reshape(-1, 7)
     expected = built_in(car, [(d, rate) for d, rate in inputs])[:, :7]
-    np.testing.assert_allclose(there, expected, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(states, expected, rtol=0, atol=1e-12)
