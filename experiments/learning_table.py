@@ -1,21 +1,20 @@
 """What training and validation have to say, on the terminal."""
 
 from collections.abc import Sequence
-from typing import Final
 
 from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bayesrace.gp.weights import OUTPUTS
-from experiments.validation import Drift, HorizonResult, OutputMetrics, Spread, ValidationResult
+from bayesrace.gp.weights import OUTPUTS, UNITS
+from experiments.notation import SMOOTHNESS
+from experiments.results import GpMetrics
+from experiments.validation import Drift, HorizonResult, Spread, ValidationResult
 from learning.assessment import ChoiceScore, KernelScore
+from learning.dataset import left_out
 
 __all__ = ["print_choices", "print_kernels", "print_validation"]
-
-_UNITS: Final = {"vx": "m/s", "vy": "m/s", "omega": "rad/s"}
-_NU: Final = {"matern05": "1/2", "matern15": "3/2", "matern25": "5/2", "rbf": "∞"}
 
 
 def _table(*titles: str, left: int = 1, padding: int = 1) -> Table:
@@ -27,14 +26,14 @@ def _table(*titles: str, left: int = 1, padding: int = 1) -> Table:
 
 def print_kernels(scores: Sequence[KernelScore], console: Console) -> None:
     """The paper's appendix: held-out error against the kernel's smoothness, per output."""
-    titles = [f"{output}\nRMSE {_UNITS[output]}\nlog dens." for output in OUTPUTS]
+    titles = [f"{output}\nRMSE {UNITS[output]}\nlog dens." for output in OUTPUTS]
     table = _table("kernel", "ν", *titles, padding=0)
     found = {(score.output, score.kernel): score for score in scores}
-    for kernel, nu in _NU.items():
+    for kernel, nu in SMOOTHNESS.items():
         row = [found.get((output, kernel)) for output in OUTPUTS]
         if any(row):
             table.add_row(kernel, nu, *(_kernel_cell(score) for score in row))
-    console.print(Text("Kernel by smoothness, held out by stretches of the drive", style="bold"))
+    console.print(Text("Kernel by smoothness, held out by parts of the drive", style="bold"))
     console.print(table)
     chosen = {score.output: score.kernel for score in scores if score.chosen}
     text = ", ".join(f"{output}: {chosen[output]}" for output in OUTPUTS if output in chosen)
@@ -55,28 +54,29 @@ def print_choices(scores: Sequence[ChoiceScore], console: Console) -> None:
     table = _table("output", "samples", "points", "RMSE", "log density", left=2)
     for score in scores:
         table.add_row(
-            f"{score.output} {_UNITS[score.output]}" if score.choice == "all" else "",
+            f"{score.output} {UNITS[score.output]}" if score.choice == "all" else "",
             score.choice, str(score.points), f"{score.rmse:.3g}", f"{score.log_density:.2f}",
         )  # fmt: skip
-    console.print(Text("What choosing samples costs, held out", style="bold"))
+    title = "What choosing samples costs, held out by stretches of the track"
+    console.print(Text(title, style="bold"))
     console.print(table)
 
 
 def print_validation(result: ValidationResult, console: Console) -> None:
     """Metrics per output, and the drift over one step and over the horizon."""
-    dropped = ", ".join(f"{n} {why}" for why, n in result.dropped.items()) or "none"
+    counts = left_out(result.dropped)
     console.print(
-        Text(f"{result.weights_version} on {result.samples} samples (left out: {dropped})"),
+        Text(f"{result.weights_version} on {result.samples} samples (left out: {counts})"),
         style="bold",
     )
     if result.learned_from:
         text = "these are the samples that the weights were learned from: an error this small is "
         console.print(Text(text + "no promise for others", style="yellow"))
     table = _table("output", "RMSE", "without GP", "R²", "coverage", "log density")
-    metrics: dict[str, OutputMetrics] = {o: getattr(result, o) for o in OUTPUTS}
+    metrics: dict[str, GpMetrics] = {o: getattr(result, o) for o in OUTPUTS}
     for output, one in metrics.items():
         table.add_row(
-            f"{output} {_UNITS[output]}", f"{one.rmse:.3g}", f"{one.uncorrected_rmse:.3g}",
+            f"{output} {UNITS[output]}", f"{one.rmse:.3g}", f"{one.uncorrected_rmse:.3g}",
             f"{one.r2:.4f}", f"{one.coverage:.3f}", f"{one.log_density:.2f}",
         )  # fmt: skip
     console.print(table)

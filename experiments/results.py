@@ -55,7 +55,7 @@ class LapResult(_Frozen):
 
 
 class GpMetrics(_Frozen):
-    """How well one output's GP predicts the residual of the BestCase run, SI units."""
+    """How well one output's GP predicts the residual of a drive, SI units."""
 
     rmse: float
     uncorrected_rmse: float = Field(description="without the GP")

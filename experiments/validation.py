@@ -11,7 +11,9 @@ from threadpoolctl import threadpool_limits
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
 from bayesrace.vehicles import get_car
-from learning.dataset import Dataset
+from experiments.notation import UNCERTAIN
+from experiments.results import GpMetrics
+from learning.dataset import Dataset, left_out
 from learning.horizon import HORIZON, Mismatch, mismatch
 from learning.residual import discretisation_of
 from learning.sources import read_samples
@@ -20,7 +22,6 @@ from learning.validation import Validation, validate
 __all__ = [
     "Drift",
     "HorizonResult",
-    "OutputMetrics",
     "Spread",
     "Validated",
     "ValidationResult",
@@ -29,22 +30,9 @@ __all__ = [
 
 Floats = NDArray[np.float64]
 
-UNCERTAIN = 0.25
-"""The paper marks where the largest of the three standard deviations is above this."""
-
 
 class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class OutputMetrics(_Frozen):
-    """How well one output's GP predicts the residual, SI units."""
-
-    rmse: float
-    uncorrected_rmse: float = Field(description="without the GP")
-    r2: float
-    coverage: float = Field(description="share of the residuals in the 95 % interval")
-    log_density: float = Field(description="mean log predictive density")
 
 
 class Spread(_Frozen):
@@ -97,9 +85,9 @@ class HorizonResult(_Frozen):
 class ValidationResult(_Frozen):
     """What ``--json`` writes."""
 
-    vx: OutputMetrics
-    vy: OutputMetrics
-    omega: OutputMetrics
+    vx: GpMetrics
+    vy: GpMetrics
+    omega: GpMetrics
     one_step: HorizonResult | None
     horizon: HorizonResult | None = Field(description="null if no drive is long enough")
     weights_version: str
@@ -137,8 +125,8 @@ def validate_weights(
     samples = read_samples(drives, weights.car, name, discretisation, runs=runs)
     data = samples.dataset
     if len(data) == 0:
-        left_out = ", ".join(f"{n} {why}" for why, n in data.dropped.items()) or "none"
-        raise InputError(f"validation: no samples left (left out: {left_out}); drive longer")
+        counts = left_out(data.dropped)
+        raise InputError(f"validation: no samples left (left out: {counts}); drive longer")
     # On a busy machine the threads of BLAS wait for each other longer than they work.
     with threadpool_limits(1):
         validation = validate(weights, data, discretisation)
@@ -155,7 +143,7 @@ def validate_weights(
         )
 
     metrics = {
-        output: OutputMetrics.model_validate(dict(numbers))
+        output: GpMetrics.model_validate(dict(numbers))
         for output, numbers in validation.metrics.items()
     }
     result = ValidationResult(
@@ -170,7 +158,7 @@ def validate_weights(
         samples=len(data),
         dropped=dict(data.dropped),
         threshold=threshold,
-        uncertain=int((validation.sigma.max(axis=1) > threshold).sum()),
+        uncertain=int(validation.uncertain(threshold).sum()),
         learned_from=bool(weights.dataset_digest) and weights.dataset_digest == data.digest(),
     )
     return Validated(result, validation, data)

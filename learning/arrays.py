@@ -22,7 +22,8 @@ read: ``states`` (6 or 7, n + 1) and ``inputs`` (2, n), beside whatever else, bu
 
 import os
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -32,12 +33,14 @@ from numpy.typing import NDArray
 from bayesrace.errors import InputError
 from bayesrace.vehicles.parameters import CarParameters, get_car
 from learning.dataset import Dataset, dataset_from_arrays
-from learning.published import read_published
+from learning.published import is_published, published_drive
 
-__all__ = ["MAX_BYTES", "dataset_from_npz", "write_npz"]
+__all__ = ["MAX_BYTES", "car_of_npz", "dataset_from_npz", "write_npz"]
 
 MAX_BYTES: Final = 1 << 30
 """Unpacked arrays larger than this are refused before they are read."""
+
+_SAME_STEP_S: Final = 1e-9
 
 _SAMPLES: Final = ("x", "u", "x_next")
 _DRIVE: Final = ("states", "inputs")
@@ -58,60 +61,70 @@ def dataset_from_npz(
     """
     arrays = _read(Path(path))
     try:
-        if _is_published(arrays):
+        if is_published(arrays):
             if car is None or step_s is None:
                 raise InputError("the published form does not name its car and step; give both")
-            return read_published(path, car, step_s)
+            return published_drive(arrays["states"], arrays["inputs"], car, step_s)
         dataset = _dataset(arrays)
         if car is not None and dataset.car != car:
             raise InputError(f"samples of the car '{dataset.car.name}', not of '{car.name}'")
-        if step_s is not None and abs(dataset.step_s - step_s) > 1e-9:
+        if step_s is not None and abs(dataset.step_s - step_s) > _SAME_STEP_S:
             raise InputError(f"samples {dataset.step_s:g} s apart, not {step_s:g} s")
     except InputError as error:
-        text = str(error)
-        raise InputError(text if text.startswith(str(path)) else f"{path}: {text}") from error
-    return dataset
+        raise InputError(f"{path}: {error}") from error
+    # The number that is meant: one of single precision could not be mixed with others.
+    return dataset if step_s is None else replace(dataset, step_s=step_s)
 
 
-def _read(path: Path) -> dict[str, NDArray[Any]]:
+def car_of_npz(path: str | os.PathLike[str]) -> str:
+    """Name of the car that a file tells; empty if it tells none. InputError if it is no such file.
+
+    Whether the samples are fit to be read is not looked at.
+    """
+    arrays = _read(Path(path), ("car",))
+    try:
+        return _car_name(arrays["car"]) if "car" in arrays else ""
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def _read(path: Path, names: Collection[str] | None = None) -> dict[str, NDArray[Any]]:
+    """Arrays by name, all or those of ``names`` that are there."""
     try:
         with zipfile.ZipFile(path) as archive:
             if sum(member.file_size for member in archive.infolist()) > MAX_BYTES:
                 raise InputError(f"{path}: more than {MAX_BYTES >> 20} MB; split it")
         with np.load(path, allow_pickle=False) as file:
-            return {name: np.asarray(file[name]) for name in file.files}
+            wanted = [name for name in file.files if names is None or name in names]
+            return {name: np.asarray(file[name]) for name in wanted}
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
     except InputError:
         raise
-    except (ValueError, EOFError, MemoryError, NotImplementedError, zipfile.BadZipFile) as error:
+    except Exception as error:  # of zipfile, zlib, lzma, numpy: whatever damage makes them say
         raise InputError(f"{path}: not arrays as numpy.savez writes them ({error})") from error
-
-
-def _is_published(arrays: Mapping[str, NDArray[Any]]) -> bool:
-    if not set(_DRIVE) <= set(arrays) or set(_ABOUT) & set(arrays):
-        return False
-    states, inputs = (arrays[name].shape for name in _DRIVE)
-    return len(states) == 2 and states[0] in (6, 7) and inputs == (2, states[1] - 1)
 
 
 def _dataset(arrays: Mapping[str, NDArray[Any]]) -> Dataset:
     names = set(arrays) - set(_ABOUT)
     if not set(_ABOUT) <= set(arrays) or names not in (set(_SAMPLES), set(_DRIVE)):
         raise InputError(f"arrays {', '.join(sorted(arrays)) or 'none'}; {_SCHEMA}")
-    about = arrays["car"], arrays["step_s"]
-    if about[0].shape != () or about[0].dtype.kind != "U":
-        raise InputError("'car' must be one text")
+    car = get_car(_car_name(arrays["car"]))
     for name in sorted(names | {"step_s"}):
         if arrays[name].dtype.kind not in "fiu":
             raise InputError(f"'{name}' holds no numbers")
-    step_s = float(about[1]) if about[1].shape == () else float("nan")
+    step_s = float(arrays["step_s"]) if arrays["step_s"].shape == () else float("nan")
     if not 0 < step_s <= 1:
         raise InputError("'step_s' must be one number of seconds, above 0 and at most 1")
-    car = get_car(str(about[0]))
     if names == set(_DRIVE):
         return dataset_from_arrays(car, step_s, arrays["states"], arrays["inputs"])
     return Dataset(car, step_s, arrays["x"], arrays["u"], arrays["x_next"])
+
+
+def _car_name(array: NDArray[Any]) -> str:
+    if array.shape != () or array.dtype.kind != "U":
+        raise InputError("'car' must be one text")
+    return str(array)
 
 
 def write_npz(path: str | os.PathLike[str], dataset: Dataset) -> None:

@@ -1,6 +1,7 @@
 """What training tells beside the weights: kernels by smoothness, the cost of choosing samples.
 
-Every number is held out: a sample is predicted by a GP that has not seen its stretch of the drive.
+Every number is held out: a sample is predicted by a GP that has not seen its part of the drive
+(kernels) or its stretch of the track (choices); see :mod:`learning.folds`.
 """
 
 import math
@@ -10,12 +11,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from learning.crossvalidation import HeldOut
+from learning.crossvalidation import calibrated
 from learning.hyperparameters import Fit
-from learning.regression import predicted_blocks
+from learning.regression import judged
+from learning.scores import PredictionErrors
 from learning.subset import at_random, evenly
 
-__all__ = ["TESTS", "ChoiceScore", "KernelScore", "choice_scores", "held_out_metrics"]
+__all__ = ["TESTS", "ChoiceScore", "KernelScore", "choice_scores"]
 
 Floats = NDArray[np.float64]
 Rows = NDArray[np.int64]
@@ -40,7 +42,9 @@ class KernelScore:
     chosen: bool
 
     @classmethod
-    def of(cls, output: str, fit: Fit, held: HeldOut, scale: float, chosen: bool) -> "KernelScore":
+    def of(
+        cls, output: str, fit: Fit, held: PredictionErrors, scale: float, chosen: bool
+    ) -> "KernelScore":
         """From errors in units of ``scale``."""
         return cls(
             output,
@@ -68,33 +72,21 @@ class ChoiceScore:
     log_density: float
 
 
-def held_out_metrics(held: HeldOut, y: Floats, y_mean: float, scale: float) -> dict[str, float]:
-    """RMSE with and without the GP, R², coverage, log density: SI units, from scaled numbers.
-
-    ``y``: the scaled targets that ``held`` has the errors of; the residual is y_mean + scale * y.
-    """
-    spread = float(np.sum((y - y.mean()) ** 2))
-    return {
-        "rmse": held.rmse * scale,
-        "uncorrected_rmse": float(np.sqrt(np.mean((y_mean + scale * y) ** 2))),
-        "r2": 1.0 - float(np.sum(held.error**2)) / spread if spread > 0 else 0.0,
-        "coverage": held.coverage,
-        "log_density": held.log_density - math.log(scale),
-    }
-
-
 def choice_scores(
-    output: str, fit: Fit, z: Floats, y: Floats, rows: Rows, blocks: int, seed: int, scale: float
+    output: str, fit: Fit, z: Floats, y: Floats, rows: Rows, folds: Rows, seed: int, scale: float
 ) -> list[ChoiceScore]:
-    """All samples, the chosen ``rows``, and as many at random; scaled ``z`` (n, 6), ``y`` (n,)."""
+    """All samples, the chosen ``rows``, and as many at random; scaled ``z`` (n, 6), ``y`` (n,).
+
+    Variances are calibrated as those of weights are.
+    """
     tests = evenly(len(y), TESTS)
 
-    def judge(some: Rows) -> HeldOut:
-        return predicted_blocks(fit.kind, fit.theta, z, y, some, tests, blocks)
+    def judge(some: Rows) -> PredictionErrors:
+        return calibrated(judged(fit.kind, fit.theta, z, y, some, tests, folds), folds[tests])
 
-    def score(choice: str, count: int, judged: list[HeldOut]) -> ChoiceScore:
-        square = float(np.mean([one.rmse**2 for one in judged]))
-        density = float(np.mean([one.log_density for one in judged]))
+    def score(choice: str, count: int, errors: list[PredictionErrors]) -> ChoiceScore:
+        square = float(np.mean([one.rmse**2 for one in errors]))
+        density = float(np.mean([one.log_density for one in errors]))
         return ChoiceScore(
             output, choice, count, math.sqrt(square) * scale, density - math.log(scale)
         )

@@ -11,7 +11,14 @@ from pydantic import BaseModel, ConfigDict, Field
 from bayesrace.errors import InputError
 from bayesrace.vehicles.parameters import CarParameters
 
-__all__ = ["Dataset", "FilterSettings", "concatenate", "dataset_from_arrays", "filter_dataset"]
+__all__ = [
+    "Dataset",
+    "FilterSettings",
+    "concatenate",
+    "dataset_from_arrays",
+    "filter_dataset",
+    "left_out",
+]
 
 Floats = NDArray[np.float64]
 
@@ -36,6 +43,8 @@ class Dataset:
     dropped: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if np.ndim(self.x) != 2:
+            raise InputError(f"dataset: x has shape {np.shape(self.x)}, expected (n, {_STATES})")
         count = len(self.x)
         shapes = {"x": (count, _STATES), "u": (count, _INPUTS), "x_next": (count, _STATES)}
         for name, shape in shapes.items():
@@ -74,6 +83,11 @@ class Dataset:
         return total.hexdigest()
 
 
+def left_out(dropped: Mapping[str, int]) -> str:
+    """Counts by reason as a text."""
+    return ", ".join(f"{count} {reason}" for reason, count in dropped.items()) or "none"
+
+
 def _add(a: Mapping[str, int], b: Mapping[str, int]) -> dict[str, int]:
     return {reason: a.get(reason, 0) + b.get(reason, 0) for reason in {**a, **b}}
 
@@ -83,8 +97,11 @@ def dataset_from_arrays(
 ) -> Dataset:
     """Samples of one unbroken drive: ``states`` (n + 1, 7), ``inputs`` (n, 2)."""
     x, u = np.asarray(states, dtype=np.float64), np.asarray(inputs, dtype=np.float64)
-    if x.ndim != 2 or len(x) != len(u) + 1:
-        raise InputError(f"dataset: {len(u)} inputs need {len(u) + 1} states, got {x.shape}")
+    if x.ndim != 2 or u.ndim != 2 or len(x) != len(u) + 1:
+        raise InputError(
+            f"dataset: states of shape {x.shape} and inputs of shape {u.shape}, expected (n + 1, "
+            f"{_STATES}) and (n, {_INPUTS})"
+        )
     return Dataset(car, step_s, x[:-1], u, x[1:])
 
 

@@ -111,7 +111,7 @@ def dataset_from_log(
             continue
         if isinstance(entry.message, State):
             states.append(entry.message)
-        else:
+        elif entry.message.fallback > 0:  # others say nothing here, and each carries a plan
             telemetry.append(entry.message)
     try:
         return dataset_from_messages(states, telemetry, car, step_s, runs, settings)

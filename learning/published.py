@@ -1,7 +1,7 @@
-"""Import of drives in the arrays that the paper's code publishes (``.npz``).
+"""Drives in the arrays that the paper's code publishes (``.npz``).
 
 ``states`` is (6, T + 1) or (7, T + 1): x, y, psi, vx, vy, omega and perhaps the steering angle;
-``inputs`` is (2, T): duty cycle and **steering angle**. Nothing else in the file is read.
+``inputs`` is (2, T): duty cycle and **steering angle**. Nothing else in the file is looked at.
 
 How the angle becomes (delta, delta_rate): the published plant holds inputs[1, k] during the whole
 step k, while our cars turn the steering at a constant rate over the step, from delta_k to
@@ -14,9 +14,8 @@ residual of such a drive contains, beside the model mismatch, the difference bet
 turning steering angle: fine for comparing with the paper, wrong for driving our cars.
 """
 
-import os
-import zipfile
-from pathlib import Path
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,43 +24,32 @@ from bayesrace.errors import InputError
 from bayesrace.vehicles.parameters import CarParameters
 from learning.dataset import Dataset, dataset_from_arrays
 
-__all__ = ["read_published"]
+__all__ = ["is_published", "published_drive"]
 
 
-def _arrays(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            states, inputs = (np.asarray(file[name], np.float64) for name in ("states", "inputs"))
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error}") from error
-    except (KeyError, ValueError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: need numeric arrays 'states' and 'inputs' ({error})") from error
-    return states, inputs
+def is_published(arrays: Mapping[str, NDArray[Any]]) -> bool:
+    """Whether a file's arrays are such a drive. Ours name their car, and hold a sample a row."""
+    if not {"states", "inputs"} <= set(arrays) or {"car", "step_s"} & set(arrays):
+        return False
+    states, inputs = arrays["states"].shape, arrays["inputs"].shape
+    return len(states) == 2 and states[0] in (6, 7) and inputs == (2, states[1] - 1)
 
 
-def read_published(path: str | os.PathLike[str], car: CarParameters, step_s: float) -> Dataset:
+def published_drive(
+    states: NDArray[Any], inputs: NDArray[Any], car: CarParameters, step_s: float
+) -> Dataset:
     """All samples of the drive, unfiltered; zero columns that pad its end are left out.
 
     The published pure-pursuit drive exceeds the car's limits on purpose or not; to learn from it
-    for driving, pass the result through :func:`learning.dataset.filter_dataset`.
+    for driving, pass the result through :func:`learning.dataset.filter_dataset`. InputError for
+    arrays that hold no numbers, or no drive.
     """
-    states, inputs = _arrays(Path(path))
-    if (
-        states.ndim != 2
-        or states.shape[0] not in (6, 7)
-        or inputs.shape
-        != (
-            2,
-            states.shape[1] - 1,
-        )
-    ):
-        raise InputError(
-            f"{path}: states {states.shape} and inputs {inputs.shape} are not (6 or 7, T + 1) "
-            "and (2, T)"
-        )
+    for name, array in (("states", states), ("inputs", inputs)):
+        if array.dtype.kind not in "fiu":
+            raise InputError(f"'{name}' holds no numbers")
     used = np.flatnonzero(states.any(axis=0))
     if len(used) < 2:
-        raise InputError(f"{path}: fewer than two states that are not zero")
+        raise InputError("fewer than two states that are not zero")
     end = int(used[-1]) + 1
     delta = np.concatenate(([0.0], inputs[1, : end - 1]))
     x = np.vstack((states[:6, :end], delta)).T

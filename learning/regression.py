@@ -1,4 +1,4 @@
-"""One output's GP on scaled samples: scaling, scikit-learn's regressor, prediction of blocks."""
+"""One output's GP on scaled samples: scaling, scikit-learn's regressor, held-out errors."""
 
 import math
 from dataclasses import dataclass
@@ -12,9 +12,10 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteK
 
 from bayesrace.errors import InputError
 from bayesrace.gp.expression import kernel_matrix
-from learning.crossvalidation import HeldOut, held_out
+from learning.crossvalidation import held_out
+from learning.scores import PredictionErrors
 
-__all__ = ["Scaling", "held_out_blocks", "predicted_blocks", "regressor", "scaling_of"]
+__all__ = ["Scaling", "held_out_errors", "judged", "regressor", "scaling_of"]
 
 Floats = NDArray[np.float64]
 Rows = NDArray[np.int64]
@@ -62,28 +63,27 @@ def regressor(kind: str, theta: Floats, z: Floats, y: Floats) -> GaussianProcess
         raise InputError("GP training: covariance is singular; are samples repeated?") from error
 
 
-def held_out_blocks(gp: GaussianProcessRegressor, y: Floats, blocks: int) -> HeldOut:
-    """Errors of a fitted regressor on its own samples, each block predicted without itself."""
+def held_out_errors(gp: GaussianProcessRegressor, y: Floats, folds: Rows) -> PredictionErrors:
+    """Errors of a fitted regressor on its own samples, each predicted without its fold."""
     inverse = cho_solve((gp.L_, True), np.eye(len(y)))
-    return held_out(0.5 * (inverse + inverse.T), y, blocks)
+    return held_out(0.5 * (inverse + inverse.T), y, folds)
 
 
-def predicted_blocks(
-    kind: str, theta: Floats, z: Floats, y: Floats, rows: Rows, tests: Rows, blocks: int
-) -> HeldOut:
-    """Errors at ``tests`` of a GP on ``rows``, all indices into the samples in driving order.
+def judged(
+    kind: str, theta: Floats, z: Floats, y: Floats, rows: Rows, tests: Rows, folds: Rows
+) -> PredictionErrors:
+    """Errors at ``tests`` of a GP on ``rows``, both indices into all samples ``z``, ``y``.
 
-    The drive is cut into ``blocks`` stretches; the tests of each are predicted from the rows of all
-    others. Unlike :func:`held_out_blocks` this judges a choice of samples by all samples.
+    Each fold's tests are predicted from the rows of all other ``folds`` (n,). Unlike
+    :func:`held_out_errors` this judges a choice of samples by all samples.
     """
     signal, lengths, noise = math.exp(theta[0]), np.exp(theta[1:-1]), math.exp(theta[-1])
     error, sigma = np.empty(len(tests)), np.empty(len(tests))
-    for block in np.array_split(np.arange(len(y)), min(blocks, len(y))):
-        inside = (tests >= block[0]) & (tests <= block[-1])
-        known, asked = rows[(rows < block[0]) | (rows > block[-1])], tests[inside]
+    for fold in np.unique(folds[tests]):
+        inside = folds[tests] == fold
+        known, asked = rows[folds[rows] != fold], tests[inside]
         if len(known) == 0:
             error[inside], sigma[inside] = y[asked], math.sqrt(signal + noise)
-        if len(known) == 0 or len(asked) == 0:
             continue
         covariance = signal * kernel_matrix(kind, z[known], z[known], lengths)
         covariance[np.diag_indices_from(covariance)] += noise
@@ -99,4 +99,4 @@ def predicted_blocks(
         error[inside] = y[asked] - whitened @ explained
         variance = signal + noise - np.einsum("ij,ij->j", explained, explained)
         sigma[inside] = np.sqrt(np.maximum(variance, noise))
-    return HeldOut(error, sigma)
+    return PredictionErrors(error, sigma)

@@ -7,7 +7,7 @@ from pathlib import Path
 from bayesrace.errors import InputError
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.vehicles.parameters import CARS, CarParameters, get_car
-from learning.arrays import dataset_from_npz
+from learning.arrays import car_of_npz, dataset_from_npz
 from learning.dataset import Dataset, FilterSettings, concatenate, filter_dataset
 from learning.logs import LogFacts, dataset_from_log, log_facts
 
@@ -33,10 +33,13 @@ def _car(sources: Sequence[_Source], wanted: str, name: str) -> CarParameters:
     """The one car of all sources; InputError if they tell of several, or of none."""
     told: dict[str, Path] = {}
     for source in sources:
-        if source.facts is not None:
+        if source.facts is None:
+            car = car_of_npz(source.path)
+        else:
             driver = _driver(source.path, source.facts, name)
-            if source.facts.car or driver in CARS:
-                told.setdefault(source.facts.car or driver, source.path)
+            car = source.facts.car or (driver if driver in CARS else "")
+        if car:
+            told.setdefault(car, source.path)
     if wanted:
         told.setdefault(wanted, Path("--car"))
     if len(told) > 1:
@@ -44,12 +47,6 @@ def _car(sources: Sequence[_Source], wanted: str, name: str) -> CarParameters:
         raise InputError(f"different cars cannot be mixed: {cars}; give logs of one car")
     if told:
         return get_car(next(iter(told)))
-    for source in sources:
-        if source.facts is None:
-            try:
-                return dataset_from_npz(source.path).car
-            except InputError:
-                continue
     raise InputError("no file names its car; name it with --car")
 
 

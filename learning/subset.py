@@ -1,13 +1,19 @@
 """Which samples to keep when there are more than the controller has room for."""
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesrace.errors import InputError
 from bayesrace.gp.expression import kernel_matrix
 
-__all__ = ["at_random", "evenly", "most_informative"]
+__all__ = ["MAX_BYTES", "at_random", "evenly", "most_informative"]
 
 Floats = NDArray[np.float64]
+
+MAX_BYTES: Final = 1 << 32
+"""Of memory for a choice."""
 
 
 def evenly(count: int, wanted: int) -> NDArray[np.int64]:
@@ -29,11 +35,17 @@ def most_informative(
     """Indices of ``wanted`` samples, each of largest posterior variance given those before it.
 
     A pivoted Cholesky factorisation: O(n wanted^2) time, O(n wanted) memory. ``noise_ratio`` is
-    noise over signal variance. Sorted, so that blocks of samples stay blocks of a drive.
+    noise over signal variance. Sorted: samples stay in the order in which they were driven.
+    InputError if that memory would be more than :data:`MAX_BYTES`.
     """
     count = len(z)
     if count <= wanted:
         return np.arange(count)
+    if 8 * count * wanted > MAX_BYTES:
+        raise InputError(
+            f"choosing {wanted} of {count} samples would take {8e-9 * count * wanted:.0f} GB of "
+            "memory; give fewer samples, or choose fewer"
+        )
     variance = np.ones(count)
     columns = np.zeros((wanted, count))
     chosen = np.zeros(wanted, dtype=np.int64)

@@ -3,16 +3,18 @@
 1. Standardise features and targets, once (scikit-learn's own ``normalize_y`` stays off).
 2. Per output and candidate kernel: hyperparameters by marginal likelihood from seeded starts, or
    from given weights (:mod:`learning.hyperparameters`), on at most ``hyper_points`` samples.
-3. Per output: the kernel of largest held-out log density on contiguous blocks
-   (:mod:`learning.crossvalidation`).
+3. Per output: the kernel of largest log density held out by spans of the drive
+   (:mod:`learning.folds`, :mod:`learning.crossvalidation`).
 4. Factorise with scikit-learn on all samples, or on the most informative ones that fit.
-5. Scale all variances so that the 95 % interval holds 95 % of the held-out errors, if it held
-   less. The mean does not change. A likelihood that finds the data noise-free and smooth is
-   over-confident when the model is not quite right; setting the variance by cross-validation is
-   the known remedy (Bachoc, "Cross validation and maximum likelihood estimations of
-   hyper-parameters of Gaussian processes with model misspecification", CSDA 2013).
+5. Scale all variances so that the 95 % interval holds 95 % of the errors held out by stretches of
+   the track, if it held less. The mean does not change. A likelihood that finds the data
+   noise-free and smooth is over-confident when the model is not quite right; setting the variance
+   by cross-validation is the known remedy (Bachoc, "Cross validation and maximum likelihood
+   estimations of hyper-parameters of Gaussian processes with model misspecification", CSDA 2013).
 
-Only training samples are used for any of this.
+Only training samples are used for any of this. The metrics that the weights carry are those of the
+errors held out by stretches, each stretch with a scale found on the others; hyperparameters, kernel
+and choice of samples have seen all stretches.
 """
 
 import hashlib
@@ -33,11 +35,13 @@ from bayesrace import __version__
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import FEATURES, OUTPUTS, GpOutput, GpWeights, encode_weights
 from bayesrace.integrators import Discretisation
-from learning.assessment import TESTS, ChoiceScore, KernelScore, choice_scores, held_out_metrics
-from learning.dataset import Dataset
+from learning.assessment import TESTS, ChoiceScore, KernelScore, choice_scores
+from learning.crossvalidation import calibrated
+from learning.dataset import Dataset, left_out
+from learning.folds import spans, stretches
 from learning.hyperparameters import TOLERANCE, Fit, best, maximise, starts
 from learning.likelihood import PairDistances
-from learning.regression import Scaling, held_out_blocks, predicted_blocks, regressor, scaling_of
+from learning.regression import Scaling, held_out_errors, judged, regressor, scaling_of
 from learning.residual import identity, residual
 from learning.subset import evenly, most_informative
 
@@ -52,6 +56,7 @@ __all__ = [
 ]
 
 Floats = NDArray[np.float64]
+Rows = NDArray[np.int64]
 Kernel = Literal["rbf", "matern05", "matern15", "matern25"]
 
 Progress = Callable[[float, str], None]
@@ -91,7 +96,9 @@ class TrainingSettings(BaseModel):
     warm_iterations: int = Field(
         default=30, ge=1, description="the same, starting from given weights"
     )
-    blocks: int = Field(default=10, ge=2, description="contiguous blocks of the cross-validation")
+    folds: int = Field(
+        default=10, ge=2, description="parts of the drive, or of the track, each held out in turn"
+    )
     threads: int = Field(default=0, ge=0, description="parallel fits; 0 is one per core")
 
 
@@ -144,28 +151,33 @@ def _run(
 ) -> list[Fit]:
     """All optimisations, several at once, results in the order of the tasks."""
     pairs = PairDistances(z)
-    with ThreadPoolExecutor(settings.threads or os.cpu_count() or 1) as pool:
-        futures = [
+    pool = ThreadPoolExecutor(settings.threads or os.cpu_count() or 1)
+    try:
+        futures = {
             pool.submit(
                 maximise, t.kind, pairs, targets[t.output], t.start, t.iterations,
                 settings.tolerance,
-            )
+            ): t
             for t in tasks
-        ]  # fmt: skip
+        }  # fmt: skip
         for done, future in enumerate(as_completed(futures), start=1):
-            task = tasks[futures.index(future)]
-            report(0.9 * done / len(tasks), f"{OUTPUTS[task.output]}: {task.kind}")
+            task = futures[future]
             future.result()
+            report(0.9 * done / len(tasks), f"{OUTPUTS[task.output]}: {task.kind}")
+    finally:
+        # Interrupted, or failed: what has not begun is not worth waiting for.
+        pool.shutdown(cancel_futures=True)
     return [future.result() for future in futures]
 
 
 def _choose(
-    output: str, fits: Sequence[Fit], z: Floats, y: Floats, blocks: int, scale: float
+    output: str, fits: Sequence[Fit], z: Floats, y: Floats, folds: int, scale: float
 ) -> tuple[Fit, list[KernelScore]]:
     """Best start per kernel by likelihood, then best kernel by held-out log density."""
     kinds = list(dict.fromkeys(fit.kind for fit in fits))
     candidates = [best([fit for fit in fits if fit.kind == kind]) for kind in kinds]
-    held = [held_out_blocks(regressor(c.kind, c.theta, z, y), y, blocks) for c in candidates]
+    parts = spans(len(y), folds)
+    held = [held_out_errors(regressor(c.kind, c.theta, z, y), y, parts) for c in candidates]
     chosen = max(range(len(candidates)), key=lambda i: held[i].log_density)
     scores = [
         KernelScore.of(output, candidate, errors, scale, i == chosen)
@@ -180,6 +192,7 @@ def _finish(
     scaling: Scaling,
     z_raw: Floats,
     y: Floats,
+    folds: Rows,
     settings: TrainingSettings,
     compare: bool,
 ) -> tuple[GpOutput, dict[str, dict[str, float]], list[ChoiceScore]]:
@@ -188,7 +201,9 @@ def _finish(
     z, lengths = scaling.features(z_raw), np.exp(fit.theta[1:-1])
     rows = most_informative(fit.kind, z, lengths, noise / signal, settings.capacity)
     gp = regressor(fit.kind, fit.theta, z[rows], y[rows])
-    scale = max(1.0, held_out_blocks(gp, y[rows], settings.blocks).variance_scale)
+    tests = evenly(len(y), TESTS)
+    errors = judged(fit.kind, fit.theta, z, y, rows, tests, folds)
+    scale = errors.variance_scale
     output = GpOutput(
         kernel=fit.kind,
         length_scales=lengths * scaling.z_scale,
@@ -199,11 +214,9 @@ def _finish(
         y_mean=scaling.y_mean,
         y_scale=scaling.y_scale,
     )
-    tests = evenly(len(y), TESTS)
-    held = predicted_blocks(fit.kind, fit.theta, z, y, rows, tests, settings.blocks)
-    held = replace(held, sigma=held.sigma * math.sqrt(scale))
+    held = calibrated(errors, folds[tests])
     metrics = {
-        name: held_out_metrics(held, y[tests], scaling.y_mean, scaling.y_scale),
+        name: held.metrics(y[tests], scaling.y_mean, scaling.y_scale),
         f"training {name}": {
             "log_likelihood": fit.log_likelihood,
             "variance_scale": scale,
@@ -213,8 +226,7 @@ def _finish(
     }
     choices = []
     if compare and len(rows) < len(y):
-        numbers = (settings.blocks, settings.seed, scaling.y_scale)
-        choices = choice_scores(name, fit, z, y, rows, *numbers)
+        choices = choice_scores(name, fit, z, y, rows, folds, settings.seed, scaling.y_scale)
     return output, metrics, choices
 
 
@@ -222,11 +234,13 @@ def _check(dataset: Dataset) -> None:
     """InputError for samples that nothing can be learned from."""
     count = len(dataset)
     if not MIN_SAMPLES <= count <= MAX_SAMPLES:
-        left_out = ", ".join(f"{n} {why}" for why, n in dataset.dropped.items()) or "none"
         few = count < MIN_SAMPLES
         needed = f"at least {MIN_SAMPLES} are needed" if few else f"{MAX_SAMPLES} are the most"
         remedy = "drive longer" if few else "give fewer logs"
-        raise InputError(f"GP training: {count} samples, {needed} (left out: {left_out}); {remedy}")
+        raise InputError(
+            f"GP training: {count} samples, {needed} (left out: {left_out(dataset.dropped)}); "
+            f"{remedy}"
+        )
     _check_columns(dataset.features, FEATURES, "{} is {:g} in every sample; vary it while driving")
 
 
@@ -296,7 +310,7 @@ def fit(
     _check_columns(y, OUTPUTS, "the residual of {} is {:g} in every sample: nothing to learn")
     scalings = [scaling_of(z, column) for column in y.T]
     targets = [s.targets(column) for s, column in zip(scalings, y.T, strict=True)]
-    rows = evenly(len(z), settings.hyper_points)
+    rows, folds = evenly(len(z), settings.hyper_points), stretches(dataset, settings.folds)
     subset, subset_targets = scalings[0].features(z)[rows], [column[rows] for column in targets]
     tasks = _tasks(settings, scalings, initial)
     outputs: list[GpOutput] = []
@@ -309,10 +323,10 @@ def fit(
         for i, label in enumerate(OUTPUTS):
             own = [fit for fit, task in zip(fits, tasks, strict=True) if task.output == i]
             chosen, scores = _choose(
-                label, own, subset, subset_targets[i], settings.blocks, scalings[i].y_scale
+                label, own, subset, subset_targets[i], settings.folds, scalings[i].y_scale
             )
             output, measured, costs = _finish(
-                label, chosen, scalings[i], z, targets[i], settings, compare
+                label, chosen, scalings[i], z, targets[i], folds, settings, compare
             )
             outputs.append(output)
             kernels += scores

@@ -1,7 +1,9 @@
 """How well weights predict the residual of a drive that they were not trained on."""
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +15,14 @@ from bayesrace.gp.weights import OUTPUTS, GpOutput, GpWeights
 from bayesrace.integrators import Discretisation
 from learning.dataset import Dataset
 from learning.residual import identity, residual
+from learning.scores import NORMAL_95, PredictionErrors
 
-__all__ = ["Validation", "predictive_sigma", "validate", "with_metrics"]
+__all__ = ["Validation", "predictive_sigma", "validate"]
 
 Floats = NDArray[np.float64]
 
-_NORMAL_95 = 1.959963984540054
+_AT_ONCE: Final = 4096
+"""Samples whose covariances with all training points are in memory together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +43,18 @@ class Validation:
         """Residual that is left after the correction."""
         return self.residual - self.mean
 
+    @property
+    def band(self) -> Floats:
+        """Half the width of the 95 % interval about the mean."""
+        return NORMAL_95 * self.sigma
+
+    def uncertain(self, threshold: float) -> NDArray[np.bool_]:
+        """Samples (n,) whose largest standard deviation, over the outputs, is above this.
+
+        The paper's mark, which compares m/s and rad/s with one number.
+        """
+        return np.asarray(self.sigma.max(axis=1) > threshold)
+
 
 def _output_sigma(output: GpOutput, z: Floats) -> Floats:
     prior = output.signal_variance + output.noise_variance
@@ -51,10 +67,14 @@ def _output_sigma(output: GpOutput, z: Floats) -> Floats:
         factor, _ = cho_factor(own, lower=True)
     except np.linalg.LinAlgError as error:
         raise InputError("GP weights: covariance of the inputs is singular; train again") from error
-    cross = signal * kernel_matrix(output.kernel, output.inputs, z, output.length_scales)
-    explained = solve_triangular(factor, cross, lower=True, check_finite=False)
-    variance = prior - np.einsum("ij,ij->j", explained, explained)
-    sigma: Floats = output.y_scale * np.sqrt(np.maximum(variance, output.noise_variance))
+    explained = np.empty(len(z))
+    for begin in range(0, len(z), _AT_ONCE):
+        rows = slice(begin, begin + _AT_ONCE)
+        cross = signal * kernel_matrix(output.kernel, output.inputs, z[rows], output.length_scales)
+        whitened = solve_triangular(factor, cross, lower=True, check_finite=False)
+        explained[rows] = np.einsum("ij,ij->j", whitened, whitened)
+    variance = np.maximum(prior - explained, output.noise_variance)
+    sigma: Floats = output.y_scale * np.sqrt(variance)
     return sigma
 
 
@@ -66,23 +86,11 @@ def predictive_sigma(weights: GpWeights, z: Floats) -> Floats:
     return np.column_stack([_output_sigma(output, z) for output in weights.outputs])
 
 
-def _metrics(residual: Floats, mean: Floats, sigma: Floats) -> dict[str, float]:
-    error = residual - mean
-    spread = float(np.sum((residual - residual.mean()) ** 2))
-    score = (error / sigma) ** 2 + np.log(2 * np.pi * sigma**2)
-    return {
-        "rmse": float(np.sqrt(np.mean(error**2))),
-        "uncorrected_rmse": float(np.sqrt(np.mean(residual**2))),
-        "r2": 1.0 - float(np.sum(error**2)) / spread if spread > 0 else 0.0,
-        "coverage": float(np.mean(np.abs(error) <= _NORMAL_95 * sigma)),
-        "log_density": float(-0.5 * score.mean()),
-    }
-
-
 def validate(weights: GpWeights, dataset: Dataset, discretisation: Discretisation) -> Validation:
     """Compares prediction and residual on ``dataset``.
 
-    InputError without samples, or if the weights are for another discretised model.
+    InputError without samples, if the weights are for another discretised model, or if a metric is
+    not finite.
     """
     name = identity(dataset, discretisation)
     if weights.discretisation != name:
@@ -91,12 +99,14 @@ def validate(weights: GpWeights, dataset: Dataset, discretisation: Discretisatio
         raise InputError("validation: no samples left; drive longer")
     z, truth = dataset.features, residual(dataset, discretisation)
     mean, sigma = evaluate_mean(weights, z), predictive_sigma(weights, z)
-    metrics = {
-        name: _metrics(truth[:, i], mean[:, i], sigma[:, i]) for i, name in enumerate(OUTPUTS)
-    }
+    with np.errstate(all="ignore"):
+        metrics = {
+            output: PredictionErrors(truth[:, i] - mean[:, i], sigma[:, i]).metrics(truth[:, i])
+            for i, output in enumerate(OUTPUTS)
+        }
+    if not all(math.isfinite(value) for one in metrics.values() for value in one.values()):
+        raise InputError(
+            f"validation: weights '{weights.version}' predict what is not finite, or without any "
+            "uncertainty; train again"
+        )
     return Validation(truth, mean, sigma, metrics)
-
-
-def with_metrics(weights: GpWeights, validation: Validation) -> GpWeights:
-    """The same weights carrying the validation's metrics under the outputs' names."""
-    return replace(weights, metrics={**weights.metrics, **validation.metrics})

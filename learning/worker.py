@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from bayesrace.clock import die_with_parent
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import GpWeights, read_weights, write_weights
+from bayesrace.gp.weights import OUTPUTS, GpWeights, read_weights, write_weights
 from bayesrace.integrators import Discretisation
 from bayesrace.vehicles.parameters import get_car
 from learning.arrays import dataset_from_npz, write_npz
@@ -100,7 +100,7 @@ def perform(task: Task) -> Outcome:
     )
     if weights is None:
         return outcome
-    held_out = {name: dict(weights.metrics[name]) for name in ("vx", "vy", "omega")}
+    held_out = {name: dict(weights.metrics[name]) for name in OUTPUTS}
     return outcome.model_copy(
         update={
             "version": weights.version, "points": max(weights.counts), "metrics": held_out,

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,9 +47,12 @@ def state(run: int, seq: int, x: Floats, u: Floats) -> State:
 
 
 def telemetry(run: int, state_seq: int, fallback: int) -> Telemetry:
-    values: dict[str, Any] = {field.name: 0 for field in fields(Telemetry)}
-    told = {"run": run, "state_seq": state_seq, "fallback": fallback, "plan_x": (), "plan_u": ()}
-    return Telemetry(**(values | told))
+    kinds = get_type_hints(Telemetry, include_extras=True)
+    nothing: dict[str, Any] = {
+        one.name: get_args(kinds[one.name])[0]() for one in fields(Telemetry)
+    }
+    told = {"seq": state_seq, "run": run, "state_seq": state_seq, "fallback": fallback}
+    return Telemetry(**(nothing | told))
 
 
 def logged(data: Dataset, run: int) -> list[State]:

@@ -9,8 +9,8 @@ import pytest
 
 from bayesrace.integrators import PREDICTION
 from bayesrace.vehicles import get_car
+from learning.arrays import dataset_from_npz
 from learning.dataset import Dataset, concatenate, filter_dataset
-from learning.published import read_published
 from learning.training import train
 from learning.validation import Validation, validate
 from tests.reference import reference_file
@@ -25,7 +25,7 @@ PUBLISHED_UPDATED_RMSE = {"vx": 0.00065, "vy": 0.00039, "omega": 0.142}
 
 def drive(name: str) -> Dataset:
     path = reference_file(f"data/{name}.npz")
-    return read_published(path, get_car("orca"), PREDICTION.step_s).select(slice(POINTS))
+    return dataset_from_npz(path, get_car("orca"), PREDICTION.step_s).select(slice(POINTS))
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,9 @@
 That training is faster than scikit-learn is ``benchmarks/training.py``'s to say.
 """
 
+import threading
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,9 +19,9 @@ from bayesrace.gp.weights import OUTPUTS, decode_weights, encode_weights
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from learning.dataset import Dataset
-from learning.hyperparameters import BOUNDS, best, maximise, starts
+from learning.hyperparameters import BOUNDS, Fit, best, maximise, starts
 from learning.likelihood import MarginalLikelihood, PairDistances
-from learning.regression import held_out_blocks, predicted_blocks, regressor, scaling_of
+from learning.regression import held_out_errors, judged, regressor, scaling_of
 from learning.residual import discretisation_of, identity, residual
 from learning.subset import at_random
 from learning.training import MAX_SAMPLES, Training, TrainingSettings, fit, train
@@ -116,12 +118,13 @@ def test_prediction_by_stretches_leaves_the_stretch_out(driven: Dataset) -> None
     scaled, target = scaling.features(z), scaling.targets(y)
     theta = np.log([2.0] + [1.5] * 6 + [0.02])
     rows = np.arange(len(y))
-    judged = predicted_blocks("matern25", theta, scaled, target, rows, rows, 4)
-    closed = held_out_blocks(regressor("matern25", theta, scaled, target), target, 4)
-    assert judged.error == pytest.approx(closed.error, abs=1e-8)
-    assert judged.sigma == pytest.approx(closed.sigma, abs=1e-8)
+    folds = 4 * rows // len(y)
+    found = judged("matern25", theta, scaled, target, rows, rows, folds)
+    closed = held_out_errors(regressor("matern25", theta, scaled, target), target, folds)
+    assert found.error == pytest.approx(closed.error, abs=1e-8)
+    assert found.sigma == pytest.approx(closed.sigma, abs=1e-8)
     few, tests = rows[:30], np.array([5, 100])
-    without = predicted_blocks("matern25", theta, scaled, target, few, tests, 4)
+    without = judged("matern25", theta, scaled, target, few, tests, folds)
     # The first stretch, rows 0 to 39, holds all that is known: there is nothing but the prior.
     assert without.error[0] == target[5]
     assert without.sigma[0] == pytest.approx(np.sqrt(2.02))
@@ -134,6 +137,28 @@ def test_choice_by_chance_is_seeded_and_without_repetition() -> None:
     assert list(rows) == sorted(rows)
     assert np.array_equal(rows, at_random(100, 30, seed=4))
     assert len(at_random(10, 30, seed=0)) == 10
+
+
+def test_training_that_is_interrupted_begins_nothing_more(
+    driven: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, told = [], threading.Event()
+
+    def counted(*arguments: Any) -> Fit:
+        begun.append(arguments[0])
+        if len(begun) > 1:
+            told.wait(60)
+        return maximise(*arguments)
+
+    def interrupted(share: float, text: str) -> None:
+        told.set()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("learning.training.maximise", counted)
+    settings = QUICK.model_copy(update={"restarts": 100, "threads": 1})
+    with pytest.raises(KeyboardInterrupt):
+        fit(driven, PREDICTION, settings, progress=interrupted)
+    assert 1 <= len(begun) < 303
 
 
 # What the weights carry --------------------------------------------------------------------------

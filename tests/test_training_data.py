@@ -1,7 +1,10 @@
 """Where samples come from: plain arrays and logs, one car, one discretisation, or a reason."""
 
 import json
+import sys
+import tracemalloc
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +15,14 @@ from hypothesis import strategies as st
 
 from bayesrace.errors import InputError
 from bayesrace.integrators import PREDICTION, Discretisation
+from bayesrace.log import LogReader, LogWriter
+from bayesrace.messages import encode
 from bayesrace.vehicles.models import dynamic
 from learning.arrays import dataset_from_npz, write_npz
 from learning.dataset import Dataset
 from learning.logs import dataset_from_log, log_facts
 from learning.sources import read_samples
-from tests.driven import CAR, STEP_S, drive, write_log
+from tests.driven import CAR, STEP_S, drive, telemetry, write_log
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +79,8 @@ def test_the_published_form_needs_car_and_step(tmp_path: Path, driven: Dataset) 
         ({"inputs": np.zeros((3, 2))}, "need 'car'"),
         ({"x_nxt": np.zeros((3, 2))}, "need 'car'"),
         ({"x": np.zeros((60, 6))}, "shape"),
+        ({"x": 3.0}, "shape"),
+        ({"x": None, "u": None, "x_next": None, "states": 3.0, "inputs": 4.0}, "shape"),
         ({"u": np.zeros((59, 2))}, "shape"),
         ({"u": np.full((60, 2), np.nan)}, "not finite"),
         ({"u": np.full((60, 2), "a")}, "no numbers"),
@@ -108,6 +115,19 @@ def test_what_is_no_file_of_arrays_is_refused(tmp_path: Path) -> None:
     for path in (tmp_path / "none.npz", tmp_path):
         with pytest.raises(InputError, match="cannot read"):
             dataset_from_npz(path)
+
+
+def test_damage_inside_a_compressed_array_is_refused(tmp_path: Path, driven: Dataset) -> None:
+    path = tmp_path / "x.npz"
+    write_npz(path, driven)
+    with zipfile.ZipFile(path) as archive:
+        begin = archive.getinfo("x.npy").header_offset
+    content = bytearray(path.read_bytes())
+    name_bytes, extra_bytes = content[begin + 26], content[begin + 28]
+    content[begin + 30 + name_bytes + extra_bytes] = 0xFF  # a block of a type that there is not
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"x\.npz: not arrays"):
+        dataset_from_npz(path)
 
 
 def test_arrays_too_large_are_refused_unread(tmp_path: Path, driven: Dataset) -> None:
@@ -164,6 +184,40 @@ def test_logs_and_arrays_come_together_in_order(
     assert samples.discretisation == PREDICTION
     assert np.array_equal(samples.dataset.x, np.vstack((driven.x, other.x)))
     assert len(read_samples(paths[1:]).dataset) == len(other)
+
+
+def test_a_step_in_single_precision_is_the_step_that_is_meant(
+    tmp_path: Path, driven: Dataset, other: Dataset
+) -> None:
+    paths = [write_log(tmp_path / "a.mcap", driven)]
+    paths.append(save(tmp_path / "b.npz", other, step_s=np.float32(STEP_S)))
+    assert len(read_samples(paths).dataset) == len(driven) + len(other)
+
+
+def test_a_damaged_file_is_told_as_such(tmp_path: Path) -> None:
+    """It does not name its car either, but that is not what is wrong with it."""
+    (tmp_path / "x.npz").write_bytes(b"PK, and no more")
+    with pytest.raises(InputError, match=r"x\.npz: not arrays"):
+        read_samples([tmp_path / "x.npz"])
+
+
+def test_the_plans_in_a_log_are_not_kept(tmp_path: Path, driven: Dataset) -> None:
+    """A log of an hour holds gigabytes of them, as Python's numbers."""
+    path, plan = write_log(tmp_path / "a.mcap", driven), (0.5,) * 147
+    log = LogWriter(tmp_path / "b.mcap")
+    for entry in LogReader(path).messages():
+        log.write(entry.key, encode(entry.message), 1, entry.message.seq)
+    for cycle in range(1000):
+        fallback = int(cycle in (3, 4))
+        message = replace(telemetry(0, cycle, fallback), plan_x=plan)
+        log.write("bayesrace/orca/telemetry", encode(message), 1, cycle)
+    log.close()
+    tracemalloc.start()
+    data = dataset_from_log(tmp_path / "b.mcap", CAR, STEP_S)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert dict(data.dropped) == {"fallback": 2}
+    assert peak < 0.5 * 1000 * len(plan) * (8 + sys.getsizeof(0.5))
 
 
 def test_a_car_under_another_name_is_known_by_its_log(

@@ -4,6 +4,7 @@ import io
 import json
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -212,6 +213,23 @@ def test_validate_refuses_in_one_line(
     error = capfd.readouterr().err.strip()
     assert len(error.splitlines()) == 1
     assert words in error
+
+
+@pytest.mark.parametrize("change", [{"alpha": 1e300}, {"alpha": 1e150}, {"noise_variance": 0.0}])
+def test_weights_that_predict_nothing_finite_are_refused(
+    files: Path, weights: GpWeights, driven: Dataset, change: dict[str, float]
+) -> None:
+    """Numbers that JSON does not have: huge corrections, or certainty where a sample was."""
+    vx, vy, omega = (
+        replace(
+            output,
+            **{name: value * np.sign(getattr(output, name)) for name, value in change.items()},
+        )
+        for output in weights.outputs
+    )
+    bad = replace(weights, outputs=(vx, vy, omega))
+    with pytest.raises(InputError, match="not finite"):
+        validate_weights(bad, [files / "driven.mcap"])
 
 
 # train -------------------------------------------------------------------------------------------

@@ -34,6 +34,7 @@ __all__ = [
     "MAX_POINTS",
     "OUTPUTS",
     "SCHEMA",
+    "UNITS",
     "GpOutput",
     "GpWeights",
     "decode_weights",
@@ -47,6 +48,9 @@ Floats = NDArray[np.float64]
 
 OUTPUTS: Final = ("vx", "vy", "omega")
 """State components that get a correction, in this order."""
+
+UNITS: Final = {"vx": "m/s", "vy": "m/s", "omega": "rad/s"}
+"""Of the correction per output, added once a step."""
 
 FEATURES: Final = ("vx", "vy", "omega", "delta", "d", "delta_rate")
 """What the correction depends on, in this order."""

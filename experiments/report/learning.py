@@ -1,7 +1,6 @@
 """What the GPs know, and how long the controller thinks."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,26 +10,16 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from numpy.typing import NDArray
 
-from bayesrace.gp.weights import OUTPUTS
+from bayesrace.gp.weights import OUTPUTS, UNITS
 from experiments.analysis import DrivenRun
-from experiments.report.style import INK, MUTED, WARNING, look
+from experiments.notation import SYMBOLS, UNCERTAIN
+from experiments.report.bands import band_patch, draw_band, mark_uncertain, uncertain_handle
+from experiments.report.style import INK, MUTED, PAGE_WIDTH, look
 from learning.validation import Validation
 
-__all__ = ["UNCERTAIN", "gp_figure", "solve_figure", "uncertain"]
+__all__ = ["gp_figure", "solve_figure"]
 
 Floats = NDArray[np.float64]
-
-UNCERTAIN: Final = 0.25
-"""The paper marks where the largest of the three standard deviations is above this."""
-
-_PAGE_WIDTH: Final = 11.2
-_NORMAL_95: Final = 1.959963984540054
-_UNITS: Final = {"vx": "m/s", "vy": "m/s", "omega": "rad/s"}
-
-
-def uncertain(validation: Validation) -> NDArray[np.bool_]:
-    """Which samples the paper would mark as uncertain, shape (n,)."""
-    return np.asarray(validation.sigma.max(axis=1) > UNCERTAIN)
 
 
 def gp_figure(validations: Mapping[str, Validation], distance_m: Floats, lap_m: float) -> Figure:
@@ -38,30 +27,22 @@ def gp_figure(validations: Mapping[str, Validation], distance_m: Floats, lap_m: 
 
     ``distance_m`` (n,): how far the car had come at each validated sample.
     """
-    figure = Figure(figsize=(_PAGE_WIDTH, 6.1))
+    figure = Figure(figsize=(PAGE_WIDTH, 6.1))
     grid = figure.subplots(len(OUTPUTS), len(validations), sharex=True, squeeze=False)
     shown = distance_m <= 3.02 * lap_m
     for column, (controller, validation) in enumerate(validations.items()):
-        marked = uncertain(validation)[shown]
+        marked = validation.uncertain(UNCERTAIN)[shown]
         for row, output in enumerate(OUTPUTS):
             axes = grid[row, column]
             _draw_error(axes, distance_m[shown], validation, row, shown)
-            axes.plot(
-                distance_m[shown][marked],
-                np.full(int(marked.sum()), 0.015),
-                "|",
-                color=WARNING,
-                markersize=5,
-                markeredgewidth=0.8,
-                transform=axes.get_xaxis_transform(),
-            )
+            mark_uncertain(axes, distance_m[shown], marked)
             metrics = validation.metrics[output]
             axes.set_title(_caption(output, metrics), fontsize=7.6, color=MUTED, loc="right")
             axes.set_ylim(*_limits(validation, row))
             if row == 0:
                 _draw_heading(axes, controller)
             if column == 0:
-                axes.set_ylabel(f"{'ω' if output == 'omega' else output} error [{_UNITS[output]}]")
+                axes.set_ylabel(f"{SYMBOLS[output]} error [{UNITS[output]}]")
     for axes in grid[-1]:
         axes.set_xlabel("distance driven by BestCase [m]")
         axes.set_xlim(0, float(distance_m[shown].max(initial=lap_m)))
@@ -88,22 +69,21 @@ def _draw_heading(axes: Axes, controller: str) -> None:
 def _draw_error(
     axes: Axes, distance_m: Floats, validation: Validation, row: int, shown: NDArray[np.bool_]
 ) -> None:
-    band = _NORMAL_95 * validation.sigma[shown, row]
-    axes.fill_between(distance_m, -band, band, color="#bcd7ea", linewidth=0, rasterized=True)
+    draw_band(axes, distance_m, 0.0, validation.band[shown, row])
     axes.plot(distance_m, validation.error[shown, row], color=INK, linewidth=0.7)
 
 
 def _limits(validation: Validation, row: int) -> tuple[float, float]:
     """Shows nearly all: single spikes would flatten everything else."""
     error = float(np.percentile(np.abs(validation.error[:, row]), 99.5))
-    band = _NORMAL_95 * float(np.percentile(validation.sigma[:, row], 99.5))
+    band = float(np.percentile(validation.band[:, row], 99.5))
     limit = 1.15 * max(error, band) or 1.0
     return -limit, limit
 
 
 def _caption(output: str, metrics: Mapping[str, float]) -> str:
     return (
-        f"RMSE {metrics['rmse']:.3g}, without GP {metrics['uncorrected_rmse']:.3g} {_UNITS[output]}"
+        f"RMSE {metrics['rmse']:.3g}, without GP {metrics['uncorrected_rmse']:.3g} {UNITS[output]}"
         f" · R² {metrics['r2']:.3f} · coverage {metrics['coverage']:.2f}"
     )
 
@@ -117,10 +97,8 @@ def _draw_lap_ends(panels: Iterable[Axes], distance_m: Floats, lap_m: float) -> 
 def _gp_marks() -> list[Line2D | Patch]:
     return [
         Line2D([], [], color=INK, linewidth=1, label="error left after the correction"),
-        Patch(color="#bcd7ea", label="95 % band predicted"),
-        Line2D(
-            [], [], color=WARNING, marker="|", linestyle="", label=f"largest sigma > {UNCERTAIN}"
-        ),
+        band_patch(),
+        uncertain_handle(UNCERTAIN),
     ]
 
 
@@ -128,7 +106,7 @@ def solve_figure(runs: Sequence[DrivenRun]) -> Figure:
     """Histogram of the step's execution time, one row a controller, logarithmic bins."""
     timed = [run for run in runs if len(run.record.solve_us)]
     height = 0.72 * len(timed) + 0.75
-    figure = Figure(figsize=(_PAGE_WIDTH, height))
+    figure = Figure(figsize=(PAGE_WIDTH, height))
     grid = figure.subplots(len(timed), 1, sharex=True, squeeze=False)[:, 0]
     all_us = np.concatenate([run.record.solve_us for run in timed])
     positive = np.maximum(all_us, 1e-3)

@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 from bayesrace.raceline import RaceLine
 from bayesrace.tracks import Track
 from experiments.analysis import DrivenRun
-from experiments.report.style import INK, MUTED, SURFACE, WARNING, look, speed_map
+from experiments.report.style import INK, MUTED, PAGE_WIDTH, SURFACE, WARNING, look, speed_map
 
-__all__ = ["laps_on_track"]
+__all__ = ["draw_edges", "laps_on_track"]
 
 Floats = NDArray[np.float64]
 
-_PAGE_WIDTH: Final = 11.2
 _MARGIN_M: Final = 0.12
 _MOST_SEGMENTS: Final = 1500
 
@@ -37,9 +36,9 @@ def laps_on_track(runs: Sequence[DrivenRun], track: Track, line: RaceLine) -> Fi
     low, high = edges.min(axis=0) - _MARGIN_M, edges.max(axis=0) + _MARGIN_M
     columns = 1 if len(runs) == 1 else 2
     rows = max(1, -(-len(runs) // columns))
-    panel_width = (_PAGE_WIDTH - 1.0) / columns
+    panel_width = (PAGE_WIDTH - 1.0) / columns
     panel_height = min(panel_width * float((high[1] - low[1]) / (high[0] - low[0])), 6.0)
-    figure = Figure(figsize=(_PAGE_WIDTH, rows * (panel_height + 0.42) + 0.35))
+    figure = Figure(figsize=(PAGE_WIDTH, rows * (panel_height + 0.42) + 0.35))
     grid = figure.subplots(rows, columns, squeeze=False)
     speed = Normalize(0.0, _top_speed(runs, line))
     for axes, run in zip(grid.flat, runs, strict=False):
@@ -62,12 +61,17 @@ def _top_speed(runs: Sequence[DrivenRun], line: RaceLine) -> float:
     return max([*speeds, float(line.vx_mps.max())])
 
 
-def _draw_track(axes: Axes, track: Track, line: RaceLine, right: Floats, left: Floats) -> None:
+def draw_edges(axes: Axes, right: Floats, left: Floats) -> None:
+    """The track as an area between its edges, each (n, 2)."""
     ring = np.concatenate([right, right[:1], left[:1], left[::-1]])
     axes.fill(ring[:, 0], ring[:, 1], color=SURFACE, linewidth=0)
     for edge in (right, left):
         closed = np.concatenate([edge, edge[:1]])
         axes.plot(closed[:, 0], closed[:, 1], color="#a3a39b", linewidth=0.7)
+
+
+def _draw_track(axes: Axes, track: Track, line: RaceLine, right: Floats, left: Floats) -> None:
+    draw_edges(axes, right, left)
     path = np.concatenate([line.xy_m, line.xy_m[:1]])
     thin = path[:: max(1, len(path) // 600)]
     axes.plot(thin[:, 0], thin[:, 1], color=INK, linewidth=0.5, linestyle=(0, (5, 3)))

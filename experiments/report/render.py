@@ -13,9 +13,10 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from bayesrace.vehicles import get_car
 from experiments.analysis import RaceAnalysis, read_race
+from experiments.notation import UNCERTAIN
 from experiments.published import LIMIT, SOURCE, compare_gp, compare_laps
 from experiments.report.canvas import inline_svg, write_png
-from experiments.report.learning import UNCERTAIN, gp_figure, solve_figure, uncertain
+from experiments.report.learning import gp_figure, solve_figure
 from experiments.report.maps import laps_on_track
 from experiments.report.style import figure_style, look
 from experiments.report.traces import deviation_figure, inputs_figure, speed_figure
@@ -157,7 +158,7 @@ def _compilers(run_dir: Path) -> list[tuple[str, str]]:
 def _uncertain(analysis: RaceAnalysis) -> list[tuple[str, int, int]]:
     """(name of the controller, samples with a large sigma, all samples) for each GP."""
     return [
-        (look(controller).name, int(uncertain(validation).sum()), len(validation.sigma))
+        (look(controller).name, int(validation.uncertain(UNCERTAIN).sum()), len(validation.sigma))
         for controller, validation in analysis.validations.items()
     ]
 

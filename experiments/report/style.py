@@ -7,12 +7,25 @@ from typing import Any, Final, NamedTuple, cast
 import matplotlib as mpl
 from matplotlib.colors import Colormap, LinearSegmentedColormap
 
-__all__ = ["INK", "MUTED", "SURFACE", "WARNING", "Look", "figure_style", "look", "speed_map"]
+__all__ = [
+    "INK",
+    "MUTED",
+    "PAGE_WIDTH",
+    "SURFACE",
+    "WARNING",
+    "Look",
+    "figure_style",
+    "look",
+    "speed_map",
+]
 
 INK: Final = "#1c1c1a"
 MUTED: Final = "#75756f"
 SURFACE: Final = "#e7e7e2"
 WARNING: Final = "#c8102e"
+
+PAGE_WIDTH: Final = 11.2
+"""Of a figure over the whole page [inch]."""
 
 
 class Look(NamedTuple):

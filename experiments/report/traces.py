@@ -13,13 +13,12 @@ from bayesrace.raceline import RaceLine
 from bayesrace.tracks import Track
 from bayesrace.vehicles import CarParameters
 from experiments.analysis import DrivenRun
-from experiments.report.style import INK, MUTED, look
+from experiments.report.style import INK, MUTED, PAGE_WIDTH, look
 
 __all__ = ["deviation_figure", "inputs_figure", "speed_figure"]
 
 Floats = NDArray[np.float64]
 
-_PAGE_WIDTH: Final = 11.2
 _LEAP_M: Final = 1.0
 
 
@@ -67,7 +66,7 @@ def _flying_laps(runs: Sequence[DrivenRun], track: Track) -> list[_Lap]:
 
 def _figure(heights: Sequence[float], track: Track) -> tuple[Figure, list[Axes]]:
     total = sum(heights) + 0.45 * len(heights) + 0.4
-    figure = Figure(figsize=(_PAGE_WIDTH, total))
+    figure = Figure(figsize=(PAGE_WIDTH, total))
     grid = figure.subplots(
         len(heights), 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": heights}
     )

@@ -1,23 +1,18 @@
 """Held-out error against the smoothness of the kernel: the figure of the paper's appendix."""
 
 from collections.abc import Sequence
-from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from bayesrace.gp.weights import OUTPUTS
+from bayesrace.gp.weights import OUTPUTS, UNITS
+from experiments.notation import SMOOTHNESS, SYMBOLS
 from experiments.report.style import INK, MUTED, WARNING
 from learning.assessment import KernelScore
 
-__all__ = ["SMOOTHNESS", "kernel_figure"]
-
-SMOOTHNESS: Final = {"matern05": "1/2", "matern15": "3/2", "matern25": "5/2", "rbf": "∞"}
-"""Kernels from rough to smooth, and their nu."""
-
-_UNITS: Final = {"vx": "m/s", "vy": "m/s", "omega": "rad/s"}
+__all__ = ["kernel_figure"]
 
 
 def kernel_figure(scores: Sequence[KernelScore]) -> Figure:
@@ -29,10 +24,10 @@ def kernel_figure(scores: Sequence[KernelScore]) -> Figure:
             (score for score in scores if score.output == output),
             key=lambda score: list(SMOOTHNESS).index(score.kernel),
         )
-        name = "ω" if output == "omega" else output
+        name = SYMBOLS[output]
         above, below = grid[:, column]
         _draw(above, own, [score.rmse for score in own])
-        above.set_title(f"{name} RMSE [{_UNITS[output]}]")
+        above.set_title(f"{name} RMSE [{UNITS[output]}]")
         above.set_ylim(bottom=0)
         _draw(below, own, [score.log_density for score in own])
         below.set_title(f"{name} log density")
@@ -41,7 +36,8 @@ def kernel_figure(scores: Sequence[KernelScore]) -> Figure:
     chosen = Line2D(
         [], [], marker="o", linestyle="", color=WARNING, label="chosen: largest log density"
     )
-    held = Line2D([], [], marker="o", color=INK, linewidth=1, label="held out, by stretches")
+    label = "held out, by parts of the drive"
+    held = Line2D([], [], marker="o", color=INK, linewidth=1, label=label)
     figure.legend(handles=[held, chosen], loc="upper center", ncols=2)
     return figure
 

@@ -10,9 +10,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from bayesrace.gp.weights import OUTPUTS
+from bayesrace.gp.weights import OUTPUTS, UNITS
 from bayesrace.tracks import Track
-from experiments.report.style import INK, MUTED, SURFACE, WARNING
+from experiments.notation import SYMBOLS
+from experiments.report.bands import band_patch, draw_band, mark_uncertain, uncertain_handle
+from experiments.report.maps import draw_edges
+from experiments.report.style import INK, MUTED, PAGE_WIDTH, WARNING
 from learning.dataset import Dataset
 from learning.horizon import unbroken
 from learning.validation import Validation
@@ -21,10 +24,7 @@ __all__ = ["band_figure", "track_figure"]
 
 Floats = NDArray[np.float64]
 
-_WIDTH: Final = 11.2
-_NORMAL_95: Final = 1.959963984540054
-_UNITS: Final = {"vx": "m/s", "vy": "m/s", "omega": "rad/s"}
-_BAND, _MEAN = "#bcd7ea", "#0072B2"
+_MEAN: Final = "#0072B2"
 _MARGIN_M: Final = 0.12
 
 
@@ -33,35 +33,26 @@ def band_figure(validation: Validation, step_s: float, threshold: float) -> Figu
 
     Right, what the correction leaves, at its own scale. Marks below: largest sigma > ``threshold``.
     """
-    figure = Figure(figsize=(_WIDTH, 6.4))
+    figure = Figure(figsize=(PAGE_WIDTH, 6.4))
     grid = figure.subplots(len(OUTPUTS), 2, sharex=True, squeeze=False)
     time_s: Floats = np.arange(len(validation.sigma), dtype=np.float64) * step_s
-    marked = validation.sigma.max(axis=1) > threshold
+    marked = validation.uncertain(threshold)
     nothing = np.zeros(len(time_s))
     for row, output in enumerate(OUTPUTS):
-        mean, sigma = validation.mean[:, row], validation.sigma[:, row]
+        mean, half = validation.mean[:, row], validation.band[:, row]
         before, after = grid[row]
-        _draw(before, time_s, validation.residual[:, row], mean, sigma)
-        _draw(after, time_s, validation.error[:, row], nothing, sigma)
+        _draw(before, time_s, validation.residual[:, row], mean, half)
+        _draw(after, time_s, validation.error[:, row], nothing, half)
         for axes in (before, after):
-            axes.plot(
-                time_s[marked],
-                np.full(int(marked.sum()), 0.015),
-                "|",
-                color=WARNING,
-                markersize=5,
-                markeredgewidth=0.8,
-                transform=axes.get_xaxis_transform(),
-            )
-        name = "ω" if output == "omega" else output
-        before.set_ylabel(f"{name} error [{_UNITS[output]}]")
+            mark_uncertain(axes, time_s, marked)
+        before.set_ylabel(f"{SYMBOLS[output]} error [{UNITS[output]}]")
         metrics = validation.metrics[output]
         before.set_title(
-            f"RMSE without GP {metrics['uncorrected_rmse']:.3g} {_UNITS[output]}",
+            f"RMSE without GP {metrics['uncorrected_rmse']:.3g} {UNITS[output]}",
             fontsize=7.6, color=MUTED, loc="right",
         )  # fmt: skip
         after.set_title(
-            f"RMSE {metrics['rmse']:.3g} {_UNITS[output]} · R² {metrics['r2']:.4f}"
+            f"RMSE {metrics['rmse']:.3g} {UNITS[output]} · R² {metrics['r2']:.4f}"
             f" · coverage {metrics['coverage']:.2f}",
             fontsize=7.6, color=MUTED, loc="right",
         )  # fmt: skip
@@ -76,14 +67,13 @@ def band_figure(validation: Validation, step_s: float, threshold: float) -> Figu
     return figure
 
 
-def _draw(axes: Axes, time_s: Floats, error: Floats, mean: Floats, sigma: Floats) -> None:
+def _draw(axes: Axes, time_s: Floats, error: Floats, mean: Floats, half: Floats) -> None:
     """Error, prediction and its band; where the band is widest it may leave the picture."""
-    band = _NORMAL_95 * sigma
-    axes.fill_between(time_s, mean - band, mean + band, color=_BAND, linewidth=0, rasterized=True)
+    draw_band(axes, time_s, mean, half)
     axes.plot(time_s, mean, color=_MEAN, linewidth=0.9)
     axes.plot(time_s, error, color=INK, linewidth=0.7)
-    low = min(float(error.min()), float(np.percentile(mean - band, 1)))
-    high = max(float(error.max()), float(np.percentile(mean + band, 99)))
+    low = min(float(error.min()), float(np.percentile(mean - half, 1)))
+    high = max(float(error.max()), float(np.percentile(mean + half, 99)))
     room = 0.08 * (high - low) or 1.0
     axes.set_ylim(low - room, high + room)
 
@@ -92,10 +82,8 @@ def _marks(threshold: float) -> list[Line2D | Patch]:
     return [
         Line2D([], [], color=INK, linewidth=1, label="driven minus predicted"),
         Line2D([], [], color=_MEAN, linewidth=1, label="the GP's mean"),
-        Patch(color=_BAND, label="95 % band predicted"),
-        Line2D(
-            [], [], color=WARNING, marker="|", linestyle="", label=f"largest sigma > {threshold:g}"
-        ),
+        band_patch(),
+        uncertain_handle(threshold),
     ]
 
 
@@ -105,17 +93,13 @@ def track_figure(
     """Where the car was, in red where the largest sigma is above ``threshold`` (paper's figure)."""
     xy = dataset.x[:, :2]
     corners = xy
-    figure = Figure(figsize=(_WIDTH * 0.72, 6.4))
+    figure = Figure(figsize=(PAGE_WIDTH * 0.72, 6.4))
     axes = figure.subplots()
     if track is not None:
         right, left = track.boundaries(0.04)
         corners = np.concatenate([xy, right, left])
-        ring = np.concatenate([right, right[:1], left[:1], left[::-1]])
-        axes.fill(ring[:, 0], ring[:, 1], color=SURFACE, linewidth=0)
-        for edge in (right, left):
-            closed = np.concatenate([edge, edge[:1]])
-            axes.plot(closed[:, 0], closed[:, 1], color="#a3a39b", linewidth=0.7)
-    uncertain = validation.sigma.max(axis=1) > threshold
+        draw_edges(axes, right, left)
+    uncertain = validation.uncertain(threshold)
     segments = np.stack([xy, dataset.x_next[:, :2]], axis=1)
     for rows, colour, width, order in (
         (~uncertain, INK, 1.0, 3),

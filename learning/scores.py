@@ -1,0 +1,76 @@
+"""How good predictions with an uncertainty are: the numbers that training and validation tell.
+
+A prediction of one output is a mean and a standard deviation sigma, with the learned noise in it.
+With error = truth - mean, over n samples
+
+    RMSE                     sqrt(mean(error^2))
+    R^2                      1 - sum(error^2) / sum((truth - mean(truth))^2)
+    coverage                 share of |error| <= 1.96 sigma, the 95 % interval
+    log predictive density   mean of log N(error; 0, sigma^2)
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["NORMAL_95", "PredictionErrors"]
+
+Floats = NDArray[np.float64]
+
+NORMAL_95: Final = 1.959963984540054
+"""Half the width of the 95 % interval, in standard deviations."""
+
+
+@dataclass(frozen=True, eq=False)
+class PredictionErrors:
+    """Errors and predictive standard deviations of one output, each (n,), in the same unit."""
+
+    error: Floats
+    sigma: Floats
+
+    @property
+    def rmse(self) -> float:
+        """Root mean square error."""
+        return float(np.sqrt(np.mean(self.error**2)))
+
+    @property
+    def coverage(self) -> float:
+        """Share of errors within the 95 % interval."""
+        return float(np.mean(np.abs(self.error) <= NORMAL_95 * self.sigma))
+
+    @property
+    def log_density(self) -> float:
+        """Mean log predictive density per sample."""
+        score = (self.error / self.sigma) ** 2 + np.log(2 * np.pi * self.sigma**2)
+        return float(-0.5 * score.mean())
+
+    @property
+    def variance_scale(self) -> float:
+        """Factor on all variances that makes the 95 % interval hold 95 % of the errors; at least 1.
+
+        An interval that holds more is left alone: 20 errors say little about the one outside.
+        """
+        ratio = np.quantile(np.abs(self.error) / self.sigma, 0.95) / NORMAL_95
+        return max(1.0, float(ratio**2))
+
+    def r2(self, truth: Floats) -> float:
+        """Share of the variance of ``truth`` (n,) that is predicted; 0 where it has none."""
+        spread = float(np.sum((truth - truth.mean()) ** 2))
+        return 1.0 - float(np.sum(self.error**2)) / spread if spread > 0 else 0.0
+
+    def metrics(self, truth: Floats, offset: float = 0.0, scale: float = 1.0) -> dict[str, float]:
+        """All scores, and the RMSE that predicting zero would have (``uncorrected_rmse``).
+
+        ``truth`` (n,), like errors and sigmas, may be in scaled units: what was measured is
+        ``offset + scale * truth``, and the scores are in its unit.
+        """
+        return {
+            "rmse": self.rmse * scale,
+            "uncorrected_rmse": float(np.sqrt(np.mean((offset + scale * truth) ** 2))),
+            "r2": self.r2(truth),
+            "coverage": self.coverage,
+            "log_density": self.log_density - math.log(scale),
+        }
