@@ -1,16 +1,42 @@
-"""Ctrl-C that is never lost, whatever library it strikes in."""
+"""Signals: as items of a thread's queue, or as a Ctrl-C that is never lost, wherever it strikes."""
 
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-__all__ = ["deferred_interrupt", "raise_if_interrupted", "remembering_interrupts"]
+__all__ = [
+    "catching_signals",
+    "deferred_interrupt",
+    "raise_if_interrupted",
+    "remembering_interrupts",
+]
 
 _pending = threading.Event()
+
+
+@contextmanager
+def catching_signals(arrived: Callable[[int], None]) -> Iterator[None]:
+    """For the block, SIGINT and SIGTERM are only told, by number. Nothing off the main thread.
+
+    ``arrived`` runs in the signal handler, between any two instructions of the main thread: let it
+    put the signal into a :class:`queue.SimpleQueue`, whose ``put`` may interrupt itself.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {
+        one: signal.signal(one, lambda number, _frame: arrived(number))
+        for one in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextmanager

@@ -40,6 +40,14 @@ class Manifest(BaseModel):
     build_hash: str = Field(description="hash of everything that shaped the artefact")
     library_sha256: str
 
+    def check_points(self, points: int) -> None:
+        """InputError if GPs of so many points do not fit into this controller."""
+        if points > self.gp_capacity:
+            raise InputError(
+                f"--points {points} are more than this controller has room for "
+                f"({self.gp_capacity}); give fewer, or build one with --gp-capacity"
+            )
+
 
 def read_manifest(artefact: Path) -> Manifest:
     """Manifest of the artefact folder; InputError if it is not one or belongs to another ABI."""

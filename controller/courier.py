@@ -5,24 +5,23 @@ decodes and checks, the compiled code copies, both without the interpreter's loc
 thread, which shares that lock, is not held up.
 """
 
-import contextlib
 import logging
-import os
 import select
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
-from bayesrace.errors import InputError
-from bayesrace.messages import ACCEPTED, ROLLBACK, WEIGHTS, Reply, Scalar
-from bayesrace.transport import Request, declare_service, decode_request
+from bayesrace.messages import ACCEPTED, ROLLBACK, WEIGHTS, Scalar
+from bayesrace.transport import Request, decode_request, fetch_all
 from controller.gate.link import Link
 from controller.gate.memory import Memory
 from controller.gate.settings import GateSettings
-from controller.latecomer import Latecomer
+from controller.gate.supervisor import Supervisor
+from controller.latecomer import Latecomer, encode_answer
 from controller.ledger import Job, Ledger
+from controller.offers import Offers
+from controller.requests import RequestQueue, reply
 from controller.takeover import Offer, Takeover, WeightsPort
 
 __all__ = ["Courier"]
@@ -32,20 +31,12 @@ _log = logging.getLogger("bayesrace.controller")
 _TAKE_S: Final = 5.0
 """The control loop, driving or idle, takes over within a cycle or a heartbeat; this is a stall."""
 
+_KEEP_S: Final = 10.0
+"""Within which what has been taken over is kept, by the next gatekeeper if need be."""
+
 _OFFERED_MS: Final = 5
 """How often the thread looks whether an offer has been taken: the control thread wakes nobody."""
 _HURRY_MS: Final = 200
-
-_START_S: Final = 15.0
-"""Until then a gatekeeper is there or something is wrong."""
-
-_RESTART_S: Final = 1.0
-_LONGEST_PAUSE_S: Final = 30.0
-"""From an end to the next start, doubled for each that ends before it was ready: one that cannot
-start must not keep a CPU busy beside the control loop."""
-
-_MOST_REQUESTS: Final = 32
-"""That wait; each may hold a file."""
 
 _FILE_BYTES: Final = 100_000
 """Of a weights file, beyond its arrays."""
@@ -66,51 +57,45 @@ class Courier:
         adopt: Callable[[str], None],
         announce: Announce,
     ) -> None:
-        self._session, self._name, self._port, self._settings = session, name, port, settings
-        self._announce = announce
-        manifest = port.step.manifest
-        self._memory = Memory(manifest.gp_capacity)
-        self._woken, self._wake = os.pipe()
-        os.set_blocking(self._woken, False)
-        os.set_blocking(self._wake, False)
-        self.takeover = Takeover(self._memory, adopt)
+        self._port, self._settings, self._announce = port, settings, announce
+        capacity = port.step.manifest.gp_capacity
+        memory = self._memory = Memory(capacity)
+        self.takeover = Takeover(memory, adopt)
         self.takeover.watching = not port.history[-1].proven
-        self.text = ""
-        """What there is to say about weights; empty while all is well."""
-        self.counters: dict[str, int] = {
-            "weights_taken": 0, "weights_refused": 0, "weights_rolled_back": 0,
-            "gatekeeper_starts": 0,
-        }  # fmt: skip
-        self._link: Link | None = None
-        self._started_s = self._ended_s = 0.0
-        self._pause_s = _RESTART_S
-        self._requests: deque[Request] = deque()
+        self._keeper = Supervisor(self._start_gatekeeper, lambda: memory.alive_s, settings.hang_s)
+        self._trouble = ""
+        """With weights, apart from a gatekeeper that is gone; until the next are kept."""
         self._job: Job | None = None
         self._watched_from = 0
         self._ledger = Ledger(port)
         self._facts: Mapping[str, Scalar] = {}
         """Why the watch goes back."""
-        self._offered = 0
-        """Offers of which it is not known yet what has become."""
-        fresh = len(port.history) == 1 and not port.history[0].data
-        self._latecomer = Latecomer(session, name, fresh)
+        self._offers = Offers(port, memory, self.takeover)
         self._stopping = False
-        most = 3 * 8 * 7 * (manifest.gp_capacity + 1) + _FILE_BYTES
-        self._most_bytes = most
-        self._declared = [
-            declare_service(session, service, name, self._arrive, most)
-            for service in (WEIGHTS, ROLLBACK, ACCEPTED)
-        ]
+        self._most_bytes = 3 * 8 * 7 * (capacity + 1) + _FILE_BYTES
+        fresh = len(port.history) == 1 and not port.history[0].data
+        self._latecomer = Latecomer(
+            lambda: fetch_all(session, ACCEPTED, name), self._most_bytes, fresh
+        )
+        services = (WEIGHTS, ROLLBACK, ACCEPTED)
+        self._requests = RequestQueue(session, name, services, self._most_bytes)
         self._thread = threading.Thread(target=self._run, name="courier")
+
+    @property
+    def text(self) -> str:
+        """What there is to say about weights; empty while all is well."""
+        return "; ".join(filter(None, (self._keeper.text, self._trouble)))
 
     def status(self) -> dict[str, Scalar]:
         """What has happened, by name."""
         takeover = self.takeover
         return {
-            **self.counters,
+            **self._ledger.counts,
             "weights_number": self._ledger.newest.number,
             "weights_watched": not self._ledger.newest.proven,
+            "answers_ignored": self._latecomer.ignored,
             "gatekeeper": takeover.gatekeeper,
+            "gatekeeper_starts": self._keeper.starts,
             "takeover_us": takeover.taken_us,
             "takeover_longest_us": takeover.longest_us,
             "watch_missed": takeover.unwatched,
@@ -118,30 +103,17 @@ class Courier:
 
     def start(self) -> None:
         """Before the control thread gets its priority and its CPU, which are not for this one."""
-        self._spawn()
+        self._look_after_gatekeeper()
         self._thread.start()
 
     def stop(self) -> None:
         """Refuses what is not answered, and ends thread and gatekeeper."""
         self._stopping = True
-        self._rouse()
+        self._requests.wake()
         self._thread.join()
-        if self._link is not None:
-            self._link.close()
+        self._keeper.close()
 
     # The thread ----------------------------------------------------------------------------------
-
-    def _arrive(self, request: Request) -> None:
-        """In the transport's thread."""
-        if len(self._requests) >= _MOST_REQUESTS:
-            self._reply(request, False, f"{_MOST_REQUESTS} requests wait already: try later", {})
-            return
-        self._requests.append(request)
-        self._rouse()
-
-    def _rouse(self) -> None:
-        with contextlib.suppress(BlockingIOError):  # full of wake-ups
-            os.write(self._wake, b"\0")
 
     def _run(self) -> None:
         while not self._stopping:
@@ -150,86 +122,73 @@ class Courier:
             except Exception:
                 # Without this thread nobody could send weights, and bad ones would not be given up.
                 _log.exception("weights: a fault of the controller's own")
+                self._keeper.lose("was ended after a fault of the controller's own")
                 self._bereaved()
-        for request in [*self._requests, *([self._job.request] if self._job else [])]:
-            if request is not None:
-                self._reply(request, False, "the controller ends", {})
+        why_not = "the controller ends"
+        self._settled(why_not)
+        self._refuse(why_not, {})
+        while (request := self._requests.pop()) is not None:
+            reply(request, False, why_not, {})
 
     def _turn(self) -> None:
         """Waits, and does what there is to do."""
         self._wait()
-        while self.takeover.taken:
-            self._taken(self.takeover.taken.popleft())
+        while (offer := self._offers.taken()) is not None:
+            self._taken(offer)
+        self._look_after_gatekeeper()
         self._expire()
-        while self._requests and self._job is None and not self._stopping:
-            if not self._begin(self._requests[0]):
+        while self._job is None and (request := self._requests.pop()) is not None:
+            if not self._begin(request):
+                self._requests.put_back(request)
                 break
-            self._requests.popleft()
         if self._latecomer.asking:
             self._ask_others()
 
     def _wait(self) -> None:
         """Until something has happened, or may have to be done; reads what the gatekeeper says."""
         poll = select.poll()
-        poll.register(self._woken, select.POLLIN)
-        if self._link is not None:
-            poll.register(self._link.fileno(), select.POLLIN)
-        idle = self._job is None and self._link is not None and not self._latecomer.asking
-        hurry = not idle or not self.takeover.gatekeeper
-        patience_ms = _OFFERED_MS if self._offered else _HURRY_MS if hurry else None
-        for fd, _ in poll.poll(patience_ms):
-            if fd == self._woken:
-                with contextlib.suppress(BlockingIOError):
-                    os.read(self._woken, 4096)
-            elif self._link is not None:
+        poll.register(self._requests, select.POLLIN)
+        if (gatekeeper := self._keeper.fileno()) is not None:
+            poll.register(gatekeeper, select.POLLIN)
+        patience_ms = self._keeper.patience_s * 1e3
+        if self._job is not None or self._latecomer.asking:
+            patience_ms = min(patience_ms, _HURRY_MS)
+        for fd, _ in poll.poll(_OFFERED_MS if self._offers.under_way else patience_ms):
+            if fd == self._requests.fileno():
+                self._requests.hear()
+            else:
                 self._hear()
 
     def _expire(self) -> None:
-        now_s, job = time.monotonic(), self._job
-        if self._link is None:
-            # What is offered has to be settled first: the next one is told where things stand.
-            if not self._offered and now_s - self._ended_s > self._pause_s:
-                self._spawn()
-        elif not self.takeover.gatekeeper and now_s - self._started_s > _START_S:
-            self._bereaved()
-        if job is None or now_s < job.until_s:
+        """Answers for what the control loop, or the gatekeeper, has not done in time."""
+        job = self._job
+        if job is None or job.offer is None or time.monotonic() < job.until_s:
             return
         if job.answer:
-            self._settled()
+            self._settled(f"the gatekeeper did not do so within {_KEEP_S:g} s")
             return
-        if job.offer is None:  # it hangs: what it would say later is for a request long answered
-            self._bereaved()
-            return
-        with contextlib.suppress(ValueError):  # taken at this moment: then it counts
-            self.takeover.offers.remove(job.offer)
-            self._offered -= 1
-            self._tell("dropped")
+        if self._offers.withdraw(job.offer):
+            self._keeper.tell("dropped")
             self._refuse(f"the control loop did not take over within {_TAKE_S:g} s", {})
 
     # The gatekeeper ------------------------------------------------------------------------------
 
-    def _spawn(self) -> None:
-        """Starts the gatekeeper and tells it where things stand."""
-        self._started_s = time.monotonic()
-        try:
-            self._link = Link(self._memory)
-        except (InputError, OSError) as error:
-            self._pause()
-            self._say("gatekeeper_ended", f"the gatekeeper cannot be started: {error}")
-            return
-        self.counters["gatekeeper_starts"] += 1
-        port = self._port
-        self._link.begin(
+    def _start_gatekeeper(self) -> Link:
+        """Starts one and tells it where things stand; OSError if the system does not."""
+        link, port = Link(self._memory), self._port
+        link.begin(
             self._settings, port.artefact, port.step.manifest, port.history, port.next_number,
             port.withdrawn, port.store, self._watched_from,
         )  # fmt: skip
+        return link
 
-    def _tell(self, kind: str, payload: bytes = b"", **fields: Any) -> None:
-        if self._link is not None:
-            self._link.tell(kind, payload, **fields)
+    def _look_after_gatekeeper(self) -> None:
+        # What is offered has to be settled first: the next one is told where things stand.
+        if not self._keeper.look(may_start=not self._offers.under_way):
+            self._bereaved()
 
     def _hear(self) -> None:
-        heard = None if self._link is None else self._link.hear()
+        heard = self._keeper.hear()
         if heard is None:
             self._bereaved()
             return
@@ -237,8 +196,6 @@ class Courier:
         match fields["kind"]:
             case "ready":
                 self.takeover.gatekeeper = True
-                self._pause_s = _RESTART_S
-                self.text = ""
             case "refused":
                 self._refuse(fields["text"], fields["data"])
             case "offer":
@@ -246,53 +203,37 @@ class Courier:
             case "give_up":
                 self._give_up(fields)
             case "settled":
-                self._settled()
+                self._kept(fields["why_not"])
             case "proven":
                 if news := self._ledger.prove(int(fields["number"])):
                     self._announce("weights_proven", *news)
-            case "complaint":
-                self._say("weights_not_kept", fields["text"])
 
     def _bereaved(self) -> None:
         """The gatekeeper is gone; the car is driven on with what is in use."""
-        if not self.takeover.gatekeeper:
-            self._pause_s = min(2 * self._pause_s, _LONGEST_PAUSE_S)
-        self._pause()
         self.takeover.gatekeeper = False
-        if self._link is not None:
-            self._link.close()
-            self._link = None
-        self._say(
-            "gatekeeper_ended",
-            "the gatekeeper ended or hung (killed, or by a fault): weights in use stay and are not "
-            "watched until it is there again",
-        )
-        if self._job is not None and self._job.answer:
-            self._settled()
-        elif self._job is not None and self._job.offer is None:
-            self._refuse(f"{self.text}; send them again in a moment", {})
-
-    def _pause(self) -> None:
-        self._ended_s = time.monotonic()
-
-    def _say(self, kind: str, text: str) -> None:
-        self.text = text
+        text = self._keeper.text
         _log.warning("%s", text)
-        self._announce(kind, text, {})
+        self._announce("gatekeeper_ended", text, {})
+        if self._job is not None and self._job.offer is None:
+            self._refuse(f"{text}; send them again in a moment", {})
+        self._settle_unkept()
+
+    def _settle_unkept(self) -> None:
+        """Without a store nobody has to be waited for; else the next gatekeeper keeps it first."""
+        if self._port.store is None and not self.takeover.gatekeeper:
+            self._settled()
 
     # Requests ------------------------------------------------------------------------------------
 
     def _begin(self, request: Request) -> bool:
         """Starts on a request; False if it has to wait for the gatekeeper, which is starting."""
         if request.service is ACCEPTED:
-            newest = self._ledger.newest
-            request.answer_raw(newest.data if newest.number else b"")
+            request.answer_raw(encode_answer(self._ledger.newest, self._port.withdrawn))
             return True
         if not self.takeover.gatekeeper:
-            if time.monotonic() - self._started_s < _START_S and not self.text:
+            if not self._keeper.text:
                 return False
-            text = self.text or f"the gatekeeper has not started within {_START_S:g} s"
-            self._refused(request, f"{text}; send them again in a moment", {})
+            self._refused(request, f"{self._keeper.text}; send them again in a moment", {})
             return True
         if request.service is ROLLBACK:
             self._begin_rollback(request)
@@ -301,29 +242,30 @@ class Courier:
                 request, f"{request.size} bytes are more than any weights that would fit", {}
             )
         else:
-            self._begin_check(request.payload, request)
+            self._begin_check(Job("weights", request.payload, request))
         return True
 
-    def _begin_check(self, data: bytes, request: Request | None, why: str = "") -> None:
-        self._job = Job("weights", data, request, why, time.monotonic() + _START_S)
-        self._tell("check", data, number=self._port.next_number)
+    def _begin_check(self, job: Job) -> None:
+        self._job = job
+        self._keeper.tell("check", job.data, number=self._port.next_number)
 
     def _begin_rollback(self, request: Request) -> None:
         message, why_not = decode_request(request)
         if message is not None and self._ledger.before is None:
             why_not = "there are no weights before those in use"
         if why_not:
-            self._reply(request, False, why_not, {})
+            reply(request, False, why_not, {})
             return
-        until_s = time.monotonic() + _START_S
-        self._job = Job("previous", b"", request, message.text, until_s)
-        self._tell("previous", number=self._ledger.newest.number)
+        self._job = Job("previous", b"", request, message.text)
+        self._keeper.tell("previous", number=self._ledger.newest.number)
 
     def _ask_others(self) -> None:
-        if self._ledger.before is not None:
-            self._latecomer.stop()
-        elif self._job is None and self.takeover.gatekeeper and (data := self._latecomer.ask()):
-            self._begin_check(data, None, "from another controller of this car")
+        if self._job is not None or not self.takeover.gatekeeper:
+            return
+        found = self._latecomer.next(self._ledger.newest)
+        if found is not None:
+            why = "from another controller of this car"
+            self._begin_check(Job("weights", found.data, None, why, found.accepted_utc_ns))
 
     def _refuse(self, text: str, data: Mapping[str, Scalar]) -> None:
         job, self._job = self._job, None
@@ -331,96 +273,91 @@ class Courier:
             return
         if job.kind == "previous":
             if job.request is not None:
-                self._reply(job.request, False, text, data)
+                reply(job.request, False, text, data)
             return
         self._refused(job.request, text, data)
 
     def _refused(self, request: Request | None, text: str, data: Mapping[str, Scalar]) -> None:
-        self.counters["weights_refused"] += 1
+        self._ledger.counts["weights_refused"] += 1
         if request is not None:
-            self._reply(request, False, text, data)
+            reply(request, False, text, data)
         self._announce("weights_refused", text, data)
-
-    @staticmethod
-    def _reply(request: Request, accepted: bool, text: str, data: Mapping[str, Scalar]) -> None:
-        request.answer(Reply(0, time.monotonic_ns(), accepted, text[:2000], dict(data)))
 
     # Takeover ------------------------------------------------------------------------------------
 
-    def _stage(self, offer: Offer) -> str:
-        """Lays the weights in shared memory beside those in use, and offers them; "" or why not."""
-        try:
-            self._port.step.stage_weights(self._memory.outputs())
-        except InputError as error:
-            self._tell("dropped")
-            return str(error)
-        self._offered += 1
-        self.takeover.offers.append(offer)
-        return ""
-
     def _offer(self, fields: Mapping[str, Any]) -> None:
-        job, before = self._job, self._ledger.before
-        if job is None:  # has been refused meanwhile: it took too long
-            self._tell("dropped")
+        """What the request under way asks for has passed the gate."""
+        job, facts = self._job, fields["data"]
+        watch = self._settings.watch_s > 0
+        offer = None if job is None else self._ledger.offer(job, facts, fields["text"], watch)
+        if job is None or offer is None:
+            self._keeper.tell("dropped")
+            self._refuse("there are no weights before those in use any more", {})
             return
-        if job.kind == "previous":
-            if before is None:
-                self._tell("dropped")
-                self._refuse("there are no weights before those in use any more", {})
-                return
-            offer = Offer(before.version, before.number, "previous", not before.proven)
-        else:
-            version, watched = str(fields["data"]["version"]), self._settings.watch_s > 0
-            number = self._port.next_number
-            offer = Offer(version, number, "weights", watched, fields["text"])
-        job.facts, job.offer = fields["data"], offer
+        job.facts, job.offer = facts, offer
         job.until_s = time.monotonic() + _TAKE_S
-        why_not = self._stage(offer)
-        if why_not:
+        if why_not := self._offers.put(offer):
+            self._keeper.tell("dropped")
             self._refuse(why_not, {})
 
     def _give_up(self, fields: Mapping[str, Any]) -> None:
-        old = self._ledger.named(int(fields["number"]))
-        offer = Offer(old.version, old.number, "give_up", watched=False, text=fields["text"])
+        """The watch wants to go back, whatever is under way."""
         self._facts = fields["data"]
-        why_not = self._stage(offer)
-        if why_not:
-            self._say("weights_refused", f"going back is not possible: {why_not}")
+        if why_not := self._offers.put(self._ledger.offer_back(fields["number"], fields["text"])):
+            self._keeper.tell("dropped")
+            self._complain("weights_refused", f"going back is not possible: {why_not}")
 
     def _taken(self, offer: Offer) -> None:
         """The control thread has taken over: the gatekeeper is told, and whoever waits."""
         job = self._job
-        self._offered -= 1
         if offer.cycle < 0:
-            self._tell("dropped")
+            self._keeper.tell("dropped")
             if offer.kind == "give_up":
-                self._say("weights_refused", f"going back was not possible: {offer.text}")
+                self._complain("weights_refused", f"going back was not possible: {offer.text}")
             else:
                 self._refuse(offer.text, {})
             return
         self._watched_from = offer.noted
         if offer.kind == "give_up":
-            self.counters["weights_rolled_back"] += 1
             self._announce("weights_rolled_back", *self._ledger.go_back(offer, self._facts, None))
-        elif job is not None and offer.kind == "previous":
-            self.counters["weights_rolled_back"] += 1
-            job.answer, job.facts = self._ledger.go_back(offer, {}, job.why)
         elif job is not None:
-            self.counters["weights_taken"] += 1
-            taken_us = self.takeover.taken_us
-            news = self._ledger.accept(offer, job.data, job.facts, job.why, taken_us)
-            job.answer, job.facts = news
-        self._tell("taken", noted=offer.noted)
-        if self._link is None:
-            self._settled()
+            self._answer_taken(offer, job)
+        self._keeper.tell(
+            "taken", noted=offer.noted, accepted_utc_ns=self._ledger.newest.accepted_utc_ns
+        )
+        self._settle_unkept()
 
-    def _settled(self) -> None:
-        """Answers who waits: what was taken over is kept, or nobody is there to keep it."""
+    def _answer_taken(self, offer: Offer, job: Job) -> None:
+        """Makes the answer, for when it is kept."""
+        if offer.kind == "previous":
+            job.answer, job.facts = self._ledger.go_back(offer, {}, job.why)
+        else:
+            job.answer, job.facts = self._ledger.accept(offer, job, self.takeover.taken_us)
+        job.until_s = time.monotonic() + _KEEP_S
+        if job.request is not None:
+            self._latecomer.stop()
+
+    def _kept(self, why_not: str) -> None:
+        """The gatekeeper has kept what is accepted, or not."""
+        self._trouble = ""
+        if why_not:
+            self._complain("weights_not_kept", f"accepted weights cannot be kept: {why_not}")
+        self._settled(why_not)
+
+    def _settled(self, why_not_kept: str = "") -> None:
+        """Answers who waits for what was taken over."""
         job = self._job
         if job is None or not job.answer:
             return
         self._job = None
+        keeps = self._port.store is not None
+        answer = f"{job.answer}; not kept: {why_not_kept}" if why_not_kept and keeps else job.answer
         if job.request is not None:
-            self._reply(job.request, True, job.answer, job.facts)
+            reply(job.request, True, answer, job.facts)
         event = "weights_accepted" if job.kind == "weights" else "weights_rolled_back"
-        self._announce(event, job.answer, job.facts)
+        self._announce(event, answer, job.facts)
+
+    def _complain(self, kind: str, text: str) -> None:
+        self._trouble = text
+        _log.warning("%s", text)
+        self._announce(kind, text, {})

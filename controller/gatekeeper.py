@@ -41,6 +41,10 @@ _LOCKSTEP_POLL_S: Final = 5e-5
 _POLL_S: Final = 0.02
 _IDLE_POLL_S: Final = 0.05
 _IDLE_NS: Final = 1_000_000_000
+_REST_S: Final = 1.0
+"""Without a watch, and at most: how long it waits between two signs of life."""
+_SIGNS: Final = 8
+"""Of life, at least, within the time after which it is taken to hang."""
 
 
 class Gatekeeper:
@@ -61,13 +65,15 @@ class Gatekeeper:
         if first is None:
             return
         self._start(*first)
+        self._memory.show_life()
         self._channel.send("ready")
-        if self._store is not None:  # one that died may not have come to it
+        if self._folder is not None:  # one that died may not have come to it
             self._keep()
         while True:
+            self._memory.show_life()
             if self._watch is not None:
                 self._look()
-            if not self._backlog and not self._arrived():
+            if not self._backlog and not self._arrived(self._patience_s()):
                 continue
             message = self._backlog.popleft() if self._backlog else self._channel.receive()
             if message is None:
@@ -82,6 +88,7 @@ class Gatekeeper:
 
     def _start(self, fields: dict[str, Any], data: bytes) -> None:
         settings = GateSettings.model_validate(fields["settings"])
+        self._rest_s = min(_REST_S, settings.hang_s / _SIGNS)
         self._gate = Gate(settings, Path(fields["artefact"]), get_car(fields["car"]))
         self._sampler = Sampler(self._gate.step_s, settings.moving_mps)
         self._recent: deque[Sample] = deque(maxlen=settings.recent_samples)
@@ -90,11 +97,13 @@ class Gatekeeper:
         self._files: list[Accepted] = []
         self._incumbents: list[Incumbent] = []
         begin = 0
-        for number, version, proven, size in fields["history"]:
-            self._push(Accepted(number, version, data[begin : begin + size], proven))
+        for number, version, proven, accepted_utc_ns, size in fields["history"]:
+            file = data[begin : begin + size]
+            self._push(Accepted(number, version, file, proven, accepted_utc_ns))
             begin += size
-        store = fields["store"]
-        self._store = Store(Path(store), fields["discretisation"]) if store else None
+        self._folder = Path(fields["store"]) if fields["store"] else None
+        self._discretisation = str(fields["discretisation"])
+        self._store: Store | None = None
         self._update()
         self._watch_in_use(int(fields["watch_from"]))
 
@@ -125,14 +134,15 @@ class Gatekeeper:
 
     # Requests ------------------------------------------------------------------------------------
 
-    def _arrived(self) -> bool:
-        """Waits for a message, as long as the watch has time for."""
-        readable, _, _ = select.select([self._channel], [], [], self._patience_s())
+    def _arrived(self, patience_s: float) -> bool:
+        """Waits for a message."""
+        readable, _, _ = select.select([self._channel], [], [], patience_s)
         return bool(readable)
 
-    def _patience_s(self) -> float | None:
+    def _patience_s(self) -> float:
+        """How long the watch has time."""
         if self._watch is None:
-            return None
+            return self._rest_s
         if time.monotonic_ns() - self._read_ns > _IDLE_NS:
             return _IDLE_POLL_S
         return _LOCKSTEP_POLL_S if self._lockstep else _POLL_S
@@ -153,10 +163,11 @@ class Gatekeeper:
         if taken is None:
             self._watch_in_use(self._watch_from)
             return
-        self._push(Accepted(number, weights.version, data, proven=False))
+        accepted_utc_ns = int(taken["accepted_utc_ns"])
+        self._push(Accepted(number, weights.version, data, False, accepted_utc_ns))
         self._incumbents[-1] = replace(self._incumbents[-1], _model=verdict.model)
         self._next_number = number + 1
-        self._watch_in_use(taken)
+        self._watch_in_use(int(taken["noted"]))
         self._keep()
 
     def _judged(self, data: bytes) -> Verdict:
@@ -196,27 +207,35 @@ class Gatekeeper:
             self._watch_in_use(self._watch_from)
             return
         self._pop()
-        self._watch_in_use(taken)
+        self._watch_in_use(int(taken["noted"]))
         self._keep()
 
-    def _outcome(self) -> int | None:
-        """How many states had been noted when the offer was taken; None if it was not."""
-        while (message := self._channel.receive()) is not None:
-            kind = message[0]["kind"]
-            if kind == "taken":
-                return int(message[0]["noted"])
-            if kind == "dropped":
+    def _outcome(self) -> dict[str, Any] | None:
+        """When the offer was taken: states noted before, and the time; None if it was not."""
+        while True:
+            self._memory.show_life()
+            if not self._arrived(self._rest_s):
+                continue
+            message = self._channel.receive()
+            if message is None:
+                sys.exit(0)
+            if message[0]["kind"] == "taken":
+                return message[0]
+            if message[0]["kind"] == "dropped":
                 return None
             self._backlog.append(message)
-        sys.exit(0)
 
     def _keep(self) -> None:
+        """In the store, if there is one; whoever waits for an answer is told if it cannot."""
+        why_not = ""
         try:
-            if self._store is not None:
+            if self._folder is not None:
+                # Opened as late as this: whoever watches must not die of a disk that is full.
+                self._store = self._store or Store(self._folder, self._discretisation)
                 self._store.keep(self._files, self._next_number, self._withdrawn)
         except InputError as error:
-            self._channel.send("complaint", text=f"accepted weights cannot be kept: {error}")
-        self._channel.send("settled")
+            why_not = str(error)
+        self._channel.send("settled", why_not=why_not)
 
     # The watch -----------------------------------------------------------------------------------
 
@@ -271,7 +290,7 @@ class Gatekeeper:
             return
         while self._incumbents[-1].number != watch.old.number:
             self._withdrawn.append(digest_of(self._pop().data))
-        self._watch_in_use(taken)
+        self._watch_in_use(int(taken["noted"]))
         self._keep()
 
 

@@ -1,40 +1,148 @@
-"""A controller that joins late asks others of its car for what they have accepted."""
+"""A controller that joins late asks others of its car for the newest weights they have accepted.
 
+Their answer, little-endian, is empty if there is nothing to tell:
+
+    magic | u16 layout | u16 count | i64 accepted_utc_ns | count * sha256 | weights file or nothing
+
+Newest is what was accepted last, by whoever accepted it first: going back to older weights makes
+them no newer. What somebody has given up, because it predicted worse, is listed by its digest, and
+taken from nobody.
+"""
+
+import logging
+import struct
 import time
-from typing import Any, Final
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
 
-from bayesrace.messages import ACCEPTED
-from bayesrace.transport import fetch
+from bayesrace.errors import InputError
+from controller.gate.store import WITHDRAWN, Accepted, digest_of
 
-__all__ = ["Latecomer"]
+__all__ = ["Found", "Latecomer", "encode_answer", "newest_first"]
+
+_log = logging.getLogger("bayesrace.controller")
+
+_MAGIC: Final = b"BRACEAC\n"
+_LAYOUT: Final = 1
+_HEAD: Final = struct.Struct("<8sHHq")
+_DIGEST_BYTES: Final = 32
+
+_MOST_ANSWERS: Final = 32
+"""That are read; a car has a controller or two."""
+
+_CLOCKS_APART_NS: Final = 3600 * 10**9
+"""By which another host's clock may be ahead: later weights would be the newest for ever."""
 
 _ASK_S: Final = (0.2, 1.0, 3.0)
 """When, after the start: connections take a moment, and then there is nobody."""
 
 
-class Latecomer:
-    """Asks a few times, until somebody has an answer or there is no need any more."""
+@dataclass(frozen=True)
+class Found:
+    """Weights that another controller has in use."""
 
-    def __init__(self, session: Any, name: str, needed: bool) -> None:
-        self._session, self._name = session, name
+    accepted_utc_ns: int
+    data: bytes
+    digest: str
+
+
+def encode_answer(in_use: Accepted, withdrawn: Sequence[str]) -> bytes:
+    """What a controller with these weights, which has given up those, answers."""
+    given_up = [bytes.fromhex(digest) for digest in withdrawn[-WITHDRAWN:]]
+    data = in_use.data if in_use.number else b""
+    if not data and not given_up:
+        return b""
+    head = _HEAD.pack(_MAGIC, _LAYOUT, len(given_up), in_use.accepted_utc_ns)
+    return head + b"".join(given_up) + data
+
+
+def newest_first(
+    answers: Sequence[bytes], most_bytes: int, now_utc_ns: int
+) -> tuple[list[Found], list[str]]:
+    """The weights in the answers that nobody has given up, each once; and why others are ignored.
+
+    ``most_bytes``: of a weights file that can be of use. The order of the answers is no matter.
+    """
+    found: dict[str, Found] = {}
+    given_up: set[str] = set()
+    ignored = [f"more than {_MOST_ANSWERS} answers"] * max(len(answers) - _MOST_ANSWERS, 0)
+    for answer in answers[:_MOST_ANSWERS]:
+        try:
+            one, digests = _decode(answer, most_bytes, now_utc_ns)
+        except InputError as error:
+            ignored.append(str(error))
+            continue
+        given_up.update(digests)
+        if one is not None:
+            found[one.digest] = min(found.get(one.digest, one), one, key=_age)
+    left = [one for digest, one in found.items() if digest not in given_up]
+    return sorted(left, key=_age, reverse=True), ignored
+
+
+def _age(one: Found) -> tuple[int, str]:
+    """To sort by; the digest for those of the same time."""
+    return one.accepted_utc_ns, one.digest
+
+
+def _decode(answer: bytes, most_bytes: int, now_utc_ns: int) -> tuple[Found | None, list[str]]:
+    """Weights, if it has any, and digests of those given up; InputError if it is malformed."""
+    if not answer:
+        return None, []
+    if len(answer) < _HEAD.size or not answer.startswith(_MAGIC):
+        raise InputError(f"{len(answer)} bytes that are no answer of a controller of this release")
+    _, layout, count, accepted_utc_ns = _HEAD.unpack_from(answer)
+    if layout != _LAYOUT:
+        raise InputError(f"layout {layout} is not {_LAYOUT}; use the same release everywhere")
+    begin = _HEAD.size + count * _DIGEST_BYTES
+    if count > WITHDRAWN or not begin <= len(answer) <= begin + most_bytes:
+        raise InputError(f"{len(answer)} bytes are not the size of an answer with {count} digests")
+    if not 0 <= accepted_utc_ns <= now_utc_ns + _CLOCKS_APART_NS:
+        ahead_s = (accepted_utc_ns - now_utc_ns) * 1e-9
+        raise InputError(f"weights accepted {ahead_s:.3g} s from now; set the clocks")
+    digests = [
+        answer[at : at + _DIGEST_BYTES].hex() for at in range(_HEAD.size, begin, _DIGEST_BYTES)
+    ]
+    data = answer[begin:]
+    return Found(accepted_utc_ns, data, digest_of(data)) if data else None, digests
+
+
+class Latecomer:
+    """Asks a few times, as long as nobody decides what this controller is to drive with."""
+
+    def __init__(self, ask: Callable[[], Sequence[bytes]], most_bytes: int, needed: bool) -> None:
+        """``ask``: brings the answers of all others that are connected. ``most_bytes``: see
+        :func:`newest_first`. ``needed`` False: it has weights already, and is no latecomer."""
+        self._ask, self._most_bytes = ask, most_bytes
         self._begin_s = time.monotonic()
         self._due_s = list(_ASK_S) if needed else []
+        self._found: list[Found] = []
+        self._tried: set[str] = set()
+        self.ignored = 0
+        """Answers that could not be used."""
 
     @property
     def asking(self) -> bool:
-        """Whether there is a question left."""
-        return bool(self._due_s)
+        """Whether there is a question left, or an answer that has not been looked at."""
+        return bool(self._due_s or self._found)
 
-    def ask(self) -> bytes:
-        """The weights file of another controller, if it is time to ask and one has any."""
-        if not self._due_s or time.monotonic() - self._begin_s < self._due_s[0]:
-            return b""
-        self._due_s.pop(0)
-        data = fetch(self._session, ACCEPTED, self._name)
-        if data:
-            self.stop()
-        return data
+    def next(self, in_use: Accepted) -> Found | None:
+        """The newest weights of others, newer than those in use, that it has not brought yet."""
+        if self._due_s and time.monotonic() - self._begin_s >= self._due_s[0]:
+            self._due_s.pop(0)
+            self._found, ignored = newest_first(self._ask(), self._most_bytes, time.time_ns())
+            self.ignored += len(ignored)
+            for why in ignored[:1]:
+                _log.warning("ignored %d answer(s) of other controllers: %s", len(ignored), why)
+        while self._found:
+            one = self._found.pop(0)
+            newer = not in_use.number or one.accepted_utc_ns > in_use.accepted_utc_ns
+            if newer and one.digest not in self._tried:
+                self._tried.add(one.digest)
+                return one
+        return None
 
     def stop(self) -> None:
-        """It has weights."""
+        """It has been told what to drive with."""
         self._due_s.clear()
+        self._found.clear()

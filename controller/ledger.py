@@ -1,5 +1,6 @@
 """Which weights have been accepted, in which order, and the words for what has changed."""
 
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -22,7 +23,10 @@ class Job:
     data: bytes
     request: Request | None
     why: str = ""
+    accepted_utc_ns: int | None = None
+    """When another controller accepted them; None: nobody has."""
     until_s: float = 0.0
+    """Offered: when it must have been taken over; taken over: when it must have been kept."""
     facts: Mapping[str, Scalar] = field(default_factory=dict)
     """What the gate has compared."""
     offer: Offer | None = None
@@ -35,6 +39,7 @@ class Ledger:
 
     def __init__(self, port: WeightsPort) -> None:
         self._port = port
+        self.counts = {"weights_taken": 0, "weights_refused": 0, "weights_rolled_back": 0}
 
     @property
     def newest(self) -> Accepted:
@@ -46,33 +51,43 @@ class Ledger:
         """Those before them."""
         return self._port.history[-2] if len(self._port.history) > 1 else None
 
-    def named(self, number: int) -> Accepted:
-        """The weights of this acceptance number."""
-        return next(one for one in self._port.history if one.number == number)
+    def offer(self, job: Job, facts: Mapping[str, Scalar], text: str, watch: bool) -> Offer | None:
+        """What a job asks for, once the gate has passed it; None if there is nothing to go back to.
 
-    def accept(
-        self,
-        offer: Offer,
-        data: bytes,
-        facts: Mapping[str, Scalar],
-        source: str,
-        taken_us: float,
-    ) -> News:
-        """The offer, of this file, has been taken over."""
+        ``watch``: whether new weights are watched.
+        """
+        if job.kind == "weights":
+            version = str(facts["version"])
+            return Offer(version, self._port.next_number, "weights", watch, text)
+        before = self.before
+        if before is None:
+            return None
+        return Offer(before.version, before.number, "previous", not before.proven)
+
+    def offer_back(self, number: int, why: str) -> Offer:
+        """Earlier weights, which the watch wants back."""
+        old = next(one for one in self._port.history if one.number == number)
+        return Offer(old.version, old.number, "give_up", watched=False, text=why)
+
+    def accept(self, offer: Offer, job: Job, taken_us: float) -> News:
+        """The offer, of this job's file, has been taken over."""
         port = self._port
-        accepted = Accepted(offer.number, offer.version, data, proven=not offer.watched)
+        self.counts["weights_taken"] += 1
+        at_ns = time.time_ns() if job.accepted_utc_ns is None else job.accepted_utc_ns
+        accepted = Accepted(offer.number, offer.version, job.data, not offer.watched, at_ns)
         port.history = trimmed([*port.history, accepted])
         port.next_number = offer.number + 1
-        who = f"weights {offer.version} {source}".rstrip()
+        who = f"weights {offer.version} {job.why}".rstrip()
         text = f"{who} in use from cycle {offer.cycle} on, as number {offer.number}; {offer.text}"
         mine: dict[str, Scalar] = {
             "number": offer.number, "cycle": offer.cycle, "takeover_us": taken_us
         }  # fmt: skip
-        return text, {**facts, **mine}
+        return text, {**job.facts, **mine}
 
     def go_back(self, offer: Offer, facts: Mapping[str, Scalar], request: str | None) -> News:
         """Earlier weights are in use again, on ``request`` (why) or because of the watch."""
         port, left = self._port, self._port.history[-1]
+        self.counts["weights_rolled_back"] += 1
         while port.history[-1].number != offer.number:
             given_up = port.history.pop()
             if request is None:

@@ -1,13 +1,20 @@
-"""Ctrl-C is one interrupt with exit code 130, wherever in the program it strikes."""
+"""Ctrl-C is one interrupt with exit code 130, wherever in the program it strikes; where a loop
+waits for everything that happens, signals are but one of these things."""
 
 import os
+import signal
 import subprocess
 import sys
+import threading
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
+from bayesrace.interrupts import catching_signals
 from tests.programs import ROOT
+
+pytestmark = pytest.mark.alone
 
 SWALLOWED = """
 import os, signal, sys, weakref
@@ -45,3 +52,29 @@ def test_an_interrupt_anywhere_is_one_interrupt(tmp_path: Path, how: str) -> Non
         check=False,
     )
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
+def test_signals_are_told_and_do_nothing_else() -> None:
+    caught = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.getsignal(one) for one in caught]
+    told: list[int] = []
+    with suppress(ZeroDivisionError), catching_signals(told.append):
+        for one in caught:
+            signal.raise_signal(one)
+        raise ZeroDivisionError
+    assert told == [*caught]
+    assert [signal.getsignal(one) for one in caught] == before
+
+
+def test_off_the_main_thread_signals_are_left_alone() -> None:
+    """There, Python could not set a handler."""
+    before, within = signal.getsignal(signal.SIGINT), []
+
+    def elsewhere() -> None:
+        with catching_signals(lambda _number: None):
+            within.append(signal.getsignal(signal.SIGINT))
+
+    thread = threading.Thread(target=elsewhere)
+    thread.start()
+    thread.join()
+    assert within == [before]

@@ -3,13 +3,15 @@
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from typing import Any
 
 import pytest
 
 from bayesrace.errors import InputError
 from bayesrace.messages import (
+    ACCEPTED,
     EVENT,
     STATE,
     STATUS,
@@ -17,10 +19,12 @@ from bayesrace.messages import (
     WEIGHTS,
     Event,
     Reply,
+    Service,
     State,
     Status,
     StatusRequest,
     StopRequest,
+    car_key,
     encode,
 )
 from bayesrace.transport import (
@@ -30,11 +34,17 @@ from bayesrace.transport import (
     Item,
     Kind,
     Publisher,
+    Request,
     ask,
+    ask_all,
+    declare_service,
     decode_request,
+    fetch_all,
     free_endpoint,
     open_session,
 )
+
+pytestmark = pytest.mark.alone
 
 
 @pytest.fixture
@@ -126,6 +136,38 @@ def test_requests_are_answered_and_silence_is_an_error(pair: tuple[Any, Any]) ->
         thread.join()
     with pytest.raises(InputError, match="nobody answered on bayesrace/other/plant/status"):
         ask(session, STATUS, "other", StatusRequest(0, 0), "plant")
+
+
+@contextmanager
+def answering(pair: tuple[Any, Any], service: Service[Any, Any], *data: bytes) -> Iterator[None]:
+    """The first answers are of the first session, the last one is of the second."""
+    with ExitStack() as stack:
+        for number, one in enumerate(data, 1):
+            answer = partial(Request.answer_raw, data=one)
+            session = pair[number == len(data)]
+            stack.enter_context(declare_service(session, service, "orca", answer))
+        inboxes = [Inbox(session, "orca") for session in pair]
+        meet(*inboxes)
+        yield
+
+
+def test_of_several_under_one_name_a_refusal_is_the_answer(pair: tuple[Any, Any]) -> None:
+    """All are heard, and a yes of one does not hide the no of another."""
+    replies = [Reply(0, 0, accepted, "", {}) for accepted in (True, False, True)]
+    request, key = StopRequest(0, 0, ""), car_key(STOP.key, "orca")
+    encoded = [encode(one) for one in replies]
+    with answering(pair, STOP, *encoded):
+        for session in pair:
+            answers = ask_all(session, (key, "bayesrace/nobody"), request, 5.0)
+            assert sorted(answers[key]) == sorted(encoded)
+            assert answers["bayesrace/nobody"] == []
+            assert ask(session, STOP, "orca", request) == replies[1]
+
+
+def test_what_others_have_is_fetched_and_not_the_own(pair: tuple[Any, Any]) -> None:
+    with answering(pair, ACCEPTED, b"theirs", b"another's", b"own"):
+        assert sorted(fetch_all(pair[1], ACCEPTED, "orca")) == [b"another's", b"theirs"]
+        assert fetch_all(pair[1], ACCEPTED, "other") == []
 
 
 def test_a_malformed_request_is_refused_with_a_reason(pair: tuple[Any, Any]) -> None:

@@ -84,7 +84,7 @@ class Topic(Generic[M]):
 @dataclass(frozen=True)
 class Service(Generic[M, A]):
     """One row of the table of requests. ``request`` or ``answer`` None: the payload is no message,
-    but a weights file."""
+    but a weights file, or one in a frame."""
 
     name: str
     key: str
@@ -138,8 +138,9 @@ ROLLBACK: Final = Service(
 ACCEPTED: Final[Service[Message, Message]] = Service(
     "accepted", "bayesrace/{car}/controller/accepted", None, None, 2.0
 )
-"""Asked without payload, for who joins late. The answer is the file of the weights in use, empty if
-the controller has accepted none since its start."""
+"""Asked without payload, for who joins late. The answer (``controller/latecomer.py``) frames the
+file of the weights in use with its time of acceptance and the digests of those given up; empty if
+there is nothing to tell."""
 COMMAND: Final = Service("command", "bayesrace/{car}/controller/command", Command, Reply, 5.0)
 CLOCK: Final = Service("clock", "bayesrace/{car}/{source}/clock", ClockRequest, ClockReading, 2.0)
 SERVICES: Final[tuple[Service[Any, Any], ...]] = (

@@ -1,6 +1,15 @@
 """Zenoh, wrapped thinly: sessions with explicit endpoints, publishers, one inbox per thread."""
 
-from bayesrace.transport.client import Director, RefusedError, ask, fetch
+from bayesrace.transport.client import (
+    Director,
+    RefusedError,
+    ask,
+    ask_all,
+    decisive,
+    fetch_all,
+    send_rollback,
+    send_weights,
+)
 from bayesrace.transport.heartbeat import HEARTBEAT_S, Heartbeat
 from bayesrace.transport.inbox import (
     LOCKSTEP_SPIN_S,
@@ -39,9 +48,13 @@ __all__ = [
     "RefusedError",
     "Request",
     "ask",
+    "ask_all",
+    "decisive",
     "declare_service",
     "decode_request",
-    "fetch",
+    "fetch_all",
     "free_endpoint",
     "open_session",
+    "send_rollback",
+    "send_weights",
 ]

@@ -1,7 +1,7 @@
 """Asking other processes, and following a run from outside."""
 
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Sequence
 from typing import Any, TypeVar
 
 import zenoh
@@ -30,7 +30,16 @@ from bayesrace.messages import (
 )
 from bayesrace.transport.inbox import Inbox, Kind
 
-__all__ = ["Director", "RefusedError", "ask", "fetch"]
+__all__ = [
+    "Director",
+    "RefusedError",
+    "ask",
+    "ask_all",
+    "decisive",
+    "fetch_all",
+    "send_rollback",
+    "send_weights",
+]
 
 A = TypeVar("A", bound=Message)
 
@@ -45,46 +54,100 @@ class RefusedError(InputError):
 
 
 def ask(
-    session: Any, service: Service[Any, A], car: str, request: Message | bytes, source: str = ""
+    session: Any,
+    service: Service[Any, A],
+    car: str,
+    request: Message | bytes,
+    source: str = "",
+    timeout_s: float | None = None,
 ) -> A:
-    """Ask a process and wait for its answer, as long as the table says.
+    """Ask a process and wait for its answer, as long as the table says unless told otherwise.
 
-    Raises InputError if nobody answers in time or the answer is not a valid one.
+    Of several that answer to one name, :func:`decisive` chooses. Raises InputError if nobody
+    answers in time or an answer is not a valid one.
     """
     if service.answer is None:
-        raise TypeError(f"the answer of '{service.name}' is not a message; fetch it")
+        raise TypeError(f"the answer of '{service.name}' is not a message; use fetch_all")
     key = car_key(service.key, car, source)
+    limit_s = service.timeout_s if timeout_s is None else timeout_s
+    answers = ask_all(session, (key,), request, limit_s)[key]
+    answer = decisive([decode(service.answer, one) for one in answers])
+    if answer is None:
+        raise InputError(
+            f"nobody answered on {key} within {limit_s:g} s; is the process for car '{car}' "
+            "running, its endpoint among those to connect to, and the time enough?"
+        )
+    return answer
+
+
+def ask_all(
+    session: Any,
+    keys: Collection[str],
+    request: Message | bytes,
+    timeout_s: float,
+    where: zenoh.Locality = zenoh.Locality.ANY,
+) -> dict[str, list[bytes]]:
+    """Every answer to one request, by key; all keys are asked at once.
+
+    Returns when all have answered or the time is over. A key nobody answers on has none; one with
+    several answers belongs to several processes.
+    """
     payload = request if isinstance(request, bytes) else encode(request)
-    answer = next(_answers(session, service, key, payload, zenoh.Locality.ANY), None)
-    if answer is not None:
-        return decode(service.answer, answer)
-    raise InputError(
-        f"nobody answered on {key}; is the process for car '{car}' running, and its endpoint "
-        "among those to connect to?"
-    )
+    pending = {
+        key: session.get(
+            key,
+            payload=payload,
+            timeout=timeout_s,
+            target=zenoh.QueryTarget.ALL,
+            # Two processes under one name would otherwise be one answer.
+            consolidation=zenoh.ConsolidationMode.NONE,
+            # Dropped, a question is never answered: on a loaded machine that ended a race.
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            allowed_destination=where,
+        )
+        for key in keys
+    }
+    return {
+        key: [one.ok.payload.to_bytes() for one in replies if one.ok is not None]
+        for key, replies in pending.items()
+    }
 
 
-def fetch(session: Any, service: Service[Any, Any], car: str) -> bytes:
-    """The longest answer of other processes that is no message; empty if nobody has one."""
+def fetch_all(session: Any, service: Service[Any, Any], car: str) -> list[bytes]:
+    """The answers of all other processes, as bytes: for answers that are no messages."""
     key = car_key(service.key, car)
-    return max(_answers(session, service, key, b"", zenoh.Locality.REMOTE), key=len, default=b"")
+    return ask_all(session, (key,), b"", service.timeout_s, zenoh.Locality.REMOTE)[key]
 
 
-def _answers(
-    session: Any, service: Service[Any, Any], key: str, payload: bytes, where: zenoh.Locality
-) -> Iterator[bytes]:
-    replies = session.get(
-        key,
-        payload=payload,
-        timeout=service.timeout_s,
-        target=zenoh.QueryTarget.ALL,
-        # Dropped, a question is never answered: on a loaded machine that ended a race.
-        congestion_control=zenoh.CongestionControl.BLOCK,
-        allowed_destination=where,
-    )
-    for reply in replies:
-        if reply.ok is not None:
-            yield reply.ok.payload.to_bytes()
+def decisive(answers: Sequence[A]) -> A | None:
+    """Of several answers under one name, a refusal if there is one; None if there are none.
+
+    A name that two processes answer to must not pass for a yes of both.
+    """
+    refusals = (one for one in answers if isinstance(one, Reply) and not one.accepted)
+    return next(refusals, answers[0] if answers else None)
+
+
+def send_weights(session: Any, car: str, data: bytes, timeout_s: float | None = None) -> Reply:
+    """The controller's answer to new weights (the file's bytes), accepted or not.
+
+    Accepted, it drives with them from now on. ``data`` of the answer: ``version``, ``number`` (of
+    acceptance, rising), ``cycle`` (tick of the first cycle that they drive), ``probation`` (too few
+    samples to compare), and what was compared: ``samples``, ``error_new_vx``, ``error_old_vx``,
+    ``error_nominal_vx`` and so on, one-step prediction errors (RMSE) of the new weights, those
+    before, and the uncorrected model.
+    """
+    return ask(session, WEIGHTS, car, data, timeout_s=timeout_s)
+
+
+def send_rollback(session: Any, car: str, text: str, timeout_s: float | None = None) -> Reply:
+    """Back to the weights before those in use; ``text``: why. The answer, accepted or not.
+
+    ``data`` of the answer: ``version`` and ``number`` of those in use from ``cycle`` on,
+    ``from_version`` and ``from_number`` of those given up.
+    """
+    request = RollbackRequest(0, time.monotonic_ns(), text[:2000])
+    return ask(session, ROLLBACK, car, request, timeout_s=timeout_s)
 
 
 class Director:
@@ -135,25 +198,12 @@ class Director:
         return ask(self._session, STOP, self._car, StopRequest(0, time.monotonic_ns(), text))
 
     def send_weights(self, data: bytes) -> Reply:
-        """Hand new weights (the file's bytes) to the running controller, which drives with them
-        when this returns; RefusedError with its reasons if it does not.
-
-        ``data`` of the answer: ``version``, ``number`` (of acceptance, rising), ``cycle`` (tick of
-        the first cycle that they drive), ``probation`` (too few samples to compare), and what was
-        compared: ``samples``, ``error_new_vx``, ``error_old_vx``, ``error_nominal_vx`` and so on,
-        one-step prediction errors (RMSE) of the new weights, those before, and the uncorrected
-        model.
-        """
-        return self._accepted("weights", ask(self._session, WEIGHTS, self._car, data))
+        """:func:`send_weights`; RefusedError with the reasons if they are refused."""
+        return self._accepted("weights", send_weights(self._session, self._car, data))
 
     def rollback(self, text: str) -> Reply:
-        """Back to the weights before those in use; ``text``: why. RefusedError if there are none.
-
-        ``data`` of the answer: ``version`` and ``number`` of those in use from ``cycle`` on,
-        ``from_version`` and ``from_number`` of those given up.
-        """
-        request = RollbackRequest(0, time.monotonic_ns(), text[:2000])
-        return self._accepted("rollback", ask(self._session, ROLLBACK, self._car, request))
+        """:func:`send_rollback`; RefusedError if there is nothing to go back to."""
+        return self._accepted("rollback", send_rollback(self._session, self._car, text))
 
     def wait_for_end(self, run: int, timeout_s: float, absence_s: float = 1.0) -> Event:
         """The ``run_ended`` event of a run.

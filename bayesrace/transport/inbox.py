@@ -9,19 +9,18 @@ queue, and a clock thread, wakes it with an empty message that never leaves the 
 
 import os
 import queue
-import signal
 import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from enum import Enum
-from types import FrameType
 from typing import Any, Final, NamedTuple
 
 import zenoh
 
 from bayesrace.errors import InputError
+from bayesrace.interrupts import catching_signals
 from bayesrace.messages import (
     ALIVE,
     CLOCK,
@@ -205,19 +204,12 @@ class Inbox:
     @contextmanager
     def catching_signals(self) -> Iterator[None]:
         """For the block, let SIGINT and SIGTERM arrive as items; nothing off the main thread."""
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
 
-        def on_signal(number: int, _frame: FrameType | None) -> None:
+        def arrived(number: int) -> None:
             self._items.put(Item(Kind.SIGNAL, "", number, time.monotonic_ns()))
 
-        before = {n: signal.signal(n, on_signal) for n in (signal.SIGINT, signal.SIGTERM)}
-        try:
+        with catching_signals(arrived):
             yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
 
     def get(self, timeout_s: float = 0.0) -> Item | None:
         """The next item; None if nothing arrives in time."""

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import OUTPUTS, GpWeights
+from bayesrace.gp.weights import OUTPUTS, UNITS, GpWeights
 from bayesrace.messages import Scalar
 from bayesrace.vehicles.parameters import CarParameters
 from controller.gate.model import OneStepModel, plausible_samples
@@ -28,8 +28,6 @@ _HOPELESS: Final = 0.8
 _CLOCKS_APART_S: Final = 3600.0
 """By which the clock of who trains may be ahead."""
 
-_UNITS: Final = ("m/s", "m/s", "rad/s")
-
 
 @dataclass(frozen=True)
 class Comparison:
@@ -45,9 +43,9 @@ class Comparison:
     @property
     def text(self) -> str:
         """For people."""
-        pairs = zip(OUTPUTS, self.old, self.new, _UNITS, strict=True)
+        pairs = zip(OUTPUTS, self.old, self.new, strict=True)
         errors = ", ".join(
-            f"{name} {old:.4g} to {new:.4g} {unit}" for name, old, new, unit in pairs
+            f"{name} {old:.4g} to {new:.4g} {UNITS[name]}" for name, old, new in pairs
         )
         return f"one-step errors over {self.samples} samples go from {errors}"
 

@@ -12,8 +12,6 @@ import time
 from collections.abc import Sequence
 from typing import Final
 
-from bayesrace.errors import InputError
-
 __all__ = ["ended", "spawn"]
 
 _SETPGROUP: Final = 0x02
@@ -24,7 +22,8 @@ _ATTRIBUTES_BYTES: Final = 1024
 def spawn(module: str, arguments: Sequence[str]) -> int:
     """Process number of ``python -m module arguments``; inheritable descriptors go with it.
 
-    A process group of its own: Ctrl-C at the terminal is the starter's matter.
+    A process group of its own: Ctrl-C at the terminal is the starter's matter. OSError if the
+    system does not start it.
     """
     libc = ct.CDLL(None, use_errno=True)
     path = os.pathsep.join(os.path.abspath(entry) for entry in sys.path)  # noqa: PTH100
@@ -40,7 +39,7 @@ def spawn(module: str, arguments: Sequence[str]) -> int:
     )
     libc.posix_spawnattr_destroy(attributes)
     if error:
-        raise InputError(f"the gatekeeper cannot be started: {os.strerror(error)}")
+        raise OSError(error, os.strerror(error))
     return pid.value
 
 

@@ -26,7 +26,7 @@ class Link:
     """One gatekeeper process, from its start to its end."""
 
     def __init__(self, memory: Memory) -> None:
-        """Starts it; InputError if the system does not."""
+        """Starts it; OSError if the system does not."""
         own, its = socket.socketpair()
         for fd in (its.fileno(), memory.fd):
             os.set_inheritable(fd, True)
@@ -65,7 +65,10 @@ class Link:
             artefact=str(artefact),
             car=manifest.car,
             discretisation=manifest.discretisation,
-            history=[(one.number, one.version, one.proven, len(one.data)) for one in history],
+            history=[
+                (one.number, one.version, one.proven, one.accepted_utc_ns, len(one.data))
+                for one in history
+            ],
             next_number=next_number,
             withdrawn=list(withdrawn),
             store=None if store is None else str(store.resolve()),

@@ -1,6 +1,7 @@
 """Memory that a controller shares with its gatekeeper: states one way, weights the other.
 
-    header   u64 states noted; u64 what the watch has seen of them, and what it thinks
+    header   u64 states noted; u64 what the watch has seen of them, and what it thinks; u64 when
+             the gatekeeper gave its last sign of life, monotonic clock [ns]
     ring     the newest states, written by the control thread alone
     weights  one set, as ``br_mpc_gp`` wants it, written by the gatekeeper alone
 
@@ -76,7 +77,7 @@ class Memory:
         self._map = mmap.mmap(self.fd, size)
         if made:
             self._map[:] = bytes(size)  # no page is missing when the loop first writes there
-        self._words = memoryview(self._map)[:16].cast("Q")
+        self._words = memoryview(self._map)[:24].cast("Q")
         self._noted = self._words[0]
         flat: npt.NDArray[np.float64] = np.frombuffer(
             self._map, np.float64, per_output * len(OUTPUTS), begin
@@ -119,6 +120,11 @@ class Memory:
         word = self._words[1]
         return word >> 1, bool(word & 1)
 
+    @property
+    def alive_s(self) -> float:
+        """Monotonic clock of the gatekeeper's last sign of life."""
+        return self._words[2] * 1e-9
+
     # The gatekeeper's side -----------------------------------------------------------------------
 
     def read(self, begin: int) -> tuple[list[Noted], int]:
@@ -154,6 +160,10 @@ class Memory:
     def tell_watched(self, count: int, go_back: bool) -> None:
         """What the control thread waits for in lockstep."""
         self._words[1] = count << 1 | go_back
+
+    def show_life(self) -> None:
+        """Whoever does not for long is taken to hang."""
+        self._words[2] = time.monotonic_ns()
 
 
 def _anonymous_file(size: int) -> int:

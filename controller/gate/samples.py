@@ -1,6 +1,5 @@
 """Samples of what the car did within one Ts, made of states as they come."""
 
-from collections.abc import Iterable
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -54,10 +53,6 @@ class Sampler:
             duration_s = self._step_s  # else the model takes another way
         x, x_next = np.array(first.x), np.array(noted.x)
         return Sample(noted.number, noted.at_ns, duration_s, x, u, x_next)
-
-    def take(self, notes: Iterable[Noted]) -> list[Sample]:
-        """Those that they complete."""
-        return [sample for one in notes if (sample := self.add(one)) is not None]
 
     def _begin(self, noted: Noted) -> None:
         self._first = noted

@@ -54,6 +54,13 @@ class GateSettings(BaseModel):
     moving_mps: float = Field(
         0.05, ge=0, description="slower, a car that stands says nothing but that it stands"
     )
+    hang_s: float = Field(
+        15.0,
+        ge=0.5,
+        le=3600,
+        description="without a sign of life for this long a gatekeeper hangs, and is replaced; "
+        "a check takes some .1 s, and many times that beside other work",
+    )
     watch_s: float = Field(
         10.0, ge=0, le=3600, description="driving after which weights are no longer watched"
     )

@@ -6,25 +6,26 @@ last entry of the index is the one in use.
 
 import hashlib
 import os
-import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Protocol, TypeVar
+from typing import Annotated, Final, Protocol, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import MAX_BYTES, decode_weights
 
-__all__ = ["HISTORY", "Accepted", "Store", "digest_of", "trimmed"]
+__all__ = ["HISTORY", "WITHDRAWN", "Accepted", "Store", "digest_of", "trimmed"]
 
 HISTORY: Final = 8
 """Accepted weights that are kept."""
 
+WITHDRAWN: Final = 32
+"""Digests of given up weights that are kept."""
+
 _INDEX: Final = "index.json"
-_WITHDRAWN: Final = 32
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,12 @@ class Accepted:
     """The file; empty: without correction."""
     proven: bool
     """Watched to the end of its time."""
+    accepted_utc_ns: int = 0
+    """Since 1970, by the clock of the controller that accepted it first; 0: not known, which counts
+    as older than all others."""
+
+
+_Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
 class _Entry(BaseModel):
@@ -46,9 +53,9 @@ class _Entry(BaseModel):
     number: int = Field(ge=1)
     version: str
     file: str = Field(pattern=r"^[0-9a-f-]+\.bin$")
-    digest: str
+    digest: _Digest
     proven: bool
-    accepted_utc_ns: int
+    accepted_utc_ns: int = Field(0, ge=0)
 
 
 class _Index(BaseModel):
@@ -59,7 +66,7 @@ class _Index(BaseModel):
     discretisation: str = ""
     """Of the controller that accepted them."""
     entries: tuple[_Entry, ...] = ()
-    withdrawn: tuple[str, ...] = ()
+    withdrawn: tuple[_Digest, ...] = ()
     """Digests of weights that were given up while they were watched."""
 
 
@@ -108,7 +115,9 @@ class Store:
                 f"{discretisation}; choose another folder"
             )
         self._index = self._index.model_copy(update={"discretisation": discretisation})
-        self._write_index()  # a folder that cannot be written is told now, not while driving
+        self._write_index(
+            self._index
+        )  # a folder that cannot be written is told now, not while driving
 
     @property
     def next_number(self) -> int:
@@ -128,7 +137,8 @@ class Store:
                 path = self._folder / entry.file
                 data = path.read_bytes() if path.stat().st_size <= MAX_BYTES else b""
                 if digest_of(data) == entry.digest and decode_weights(data):
-                    found.append(Accepted(entry.number, entry.version, data, entry.proven))
+                    how = entry.proven, entry.accepted_utc_ns
+                    found.append(Accepted(entry.number, entry.version, data, *how))
             except (OSError, InputError):
                 continue
         return found
@@ -143,14 +153,15 @@ class Store:
             entry = known.get(one.number) or self._written(one)
             entries.append(entry.model_copy(update={"proven": one.proven}))
         before = {entry.file for entry in self._index.entries}
-        self._index = self._index.model_copy(
+        index = self._index.model_copy(
             update={
                 "next_number": next_number,
                 "entries": tuple(entries),
-                "withdrawn": tuple(withdrawn)[-_WITHDRAWN:],
+                "withdrawn": tuple(withdrawn)[-WITHDRAWN:],
             }
         )
-        self._write_index()
+        self._write_index(index)
+        self._index = index  # not before: what the folder holds is what its own index says
         for name in before - {entry.file for entry in entries}:
             with suppress(OSError):  # it is in nobody's way
                 (self._folder / name).unlink(missing_ok=True)
@@ -165,11 +176,11 @@ class Store:
             file=name,
             digest=digest,
             proven=one.proven,
-            accepted_utc_ns=time.time_ns(),
+            accepted_utc_ns=one.accepted_utc_ns,
         )
 
-    def _write_index(self) -> None:
-        self._write(_INDEX, (self._index.model_dump_json(indent=1) + "\n").encode())
+    def _write_index(self, index: _Index) -> None:
+        self._write(_INDEX, (index.model_dump_json(indent=1) + "\n").encode())
 
     def _write(self, name: str, data: bytes) -> None:
         target = self._folder / name
@@ -181,4 +192,6 @@ class Store:
                 os.fsync(file.fileno())
             partial.replace(target)
         except OSError as error:
+            with suppress(OSError):
+                partial.unlink(missing_ok=True)
             raise InputError(f"store {target}: {error.strerror or error}") from None

@@ -7,44 +7,20 @@ controller; accepted weights survive a restart; who joins late takes over what h
 import os
 import signal
 import threading
-from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from bayesrace.gp.weights import GpWeights, encode_weights, read_weights
-from bayesrace.messages import (
-    ACCEPTED,
-)
-from bayesrace.transport import (
-    Director,
-    Endpoints,
-    fetch,
-    free_endpoint,
-    open_session,
-)
+from bayesrace.gp.weights import GpWeights, encode_weights
+from bayesrace.messages import ACCEPTED
+from bayesrace.transport import Director, Endpoints, fetch_all, free_endpoint, open_session
 from tests.network.cars import Course, Program, start_controller, start_plant
 from tests.programs import until
-from tests.takeover_rig import Rig, gatekeepers, make_course, rigged
+from tests.takeover.rig import Rig, gatekeepers
 
-
-@pytest.fixture(scope="module")
-def course(tmp_path_factory: pytest.TempPathFactory) -> Course:
-    return make_course(tmp_path_factory.mktemp("course"))
-
-
-@pytest.fixture(scope="module")
-def good(course: Course) -> GpWeights:
-    """What the controllers are started with."""
-    return read_weights(course.weights_file)
-
-
-@pytest.fixture
-def rig(tmp_path: Path, course: Course) -> Iterator[Rig]:
-    with rigged(tmp_path, course) as made:
-        yield made
+pytestmark = pytest.mark.alone
 
 
 def test_the_gatekeepers_end_does_not_touch_the_drive(rig: Rig, good: GpWeights) -> None:
@@ -131,32 +107,41 @@ def test_accepted_weights_survive_a_restart(
             controller.end()
 
 
-def test_a_late_controller_takes_what_another_has_accepted(
-    tmp_path: Path, course: Course, good: GpWeights
+def test_a_late_controller_takes_the_newest_that_others_have_accepted(
+    tmp_path: Path, course: Course, good: GpWeights, again: GpWeights
 ) -> None:
-    """Connected to each other; the late one is on hold, and has no weights of its own."""
-    at_plant, first_at, late_at = (free_endpoint() for _ in range(3))
-    bare = replace(course, weights_file=course.weights_file.with_name("none"))
-    arguments = [str(word) for word in bare.arguments[:-2]]
+    """Connected to two; the late one is on hold, and has no weights of its own."""
+    at_plant, late_at, *others_at = (free_endpoint() for _ in range(4))
+    bare = [str(word) for word in course.arguments[:-2]]
     with ExitStack() as stack:
         stack.enter_context(start_plant(tmp_path, at_plant))
-        first = stack.enter_context(start_controller(tmp_path, course, at_plant, first_at))
-        session = stack.enter_context(open_session(Endpoints(connect=(at_plant, first_at))))
-        director = Director(session, "orca")
-        director.wait_for(("controller",), 20.0)
-        assert fetch(session, ACCEPTED, "orca") == b""
-        sent = encode_weights(replace(good, version="shared"))
-        director.send_weights(sent)
-        assert fetch(session, ACCEPTED, "orca") == sent
+        programs, sessions, directors = [], [], []
+        for number, where in enumerate(others_at):
+            folder = tmp_path / str(number)
+            folder.mkdir()
+            programs.append(stack.enter_context(start_controller(folder, course, at_plant, where)))
+            session = stack.enter_context(open_session(Endpoints(connect=(where,))))
+            director = Director(session, "orca")
+            director.wait_for(("controller",), 20.0)
+            assert fetch_all(session, ACCEPTED, "orca") == [b""]
+            sessions.append(session)
+            directors.append(director)
+        larger = replace(again, version="older", program="whose file is the longer one")
+        directors[1].send_weights(encode_weights(larger))
+        directors[0].send_weights(encode_weights(replace(good, version="newer")))
+        connect = [word for where in others_at for word in ("--endpoint", where)]
         late = stack.enter_context(
             Program(
-                tmp_path / "late.txt", "controller", *arguments, "--endpoint", first_at,
+                tmp_path / "late.txt", "controller", *bare, *connect,
                 "--listen", late_at, "--hold", "--parent-pid", str(os.getpid()),
             )
         )  # fmt: skip
-        other = stack.enter_context(open_session(Endpoints(connect=(late_at,))))
-        follower = Director(other, "orca")
+        session = stack.enter_context(open_session(Endpoints(connect=(late_at,))))
+        follower = Director(session, "orca")
         follower.wait_for(("controller",), 20.0)
-        until(lambda: follower.status("controller").weights_version == "shared", "its weights")
-        first.end()
-        late.end()
+        until(lambda: follower.status("controller").weights_version == "newer", "the newest")
+        assert follower.status("controller").counters["answers_ignored"] == 0
+        theirs, its = (fetch_all(one, ACCEPTED, "orca") for one in (sessions[0], session))
+        assert its == theirs  # the time of acceptance included
+        for program in (*programs, late):
+            program.end()

@@ -14,14 +14,7 @@ import pytest
 
 from bayesrace.gp.weights import GpWeights, encode_weights, write_weights
 from bayesrace.log import LogReader, Recorder
-from bayesrace.messages import (
-    EVENT,
-    STATE,
-    Event,
-    State,
-    car_key,
-    decode,
-)
+from bayesrace.messages import EVENT, STATE, TELEMETRY, Event, State, car_key, decode
 from bayesrace.raceline.line import write_raceline
 from bayesrace.tracks import Track, write_track
 from bayesrace.transport import (
@@ -87,6 +80,13 @@ class Rig:
         """Data of the answer."""
         return dict(self.director.send_weights(encode_weights(weights)).data)
 
+    def drive_and_send(self, run: int, weights: GpWeights, times: int) -> list[int]:
+        """In lockstep, handing over weights so often; the cycles that were told."""
+        self.start(run)
+        cycles = [self.send(weights)["cycle"] for _ in range(times)]
+        self.director.wait_for_end(run, 60.0)
+        return cycles
+
     def refusal(self, data: bytes) -> str:
         """Why they are not taken over."""
         with pytest.raises(RefusedError) as caught:
@@ -109,6 +109,10 @@ class Rig:
 
     def states(self, run: int) -> list[State]:
         return [one for one in self.reader().select(STATE) if one.run == run]
+
+    def ticks(self, run: int) -> list[int]:
+        """Numbers of its cycles."""
+        return [one.tick for one in self.reader().select(TELEMETRY) if one.run == run]
 
     def events(self, kind: str) -> list[Event]:
         found = [one for one in self.reader().select(EVENT) if one.source == "controller"]

@@ -1,11 +1,11 @@
-"""What the gate refuses and what it lets through, without a process: checks, watch, samples, store.
+"""What the gate refuses and what it lets through, without a process: checks, watch, samples.
 
 Promises guarded: weights with a sign flipped, outputs exchanged, a wrong size, an offset, of
 another car, older than those in use, absurd or overflowing never pass, honest ones always do; the
-watch gives the former up within a second of driving and the latter never; what is kept survives.
+watch gives the former up within a second of driving and the latter never.
 """
 
-import json
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bayesrace.errors import InputError
-from bayesrace.gp.weights import GpOutput, GpWeights, encode_weights, zero_weights
+from bayesrace.gp.weights import GpOutput, GpWeights
 from bayesrace.messages import State
 from bayesrace.vehicles import CarParameters, get_car
 from controller.gate.judge import Gate, Incumbent, Watch, compare
@@ -22,14 +21,13 @@ from controller.gate.memory import ALL_SEEN, Memory, Noted
 from controller.gate.model import plausible_samples
 from controller.gate.samples import Sample, Sampler
 from controller.gate.settings import GateSettings
-from controller.gate.store import HISTORY, Accepted, Store, trimmed
 from tests.conftest import fit_weights, smooth_drive
-from tests.spoilt_weights import SPOILT, spoilt
+from tests.takeover.rig import KINDS
+from tests.takeover.spoilt_weights import SPOILT, spoilt
 
 Floats = NDArray[np.float64]
 
 STEP_S = 0.02
-KINDS = ("rbf", "matern25", "matern15")
 LIMIT_SAMPLES = 40
 """Within which the watch has to give spoilt weights up; the car starts at 1.5 m/s."""
 
@@ -43,21 +41,21 @@ def notes(states: Floats, inputs: Floats, step_s: float = STEP_S, begin: int = 0
     ]
 
 
+def completed(states: Iterable[Noted]) -> list[Sample]:
+    """The samples that a gatekeeper makes of them."""
+    sampler = Sampler(STEP_S, 0.05)
+    return [sample for one in states if (sample := sampler.add(one)) is not None]
+
+
 @pytest.fixture(scope="module")
 def drive(car: CarParameters) -> list[Sample]:
     """600 samples of a drive that nothing here was learned from."""
-    return Sampler(STEP_S, 0.05).take(notes(*smooth_drive(car, 601, seed=7)))
+    return completed(notes(*smooth_drive(car, 601, seed=7)))
 
 
 @pytest.fixture(scope="module")
 def honest(car: CarParameters) -> GpWeights:
     return fit_weights(car, KINDS, count=300, seed=1)
-
-
-@pytest.fixture(scope="module")
-def again(car: CarParameters) -> GpWeights:
-    """Learned from another drive."""
-    return fit_weights(car, KINDS, count=300, seed=2)
 
 
 @pytest.fixture(scope="module")
@@ -242,8 +240,8 @@ def test_faster_states_are_joined_to_samples_of_one_step(car: CarParameters) -> 
     states, inputs = smooth_drive(car, count + 1, seed=3)
     dense_x = np.repeat(states, per_step, axis=0)
     dense_u = np.repeat(inputs, per_step, axis=0)
-    joined = Sampler(STEP_S, 0.05).take(notes(dense_x, dense_u, STEP_S / per_step))
-    direct = Sampler(STEP_S, 0.05).take(notes(states, inputs))
+    joined = completed(notes(dense_x, dense_u, STEP_S / per_step))
+    direct = completed(notes(states, inputs))
     assert len(joined) == len(direct) == count
     for one, other in zip(joined, direct, strict=True):
         assert one.duration_s == other.duration_s == STEP_S
@@ -254,13 +252,13 @@ def test_faster_states_are_joined_to_samples_of_one_step(car: CarParameters) -> 
 def test_gaps_standstill_and_repeated_states_make_no_sample(car: CarParameters) -> None:
     row = notes(*smooth_drive(car, 12, seed=3))
     lost = [*row[:4], *row[5:]]
-    assert [s.number for s in Sampler(STEP_S, 0.05).take(lost)] == [1, 2, 3, 6, 7, 8, 9, 10, 11]
+    assert [s.number for s in completed(lost)] == [1, 2, 3, 6, 7, 8, 9, 10, 11]
     repeated = [*row[:5], row[4]._replace(seq=5)]
-    assert len(Sampler(STEP_S, 0.05).take(repeated)) == 4
+    assert len(completed(repeated)) == 4
     other_run = [*row[:5], *(one._replace(run=2) for one in row[5:])]
-    assert len(Sampler(STEP_S, 0.05).take(other_run)) == 10
+    assert len(completed(other_run)) == 10
     standing = [one._replace(x=(0.0, 0, 0, 0.04, 0, 0, 0)) for one in row]
-    assert Sampler(STEP_S, 0.05).take(standing) == []
+    assert completed(standing) == []
 
 
 # Shared memory -------------------------------------------------------------------------------
@@ -319,66 +317,6 @@ def test_what_the_watch_has_seen_is_one_word(memories: tuple[Memory, Memory]) ->
     for told in ((0, False), (17, True), (ALL_SEEN, False)):
         reader.tell_watched(*told)
         assert writer.watched == told
-
-
-# Store ---------------------------------------------------------------------------------------
-
-
-def accepted(car: CarParameters, number: int, proven: bool = True) -> Accepted:
-    version = f"v{number}"
-    return Accepted(number, version, encode_weights(zero_weights(car.name, "d", version)), proven)
-
-
-def test_what_is_kept_is_found_again(tmp_path: Path, car: CarParameters) -> None:
-    store = Store(tmp_path / "new" / "store", "d")
-    assert (store.load(), store.next_number) == ([], 1)
-    history = [Accepted(0, "", b"", True), accepted(car, 1), accepted(car, 2, proven=False)]
-    store.keep(history, 3, ["abc"])
-    again = Store(tmp_path / "new" / "store", "d")
-    assert again.load() == history[1:]
-    assert (again.next_number, again.withdrawn) == (3, ("abc",))
-    again.keep(history[:2], 3)  # rolled back
-    assert Store(tmp_path / "new" / "store", "d").load() == history[1:2]
-    assert len(list((tmp_path / "new" / "store").iterdir())) == 2
-
-
-def test_the_store_keeps_the_newest_and_a_proven_one(tmp_path: Path, car: CarParameters) -> None:
-    store = Store(tmp_path, "d")
-    history: list[Accepted] = []
-    for number in range(1, 15):
-        history = trimmed([*history, accepted(car, number, proven=number == 2)])
-        store.keep(history, number + 1)
-    numbers = [one.number for one in Store(tmp_path, "d").load()]
-    assert numbers == [2, *range(15 - HISTORY, 15)]
-    assert len(list(tmp_path.glob("*.bin"))) == HISTORY + 1
-
-
-def test_a_store_of_another_model_or_a_damaged_one_is_refused(
-    tmp_path: Path, car: CarParameters
-) -> None:
-    Store(tmp_path, "d").keep([accepted(car, 1)], 2)
-    with pytest.raises(InputError, match="predicts with e; choose another folder"):
-        Store(tmp_path, "e")
-    (tmp_path / "index.json").write_text("{")
-    with pytest.raises(InputError, match="is damaged"):
-        Store(tmp_path, "d")
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="choose another folder"):
-        Store(tmp_path / "file", "d")
-
-
-def test_a_file_that_is_not_what_the_index_says_is_passed_over(
-    tmp_path: Path, car: CarParameters
-) -> None:
-    Store(tmp_path, "d").keep([accepted(car, 1), accepted(car, 2)], 3)
-    newest = max(tmp_path.glob("*.bin"))
-    newest.write_bytes(newest.read_bytes()[:-1])
-    assert [one.number for one in Store(tmp_path, "d").load()] == [1]
-    index = json.loads((tmp_path / "index.json").read_text())
-    index["entries"][0]["file"] = "../elsewhere.bin"
-    (tmp_path / "index.json").write_text(json.dumps(index))
-    with pytest.raises(InputError, match="is damaged"):
-        Store(tmp_path, "d")
 
 
 def test_the_limits_hold_for_the_car_that_is_built_in() -> None:

@@ -1,0 +1,1 @@
+"""New weights for a running controller: gate, gatekeeper, takeover, watch; see ``rig.py``."""

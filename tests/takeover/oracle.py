@@ -1,0 +1,58 @@
+"""What a controller with given weights would have sent: the compiled step, in this process."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bayesrace.gp.weights import GpWeights, encode_weights
+from bayesrace.messages import State
+from bayesrace.vehicles import get_car
+from controller.assembly import predictive_controller
+from controller.driver import Driver
+from controller.native_step import NativeStep
+from controller.path_table import make_path_table
+from controller.process_settings import ControllerSettings
+from controller.settings import MpcSettings
+from tests.network.cars import Course
+
+__all__ = ["converged", "replayed"]
+
+Floats = NDArray[np.float64]
+
+CAR = get_car("orca")
+
+
+def replayed(course: Course, states: Sequence[State], weights: Mapping[int, GpWeights]) -> Floats:
+    """Inputs (n, 2) of a controller that answers these states of a lockstep run, one by one.
+
+    ``weights``: new ones, by the index of the first state that they answer.
+    """
+    files = course.track_file, course.line_file
+    controller = predictive_controller(course.artefact, CAR, *files, weights=course.weights_file)
+    settings = ControllerSettings()
+    driver = Driver(
+        controller, CAR, settings.fallback, settings.compensation, settings.stale_s,
+        settings.stop_mps2,
+    )  # fmt: skip
+    inputs = []
+    for index, state in enumerate(states):
+        if index in weights:
+            controller.set_weights(encode_weights(weights[index]))
+        if index:
+            driver.prepare(driver.states.interval_s)
+        assert driver.observe(state)
+        driver.decide(state, state.time_s)
+        decision = driver.settle()
+        inputs.append((decision.d, decision.delta_rate))
+    return np.array(inputs)
+
+
+def converged(course: Course, weights: GpWeights, x: ArrayLike, d_previous: float) -> Floats:
+    """The optimal input (2,) at state x (7,), from a guess that knows no plan."""
+    step = NativeStep(course.artefact, CAR, MpcSettings())
+    step.set_path(make_path_table(course.track, course.line))
+    step.set_weights(weights)
+    status = step.step(np.array(x), d_previous)
+    assert status.usable, status
+    return step.u.copy()

@@ -1,0 +1,195 @@
+"""What happens to weights when the gatekeeper ends, or hangs, at the worst of moments.
+
+Promises guarded: who is told that weights are accepted finds them in use and in the store; whoever
+asks is answered; there is always a way back; the gatekeeper's trouble is not the car's.
+"""
+
+import os
+import resource
+import shutil
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from bayesrace.gp.weights import GpWeights
+from controller.gate.settings import GateSettings
+from tests.network.cars import Course
+from tests.programs import until
+from tests.takeover.bench import bench
+
+pytestmark = pytest.mark.alone
+
+
+@pytest.mark.parametrize("keeps", [True, False])
+def test_a_gatekeeper_killed_between_offer_and_takeover(
+    tmp_path: Path, course: Course, good: GpWeights, again: GpWeights, keeps: bool
+) -> None:
+    """What is offered is taken over all the same, and the next gatekeeper knows and keeps it."""
+    with bench(course, store=tmp_path / "store" if keeps else None) as made:
+        answer = made.send(again)
+        made.offered("weights")
+        os.kill(made.gatekeeper, signal.SIGKILL)
+        made.gone()
+        assert not answer.done()
+        assert made.version == good.version
+        made.cycle()
+        assert made.version == again.version
+        reply = made.settle(answer)
+        assert (reply.accepted, reply.data["version"]) == (True, again.version)
+        assert "not kept" not in reply.text
+        if keeps:
+            assert made.kept() == [again.version]
+            assert made.status("gatekeeper_starts") == 2
+        made.ready(2)
+        assert made.accept(replace(good, version="next")).data["number"] == 2
+        assert made.settle(made.roll_back()).data["version"] == again.version
+
+
+def test_a_gatekeeper_killed_between_takeover_and_keeping(
+    tmp_path: Path, course: Course, again: GpWeights
+) -> None:
+    """Nobody is told that weights are accepted before a restart would find them."""
+    with bench(course, store=tmp_path / "store") as made:
+        answer = made.send(again)
+        made.offered("weights")
+        victim = made.gatekeeper
+        os.kill(victim, signal.SIGSTOP)
+        made.cycle()
+        until(lambda: made.status("weights_number") == 1, "the takeover is noted")
+        assert made.version == again.version
+        assert (made.kept(), answer.done()) == ([], False)
+        os.kill(victim, signal.SIGKILL)
+        reply = made.settle(answer)
+        assert (reply.accepted, made.kept()) == (True, [again.version])
+        assert "not kept" not in reply.text
+        assert made.said("weights_accepted") == [reply.text]
+
+
+@pytest.mark.slow
+def test_a_gatekeeper_that_hangs_is_replaced(
+    course: Course, good: GpWeights, again: GpWeights
+) -> None:
+    """Whoever has asked is told; what is in use stays, and is soon watched again."""
+    with bench(course, GateSettings(hang_s=1.0)) as made:
+        made.accept(again)
+        os.kill(made.gatekeeper, signal.SIGSTOP)
+        reply = made.settle(made.send(replace(good, version="next")))
+        assert not reply.accepted
+        assert "the gatekeeper hung, without a sign of life for 1 s" in reply.text
+        assert "send them again in a moment" in reply.text
+        assert made.said("gatekeeper_ended")
+        assert made.version == again.version
+        made.ready(2)
+        until(lambda: made.courier.text == "", "all is well")
+
+        def goes_back() -> bool:
+            made.drive(1, fallen_back=True)
+            return bool(made.takeover.offers)
+
+        until(goes_back, "the watch gives them up")
+        made.cycle()
+        assert made.version == good.version
+
+
+def test_an_offer_that_the_control_loop_does_not_take_is_withdrawn(
+    course: Course, good: GpWeights, again: GpWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("controller.courier._TAKE_S", 0.1)
+    with bench(course) as made:
+        refusal = made.send(again).result(60.0)
+        assert not refusal.accepted
+        assert "the control loop did not take over within" in refusal.text
+        made.cycle()
+        assert made.version == good.version
+        monkeypatch.undo()
+        assert made.accept(again).data["number"] == 1
+
+
+def test_whoever_waits_when_the_controller_ends_is_told(course: Course, again: GpWeights) -> None:
+    with bench(course) as made:
+        answers = [made.send(again), made.roll_back()]
+        made.offered("weights")
+        made.courier.stop()
+        replies = [answer.result(60.0) for answer in answers]
+        assert [(one.accepted, one.text) for one in replies] == [(False, "the controller ends")] * 2
+
+
+# The watch, and requests at the same time ----------------------------------------------------
+
+
+def test_a_request_to_go_back_while_the_watch_does(
+    course: Course, good: GpWeights, again: GpWeights
+) -> None:
+    """The watch has said so first; who asks is told, and one step back is made, not two."""
+    with bench(course) as made:
+        made.accept(again)
+        made.accept(replace(again, version="bad"))
+        made.drive(25, fallen_back=True)
+        made.offered("give_up")
+        answer = made.roll_back()
+        until(lambda: made.asked, "the request has come")
+        third = made.send(replace(again, version="third"))
+        made.cycle()
+        assert made.version == good.version
+        reply = made.settle(answer)
+        assert (reply.accepted, reply.text) == (False, "the watch has gone back meanwhile")
+        reply = made.settle(third)
+        assert (reply.accepted, made.version) == (True, "third")
+        assert [len(made.said("weights_rolled_back")), made.status("weights_rolled_back")] == [1, 1]
+        refused = made.settle(made.send(again))
+        assert "given up before" in refused.text
+
+
+def test_the_watch_wants_to_go_back_while_a_request_does(
+    course: Course, good: GpWeights, again: GpWeights
+) -> None:
+    with bench(course) as made:
+        made.accept(again)
+        answer = made.roll_back()
+        made.offered("previous")
+        made.drive(50, fallen_back=True)
+        reply = made.settle(answer)
+        assert (reply.accepted, reply.data["by"]) == (True, "request")
+        assert made.version == good.version
+        assert made.accept(again).data["number"] == 2  # not given up
+        assert made.status("weights_rolled_back") == 1
+
+
+# The store -----------------------------------------------------------------------------------
+
+
+def test_a_full_disk_does_not_stop_a_takeover(
+    tmp_path: Path, course: Course, good: GpWeights, again: GpWeights
+) -> None:
+    """It is said that weights are not kept; they are as soon as there is room."""
+    with bench(course, store=tmp_path / "store") as made:
+        hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
+        resource.prlimit(made.gatekeeper, resource.RLIMIT_FSIZE, (1000, hard))
+        reply = made.accept(again)
+        assert "; not kept: store" in reply.text
+        assert "File too large" in reply.text
+        assert (made.version, made.kept()) == (again.version, [])
+        assert "File too large" in made.courier.text
+        assert made.said("weights_not_kept")
+        resource.prlimit(made.gatekeeper, resource.RLIMIT_FSIZE, (hard, hard))
+        reply = made.accept(replace(good, version="next"))
+        assert "not kept" not in reply.text
+        assert (made.kept(), made.courier.text) == ([again.version, "next"], "")
+
+
+def test_a_store_that_has_vanished_does_not_keep_a_gatekeeper_from_its_work(
+    tmp_path: Path, course: Course, good: GpWeights, again: GpWeights
+) -> None:
+    store = tmp_path / "store"
+    with bench(course, store=store) as made:
+        shutil.rmtree(store)
+        store.write_text("in the way")
+        os.kill(made.gatekeeper, signal.SIGKILL)
+        made.ready(2)
+        assert "; not kept: store" in made.accept(again).text
+        made.drive(25, fallen_back=True)
+        made.offered("give_up")
+        made.cycle()
+        assert made.version == good.version
