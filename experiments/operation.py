@@ -2,16 +2,14 @@
 
 import logging
 import queue
-import signal
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import contextmanager
-from types import FrameType
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, Final, Literal, NamedTuple
 
 import zenoh
 
 from bayesrace.errors import InputError
+from bayesrace.interrupts import catching_signals
 from bayesrace.messages import (
     ALIVE,
     COMMAND,
@@ -19,16 +17,13 @@ from bayesrace.messages import (
     STATUS,
     Command,
     Decoder,
-    Message,
     Reply,
-    Service,
     Status,
     StatusRequest,
     car_key,
     decode,
-    encode,
 )
-from bayesrace.transport import Endpoints, open_session
+from bayesrace.transport import Endpoints, ask_all, decisive, open_session
 from experiments.picture import SOURCES, Picture, Process
 
 __all__ = ["Found", "ask_statuses", "command", "find", "follow", "pick", "route"]
@@ -116,32 +111,6 @@ def _nobody(session: Any, endpoints: Endpoints, timeout_s: float, name: str) -> 
     return InputError(f"no car at {where}, though somebody listens there; {start}: --endpoint")
 
 
-def _ask_all(
-    session: Any,
-    service: Service[Any, Any],
-    keys: Collection[str],
-    request: Message,
-    limit_s: float,
-) -> dict[str, list[bytes]]:
-    """The answers to one request, asked of all these keys at once."""
-    pending = {
-        key: session.get(
-            key,
-            payload=encode(request),
-            timeout=min(service.timeout_s, limit_s),
-            target=zenoh.QueryTarget.ALL,
-            # Two processes under one name would otherwise be one answer.
-            consolidation=zenoh.ConsolidationMode.NONE,
-            congestion_control=zenoh.CongestionControl.BLOCK,
-        )
-        for key in keys
-    }
-    return {
-        key: [one.ok.payload.to_bytes() for one in replies if one.ok is not None]
-        for key, replies in pending.items()
-    }
-
-
 def ask_statuses(session: Any, found: Found, timeout_s: float) -> Picture:
     """What the processes say of themselves, those included that do not answer in time."""
     keys = {
@@ -150,7 +119,7 @@ def ask_statuses(session: Any, found: Found, timeout_s: float) -> Picture:
         for source in sources
     }
     request = StatusRequest(0, time.monotonic_ns())
-    answers = _ask_all(session, STATUS, keys, request, timeout_s)
+    answers = ask_all(session, keys, request, timeout_s)
     picture = Picture({})
     for key, place in keys.items():
         picture.put(*place, _process(answers[key], f"no answer within {timeout_s:g} s"))
@@ -186,33 +155,17 @@ def command(
     """Tell the controllers of these cars, all at once; each one's answer, or why there is none."""
     keys = {car: car_key(COMMAND.key, car) for car in cars}
     request = Command(0, time.monotonic_ns(), word, text)
-    answers = _ask_all(session, COMMAND, keys.values(), request, timeout_s)
+    answers = ask_all(session, keys.values(), request, timeout_s)
     return {car: _reply(answers[key], timeout_s) for car, key in keys.items()}
 
 
 def _reply(answers: list[bytes], timeout_s: float) -> Reply | str:
-    """The refusal if there is one: a name that two controllers answer to has two answers."""
+    """What the controllers under one name say together, or why that is unknown."""
     try:
-        replies = [decode(Reply, data) for data in answers]
+        reply = decisive([decode(Reply, data) for data in answers])
     except InputError as error:
         return str(error)
-    refusals = [reply for reply in replies if not reply.accepted]
-    return next(iter(refusals or replies), f"no answer within {timeout_s:g} s")
-
-
-@contextmanager
-def _signals(arrived: Callable[[], None]) -> Iterator[None]:
-    """For the block, SIGINT and SIGTERM are what ``arrived`` makes of them."""
-
-    def on_signal(_number: int, _frame: FrameType | None) -> None:
-        arrived()
-
-    before = {n: signal.signal(n, on_signal) for n in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    return reply or f"no answer within {timeout_s:g} s"
 
 
 class _News:
@@ -254,7 +207,7 @@ def follow(
     """
     news, decoder = _News(session, name), Decoder(Status)
     due_s = 0.0
-    with _signals(news.end):
+    with catching_signals(lambda _number: news.end()):
         while True:
             if (now_s := time.monotonic()) >= due_s:
                 picture.silence(now_s)
@@ -287,6 +240,6 @@ def _note_token(picture: Picture, place: _Place, there: bool) -> None:
 def route(endpoints: Endpoints) -> None:
     """Forward between all that connect to this process, until SIGINT or SIGTERM."""
     told: queue.SimpleQueue[None] = queue.SimpleQueue()
-    with _signals(lambda: told.put(None)), open_session(endpoints):
+    with catching_signals(lambda _number: told.put(None)), open_session(endpoints):
         _log.info("router on %s", ", ".join(endpoints.listen))
         told.get()

@@ -25,6 +25,8 @@ from experiments.cli import main
 from tests.conftest import Circuit
 from tests.programs import finish, run, start, until
 
+pytestmark = pytest.mark.alone
+
 SUBCOMMANDS = (
     "race", "drive", "report", "bench", "tracks", "raceline", "collect", "train", "build",
     "plant", "controller", "status", "stop", "go", "router", "latency",
@@ -196,6 +198,15 @@ def test_missing_and_wrong_input_files_are_refused(
             "controller", "--artefact", kinematic_artefact, *course, "--settings", argument
         )
         refused(outcome, argument)
+
+
+def test_more_points_than_the_controller_holds_are_refused(
+    cli: Cli, kinematic_artefact: Path
+) -> None:
+    """Before anything is learned for it."""
+    for command in ("train", "learn"):
+        outcome = cli(command, "--artefact", kinematic_artefact, "--points", "20000")
+        refused(outcome, "--points 20000", "room for (1024)", "--gp-capacity")
 
 
 def test_weights_of_another_discretisation_are_refused(

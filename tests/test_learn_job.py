@@ -11,16 +11,16 @@ import pytest
 from rich.console import Console
 
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import write_weights, zero_weights
+from bayesrace.gp.weights import read_weights, write_weights, zero_weights
 from bayesrace.integrators import PERFECT, PREDICTION
-from bayesrace.messages import Event, Scalar
+from bayesrace.messages import Event, Reply, Scalar
 from bayesrace.vehicles.models import dynamic
 from experiments.learn import desk as desk_module
 from experiments.learn.desk import Desk
 from experiments.learn.feed import What
 from experiments.learn.figure import draw, references
-from experiments.learn.journal import Journal, LapRecord, Record, UpdateRecord
-from experiments.learn.publishing import Answer, read_bytes
+from experiments.learn.journal import MOST_WEIGHTS, Journal, LapRecord, Record, UpdateRecord
+from experiments.learn.publishing import read_bytes
 from experiments.learn.settings import LearnSettings
 from experiments.learn.table import print_laps
 from experiments.learn.trainer import NICE, Trainer
@@ -28,6 +28,8 @@ from learning.arrays import write_npz
 from learning.worker import Outcome, Task
 from tests.driven import CAR, QUICK, drive
 from tests.programs import PATIENCE_S
+
+pytestmark = pytest.mark.alone
 
 SETTINGS = LearnSettings(car=CAR.name)
 NAME = PREDICTION.identity("e_kinematic", CAR)
@@ -57,7 +59,7 @@ class Office:
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.journal = Journal(folder, SETTINGS)
         self.heard = Heard()
-        self.answers: dict[str, Answer] = {}
+        self.answers: dict[str, Reply] = {}
         self.sent: list[str] = []
         self.drives_with: str | None = ""
         monkeypatch.setattr(desk_module, "send_weights", self._send)
@@ -65,7 +67,7 @@ class Office:
         feed: Any = self.heard
         self.desk = Desk(None, "orca", self.journal, feed, self.heard.said.append)
 
-    def _send(self, _session: Any, _car: str, data: bytes, _timeout_s: float) -> Answer:
+    def _send(self, _session: Any, _car: str, data: bytes) -> Reply:
         version = next(one.version for one in self.journal.record.updates
                        if read_bytes(self.journal.path(one.file)) == data)  # fmt: skip
         self.sent.append(version)
@@ -82,7 +84,7 @@ class Office:
 
         return Told
 
-    def learn(self, version: str, answer: Answer | None = None) -> UpdateRecord:
+    def learn(self, version: str, answer: Reply | None = None) -> UpdateRecord:
         path = self.journal.path(f"{version}.bin")
         write_weights(path, zero_weights(CAR.name, NAME, version))
         update = UpdateRecord(after_lap=1, version=version, file=path.name)
@@ -103,7 +105,7 @@ class Office:
         self.desk.presence(there=True)
         self.work()
 
-    def offer(self, version: str, answer: Answer | None = None) -> None:
+    def offer(self, version: str, answer: Reply | None = None) -> None:
         self.desk.offer(self.learn(version, answer))
         self.work()
 
@@ -121,8 +123,9 @@ def office(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Office:
     return Office(tmp_path / "job", monkeypatch)
 
 
-def yes(version: str, number: int = 1) -> Answer:
-    return Answer(True, "taken", version, "", 40 + number, number)
+def yes(version: str, number: int = 1) -> Reply:
+    data: dict[str, Scalar] = {"version": version, "cycle": 40 + number, "number": number}
+    return Reply(0, 0, True, "taken", data)
 
 
 def test_what_is_accepted_is_noted_with_its_cycle(office: Office) -> None:
@@ -136,7 +139,7 @@ def test_what_is_accepted_is_noted_with_its_cycle(office: Office) -> None:
 
 def test_what_is_refused_is_said_and_not_sent_again(office: Office) -> None:
     office.come()
-    office.offer("bad", Answer(False, "worse than those in use", "bad"))
+    office.offer("bad", Reply(0, 0, False, "worse than those in use", {}))
     assert office.verdict("bad") == "refused"
     assert any("worse than those in use" in line for line in office.heard.said)
     office.offer("bad")
@@ -196,17 +199,45 @@ def test_a_folder_is_gone_on_with(tmp_path: Path) -> None:
     assert not journal.resumed
     journal.add_lap(lap(1, 5.0))
     journal.add_update(UpdateRecord(after_lap=1, version="a", verdict="refused"))
-    samples = drive(dynamic(CAR), 30, seed=1)
-    journal.put_samples("new.npz", samples)
     again = Journal(tmp_path / "job", SETTINGS)
     assert again.resumed
     assert again.record == journal.record
     assert again.declined("a")
-    found = again.samples("new.npz", CAR)
-    assert found is not None
-    assert found.digest() == samples.digest()
     content = json.loads((tmp_path / "job/laps.json").read_text())
     assert content["laps"][0]["time_s"] == 5.0
+
+
+def test_weights_files_stay_bounded(tmp_path: Path) -> None:
+    """The newest; those in use and those last accepted, however old; what was given. No orphans."""
+    journal = Journal(tmp_path / "job", SETTINGS)
+    verdicts = {2: "accepted", 3: "accepted"}
+    for k in range(1, MOST_WEIGHTS + 8):
+        path = journal.free_weights(k // 2)
+        write_weights(path, zero_weights(CAR.name, NAME, f"v{k}"))
+        update = UpdateRecord(after_lap=k // 2, version=f"v{k}", file=path.name)
+        journal.add_update(update.model_copy(update={"verdict": verdicts.get(k, "refused")}))
+        journal.drop_weights(in_use="v2")
+    (journal.folder / "weights-given.bin").touch()
+    (journal.folder / "weights-9999.bin").touch()
+    journal.drop_weights(in_use="v2")
+    left = {read_weights(path).version for path in journal.folder.glob("weights-0*.bin")}
+    newest = {f"v{k}" for k in range(8, MOST_WEIGHTS + 8)}
+    assert left == newest | {"v2", "v3"}
+    assert not (journal.folder / "weights-9999.bin").exists()
+    assert (journal.folder / "weights-given.bin").exists()
+    files = [update.file for update in journal.record.updates]
+    assert len(set(files)) == len(files), "a deleted file's name is not given again"
+
+
+def test_what_nobody_answered_for_waits_no_longer_than_for_newer_weights(office: Office) -> None:
+    office.come()
+    office.offer("a")
+    assert office.verdict("a") == "waiting"
+    office.offer("b", yes("b"))
+    assert (office.verdict("a"), office.verdict("b")) == ("no answer", "accepted")
+    update = office.journal.update_of("a")
+    assert update is not None
+    assert update.answer == "nobody answers"
 
 
 @pytest.mark.parametrize(
@@ -278,9 +309,9 @@ def test_picture_and_table_show_every_kind_of_lap(tmp_path: Path) -> None:
     laps.append(lap(5, 160.0))
     updates = [
         UpdateRecord(after_lap=k, version=f"v{k}", verdict=verdict, samples=10)
-        for k, verdict in enumerate(("accepted", "refused", "rolled back", "failed"))
+        for k, verdict in enumerate(("accepted", "refused", "rolled back", "failed", "waiting"))
     ]
-    record = Record(laps=laps, updates=updates)
+    record = Record(laps=laps, updates=updates, remarks=["the car stood"])
     draw(record, {"bestcase": 7.39}, tmp_path / "laps.png")
     assert (tmp_path / "laps.png").stat().st_size > 5000
     draw(Record(laps=laps[:1]), {}, tmp_path / "rest.png")
@@ -292,6 +323,8 @@ def test_picture_and_table_show_every_kind_of_lap(tmp_path: Path) -> None:
     text = console.export_text()
     for words in ("8.000*", "7.400!", "refused", "rolled back", "v3"):
         assert words in text
+    assert "nothing to learn from: the car stood" in text
+    assert "waiting: no controller has answered" in text
     print_laps(Record(laps=[replace_number(laps[1], k) for k in range(1, 100)]), console)
     assert "the last 40 of 99 laps" in console.export_text()
 

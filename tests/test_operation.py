@@ -47,6 +47,8 @@ from experiments.status_table import COUNTERS_SHOWN, StatusTable
 from tests.conftest import Circuit
 from tests.programs import ROOT, environment, finish, run, start, until
 
+pytestmark = pytest.mark.alone
+
 PATIENCE_S = 5.0
 COUNTERS = {"deadline_misses": 3, "shifted_plan": 4, "brake": 5, "stop": 6, "refused": 7,
             "states_lost": 8, "states_stale": 9}  # fmt: skip

@@ -14,7 +14,7 @@ from tests.learning_rig import Rig, rigged
 from tests.network.cars import gentle_course
 from tests.programs import finish, run, start
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.alone]
 
 
 @pytest.fixture(scope="module")

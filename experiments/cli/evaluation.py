@@ -8,7 +8,15 @@ from typing import Annotated
 import typer
 
 from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK
-from experiments.cli.options import Car, CarName, FmuFile, FmuMap, TrackName, writable
+from experiments.cli.options import (
+    Car,
+    CarName,
+    FmuFile,
+    FmuMap,
+    TrackName,
+    connect_to,
+    writable,
+)
 
 __all__ = ["register"]
 
@@ -108,21 +116,13 @@ def drive(
     from bayesrace.log import Recorder
     from bayesrace.messages import EVENT, Event
     from bayesrace.tracks import load_track
-    from bayesrace.transport import (
-        CONTROLLER_ENDPOINT,
-        PLANT_ENDPOINT,
-        Director,
-        Endpoints,
-        Publisher,
-        open_session,
-    )
+    from bayesrace.transport import Director, Publisher, open_session
     from experiments.drive import RunPlan, execute
 
-    endpoints = Endpoints(connect=tuple(endpoint or (PLANT_ENDPOINT, CONTROLLER_ENDPOINT)))
     course = load_track(track)
     name = name or car
     with (
-        open_session(endpoints) as session,
+        open_session(connect_to(endpoint)) as session,
         Recorder(session, name, log, {"drive": {"car": car, "track": course.name}}),
     ):
         director = Director(session, name)

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from bayesrace.errors import InputError
-from experiments.cli.options import Car, CarName, writable
+from experiments.cli.options import Car, CarName, connect_to, writable
 
 __all__ = ["register"]
 
@@ -59,12 +59,11 @@ def latency(
 
     from bayesrace.realtime import RealtimeSettings
     from bayesrace.tracks import DEFAULT_RACE_TRACK
-    from bayesrace.transport import CONTROLLER_ENDPOINT, PLANT_ENDPOINT
     from experiments.latency.report import print_report
     from experiments.latency.settings import LatencySettings
     from experiments.progress import stages_on
 
-    ends = tuple(endpoint or (PLANT_ENDPOINT, CONTROLLER_ENDPOINT)) if attach else ()
+    ends = connect_to(endpoint).connect if attach else ()
     settings = LatencySettings(
         car=car, name=name, rate_hz=rate, duration_s=duration, load=load,
         settle_s=1.0 if attach else 3.0,

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from experiments.cli.options import Car, CarName, writable
+from experiments.cli.options import Car, CarName, Endpoint, connect_to, writable
+from experiments.notation import UNCERTAIN
 
 if TYPE_CHECKING:
     from bayesrace.transport import Endpoints
@@ -15,14 +16,6 @@ __all__ = ["register"]
 
 Name = Annotated[
     str, typer.Option("--name", "--car", help="Name of the car; the only one there is without.")
-]
-Endpoint = Annotated[
-    list[str] | None,
-    typer.Option(
-        help="Zenoh endpoint of a plant, a controller or a router; can be given several times "
-        "[tcp/127.0.0.1:7447 and :7448, the plant's and the controller's own].",
-        show_default=False,
-    ),
 ]
 Timeout = Annotated[
     float,
@@ -53,7 +46,7 @@ def validate(
     ] = None,
     threshold: Annotated[
         float, typer.Option(min=0, help="Mark where the largest sigma is above this.")
-    ] = 0.25,
+    ] = UNCERTAIN,
     run: Annotated[
         list[int] | None, typer.Option(help="Only this run of the log; repeatable.")
     ] = None,
@@ -106,14 +99,14 @@ def publish(
 
     Exit code 0 once it drives with them, 1 if it refuses, 2 if it cannot be asked.
     """
-    from bayesrace.transport import open_session
-    from experiments.learn.publishing import RefusalError, read_bytes, send_weights
+    from bayesrace.transport import open_session, send_weights
+    from experiments.learn.publishing import Answer, RefusalError, read_bytes
 
     data = read_bytes(weights)
-    endpoints = _endpoints(endpoint)
+    endpoints = connect_to(endpoint)
     with open_session(endpoints) as session:
         car = _controller(session, endpoints, name, timeout)
-        answer = send_weights(session, car, data, timeout)
+        answer = Answer.of(send_weights(session, car, data, timeout))
     if not answer.accepted:
         raise RefusalError(f"{car}: {answer.words}")
     typer.echo(f"{car}: {answer.version} {answer.words}")
@@ -129,13 +122,13 @@ def rollback(
 
     Exit code 0 once it drives with them, 1 if there are none, 2 if it cannot be asked.
     """
-    from bayesrace.transport import open_session
-    from experiments.learn.publishing import RefusalError, send_rollback
+    from bayesrace.transport import open_session, send_rollback
+    from experiments.learn.publishing import Answer, RefusalError
 
-    endpoints = _endpoints(endpoint)
+    endpoints = connect_to(endpoint)
     with open_session(endpoints) as session:
         car = _controller(session, endpoints, name, timeout)
-        answer = send_rollback(session, car, reason or "bayesrace rollback", timeout)
+        answer = Answer.of(send_rollback(session, car, reason or "bayesrace rollback", timeout))
     if not answer.accepted:
         raise RefusalError(f"{car}: {answer.words}")
     instead = f", instead of {answer.before}" if answer.before else ""
@@ -204,15 +197,9 @@ def learn(
     )
     stamp = datetime.now(UTC).astimezone().strftime("%Y%m%d-%H%M%S")
     folder = out or Path("runs") / f"learn-{stamp}"
-    journal = follow(settings, _endpoints(endpoint), folder, data or [], weights, typer.echo)
+    journal = follow(settings, connect_to(endpoint), folder, data or [], weights, typer.echo)
     print_laps(journal.record)
     typer.echo(str(folder))
-
-
-def _endpoints(given: list[str] | None) -> "Endpoints":
-    from bayesrace.transport import CONTROLLER_ENDPOINT, PLANT_ENDPOINT, Endpoints
-
-    return Endpoints(connect=tuple(given or (PLANT_ENDPOINT, CONTROLLER_ENDPOINT)))
 
 
 def _controller(session: object, endpoints: "Endpoints", name: str, timeout_s: float) -> str:

@@ -11,23 +11,14 @@ import typer
 
 from bayesrace.clock import die_with_parent
 from bayesrace.errors import InputError
-from experiments.cli.options import ParentPid
+from experiments.cli.options import Endpoint, ParentPid, connect_to
 
 if TYPE_CHECKING:
-    from bayesrace.transport import Endpoints
     from experiments.picture import Picture
 
 __all__ = ["register"]
 
 Name = Annotated[str, typer.Option(help="Name of the car.")]
-Endpoint = Annotated[
-    list[str] | None,
-    typer.Option(
-        help="Zenoh endpoint of a plant, a controller or a router; can be given several times "
-        "[tcp/127.0.0.1:7447 and :7448, the plant's and the controller's own].",
-        show_default=False,
-    ),
-]
 Timeout = Annotated[
     float, typer.Option(min=0.1, max=60.0, help="Seconds to find the cars, and again to answer.")
 ]
@@ -62,7 +53,7 @@ def status(
     from experiments.operation import ask_statuses, find
     from experiments.status_table import StatusTable
 
-    endpoints = _endpoints(endpoint)
+    endpoints = connect_to(endpoint)
     with open_session(endpoints) as session, _until_nobody_reads():
         picture = ask_statuses(session, find(session, endpoints, timeout, name), timeout)
         if watch and as_json:
@@ -121,12 +112,6 @@ def _until_nobody_reads() -> Iterator[None]:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _endpoints(given: list[str] | None) -> "Endpoints":
-    from bayesrace.transport import CONTROLLER_ENDPOINT, PLANT_ENDPOINT, Endpoints
-
-    return Endpoints(connect=tuple(given or (PLANT_ENDPOINT, CONTROLLER_ENDPOINT)))
-
-
 def stop(
     name: Name = "",
     endpoint: Endpoint = None,
@@ -166,7 +151,7 @@ def _command(
     from experiments.operation import command, find, pick
     from experiments.picture import printable
 
-    endpoints = _endpoints(endpoint)
+    endpoints = connect_to(endpoint)
     with open_session(endpoints) as session:
         cars = pick(find(session, endpoints, timeout, name, ("controller",)), name, everybody)
         answers = command(session, cars, word, reason, timeout)

@@ -1,15 +1,19 @@
 """Options that several subcommands share."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from bayesrace.errors import InputError
 
+if TYPE_CHECKING:
+    from bayesrace.transport import Endpoints
+
 __all__ = [
     "Car",
     "CarName",
+    "Endpoint",
     "FmuFile",
     "FmuMap",
     "LowLatency",
@@ -17,6 +21,7 @@ __all__ = [
     "ParentPid",
     "RaceLineFile",
     "TrackName",
+    "connect_to",
     "writable",
 ]
 
@@ -28,6 +33,21 @@ TrackName = Annotated[str, typer.Option(help="Track: built-in name, random:SEED 
 RaceLineFile = Annotated[
     Path, typer.Option("--raceline", help="Racing line file, as 'bayesrace raceline' writes it.")
 ]
+Endpoint = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Zenoh endpoint of a plant, a controller or a router; can be given several times "
+        "[tcp/127.0.0.1:7447 and :7448, the plant's and the controller's own].",
+        show_default=False,
+    ),
+]
+
+
+def connect_to(given: list[str] | None) -> "Endpoints":
+    """What to connect to: the endpoints given, or the plant's and the controller's own."""
+    from bayesrace.transport import CONTROLLER_ENDPOINT, PLANT_ENDPOINT, Endpoints
+
+    return Endpoints(connect=tuple(given or (PLANT_ENDPOINT, CONTROLLER_ENDPOINT)))
 
 
 def writable(path: Path | None) -> Path | None:

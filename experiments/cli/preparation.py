@@ -156,6 +156,7 @@ def train(
     from bayesrace.vehicles import get_car
     from experiments.learning_table import print_choices, print_kernels
     from experiments.progress import stages_on
+    from learning.dataset import left_out
     from learning.residual import discretisation_of
     from learning.sources import read_samples
     from learning.training import TrainingSettings, fit
@@ -165,7 +166,7 @@ def train(
         manifest = read_manifest(artefact)
         car = car or manifest.car
         wanted = discretisation_of(manifest.discretisation, get_car(manifest.car))
-        _check_capacity(points, manifest.gp_capacity)
+        manifest.check_points(points)
     samples = read_samples([*(logs or []), *(data or [])], car, name, wanted)
     console = Console()
     every = tuple(one.value for one in KernelChoice if one is not KernelChoice.auto)
@@ -190,21 +191,13 @@ def train(
 
         with figure_style():
             write_png(kernel_figure(training.kernels), plot)
-    dropped = ", ".join(f"{n} {why}" for why, n in samples.dataset.dropped.items()) or "none"
     console.print(
-        f"{weights.version}: {len(samples.dataset)} samples (left out: {dropped}), "
+        f"{weights.version}: {len(samples.dataset)} samples "
+        f"(left out: {left_out(samples.dataset.dropped)}), "
         f"kernels {', '.join(weights.kernels)}: {out}",
         highlight=False,
         soft_wrap=True,
     )
-
-
-def _check_capacity(points: int, capacity: int) -> None:
-    if points > capacity:
-        raise InputError(
-            f"--points {points} are more than this controller has room for ({capacity}); give "
-            "fewer, or build one with --gp-capacity"
-        )
 
 
 def build(

@@ -11,6 +11,7 @@ from bayesrace.errors import InputError
 from bayesrace.messages import Actuation, State, Telemetry
 from bayesrace.tracks import StartLine, Track
 from bayesrace.vehicles.parameters import CarParameters
+from experiments.learn.usable import why_unusable
 from learning.dataset import Dataset
 from learning.logs import dataset_from_messages
 
@@ -25,6 +26,11 @@ _PATIENCE_S: Final = 0.5
 
 _FAR_S: Final = 0.1
 """Two states further apart leave it open when the line between them was crossed."""
+
+
+_WORTH_A_WORD: Final = 50
+"""A stretch without a lap's end says why it is of no use from so many states on: less remains
+between the last lap and the end of a run."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +56,9 @@ class Driven:
 
     samples: Dataset | None
     lap: Lap | None
+    why_not: str = ""
+    """Why none of it can be learned from, and what to do about it; empty if some of it can, or if
+    it is too short to say."""
 
 
 @dataclass(eq=False)
@@ -182,9 +191,12 @@ class Collector:
         fallbacks = [self._fallbacks.pop(key) for key in cycles]
         try:
             samples = dataset_from_messages(stretch.states, fallbacks, self._car, self._step_s)
-        except InputError:  # no two consecutive states
+        except InputError:  # no two states that are a step apart
             samples = None
-        return Driven(samples, self._lap(stretch, len(fallbacks)) if stretch.is_lap else None)
+        lap = self._lap(stretch, len(fallbacks)) if stretch.is_lap else None
+        told = lap is not None or len(stretch.states) >= _WORTH_A_WORD
+        why_not = why_unusable(stretch.states, samples, self._car, self._step_s) if told else ""
+        return Driven(samples, lap, why_not)
 
     def _lap(self, stretch: _Stretch, fallbacks: int) -> Lap:
         off_m = None

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from bayesrace.errors import InputError
-from bayesrace.messages import STATUS, WEIGHTS, Event, StatusRequest
-from bayesrace.transport import ask
+from bayesrace.messages import STATUS, Event, StatusRequest
+from bayesrace.transport import ask, send_weights
 from experiments.learn.feed import Feed, What
 from experiments.learn.journal import Journal, UpdateRecord
-from experiments.learn.publishing import Answer, read_bytes, send_weights
+from experiments.learn.publishing import Answer, read_bytes
 
 __all__ = ["Desk"]
 
@@ -47,12 +47,18 @@ class Desk:
         self._thread = ThreadPoolExecutor(1, "learn-desk")
         self._pending = 0
         self._there = False
+        self._closed = False
         self._in_use = ""
 
     @property
     def busy(self) -> bool:
         """An answer is being waited for."""
         return self._pending > 0
+
+    @property
+    def in_use(self) -> str:
+        """Version that the controller drives with, as far as it has been told; else empty."""
+        return self._in_use
 
     def offer(self, update: UpdateRecord) -> None:
         """Sends the weights of an update, unless nobody would want them."""
@@ -70,8 +76,7 @@ class Desk:
         """The controller has come or gone."""
         came, self._there = there and not self._there, there
         if came:
-            self._pending += 1
-            self._thread.submit(self._ask_status)
+            self._do(self._ask_status)
         elif not there:
             self._say("the controller is gone; waiting for it")
 
@@ -98,6 +103,8 @@ class Desk:
             return
         update = self._journal.update_of(told.version)
         if told.answer is None:
+            if update is not None and update.verdict == "waiting":
+                self._journal.change_update(told.version, answer=told.why_not)
             self._say(f"{told.version}: {told.why_not}")
         elif not told.answer.accepted:
             self._settle(told.version, "refused", told.answer.text)
@@ -109,7 +116,11 @@ class Desk:
                 self._settle(told.version, "accepted", told.answer.words, **numbers)
 
     def close(self) -> None:
-        """Waits for an answer under way; what has not begun is not sent."""
+        """Nothing more is sent: what waits is for the next job."""
+        self._closed = True
+
+    def wait(self) -> None:
+        """After :meth:`close`: until an answer under way is there for :meth:`answer`."""
         self._thread.shutdown(wait=True, cancel_futures=True)
 
     def _arrived(self, version: str | None) -> None:
@@ -125,20 +136,28 @@ class Desk:
             self._send(ours)
 
     def _send(self, update: UpdateRecord) -> None:
-        self._pending += 1
-        self._thread.submit(self._exchange, update)
-
-    def _exchange(self, update: UpdateRecord) -> None:
-        """In the thread."""
         try:
             data = read_bytes(self._journal.path(update.file))
-            answer = send_weights(self._session, self._name, data, WEIGHTS.timeout_s)
         except InputError as error:
-            self._feed.put(What.ANSWER, _Sent(update.version, None, str(error)))
-        except Exception as error:  # the session has been closed, say: the job must not wait on
-            self._feed.put(What.ANSWER, _Sent(update.version, None, f"not sent: {error}"))
+            self._say(f"{update.version}: {error}")
         else:
-            self._feed.put(What.ANSWER, _Sent(update.version, answer))
+            self._do(self._exchange, update.version, data)
+
+    def _do(self, work: Callable[..., None], *arguments: Any) -> None:
+        """In the thread, unless this is closed."""
+        if not self._closed:
+            self._pending += 1
+            self._thread.submit(work, *arguments)
+
+    def _exchange(self, version: str, data: bytes) -> None:
+        """In the thread."""
+        try:
+            sent = _Sent(version, Answer.of(send_weights(self._session, self._name, data)))
+        except InputError as error:
+            sent = _Sent(version, None, str(error))
+        except Exception as error:  # the session has been closed, say: the job must not wait on
+            sent = _Sent(version, None, f"not sent: {error}")
+        self._feed.put(What.ANSWER, sent)
 
     def _ask_status(self) -> None:
         """In the thread."""

@@ -1,11 +1,8 @@
 """Everything that can happen to the learning job, in one queue for its one thread."""
 
 import queue
-import signal
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from enum import Enum
-from types import FrameType
 from typing import Any, Final, NamedTuple
 
 import zenoh
@@ -83,19 +80,10 @@ class Feed:
         except queue.Empty:
             return None
 
-    @contextmanager
-    def catching_signals(self) -> Iterator[None]:
-        """For the block, SIGINT and SIGTERM are items. For the main thread."""
-
-        def on_signal(_number: int, _frame: FrameType | None) -> None:
-            self.put(What.END)
-
-        before = {n: signal.signal(n, on_signal) for n in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
+    def waiting(self) -> Iterator[Item]:
+        """The items that are there by now, without those that come meanwhile."""
+        for _ in range(self._items.qsize()):
+            yield self._items.get()
 
     def _taking(self, what: What) -> Any:
         def on_sample(sample: Any) -> None:

@@ -31,11 +31,7 @@ def discretisation_from(
     told: dict[Discretisation, str] = {}
     if artefact is not None:
         manifest = read_manifest(artefact)
-        if points > manifest.gp_capacity:
-            raise InputError(
-                f"--points {points} are more than this controller has room for "
-                f"({manifest.gp_capacity}); give fewer, or build one with --gp-capacity"
-            )
+        manifest.check_points(points)
         told[discretisation_of(manifest.discretisation, car)] = str(artefact)
     if weights is not None:
         told.setdefault(discretisation_of(read_weights(weights).discretisation, car), str(weights))

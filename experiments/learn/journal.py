@@ -5,9 +5,10 @@ file              what
 ================  ===============================================================================
 settings.json     of the job (:class:`.settings.LearnSettings`)
 laps.json         :class:`Record`: every lap, every update with the controller's answer
-weights-NNNN.bin  weights learned after that lap (0000: from the data given)
-kept.npz          samples kept so far, bounded (form: :mod:`learning.arrays`)
-new.npz           samples that no update has learned from yet
+weights-NNNN.bin  weights learned after that lap (0000: from the data given); the newest ones
+weights-given.bin weights that the job was given to begin with
+kept-N.npz        samples kept so far, bounded (:mod:`.store`; form: :mod:`learning.arrays`)
+new-N.npz         samples that no update has learned from yet
 laps.png          lap time against lap number
 ================  ===============================================================================
 
@@ -15,20 +16,28 @@ Every file is replaced whole: whenever the job is killed, the folder can be gone
 """
 
 from collections.abc import Mapping
+from itertools import count
 from pathlib import Path
 from typing import Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from bayesrace.errors import InputError
-from bayesrace.vehicles.parameters import CarParameters
 from experiments.learn.settings import LearnSettings
-from learning.arrays import dataset_from_npz, write_npz
-from learning.dataset import Dataset
 
-__all__ = ["Journal", "LapRecord", "Record", "UpdateRecord"]
+__all__ = ["MOST_WEIGHTS", "Journal", "LapRecord", "Record", "UpdateRecord"]
 
-Verdict = Literal["waiting", "accepted", "refused", "rolled back", "not sent", "failed"]
+MOST_WEIGHTS: Final = 20
+"""Weights files that stay, the newest; besides, those that are in use or were last accepted."""
+
+_MOST_REMARKS: Final = 50
+"""Each is there once, but some name a number."""
+
+Verdict = Literal[
+    "waiting", "accepted", "refused", "rolled back", "not sent", "no answer", "failed"
+]
+"""Of weights: ``waiting`` for a controller's answer; ``no answer``: newer weights came first; ``not
+sent``: declined before; ``failed``: the training."""
 
 
 class _Frozen(BaseModel):
@@ -54,7 +63,7 @@ class UpdateRecord(_Frozen):
 
     after_lap: int = Field(description="last lap that it learned from; 0: only the data given")
     version: str = Field("", description="of its weights; empty if there are none")
-    file: str = ""
+    file: str = Field("", description="of the weights; those of long ago are deleted")
     samples: int = Field(0, description="learned from")
     kept: int = Field(0, description="samples kept for the next time")
     points: int = Field(0, description="training points per output, the most")
@@ -72,16 +81,20 @@ class Record(_Frozen):
     """``laps.json``."""
 
     schema_version: Literal[1] = 1
+    recall: bool = Field(
+        True, description="what the given weights know counts until samples are kept"
+    )
     laps: list[LapRecord] = Field(default_factory=list)
     updates: list[UpdateRecord] = Field(default_factory=list)
+    remarks: list[str] = Field(
+        default_factory=list, description="why nothing could be learned from a drive, each once"
+    )
 
 
 class _Files:
     settings: Final = "settings.json"
     record: Final = "laps.json"
-    kept: Final = "kept.npz"
-    next_kept: Final = "kept-next.npz"
-    new: Final = "new.npz"
+    given: Final = "weights-given.bin"
     plot: Final = "laps.png"
     worker: Final = "worker.log"
 
@@ -98,6 +111,8 @@ class Journal:
         """
         self.folder = folder
         self.record = Record()
+        self.resumed = (folder / _Files.record).exists()
+        """There is something to go on with."""
         path = folder / _Files.settings
         if path.exists():
             self._check(path, settings)
@@ -106,12 +121,8 @@ class Journal:
             raise InputError(f"{folder} holds something else; choose another folder")
         folder.mkdir(parents=True, exist_ok=True)
         _replace(path, settings.model_dump_json(indent=1) + "\n")
-
-    @property
-    def resumed(self) -> bool:
-        """There is something to go on with."""
-        samples = self.existing(_Files.kept) or self.existing(_Files.new)
-        return bool(self.record.laps or self.record.updates or samples)
+        for partial in folder.glob(".weights-*"):  # of a killed job
+            partial.unlink()
 
     def path(self, name: str) -> Path:
         """Of a file in the folder."""
@@ -122,13 +133,33 @@ class Journal:
         path = self.path(name)
         return path if path.is_file() else None
 
+    def begin(self, given: UpdateRecord | None, recall: bool) -> None:
+        """From now on the folder is gone on with: what was given is in it."""
+        updates = [] if given is None else [given]
+        self._write(Record(recall=recall, updates=updates))
+
+    def save(self) -> None:
+        """Writes the record though nothing is new: what else is there will be gone on with."""
+        self._write(self.record)
+
     def add_lap(self, lap: LapRecord) -> None:
         """One lap more."""
         self._write(self.record.model_copy(update={"laps": [*self.record.laps, lap]}))
 
     def add_update(self, update: UpdateRecord) -> None:
-        """One update more."""
-        self._write(self.record.model_copy(update={"updates": [*self.record.updates, update]}))
+        """One update more; those before it do not wait for an answer any more."""
+        before = [
+            one.model_copy(update={"verdict": "no answer"}) if one.verdict == "waiting" else one
+            for one in self.record.updates
+        ]
+        self._write(self.record.model_copy(update={"updates": [*before, update]}))
+
+    def remark(self, text: str) -> None:
+        """Notes it, unless it has been."""
+        remarks = self.record.remarks
+        if text not in remarks:
+            newest = [*remarks, text][-_MOST_REMARKS:]
+            self._write(self.record.model_copy(update={"remarks": newest}))
 
     def change_update(self, version: str, **changes: object) -> UpdateRecord | None:
         """Changes the last update of this version; None if there is none."""
@@ -158,18 +189,24 @@ class Journal:
         verdicts = {one.verdict for one in self.record.updates if one.version == version}
         return bool(verdicts & {"refused", "rolled back"})
 
-    def put_samples(self, name: str, samples: Dataset) -> Path:
-        """Writes samples to a file of the folder, whole or not at all."""
-        path = self.path(name)
-        partial = path.with_name(f".{path.stem}.part.npz")
-        write_npz(partial, samples)
-        partial.replace(path)
-        return path
+    def free_weights(self, lap: int) -> Path:
+        """A file for the weights after this lap that no update has had."""
+        taken = {one.file for one in self.record.updates}
+        names = (f"weights-{lap:04d}{'' if k == 1 else f'-{k}'}.bin" for k in count(1))
+        return self.path(next(name for name in names if name not in taken))
 
-    def samples(self, name: str, car: CarParameters) -> Dataset | None:
-        """Samples of a file of the folder, if it is there."""
-        path = self.existing(name)
-        return None if path is None else dataset_from_npz(path, car)
+    def drop_weights(self, in_use: str) -> None:
+        """Deletes weights files, but for the newest, those last accepted and those in use.
+
+        ``in_use``: version that the controller drives with. Weights that a killed job has left
+        without an update go as well, so call it only while no training is under way.
+        """
+        updates = [one for one in self.record.updates if one.file]
+        needed = [*updates[-MOST_WEIGHTS:], self.last_accepted(), self.update_of(in_use)]
+        names = {one.file for one in needed if one is not None}
+        for path in self.folder.glob("weights-[0-9]*.bin"):
+            if path.name not in names:
+                path.unlink()
 
     def _check(self, path: Path, settings: LearnSettings) -> None:
         try:

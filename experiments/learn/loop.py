@@ -6,25 +6,23 @@ may come, go and be started again at any time.
 """
 
 import os
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights, write_weights
+from bayesrace.interrupts import catching_signals, deferred_interrupt
 from bayesrace.messages import Actuation, Decoder, Event, State, Telemetry
 from bayesrace.tracks import Track
 from bayesrace.vehicles.parameters import get_car
-from experiments.learn.collector import Collector, Driven
+from experiments.learn.collector import Collector, Driven, Lap
 from experiments.learn.desk import Desk
 from experiments.learn.feed import Feed, Item, What
 from experiments.learn.journal import Journal, LapRecord, UpdateRecord
 from experiments.learn.settings import LearnSettings
+from experiments.learn.store import SampleStore
 from experiments.learn.trainer import Trainer
-from learning.dataset import Dataset, concatenate
-from learning.pool import MOST_NEW
-from learning.subset import evenly
+from learning.dataset import Dataset
 from learning.training import TrainingSettings
 from learning.worker import Outcome, Task
 
@@ -33,8 +31,6 @@ __all__ = ["Learner"]
 _TICK_S: Final = 0.1
 _LONELY_S: Final = 5.0
 """After this long without plant or controller, that is said."""
-
-_GIVEN: Final = "weights-given.bin"
 
 
 class Learner:
@@ -64,13 +60,11 @@ class Learner:
             What.ACTUATION: Decoder(Actuation),
             What.EVENT: Decoder(Event),
         }
-        self._new: list[Dataset] = []
-        """Driven since the last training began."""
+        self._store = SampleStore(journal.folder, self._car)
         self._task: Task | None = None
         self._due = False
         """There is something to learn that no training has been asked for."""
-        self._recall = True
-        """What given weights know counts as samples: the samples themselves are not at hand."""
+        self._remarked: set[str] = set()
         self._there: set[str] = set()
         self._waited_s = 0.0
         self._laps = 0
@@ -78,27 +72,32 @@ class Learner:
 
     def begin(self, samples: Dataset | None, weights: GpWeights | None) -> None:
         """What is known before the first lap; of a folder gone on with, what was known last."""
-        journal = self._journal
+        journal, store = self._journal, self._store
         if journal.resumed:
-            samples, weights = journal.samples(Journal.FILES.new, self._car), None
-            last = len(journal.record.laps)
-            self._say(f"going on in {journal.folder} after lap {last}")
-        if weights is not None:
-            write_weights(journal.path(_GIVEN), weights)
-            points = max(weights.counts)
-            given = UpdateRecord(after_lap=0, version=weights.version, file=_GIVEN, points=points)
-            journal.add_update(given)
-        if samples is not None and len(samples):
-            self._recall = weights is None or weights.dataset_digest != samples.digest()
-            self._new.append(samples)
-            self._due = True
+            self._say(f"going on in {journal.folder} after lap {len(journal.record.laps)}")
+        else:  # what an unfinished beginning has left is given once more
+            store.clear()
+            journal.path(Journal.FILES.given).unlink(missing_ok=True)
+            if samples is not None:
+                store.add(samples)
+                store.save()
+            given = None if weights is None else self._given(weights)
+            if given is not None or store.waiting:
+                journal.begin(given, recall=not _known(weights, samples))
+        self._due = store.waiting
+
+    def _given(self, weights: GpWeights) -> UpdateRecord:
+        path = self._journal.path(Journal.FILES.given)
+        write_weights(path, weights)
+        points = max(weights.counts)
+        return UpdateRecord(after_lap=0, version=weights.version, file=path.name, points=points)
 
     def run(self) -> None:
         """Until the wanted number of laps is learned from, or a signal."""
         feed = self._feed
         self._trainer.prepare()
         try:
-            with feed.catching_signals():
+            with catching_signals(lambda _number: feed.put(What.END)):
                 while not self._done():
                     item = feed.next(_TICK_S)
                     if item is not None:
@@ -118,19 +117,24 @@ class Learner:
 
     def _end(self) -> None:
         """What has been driven and not yet learned from is for the next time."""
-        self._trainer.stop()
-        self._desk.close()
-        for driven in self._collector.end():
-            self._note(driven, whole=False)
-        new = list(self._new)
-        if self._task is not None:
-            with suppress(InputError):
-                waiting = self._journal.samples(Journal.FILES.new, self._car)
-                new = new if waiting is None else [waiting, *new]
-        if new:
-            self._journal.put_samples(Journal.FILES.new, _thinned(new))
+        with deferred_interrupt():
+            self._trainer.stop()
+            self._desk.close()
+            self._take_rest()
+            for driven in self._collector.end():
+                self._note(driven, whole=False)
+            self._store.end()
+            if self._store.waiting:
+                self._journal.save()
+                self._store.save()
+        self._desk.wait()  # seconds, perhaps; who interrupts now loses no more than the answer
+        self._take_rest()
         if self._feed.lost:
             self._say(f"{self._feed.lost} messages came faster than they could be read")
+
+    def _take_rest(self) -> None:
+        for item in self._feed.waiting():
+            self._take(item)
 
     # What happens ------------------------------------------------------------------------------
 
@@ -178,14 +182,16 @@ class Learner:
 
     def _note(self, driven: Driven, whole: bool = True) -> None:
         """A stretch has been driven."""
-        samples = driven.samples
-        if samples is not None and len(samples):
-            self._new = [_thinned([*self._new, samples])]
-        lap = driven.lap
-        if lap is None or not whole:
-            return
+        if driven.samples is not None:
+            self._store.add(driven.samples)
+        if driven.lap is not None and whole:
+            self._note_lap(driven.lap, driven.samples)
+        if driven.why_not:
+            self._remark(driven.why_not)
+
+    def _note_lap(self, lap: Lap, samples: Dataset | None) -> None:
         self._laps += 1
-        self._due = self._due or bool(self._new)
+        self._due = self._due or self._store.waiting
         record = LapRecord(
             lap=len(self._journal.record.laps) + 1,
             run=lap.run,
@@ -200,23 +206,30 @@ class Learner:
         self._journal.add_lap(record)
         self._say(_lap_words(record))
 
+    def _remark(self, why_not: str) -> None:
+        """Why nothing is learned from what was driven: once for each cause."""
+        self._journal.remark(why_not)
+        if why_not not in self._remarked:
+            self._remarked.add(why_not)
+            self._say(f"nothing to learn from: {why_not}")
+
     # Learning ----------------------------------------------------------------------------------
 
     def _train(self) -> None:
         """Starts a training, if there is something to learn and nothing under way."""
-        if not self._due or not self._new or self._task is not None or self._desk.busy:
+        waiting = self._due and self._store.waiting
+        if not waiting or self._task is not None or self._desk.busy:
             return
-        journal, files, settings = self._journal, Journal.FILES, self._settings
-        new = journal.put_samples(files.new, _thinned(self._new))
-        after = len(journal.record.laps)
-        old, given = journal.existing(files.kept), journal.existing(_GIVEN)
+        journal, settings = self._journal, self._settings
+        after, given = len(journal.record.laps), journal.existing(Journal.FILES.given)
+        batch = self._store.begin()
         self._task = Task(
             number=after,
             car=settings.car,
             discretisation=settings.discretisation,
-            old=old,
-            new=(new,),
-            recall=given if old is None and self._recall else None,
+            old=batch.old,
+            new=(batch.new,),
+            recall=given if batch.old is None and journal.record.recall else None,
             initial=self._initial(given),
             training=TrainingSettings(
                 capacity=settings.points,
@@ -224,10 +237,10 @@ class Learner:
                 threads=max(1, (os.cpu_count() or 1) - 1),
             ),
             keep=settings.keep,
-            weights=self._free(after),
-            kept=journal.path(files.next_kept),
+            weights=journal.free_weights(after),
+            kept=batch.kept,
         )
-        self._new, self._due = [], False
+        self._due = False
         self._trainer.start(self._task)
 
     def _initial(self, given: Path | None) -> Path | None:
@@ -238,24 +251,12 @@ class Learner:
         accepted = self._journal.last_accepted()
         return given if accepted is None else self._journal.path(accepted.file)
 
-    def _free(self, lap: int) -> Path:
-        """A file name for the weights after this lap: those that were published stay."""
-        names = (f"weights-{lap:04d}{suffix}.bin" for suffix in _suffixes())
-        return next(path for name in names if not (path := self._journal.path(name)).exists())
-
     def _learned(self, outcome: Outcome) -> None:
-        task, self._task = self._task, None
+        task = self._task
         if task is None or outcome.number != task.number:
             return
-        journal, files = self._journal, Journal.FILES
-        kept = journal.existing(files.next_kept)
-        if kept is not None:
-            kept.replace(journal.path(files.kept))
-            journal.path(files.new).unlink(missing_ok=True)
-        else:  # the process has died over it: with the next lap once more
-            with suppress(InputError):
-                waiting = journal.samples(files.new, self._car)
-                self._new = self._new if waiting is None else [waiting, *self._new]
+        self._task = None
+        self._store.end()
         update = UpdateRecord(
             after_lap=task.number,
             version=outcome.version,
@@ -268,7 +269,8 @@ class Learner:
             verdict="failed" if outcome.error else "waiting",
             answer=outcome.error,
         )
-        journal.add_update(update)
+        self._journal.add_update(update)
+        self._journal.drop_weights(self._desk.in_use)
         self._draw()
         if outcome.error:
             self._say(f"nothing learned after lap {task.number}: {outcome.error}")
@@ -280,14 +282,11 @@ class Learner:
         self._desk.offer(update)
 
 
-def _thinned(datasets: Sequence[Dataset]) -> Dataset:
-    """All samples, or as many as may come at once."""
-    every = concatenate(datasets)
-    return every.select(evenly(len(every), MOST_NEW), "too many at once")
-
-
-def _suffixes() -> list[str]:
-    return ["", *(f"-{number}" for number in range(2, 1000))]
+def _known(weights: GpWeights | None, samples: Dataset | None) -> bool:
+    """The weights were learned from these very samples."""
+    if weights is None or samples is None:
+        return False
+    return weights.dataset_digest == samples.digest()
 
 
 def _lap_words(lap: LapRecord) -> str:

@@ -1,27 +1,13 @@
-"""Handing weights to running controllers, and taking them back."""
+"""What publishing weights comes to: the file that is sent, and what the controller makes of it."""
 
-import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import zenoh
 
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import MAX_BYTES
-from bayesrace.messages import (
-    ROLLBACK,
-    WEIGHTS,
-    Reply,
-    RollbackRequest,
-    Scalar,
-    Service,
-    car_key,
-    decode,
-    encode,
-)
+from bayesrace.messages import Reply, Scalar
 
-__all__ = ["Answer", "RefusalError", "read_bytes", "send_rollback", "send_weights"]
+__all__ = ["Answer", "RefusalError", "read_bytes"]
 
 
 class RefusalError(RuntimeError):
@@ -43,6 +29,18 @@ class Answer:
     """Cycle of the controller from which on; None if it does not say."""
     acceptance: int | None = None
     """Number of this takeover among all of the car's."""
+
+    @classmethod
+    def of(cls, reply: Reply) -> "Answer":
+        """What is in the data of a reply; what is missing there, or of another type, is not."""
+        return cls(
+            reply.accepted,
+            reply.text,
+            str(reply.data.get("version", "")),
+            str(reply.data.get("from_version", "")),
+            _count(reply.data.get("cycle")),
+            _count(reply.data.get("number")),
+        )
 
     @property
     def words(self) -> str:
@@ -68,51 +66,6 @@ def read_bytes(path: Path) -> bytes:
     if len(data) > MAX_BYTES:
         raise InputError(f"{path} is longer than any weights file; give one from 'bayesrace train'")
     return data
-
-
-def send_weights(session: Any, car: str, data: bytes, timeout_s: float) -> Answer:
-    """The controller's answer to these weights; InputError if none comes in time."""
-    return _answer(_ask(session, WEIGHTS, car, data, timeout_s))
-
-
-def send_rollback(session: Any, car: str, text: str, timeout_s: float) -> Answer:
-    """Back to the weights before those in use; ``text``: why. InputError if no answer comes."""
-    request = encode(RollbackRequest(0, time.monotonic_ns(), text[:2000]))
-    return _answer(_ask(session, ROLLBACK, car, request, timeout_s))
-
-
-def _ask(
-    session: Any, service: Service[Any, Reply], car: str, payload: bytes, timeout_s: float
-) -> Reply:
-    """The answer; the refusal, if two controllers go by one name and one of them refuses."""
-    key = car_key(service.key, car)
-    replies = session.get(
-        key,
-        payload=payload,
-        timeout=timeout_s,
-        target=zenoh.QueryTarget.ALL,
-        # Two controllers under one name would otherwise be one answer.
-        consolidation=zenoh.ConsolidationMode.NONE,
-        congestion_control=zenoh.CongestionControl.BLOCK,
-    )
-    answers = [decode(Reply, one.ok.payload.to_bytes()) for one in replies if one.ok is not None]
-    if not answers:
-        raise InputError(
-            f"the controller of car '{car}' did not answer within {timeout_s:g} s; it has ended, "
-            "hangs, or the network is slow: --timeout"
-        )
-    return next((one for one in answers if not one.accepted), answers[0])
-
-
-def _answer(reply: Reply) -> Answer:
-    return Answer(
-        reply.accepted,
-        reply.text,
-        str(reply.data.get("version", "")),
-        str(reply.data.get("from_version", "")),
-        _count(reply.data.get("cycle")),
-        _count(reply.data.get("number")),
-    )
 
 
 def _count(value: Scalar | None) -> int | None:

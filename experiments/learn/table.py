@@ -34,6 +34,12 @@ def print_laps(record: Record, console: Console | None = None) -> None:
     console.print(Text("new: samples of the lap; of: samples learned from; in: training time"))
     if any(not lap.flying or lap.off_track_m for lap in record.laps):
         console.print(Text("*: from rest; !: off the track"))
+    if any(update.verdict == "waiting" for update in record.updates):
+        console.print(
+            Text("waiting: no controller has answered; sent when the job is gone on with")
+        )
+    for remark in record.remarks:
+        console.print(Text(f"nothing to learn from: {remark}"))
 
 
 def _time(lap: LapRecord) -> str:
