@@ -36,9 +36,6 @@ HALTED = 253
 _STANDING_MPS = 0.1
 """Speed below which a stop ends in holding the brake."""
 
-_STUCK_S = 0.5
-"""How long a car that is to be driven may stand before its controller begins anew."""
-
 _LONGEST_S = 1.0
 """Longest piece of dead reckoning."""
 
@@ -98,7 +95,6 @@ class Driver:
         self._stepped_s: float | None = None
         self._vx_mps = 0.0
         self._standing = False
-        self._standing_s: float | None = None
         self._reckoned = np.zeros(7)
         self._reckoned_s: float | None = None
         self._u_sent = np.zeros(2)
@@ -175,7 +171,6 @@ class Driver:
         else:
             self._reckoned_s = None
             self._vx_mps = float(state.x[3])
-            self._unstick(state, basis_s)
             self._step(state, budget_s)
         return decision
 
@@ -234,20 +229,6 @@ class Driver:
         decision.d, decision.delta_rate = self._fallback.halt(float(state.x[3]), time_s)
         decision.level, decision.status = Level.STOP, HALTED
         return decision
-
-    def _unstick(self, state: State, basis_s: float) -> None:
-        """Lets the controller begin anew where the car stands although it is to be driven.
-
-        A plan that stands still is a local optimum where the car points away from the line, as it
-        may after braking blind; what follows a reset begins from another guess.
-        """
-        standing = abs(self._vx_mps) < _STANDING_MPS / 2 and self._halted is None
-        if not standing or self._standing_s is None or basis_s < self._standing_s:
-            self._standing_s = basis_s if standing else None
-        elif basis_s - self._standing_s > _STUCK_S + 1e-6:
-            self._standing_s = basis_s
-            self._controller.reset(state)
-            self._stepped_s = None
 
     def _reckon(self, state: State, basis_s: float) -> None:
         """How fast the car may still be: by the model, braking since it was last seen.

@@ -2,8 +2,9 @@
 
 Level 0 the solution; 1 the previous plan, shifted, for a bounded time; 2 braking along the plan's
 steering, and with the steering held when the plan is over; 3 standing still. Every cycle is counted
-under its level. From level 1 the next usable solution leads back; from 2 and 3 several in a row,
-so that a controller that works every other cycle does not jerk the car.
+under its level. From levels 1 and 3 the next usable solution leads back; from 2 several in a row,
+so that a controller that works every other cycle does not jerk the car. A standing car is not
+jerked, and where only the first step after a cold start is usable it would wait for ever.
 """
 
 import math
@@ -39,7 +40,8 @@ class FallbackSettings(BaseModel):
         default=3,
         ge=1,
         le=100,
-        description="usable solutions in a row that end braking; the last of them is driven",
+        description="usable solutions in a row that end braking; the last of them is driven. "
+        "A car that stands drives the first",
     )
     tolerance: float = Field(
         default=1e-3, ge=0, le=0.1, description="excess over a limit that is clipped, not refused"
@@ -82,7 +84,8 @@ class Fallback:
         else:
             chosen = self._step_down(vx_mps, time_s + late_s)
             if chosen[2] >= Level.BRAKE:
-                self._to_recover = self._settings.recover_cycles
+                stands = chosen[2] is Level.STOP
+                self._to_recover = 1 if stands else self._settings.recover_cycles
         self.counts[chosen[2]] += 1
         return chosen
 

@@ -272,17 +272,3 @@ def test_another_plant_begins_anew_and_its_forerunner_is_not_heard(rig: Rig) -> 
     assert not rig.driver.observe(left_over)
     assert rig.driver.states.stale == 1
     assert rig.cycle().level is Level.SOLUTION
-
-
-@pytest.mark.parametrize("turned_rad", [-1.1, 1.1])
-def test_a_car_that_stands_and_points_away_finds_its_way(
-    native: NativeStep, circuit: Circuit, turned_rad: float
-) -> None:
-    """As after braking blind in a bend: standing still is a plan of least cost nearby."""
-    rig = Rig(native, circuit)
-    rig.x = circuit.start(1.0, 0.0)
-    rig.x[2] += turned_rad
-    rig.x[6] = 0.35 * np.sign(turned_rad)
-    for _ in range(100):
-        rig.cycle()
-    assert rig.x[3] > 0.5

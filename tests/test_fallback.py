@@ -63,6 +63,14 @@ def test_one_good_solution_ends_the_shifted_plan_several_end_braking() -> None:
     assert levels == [0, 1, 0, 1, 2, 2, 2, 2, 2, 2, 2, 0, 0]
 
 
+def test_a_standing_car_drives_the_first_good_solution() -> None:
+    """Where only every other one is good, three in a row would never come."""
+    fallback = Fallback(CAR, FallbackSettings(shifted_s=0.1, recover_cycles=3))
+    outputs = [bad(), good(), bad(), good()]
+    told = [fallback.decide(one, 0.0, k * STEP_S)[2] for k, one in enumerate(outputs)]
+    assert told == [Level.STOP, Level.SOLUTION, Level.SHIFTED_PLAN, Level.SOLUTION]
+
+
 @pytest.mark.parametrize(
     "u",
     [

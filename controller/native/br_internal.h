@@ -13,8 +13,6 @@
 #define BR_ROWS (BR_M + 2 * BR_N)                /* input bounds, steering angle, half-planes */
 #define BR_COLS ((((BR_ROWS + 1) + 7) / 8) * 8)  /* right-hand sides of one substitution */
 #define BR_HORIZON_S (BR_N * BR_TS)
-#define BR_SLOW_MPS 0.2       /* below this speed, and pointing farther away from the reference than */
-#define BR_MISALIGNED_RAD 0.5 /* this, the first guess steers towards it */
 #define BR_LINE_SEARCH_TRIALS 5
 #define BR_GP_PADDED (((BR_GP_CAPACITY + 7) / 8) * 8)
 
@@ -121,9 +119,12 @@ struct br_mpc {
     double d_lowest;     /* d_min, less where the car is slow: see BR_BRAKE_FADE_MPS */
     double x0[BR_NX];
     br_mpc_reference reference[BR_N];
+    double turn;         /* the side that the car turns round to, 1 left, -1 right; 0: it does not */
+    double turn_u[BR_N][BR_NU]; /* inputs that the reference of a turn has been made with */
     /* the plan, primal and dual */
     int warm;            /* a plan from the step before is there */
     int linearised;      /* stage[] belongs to the plan and the weights in use */
+    unsigned attempts;   /* steps without a usable plan since the last warm start that gave one */
     int unfinished;      /* iterations that BR_TIME_LIMIT has left without a usable plan */
     double lag;          /* of the plan, without what br_mpc_prepare shifted, behind the last state */
     int ahead;           /* shifts that br_mpc_prepare did */
@@ -153,6 +154,10 @@ void br_weights_init(br_mpc *mpc);
 br_mpc_error br_path_load(br_path *path, const double *table, int n, double spacing);
 void br_path_plan(br_path *path, const double x[BR_NX], br_mpc_reference reference[BR_N],
                   double *lateral);
+void br_path_ahead(const br_path *path, double distance, double point[2]);
+
+/* br_turn.c */
+void br_turn(br_mpc *mpc);
 
 /* br_stage.c */
 void br_stage_linearise(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],

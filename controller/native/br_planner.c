@@ -70,17 +70,18 @@ static int same_direction(const br_path *path, int i, double psi) {
     return (b[X] - a[X]) * cos(psi) + (b[Y] - a[Y]) * sin(psi) > 0;
 }
 
-/* Nearest row; anywhere, among those that lead the way the car points, if there is one. */
+/* Nearest row anywhere; one that leads another way than the car points counts as a track's width
+ * farther, so that a car is not taken for one on the piece of track beside its own. */
 static int nearest_anywhere(const br_path *path, const double x[BR_NX]) {
-    int best = 0, best_is_ahead = 0;
-    double best_d2 = INFINITY;
+    int best = 0;
+    double best_distance = INFINITY;
     for (int i = 0; i < path->n; ++i) {
-        const int ahead = same_direction(path, i, x[2]);
-        const double d2 = squared_distance(path->table[i], x);
-        if ((ahead && !best_is_ahead) || (ahead == best_is_ahead && d2 < best_d2)) {
+        const double *row = path->table[i];
+        double distance = sqrt(squared_distance(row, x));
+        if (!same_direction(path, i, x[2])) distance += row[UPPER] - row[LOWER];
+        if (distance < best_distance) {
             best = i;
-            best_d2 = d2;
-            best_is_ahead = ahead;
+            best_distance = distance;
         }
     }
     return best;
@@ -118,6 +119,14 @@ static void project(const br_path *path, int i, const double x[BR_NX], double *s
             *lateral = copysign(sqrt(d2), tx * py - ty * px);
         }
     }
+}
+
+/* Where the line is, this far ahead of the car's last projection. */
+void br_path_ahead(const br_path *path, double distance, double point[2]) {
+    double row[BR_PATH_COLUMNS];
+    path_at(path, path->s + distance, row);
+    point[0] = row[X];
+    point[1] = row[Y];
 }
 
 void br_path_plan(br_path *path, const double x[BR_NX], br_mpc_reference reference[BR_N],

@@ -17,28 +17,19 @@ static void linearise(br_mpc *mpc, int first) {
 
 void br_sqp_linearise(br_mpc *mpc) { linearise(mpc, 0); }
 
-/* Steering rate of the first guess: none; but where the car is slow and points away from the line,
- * as after braking blind, towards the reference. From there a guess that goes straight on leads away,
- * and to a plan that stands still. */
-static double first_steering(const br_mpc *mpc, int k) {
-    const double *x = mpc->plan.x[k];
-    const br_mpc_reference *to = &mpc->reference[BR_N - 1];
-    const double away = remainder(atan2(to->y - mpc->x0[1], to->x - mpc->x0[0]) - mpc->x0[2], 2 * M_PI);
-    if (fabs(mpc->x0[3]) > BR_SLOW_MPS || fabs(away) < BR_MISALIGNED_RAD) return 0;
-    const double off = remainder(atan2(to->y - x[1], to->x - x[0]) - x[2], 2 * M_PI);
-    const double limit = mpc->parameters.delta_max_rad, rate = mpc->parameters.delta_rate_max_radps;
-    const double target = fmin(fmax(off, -limit), limit);
-    return fmin(fmax((target - x[6]) / BR_TS, -rate), rate);
-}
-
-/* Without a plan from before: hold the steering, half throttle, see where that leads. */
+/* Without a plan from before: hold the steering, half throttle, see where that leads; or turn.
+ * Where that has led to no plan time and again, Newton's steps may go round in circles: then other
+ * throttles are tried. */
 void br_sqp_cold_start(br_mpc *mpc) {
+    static const double throttles[] = {0.5, 0.5, 1.0, 0.25};
+    const double share = throttles[mpc->attempts % 4], d_max = mpc->parameters.d_max;
+    const double throttle = fmin(fmax(mpc->d_previous, share * d_max), d_max);
     memcpy(mpc->plan.x[0], mpc->x0, sizeof mpc->x0);
     memset(mpc->plan.costate, 0, sizeof mpc->plan.costate);
     memset(mpc->plan.multiplier, 0, sizeof mpc->plan.multiplier);
     for (int k = 0; k < BR_N; ++k) {
-        mpc->plan.u[k][0] = fmin(fmax(mpc->d_previous, 0.5 * mpc->parameters.d_max), mpc->parameters.d_max);
-        mpc->plan.u[k][1] = first_steering(mpc, k);
+        mpc->plan.u[k][0] = mpc->turn ? mpc->turn_u[k][0] : throttle;
+        mpc->plan.u[k][1] = mpc->turn ? mpc->turn_u[k][1] : 0;
         br_stage_linearise(&mpc->gp[mpc->gp_in_use], mpc->plan.x[k], mpc->plan.u[k], mpc->plan.costate[k + 1], &mpc->stage[k]);
         memcpy(mpc->plan.x[k + 1], mpc->stage[k].f, sizeof mpc->plan.x[k + 1]);
     }

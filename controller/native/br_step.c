@@ -62,6 +62,8 @@ static void solve(br_mpc *mpc, double u[BR_NU], br_mpc_status *status, br_mpc_in
     *status = optimise(mpc);
     const int good = br_usable(*status), unfinished = *status == BR_TIME_LIMIT;
     if (good) memcpy(u, mpc->plan.u[0], sizeof mpc->plan.u[0]);
+    if (!good) mpc->attempts += 1;
+    else if (mpc->warm) mpc->attempts = 0;
     mpc->warm = good || unfinished; /* another bad plan is no start for the next step */
     mpc->unfinished = unfinished ? mpc->unfinished + mpc->info.iterations : 0;
     memcpy(mpc->answer_x, mpc->plan.x, sizeof mpc->answer_x);
@@ -108,6 +110,7 @@ br_mpc_error br_mpc_step(br_mpc *mpc, const double x[BR_NX], double d_previous, 
     if (!mpc->path.ready) return BR_ERROR_NOT_READY;
     if (!plausible) return BR_OK;
     br_path_plan(&mpc->path, x, mpc->reference, &mpc->info.lateral_m);
+    br_turn(mpc);
     mpc->info.s_ref_m = mpc->path.s;
     solve(mpc, u, status, info);
     return BR_OK;
@@ -122,6 +125,7 @@ br_mpc_error br_mpc_solve(br_mpc *mpc, const double x[BR_NX], double d_previous,
     const br_mpc_error error = begin(mpc, &r, &plausible);
     if (error || !plausible) return error;
     memcpy(mpc->reference, reference, sizeof mpc->reference);
+    mpc->turn = 0;
     solve(mpc, u, status, info);
     return BR_OK;
 }

@@ -1,0 +1,73 @@
+/* Turning round: what the planner does where the car is slow and points away from its line.
+ *
+ * A horizon is too short for a turn to pay: whichever way the car sets off, it first gets farther
+ * from the reference, and the optimal plan is to stand still for ever. So the reference is laid
+ * along the turn itself: where the corrected model goes when it steers to one side at a walking
+ * pace until it faces the line again. The track's edges do not count on the way; the car may
+ * have been across one already, and its turning circle can be wider than the track.
+ */
+#include <math.h>
+
+#include "br_internal.h"
+
+#define SLOW_MPS 0.2    /* a turn begins below this speed where the line is */
+#define AWAY_RAD 0.6    /* farther than this to one side, */
+#define FACED_RAD 0.3   /* and ends within this */
+#define AHEAD_M 0.5     /* of the car, the point of the line that it turns to */
+#define WIDER_M 2.0     /* the track to either side, on the way */
+#define PACE_MPS 0.5
+#define TOO_FAST_MPS 1.0 /* no turn of ours any more */
+#define THROTTLE 2.0     /* duty cycle per m/s below the pace */
+#define BEHIND_RAD 2.0   /* with the line farther behind than this, either side serves */
+
+/* Angle to the point, seen from the car; positive left. */
+static double bearing(const double x[BR_NX], const double to[2]) {
+    return remainder(atan2(to[1] - x[1], to[0] - x[0]) - x[2], 2 * M_PI);
+}
+
+/* The side to turn to: the nearer one, or, with the line behind, the one with more room. */
+static double side(const double x[BR_NX], double away, const br_mpc_reference *here) {
+    if (fabs(away) < BEHIND_RAD) return copysign(1, away);
+    const double along = here->normal_x * x[0] + here->normal_y * x[1];
+    const double room_left = here->upper - along, room_right = along - here->lower;
+    const double facing = here->normal_x * -sin(x[2]) + here->normal_y * cos(x[2]);
+    return copysign(1, (room_left - room_right) * facing);
+}
+
+/* Begins, goes on with and ends a turn. */
+static void decide(br_mpc *mpc, const double target[2]) {
+    const double *x = mpc->x0, away = bearing(x, target), speed = fabs(x[3]);
+    if (mpc->turn) {
+        const double left = away * mpc->turn;
+        if ((left > -M_PI / 2 && left < FACED_RAD) || speed > TOO_FAST_MPS) mpc->turn = 0;
+    } else if (speed < SLOW_MPS && fabs(away) > AWAY_RAD) {
+        mpc->turn = side(x, away, &mpc->reference[0]);
+        mpc->warm = 0;
+    }
+    if (mpc->path.speed_limit < PACE_MPS) mpc->turn = 0; /* it is to stop */
+}
+
+void br_turn(br_mpc *mpc) {
+    double target[2], x[BR_NX], next[BR_NX];
+    br_path_ahead(&mpc->path, AHEAD_M, target);
+    decide(mpc, target);
+    if (!mpc->turn) return;
+    const br_mpc_parameters *p = &mpc->parameters;
+    memcpy(x, mpc->x0, sizeof x);
+    for (int k = 0; k < BR_N; ++k) {
+        double left = bearing(x, target) * mpc->turn;
+        if (left < -M_PI / 2) left += 2 * M_PI;
+        const double steering = mpc->turn * fmin(left, p->delta_max_rad);
+        const double rate = (steering - x[6]) / BR_TS;
+        double *u = mpc->turn_u[k];
+        u[0] = fmin(fmax(THROTTLE * (PACE_MPS - x[3]), 0), p->d_max);
+        u[1] = fmin(fmax(rate, -p->delta_rate_max_radps), p->delta_rate_max_radps);
+        br_stage_advance(&mpc->gp[mpc->gp_in_use], x, u, BR_TS, next);
+        memcpy(x, next, sizeof x);
+        br_mpc_reference *reference = &mpc->reference[k];
+        reference->x = x[0];
+        reference->y = x[1];
+        reference->lower -= WIDER_M;
+        reference->upper += WIDER_M;
+    }
+}

@@ -1,0 +1,119 @@
+"""A car that stands, wherever and however it points, gets under way along its line again."""
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from bayesrace.vehicles import CarParameters
+from controller.native_step import NativeStep
+from tests.conftest import SETTINGS, Circuit
+from tests.test_driver import Rig
+
+Floats = NDArray[np.float64]
+
+
+def standing(
+    circuit: Circuit, s_m: float, to_left_m: float, turned_rad: float, steering: float = 0.0
+) -> Floats:
+    """State of a car that stands beside the line and is turned away from it."""
+    x = circuit.start(s_m, 0.0)
+    x[:2] += to_left_m * np.array([-np.sin(x[2]), np.cos(x[2])])
+    x[2] += turned_rad
+    x[6] = steering
+    return x
+
+
+def test_a_car_gets_under_way_from_any_pose(native: NativeStep, circuit: Circuit) -> None:
+    """Without turning round on purpose, an eighth of such poses end in standing for ever."""
+    random = np.random.default_rng(3)
+    for _ in range(12):
+        rig = Rig(native, circuit)
+        native.reset()
+        rig.x = standing(
+            circuit,
+            random.uniform(0, 6.3),
+            random.uniform(-0.4, 0.4),
+            random.uniform(-math.pi, math.pi),
+            random.uniform(-0.35, 0.35),
+        )
+        pose = rig.x.round(3).tolist()
+        for _ in range(150):
+            rig.cycle()
+        where = native.info.s_ref_m
+        for _ in range(50):
+            rig.cycle()
+        ahead = (native.info.s_ref_m - where) % circuit.line.length_m
+        assert 0.5 < ahead < circuit.line.length_m / 2, f"{ahead} m in a second from {pose}"
+
+
+@pytest.mark.parametrize("to_left_m", [-0.1, 0.1])
+@pytest.mark.parametrize("turned_rad", [math.pi - 0.2, math.pi + 0.2])
+def test_it_turns_to_the_side_with_more_room(
+    native: NativeStep, circuit: Circuit, to_left_m: float, turned_rad: float
+) -> None:
+    """Pointing the other way, its right is the line's left."""
+    native.reset()
+    x = standing(circuit, 1.0, 0.0, turned_rad)
+    right, left = circuit.track.widths(circuit.track.project(x[:2]).s_m)
+    middle = float((left - right) / 2 - circuit.track.project(x[:2]).n_m)
+    x = standing(circuit, 1.0, middle + to_left_m, turned_rad)
+    assert native.step(x, 0.0).usable
+    assert np.sign(native.u[1]) == np.sign(to_left_m)
+
+
+@pytest.mark.parametrize("turned_rad", [-1.0, 1.0])
+def test_it_turns_the_shorter_way(native: NativeStep, circuit: Circuit, turned_rad: float) -> None:
+    native.reset()
+    assert native.step(standing(circuit, 1.0, 0.0, turned_rad), 0.0).usable
+    assert np.sign(native.u[1]) == -np.sign(turned_rad)
+
+
+def test_the_pace_is_kept_and_the_turn_ends_when_the_line_is_faced(
+    native: NativeStep, circuit: Circuit
+) -> None:
+    rig = Rig(native, circuit)
+    native.reset()
+    rig.x = standing(circuit, 1.0, 0.0, math.pi)
+    begin_rad = rig.x[2]
+    fastest = 0.0
+    while abs(rig.x[2] - begin_rad) < 2.2:
+        rig.cycle()
+        fastest = max(fastest, rig.x[3])
+        assert rig.seq < 200
+    assert fastest < 0.7
+    for _ in range(100):
+        rig.cycle()
+    assert rig.x[3] > 1.0
+
+
+def test_a_stop_on_command_ends_a_turn(native: NativeStep, circuit: Circuit) -> None:
+    rig = Rig(native, circuit)
+    native.reset()
+    rig.x = standing(circuit, 1.0, 0.0, math.pi)
+    for _ in range(20):
+        rig.cycle()
+    assert rig.x[3] > 0.2
+    rig.driver.stop()
+    for _ in range(100):
+        rig.cycle()
+    assert abs(rig.x[3]) < 0.05
+
+
+def test_what_has_failed_twice_is_begun_otherwise(
+    native: NativeStep, circuit: Circuit, car: CarParameters
+) -> None:
+    """The same cold start over and over would fail for ever where the state does not change."""
+    hopeless = SETTINGS.model_copy(update={"iterations_cold": 1, "defect_max": 1e-12})
+    native.set_parameters(car, hopeless)
+    x = standing(circuit, 1.0, 0.0, 0.0)
+    plans = []
+    for _ in range(5):
+        assert not native.step(x, 0.0).usable
+        plans.append(native.read_plan()[1].copy())
+    first, second, third, fourth, fifth = plans
+    np.testing.assert_array_equal(first, second)
+    assert not np.allclose(third, first)
+    assert not np.allclose(fourth, third)
+    np.testing.assert_array_equal(fifth, first)
