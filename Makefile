@@ -32,8 +32,10 @@ race: $(VENV)/.ready
 bench: $(VENV)/.ready
 	$(BIN)/bayesrace bench $(ARGS)
 
+# First what may share the processors, then the rest, test by test. 5: ARGS selects none of a part.
 test: $(VENV)/.ready-dev
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest --part shared --numprocesses auto --maxprocesses 8 --dist loadfile $(ARGS) || [ $$? -eq 5 ]
+	$(BIN)/python -m pytest --part alone $(ARGS) || [ $$? -eq 5 ]
 
 lint: $(VENV)/.ready-dev
 	$(BIN)/ruff check .

@@ -54,6 +54,24 @@ NOISE = 0.02
 LENGTH_SCALES = np.array([2.0, 1.0, 10.0, 0.5, 1.5, 10.0])
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--part",
+        choices=("shared", "alone"),
+        help="only the tests that may run side by side, or only those marked 'alone'",
+    )
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    part = config.getoption("--part")
+    if part is None:
+        return
+    alone = [item for item in items if "alone" in item.keywords]
+    shared = [item for item in items if "alone" not in item.keywords]
+    items[:], others = (alone, shared) if part == "alone" else (shared, alone)
+    config.hook.pytest_deselected(items=others)
+
+
 def discrete(
     model: Model, discretisation: Discretisation = TRUTH
 ) -> Callable[[Floats, Floats], Floats]:

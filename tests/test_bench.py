@@ -7,6 +7,8 @@ import pytest
 
 from tests.programs import run
 
+pytestmark = pytest.mark.alone
+
 
 @pytest.fixture(scope="module")
 def numbers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:

@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 
 from experiments.latency.clocks import ClockPair, Exchange, OffsetEstimator
 
+pytestmark = pytest.mark.alone
+
 
 @dataclass(frozen=True)
 class Remote:

@@ -24,7 +24,7 @@ from experiments.preparation import PreparationSettings, Prepared, prepare
 from experiments.progress import stages_on
 from tests.programs import COMMAND, ROOT, environment, finish, leftovers, peanut, run, start, until
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.alone]
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,8 @@ from bayesrace.vehicles import CarParameters
 from controller.native_step import NativeStep, StepStatus
 from tests.conftest import SETTINGS, Circuit, Problem
 
+pytestmark = pytest.mark.alone
+
 Floats = NDArray[np.float64]
 Make = Callable[..., NativeStep]
 

@@ -18,6 +18,8 @@ from plant.simulator import GuardCounters
 from plant.vehicle import Vehicle, open_vehicle
 from tests.car_fmu import packed_car
 
+pytestmark = pytest.mark.alone
+
 EPOCH = 7
 
 VEHICLE = cast(Vehicle, None)

@@ -21,7 +21,7 @@ from tests.foreign_fmu import FOREIGN_MAP, build_foreign_fmu
 from tests.programs import Race, leftovers, peanut, run
 from tests.reference import reference_file
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.alone]
 
 CONTROLLERS = ["worstcase", "bayesrace", "bayesrace-updated", "bestcase"]
 LAP_FORM: dict[str, type | tuple[type, ...]] = {

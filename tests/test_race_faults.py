@@ -22,6 +22,7 @@ from tests.programs import finish, leftovers, peanut, run, start, started_by, un
 
 pytestmark = [
     pytest.mark.slow,
+    pytest.mark.alone,
     pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks into /proc"),
 ]
 

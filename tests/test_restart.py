@@ -33,7 +33,7 @@ from tests.network.observer import Observer, observing
 from tests.network.proxy import Proxy
 from tests.programs import until
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.alone]
 
 _log = logging.getLogger(__name__)
 

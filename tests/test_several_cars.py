@@ -24,7 +24,7 @@ from tests.network.journey import Journey
 from tests.network.observer import Observer, observing
 from tests.programs import until
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.alone]
 
 CARS = ("red", "green", "blue", "white")
 APART_M = 10.0

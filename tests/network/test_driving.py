@@ -24,7 +24,7 @@ from tests.network.journey import STANDING_MPS, Journey
 from tests.network.observer import Remote, observing_from
 from tests.programs import PATIENCE_S, until
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.alone]
 
 NAME = "orca"
 

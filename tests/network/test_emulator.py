@@ -19,6 +19,8 @@ from tests.network.emulator import Emulator
 from tests.network.hosts import CONTROLLER_IP, PLANT_IP, Network, network, why_not_here
 from tests.programs import ROOT
 
+pytestmark = pytest.mark.alone
+
 PORT = 5000
 
 
