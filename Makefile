@@ -32,10 +32,14 @@ race: $(VENV)/.ready
 bench: $(VENV)/.ready
 	$(BIN)/bayesrace bench $(ARGS)
 
-# First what may share the processors, then the rest, test by test. 5: ARGS selects none of a part.
+# First what may share the processors, then the rest, test by test; plain pytest does all of them in
+# one go, for debugging. 5 means that ARGS selects no test of a part.
+SIDE_BY_SIDE := --numprocesses auto --maxprocesses 8 --dist loadfile
 test: $(VENV)/.ready-dev
-	$(BIN)/python -m pytest --part shared --numprocesses auto --maxprocesses 8 --dist loadfile $(ARGS) || [ $$? -eq 5 ]
-	$(BIN)/python -m pytest --part alone $(ARGS) || [ $$? -eq 5 ]
+	@$(BIN)/python -m pytest --part shared $(SIDE_BY_SIDE) $(ARGS); shared=$$?; \
+	$(BIN)/python -m pytest --part alone $(ARGS); alone=$$?; \
+	for code in $$shared $$alone; do [ $$code -eq 0 ] || [ $$code -eq 5 ] || exit $$code; done; \
+	[ $$shared -ne 5 ] || [ $$alone -ne 5 ] || { echo "ARGS selects no test" >&2; exit 5; }
 
 lint: $(VENV)/.ready-dev
 	$(BIN)/ruff check .

@@ -66,8 +66,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     part = config.getoption("--part")
     if part is None:
         return
-    alone = [item for item in items if "alone" in item.keywords]
-    shared = [item for item in items if "alone" not in item.keywords]
+    alone = [item for item in items if item.get_closest_marker("alone")]
+    shared = [item for item in items if not item.get_closest_marker("alone")]
     items[:], others = (alone, shared) if part == "alone" else (shared, alone)
     config.hook.pytest_deselected(items=others)
 

@@ -25,8 +25,6 @@ from experiments.cli import main
 from tests.conftest import Circuit
 from tests.programs import finish, run, start, until
 
-pytestmark = pytest.mark.alone
-
 SUBCOMMANDS = (
     "race", "drive", "report", "bench", "tracks", "raceline", "collect", "train", "build",
     "plant", "controller", "status", "stop", "go", "router", "latency",
@@ -307,6 +305,7 @@ def ended() -> Iterator[list[subprocess.Popen[str]]]:
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_the_chain_by_files_in_four_terminals(
     tmp_path: Path, ended: list[subprocess.Popen[str]]
 ) -> None:
@@ -352,6 +351,7 @@ def test_the_chain_by_files_in_four_terminals(
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_drive_says_when_the_controller_is_lost(
     tmp_path: Path,
     course: tuple[str | Path, ...],

@@ -9,8 +9,6 @@ from hypothesis import strategies as st
 
 from experiments.latency.clocks import ClockPair, Exchange, OffsetEstimator
 
-pytestmark = pytest.mark.alone
-
 
 @dataclass(frozen=True)
 class Remote:

@@ -14,8 +14,6 @@ from bayesrace.vehicles import CarParameters
 from controller.native_step import NativeStep, StepStatus
 from tests.conftest import SETTINGS, Circuit, Problem
 
-pytestmark = pytest.mark.alone
-
 Floats = NDArray[np.float64]
 Make = Callable[..., NativeStep]
 
