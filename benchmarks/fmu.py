@@ -43,6 +43,7 @@ from plant.fmu.export import car_fmu
 from plant.fmu.simulator import open_fmu
 from plant.simulator import PLANT, Simulator
 
+VERSIONS: Final[tuple[Literal[2, 3], ...]] = (2, 3)
 STEP_S: Final = PLANT.step_s
 PERIODS, WARM_UP = 20_000, 500
 INPUTS: Final = ("d", "delta_rate")
@@ -171,9 +172,8 @@ def print_laps(fmus: dict[str, Path], prepared: Prepared, folder: Path, console:
         row(name, own, own.x)
     path = make_path_table(track, line)
     x0 = [*track.start_pose(), START_MPS, 0.0, 0.0, 0.0]
-    versions: tuple[Literal[2, 3], ...] = (2, 3)
     for cpu in ("native", "portable"):
-        for version, fmu in zip(versions, fmus.values(), strict=True):
+        for version, fmu in zip(VERSIONS, fmus.values(), strict=True):
             definition = controller_fmu(
                 prepared.artefact, car, path.rows, path.spacing_m, MpcSettings().model_dump(),
                 FallbackSettings().model_dump(), weights, version, cpu,
@@ -196,10 +196,9 @@ def main() -> None:
     console = Console()
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        versions: tuple[Literal[2, 3], ...] = (2, 3)
         fmus = {
             f"FMI {n}.0": pack(car_fmu(get_car("orca"), n), folder / f"car{n}.fmu")
-            for n in versions
+            for n in VERSIONS
         }
         print_times(fmus, console)
         if not options.laps:

@@ -3,8 +3,10 @@
 import inspect
 import re
 import subprocess
+import tempfile
 import zipfile
 from enum import IntEnum
+from functools import cache
 from pathlib import Path
 from typing import Final
 
@@ -12,13 +14,18 @@ import fmpy
 from fmpy.fmi2 import FMU2Slave
 from fmpy.fmi3 import FMU3Slave
 
+from bayesrace.vehicles.models import STATES
 from codegen.compiler import find_compiler
+from plant.fmu.host import FmuHost
 
-__all__ = ["Mode", "faulty_fmu", "faulty_library"]
+__all__ = ["PATIENCE_S", "STATES", "Mode", "faulty_fmu", "faulty_library", "worker_of"]
 
 SOURCE: Final = Path(__file__).parent / "native" / "faulty_fmu.c"
 HEADERS: Final = Path(fmpy.__file__).parent / "c-code"
-STATES: Final = ("x", "y", "psi", "vx", "vy", "omega", "delta")
+PATIENCE_S: Final = 20.0
+"""For what takes a second at most on an idle machine."""
+
+_FOLDER: Final = tempfile.TemporaryDirectory(prefix="faulty-fmu-")
 
 Mode = IntEnum(
     "Mode",
@@ -29,8 +36,10 @@ Mode = IntEnum(
 """As in the C file."""
 
 
-def faulty_library(version: int, out: Path) -> Path:
-    """Compiles the library; functions that the C file lacks answer "error"."""
+@cache
+def faulty_library(version: int) -> Path:
+    """The library, compiled once a session; functions that the C file lacks answer "error"."""
+    out = Path(_FOLDER.name) / f"faulty{version}.so"
     source = SOURCE.read_text()
     slave = FMU3Slave if version == 3 else FMU2Slave
     called = [name for name, _ in inspect.getmembers(slave) if name.startswith(f"fmi{version}")]
@@ -69,6 +78,12 @@ def faulty_fmu(
         archive.writestr("modelDescription.xml", describe(guid, attributes))
         archive.write(library, f"binaries/{folder}/faulty{fmpy.sharedLibraryExtension}")
     return out
+
+
+def worker_of(host: FmuHost) -> "subprocess.Popen[bytes]":
+    """The process that the FMU runs in."""
+    assert host._process is not None
+    return host._process._popen
 
 
 def _description_2(guid: str, attributes: str) -> str:

@@ -1,23 +1,16 @@
-"""The car's FMUs for tests: each made once, and driven beside the built-in plant."""
+"""The car's FMUs driven beside the built-in plant."""
 
-import atexit
-import shutil
-import tempfile
 from collections.abc import Sequence
-from functools import cache
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from fmpy import extract
 from numpy.typing import NDArray
 
-from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import STATES, dynamic
 from bayesrace.vehicles.parameters import CarParameters
-from codegen.fmu import pack
-from plant.fmu.export import car_fmu
 from plant.simulator import Simulator, plant_discretisation
+from tests.car_fmu import packed_car as exported
+from tests.car_fmu import unpacked_car as extracted
 from tests.fmu_master import Slave
 
 __all__ = ["Commands", "built_in", "commands", "driven", "exported", "extracted", "slave"]
@@ -26,27 +19,6 @@ Floats = NDArray[np.float64]
 Commands = Sequence[tuple[float, float]]
 Version = Literal[2, 3]
 Kind = Literal["cs", "me"]
-
-
-@cache
-def _folder() -> Path:
-    folder = tempfile.mkdtemp(prefix="fmu-tests-")
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return Path(folder)
-
-
-@cache
-def exported(version: Version = 3, kind: Kind = "cs") -> Path:
-    """The car's FMU for this platform."""
-    return pack(car_fmu(get_car("orca"), version, kind), _folder() / f"car-{version}-{kind}.fmu")
-
-
-@cache
-def extracted(version: Version = 3, kind: Kind = "cs") -> Path:
-    """The folder of the car's FMU."""
-    folder = _folder() / f"car-{version}-{kind}"
-    extract(str(exported(version, kind)), unzipdir=str(folder))
-    return folder
 
 
 def slave(version: Version = 3) -> Slave:

@@ -1,5 +1,10 @@
-"""What the tests of the controller's FMU share: the lockstep run that it must drive, exports."""
+"""What the tests of the controller's FMU share: the lockstep run that it must drive, exports.
 
+The fixtures ``exported`` and ``lockstep`` are there for who imports their functions.
+"""
+
+import fcntl
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,8 +16,8 @@ from numpy.typing import NDArray
 
 from bayesrace.gp.weights import GpWeights
 from bayesrace.messages import State
-from bayesrace.vehicles import CarParameters, get_car
-from bayesrace.vehicles.models import dynamic
+from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles.models import STATES, dynamic
 from codegen.fmu import FmuDefinition, pack
 from codegen.fmu.controller import controller_fmu
 from controller.compensation import CompensationSettings
@@ -20,10 +25,10 @@ from controller.driver import Driver
 from controller.fallback import FallbackSettings
 from controller.mpc import PredictiveController
 from controller.native_step import NativeStep, StepStatus
-from plant.fmu.export import car_fmu
 from plant.simulator import Simulator
+from tests.car_fmu import packed_car
 from tests.conftest import SETTINGS, Circuit
-from tests.fmu_master import STATES, Slave
+from tests.fmu_master import Slave
 
 __all__ = [
     "RACING",
@@ -32,8 +37,8 @@ __all__ = [
     "Exported",
     "Lockstep",
     "answers",
-    "make_exported",
-    "make_lockstep",
+    "exported_controllers",
+    "lockstep_runs",
     "same",
     "strewn",
     "versions",
@@ -99,38 +104,46 @@ class Lockstep:
 
 @dataclass(frozen=True)
 class Exported:
-    """FMUs made once, and folders they are extracted to once."""
+    """FMUs made once, and folders they are extracted to once; ``define``: the controller's."""
 
     folder: Path
+    shared: Path
+    """With the test processes beside this one: they take seconds to compile."""
     define: Callable[..., FmuDefinition]
 
     def fmu(self, version: Literal[2, 3], cpu: str = "native") -> Path:
         """The controller's."""
-        out = self.folder / f"controller{version}-{cpu}.fmu"
-        return out if out.exists() else pack(self.define(version=version, cpu=cpu), out)
+        out = self.shared / f"controller{version}-{cpu}.fmu"
+        with out.with_suffix(".lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            return out if out.exists() else pack(self.define(version=version, cpu=cpu), out)
 
     def plant(self, version: Literal[2, 3]) -> Path:
         """The car's."""
-        out = self.folder / f"car{version}.fmu"
-        return out if out.exists() else pack(car_fmu(get_car("orca"), version), out)
+        return packed_car(version)
 
     def slave(
         self, fmu: Path, values: Mapping[str, float] | None = None, name: str = "one"
     ) -> Slave:
         """Ready to be stepped."""
-        slave = Slave(fmu, fmu.with_suffix(""), name)
+        slave = Slave(fmu, self.folder / fmu.stem, name)
         slave.initialise(values)
         return slave
 
 
-def make_exported(
-    folder: Path, artefact: Path, car: CarParameters, circuit: Circuit, weights: GpWeights
+@pytest.fixture(scope="session", name="exported")
+def exported_controllers(
+    tmp_path_factory: pytest.TempPathFactory,
+    kinematic_artefact: Path,
+    car: CarParameters,
+    circuit: Circuit,
+    weights: GpWeights,
 ) -> Exported:
-    """Exports into ``folder`` of the controller on the circuit; what is there is taken."""
+    """The controller on the circuit."""
 
     def define(**changes: Any) -> FmuDefinition:
         values: dict[str, Any] = {
-            "artefact": artefact,
+            "artefact": kinematic_artefact,
             "car": car,
             "rows": circuit.table.rows,
             "spacing_m": circuit.table.spacing_m,
@@ -140,18 +153,24 @@ def make_exported(
         }
         return controller_fmu(**(values | changes))
 
-    folder.mkdir(exist_ok=True)
-    return Exported(folder, define)
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    return Exported(tmp_path_factory.mktemp("exported"), shared, define)
 
 
-def make_lockstep(
-    artefact: Path, car: CarParameters, circuit: Circuit, weights: GpWeights, delay_s: float = 0.0
-) -> Lockstep:
-    """Not yet run."""
-    native = NativeStep(artefact, car, RACING)
-    native.set_weights(weights)
-    native.set_path(circuit.table)
-    return Lockstep(native, car, delay_s)
+@pytest.fixture(name="lockstep")
+def lockstep_runs(
+    kinematic_artefact: Path, car: CarParameters, circuit: Circuit, weights: GpWeights
+) -> Callable[..., Lockstep]:
+    """Makes a :class:`Lockstep` on the circuit, of the delay that it is given."""
+
+    def make(delay_s: float = 0.0) -> Lockstep:
+        native = NativeStep(kinematic_artefact, car, RACING)
+        native.set_weights(weights)
+        native.set_path(circuit.table)
+        return Lockstep(native, car, delay_s)
+
+    return make
 
 
 def strewn(k: int, x: Floats) -> Floats:
@@ -174,9 +193,9 @@ def answers(slave: Slave, states: list[Floats], h: float = STEP_S) -> Floats:
     return np.array(rows)
 
 
-def same(rows: Floats, run: Lockstep) -> None:
-    """To the bit, whatever a good status is called."""
+def same(rows: Floats, run: Lockstep, tolerance: float = 0.0) -> None:
+    """To the bit, or but for rounding; whatever a good status is called."""
     expected = [(*u, *said) for u, said in zip(run.u, run.said, strict=True)]
     rows = rows.copy()
     rows[rows[:, 2] == StepStatus.ACCEPTABLE, 2] = 0
-    np.testing.assert_array_equal(rows, np.array(expected))
+    np.testing.assert_allclose(rows, np.array(expected), rtol=0, atol=tolerance)

@@ -14,6 +14,8 @@ from fmpy.fmi2 import FMU2Slave
 from fmpy.fmi3 import FMU3Slave
 from numpy.typing import NDArray
 
+from bayesrace.vehicles.models import STATES
+
 __all__ = ["Slave", "drive"]
 
 Floats = NDArray[np.float64]
@@ -94,9 +96,6 @@ class Slave:
         """Ends and frees the instance."""
         self.fmu.terminate()
         self.fmu.freeInstance()
-
-
-STATES = ("x", "y", "psi", "vx", "vy", "omega", "delta")
 
 
 def drive(

@@ -1,8 +1,6 @@
 """The controller as an FMU in a plain FMI master: the lap of the lockstep run, no bad input."""
 
 from collections.abc import Callable
-from functools import partial
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -10,46 +8,28 @@ import pytest
 from fmpy.validation import validate_fmu
 from numpy.typing import NDArray
 
-from bayesrace.gp.weights import GpWeights
-from bayesrace.vehicles import CarParameters, get_car
+from bayesrace.vehicles import get_car
+from bayesrace.vehicles.models import STATES
+from controller.driver import UNPREDICTABLE
 from controller.fallback import Level
 from controller.native_step import StepStatus
 from tests.conftest import Circuit
-from tests.fmu_lockstep import (
+from tests.fmu_lockstep import (  # noqa: F401 - fixtures are used by name
     RACING,
     STEP_S,
     STEPS,
     Exported,
     Lockstep,
     answers,
-    make_exported,
-    make_lockstep,
+    exported_controllers,
+    lockstep_runs,
     same,
     strewn,
     versions,
 )
-from tests.fmu_master import STATES, drive
+from tests.fmu_master import drive
 
 Floats = NDArray[np.float64]
-
-
-@pytest.fixture(scope="module")
-def exported(
-    tmp_path_factory: pytest.TempPathFactory,
-    kinematic_artefact: Path,
-    car: CarParameters,
-    circuit: Circuit,
-    weights: GpWeights,
-) -> Exported:
-    folder = tmp_path_factory.getbasetemp() / "controller"
-    return make_exported(folder, kinematic_artefact, car, circuit, weights)
-
-
-@pytest.fixture
-def lockstep(
-    kinematic_artefact: Path, car: CarParameters, circuit: Circuit, weights: GpWeights
-) -> Callable[..., Lockstep]:
-    return partial(make_lockstep, kinematic_artefact, car, circuit, weights)
 
 
 @versions
@@ -120,17 +100,32 @@ def test_a_car_that_stands_and_points_away_finds_its_way_as_in_lockstep(
     same(answers(exported.slave(exported.fmu(2)), run.x), run)
 
 
-def test_a_stuck_car_begins_anew_every_half_second(
-    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit
+@pytest.mark.parametrize("turned_rad", [0.0, 2.0])
+def test_a_car_that_is_held_is_answered_as_in_lockstep(
+    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit, turned_rad: float
 ) -> None:
-    """A car that is held by something, and does not move whatever is sent."""
+    """By something, whatever is sent; on its line, and about to turn round."""
+    held = circuit.start(0.5, 0.0)
+    held[2] += turned_rad
     run = lockstep()
     for k in range(80):
-        d, delta_rate = run.answer(k, circuit.start(0.5, 0.0))
+        d, delta_rate = run.answer(k, held)
         run.plant.u_applied = (float(d), float(delta_rate))
-    u = np.array(run.u)
-    assert any(not np.array_equal(a, b) for a, b in zip(u[20:], u[19:-1], strict=True))
     same(answers(exported.slave(exported.fmu(3)), run.x), run)
+
+
+def test_inputs_under_way_and_states_that_nothing_follows_from_are_compensated_for_alike(
+    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit
+) -> None:
+    """A delay of two and a half periods; a state that is no state cannot be predicted from."""
+    run = lockstep(delay_s=2.5 * STEP_S)
+    for k, x in enumerate(lockstep().run(circuit.start(v_mps=1.0), 120, strewn).x):
+        d, delta_rate = run.u[k - 3] if k >= 3 else (0.0, 0.0)
+        run.plant.u_applied = (float(d), float(delta_rate))
+        run.answer(k, x)
+    assert {status for status, _ in run.said} >= {StepStatus.CONVERGED, UNPREDICTABLE}
+    controller = exported.slave(exported.fmu(3), {"delay": 2.5 * STEP_S})
+    same(answers(controller, run.x), run, tolerance=1e-10)  # a master's time is a sum
 
 
 @versions

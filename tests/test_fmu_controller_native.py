@@ -1,7 +1,7 @@
-"""The controller FMU's own C: the fallback is the one in Python, and no file makes it misread."""
+"""The controller FMU's own C: what Python has as well is the same, and no file makes it misread."""
 
 import ctypes as ct
-import shutil
+import re
 import struct
 import subprocess
 from collections.abc import Callable
@@ -17,20 +17,29 @@ from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
 from bayesrace.manifest import read_manifest
 from bayesrace.vehicles import get_car
-from codegen.build import casadi_includes
+from bayesrace.vehicles.parameters import BRAKE_FADE_MPS
+from codegen.build import NATIVE as HEADERS
 from codegen.compiler import find_compiler
+from codegen.fmu import resources
 from codegen.fmu.resources import PATH_FILE, WEIGHTS_FILE, path_resource, weights_resource
+from controller import driver, path_table
 from controller.fallback import Fallback, FallbackSettings
 from controller.interface import StepOutput
+from controller.native_step import StepStatus
 from tests.conftest import Circuit
+from tests.fmu_lockstep import Exported, exported_controllers  # noqa: F401 - a fixture
+from tests.native_programs import PROGRAMS, SANITIZED, native_program
 
 NATIVE = Path(codegen.fmu.__file__).parent / "native"
 CAR = get_car("orca")
 N = 20
 
 _any = st.floats(allow_nan=True, allow_infinity=True)
-_duty = st.one_of(st.floats(-0.12, 1.02), _any)
-_rate = st.one_of(st.floats(-5.1, 5.1), _any)
+_excess = [share * FallbackSettings().tolerance for share in (0.95, 1.05)]
+_duty = st.one_of(st.floats(-0.12, 1.02), st.sampled_from([CAR.d_max + e for e in _excess]), _any)
+_rate = st.one_of(
+    st.floats(-5.1, 5.1), st.sampled_from([-CAR.delta_rate_max_radps - e for e in _excess]), _any
+)
 
 
 class _Settings(ct.Structure):
@@ -48,6 +57,29 @@ class _State(ct.Structure):
         ("plan_s", ct.c_double),
         ("plan", ct.c_double * (2 * N)),
     ]
+
+
+@pytest.mark.parametrize(
+    ("macro", "values"),
+    [
+        ("BR_PATH_COLUMNS", {path_table.PATH_COLUMNS, resources.PATH_COLUMNS}),
+        ("BR_PATH_CAPACITY", {path_table.CAPACITY, resources.PATH_CAPACITY}),
+        ("BR_BRAKE_FADE_MPS", {BRAKE_FADE_MPS}),
+    ],
+)
+def test_sizes_and_limits_of_the_native_step_are_those_that_python_states(
+    macro: str, values: set[float]
+) -> None:
+    found = re.search(rf"#define {macro} (\S+)", (HEADERS / "bayesrace_mpc.h").read_text())
+    assert found is not None
+    assert {float(found[1])} == values
+
+
+def test_statuses_mean_what_they_mean_in_the_controller_process(exported: Exported) -> None:
+    [status] = [one for one in exported.define().variables if one.name == "status"]
+    numbers = [int(number) for number in re.findall(r"\d+", status.description)]
+    of_steps = [one for one in StepStatus if one is not StepStatus.TIME_LIMIT]  # has no budget
+    assert numbers == [*of_steps, driver.UNPREDICTABLE, driver.HALTED, driver.STEP_RAISED]
 
 
 @pytest.fixture(scope="module")
@@ -113,27 +145,10 @@ def test_the_fallback_in_c_does_what_the_one_in_python_does(
 @pytest.fixture(scope="module")
 def loader(tmp_path_factory: pytest.TempPathFactory, kinematic_artefact: Path) -> Path:
     """tests/native/fmu_resources.c with the step, under the address and undefined sanitizers."""
-    gcc = shutil.which("gcc")
-    if gcc is None:
-        pytest.skip("gcc is not installed")
-    include, daqp = casadi_includes()
     out = tmp_path_factory.mktemp("loader") / "loader"
-    sources = [
-        Path(__file__).parent / "native" / "fmu_resources.c",
-        NATIVE / "controller_resources.c",
-        *sorted(kinematic_artefact.glob("*.c")),
-    ]
-    flags = ["-O1", "-g", "-std=gnu11", "-Wall", "-fsanitize=address,undefined"]
-    flags += ["-fno-sanitize-recover=all", "-march=native"]
-    line = [gcc, *flags, f"-I{kinematic_artefact}", f"-I{NATIVE}", "-isystem", str(include)]
-    done = subprocess.run(
-        [*line, *map(str, sources), str(daqp), "-lm", "-o", str(out)],
-        capture_output=True, text=True, check=False, timeout=200,
-    )  # fmt: skip
-    if "cannot find -lasan" in done.stderr or "cannot find -lubsan" in done.stderr:
-        pytest.skip("gcc's sanitizer libraries are not installed")
-    assert done.returncode == 0, done.stderr[-4000:]
-    return out
+    ours = ("-Wall", f"-I{NATIVE}", str(NATIVE / "controller_resources.c"))
+    source = PROGRAMS / "fmu_resources.c"
+    return native_program(kinematic_artefact, source, out, *SANITIZED, also=ours)
 
 
 @pytest.fixture(scope="module")

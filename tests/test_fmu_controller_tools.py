@@ -1,15 +1,18 @@
 """The controller's FMU among other tools: instances, saved states, misuse, exchanged weights."""
 
+import ctypes
 import shutil
 import subprocess
 import zipfile
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+import fmpy.fmi2
 import numpy as np
 import pytest
+from fmpy import extract, read_model_description
+from fmpy.fmi2 import FMU2Slave
 from fmpy.validation import validate_fmu
 from numpy.typing import NDArray
 
@@ -19,38 +22,20 @@ from bayesrace.vehicles import CarParameters
 from codegen.fmu import pack, write_sources
 from codegen.fmu.resources import WEIGHTS_FILE, exchange_weights, path_resource
 from tests.conftest import Circuit, fit_weights
-from tests.fmu_lockstep import (
+from tests.fmu_lockstep import (  # noqa: F401 - fixtures are used by name
     Exported,
     Lockstep,
     answers,
-    make_exported,
-    make_lockstep,
+    exported_controllers,
+    lockstep_runs,
     same,
     strewn,
     versions,
 )
 from tests.fmu_master import Slave
+from tests.native_programs import PROGRAMS, SANITIZED, artefact_objects, gcc
 
 Floats = NDArray[np.float64]
-
-
-@pytest.fixture(scope="module")
-def exported(
-    tmp_path_factory: pytest.TempPathFactory,
-    kinematic_artefact: Path,
-    car: CarParameters,
-    circuit: Circuit,
-    weights: GpWeights,
-) -> Exported:
-    folder = tmp_path_factory.getbasetemp() / "controller"
-    return make_exported(folder, kinematic_artefact, car, circuit, weights)
-
-
-@pytest.fixture
-def lockstep(
-    kinematic_artefact: Path, car: CarParameters, circuit: Circuit, weights: GpWeights
-) -> Callable[..., Lockstep]:
-    return partial(make_lockstep, kinematic_artefact, car, circuit, weights)
 
 
 def test_two_instances_do_not_know_each_other_and_reset_begins_the_same_run_again(
@@ -93,24 +78,22 @@ def test_a_tool_can_roll_back(
 
 @pytest.mark.slow
 def test_no_sanitizer_finds_anything_and_c_sees_what_the_master_sees(
-    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit, tmp_path: Path
+    exported: Exported,
+    lockstep: Callable[..., Lockstep],
+    circuit: Circuit,
+    kinematic_artefact: Path,
+    tmp_path: Path,
 ) -> None:
     """A drive with bad states strewn in, saved and restored states, resets, missing resources."""
-    gcc = shutil.which("gcc")
-    if gcc is None:
-        pytest.skip("gcc is not installed")
     run = lockstep().run(circuit.start(v_mps=1.0), 120, strewn)
     definition = exported.define(version=3)
     linked = write_sources(definition, tmp_path)
-    flags = ["-O1", "-g", "-std=gnu11", "-Wall", "-Wextra", "-march=native", "-ffp-contract=fast"]
-    flags += ["-Wno-unused-parameter", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
-    main = Path(__file__).parent / "native" / "fmu_controller.c"
-    line = [gcc, *flags, "-I.", str(main), *linked, "-lm", "-o", "drive"]
-    done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, timeout=280)
-    if "cannot find -lasan" in done.stderr or "cannot find -lubsan" in done.stderr:
-        pytest.skip("gcc's sanitizer libraries are not installed")
-    assert done.returncode == 0, done.stderr[-4000:]
-    assert not [line for line in done.stderr.splitlines() if "controller" in line], done.stderr
+    own = [name for name in linked if not (kinematic_artefact / name).exists()]
+    flags = (*SANITIZED, "-Wall", "-Wextra", "-Wno-unused-parameter", "-I.")
+    objects = artefact_objects(kinematic_artefact, SANITIZED)
+    main, archives = PROGRAMS / "fmu_controller.c", ("libdaqpstat.a", "-lm")
+    said = gcc(*flags, main, *own, *objects, *archives, "-o", "drive", cwd=tmp_path)
+    assert "controller" not in said
     resources = tmp_path / "resources"
     resources.mkdir()
     for name, content in definition.resources.items():
@@ -176,6 +159,43 @@ def test_missing_and_damaged_resources_are_refused_and_named(
         with pytest.raises(Exception, match="instantiate"):
             Told(fmu, damaged)
         assert words in said[-1], said
+
+
+def test_the_resources_are_found_by_uri_and_by_plain_path(
+    exported: Exported, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """FMI 2.0 wants a URI; many importers pass a path."""
+    folder = tmp_path / "an FMU, 100 %20 fine"
+    extract(str(exported.fmu(2)), unzipdir=str(folder))
+    description = read_model_description(str(folder), validate=False)
+    identifier = description.coSimulation.modelIdentifier
+    fmu: Any = FMU2Slave(
+        guid=description.guid, unzipDirectory=str(folder), modelIdentifier=identifier
+    )
+
+    def instance(location: str) -> Any:
+        token, callbacks = description.guid.encode(), ctypes.byref(fmpy.fmi2.defaultCallbacks)
+        arguments = (location.encode(), callbacks, 0, 0)
+        return fmu.fmi2Instantiate(b"one", fmpy.fmi2.fmi2CoSimulation, token, *arguments)
+
+    monkeypatch.chdir(tmp_path)
+    path = folder / "resources"
+    uri = path.as_uri()
+    assert "%" in uri.removeprefix("file:///")
+    for location in (
+        uri,
+        uri + "/",
+        uri.replace("file:///", "file:/"),
+        uri.replace("file:///", "file://localhost/"),
+        str(path),
+        f"{path}/",
+        str(path.relative_to(tmp_path)),
+    ):
+        component = instance(location)
+        assert component, location
+        fmu.fmi2FreeInstance(component)
+    for location in ("", "http" + uri.removeprefix("file"), str(path.parent)):
+        assert not instance(location), location
 
 
 def test_weights_are_exchanged_without_compiling(

@@ -147,6 +147,21 @@ def test_a_state_is_an_output_whose_derivative_is_one(instance: Instance) -> Non
     assert list(instance.fmu.getAdjointDerivative(both, known, [2.0, 3.0, 5.0])) == [2.0, 3.0, 5.0]
 
 
+def test_time_is_a_known_that_nothing_depends_on(instance: Instance) -> None:
+    """FMI counts the independent variable among the knowns of a partial derivative."""
+    instance.put(*points(1)[0])
+    names = ("der_vx", "der_delta", "x")
+    unknown = instance.references(names)
+    time, rate = instance.references(("time", "delta_rate"))
+    derivative = instance.fmu.getDirectionalDerivative
+    assert list(derivative(unknown, [time], [3.0])) == [0.0, 0.0, 0.0]
+    assert list(derivative(unknown, [time, rate], [3.0, 5.0])) == [0.0, 5.0, 0.0]
+    adjoint = instance.fmu.getAdjointDerivative(unknown, [time, rate], [3.0, 5.0, 7.0], 2)
+    assert list(adjoint) == [0.0, 5.0]
+    with pytest.raises(FMICallException):
+        derivative([time], [rate], [1.0])
+
+
 def test_misuse_is_refused(instance: Instance) -> None:
     with pytest.raises(FMICallException):
         instance.fmu.setFloat64([instance.reference["mass_kg"]], [1.0])

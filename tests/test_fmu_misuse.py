@@ -16,6 +16,7 @@ from codegen.fmu import write_sources
 from plant.fmu.export import car_fmu
 from tests.fmu_exports import Kind, Version, commands, driven, exported, extracted, slave
 from tests.fmu_master import Slave
+from tests.native_programs import PROGRAMS, SANITIZERS, gcc
 
 VERSIONS = pytest.mark.parametrize("version", [2, 3])
 
@@ -234,17 +235,10 @@ def test_misuse_under_sanitizers(
     version: Version, kind: Kind, car: CarParameters, tmp_path: Path
 ) -> None:
     """tests/native/fmi*_misuse.c: NULL, wrong sizes, wrong phases, damaged bytes, stale states."""
-    gcc = shutil.which("gcc")
-    if gcc is None:
-        pytest.skip("gcc is not installed")
     sources = write_sources(car_fmu(car, version, kind), tmp_path)
-    program = Path(__file__).parent / "native" / f"fmi{version}_misuse.c"
-    flags = ["-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-Wall"]
-    line = [gcc, *flags, "-Werror", "-I.", *sources, str(program), "-lm", "-o", "misuse"]
-    done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=False)
-    if "cannot find -lasan" in done.stderr or "cannot find -lubsan" in done.stderr:
-        pytest.skip("gcc's sanitizer libraries are not installed")
-    assert done.returncode == 0, done.stderr[-3000:]
+    program = PROGRAMS / f"fmi{version}_misuse.c"
+    flags = (*SANITIZERS, "-Wall", "-Werror", "-I.")
+    gcc(*flags, *sources, program, "-lm", "-o", "misuse", cwd=tmp_path)
     ran = subprocess.run(
         [str(tmp_path / "misuse")], capture_output=True, text=True, check=False, timeout=60
     )

@@ -9,9 +9,7 @@ import json
 import os
 import re
 import signal
-import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -26,26 +24,24 @@ from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
 from bayesrace.vehicles.parameters import get_car
 from experiments.recording import PlannedRun, RunRecord, _sort_in
 from learning.logs import dataset_from_messages
+from tests import programs
 from tests.faulty_fmu import Mode, faulty_fmu, faulty_library
 from tests.programs import until
-from tests.test_lockstep import CONTROLLER, PLANT, Rig, drive, request, start
+from tests.pursuit_rig import PATIENCE_S, PLANT, Rig, Spectator, request, running_rig, start
+
+pytestmark = pytest.mark.alone
 
 AT_S = 0.4
 """When the faults strike."""
 
-MAP = f"""
-[fmu]
-timeout_s = 0.5
-[parameters]
-at_s = {AT_S}
-[start]
-mode = {{ from = "omega", scale = 1.0 }}
-"""
+HANGS_S = 2.0
+"""A step that takes longer hangs. More than a machine stalls, less than anybody waits for."""
+
 
 FAULTS = {
     Mode.ABORT: r"crashed \(SIGABRT\); its last words: the engine is on fire",
     Mode.EXIT: "exit code 3",
-    Mode.HANG: r"did not answer within 0.5 s",
+    Mode.HANG: "did not answer within 2 s",
     Mode.NOT_A_NUMBER: "gave vx = nan",
     Mode.FAIL: r"failed \(error\); its last words: a wheel came off",
     Mode.TERMINATE: "the FMU ended the simulation",
@@ -53,60 +49,41 @@ FAULTS = {
 }
 
 
+def write_map(path: Path, timeout_s: float) -> Path:
+    """The fault comes from the start state's yaw rate."""
+    path.write_text(
+        f"[fmu]\ntimeout_s = {timeout_s}\n[parameters]\nat_s = {AT_S}\n"
+        '[start]\nmode = { from = "omega", scale = 1.0 }\n'
+    )
+    return path
+
+
 @pytest.fixture(scope="module")
 def car_fmu(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("fmu")
-    (folder / "map.toml").write_text(MAP)
-    return faulty_fmu(faulty_library(2, folder / "faulty.so"), folder / "faulty.fmu")
-
-
-def settings_of(car_fmu: Path, endpoint: str, low_latency: bool = True) -> str:
-    return json.dumps(
-        {
-            "endpoints": {"listen": [endpoint], "low_latency": low_latency},
-            "parent_pid": os.getpid(),
-            "fmu": str(car_fmu),
-            "fmu_map": str(car_fmu.with_name("map.toml")),
-        }
-    )
-
-
-@contextlib.contextmanager
-def running_rig(car_fmu: Path, low_latency: bool = True) -> Iterator[Rig]:
-    at_plant, at_controller = free_endpoint(), free_endpoint()
-    plant = start(PLANT, settings_of(car_fmu, at_plant, low_latency))
-    ends = {"listen": [at_controller], "connect": [at_plant], "low_latency": low_latency}
-    controller = start(CONTROLLER, json.dumps({"endpoints": ends, "parent_pid": os.getpid()}), "1")
-    try:
-        with open_session(Endpoints(connect=(at_plant, at_controller))) as session:
-            director = Director(session, "orca")
-            director.wait_for(("plant", "controller"), 20.0)
-            yield Rig(plant, controller, session, director)
-    finally:
-        for process in (controller, plant):
-            process.send_signal(signal.SIGTERM)
-        for process in (controller, plant):
-            output, _ = process.communicate(timeout=10)
-            assert "Traceback" not in output, output
+    return faulty_fmu(faulty_library(2), tmp_path_factory.mktemp("fmu") / "faulty.fmu")
 
 
 @pytest.fixture(scope="module")
-def rig(car_fmu: Path) -> Iterator[Rig]:
-    with running_rig(car_fmu) as rig:
+def player(car_fmu: Path) -> dict[str, str]:
+    """Plant settings that say what plays the car."""
+    map_ = write_map(car_fmu.with_name("map.toml"), HANGS_S)
+    return {"fmu": str(car_fmu), "fmu_map": str(map_)}
+
+
+@pytest.fixture(scope="module")
+def rig(player: dict[str, str]) -> Iterator[Rig]:
+    with running_rig(player) as rig:
         yield rig
 
 
 @pytest.fixture(scope="module")
-def wall_clock_rig(car_fmu: Path) -> Iterator[Rig]:
-    with running_rig(car_fmu, low_latency=False) as rig:
+def wall_clock_rig(player: dict[str, str]) -> Iterator[Rig]:
+    with running_rig(player, low_latency=False) as rig:
         yield rig
 
 
 def with_fault(mode: Mode) -> dict[str, Any]:
     return {"x0": (2.0, 0.0, np.pi / 2, 0.1, 0.0, float(mode), 0.0)}
-
-
-RUN = iter(range(1, 1000))
 
 
 @pytest.mark.parametrize(
@@ -118,9 +95,8 @@ def test_a_fault_ends_the_run_and_nothing_else(
     mode: Mode, lockstep: bool, request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
     rig: Rig = request.getfixturevalue("rig" if lockstep else "wall_clock_rig")
-    run = next(RUN)
     log = tmp_path / "log.mcap"
-    end = drive(rig, log, run, lockstep=lockstep, laps=0, **with_fault(mode))
+    end = rig.drive(log, lockstep=lockstep, laps=0, **with_fault(mode))
     assert end.data["reason"] == "plant_fault"
     assert re.search(FAULTS[mode], end.text)
     reader = LogReader(log)
@@ -137,17 +113,15 @@ def test_a_fault_ends_the_run_and_nothing_else(
     status = rig.director.status("plant")
     assert status.phase == "idle"
     assert re.search(FAULTS[mode], status.text)
-    controller = rig.director.status("controller")
-    assert controller.phase == "waiting"
+    rig.wait_for_phase("controller", "waiting")
 
 
 def test_after_all_that_it_drives_a_lap(rig: Rig, tmp_path: Path) -> None:
     digests = []
-    for _ in range(2):
-        run = next(RUN)
-        end = drive(rig, tmp_path / f"{run}.mcap", run, **with_fault(Mode.GOOD))
+    for log in (tmp_path / "1.mcap", tmp_path / "2.mcap"):
+        end = rig.drive(log, **with_fault(Mode.GOOD))
         assert end.data["reason"] == "laps", end.text
-        states = LogReader(tmp_path / f"{run}.mcap").select(STATE)
+        states = LogReader(log).select(STATE)
         digests.append([(state.time_s, state.x) for state in states])
     assert digests[0] == digests[1]
     assert rig.plant.poll() is None
@@ -155,13 +129,13 @@ def test_after_all_that_it_drives_a_lap(rig: Rig, tmp_path: Path) -> None:
 
 def test_a_failed_start_is_a_refused_run(rig: Rig) -> None:
     with pytest.raises(InputError, match=r"while it was initialised: .*this car has no wheels"):
-        rig.director.start(request(next(RUN), **with_fault(Mode.INIT_FAILS)))
+        rig.start(**with_fault(Mode.INIT_FAILS))
     assert rig.director.status("plant").phase == "idle"
 
 
 def test_talk_does_not_end_a_run(rig: Rig, tmp_path: Path) -> None:
     changes = with_fault(Mode.FLOOD_LOG) | {"max_time_s": AT_S + 0.1}
-    end = drive(rig, tmp_path / "log", next(RUN), laps=0, **changes)
+    end = rig.drive(tmp_path / "log", laps=0, **changes)
     assert end.data["reason"] == "max_time"
 
 
@@ -169,8 +143,7 @@ def test_a_slow_fmu_counts_as_overruns(wall_clock_rig: Rig, tmp_path: Path) -> N
     """60 ms for a period of 20 ms."""
     before = int(wall_clock_rig.director.status("plant").counters["overruns"])
     changes = with_fault(Mode.SLOW) | {"max_time_s": AT_S + 0.2}
-    run = next(RUN)
-    end = drive(wall_clock_rig, tmp_path / "log", run, lockstep=False, laps=0, **changes)
+    end = wall_clock_rig.drive(tmp_path / "log", lockstep=False, laps=0, **changes)
     assert end.data["reason"] == "max_time"
     assert int(end.data["overruns"]) - before >= 5
 
@@ -193,38 +166,42 @@ def workers_of(plant: int) -> dict[int, Path]:
 def test_nothing_outlives_the_plant(how: signal.Signals, car_fmu: Path, tmp_path: Path) -> None:
     """However it ends, and were the FMU hanging at that moment."""
     at_plant = free_endpoint()
-    (tmp_path / "map.toml").write_text(MAP.replace("0.5", "60.0"))
-    fmu = tmp_path / car_fmu.name
-    fmu.symlink_to(car_fmu)
-    plant = start(PLANT, settings_of(fmu, at_plant, low_latency=False))
+    settings = {
+        "endpoints": {"listen": [at_plant]},
+        "parent_pid": os.getpid(),
+        "fmu": str(car_fmu),
+        "fmu_map": str(write_map(tmp_path / "map.toml", timeout_s=60.0)),
+    }
+    plant = start(PLANT, json.dumps(settings))
     with open_session(Endpoints(connect=(at_plant,))) as session:
-        director = Director(session, "orca")
-        director.wait_for(("plant",), 20.0)
-        [(worker, folder)] = workers_of(plant.pid).items()
+        director, spectator = Director(session, "orca"), Spectator(session)
+        director.wait_for(("plant",), PATIENCE_S)
+        [folder] = workers_of(plant.pid).values()
         mode = Mode.HANG if how is signal.SIGKILL else Mode.GOOD
         director.start(request(1, lockstep=False, laps=0, max_time_s=1e5, **with_fault(mode)))
-        time.sleep(2 * AT_S)
+        before_s = AT_S - 0.03  # the last state that a hanging one gives
+        spectator.wait_for(1, lambda state: state.time_s > before_s, "the hang")
         plant.send_signal(how)
-        plant.communicate(timeout=10)
-    until(lambda: not (folder.exists() or Path(f"/proc/{worker}").exists()), "no leftovers", 10.0)
-    assert not workers_of(plant.pid)
+        plant.communicate(timeout=PATIENCE_S)
+    until(
+        lambda: not (folder.exists() or workers_of(plant.pid)), "the end of all of it", PATIENCE_S
+    )
 
 
 def test_the_command_refuses_an_unusable_fmu_in_a_line_a_fault(
     car_fmu: Path, tmp_path: Path
 ) -> None:
-    folder = car_fmu.parent
-    (tmp_path / "map.toml").write_text('[outputs]\nvx = { variable = "speed" }\n')
-    foreign = faulty_fmu(folder / "faulty.so", tmp_path / "foreign.fmu", platform="win64")
-    for options, why, lines in (
+    map_ = tmp_path / "map.toml"
+    map_.write_text('[outputs]\nvx = { variable = "speed" }\n')
+    foreign = faulty_fmu(faulty_library(2), tmp_path / "foreign.fmu", platform="win64")
+    cases: tuple[tuple[tuple[str | Path, ...], str, int], ...] = (
         (("--fmu", foreign), "is for win64", 1),
-        (("--fmu", car_fmu, "--map", tmp_path / "map.toml"), "\n  - [outputs] vx: ", 3),
-        (("--map", tmp_path / "map.toml"), "without an FMU", 1),
-    ):
-        done = subprocess.run(
-            [sys.executable, "-m", "experiments.cli", "plant", *map(str, options)],
-            capture_output=True, text=True, timeout=60, check=False,
-        )  # fmt: skip
+        (("--fmu", car_fmu, "--map", map_), "\n  - [outputs] vx: ", 3),
+        (("--map", map_), "without an FMU", 1),
+    )
+    plants = [programs.start("plant", *options) for options, _, _ in cases]
+    for plant, (_, why, lines) in zip(plants, cases, strict=True):
+        done = programs.finish(plant)
         assert done.returncode == 2
         assert len(done.stderr.strip().splitlines()) == lines
         assert why in done.stderr

@@ -5,55 +5,26 @@ lockstep; a killed plant or controller and Ctrl-C end the run with a clear messa
 and no process left over. All of it with the built-in car, and with an FMU in its place.
 """
 
-import contextlib
 import hashlib
 import itertools
 import json
-import math
-import os
 import signal
 import struct
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from bayesrace.errors import InputError
 from bayesrace.log import LogReader, Recorder
-from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY, Event, RunRequest
-from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
+from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY
 from tests.car_fmu import packed_car
+from tests.programs import until
+from tests.pursuit_rig import CONTROLLER, PATIENCE_S, PLANT, Rig, running_rig, start
 
-ROOT = Path(__file__).resolve().parents[1]
-
-CAR: dict[str, str] = {}
-"""Plant settings that say what plays the car."""
-
-PLANT = """
-import json, sys
-from plant.process import PlantSettings, main
-sys.exit(main(PlantSettings.model_validate_json(sys.argv[1])))
-"""
-
-CONTROLLER = """
-import sys
-import numpy as np
-from bayesrace.vehicles.parameters import get_car
-from controller.process import ControllerSettings, main
-from controller.pure_pursuit import PurePursuit, PurePursuitSettings
-assert not {"casadi", "sklearn", "matplotlib", "scipy"} & set(sys.modules), "slow imports"
-s = np.linspace(0, 2 * np.pi, 200, endpoint=False)
-line = PurePursuit(get_car("orca"), 2 * np.cos(s), np.sin(s), np.full(200, 1.5),
-                   PurePursuitSettings(seed=int(sys.argv[2])))
-sys.exit(main(ControllerSettings.model_validate_json(sys.argv[1]), line))
-"""
-
+pytestmark = pytest.mark.alone
 
 # Drives well, with a plan, for a second; then raises, then gives no number.
 FAILING = """
@@ -72,81 +43,24 @@ PurePursuit = Failing
 """
 
 
-@pytest.fixture(params=["built-in car", "FMU"], autouse=True)
-def _played_by(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = {"fmu": str(packed_car())} if request.param == "FMU" else {}
-    monkeypatch.setattr(sys.modules[__name__], "CAR", settings)
+@pytest.fixture(scope="module", params=["built-in car", "FMU"])
+def player(request: pytest.FixtureRequest) -> dict[str, str]:
+    """Plant settings that say what plays the car."""
+    return {"fmu": str(packed_car())} if request.param == "FMU" else {}
 
 
-@dataclass
-class Rig:
-    """Both processes, and a session that is connected to both."""
-
-    plant: subprocess.Popen[str]
-    controller: subprocess.Popen[str]
-    session: Any
-    director: Director
-
-
-def request(run: int, **changes: Any) -> RunRequest:
-    """A run on the oval (2 m by 1 m) from the start line at its rightmost point."""
-    start = (2.0, 0.0, math.pi / 2, 0.1, 0.0, 0.0, 0.0)
-    values: dict[str, Any] = {
-        "lockstep": True, "x0": start, "line_x_m": 2.0, "line_y_m": 0.0,
-        "line_heading_rad": math.pi / 2, "line_left_m": 0.3, "line_right_m": 0.3, "laps": 1,
-        "max_time_s": 60.0, "actuation_timeout_s": 5.0,
-    }  # fmt: skip
-    return RunRequest(0, time.monotonic_ns(), run, **(values | changes))
-
-
-def start(code: str, *arguments: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-c", code, *arguments],
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-
-
-@contextlib.contextmanager
-def running_rig(
-    seed: int = 1, *, low_latency: bool = True, controller_code: str = CONTROLLER
-) -> Iterator[Rig]:
-    at_plant, at_controller = free_endpoint(), free_endpoint()
-    ends: dict[str, Any] = {"listen": [at_plant], "low_latency": low_latency}
-    plant = start(PLANT, json.dumps({"endpoints": ends, "parent_pid": os.getpid(), **CAR}))
-    ends = {"listen": [at_controller], "connect": [at_plant], "low_latency": low_latency}
-    controller = start(
-        controller_code, json.dumps({"endpoints": ends, "parent_pid": os.getpid()}), str(seed)
-    )
-    try:
-        with open_session(Endpoints(connect=(at_plant, at_controller))) as session:
-            director = Director(session, "orca")
-            director.wait_for(("plant", "controller"), 20.0)
-            yield Rig(plant, controller, session, director)
-    finally:
-        for process in (controller, plant):
-            process.send_signal(signal.SIGTERM)
-        for process in (controller, plant):
-            output, _ = process.communicate(timeout=10)
-            assert "Traceback" not in output, output
-
-
-@pytest.fixture
-def rig() -> Iterator[Rig]:
-    with running_rig() as rig:
+@pytest.fixture(scope="module")
+def rig(player: dict[str, str]) -> Iterator[Rig]:
+    """For tests that leave both processes as they found them."""
+    with running_rig(player) as rig:
         yield rig
 
 
-def drive(rig: Rig, path: Path, run: int, **changes: Any) -> Event:
-    with Recorder(rig.session, "orca", path) as recorder:
-        rig.director.wait_for(("plant", "controller"), 10.0)
-        rig.director.start(request(run, **changes))
-        end = rig.director.wait_for_end(run, 60.0)
-    assert recorder.counters.missing == 0, recorder.gaps
-    assert recorder.counters.unnumbered == recorder.counters.disordered == 0
-    return end
+@pytest.fixture
+def mortal(player: dict[str, str]) -> Iterator[Rig]:
+    """For tests that end one of the processes."""
+    with running_rig(player) as rig:
+        yield rig
 
 
 def digest(log: Path) -> str:
@@ -155,22 +69,24 @@ def digest(log: Path) -> str:
     return hashlib.sha256(rows).hexdigest()
 
 
-def test_two_lockstep_runs_with_one_seed_are_identical(rig: Rig, tmp_path: Path) -> None:
+def test_two_lockstep_runs_with_one_seed_are_identical(
+    rig: Rig, player: dict[str, str], tmp_path: Path
+) -> None:
     for run in (1, 2):
-        end = drive(rig, tmp_path / f"{run}.mcap", run)
+        end = rig.drive(tmp_path / f"{run}.mcap")
         assert end.data["reason"] == "laps", end.text
         assert end.data["rejected"] == end.data["refused"] == end.data["stale"] == 0
     assert digest(tmp_path / "1.mcap") == digest(tmp_path / "2.mcap")
-    with running_rig() as other:
-        drive(other, tmp_path / "3.mcap", 1)
+    with running_rig(player) as other:
+        other.drive(tmp_path / "3.mcap")
     assert digest(tmp_path / "1.mcap") == digest(tmp_path / "3.mcap")
-    with running_rig(seed=2) as other:
-        drive(other, tmp_path / "4.mcap", 1)
+    with running_rig(player, seed=2) as other:
+        other.drive(tmp_path / "4.mcap")
     assert digest(tmp_path / "1.mcap") != digest(tmp_path / "4.mcap")
 
 
 def test_the_log_of_a_lockstep_run_is_complete(rig: Rig, tmp_path: Path) -> None:
-    end = drive(rig, tmp_path / "log.mcap", 7)
+    end = rig.drive(tmp_path / "log.mcap")
     log = LogReader(tmp_path / "log.mcap")
     states, actuations = log.select(STATE), log.select(ACTUATION)
     assert not log.truncated
@@ -186,37 +102,52 @@ def test_the_log_of_a_lockstep_run_is_complete(rig: Rig, tmp_path: Path) -> None
     assert [e.kind for e in log.select(EVENT)] == ["run_started", "run_ended"]
 
 
-def test_free_running_drives_by_the_wall_clock(tmp_path: Path) -> None:
-    begin = time.monotonic()
-    with running_rig(low_latency=False) as rig:
-        end = drive(rig, tmp_path / "log.mcap", 1, lockstep=False, laps=0, max_time_s=1.5)
-    assert end.data["reason"] == "max_time"
-    assert time.monotonic() - begin > 1.5
-    last = LogReader(tmp_path / "log.mcap").select(STATE)[-1]
-    assert np.hypot(last.x[0] - 2.0, last.x[1]) > 0.5, "the car has not been driven"
+def test_free_running_drives_by_the_wall_clock(player: dict[str, str], tmp_path: Path) -> None:
+    log = tmp_path / "log.mcap"
+    with running_rig(player, low_latency=False) as rig, Recorder(rig.session, "orca", log) as seen:
+        rig.director.wait_for(("plant", "controller"), PATIENCE_S)
+        begin = time.monotonic()
+        run = rig.start(lockstep=False, laps=0, max_time_s=1e5)
+        driven = rig.spectator.wait_for(
+            run, lambda state: np.hypot(state.x[0] - 2.0, state.x[1]) > 0.5, "half a metre"
+        )
+        assert 0.2 < driven.time_s < time.monotonic() - begin
+        assert rig.director.stop("far enough").accepted
+        end = rig.director.wait_for_end(run, PATIENCE_S)
+    assert end.data["reason"] == "stopped"
+    assert seen.counters.missing == 0, seen.gaps
+    assert LogReader(log).select(STATE)[-1].time_s == end.data["time_s"]
 
 
 def test_a_plant_for_lockstep_refuses_to_run_by_the_wall_clock(rig: Rig) -> None:
     with pytest.raises(InputError, match=r"started for lockstep \(--low-latency\)"):
-        rig.director.start(request(1, lockstep=False))
+        rig.start(lockstep=False)
 
 
-def test_a_free_running_car_brakes_when_its_controller_dies(tmp_path: Path) -> None:
+def test_a_free_running_car_brakes_when_its_controller_dies(
+    player: dict[str, str], tmp_path: Path
+) -> None:
     """Without priorities or with: by the wall clock the transport's defaults are used."""
-    with running_rig(low_latency=False) as rig, Recorder(rig.session, "orca", tmp_path / "log"):
-        rig.director.wait_for(("plant",), 10.0)
-        rig.director.start(
-            request(1, lockstep=False, laps=0, max_time_s=3.0, actuation_timeout_s=0.1)
-        )
-        time.sleep(1.0)
+    log = tmp_path / "log"
+    with running_rig(player, low_latency=False) as rig, Recorder(rig.session, "orca", log):
+        rig.director.wait_for(("plant",), PATIENCE_S)
+        run = rig.start(lockstep=False, laps=0, max_time_s=1e5, actuation_timeout_s=0.1)
+        rig.wait_until_driving(run)
         rig.controller.kill()
-        end = rig.director.wait_for_end(1, 10.0, absence_s=10.0)
-    assert end.data["reason"] == "max_time"
-    states = LogReader(tmp_path / "log").select(STATE)
+        rig.spectator.wait_for(run, lambda state: abs(state.x[3]) < 0.05, "standstill")
+        until(lambda: unanswered(rig) > 20, "late and braked periods", PATIENCE_S)
+        assert rig.director.stop("it stands").accepted
+        end = rig.director.wait_for_end(run, PATIENCE_S, absence_s=PATIENCE_S)
+    assert end.data["reason"] == "stopped"
+    states = LogReader(log).select(STATE)
     assert max(state.x[3] for state in states) > 0.5
     assert abs(states[-1].x[3]) < 0.05
-    assert int(end.data["late"]) > 20
-    assert int(end.data["braked"]) > 20
+
+
+def unanswered(rig: Rig) -> int:
+    """Periods that were late, and braked."""
+    counters = rig.director.status("plant").counters
+    return min(int(counters["late"]), int(counters["braked"]))
 
 
 @pytest.mark.slow
@@ -225,16 +156,18 @@ def test_real_time_factor_is_told(
 ) -> None:
     """A measurement, not a promise: what else the machine does decides it."""
     begin = time.perf_counter()
-    drive(rig, tmp_path / "log.mcap", 1, laps=0, max_time_s=40.0)
+    rig.drive(tmp_path / "log.mcap", laps=0, max_time_s=40.0)
     factor = 40.0 / (time.perf_counter() - begin)
     with capsys.disabled():
         print(f"\nlockstep with recorder: {factor:.1f} x real time")  # noqa: T201
 
 
-def test_a_failing_step_goes_down_the_levels_and_the_car_stops(tmp_path: Path) -> None:
+def test_a_failing_step_goes_down_the_levels_and_the_car_stops(
+    player: dict[str, str], tmp_path: Path
+) -> None:
     code = CONTROLLER.replace("assert not", FAILING + "assert not")
-    with running_rig(controller_code=code) as rig:
-        end = drive(rig, tmp_path / "log.mcap", 1, laps=0, max_time_s=4.0)
+    with running_rig(player, controller_code=code) as rig:
+        end = rig.drive(tmp_path / "log.mcap", laps=0, max_time_s=4.0)
         status = rig.director.status("controller")
     assert end.data["reason"] == "max_time"
     log = LogReader(tmp_path / "log.mcap")
@@ -247,68 +180,73 @@ def test_a_failing_step_goes_down_the_levels_and_the_car_stops(tmp_path: Path) -
     assert abs(log.select(STATE)[-1].x[3]) < 0.05
 
 
-def test_a_killed_controller_ends_a_lockstep_run(rig: Rig, tmp_path: Path) -> None:
+def test_a_killed_controller_ends_a_lockstep_run(mortal: Rig, tmp_path: Path) -> None:
+    rig = mortal
     with Recorder(rig.session, "orca", tmp_path / "log.mcap"):
-        rig.director.wait_for(("plant",), 10.0)
-        rig.director.start(request(1, laps=0, max_time_s=1e5))
-        time.sleep(0.5)
+        rig.director.wait_for(("plant",), PATIENCE_S)
+        run = rig.start(laps=0, max_time_s=1e5)
+        rig.wait_until_driving(run)
         rig.controller.kill()
-        end = rig.director.wait_for_end(1, 5.0)
+        end = rig.director.wait_for_end(run, PATIENCE_S, absence_s=PATIENCE_S)
     assert end.data["reason"] == "controller_lost"
     assert "controller vanished" in end.text
     states = LogReader(tmp_path / "log.mcap").select(STATE)
     assert states
     assert states[-1].time_s == end.data["time_s"]
     with pytest.raises(InputError, match="no controller for car 'orca'"):
-        rig.director.start(request(2))
+        rig.start()
     assert rig.director.status("plant").phase == "idle"
 
 
-def test_a_killed_plant_is_noticed_by_everyone(rig: Rig, tmp_path: Path) -> None:
+def test_a_killed_plant_is_noticed_by_everyone(mortal: Rig, tmp_path: Path) -> None:
+    rig = mortal
     with Recorder(rig.session, "orca", tmp_path / "log.mcap"):
-        rig.director.start(request(1, laps=0, max_time_s=1e5))
-        time.sleep(0.5)
+        run = rig.start(laps=0, max_time_s=1e5)
+        rig.wait_until_driving(run)
         rig.plant.kill()
-        with pytest.raises(InputError, match="plant of car 'orca' vanished during run 1"):
-            rig.director.wait_for_end(1, 5.0)
+        with pytest.raises(InputError, match=f"plant of car 'orca' vanished during run {run}"):
+            rig.director.wait_for_end(run, PATIENCE_S)
     assert LogReader(tmp_path / "log.mcap").select(STATE)
-    status = rig.director.status("controller")
-    assert (status.phase, "plant vanished" in status.text) == ("waiting", True)
+    rig.wait_for_phase("controller", "waiting")
+    assert "plant vanished" in rig.director.status("controller").text
 
 
-def test_ctrl_c_ends_plant_and_run_cleanly(rig: Rig, tmp_path: Path) -> None:
+def test_ctrl_c_ends_plant_and_run_cleanly(mortal: Rig, tmp_path: Path) -> None:
+    rig = mortal
     with Recorder(rig.session, "orca", tmp_path / "log.mcap"):
-        rig.director.start(request(1, laps=0, max_time_s=1e5))
-        time.sleep(0.3)
+        run = rig.start(laps=0, max_time_s=1e5)
+        rig.wait_until_driving(run)
         for process in (rig.plant, rig.controller):
             process.send_signal(signal.SIGINT)
-        assert rig.plant.wait(5.0) == 0
-        assert rig.controller.wait(5.0) == 0
+        rig.director.wait_for_end(run, PATIENCE_S, absence_s=PATIENCE_S)
+        assert rig.plant.wait(PATIENCE_S) == 0
+        assert rig.controller.wait(PATIENCE_S) == 0
     log = LogReader(tmp_path / "log.mcap")
     ends = [event for event in log.select(EVENT) if event.kind == "run_ended"]
     assert [event.data["reason"] for event in ends] in (["interrupted"], ["controller_lost"])
 
 
 def test_a_run_is_stopped_on_request_and_another_refused_meanwhile(rig: Rig) -> None:
-    rig.director.start(request(1, laps=0, max_time_s=1e5))
-    with pytest.raises(InputError, match="busy: run 1 under way"):
-        rig.director.start(request(2))
+    run = rig.start(laps=0, max_time_s=1e5)
+    with pytest.raises(InputError, match=f"busy: run {run} under way"):
+        rig.start()
     assert rig.director.status("plant").phase == "running"
     assert rig.director.stop("enough").accepted
-    end = rig.director.wait_for_end(1, 5.0)
+    end = rig.director.wait_for_end(run, PATIENCE_S)
     assert end.data["reason"] == "stopped"
     assert "enough" in end.text
     assert not rig.director.stop("again").accepted
 
 
 def test_weights_for_a_controller_without_any_are_refused_with_a_reason(rig: Rig) -> None:
+    before = int(rig.director.status("controller").counters["weights_refused"])
     with pytest.raises(InputError, match="pure pursuit takes no weights"):
         rig.director.send_weights(bytes(200_000))
-    assert rig.director.status("controller").counters["weights_refused"] == 1
+    assert rig.director.status("controller").counters["weights_refused"] == before + 1
 
 
 @pytest.mark.parametrize("after_s", [0.0, 1.5])
-def test_processes_do_not_outlive_who_started_them(after_s: float) -> None:
+def test_processes_do_not_outlive_who_started_them(player: dict[str, str], after_s: float) -> None:
     """Whether the parent dies while the child runs or while it is still starting."""
     starter = (
         "import os, subprocess, sys, time, json\n"
@@ -319,9 +257,10 @@ def test_processes_do_not_outlive_who_started_them(after_s: float) -> None:
         "print(p.pid, flush=True)\n"
         "time.sleep(60)\n"
     )
-    parent = start(starter, PLANT, json.dumps(CAR))
+    parent = start(starter, PLANT, json.dumps(player))
     assert parent.stdout is not None
     assert parent.stdout.readline().strip().isdigit()
     time.sleep(after_s)
     parent.kill()
-    parent.communicate(timeout=10)  # returns when the child, which holds the pipe too, has ended
+    # returns when the child, which holds the pipe too, has ended
+    parent.communicate(timeout=PATIENCE_S)

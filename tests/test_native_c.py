@@ -11,16 +11,22 @@ from numpy.typing import NDArray
 
 from bayesrace.gp.weights import GpWeights, zero_weights
 from bayesrace.vehicles import CarParameters
-from codegen.build import casadi_includes
-from codegen.compiler import FLAGS
 from controller.native_step import NativeStep
 from tests.conftest import SETTINGS, Circuit, Problem, native_numbers
+from tests.native_programs import (
+    OPTIMISED,
+    PROGRAMS,
+    SANITIZED,
+    SANITIZERS,
+    STRICT,
+    gcc,
+    native_program,
+)
 
 Floats = NDArray[np.float64]
 
-HARNESS = Path(__file__).parent / "native" / "harness.c"
+HARNESS = PROGRAMS / "harness.c"
 STEPS = 300
-STRICT = ("-Wall", "-Wextra", "-Werror", "-Wno-unused-parameter", "-Wno-unused-function")
 
 
 def states(recorded: list[Problem]) -> Floats:
@@ -54,23 +60,6 @@ def problems(
     return path
 
 
-def compiled(artefact: Path, folder: Path, *flags: str) -> Path:
-    """The harness linked with the artefact's sources and DAQP."""
-    gcc = shutil.which("gcc")
-    if gcc is None:
-        pytest.skip("gcc is not installed")
-    include, daqp = casadi_includes()
-    out = folder / "harness"
-    sources = [*sorted(artefact.glob("*.c")), HARNESS]
-    # -isystem: the warnings are for our own code
-    line = [gcc, *flags, f"-I{artefact}", "-isystem", include, *sources, daqp, "-lm", "-o", out]
-    done = subprocess.run([str(word) for word in line], capture_output=True, text=True, check=False)
-    if "cannot find -lasan" in done.stderr or "cannot find -lubsan" in done.stderr:
-        pytest.skip("gcc's sanitizer libraries are not installed")
-    assert done.returncode == 0, done.stderr[-4000:]
-    return out
-
-
 def run(program: Path, problems: Path, folder: Path, *under: str) -> Floats:
     """The harness' results; "under" another program, such as valgrind."""
     results = folder / "results.bin"
@@ -90,8 +79,9 @@ def test_the_control_loop_never_allocates_and_python_sees_the_same_bits(
     recorded: list[Problem],
 ) -> None:
     wraps = [f"-Wl,--wrap={name}" for name in ("malloc", "calloc", "realloc", "free")]
-    flags = [flag for flag in FLAGS if flag != "-fPIC"]
-    program = compiled(kinematic_artefact, tmp_path, *flags, "-DCOUNT_ALLOCATIONS", *STRICT, *wraps)
+    counting = ["-DCOUNT_ALLOCATIONS", *wraps]
+    out = tmp_path / "harness"
+    program = native_program(kinematic_artefact, HARNESS, out, *OPTIMISED, also=counting)
     results = run(program, problems, tmp_path)
     assert (results[:, 0] == 0).all()
     assert set(np.unique(results[:, 1])) >= {1.0, 3.0, 6.0}  # acceptable, infeasible, bad state
@@ -127,6 +117,7 @@ def test_no_sanitizer_finds_anything(
     request: pytest.FixtureRequest,
 ) -> None:
     folder: Path = request.getfixturevalue(artefact)
+    flags = SANITIZED
     if artefact == "dynamic_artefact":  # its capacity is 8 points
         nothing = native_numbers(SETTINGS, car, zero_weights(car.name, "none"))
         full = len(native_numbers(SETTINGS, car, weights))
@@ -135,9 +126,9 @@ def test_no_sanitizer_finds_anything(
         head = data[: len(data) - len(steps) - full]
         problems = tmp_path / "problems.bin"
         np.concatenate([head, nothing, steps]).tofile(problems)
-    flags = ("-O1", "-g", "-std=gnu11", "-march=native", "-fno-omit-frame-pointer")
-    sanitize = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
-    results = run(compiled(folder, tmp_path, *flags, *sanitize), problems, tmp_path)
+        flags = SANITIZERS  # its equations take long to optimise
+    program = native_program(folder, HARNESS, tmp_path / "harness", *flags)
+    results = run(program, problems, tmp_path)
     assert (results[:, 0] == 0).all()
 
 
@@ -149,17 +140,16 @@ def test_valgrind_finds_nothing(kinematic_artefact: Path, problems: Path, tmp_pa
         pytest.skip("valgrind is not installed")
     # not for this very CPU, whose instructions valgrind may not know
     march = ("-march=x86-64-v2",) if platform.machine() == "x86_64" else ()
-    program = compiled(kinematic_artefact, tmp_path, "-O1", "-g", "-std=gnu11", *march, *STRICT)
-    line = [valgrind, "-q", "--leak-check=full", "--error-exitcode=9", "--track-origins=yes"]
+    flags = ("-O1", "-g", "-std=gnu11", *march, *STRICT)
+    program = native_program(kinematic_artefact, HARNESS, tmp_path / "harness", *flags)
+    # --track-origins=yes takes as long again: for when there is a finding
+    line = [valgrind, "-q", "--leak-check=full", "--error-exitcode=9"]
     results = run(program, problems, tmp_path, *line)
     assert (results[:, 0] == 0).all()
 
 
 def test_the_public_header_is_plain_c99(kinematic_artefact: Path, tmp_path: Path) -> None:
-    gcc = shutil.which("gcc")
-    if gcc is None:
-        pytest.skip("gcc is not installed")
     source = tmp_path / "user.c"
     source.write_text('#include "bayesrace_mpc.h"\nint main(void) { return br_mpc_abi() - 1; }\n')
-    line = [gcc, "-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-fsyntax-only"]
-    subprocess.run([*line, f"-I{kinematic_artefact}", str(source)], check=True)
+    strict = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror")
+    gcc(*strict, "-fsyntax-only", f"-I{kinematic_artefact}", source)

@@ -14,31 +14,18 @@ from numpy.typing import NDArray
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
 from bayesrace.vehicles import CarParameters
-from codegen.build import casadi_includes
 from controller.gate.memory import Memory
 from controller.native_library import Gp
 from controller.native_step import NativeStep
 from tests.conftest import SETTINGS, Circuit, Problem, fit_weights, mirrored_weights
-
-PROGRAM = Path(__file__).parent / "native" / "staging.c"
-
-
-def compiled(artefact: Path, folder: Path, *flags: str) -> Path:
-    gcc = shutil.which("gcc")
-    if gcc is None:
-        pytest.skip("gcc is not installed")
-    include, daqp = casadi_includes()
-    out = folder / "staging"
-    files = [*sorted(artefact.glob("*.c")), PROGRAM, daqp]
-    line = [gcc, *flags, f"-I{artefact}", "-isystem", include, *files, "-lm", "-pthread", "-o", out]
-    done = subprocess.run([str(word) for word in line], capture_output=True, text=True, check=False)
-    if "cannot find -ltsan" in done.stderr or "libtsan" in done.stderr:
-        pytest.skip("gcc's thread sanitizer is not installed")
-    assert done.returncode == 0, done.stderr[-4000:]
-    return out
+from tests.native_programs import OPTIMISED, PROGRAMS, native_program
 
 
-def run(line: Sequence[str | Path]) -> None:
+def staging(artefact: Path, folder: Path, *flags: str, under: Sequence[str] = ()) -> None:
+    """Compiles tests/native/staging.c and runs it, under another program if there is one."""
+    source, out = PROGRAMS / "staging.c", folder / "staging"
+    program = native_program(artefact, source, out, *flags, also=["-pthread"])
+    line: list[str | Path] = [*under, program]
     done = subprocess.run(line, capture_output=True, text=True, check=False, timeout=120)
     if "unexpected memory mapping" in done.stderr:
         pytest.skip("the thread sanitizer does not know this system's memory layout")
@@ -47,15 +34,15 @@ def run(line: Sequence[str | Path]) -> None:
 
 
 def test_no_data_race_and_no_mixture(kinematic_artefact: Path, tmp_path: Path) -> None:
-    flags = ("-O1", "-g", "-std=gnu11", "-march=native", "-fsanitize=thread")
+    flags = ("-O0", "-g", "-std=gnu11", "-march=native", "-fsanitize=thread")
     # some kernels spread memory farther than the sanitizer expects
     flat = shutil.which("setarch")
     under = [flat, platform.machine(), "-R"] if flat else []
-    run([*under, compiled(kinematic_artefact, tmp_path, *flags)])
+    staging(kinematic_artefact, tmp_path, *flags, under=under)
 
 
 def test_no_mixture_at_full_speed(kinematic_artefact: Path, tmp_path: Path) -> None:
-    run([compiled(kinematic_artefact, tmp_path, "-O3", "-std=gnu11", "-march=native")])
+    staging(kinematic_artefact, tmp_path, *OPTIMISED)
 
 
 Lay = Callable[[GpWeights], "ct.Array[Gp]"]

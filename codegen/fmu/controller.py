@@ -66,6 +66,24 @@ _COUNTS: Final = (
     ("iterations_cold", "the same for the first step and after a reset"),
 )
 
+_STATUSES: Final = (
+    "converged",
+    "acceptable",
+    "defect",
+    "infeasible",
+    "QP limit",
+    "not finite",
+    "bad state",
+)
+"""br_mpc_status in order, but for the last: a step without a budget is never out of time."""
+
+_WITHOUT_STEP: Final = {
+    "STATUS_UNPREDICTABLE": (252, "not predictable"),
+    "STATUS_NO_STEP": (253, "none yet"),
+    "STATUS_REFUSED": (255, "refused"),
+}
+"""Statuses of a cycle without a step: name in C, number as in ``controller/driver.py``, meaning."""
+
 _FALLBACK: Final = (
     ("shifted_s", "shifted_s", "s", False, "how long a plan may be driven without a new one"),
     ("tolerance", "limit_tolerance", "1", False, "excess over a limit that is clipped"),
@@ -114,6 +132,7 @@ def controller_fmu(
         constants={
             "CONTROLLER_IDENTITY": manifest.discretisation,
             "NO_SPEED_LIMIT": _NO_LIMIT_MPS,
+            **{name: number for name, (number, _) in _WITHOUT_STEP.items()},
         },
         resources={
             PATH_FILE: path_resource(rows, spacing_m),
@@ -146,7 +165,7 @@ def _variables(
         *_objective(settings),
         *_limits(car),
         *_timing(manifest, fallback),
-        *_outputs(car),
+        *_outputs(),
     )
 
 
@@ -225,7 +244,7 @@ def _timing(manifest: Manifest, fallback: Mapping[str, float]) -> list[Variable]
         Variable(
             "recover_cycles",
             "parameter",
-            "fallback: usable solutions in a row that end braking",
+            "fallback: usable solutions in a row that end braking; a standing car drives the first",
             "integer",
             start=float(_value(fallback, "recover_cycles")),
             min=1,
@@ -261,21 +280,18 @@ def _timing(manifest: Manifest, fallback: Mapping[str, float]) -> list[Variable]
     ]
 
 
-def _outputs(car: CarParameters) -> list[Variable]:
+def _outputs() -> list[Variable]:
     def output(
         name: str, text: str, kind: Literal["real", "integer", "boolean"], unit: str | None = None
     ) -> Variable:
         return Variable(name, "output", text, kind, unit, dependencies=None)
 
-    statuses = "0 converged, 1 acceptable, 2 defect, 3 infeasible, 4 QP limit, 5 not finite, "
+    numbered = (*enumerate(_STATUSES), *_WITHOUT_STEP.values())
+    statuses = ", ".join(f"{number} {text}" for number, text in numbered)
     return [
         output("d", "duty cycle", "real", "1"),
         output("delta_rate", "steering rate", "real", "rad/s"),
-        output(
-            "status",
-            f"of the step: {statuses}6 bad state, 252 not predictable, 253 none yet, 255 refused",
-            "integer",
-        ),
+        output("status", f"of the step: {statuses}", "integer"),
         output("usable", "the step's solution may be driven", "boolean"),
         output(
             "fallback_level", "0 the solution, 1 the plan before, 2 braking, 3 standing", "integer"

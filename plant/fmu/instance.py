@@ -32,7 +32,6 @@ Logger = Callable[[int, str, str], None]
 """Takes status, category and message."""
 
 _STATUS: Final = ("ok", "warning", "discard", "error", "fatal", "pending")
-_DISCARD: Final = 2
 
 _MOST_RETURNS: Final = 10_000
 """Early returns within one step; more is no progress."""
@@ -225,14 +224,20 @@ class _Fmi2(_Base):
             _call(_raise, error)
 
     def _discarded(self) -> str:
-        """What the FMU says of a step it has refused."""
+        """What the FMU says of a step it has not finished, be it to end the simulation."""
+        if self._status(self._fmu.getBooleanStatus, fmi2Terminated):
+            return "the FMU ended the simulation"
+        reached_s = self._status(self._fmu.getRealStatus, fmi2LastSuccessfulTime)
+        reached = "" if reached_s is None else f" (it got to {reached_s:.6g} s)"
+        return f"fmi2DoStep discarded the step{reached}"
+
+    @staticmethod
+    def _status(get: Callable[[int], Any], kind: int) -> Any:
+        """None if the FMU cannot tell, which FMI allows."""
         try:
-            if self._fmu.getBooleanStatus(fmi2Terminated):
-                return "the FMU ended the simulation"
-            reached_s = self._fmu.getRealStatus(fmi2LastSuccessfulTime)
-        except Exception:  # it need not be able to tell
-            return "fmi2DoStep discarded the step"
-        return f"fmi2DoStep discarded the step (it got to {reached_s:.6g} s)"
+            return get(kind)
+        except Exception:  # or lacks the function
+            return None
 
     def free(self) -> None:
         try:

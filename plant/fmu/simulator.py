@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bayesrace.errors import InputError
+from bayesrace.vehicles.models import STATES
 from bayesrace.vehicles.parameters import CarParameters
 from plant.fmu.faults import FmuFault
 from plant.fmu.host import FmuHost, Value
@@ -26,8 +27,6 @@ _STEP_S: Final = 1e-3
 
 _LIMIT: Final = 1e6
 """Beyond this no number of a state can be sent, nor be a car's."""
-
-_STATES: Final = ("x", "y", "psi", "vx", "vy", "omega", "delta")
 
 
 class Connection(Protocol):
@@ -105,7 +104,7 @@ class FmuSimulator:
         self.guard = PlantGuard(car)
         self.u_applied: tuple[float, float] = (0.0, 0.0)
         self.steps = 0
-        self.x: Array = np.zeros(len(_STATES))
+        self.x: Array = np.zeros(len(STATES))
         self._host = host
         self._wiring = wiring
         self._part_s = communication_step(host.description, wiring.step_s, self.step_s)
@@ -182,7 +181,7 @@ class FmuSimulator:
     def _take(self, x: Array) -> None:
         """Makes it the state, if it is one."""
         if not np.all(np.abs(x) <= _LIMIT):
-            for name, value in zip(_STATES, x.tolist(), strict=True):
+            for name, value in zip(STATES, x.tolist(), strict=True):
                 if not abs(value) <= _LIMIT:
                     raise self._host.fault(f"its outputs make {name} = {value:g}, which no car has")
         self.x[:] = x

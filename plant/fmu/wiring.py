@@ -178,36 +178,38 @@ class OutputLinks:
 
 
 @dataclass(frozen=True, slots=True)
-class InputLink:
-    """An FMU input, what of :data:`COMMANDS` drives it, and the range that the FMU declares."""
+class _Link:
+    """A variable of the FMU that a quantity of ours sets, and the range that the FMU declares."""
 
     variable: str
     source: str
+    """Name of our quantity."""
     scale: float = 1.0
     offset: float = 0.0
     lowest: float = -math.inf
     highest: float = math.inf
 
-    def value(self, commands: Mapping[str, float]) -> float:
-        """The FMU's value, within its range: an actuator at its stop stays there."""
-        value = self.scale * commands[self.source] + self.offset
-        return min(max(value, self.lowest), self.highest)
+    def _converted(self, ours: Mapping[str, float]) -> float:
+        """The FMU's value, not yet held against its range."""
+        return self.scale * ours[self.source] + self.offset
 
 
 @dataclass(frozen=True, slots=True)
-class StartLink:
-    """A start value of the FMU, what of :data:`STARTS` sets it, and the range it declares."""
+class InputLink(_Link):
+    """An FMU input, and what of :data:`COMMANDS` drives it."""
 
-    variable: str
-    source: str
-    scale: float = 1.0
-    offset: float = 0.0
-    lowest: float = -math.inf
-    highest: float = math.inf
+    def value(self, commands: Mapping[str, float]) -> float:
+        """The FMU's value, within its range: an actuator at its stop stays there."""
+        return min(max(self._converted(commands), self.lowest), self.highest)
+
+
+@dataclass(frozen=True, slots=True)
+class StartLink(_Link):
+    """A start value of the FMU, and what of :data:`STARTS` sets it."""
 
     def value(self, starts: Mapping[str, float]) -> float:
         """The FMU's value; a heading is turned into the declared range. InputError outside it."""
-        value = self.scale * starts[self.source] + self.offset
+        value = self._converted(starts)
         if not self.lowest <= value <= self.highest and self.source == "psi":
             turn = abs(self.scale) * TURN
             anchor = self.lowest if math.isfinite(self.lowest) else self.highest - turn

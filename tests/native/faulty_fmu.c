@@ -37,8 +37,8 @@ enum { /* value references */
 
 enum { /* modes; the numbers are those in tests/faulty_fmu.py */
     GOOD, ABORT, SEGFAULT, EXIT, HANG, NOT_A_NUMBER, FAIL, REFUSE, FLOOD_LOG, FLOOD_STDOUT, SLOW,
-    TERMINATE, INIT_FAILS, INIT_HANGS, INIT_ABORTS, HUGE_VALUE, CLOSE_ALL, EARLY, STUCK, SAY, WORST, SCRIBBLE,
-    ORPHAN
+    TERMINATE, INIT_FAILS, INIT_HANGS, INIT_ABORTS, HUGE_VALUE, CLOSE_ALL, EARLY, STUCK, SAY, WORST,
+    SCRIBBLE, ORPHAN
 };
 
 typedef struct {
@@ -259,8 +259,9 @@ EXPORT Status fmi2DoStep(fmi2Component c, Real t, Real h, fmi2Boolean none) {
 }
 
 EXPORT Status fmi2GetBooleanStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Boolean *told) {
-    *told = kind == fmi2Terminated && ((Car *)c)->ended;
-    return (Status)OK;
+    const Car *car = c;
+    *told = kind == fmi2Terminated && car->ended;
+    return (Status)(car->value[MODE] == REFUSE ? DISCARD : OK); /* then it cannot tell */
 }
 
 EXPORT Status fmi2GetRealStatus(fmi2Component c, const fmi2StatusKind kind, Real *told) {

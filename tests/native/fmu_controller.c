@@ -10,16 +10,9 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "check.h"
 #include "fmi3Functions.h"
 #include "fmu_config.h"
-
-#define CHECK(condition)                                                                 \
-    do {                                                                                 \
-        if (!(condition)) {                                                              \
-            fprintf(stderr, "fmu_controller.c:%d: %s\n", __LINE__, #condition);          \
-            exit(1);                                                                     \
-        }                                                                                \
-    } while (0)
 
 static void told(fmi3InstanceEnvironment e, fmi3Status status, fmi3String kind, fmi3String text) {
     (void)e, (void)status, (void)kind;

@@ -18,13 +18,8 @@
 
 #include "bayesrace_mpc.h"
 
-#define CHECK(condition)                                                            \
-    do {                                                                            \
-        if (!(condition)) {                                                         \
-            fprintf(stderr, "fuzz.c:%d: %s\n", __LINE__, #condition);               \
-            abort();                                                                \
-        }                                                                           \
-    } while (0)
+#define CHECK_END abort()
+#include "check.h"
 
 #define ROWS 160
 #define RADIUS_M 1.2

@@ -5,9 +5,9 @@
  * PROBLEMS, all doubles: spacing, rows, table; the parameters; per GP output kernel, n, offset,
  * scale, 6 length scales, n x 6 inputs, n alphas; steps, then per step x (7) and d_previous.
  * RESULTS: per step error, status, u (2). The first half goes one stage at a time, without budget;
- * the second adds other times, budgets by a clock that counts its readings, and spoiled references. With -DCOUNT_ALLOCATIONS and the linker's --wrap, any
- * allocation after br_mpc_init ends the program with code 3. Code 1: a promise of the interface
- * is broken (the line says which).
+ * the second adds other times, budgets by a clock that counts its readings, and spoiled references.
+ * With -DCOUNT_ALLOCATIONS and the linker's --wrap, any allocation after br_mpc_init ends the
+ * program with code 3. Code 1: a promise of the interface is broken (the line says which).
  */
 #include <math.h>
 #include <stdio.h>
@@ -15,6 +15,7 @@
 #include <string.h>
 
 #include "bayesrace_mpc.h"
+#include "check.h"
 
 static int armed = 0;
 
@@ -38,14 +39,6 @@ void *__wrap_calloc(size_t n, size_t size) { forbidden("calloc"); return __real_
 void *__wrap_realloc(void *p, size_t size) { forbidden("realloc"); return __real_realloc(p, size); }
 void __wrap_free(void *p) { forbidden("free"); __real_free(p); }
 #endif
-
-#define CHECK(condition)                                                                 \
-    do {                                                                                 \
-        if (!(condition)) {                                                              \
-            fprintf(stderr, "harness.c:%d: %s\n", __LINE__, #condition);                 \
-            exit(1);                                                                     \
-        }                                                                                \
-    } while (0)
 
 static const double *cursor;
 static double next(void) { return *cursor++; }

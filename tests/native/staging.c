@@ -12,14 +12,7 @@
 #include <stdlib.h>
 
 #include "bayesrace_mpc.h"
-
-#define CHECK(condition)                                                                 \
-    do {                                                                                 \
-        if (!(condition)) {                                                              \
-            fprintf(stderr, "staging.c:%d: %s\n", __LINE__, #condition);                 \
-            exit(1);                                                                     \
-        }                                                                                \
-    } while (0)
+#include "check.h"
 
 enum { POINTS = 64, ROUNDS = 400, ROWS = 400 };
 
@@ -88,7 +81,8 @@ static int control(const double nominal[BR_NX]) {
         CHECK(error == BR_OK ? now > number : now == number);
         taken += error == BR_OK;
         number = now;
-        CHECK(br_mpc_predict(mpc, x, u, BR_TS, x + 0) == BR_OK || 1);
+        const br_mpc_error predicted = br_mpc_predict(mpc, x, u, BR_TS, x);
+        CHECK(predicted == BR_OK || predicted == BR_ERROR_STATE);
         x[0] = 1, x[1] = 0, x[2] = 1.5707963, x[3] = 1, x[4] = x[5] = x[6] = 0;
         CHECK(br_mpc_step(mpc, x, 0, BR_TS, 0, u, &status, NULL) == BR_OK);
         CHECK(br_mpc_prepare(mpc, BR_TS, 0) == BR_OK);

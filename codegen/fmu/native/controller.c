@@ -14,12 +14,7 @@
 #include "controller_resources.h"
 #include "fmu_model.h"
 
-#define STANDING_MPS 0.05 /* a car that is to be driven and stands ... */
-#define STUCK_S 0.5       /* ... for that long begins anew */
-#define HISTORY 256       /* inputs under way: the longest delay at 500 Hz */
-
-/* Beyond those of br_mpc_status, as in controller/driver.py. */
-enum { STATUS_UNPREDICTABLE = 252, STATUS_NO_STEP = 253, STATUS_REFUSED = 255 };
+#define HISTORY 256 /* inputs under way: the longest delay at 500 Hz */
 
 typedef struct {
     double basis_s, u[BR_NU];
@@ -29,10 +24,9 @@ typedef struct {
 typedef struct {
     fallback fallback;
     fallback_settings settings;
-    double next_s;     /* release of the next control step */
-    double stepped_s;  /* moment for which the last one was made */
-    double standing_s; /* since when the car stands */
-    int has_stepped, stands;
+    double next_s;    /* release of the next control step */
+    double stepped_s; /* moment for which the last one was made */
+    int has_stepped;
     int first, count; /* of the inputs sent */
     sent_input sent[HISTORY];
 } controller;
@@ -88,7 +82,8 @@ static int take_parameters(fmu_instance *instance) {
     };
     const br_mpc_error error = br_mpc_set_parameters(native(instance), &parameters);
     if (error) { /* the ones before stay */
-        fmu_log(instance, "controller: %s (q_position to iterations_cold; d_min must be below d_max)",
+        fmu_log(instance,
+                "controller: %s (q_position to iterations_cold; d_min must be below d_max)",
                 br_mpc_error_text(error));
         return -1;
     }
@@ -128,22 +123,6 @@ static int due(controller *c, double time_s, double period_s) {
     if (period_s > 0)
         c->next_s += period_s * (floor((time_s + early - c->next_s) / period_s) + 1);
     return 1;
-}
-
-/* Where a car that is to be driven stands, its plan is a local optimum: what follows a reset begins
- * from another guess. */
-static void unstick(fmu_instance *instance) {
-    controller *c = instance->model;
-    const double *v = instance->value, now = instance->time;
-    const int standing = fabs(v[FMU_V_vx]) < STANDING_MPS && v[FMU_V_speed_limit] > STANDING_MPS;
-    if (!standing || !c->stands || now < c->standing_s) {
-        c->stands = standing;
-        c->standing_s = now;
-    } else if (now - c->standing_s > STUCK_S + 1e-6) {
-        c->standing_s = now;
-        br_mpc_reset(native(instance));
-        c->has_stepped = 0;
-    }
 }
 
 static sent_input *sent(controller *c, int i) { return &c->sent[(c->first + i) % HISTORY]; }
@@ -193,7 +172,6 @@ static int solve(fmu_instance *instance, double u[BR_NU], br_mpc_info *info) {
     if (limit >= NO_SPEED_LIMIT) limit = INFINITY;
     if (br_mpc_set_speed_limit(native(instance), limit, v[FMU_V_speed_limit_rate]))
         return STATUS_REFUSED;
-    unstick(instance);
     if (at_acting(instance, x, &d)) return STATUS_UNPREDICTABLE;
     const double time_s = instance->time + v[FMU_V_delay];
     const double elapsed_s = c->has_stepped ? fmax(time_s - c->stepped_s, 0) : 0;

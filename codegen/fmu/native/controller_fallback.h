@@ -1,7 +1,7 @@
 /* What is sent when there is no solution to send: controller/fallback.py in C, tested against it.
  *
  * Level 0 the solution; 1 the previous plan, shifted, for a bounded time; 2 braking along the
- * plan's steering; 3 standing still. From level 1 the next usable solution leads back, from 2 and 3
+ * plan's steering; 3 standing still. From levels 1 and 3 the next usable solution leads back, from 2
  * several in a row.
  */
 #ifndef CONTROLLER_FALLBACK_H

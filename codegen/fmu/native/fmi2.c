@@ -1,4 +1,5 @@
 /* FMI 2.0 Co-Simulation over fmu_layer.h. */
+#include <ctype.h>
 #include <string.h>
 
 #include "fmi2Functions.h"
@@ -37,14 +38,27 @@ void fmu_emit(const fmu_instance *instance, const char *text)
 
 static int hex(char c)
 {
-    return c >= '0' && c <= '9' ? c - '0' : (c | 32) >= 'a' && (c | 32) <= 'f' ? (c | 32) - 'a' + 10 : -1;
+    const int lower = c | 32;
+    if (c >= '0' && c <= '9') return c - '0';
+    return lower >= 'a' && lower <= 'f' ? lower - 'a' + 10 : -1;
 }
 
-/* file:///a%20b, file:/a%20b and file://host/a to a path; NULL if it is no file or too long. */
-static const char *plain_path(const char *uri, char *path, size_t size)
+static int has_scheme(const char *location)
 {
-    if (!uri || strncmp(uri, "file:", 5) != 0) return NULL;
-    uri += 5;
+    size_t n = 0;
+    while (isalnum((unsigned char)location[n])) n++;
+    return n > 1 && location[n] == ':'; /* a single letter is a drive */
+}
+
+/* The folder that is meant by file:///a%20b, file:/a%20b or file://host/a, as FMI has it, or by a
+ * plain path, as many importers pass it; NULL for another scheme, nothing, or a URI that is too
+ * long. The answer may lie in either argument. */
+static const char *folder_of(const char *location, char *path, size_t size)
+{
+    if (!location || !location[0]) return NULL;
+    if (!has_scheme(location)) return location;
+    if (strncmp(location, "file:", 5) != 0) return NULL;
+    const char *uri = location + 5;
     if (strncmp(uri, "//", 2) == 0) {
         uri = strchr(uri + 2, '/');
         if (!uri) return NULL;
@@ -86,7 +100,7 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, f
     void *logger = NULL;
     if (!functions || type != fmi2CoSimulation) return NULL;
     memcpy(&logger, &functions->logger, sizeof logger);
-    return fmu_new(name, guid, plain_path(resources, path, sizeof path), logger,
+    return fmu_new(name, guid, folder_of(resources, path, sizeof path), logger,
                    functions->componentEnvironment);
 }
 
@@ -269,8 +283,9 @@ fmi2Status fmi2GetRealStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Rea
 fmi2Status fmi2GetBooleanStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Boolean *value)
 {
     INSTANCE;
+    (void)instance;
     if (kind != fmi2Terminated || !value) return fmi2Discard;
-    *value = instance->phase == FMU_TERMINATED;
+    *value = fmi2False; /* whether the FMU wants the simulation to end: ours never does */
     return fmi2OK;
 }
 

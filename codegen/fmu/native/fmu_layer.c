@@ -328,6 +328,7 @@ int fmu_differentiable(const fmu_instance *instance, const uint32_t *known, size
         }
     }
     for (size_t i = 0; i < n_known; i++) {
+        if (known[i] == FMU_VALUES) continue; /* time: FMI counts it among the knowns */
         const fmu_variable *variable = find(instance, known[i], FMU_REAL);
         if (!variable) return FMU_REFUSED;
         if (variable->role == FMU_CALCULATED) {

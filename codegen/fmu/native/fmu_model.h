@@ -63,8 +63,8 @@ int fmu_model_derivatives(const fmu_instance *instance, double *dx);
 
 /* Model Exchange: out[unknown] = sum over known of d unknown / d known * seed[known], and the
  * adjoint out[known] = sum over unknown of seed[unknown] * d unknown / d known. Unknowns are
- * derivatives of states or states, knowns states, inputs or parameters; the layer has checked that.
- * Only called if FMU_DERIVATIVES is 1. */
+ * derivatives of states or states, knowns states, inputs, parameters or time, whose reference is
+ * FMU_VALUES; the layer has checked that. Only called if FMU_DERIVATIVES is 1. */
 int fmu_model_directional(const fmu_instance *instance, const uint32_t *known, size_t n_known,
                           const double *seed, const uint32_t *unknown, size_t n_unknown,
                           double *out);

@@ -125,7 +125,8 @@ int fmu_model_derivatives(const fmu_instance *car, double *dx)
     return car_rates(arg, res, iw, w, 0) ? -1 : 0;
 }
 
-/* Seeds of all values; the derivative of state i is variable FMU_V_der_x + i. */
+/* s: seeds or sensitivities of all values, and last of time, which is in none of the equations.
+ * The derivative of state i is variable FMU_V_der_x + i. */
 #define IS_DERIVATIVE(reference) ((reference) - FMU_V_der_x < (uint32_t)NX)
 
 int fmu_model_directional(const fmu_instance *car, const uint32_t *known, size_t n_known,
@@ -133,7 +134,7 @@ int fmu_model_directional(const fmu_instance *car, const uint32_t *known, size_t
                           double *out)
 {
     const double *v = car->value;
-    double s[FMU_VALUES] = {0}, rates[NX];
+    double s[FMU_VALUES + 1] = {0}, rates[NX];
     for (size_t i = 0; i < n_known; i++) s[known[i]] += seed[i];
     const double *arg[car_forward_SZ_ARG] = {
         &v[FIRST_STATE],  &v[FIRST_INPUT],  &v[FIRST_PARAMETER],
@@ -151,7 +152,7 @@ int fmu_model_adjoint(const fmu_instance *car, const uint32_t *unknown, size_t n
                       const double *seed, const uint32_t *known, size_t n_known, double *out)
 {
     const double *v = car->value;
-    double s[FMU_VALUES] = {0}, rates[NX] = {0}, part[NX + NU + NP];
+    double s[FMU_VALUES + 1] = {0}, rates[NX] = {0}, part[NX + NU + NP];
     for (size_t i = 0; i < n_unknown; i++) {
         if (IS_DERIVATIVE(unknown[i]))
             rates[unknown[i] - FMU_V_der_x] += seed[i];

@@ -1,0 +1,103 @@
+"""C programs around the native step, compiled by gcc: under sanitizers, or with any other flags."""
+
+import atexit
+import os
+import re
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from codegen.build import casadi_includes
+from codegen.compiler import FLAGS
+
+__all__ = [
+    "OPTIMISED",
+    "PROGRAMS",
+    "SANITIZED",
+    "SANITIZERS",
+    "STRICT",
+    "artefact_objects",
+    "gcc",
+    "native_program",
+]
+
+PROGRAMS: Final = Path(__file__).parent / "native"
+"""Where the programs lie."""
+
+SANITIZERS: Final[tuple[str, ...]] = (
+    "-g",
+    "-std=gnu11",
+    "-march=native",
+    "-fno-omit-frame-pointer",
+    "-fsanitize=address,undefined",
+    "-fno-sanitize-recover=all",
+)
+"""Not optimised: compiled in a third of the time."""
+
+SANITIZED: Final[tuple[str, ...]] = ("-O1", *SANITIZERS)
+"""For what runs for longer than it takes to compile."""
+
+STRICT: Final = ("-Wall", "-Wextra", "-Werror", "-Wno-unused-parameter", "-Wno-unused-function")
+
+OPTIMISED: Final = (*(flag for flag in FLAGS if flag != "-fPIC"), *STRICT)
+"""As the artefact's library is, and therefore to the same bits."""
+
+Word = str | Path
+
+
+def gcc(*words: Word, cwd: Path | None = None) -> str:
+    """Runs gcc; its warnings. Skips the test where gcc or one of its sanitizers is missing."""
+    compiler = shutil.which("gcc")
+    if compiler is None:
+        pytest.skip("gcc is not installed")
+    done = subprocess.run(
+        [compiler, *words], cwd=cwd, capture_output=True, text=True, check=False, timeout=280
+    )
+    if re.search(r"cannot find \S*(asan|ubsan|tsan)", done.stderr):
+        pytest.skip("gcc's sanitizer libraries are not installed")
+    assert done.returncode == 0, done.stderr[-4000:]
+    return done.stderr
+
+
+@cache
+def _folder() -> Path:
+    folder = tempfile.mkdtemp(prefix="native-tests-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return Path(folder)
+
+
+@cache
+def artefact_objects(artefact: Path, flags: tuple[str, ...]) -> tuple[Path, ...]:
+    """The artefact's own sources as object files, compiled with these flags once a session."""
+    folder = Path(tempfile.mkdtemp(dir=_folder()))
+    # -isystem: the warnings are for our own code
+    line: list[Word] = [*flags, f"-I{artefact}", "-isystem", casadi_includes()[0], "-c"]
+
+    def compiled(source: Path) -> Path:
+        out = folder / f"{source.stem}.o"
+        gcc(*line, source, "-o", out)
+        return out
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return tuple(pool.map(compiled, sorted(artefact.glob("*.c"))))
+
+
+def native_program(
+    artefact: Path, source: Path, out: Path, *flags: str, also: Sequence[str] = ()
+) -> Path:
+    """``source`` as a program with the artefact's own sources and DAQP.
+
+    ``also``: further sources, and flags that are for them, for it and for the linker alone.
+    """
+    include, daqp = casadi_includes()
+    objects = artefact_objects(artefact, flags)
+    line: list[Word] = [*flags, f"-I{artefact}", "-isystem", include, *also, source]
+    gcc(*line, *objects, daqp, "-lm", "-o", out)
+    return out

@@ -1,0 +1,138 @@
+"""An FMU as the car: the guard in front of it, commands that change, faults, its own step."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from bayesrace.errors import InputError
+from bayesrace.vehicles.parameters import get_car
+from plant.fmu.faults import FmuFault
+from plant.fmu.host import FmuHost
+from plant.fmu.package import read_description
+from plant.fmu.simulator import FmuSimulator, communication_step, open_fmu
+from tests.faulty_fmu import PATIENCE_S, STATES, Mode, faulty_fmu, faulty_library, worker_of
+from tests.programs import until
+
+pytestmark = pytest.mark.alone
+
+Array = npt.NDArray[np.float64]
+
+COMMANDS = ("d", "delta_rate")
+CAR = get_car("orca")
+
+
+@pytest.fixture(scope="module")
+def host(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FmuHost]:
+    path = faulty_fmu(faulty_library(2), tmp_path_factory.mktemp("fmu") / "faulty.fmu")
+    with FmuHost(path, COMMANDS, STATES, PATIENCE_S, PATIENCE_S) as host:
+        yield host
+
+
+class OwnNames:
+    """Wiring of an FMU with our own names; ``angle``: it is told the steering angle."""
+
+    inputs = COMMANDS
+    outputs = STATES
+    timeout_s = 1.0
+    placed = False
+
+    def __init__(self, *, angle: bool = False, step_s: float | None = None) -> None:
+        self._angle = angle
+        self.step_s = step_s
+
+    def start_values(self, x0: list[float]) -> dict[str, float]:
+        return dict(zip(STATES, x0, strict=True))
+
+    def begin(self, outputs: list[float], x0: list[float]) -> Array:
+        return np.array(outputs)
+
+    def to_inputs(self, u: tuple[float, float], delta_rad: float, duration_s: float) -> list[float]:
+        return [u[0], delta_rad + duration_s * u[1] if self._angle else u[1]]
+
+    def state(self, outputs: list[float], u: object, duration_s: float) -> Array:
+        return np.array(outputs)
+
+
+def simulator(host: FmuHost, **settings: object) -> FmuSimulator:
+    return FmuSimulator(CAR, host, OwnNames(**settings))  # type: ignore[arg-type]
+
+
+def test_the_guard_stays_in_front_of_the_fmu(host: FmuHost) -> None:
+    car = simulator(host)
+    car.reset((0, 0, 0, 2.0, 0, 0, 0.3))
+    car.step((5.0, 99.0))
+    assert car.u_applied == pytest.approx((CAR.d_max, 0.05 / 0.02))
+    car.step((math.nan, 0.0))
+    assert car.u_applied == pytest.approx((CAR.d_min, 0.0), abs=0)
+    assert car.guard.counters.as_dict() == {"rejected": 1, "clipped": 1, "braked": 1}
+    assert (car.steps, car.time_s) == (2, 0.04)
+    with pytest.raises(InputError, match="steering angle"):
+        car.reset((0, 0, 0, 0, 0, 0, 0.5))
+
+
+def test_a_command_that_changes_within_the_period_acts_from_there(
+    host: FmuHost,
+) -> None:
+    """One step of any size, steps of 1 ms, and steering angles that follow the rate."""
+    deltas = []
+    for settings in ({}, {"step_s": 1e-3}, {"angle": True}):
+        car = simulator(host, **settings)
+        car.reset((0, 0, 0, 1.0, 0, 0, 0.01))
+        car.step_switched([(5, (0.5, 2.0)), (0, None), (15, None)])
+        assert car.u_applied == pytest.approx(((5 * 0.5 + 15 * CAR.d_min) / 20, 0.5))
+        deltas.append(car.x[6])
+    assert deltas[:2] == pytest.approx([0.02, 0.02])
+    # This FMU integrates its second input: the sum of the angles that it was told.
+    first = [0.01 + 0.002 * k for k in range(1, 6)]
+    held = 0.01 + 1e-3 * sum(first)
+    assert deltas[2] == pytest.approx(held + 0.015 * held)
+    with pytest.raises(ValueError, match="20 substeps"):
+        car.step_switched([(7, None)])
+
+
+def test_after_a_fault_the_last_sample_stands(host: FmuHost) -> None:
+    car = simulator(host)
+    car.reset((0, 0, 0, 1.0, 0, 0, 0))
+    car.step((0.5, 1.0))
+    before, applied = car.x.copy(), car.u_applied
+    worker = worker_of(host)
+    worker.kill()
+    until(lambda: worker.poll() is not None, "its end", PATIENCE_S)
+    with pytest.raises(FmuFault, match="SIGKILL"):
+        car.step_switched([(5, None), (15, (0.1, 0.0))])
+    np.testing.assert_array_equal(car.x, before)
+    assert (car.steps, car.u_applied) == (1, applied)
+    car.reset((0, 0, 0, 1.0, 0, 0, 0))
+    host.start({"mode": float(Mode.HUGE_VALUE), "at_s": 0.0})
+    with pytest.raises(FmuFault, match=r"vx = 1e\+09"):
+        car.step((0.5, 1.0))
+
+
+def test_the_communication_step(tmp_path: Path) -> None:
+    def step(attributes: str, wanted_s: float | None = None, version: int = 2) -> float:
+        path = faulty_fmu(faulty_library(2), tmp_path / "s.fmu", version, attributes=attributes)
+        return communication_step(read_description(path), wanted_s, 0.02)
+
+    any_size = 'canHandleVariableCommunicationStepSize="true"'
+    assert step(any_size) == 1e-3
+    assert step(any_size, 0.005) == 0.005
+    assert step("") == 0.02
+    assert step('fixedInternalStepSize="0.004"', version=3) == 0.004
+    assert step('fixedInternalStepSize="0.003"', version=3) == 0.02
+    assert step(any_size + ' fixedInternalStepSize="0.0025"', version=3) == 0.0025
+    for wrong in (0.003, 0.04, 0.0, math.nan):
+        with pytest.raises(InputError, match="does not divide the plant's period"):
+            step("", wrong)
+
+
+def test_our_own_names_need_no_map(tmp_path: Path) -> None:
+    path = faulty_fmu(faulty_library(3), tmp_path / "own.fmu", 3)
+    with open_fmu(CAR, path) as car:
+        car.reset((1.0, 2.0, 0.5, 1.0, 0, 0, 0))
+        np.testing.assert_array_equal(car.x, (1.0, 2.0, 0.5, 1.0, 0, 0, 0))
+        car.step((0.5, 1.0))
+        assert car.x[6] == pytest.approx(0.02)
