@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 from bayesrace.vehicles.models import STATES, dynamic
 from bayesrace.vehicles.parameters import CarParameters
 from plant.simulator import Simulator, plant_discretisation
-from tests.car_fmu import packed_car as exported
-from tests.car_fmu import unpacked_car as extracted
+from tests.car_fmu import packed_car, unpacked_car
 from tests.fmu_master import Slave
 
-__all__ = ["Commands", "built_in", "commands", "driven", "exported", "extracted", "slave"]
+__all__ = ["Commands", "built_in", "commands", "driven", "slave"]
 
 Floats = NDArray[np.float64]
 Commands = Sequence[tuple[float, float]]
@@ -23,7 +22,7 @@ Kind = Literal["cs", "me"]
 
 def slave(version: Version = 3) -> Slave:
     """A new instance of the Co-Simulation FMU."""
-    return Slave(exported(version), extracted(version))
+    return Slave(packed_car(version), unpacked_car(version))
 
 
 def commands(count: int, seed: int = 0, bad: bool = True) -> list[tuple[float, float]]:

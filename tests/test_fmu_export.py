@@ -21,16 +21,8 @@ from bayesrace.vehicles.parameters import BRAKE_FADE_MPS
 from codegen.fmu import FmuDefinition, Variable, pack
 from plant.fmu.export import car_fmu, car_values
 from plant.simulator import PlantGuard
-from tests.fmu_exports import (
-    Kind,
-    Version,
-    built_in,
-    commands,
-    driven,
-    exported,
-    extracted,
-    slave,
-)
+from tests.car_fmu import packed_car, unpacked_car
+from tests.fmu_exports import Kind, Version, built_in, commands, driven, slave
 from tests.fmu_master import Slave
 
 etree: Any = pytest.importorskip("lxml.etree")
@@ -53,7 +45,7 @@ def with_values(car: CarParameters, values: dict[str, float]) -> CarParameters:
 
 @pytest.mark.parametrize(("version", "kind"), ALL)
 def test_fmpy_validates_without_a_finding(version: Version, kind: Kind) -> None:
-    assert validate_fmu(str(exported(version, kind))) == []
+    assert validate_fmu(str(packed_car(version, kind))) == []
 
 
 def test_the_other_xml_files_of_fmi_3_fit_their_schemas() -> None:
@@ -62,13 +54,13 @@ def test_the_other_xml_files_of_fmi_3_fit_their_schemas() -> None:
         ("fmi3BuildDescription.xsd", "sources/buildDescription.xml"),
         ("fmi3TerminalsAndIcons.xsd", "terminalsAndIcons/terminalsAndIcons.xml"),
     ):
-        document = etree.parse(str(extracted(3) / name))
+        document = etree.parse(str(unpacked_car(3) / name))
         etree.XMLSchema(file=str(schemas / schema)).assertValid(document)
 
 
 @pytest.mark.parametrize(("version", "kind"), ALL)
 def test_the_archive_has_what_people_look_for(version: Version, kind: Kind) -> None:
-    with zipfile.ZipFile(exported(version, kind)) as archive:
+    with zipfile.ZipFile(packed_car(version, kind)) as archive:
         names = set(archive.namelist())
         page = archive.read("documentation/index.html").decode()
         description = etree.fromstring(archive.read("modelDescription.xml"))
@@ -90,12 +82,12 @@ def test_the_archive_has_what_people_look_for(version: Version, kind: Kind) -> N
 
 def test_the_same_export_is_the_same_file(tmp_path: Path, car: CarParameters) -> None:
     again = pack(car_fmu(car, 3, "cs"), tmp_path / "again.fmu")
-    assert again.read_bytes() == exported(3).read_bytes()
+    assert again.read_bytes() == packed_car(3).read_bytes()
 
 
 def test_another_car_has_another_token(car: CarParameters) -> None:
     tokens = set()
-    for fmu in (exported(2), exported(3), exported(3, "me")):
+    for fmu in (packed_car(2), packed_car(3), packed_car(3, "me")):
         text = zipfile.ZipFile(fmu).read("modelDescription.xml").decode()
         tokens |= set(re.findall(r'(?:guid|instantiationToken)="([^"]+)"', text))
     assert len(tokens) == 3

@@ -20,7 +20,7 @@ from bayesrace.vehicles.models import (
 )
 from plant.fmu.export import car_values
 from plant.simulator import Simulator
-from tests.fmu_exports import exported, extracted
+from tests.car_fmu import packed_car, unpacked_car
 
 Floats = NDArray[np.float64]
 
@@ -32,11 +32,11 @@ class Instance:
     """One instance in continuous-time mode."""
 
     def __init__(self) -> None:
-        description = read_model_description(str(extracted(3, "me")))
+        description = read_model_description(str(unpacked_car(3, "me")))
         self.reference = {v.name: v.valueReference for v in description.modelVariables}
         self.messages: list[str] = []
         self.fmu: Any = instantiate_fmu(
-            str(extracted(3, "me")),
+            str(unpacked_car(3, "me")),
             description,
             "ModelExchange",
             logger=lambda _, status, category, text: self.messages.append(text.decode()),
@@ -185,7 +185,7 @@ def test_a_solver_of_variable_step_drives_like_the_plant(
 ) -> None:
     start = {"x": 1.0, "psi": 0.3, "vx": 1.0, "d": d, "delta_rate": rate}
     result = simulate_fmu(
-        str(exported(3, "me")),
+        str(packed_car(3, "me")),
         fmi_type="ModelExchange",
         solver="CVode",
         relative_tolerance=1e-10,
@@ -206,7 +206,7 @@ def test_a_solver_of_variable_step_drives_like_the_plant(
 @pytest.fixture(scope="module")
 def imported() -> Any:
     """The FMU as CasADi's function (x, u) -> xdot."""
-    builder = ca.DaeBuilder("car", str(extracted(3, "me")))
+    builder = ca.DaeBuilder("car", str(unpacked_car(3, "me")))
     return builder.create("f", ["x", "u"], ["ode"])
 
 

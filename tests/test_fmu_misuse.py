@@ -14,7 +14,8 @@ from fmpy.fmi1 import FMICallException
 from bayesrace.vehicles import CarParameters
 from codegen.fmu import write_sources
 from plant.fmu.export import car_fmu
-from tests.fmu_exports import Kind, Version, commands, driven, exported, extracted, slave
+from tests.car_fmu import packed_car, unpacked_car
+from tests.fmu_exports import Kind, Version, commands, driven, slave
 from tests.fmu_master import Slave
 from tests.native_programs import PROGRAMS, SANITIZERS, gcc
 
@@ -191,13 +192,13 @@ def test_the_token_of_another_fmu_gives_no_instance(version: Version) -> None:
 
 def _with_token(one: Slave, version: Version, token: str) -> tuple[Slave, Path, Path]:
     """Arguments of an instance whose description has another token."""
-    folder = extracted(version).with_name(f"foreign-{version}")
-    shutil.copytree(extracted(version), folder, dirs_exist_ok=True)
+    folder = unpacked_car(version).with_name(f"foreign-{version}")
+    shutil.copytree(unpacked_car(version), folder, dirs_exist_ok=True)
     path = folder / "modelDescription.xml"
     text = path.read_text()
     start = text.index("{")
     path.write_text(text[:start] + token + text[text.index("}") + 1 :])
-    return one, exported(version), folder
+    return one, packed_car(version), folder
 
 
 def test_instances_do_not_know_each_other() -> None:

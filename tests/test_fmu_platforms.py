@@ -20,7 +20,8 @@ from codegen.compiler import find_compiler
 from codegen.fmu import host_platform, pack
 from codegen.fmu.platforms import get_platform
 from plant.fmu.export import car_fmu
-from tests.fmu_exports import Version, built_in, commands, driven, exported, slave
+from tests.car_fmu import packed_car
+from tests.fmu_exports import Version, built_in, commands, driven, slave
 from tests.fmu_master import Slave
 
 HERE = Path(__file__).parent
@@ -53,13 +54,13 @@ def test_the_sources_rebuild_the_binary_with_the_line_they_state(
     expected = driven(one, inputs)
     one.close()
     folder = tmp_path / "fmu"
-    extract(str(exported(version)), unzipdir=str(folder))
+    extract(str(packed_car(version)), unzipdir=str(folder))
     (binary,) = (folder / "binaries").glob("*/*")
     binary.unlink()
     sources = folder / "sources"
     subprocess.run(readme_line(sources), cwd=sources, check=True)
     shutil.move(sources / binary.name, binary)
-    again = Slave(exported(version), folder)
+    again = Slave(packed_car(version), folder)
     again.initialise()
     np.testing.assert_array_equal(driven(again, inputs), expected)
     again.close()
