@@ -2,9 +2,9 @@
 
 Level 0 the solution; 1 the previous plan, shifted, for a bounded time; 2 braking along the plan's
 steering, and with the steering held when the plan is over; 3 standing still. Every cycle is counted
-under its level. From levels 1 and 3 the next usable solution leads back; from 2 several in a row,
-so that a controller that works every other cycle does not jerk the car. A standing car is not
-jerked, and where only the first step after a cold start is usable it would wait for ever.
+under its level. From level 1 the next usable solution leads back; from 2 several in a row, so that
+a controller that works every other cycle does not jerk the car. A standing car is not jerked: it
+drives the next one. Where only the first step after a cold start is usable it would stand for ever.
 """
 
 import math
@@ -84,8 +84,7 @@ class Fallback:
         else:
             chosen = self._step_down(vx_mps, time_s + late_s)
             if chosen[2] >= Level.BRAKE:
-                stands = chosen[2] is Level.STOP
-                self._to_recover = 1 if stands else self._settings.recover_cycles
+                self._to_recover = self._settings.recover_cycles
         self.counts[chosen[2]] += 1
         return chosen
 
@@ -114,7 +113,7 @@ class Fallback:
         # The plan is kept only from solutions that were fit to be driven.
         self._plan = self._fit(output)
         self._plan_s, self._row_s = time_s, output.plan_step_s
-        if self._to_recover > 1:
+        if self._to_recover > 1 and vx_mps > self._settings.brake_fade_mps:
             self._to_recover -= 1
             return self._braking(vx_mps, time_s + late_s)
         self._to_recover = 0

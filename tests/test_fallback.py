@@ -71,6 +71,13 @@ def test_a_standing_car_drives_the_first_good_solution() -> None:
     assert told == [Level.STOP, Level.SOLUTION, Level.SHIFTED_PLAN, Level.SOLUTION]
 
 
+def test_a_car_that_has_come_to_stand_does_so_too() -> None:
+    fallback = Fallback(CAR, FallbackSettings(shifted_s=0.0, recover_cycles=3))
+    outputs = [(bad(), 0.2), (good(), 0.15), (good(), 0.05)]
+    told = [fallback.decide(one, vx, k * STEP_S)[2] for k, (one, vx) in enumerate(outputs)]
+    assert told == [Level.BRAKE, Level.BRAKE, Level.SOLUTION]
+
+
 @pytest.mark.parametrize(
     "u",
     [

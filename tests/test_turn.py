@@ -1,4 +1,4 @@
-"""A car that stands, wherever and however it points, gets under way along its line again."""
+"""A car that stands beside its line, however it points, gets under way along it again."""
 
 import math
 
@@ -63,6 +63,32 @@ def test_it_turns_to_the_side_with_more_room(
     assert np.sign(native.u[1]) == np.sign(to_left_m)
 
 
+def test_a_speed_limit_is_kept_in_a_turn(native: NativeStep, circuit: Circuit) -> None:
+    rig = Rig(native, circuit)
+    native.reset()
+    native.set_speed_limit(0.3)
+    rig.x = standing(circuit, 1.0, 0.0, math.pi)
+    begin_rad, fastest = rig.x[2], 0.0
+    while abs(rig.x[2] - begin_rad) < 2.2:
+        rig.cycle()
+        fastest = max(fastest, rig.x[3])
+        assert rig.seq < 300
+    assert 0.1 < fastest < 0.3
+
+
+def test_where_it_is_to_stop_a_car_that_points_away_keeps_its_plan(
+    native: NativeStep, circuit: Circuit
+) -> None:
+    native.reset()
+    native.set_speed_limit(0.0)
+    x = standing(circuit, 1.0, 0.0, math.pi)
+    native.step(x, 0.0)
+    assert native.info.shifts == -1
+    for _ in range(3):
+        assert native.step(x, 0.0).usable
+        assert native.info.shifts == 1
+
+
 @pytest.mark.parametrize("turned_rad", [-1.0, 1.0])
 def test_it_turns_the_shorter_way(native: NativeStep, circuit: Circuit, turned_rad: float) -> None:
     native.reset()
@@ -117,3 +143,7 @@ def test_what_has_failed_twice_is_begun_otherwise(
     assert not np.allclose(third, first)
     assert not np.allclose(fourth, third)
     np.testing.assert_array_equal(fifth, first)
+    native.step(x, 0.0)
+    native.reset()
+    native.step(x, 0.0)
+    np.testing.assert_array_equal(native.read_plan()[1], first)

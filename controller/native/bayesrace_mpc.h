@@ -181,6 +181,8 @@ BR_API double br_mpc_monotonic(void *context);
 BR_API void br_mpc_reset(br_mpc *mpc);
 
 /* One control step: projects the car on the racing line, makes the reference, solves, checks.
+ * Where the car stands and points away from the line, the reference (br_mpc_get_reference) leads it
+ * round at a walking pace instead, with the track's edges 2 m farther out: see br_turn.c.
  *
  * x: measured state. d_previous: duty cycle that acts now. u: first input of the plan; written
  * only for BR_CONVERGED and BR_ACCEPTABLE. info may be NULL.

@@ -18,8 +18,8 @@ static void linearise(br_mpc *mpc, int first) {
 void br_sqp_linearise(br_mpc *mpc) { linearise(mpc, 0); }
 
 /* Without a plan from before: hold the steering, half throttle, see where that leads; or turn.
- * Where that has led to no plan time and again, Newton's steps may go round in circles: then other
- * throttles are tried. */
+ * Where that has led to no plan time and again, Newton's steps may go round in circles: then, but
+ * for a turn, other throttles are tried. */
 void br_sqp_cold_start(br_mpc *mpc) {
     static const double throttles[] = {0.5, 0.5, 1.0, 0.25};
     const double share = throttles[mpc->attempts % 4], d_max = mpc->parameters.d_max;

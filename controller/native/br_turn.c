@@ -10,15 +10,16 @@
 
 #include "br_internal.h"
 
-#define SLOW_MPS 0.2    /* a turn begins below this speed where the line is */
-#define AWAY_RAD 0.6    /* farther than this to one side, */
-#define FACED_RAD 0.3   /* and ends within this */
-#define AHEAD_M 0.5     /* of the car, the point of the line that it turns to */
-#define WIDER_M 2.0     /* the track to either side, on the way */
-#define PACE_MPS 0.5
+#define SLOW_MPS 0.2     /* a turn begins below this speed if the line is */
+#define AWAY_RAD 0.6     /* farther than this to one side, */
+#define FACED_RAD 0.3    /* and ends within this */
+#define AHEAD_M 0.5      /* of the car: the point of the line that it turns to */
+#define BEHIND_RAD 2.0   /* with that point farther behind than this, either side serves */
+#define WIDER_M 2.0      /* the track to either side, on the way */
+#define PACE_MPS 0.5     /* or the speed limit, if that is lower */
+#define STOP_MPS 0.05    /* a limit below this is a stop */
 #define TOO_FAST_MPS 1.0 /* no turn of ours any more */
 #define THROTTLE 2.0     /* duty cycle per m/s below the pace */
-#define BEHIND_RAD 2.0   /* with the line farther behind than this, either side serves */
 
 /* Angle to the point, seen from the car; positive left. */
 static double bearing(const double x[BR_NX], const double to[2]) {
@@ -34,17 +35,23 @@ static double side(const double x[BR_NX], double away, const br_mpc_reference *h
     return copysign(1, (room_left - room_right) * facing);
 }
 
+/* Angle still to be turned by; below zero where the car has turned too far, by a quarter at most. */
+static double remaining(double turn, double away) {
+    const double angle = turn * away;
+    return angle < -M_PI / 2 ? angle + 2 * M_PI : angle;
+}
+
 /* Begins, goes on with and ends a turn. */
 static void decide(br_mpc *mpc, const double target[2]) {
     const double *x = mpc->x0, away = bearing(x, target), speed = fabs(x[3]);
-    if (mpc->turn) {
-        const double left = away * mpc->turn;
-        if ((left > -M_PI / 2 && left < FACED_RAD) || speed > TOO_FAST_MPS) mpc->turn = 0;
+    if (mpc->path.speed_limit < STOP_MPS || speed > TOO_FAST_MPS) {
+        mpc->turn = 0;
+    } else if (mpc->turn) {
+        if (remaining(mpc->turn, away) < FACED_RAD) mpc->turn = 0;
     } else if (speed < SLOW_MPS && fabs(away) > AWAY_RAD) {
         mpc->turn = side(x, away, &mpc->reference[0]);
         mpc->warm = 0;
     }
-    if (mpc->path.speed_limit < PACE_MPS) mpc->turn = 0; /* it is to stop */
 }
 
 void br_turn(br_mpc *mpc) {
@@ -53,14 +60,14 @@ void br_turn(br_mpc *mpc) {
     decide(mpc, target);
     if (!mpc->turn) return;
     const br_mpc_parameters *p = &mpc->parameters;
+    const double pace = fmin(PACE_MPS, mpc->path.speed_limit);
     memcpy(x, mpc->x0, sizeof x);
     for (int k = 0; k < BR_N; ++k) {
-        double left = bearing(x, target) * mpc->turn;
-        if (left < -M_PI / 2) left += 2 * M_PI;
-        const double steering = mpc->turn * fmin(left, p->delta_max_rad);
+        const double angle = remaining(mpc->turn, bearing(x, target));
+        const double steering = mpc->turn * fmax(fmin(angle, p->delta_max_rad), -p->delta_max_rad);
         const double rate = (steering - x[6]) / BR_TS;
         double *u = mpc->turn_u[k];
-        u[0] = fmin(fmax(THROTTLE * (PACE_MPS - x[3]), 0), p->d_max);
+        u[0] = fmin(fmax(THROTTLE * (pace - x[3]), 0), p->d_max);
         u[1] = fmin(fmax(rate, -p->delta_rate_max_radps), p->delta_rate_max_radps);
         br_stage_advance(&mpc->gp[mpc->gp_in_use], x, u, BR_TS, next);
         memcpy(x, next, sizeof x);

@@ -65,11 +65,11 @@ int fallback_decide(fallback *state, const fallback_settings *s, const double pl
                     double vx_mps, double time_s, double u[BR_NU]) {
     if (!plan || !usable(s, plan[0])) {
         const int level = step_down(state, s, vx_mps, time_s, u);
-        if (level >= LEVEL_BRAKE) state->to_recover = level == LEVEL_STOP ? 1 : s->recover_cycles;
+        if (level >= LEVEL_BRAKE) state->to_recover = s->recover_cycles;
         return level;
     }
     keep(state, plan, time_s); /* only what was fit to be driven is */
-    if (state->to_recover > 1) {
+    if (state->to_recover > 1 && vx_mps > s->brake_fade_mps) { /* a standing car is not jerked */
         state->to_recover -= 1;
         return braking(state, s, vx_mps, time_s, u);
     }

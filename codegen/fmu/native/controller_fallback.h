@@ -1,8 +1,8 @@
 /* What is sent when there is no solution to send: controller/fallback.py in C, tested against it.
  *
  * Level 0 the solution; 1 the previous plan, shifted, for a bounded time; 2 braking along the
- * plan's steering; 3 standing still. From levels 1 and 3 the next usable solution leads back, from 2
- * several in a row.
+ * plan's steering; 3 standing still. From level 1 the next usable solution leads back, from 2
+ * several in a row; a standing car drives the next.
  */
 #ifndef CONTROLLER_FALLBACK_H
 #define CONTROLLER_FALLBACK_H
