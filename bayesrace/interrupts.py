@@ -35,7 +35,8 @@ def catching_signals(arrived: Callable[[int], None]) -> Iterator[None]:
     try:
         yield
     finally:
-        for number, handler in before.items():
+        # SIGINT last: from then on it raises, and nothing must be left undone.
+        for number, handler in reversed(before.items()):
             signal.signal(number, handler)
 
 
@@ -82,8 +83,9 @@ def raise_if_interrupted() -> None:
 def deferred_interrupt() -> Iterator[None]:
     """For the block, SIGINT waits; then it is KeyboardInterrupt. Nothing off the main thread.
 
-    For calls of a few seconds into libraries that would make something else of it: CasADi turns it
-    into a failed evaluation, and IPOPT into a problem without a solution.
+    For what takes seconds and must be whole, such as saving; and for calls into libraries that
+    would make something else of it: CasADi turns it into a failed evaluation, and IPOPT into a
+    problem without a solution.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

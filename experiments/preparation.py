@@ -5,9 +5,6 @@ depends on settings and code alone, so it is kept in the cache beside the built 
 """
 
 import hashlib
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -15,6 +12,7 @@ from typing import Final
 from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.errors import InputError
+from bayesrace.files import replacing
 from bayesrace.gp.weights import read_weights, write_weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.raceline import compute_raceline, read_raceline, write_raceline
@@ -102,7 +100,7 @@ def prepare(
     track = load_track(settings.track, car.width_m)
     folder = cache_folder() / f"line-{_digest(car, track)}"
     folder.mkdir(parents=True, exist_ok=True)
-    with _replacing(folder / _TRACK) as partial:
+    with replacing(folder / _TRACK) as partial:
         write_track(partial, track)
     if raceline is None:
         raceline = _line(folder, track, car, stages)
@@ -119,7 +117,7 @@ def _line(folder: Path, track: Track, car: CarParameters, stages: Stages) -> Pat
     try:
         read_raceline(path)
     except InputError:  # not there yet, or damaged
-        with stages.stage("racing line"), _replacing(path) as partial:
+        with stages.stage("racing line"), replacing(path) as partial:
             write_raceline(partial, compute_raceline(track, car))
     return path
 
@@ -137,17 +135,6 @@ def _weights(settings: PreparationSettings, car: CarParameters, stages: Stages) 
             options = TrainingSettings(capacity=settings.points, seed=settings.seed)
             write_weights(path, train(samples, PREDICTION, options, progress=stage.update))
     return path
-
-
-@contextmanager
-def _replacing(path: Path) -> Iterator[Path]:
-    """A file to write that takes the place of ``path`` once whole: others may be reading that."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        yield partial
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _digest(car: CarParameters, track: Track, *numbers: float) -> str:

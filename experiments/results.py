@@ -5,6 +5,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from bayesrace.errors import InputError
+from bayesrace.files import write_whole
 
 __all__ = [
     "GpMetrics",
@@ -100,10 +101,7 @@ class RaceResult(_Frozen):
 
 def write_result(path: Path, result: RaceResult) -> None:
     """Writes ``result.json``: the whole file or nothing."""
-    text = result.model_dump_json(indent=2) + "\n"
-    scratch = path.with_name(path.name + ".part")
-    scratch.write_text(text, encoding="utf-8")
-    scratch.replace(path)
+    write_whole(path, result.model_dump_json(indent=2) + "\n")
 
 
 def read_result(path: Path) -> RaceResult:

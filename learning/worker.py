@@ -7,7 +7,6 @@ line (:class:`Outcome`) when it is done. Samples and weights travel as files. It
 input, or with the process of number PARENT.
 """
 
-import os
 import sys
 import time
 from collections.abc import Mapping
@@ -17,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from bayesrace.clock import die_with_parent
 from bayesrace.errors import InputError
+from bayesrace.files import replacing
 from bayesrace.gp.weights import OUTPUTS, GpWeights, read_weights, write_weights
 from bayesrace.integrators import Discretisation
 from bayesrace.vehicles.parameters import get_car
@@ -88,9 +88,8 @@ def perform(task: Task) -> Outcome:
     if weights is not None:
         write_weights(task.weights, weights)
     kept = bounded(samples, task.keep, weights or initial)
-    partial = task.kept.with_name(f".{task.kept.stem}.{os.getpid()}.npz")
-    write_npz(partial, kept)
-    partial.replace(task.kept)
+    with replacing(task.kept) as partial:
+        write_npz(partial, kept)
     outcome = Outcome(
         number=task.number,
         error=error,

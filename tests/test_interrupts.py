@@ -8,13 +8,12 @@ import sys
 import threading
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from bayesrace.interrupts import catching_signals
 from tests.programs import ROOT
-
-pytestmark = pytest.mark.alone
 
 SWALLOWED = """
 import os, signal, sys, weakref
@@ -64,6 +63,26 @@ def test_signals_are_told_and_do_nothing_else() -> None:
         raise ZeroDivisionError
     assert told == [*caught]
     assert [signal.getsignal(one) for one in caught] == before
+
+
+def test_a_signal_while_handlers_are_restored_leaves_none_behind(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Ctrl-C in between must not leave SIGTERM being told to a loop that is over."""
+    caught = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.getsignal(one) for one in caught]
+    told: list[int] = []
+    restore = signal.signal
+
+    def struck(*arguments: Any) -> Any:
+        handler = restore(*arguments)
+        signal.raise_signal(signal.SIGINT)
+        return handler
+
+    with pytest.raises(KeyboardInterrupt), catching_signals(told.append):
+        monkeypatch.setattr(signal, "signal", struck)
+    assert [signal.getsignal(one) for one in caught] == before
+    assert told == [signal.SIGINT]
 
 
 def test_off_the_main_thread_signals_are_left_alone() -> None:

@@ -1,6 +1,5 @@
-"""Parts of the learning job, each alone: folder, worker, dealings with the controller, picture."""
+"""Parts of the learning job, each alone: worker, dealings with the controller, picture."""
 
-import json
 import os
 import queue
 import signal
@@ -11,15 +10,16 @@ import pytest
 from rich.console import Console
 
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import read_weights, write_weights, zero_weights
-from bayesrace.integrators import PERFECT, PREDICTION
+from bayesrace.gp.weights import write_weights, zero_weights
+from bayesrace.integrators import PREDICTION
 from bayesrace.messages import Event, Reply, Scalar
 from bayesrace.vehicles.models import dynamic
 from experiments.learn import desk as desk_module
+from experiments.learn import trainer as trainer_module
 from experiments.learn.desk import Desk
 from experiments.learn.feed import What
 from experiments.learn.figure import draw, references
-from experiments.learn.journal import MOST_WEIGHTS, Journal, LapRecord, Record, UpdateRecord
+from experiments.learn.journal import Journal, LapRecord, Record, UpdateRecord
 from experiments.learn.publishing import read_bytes
 from experiments.learn.settings import LearnSettings
 from experiments.learn.table import print_laps
@@ -27,19 +27,13 @@ from experiments.learn.trainer import NICE, Trainer
 from learning.arrays import write_npz
 from learning.worker import Outcome, Task
 from tests.driven import CAR, QUICK, drive
+from tests.learning_rig import lap
 from tests.programs import PATIENCE_S
 
 pytestmark = pytest.mark.alone
 
 SETTINGS = LearnSettings(car=CAR.name)
 NAME = PREDICTION.identity("e_kinematic", CAR)
-
-
-def lap(number: int, time_s: float | None, *, flying: bool = True, off_m: float = 0) -> LapRecord:
-    return LapRecord(
-        lap=number, run=1, time_s=time_s, flying=flying, versions=["a"], samples=100, left_out={},
-        fallbacks=0, off_track_m=off_m,
-    )  # fmt: skip
 
 
 class Heard:
@@ -194,39 +188,62 @@ def test_weights_of_somebody_else_are_left_alone(office: Office) -> None:
     assert office.sent == ["a"]
 
 
-def test_a_folder_is_gone_on_with(tmp_path: Path) -> None:
-    journal = Journal(tmp_path / "job", SETTINGS)
-    assert not journal.resumed
-    journal.add_lap(lap(1, 5.0))
-    journal.add_update(UpdateRecord(after_lap=1, version="a", verdict="refused"))
-    again = Journal(tmp_path / "job", SETTINGS)
-    assert again.resumed
-    assert again.record == journal.record
-    assert again.declined("a")
-    content = json.loads((tmp_path / "job/laps.json").read_text())
-    assert content["laps"][0]["time_s"] == 5.0
+def test_not_now_is_no_refusal(office: Office) -> None:
+    """It waits for a controller that takes it, which learning goes on from meanwhile."""
+    office.come()
+    office.offer("a", Reply(0, 0, False, "the controller ends", {"again": True}))
+    update = office.journal.update_of("a")
+    assert update is not None
+    assert update.verdict == "waiting"
+    assert update.answer == "refused for now, try again: the controller ends"
+    assert any("the controller ends" in line for line in office.heard.said)
+    office.desk.presence(there=False)
+    office.answers["a"] = yes("a")
+    office.come()
+    assert (office.sent, office.verdict("a")) == (["a", "a"], "accepted")
 
 
-def test_weights_files_stay_bounded(tmp_path: Path) -> None:
-    """The newest; those in use and those last accepted, however old; what was given. No orphans."""
-    journal = Journal(tmp_path / "job", SETTINGS)
-    verdicts = {2: "accepted", 3: "accepted"}
-    for k in range(1, MOST_WEIGHTS + 8):
-        path = journal.free_weights(k // 2)
-        write_weights(path, zero_weights(CAR.name, NAME, f"v{k}"))
-        update = UpdateRecord(after_lap=k // 2, version=f"v{k}", file=path.name)
-        journal.add_update(update.model_copy(update={"verdict": verdicts.get(k, "refused")}))
-        journal.drop_weights(in_use="v2")
-    (journal.folder / "weights-given.bin").touch()
-    (journal.folder / "weights-9999.bin").touch()
-    journal.drop_weights(in_use="v2")
-    left = {read_weights(path).version for path in journal.folder.glob("weights-0*.bin")}
-    newest = {f"v{k}" for k in range(8, MOST_WEIGHTS + 8)}
-    assert left == newest | {"v2", "v3"}
-    assert not (journal.folder / "weights-9999.bin").exists()
-    assert (journal.folder / "weights-given.bin").exists()
-    files = [update.file for update in journal.record.updates]
-    assert len(set(files)) == len(files), "a deleted file's name is not given again"
+def test_not_now_to_what_was_in_use_before_is_no_refusal_either(office: Office) -> None:
+    """The newest weights are given to the next controller, too."""
+    office.come("old")
+    office.offer("a", yes("a"))
+    for answer in (Reply(0, 0, False, "the controller ends", {"again": True}), yes("a")):
+        office.answers["a"] = answer
+        office.desk.presence(there=False)
+        office.come("old")
+    assert (office.sent, office.verdict("a")) == (["a"] * 3, "accepted")
+
+
+def test_an_acceptance_without_an_answer_is_noted(office: Office) -> None:
+    """The answer was lost, came too late, or newer weights were quicker than it: they drive."""
+    office.come()
+    office.offer("a")
+    assert office.verdict("a") == "waiting"
+    office.event("weights_accepted", version="a", cycle=7, number=3)
+    update = office.journal.update_of("a")
+    assert update is not None
+    assert (update.verdict, update.cycle, update.acceptance) == ("accepted", 7, 3)
+    office.offer("b")
+    office.offer("c")
+    assert office.verdict("b") == "no answer"
+    office.event("weights_accepted", version="b", cycle=8, number=4)
+    assert office.verdict("b") == "accepted"
+    assert office.desk.in_use == "b"
+
+
+def test_an_acceptance_that_is_known_already_is_said_once(office: Office) -> None:
+    """The event may come before the answer; what is in use waits for nobody."""
+    office.come()
+    office.desk.offer(office.learn("a", yes("a")))
+    office.event("weights_accepted", version="a", cycle=41, number=1)
+    office.work()
+    office.desk.offer(office.learn("b"))
+    office.event("weights_accepted", version="b", cycle=42, number=2)
+    office.work()
+    assert [office.verdict(version) for version in "ab"] == ["accepted"] * 2
+    for version, cycle in (("a", 41), ("b", 42)):
+        words = f"{version}: taken over at cycle {cycle}"
+        assert len([line for line in office.heard.said if line.startswith(words)]) == 1
 
 
 def test_what_nobody_answered_for_waits_no_longer_than_for_newer_weights(office: Office) -> None:
@@ -240,22 +257,24 @@ def test_what_nobody_answered_for_waits_no_longer_than_for_newer_weights(office:
     assert update.answer == "nobody answers"
 
 
-@pytest.mark.parametrize(
-    "changes", [{"name": "other"}, {"discretisation": PERFECT}], ids=["name", "discretisation"]
-)
-def test_a_folder_of_another_job_is_not(tmp_path: Path, changes: dict[str, Any]) -> None:
-    Journal(tmp_path / "job", SETTINGS)
-    with pytest.raises(InputError, match="choose another"):
-        Journal(tmp_path / "job", SETTINGS.model_copy(update=changes))
-
-
-def test_a_folder_of_something_else_is_not(tmp_path: Path) -> None:
-    (tmp_path / "letter.txt").write_text("dear")
-    with pytest.raises(InputError, match="something else"):
-        Journal(tmp_path, SETTINGS)
-    (tmp_path / "settings.json").write_text("{}x")
-    with pytest.raises(InputError, match="no learning job"):
-        Journal(tmp_path, SETTINGS)
+def test_what_the_training_processes_say_does_not_grow(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither from job to job nor from task to task."""
+    output = tmp_path / "worker.log"
+    output.write_text("of the job before")
+    trainer = Trainer(output, lambda _: None)
+    monkeypatch.setattr(Trainer, "prepare", lambda _: None)
+    assert output.read_text() == ""
+    monkeypatch.setattr(trainer_module, "_MOST_OUTPUT", 10)
+    task = Task(
+        number=1, car=CAR.name, discretisation=PREDICTION, keep=60, weights=output, kept=output
+    )
+    for words, left in (("few words", "few words"), (", and more", "")):
+        with output.open("a") as file:
+            file.write(words)
+        trainer.start(task)
+        assert output.read_text() == left
 
 
 class Workshop:
@@ -295,6 +314,7 @@ def test_training_is_a_niced_process_that_may_die(tmp_path: Path) -> None:
         assert os.getpriority(os.PRIO_PROCESS, workshop.pid()) == NICE
         workshop.start(2, new=(tmp_path / "gone.npz",))
         assert "gone.npz" in workshop.outcome().error
+        os.kill(workshop.pid(), signal.SIGSTOP)  # else it might be done before it is killed
         workshop.start(3)
         os.kill(workshop.pid(), signal.SIGKILL)
         assert workshop.outcome() == Outcome(number=3, error="the training was killed by signal 9")

@@ -115,6 +115,7 @@ def test_another_plant_with_the_same_run_is_another_run(states: list[State]) -> 
 def test_a_lap_waits_for_its_telemetry_but_not_for_ever(
     states: list[State], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(collector, "_PATIENCE_S", 1e9)
     made = Collector(CAR, STEP_S)
     for one in states[:70]:
         made.state(one)

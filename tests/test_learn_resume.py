@@ -40,8 +40,6 @@ from learning.worker import Outcome, Task
 from tests.driven import CAR, STEP_S, drive, logged, telemetry
 from tests.programs import until
 
-pytestmark = pytest.mark.alone
-
 NAME = PREDICTION.identity("e_kinematic", CAR)
 FIRST, SECOND = (drive(dynamic(CAR), 60, seed) for seed in (1, 2))
 
@@ -75,18 +73,18 @@ class Jobs:
     ) -> Journal:
         """A job to its end, which finds all these messages waiting; ``end``: and Ctrl-C."""
         settings = LearnSettings(car=CAR.name, laps=laps)
-        journal = Journal(folder, settings)
-        learner = self._learner = Learner(
-            self.session, settings, journal, None, self.said.append, lambda: self.at("noted")
-        )
-        learner.begin(given, weights)
-        if controller:
-            self.put(What.PRESENCE, ("controller", True))
-        for state in driven:
-            self.put(What.STATE, encode(state))
-        if end:
-            self.put(What.END)
-        learner.run()
+        with Journal(folder, settings) as journal:
+            learner = self._learner = Learner(
+                self.session, settings, journal, None, self.said.append, lambda: self.at("noted")
+            )
+            learner.begin(given, weights)
+            if controller:
+                self.put(What.PRESENCE, ("controller", True))
+            for state in driven:
+                self.put(What.STATE, encode(state))
+            if end:
+                self.put(What.END)
+            learner.run()
         return journal
 
     @property
@@ -173,7 +171,11 @@ def test_after_a_kill_every_sample_is_learned_from_once(jobs: Jobs, moment: str)
     jobs.run(folder, *lap_of(FIRST))
     assert_once(jobs.learned[-1], FIRST)
     jobs.at = lambda _moment: None
-    for partial in (".kept-0002.77.npz", ".new-0002.npz", ".weights-0001.bin.77.1"):
+    for partial in (
+        ".kept-0002.77.1.part.npz",
+        ".weights-0001.77.1.part.bin",
+        ".laps.77.1.part.json",
+    ):
         (killed / partial).touch()
     journal = jobs.run(killed, *lap_of(SECOND, run=2))
     assert_once(jobs.learned[-1], FIRST, SECOND)
@@ -265,6 +267,21 @@ def test_an_answer_under_way_when_interrupted_is_noted(
     journal = jobs.run(jobs.root, *lap_of(FIRST), laps=9, controller=True)
     (update,) = journal.record.updates
     assert (update.verdict, update.cycle) == ("accepted", 7)
+    assert any("waiting for the controller's answer" in line for line in jobs.said)
+
+
+def test_after_not_now_the_next_training_begins_where_the_last_left_off(
+    jobs: Jobs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And the weights that it was said to are kept for a controller that takes them."""
+    not_now = Reply(0, 0, False, "the controller ends", {"again": True})
+    monkeypatch.setattr(desk_module, "send_weights", lambda *_: not_now)
+    monkeypatch.setattr(desk_module, "ask", silence)
+    given = zero_weights(CAR.name, NAME, "given")
+    first = jobs.run(jobs.root, *lap_of(FIRST), weights=given, controller=True)
+    assert [one.verdict for one in first.record.updates] == ["no answer", "waiting"]
+    jobs.run(jobs.root, *lap_of(SECOND, run=2))
+    assert [task.initial for task in jobs.tasks] == [jobs.root / "weights-given.bin"] * 2
 
 
 def test_what_was_not_sent_is_sent_by_the_next_job(
@@ -305,7 +322,8 @@ def test_a_plant_with_another_period_is_said_once_and_noted(jobs: Jobs) -> None:
     (said,) = (line for line in jobs.said if "nothing to learn from" in line)
     assert "0.01 s apart, the model's step is 0.02 s" in said
     assert "--rate 50" in said
-    (noted,) = Journal(jobs.root, LearnSettings(car=CAR.name)).record.remarks
+    with Journal(jobs.root, LearnSettings(car=CAR.name)) as again:
+        (noted,) = again.record.remarks
     assert noted in said
     assert [lap.samples for lap in journal.record.laps] == [0, 0]
     console = Console(record=True, width=400)

@@ -136,6 +136,8 @@ def test_requests_are_answered_and_silence_is_an_error(pair: tuple[Any, Any]) ->
         thread.join()
     with pytest.raises(InputError, match="nobody answered on bayesrace/other/plant/status"):
         ask(session, STATUS, "other", StatusRequest(0, 0), "plant")
+    with pytest.raises(InputError, match=r"within 0\.1 s; .* wait longer \(--timeout\)"):
+        ask(session, STOP, "other", StopRequest(0, 0, ""), timeout_s=0.1)
 
 
 @contextmanager
@@ -162,6 +164,17 @@ def test_of_several_under_one_name_a_refusal_is_the_answer(pair: tuple[Any, Any]
             assert sorted(answers[key]) == sorted(encoded)
             assert answers["bayesrace/nobody"] == []
             assert ask(session, STOP, "orca", request) == replies[1]
+
+
+def test_a_malformed_answer_does_not_hide_the_valid_ones(pair: tuple[Any, Any]) -> None:
+    request, reply = StopRequest(0, 0, ""), Reply(0, 0, True, "", {})
+    with answering(pair, STOP, b"junk", encode(reply), b"more junk"):
+        assert ask(pair[1], STOP, "orca", request) == reply
+    with (
+        answering(pair, STOP, b"junk", b"more junk"),
+        pytest.raises(InputError, match="Reply: "),
+    ):
+        ask(pair[1], STOP, "orca", request)
 
 
 def test_what_others_have_is_fetched_and_not_the_own(pair: tuple[Any, Any]) -> None:

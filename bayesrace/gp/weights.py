@@ -15,7 +15,6 @@ executes anything.
 import hashlib
 import os
 import struct
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,6 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesrace.errors import InputError
+from bayesrace.files import write_whole
 
 __all__ = [
     "FEATURES",
@@ -347,14 +347,10 @@ def decode_weights(data: bytes) -> GpWeights:
 
 def write_weights(path: str | os.PathLike[str], weights: GpWeights) -> None:
     """Writes the encoded weights; the file appears whole or not at all."""
-    target = Path(path)
-    partial = target.with_name(f".{target.name}.{os.getpid()}.{time.monotonic_ns()}")
     try:
-        partial.write_bytes(encode_weights(weights))
-        partial.replace(target)
+        write_whole(Path(path), encode_weights(weights))
     except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise InputError(f"cannot write weights file {target}: {error.strerror}") from error
+        raise InputError(f"cannot write weights file {path}: {error.strerror}") from error
 
 
 def read_weights(path: str | os.PathLike[str]) -> GpWeights:

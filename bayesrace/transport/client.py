@@ -63,21 +63,37 @@ def ask(
 ) -> A:
     """Ask a process and wait for its answer, as long as the table says unless told otherwise.
 
-    Of several that answer to one name, :func:`decisive` chooses. Raises InputError if nobody
-    answers in time or an answer is not a valid one.
+    Of several that answer to one name, :func:`decisive` chooses among the valid answers. Raises
+    InputError if nobody answers in time, or nobody validly.
     """
     if service.answer is None:
         raise TypeError(f"the answer of '{service.name}' is not a message; use fetch_all")
     key = car_key(service.key, car, source)
     limit_s = service.timeout_s if timeout_s is None else timeout_s
     answers = ask_all(session, (key,), request, limit_s)[key]
-    answer = decisive([decode(service.answer, one) for one in answers])
+    answer = decisive(_valid(service.answer, answers))
     if answer is None:
+        # Who gives a time has it from an option of that name.
+        longer = "" if timeout_s is None else " Or wait longer (--timeout)."
         raise InputError(
             f"nobody answered on {key} within {limit_s:g} s; is the process for car '{car}' "
-            "running, its endpoint among those to connect to, and the time enough?"
+            f"running, and its endpoint among those to connect to?{longer}"
         )
     return answer
+
+
+def _valid(kind: type[A], answers: Sequence[bytes]) -> list[A]:
+    """Those that can be decoded; InputError, that of the first, if there are only others."""
+    valid: list[A] = []
+    why_not: InputError | None = None
+    for data in answers:
+        try:
+            valid.append(decode(kind, data))
+        except InputError as error:
+            why_not = why_not or error
+    if why_not is not None and not valid:
+        raise why_not
+    return valid
 
 
 def ask_all(
@@ -135,7 +151,8 @@ def send_weights(session: Any, car: str, data: bytes, timeout_s: float | None = 
     acceptance, rising), ``cycle`` (tick of the first cycle that they drive), ``probation`` (too few
     samples to compare), and what was compared: ``samples``, ``error_new_vx``, ``error_old_vx``,
     ``error_nominal_vx`` and so on, one-step prediction errors (RMSE) of the new weights, those
-    before, and the uncorrected model.
+    before, and the uncorrected model. Of a refusal whose reason passes (the controller ends, say):
+    ``again``, True.
     """
     return ask(session, WEIGHTS, car, data, timeout_s=timeout_s)
 

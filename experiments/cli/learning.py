@@ -97,10 +97,11 @@ def publish(
 ) -> None:
     """Hand new weights to a running controller, and wait for its answer.
 
-    Exit code 0 once it drives with them, 1 if it refuses, 2 if it cannot be asked.
+    Exit code 0 once it drives with them, 1 if it refuses (and says so if only for now), 2 if it
+    cannot be asked.
     """
     from bayesrace.transport import open_session, send_weights
-    from experiments.learn.publishing import Answer, RefusalError, read_bytes
+    from experiments.learn.publishing import Answer, NotTakenOverError, read_bytes
 
     data = read_bytes(weights)
     endpoints = connect_to(endpoint)
@@ -108,7 +109,7 @@ def publish(
         car = _controller(session, endpoints, name, timeout)
         answer = Answer.of(send_weights(session, car, data, timeout))
     if not answer.accepted:
-        raise RefusalError(f"{car}: {answer.words}")
+        raise NotTakenOverError(f"{car}: {answer.words}")
     typer.echo(f"{car}: {answer.version} {answer.words}")
 
 
@@ -123,14 +124,14 @@ def rollback(
     Exit code 0 once it drives with them, 1 if there are none, 2 if it cannot be asked.
     """
     from bayesrace.transport import open_session, send_rollback
-    from experiments.learn.publishing import Answer, RefusalError
+    from experiments.learn.publishing import Answer, NotTakenOverError
 
     endpoints = connect_to(endpoint)
     with open_session(endpoints) as session:
         car = _controller(session, endpoints, name, timeout)
         answer = Answer.of(send_rollback(session, car, reason or "bayesrace rollback", timeout))
     if not answer.accepted:
-        raise RefusalError(f"{car}: {answer.words}")
+        raise NotTakenOverError(f"{car}: {answer.words}")
     instead = f", instead of {answer.before}" if answer.before else ""
     typer.echo(f"{car}: {answer.version} {answer.words}{instead}")
 
@@ -149,7 +150,12 @@ def learn(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Folder to leave, or to go on in [runs/learn-DATE-TIME]."),
+        typer.Option(
+            "--out",
+            "-o",
+            help="Folder to leave, or to go on in, then without reading --data and --weights "
+            "[runs/learn-DATE-TIME].",
+        ),
     ] = None,
     points: Annotated[int, typer.Option(min=20, max=20000, help="Points per output.")] = 400,
     keep: Annotated[
@@ -184,10 +190,12 @@ def learn(
     from experiments.learn.settings import LearnSettings
     from experiments.learn.table import print_laps
 
+    stamp = datetime.now(UTC).astimezone().strftime("%Y%m%d-%H%M%S")
+    folder = out or Path("runs") / f"learn-{stamp}"
     settings = LearnSettings(
         car=car,
         name=name or car,
-        discretisation=discretisation_from(get_car(car), weights, artefact, points),
+        discretisation=discretisation_from(get_car(car), weights, artefact, points, folder),
         points=points,
         keep=keep,
         laps=laps or (None if watch else 1),
@@ -195,10 +203,8 @@ def learn(
         compare=compare,
         seed=seed,
     )
-    stamp = datetime.now(UTC).astimezone().strftime("%Y%m%d-%H%M%S")
-    folder = out or Path("runs") / f"learn-{stamp}"
-    journal = follow(settings, connect_to(endpoint), folder, data or [], weights, typer.echo)
-    print_laps(journal.record)
+    record = follow(settings, connect_to(endpoint), folder, data or [], weights, typer.echo)
+    print_laps(record)
     typer.echo(str(folder))
 
 

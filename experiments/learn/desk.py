@@ -3,11 +3,11 @@
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from bayesrace.errors import InputError
-from bayesrace.messages import STATUS, Event, StatusRequest
+from bayesrace.messages import STATUS, Event, Reply, StatusRequest
 from bayesrace.transport import ask, send_weights
 from experiments.learn.feed import Feed, What
 from experiments.learn.journal import Journal, UpdateRecord
@@ -35,8 +35,8 @@ class _Asked:
 class Desk:
     """Sends in a thread of its own; everything else is for the job's thread.
 
-    Weights that nobody has answered for wait for a controller. Weights that a controller has
-    refused, or returned from, are never sent again.
+    Weights that nobody has answered for, or only with "not now", wait for a controller. Weights
+    that a controller has refused, or returned from, are never sent again.
     """
 
     def __init__(
@@ -87,6 +87,10 @@ class Desk:
         version = str(event.data.get("version", ""))
         if event.kind == "weights_accepted":
             self._in_use = version
+            update = self._journal.update_of(version)
+            # Else the answer tells, or has told; it may be late, or lost, and yet they drive.
+            if update is not None and update.verdict in ("waiting", "no answer"):
+                self._accepted(Answer.of(Reply(0, 0, True, event.text, event.data)))
         if event.kind != "weights_rolled_back":
             return
         given_up = str(event.data.get("from_version", ""))
@@ -101,19 +105,15 @@ class Desk:
         if isinstance(told, _Asked):
             self._arrived(told.version)
             return
-        update = self._journal.update_of(told.version)
         if told.answer is None:
-            if update is not None and update.verdict == "waiting":
-                self._journal.change_update(told.version, answer=told.why_not)
-            self._say(f"{told.version}: {told.why_not}")
+            self._unanswered(told.version, told.why_not)
+        elif told.answer.again:
+            self._unanswered(told.version, told.answer.words)
         elif not told.answer.accepted:
             self._settle(told.version, "refused", told.answer.text)
         else:
             self._in_use = told.version
-            # An event may have been faster: what it says is newer.
-            if update is not None and update.verdict != "rolled back":
-                numbers = {"cycle": told.answer.cycle, "acceptance": told.answer.acceptance}
-                self._settle(told.version, "accepted", told.answer.words, **numbers)
+            self._accepted(replace(told.answer, version=told.version))
 
     def close(self) -> None:
         """Nothing more is sent: what waits is for the next job."""
@@ -122,6 +122,28 @@ class Desk:
     def wait(self) -> None:
         """After :meth:`close`: until an answer under way is there for :meth:`answer`."""
         self._thread.shutdown(wait=True, cancel_futures=True)
+
+    def _unanswered(self, version: str, why: str) -> None:
+        """They may still be accepted: the newest are sent to the next controller that appears."""
+        self._say(f"{version}: {why}")
+        update = self._journal.update_of(version)
+        if update is None or version == self._in_use:  # an event has been faster
+            return
+        newest = update is self._journal.record.updates[-1]
+        if update.verdict == "waiting" or (update.verdict == "accepted" and newest):
+            self._journal.change_update(
+                version, verdict="waiting", answer=why, cycle=None, acceptance=None
+            )
+
+    def _accepted(self, answer: Answer) -> None:
+        """Notes it, unless an event or an answer has been faster: what that says is newer."""
+        update = self._journal.update_of(answer.version)
+        if update is None or update.verdict == "rolled back":
+            return
+        noted = update.verdict, update.cycle, update.acceptance
+        if noted != ("accepted", answer.cycle, answer.acceptance):
+            numbers = {"cycle": answer.cycle, "acceptance": answer.acceptance}
+            self._settle(answer.version, "accepted", answer.words, **numbers)
 
     def _arrived(self, version: str | None) -> None:
         """A controller is there and drives with that."""
@@ -156,7 +178,7 @@ class Desk:
         except InputError as error:
             sent = _Sent(version, None, str(error))
         except Exception as error:  # the session has been closed, say: the job must not wait on
-            sent = _Sent(version, None, f"not sent: {error}")
+            sent = _Sent(version, None, f"no answer: {error}")
         self._feed.put(What.ANSWER, sent)
 
     def _ask_status(self) -> None:

@@ -27,7 +27,7 @@ class What(Enum):
     OUTCOME = "outcome"
     """``value``: what :mod:`.trainer` gives."""
     ANSWER = "answer"
-    """``value``: what :mod:`.loop` made of the controller's answer."""
+    """``value``: what :mod:`.desk` made of the controller's answer."""
     END = "end"
     """A signal to end."""
 

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
+from bayesrace.files import replacing
 from experiments.learn.journal import LapRecord, Record
 from experiments.report.canvas import write_png
 from experiments.report.style import INK, MUTED, WARNING, figure_style, look
@@ -40,10 +41,8 @@ def draw(record: Record, beside: References, path: Path) -> None:
     """Writes the picture (PNG), whole or not at all; none without a timed lap."""
     if not any(lap.time_s is not None for lap in record.laps):
         return
-    partial = path.with_name(f".{path.stem}.part.png")
-    with figure_style():
+    with figure_style(), replacing(path) as partial:
         write_png(lap_figure(record, beside), partial)
-    partial.replace(path)
 
 
 def lap_figure(record: Record, beside: References) -> Figure:

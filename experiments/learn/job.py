@@ -11,7 +11,7 @@ from bayesrace.tracks import load_track
 from bayesrace.transport import Endpoints, open_session
 from bayesrace.vehicles.parameters import CarParameters, get_car
 from experiments.learn.figure import References, draw, references
-from experiments.learn.journal import Journal
+from experiments.learn.journal import Journal, Record
 from experiments.learn.loop import Learner
 from experiments.learn.settings import LearnSettings
 from learning.dataset import Dataset
@@ -22,13 +22,17 @@ __all__ = ["discretisation_from", "learn"]
 
 
 def discretisation_from(
-    car: CarParameters, weights: Path | None, artefact: Path | None, points: int
+    car: CarParameters, weights: Path | None, artefact: Path | None, points: int, folder: Path
 ) -> Discretisation:
     """What the controller predicts with, by its artefact or by weights for it; else the default.
 
-    InputError if the two contradict each other, or the points do not fit.
+    In a folder that is gone on with, what it was learned for takes the place of weights and
+    default. InputError if artefact and weights contradict each other, or the points do not fit.
     """
     told: dict[Discretisation, str] = {}
+    default = PREDICTION
+    if Journal.resumable(folder):
+        weights, default = None, Journal.settings_in(folder).discretisation
     if artefact is not None:
         manifest = read_manifest(artefact)
         manifest.check_points(points)
@@ -37,7 +41,7 @@ def discretisation_from(
         told.setdefault(discretisation_of(read_weights(weights).discretisation, car), str(weights))
     if len(told) > 1:
         raise InputError(f"{' and '.join(told.values())} are for different discretisations")
-    return next(iter(told), PREDICTION)
+    return next(iter(told), default)
 
 
 def learn(
@@ -47,24 +51,31 @@ def learn(
     data: Sequence[Path],
     weights: Path | None,
     say: Callable[[str], None],
-) -> Journal:
-    """Learns until the settings' number of laps, or a signal; the folder it has left.
+) -> Record:
+    """Learns until the settings' number of laps, or a signal; what its folder then tells.
 
+    ``data`` and ``weights`` are to begin with: in a folder that is gone on with they are not read.
     InputError for what cannot be used; a plant or a controller that is not there is none: it is
     waited for.
     """
     car = get_car(settings.car)
     track = None if settings.track is None else load_track(settings.track, car.width_m)
     beside = references(settings.compare)
-    samples = _samples(settings, data)
+    unread = []
+    if Journal.resumable(folder):
+        unread = [name for name, given in (("--data", data), ("--weights", weights)) if given]
+        data, weights = (), None
+    samples = _samples(settings, data)  # what cannot be used is told before there is a folder
     given = None if weights is None else _weights(settings, weights)
-    journal = Journal(folder, settings)
-    with open_session(endpoints) as session:
-        learner = Learner(session, settings, journal, track, say, lambda: _draw(journal, beside))
-        learner.begin(samples, given)
-        learner.run()
-    _draw(journal, beside)
-    return journal
+    with Journal(folder, settings) as journal:
+        with open_session(endpoints) as session:
+            learner = Learner(
+                session, settings, journal, track, say, lambda: _draw(journal, beside)
+            )
+            learner.begin(samples, given, unread)
+            learner.run()
+        _draw(journal, beside)
+        return journal.record
 
 
 def _draw(journal: Journal, beside: References) -> None:

@@ -10,19 +10,25 @@ weights-given.bin weights that the job was given to begin with
 kept-N.npz        samples kept so far, bounded (:mod:`.store`; form: :mod:`learning.arrays`)
 new-N.npz         samples that no update has learned from yet
 laps.png          lap time against lap number
+worker.log        what the training processes of the last job have said besides
+lock              held by the job that runs
 ================  ===============================================================================
 
-Every file is replaced whole: whenever the job is killed, the folder can be gone on with.
+Every file but the last two is replaced whole: whenever the job is killed, the folder can be gone on
+with.
 """
 
+import fcntl
 from collections.abc import Mapping
 from itertools import count
 from pathlib import Path
-from typing import Final, Literal
+from types import TracebackType
+from typing import IO, Final, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.errors import InputError
+from bayesrace.files import clear_partials, write_whole
 from experiments.learn.settings import LearnSettings
 
 __all__ = ["MOST_WEIGHTS", "Journal", "LapRecord", "Record", "UpdateRecord"]
@@ -97,32 +103,67 @@ class _Files:
     given: Final = "weights-given.bin"
     plot: Final = "laps.png"
     worker: Final = "worker.log"
+    lock: Final = "lock"
 
 
 class Journal:
-    """The folder, opened by the one job that writes it."""
+    """The folder, opened by the one job that writes it, until :meth:`close`; ``with`` it."""
 
     FILES: Final = _Files
 
     def __init__(self, folder: Path, settings: LearnSettings) -> None:
         """Makes the folder, or goes on with what is in it.
 
-        InputError if it holds a job of another car or discretisation, or something else.
+        InputError if it holds a job of another car or discretisation, or something else, or if
+        another job is at work in it.
         """
         self.folder = folder
         self.record = Record()
-        self.resumed = (folder / _Files.record).exists()
-        """There is something to go on with."""
         path = folder / _Files.settings
-        if path.exists():
-            self._check(path, settings)
-            self.record = self._read()
-        elif folder.is_dir() and any(folder.iterdir()):
+        if folder.is_dir() and not path.exists() and _foreign(folder):
             raise InputError(f"{folder} holds something else; choose another folder")
         folder.mkdir(parents=True, exist_ok=True)
-        _replace(path, settings.model_dump_json(indent=1) + "\n")
-        for partial in folder.glob(".weights-*"):  # of a killed job
-            partial.unlink()
+        self._lock = _locked(folder)
+        try:
+            self.resumed = self.resumable(folder)
+            """There is something to go on with."""
+            if path.exists():
+                self._check(settings)
+                self.record = self._read()
+            write_whole(path, settings.model_dump_json(indent=1) + "\n")
+            clear_partials(folder)  # of a killed job
+        except BaseException:
+            self.close()
+            raise
+
+    @staticmethod
+    def resumable(folder: Path) -> bool:
+        """A job that is given this folder goes on with what is in it."""
+        return (folder / _Files.record).exists()
+
+    @staticmethod
+    def settings_in(folder: Path) -> LearnSettings:
+        """Those of the job that has left this folder; InputError if none has."""
+        path = folder / _Files.settings
+        try:
+            return LearnSettings.model_validate_json(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError):  # ValidationError is a ValueError
+            raise InputError(f"{path} is of no learning job; choose another folder") from None
+
+    def close(self) -> None:
+        """Another job may have the folder; nothing may be written after this."""
+        self._lock.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
 
     def path(self, name: str) -> Path:
         """Of a file in the folder."""
@@ -208,11 +249,8 @@ class Journal:
             if path.name not in names:
                 path.unlink()
 
-    def _check(self, path: Path, settings: LearnSettings) -> None:
-        try:
-            before = LearnSettings.model_validate_json(path.read_text(encoding="utf-8"))
-        except (ValueError, ValidationError):
-            raise InputError(f"{path} is of no learning job; choose another folder") from None
+    def _check(self, settings: LearnSettings) -> None:
+        before = self.settings_in(self.folder)
         for what in ("car", "name", "discretisation"):
             if getattr(before, what) != getattr(settings, what):
                 raise InputError(
@@ -226,15 +264,31 @@ class Journal:
             return Record()
         try:
             return Record.model_validate_json(path.read_text(encoding="utf-8"))
-        except (ValueError, ValidationError) as error:
+        except ValueError as error:  # ValidationError is one
             raise InputError(f"{path} cannot be read ({error}); choose another folder") from None
 
     def _write(self, record: Record) -> None:
         self.record = record
-        _replace(self.path(_Files.record), record.model_dump_json(indent=1) + "\n")
+        write_whole(self.path(_Files.record), record.model_dump_json(indent=1) + "\n")
 
 
-def _replace(path: Path, text: str) -> None:
-    partial = path.with_name(f".{path.name}.part")
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(path)
+def _foreign(folder: Path) -> bool:
+    """There is something in it besides what a job that was killed at its very start leaves."""
+    names = (path.name for path in folder.iterdir())
+    return any(name != _Files.lock and not name.startswith(".settings.") for name in names)
+
+
+def _locked(folder: Path) -> IO[bytes]:
+    """Nobody else gets it before it is closed, by whatever end of this process.
+
+    InputError if somebody has it.
+    """
+    lock = (folder / _Files.lock).open("wb")
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        lock.close()
+        raise InputError(
+            f"another learning job is at work in {folder}; end it first, or choose another folder"
+        ) from None
+    return lock

@@ -6,7 +6,7 @@ may come, go and be started again at any time.
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -70,11 +70,17 @@ class Learner:
         self._laps = 0
         self._ending = False
 
-    def begin(self, samples: Dataset | None, weights: GpWeights | None) -> None:
-        """What is known before the first lap; of a folder gone on with, what was known last."""
+    def begin(
+        self, samples: Dataset | None, weights: GpWeights | None, unread: Sequence[str] = ()
+    ) -> None:
+        """What is known before the first lap; of a folder gone on with, what was known last.
+
+        ``unread``: options that have not been read therefore.
+        """
         journal, store = self._journal, self._store
         if journal.resumed:
-            self._say(f"going on in {journal.folder} after lap {len(journal.record.laps)}")
+            why = f"; {' and '.join(unread)} not read: only to begin with" if unread else ""
+            self._say(f"going on in {journal.folder} after lap {len(journal.record.laps)}{why}")
         else:  # what an unfinished beginning has left is given once more
             store.clear()
             journal.path(Journal.FILES.given).unlink(missing_ok=True)
@@ -127,6 +133,8 @@ class Learner:
             if self._store.waiting:
                 self._journal.save()
                 self._store.save()
+        if self._desk.busy:
+            self._say("waiting for the controller's answer; Ctrl-C ends without it")
         self._desk.wait()  # seconds, perhaps; who interrupts now loses no more than the answer
         self._take_rest()
         if self._feed.lost:

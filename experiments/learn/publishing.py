@@ -7,10 +7,10 @@ from bayesrace.errors import InputError
 from bayesrace.gp.weights import MAX_BYTES
 from bayesrace.messages import Reply, Scalar
 
-__all__ = ["Answer", "RefusalError", "read_bytes"]
+__all__ = ["Answer", "NotTakenOverError", "read_bytes"]
 
 
-class RefusalError(RuntimeError):
+class NotTakenOverError(RuntimeError):
     """The controller was asked and said no; the message is its reason."""
 
 
@@ -29,6 +29,8 @@ class Answer:
     """Cycle of the controller from which on; None if it does not say."""
     acceptance: int | None = None
     """Number of this takeover among all of the car's."""
+    again: bool = False
+    """Not accepted for a reason that passes: the same may be accepted later."""
 
     @classmethod
     def of(cls, reply: Reply) -> "Answer":
@@ -40,13 +42,14 @@ class Answer:
             str(reply.data.get("from_version", "")),
             _count(reply.data.get("cycle")),
             _count(reply.data.get("number")),
+            not reply.accepted and reply.data.get("again") is True,
         )
 
     @property
     def words(self) -> str:
         """For people."""
         if not self.accepted:
-            return f"refused: {self.text}"
+            return f"refused{' for now, try again' if self.again else ''}: {self.text}"
         if self.cycle is None:
             return f"taken over: {self.text}"
         which = "" if self.acceptance is None else f" (acceptance {self.acceptance})"

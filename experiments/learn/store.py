@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from bayesrace.errors import InputError
+from bayesrace.files import clear_partials, replacing
 from bayesrace.vehicles.parameters import CarParameters
 from learning.arrays import dataset_from_npz, write_npz
 from learning.dataset import Dataset, concatenate
@@ -39,11 +41,15 @@ class SampleStore:
     def __init__(self, folder: Path, car: CarParameters) -> None:
         """Clears away what a killed job has left over. InputError if a file is damaged."""
         self._folder = folder
-        self._trained = max((n for _, kind, n in self._files() if kind == "kept"), default=0)
+        # New samples tell the number, too, where somebody has deleted damaged ones that were kept.
+        numbers = (n if kind == "kept" else n - 1 for _, kind, n in self._files())
+        self._trained = max(numbers, default=0)
         """Number of the last training that has kept samples."""
         self._tidy()
+        if self.kept is not None:  # else every training to come would fail over it
+            _read(self.kept, car)
         new = self._file("new", self._trained + 1)
-        self._waiting = dataset_from_npz(new, car) if new.exists() else None
+        self._waiting = _read(new, car) if new.exists() else None
         self._taken: Dataset | None = None
         """By the training under way."""
 
@@ -93,9 +99,8 @@ class SampleStore:
         """Writes what waits, so that it is found again; not while a training is under way."""
         if self._waiting is not None:
             path = self._file("new", self._trained + 1)
-            partial = path.with_name(f".{path.name}")  # savez would append .npz to another name
-            write_npz(partial, self._waiting)
-            partial.replace(path)
+            with replacing(path) as partial:
+                write_npz(partial, self._waiting)
 
     def _file(self, kind: str, number: int) -> Path:
         return self._folder / f"{kind}-{number:04d}.npz"
@@ -110,9 +115,16 @@ class SampleStore:
         for path, kind, number in self._files():
             if number < self._trained or (kind == "new" and number == self._trained):
                 path.unlink()
-        for pattern in (".kept-*", ".new-*"):
-            for path in self._folder.glob(pattern):
-                path.unlink()
+        clear_partials(self._folder)
+
+
+def _read(path: Path, car: CarParameters) -> Dataset:
+    try:
+        return dataset_from_npz(path, car)
+    except InputError as error:
+        raise InputError(
+            f"{error}; delete it to go on without these samples, or choose another folder"
+        ) from None
 
 
 def _joined(datasets: Sequence[Dataset | None]) -> Dataset:

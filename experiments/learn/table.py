@@ -36,7 +36,7 @@ def print_laps(record: Record, console: Console | None = None) -> None:
         console.print(Text("*: from rest; !: off the track"))
     if any(update.verdict == "waiting" for update in record.updates):
         console.print(
-            Text("waiting: no controller has answered; sent when the job is gone on with")
+            Text("waiting: no controller has answered for good; sent when the job is gone on with")
         )
     for remark in record.remarks:
         console.print(Text(f"nothing to learn from: {remark}"))

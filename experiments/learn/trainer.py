@@ -22,6 +22,9 @@ hardly ever come to training."""
 
 _PATIENCE_S: Final = 3.0
 
+_MOST_OUTPUT: Final = 1_000_000
+"""Bytes; a file that has become longer begins anew with the next task."""
+
 
 class Trainer:
     """One task at a time, in a process that is started when there is one and again when it died.
@@ -31,8 +34,9 @@ class Trainer:
     """
 
     def __init__(self, output: Path, told: Callable[[Outcome], None]) -> None:
-        """``output``: file for what the process has to say besides."""
+        """``output``: file for what the process has to say besides; emptied."""
         self._output, self._told = output, told
+        output.write_bytes(b"")
         self._process: subprocess.Popen[str] | None = None
         self._listener: threading.Thread | None = None
         self._task: Task | None = None
@@ -53,6 +57,8 @@ class Trainer:
     def start(self, task: Task) -> None:
         """Hands the task over; only if not :attr:`busy`. For the main thread."""
         self.prepare()
+        if self._output.stat().st_size > _MOST_OUTPUT:
+            os.truncate(self._output, 0)  # the process appends: it goes on at the beginning
         self._task = task
         if self._process is not None:
             with suppress(BrokenPipeError):  # it died: the listener tells

@@ -1,0 +1,52 @@
+"""Files that appear whole or not at all, whoever is killed and whenever the power fails."""
+
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+__all__ = ["clear_partials", "replacing", "write_whole"]
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A file to write that takes the place of ``path`` when the block has ended without an error.
+
+    It is on the disk before it does: after a power failure ``path`` is the old file or the new one.
+    It lies beside ``path`` and has the same suffix, as some writers add what they miss. OSError as
+    of the block, or of the system; what was begun is deleted then.
+    """
+    unique = f"{os.getpid()}.{time.monotonic_ns()}"
+    partial = path.with_name(f".{path.stem}.{unique}.part{path.suffix}")
+    try:
+        yield partial
+        _sync(partial)
+        partial.replace(path)
+    finally:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
+    # The name, too; the content is safe without it, and not every file system can do this.
+    with suppress(OSError):
+        _sync(path.parent)
+
+
+def write_whole(path: Path, data: str | bytes) -> None:
+    """The content of a file, text in UTF-8; see :func:`replacing`."""
+    with replacing(path) as partial:
+        partial.write_bytes(data.encode() if isinstance(data, str) else data)
+
+
+def clear_partials(folder: Path) -> None:
+    """Deletes what killed processes have begun; only while nobody writes there."""
+    for partial in folder.glob(".*.part*"):
+        partial.unlink(missing_ok=True)
+
+
+def _sync(path: Path) -> None:
+    """OSError if the content cannot be brought to the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
