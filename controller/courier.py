@@ -21,7 +21,8 @@ from controller.gate.supervisor import Supervisor
 from controller.latecomer import Latecomer, encode_answer
 from controller.ledger import Job, Ledger
 from controller.offers import Offers
-from controller.requests import RequestQueue, reply
+from controller.questions import Questions
+from controller.requests import ENDS, NOT_NOW, RequestQueue, reply
 from controller.takeover import Offer, Takeover, WeightsPort
 
 __all__ = ["Courier"]
@@ -31,7 +32,7 @@ _log = logging.getLogger("bayesrace.controller")
 _TAKE_S: Final = 5.0
 """The control loop, driving or idle, takes over within a cycle or a heartbeat; this is a stall."""
 
-_KEEP_S: Final = 10.0
+_KEEP_S: Final = 5.0
 """Within which what has been taken over is kept, by the next gatekeeper if need be."""
 
 _OFFERED_MS: Final = 5
@@ -57,7 +58,7 @@ class Courier:
         adopt: Callable[[str], None],
         announce: Announce,
     ) -> None:
-        self._port, self._settings, self._announce = port, settings, announce
+        self._port, self._settings, self._publish = port, settings, announce
         capacity = port.step.manifest.gp_capacity
         memory = self._memory = Memory(capacity)
         self.takeover = Takeover(memory, adopt)
@@ -74,11 +75,10 @@ class Courier:
         self._stopping = False
         self._most_bytes = 3 * 8 * 7 * (capacity + 1) + _FILE_BYTES
         fresh = len(port.history) == 1 and not port.history[0].data
-        self._latecomer = Latecomer(
-            lambda: fetch_all(session, ACCEPTED, name), self._most_bytes, fresh
-        )
         services = (WEIGHTS, ROLLBACK, ACCEPTED)
         self._requests = RequestQueue(session, name, services, self._most_bytes)
+        self._questions = Questions(lambda: fetch_all(session, ACCEPTED, name), self._requests.wake)
+        self._latecomer = Latecomer(self._questions.ask, self._most_bytes, fresh)
         self._thread = threading.Thread(target=self._run, name="courier")
 
     @property
@@ -107,11 +107,13 @@ class Courier:
         self._thread.start()
 
     def stop(self) -> None:
-        """Refuses what is not answered, and ends thread and gatekeeper."""
+        """Refuses what is not answered, and ends threads and gatekeeper."""
         self._stopping = True
         self._requests.wake()
         self._thread.join()
         self._keeper.close()
+        self._questions.close()
+        self._memory.close()
 
     # The thread ----------------------------------------------------------------------------------
 
@@ -122,13 +124,26 @@ class Courier:
             except Exception:
                 # Without this thread nobody could send weights, and bad ones would not be given up.
                 _log.exception("weights: a fault of the controller's own")
-                self._keeper.lose("was ended after a fault of the controller's own")
-                self._bereaved()
-        why_not = "the controller ends"
-        self._settled(why_not)
-        self._refuse(why_not, {})
-        while (request := self._requests.pop()) is not None:
-            reply(request, False, why_not, {})
+                self._recover()
+        try:
+            self._settled(ENDS)
+            self._refuse(ENDS, NOT_NOW)
+        finally:
+            self._requests.close()
+
+    def _recover(self) -> None:
+        try:
+            self._keeper.lose("was ended after a fault of the controller's own")
+            self._bereaved()
+        except Exception:
+            _log.exception("weights: another fault after that")
+
+    def _announce(self, kind: str, text: str, data: Mapping[str, Scalar]) -> None:
+        """Whoever waits for an answer does not depend on it."""
+        try:
+            self._publish(kind, text, data)
+        except Exception:
+            _log.exception("weights: the event %s cannot be published", kind)
 
     def _turn(self) -> None:
         """Waits, and does what there is to do."""
@@ -137,10 +152,7 @@ class Courier:
             self._taken(offer)
         self._look_after_gatekeeper()
         self._expire()
-        while self._job is None and (request := self._requests.pop()) is not None:
-            if not self._begin(request):
-                self._requests.put_back(request)
-                break
+        self._serve()
         if self._latecomer.asking:
             self._ask_others()
 
@@ -151,7 +163,7 @@ class Courier:
         if (gatekeeper := self._keeper.fileno()) is not None:
             poll.register(gatekeeper, select.POLLIN)
         patience_ms = self._keeper.patience_s * 1e3
-        if self._job is not None or self._latecomer.asking:
+        if self._job is not None or self._requests or self._latecomer.asking:
             patience_ms = min(patience_ms, _HURRY_MS)
         for fd, _ in poll.poll(_OFFERED_MS if self._offers.under_way else patience_ms):
             if fd == self._requests.fileno():
@@ -162,14 +174,16 @@ class Courier:
     def _expire(self) -> None:
         """Answers for what the control loop, or the gatekeeper, has not done in time."""
         job = self._job
-        if job is None or job.offer is None or time.monotonic() < job.until_s:
+        if job is None or job.over or time.monotonic() < job.until_s:
             return
         if job.answer:
-            self._settled(f"the gatekeeper did not do so within {_KEEP_S:g} s")
-            return
-        if self._offers.withdraw(job.offer):
+            self._settled("the gatekeeper did not do so in time")
+        elif job.offer is None:
+            self._refused(job.request, "the gatekeeper has not answered in time", NOT_NOW)
+            job.over = True
+        elif self._offers.withdraw(job.offer):
             self._keeper.tell("dropped")
-            self._refuse(f"the control loop did not take over within {_TAKE_S:g} s", {})
+            self._refuse(f"the control loop did not take over within {_TAKE_S:g} s", NOT_NOW)
 
     # The gatekeeper ------------------------------------------------------------------------------
 
@@ -215,7 +229,7 @@ class Courier:
         _log.warning("%s", text)
         self._announce("gatekeeper_ended", text, {})
         if self._job is not None and self._job.offer is None:
-            self._refuse(f"{text}; send them again in a moment", {})
+            self._refuse(f"{text}; send them again in a moment", NOT_NOW)
         self._settle_unkept()
 
     def _settle_unkept(self) -> None:
@@ -225,38 +239,51 @@ class Courier:
 
     # Requests ------------------------------------------------------------------------------------
 
-    def _begin(self, request: Request) -> bool:
+    def _serve(self) -> None:
+        """Starts on what waits, one at a time; what has waited too long is turned away."""
+        while (waiting := self._requests.pop()) is not None:
+            request, answer_s = waiting
+            if request.service is ACCEPTED:
+                request.answer_raw(encode_answer(self._ledger.newest, self._port.withdrawn))
+            elif time.monotonic() >= answer_s - _KEEP_S:
+                why_not = "others, or the gatekeeper's start, have taken too long"
+                self._refused(request, why_not, NOT_NOW)
+            elif self._job is not None or not self._begin(request, answer_s):
+                self._requests.put_back(waiting)
+                return
+
+    def _begin(self, request: Request, answer_s: float) -> bool:
         """Starts on a request; False if it has to wait for the gatekeeper, which is starting."""
-        if request.service is ACCEPTED:
-            request.answer_raw(encode_answer(self._ledger.newest, self._port.withdrawn))
-            return True
         if not self.takeover.gatekeeper:
             if not self._keeper.text:
                 return False
-            self._refused(request, f"{self._keeper.text}; send them again in a moment", {})
+            why_not = f"{self._keeper.text}; send them again in a moment"
+            self._refused(request, why_not, NOT_NOW)
             return True
         if request.service is ROLLBACK:
-            self._begin_rollback(request)
+            self._begin_rollback(request, answer_s)
         elif request.size > self._most_bytes:
             self._refused(
                 request, f"{request.size} bytes are more than any weights that would fit", {}
             )
         else:
-            self._begin_check(Job("weights", request.payload, request))
+            self._begin_check(Job("weights", request.payload, request, answer_s=answer_s))
         return True
 
     def _begin_check(self, job: Job) -> None:
-        self._job = job
+        self._job, job.until_s = job, job.answer_s - _KEEP_S
         self._keeper.tell("check", job.data, number=self._port.next_number)
 
-    def _begin_rollback(self, request: Request) -> None:
+    def _begin_rollback(self, request: Request, answer_s: float) -> None:
         message, why_not = decode_request(request)
         if message is not None and self._ledger.before is None:
             why_not = "there are no weights before those in use"
         if why_not:
             reply(request, False, why_not, {})
             return
-        self._job = Job("previous", b"", request, message.text)
+        self._job = Job(
+            "previous", b"", request, message.text, answer_s=answer_s, until_s=answer_s - _KEEP_S
+        )
         self._keeper.tell("previous", number=self._ledger.newest.number)
 
     def _ask_others(self) -> None:
@@ -268,16 +295,19 @@ class Courier:
             self._begin_check(Job("weights", found.data, None, why, found.accepted_utc_ns))
 
     def _refuse(self, text: str, data: Mapping[str, Scalar]) -> None:
+        """Ends the job under way; ``data`` NOT_NOW: without a verdict."""
         job, self._job = self._job, None
-        if job is None:
+        if job is None or job.over:
             return
-        if job.kind == "previous":
-            if job.request is not None:
-                reply(job.request, False, text, data)
+        if job.request is None and data is NOT_NOW and self._latecomer.put_back():
             return
+        self._latecomer.judged()
         self._refused(job.request, text, data)
 
     def _refused(self, request: Request | None, text: str, data: Mapping[str, Scalar]) -> None:
+        if request is not None and request.service is ROLLBACK:
+            reply(request, False, text, data)
+            return
         self._ledger.counts["weights_refused"] += 1
         if request is not None:
             reply(request, False, text, data)
@@ -289,13 +319,15 @@ class Courier:
         """What the request under way asks for has passed the gate."""
         job, facts = self._job, fields["data"]
         watch = self._settings.watch_s > 0
-        offer = None if job is None else self._ledger.offer(job, facts, fields["text"], watch)
+        offer = None
+        if job is not None and not job.over:
+            offer = self._ledger.offer(job, facts, fields["text"], watch)
         if job is None or offer is None:
             self._keeper.tell("dropped")
             self._refuse("there are no weights before those in use any more", {})
             return
         job.facts, job.offer = facts, offer
-        job.until_s = time.monotonic() + _TAKE_S
+        job.until_s = min(time.monotonic() + _TAKE_S, job.answer_s - _KEEP_S)
         if why_not := self._offers.put(offer):
             self._keeper.tell("dropped")
             self._refuse(why_not, {})
@@ -333,9 +365,12 @@ class Courier:
             job.answer, job.facts = self._ledger.go_back(offer, {}, job.why)
         else:
             job.answer, job.facts = self._ledger.accept(offer, job, self.takeover.taken_us)
-        job.until_s = time.monotonic() + _KEEP_S
-        if job.request is not None:
+        if job.request is None:
+            self._latecomer.judged()
+            job.until_s = time.monotonic() + _KEEP_S
+        else:
             self._latecomer.stop()
+            job.until_s = job.answer_s
 
     def _kept(self, why_not: str) -> None:
         """The gatekeeper has kept what is accepted, or not."""

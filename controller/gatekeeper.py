@@ -42,9 +42,9 @@ _POLL_S: Final = 0.02
 _IDLE_POLL_S: Final = 0.05
 _IDLE_NS: Final = 1_000_000_000
 _REST_S: Final = 1.0
-"""Without a watch, and at most: how long it waits between two signs of life."""
+"""Longest wait for a message, between two signs of life, while nothing is watched."""
 _SIGNS: Final = 8
-"""Of life, at least, within the time after which it is taken to hang."""
+"""At least so many signs of life within ``hang_s``, after which it would be replaced."""
 
 
 class Gatekeeper:
@@ -140,7 +140,7 @@ class Gatekeeper:
         return bool(readable)
 
     def _patience_s(self) -> float:
-        """How long the watch has time."""
+        """How long to wait for a message before the watch looks at new states again [s]."""
         if self._watch is None:
             return self._rest_s
         if time.monotonic_ns() - self._read_ns > _IDLE_NS:

@@ -12,6 +12,7 @@ taken from nobody.
 import logging
 import struct
 import time
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -19,7 +20,7 @@ from typing import Final
 from bayesrace.errors import InputError
 from controller.gate.store import WITHDRAWN, Accepted, digest_of
 
-__all__ = ["Found", "Latecomer", "encode_answer", "newest_first"]
+__all__ = ["Found", "Latecomer", "Tell", "encode_answer", "newest_first"]
 
 _log = logging.getLogger("bayesrace.controller")
 
@@ -33,6 +34,9 @@ _MOST_ANSWERS: Final = 32
 
 _CLOCKS_APART_NS: Final = 3600 * 10**9
 """By which another host's clock may be ahead: later weights would be the newest for ever."""
+
+_MOST_TRIES: Final = 3
+"""Of the same weights without a verdict: they may be what the gatekeeper dies of."""
 
 _ASK_S: Final = (0.2, 1.0, 3.0)
 """When, after the start: connections take a moment, and then there is nobody."""
@@ -107,42 +111,86 @@ def _decode(answer: bytes, most_bytes: int, now_utc_ns: int) -> tuple[Found | No
     return Found(accepted_utc_ns, data, digest_of(data)) if data else None, digests
 
 
-class Latecomer:
-    """Asks a few times, as long as nobody decides what this controller is to drive with."""
+Tell = Callable[[Sequence[bytes]], None]
+"""Takes the answers to a question."""
 
-    def __init__(self, ask: Callable[[], Sequence[bytes]], most_bytes: int, needed: bool) -> None:
-        """``ask``: brings the answers of all others that are connected. ``most_bytes``: see
-        :func:`newest_first`. ``needed`` False: it has weights already, and is no latecomer."""
-        self._ask, self._most_bytes = ask, most_bytes
-        self._begin_s = time.monotonic()
+
+class Latecomer:
+    """Asks a few times, as long as nobody decides what this controller is to drive with.
+
+    What :meth:`next` brings is followed by :meth:`judged` or :meth:`put_back`.
+    """
+
+    def __init__(
+        self,
+        ask: Callable[[Tell], None],
+        most_bytes: int,
+        needed: bool,
+        clock_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """``ask``: asks all others that are connected, and tells their answers once, now or later,
+        in any thread. ``most_bytes``: see :func:`newest_first`. ``needed`` False: it has weights
+        already, and is no latecomer."""
+        self._ask, self._most_bytes, self._clock_s = ask, most_bytes, clock_s
+        self._begin_s = clock_s()
         self._due_s = list(_ASK_S) if needed else []
+        self._asked = False
+        """The answers have not come yet."""
+        self._answers: deque[Sequence[bytes]] = deque()
         self._found: list[Found] = []
-        self._tried: set[str] = set()
+        self._brought: Found | None = None
+        self._judged: set[str] = set()
+        self._tries: Counter[str] = Counter()
         self.ignored = 0
         """Answers that could not be used."""
 
     @property
     def asking(self) -> bool:
         """Whether there is a question left, or an answer that has not been looked at."""
-        return bool(self._due_s or self._found)
+        return bool(self._due_s or self._asked or self._found)
 
     def next(self, in_use: Accepted) -> Found | None:
-        """The newest weights of others, newer than those in use, that it has not brought yet."""
-        if self._due_s and time.monotonic() - self._begin_s >= self._due_s[0]:
+        """The newest weights of others, newer than those in use, that were not judged yet."""
+        if not self._asked and self._due_s and self._clock_s() - self._begin_s >= self._due_s[0]:
             self._due_s.pop(0)
-            self._found, ignored = newest_first(self._ask(), self._most_bytes, time.time_ns())
-            self.ignored += len(ignored)
-            for why in ignored[:1]:
-                _log.warning("ignored %d answer(s) of other controllers: %s", len(ignored), why)
+            self._asked = True
+            self._ask(self._answers.append)
+        if self._asked and self._answers:
+            self._asked = False
+            self._read(self._answers.popleft())
         while self._found:
             one = self._found.pop(0)
             newer = not in_use.number or one.accepted_utc_ns > in_use.accepted_utc_ns
-            if newer and one.digest not in self._tried:
-                self._tried.add(one.digest)
+            if newer and one.digest not in self._judged:
+                self._brought = one
+                self._tries[one.digest] += 1
                 return one
         return None
+
+    def judged(self) -> None:
+        """There is a verdict on what it has brought, which is not brought again."""
+        if self._brought is not None:
+            self._judged.add(self._brought.digest)
+            self._brought = None
+
+    def put_back(self) -> bool:
+        """There is none, for another's fault: it stays the next. False if that was so too often."""
+        one = self._brought
+        if one is None or self._tries[one.digest] >= _MOST_TRIES:
+            self.judged()
+            return False
+        self._brought = None
+        self._found.insert(0, one)
+        return True
 
     def stop(self) -> None:
         """It has been told what to drive with."""
         self._due_s.clear()
         self._found.clear()
+        self._asked = False
+
+    def _read(self, answers: Sequence[bytes]) -> None:
+        self._found, ignored = newest_first(answers, self._most_bytes, time.time_ns())
+        self.ignored += len(ignored)
+        for why in ignored[:1]:
+            _log.warning("ignored %d answer(s) of other controllers: %s", len(ignored), why)

@@ -1,5 +1,6 @@
 """Which weights have been accepted, in which order, and the words for what has changed."""
 
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -25,11 +26,15 @@ class Job:
     why: str = ""
     accepted_utc_ns: int | None = None
     """When another controller accepted them; None: nobody has."""
-    until_s: float = 0.0
-    """Offered: when it must have been taken over; taken over: when it must have been kept."""
+    answer_s: float = math.inf
+    """By the monotonic clock, when whoever asks must have been answered; inf: nobody asks."""
+    until_s: float = math.inf
+    """How long what it waits for now may take: verdict, takeover, keeping."""
     facts: Mapping[str, Scalar] = field(default_factory=dict)
     """What the gate has compared."""
     offer: Offer | None = None
+    over: bool = False
+    """Refused, because the verdict takes too long; until that, the gatekeeper does nothing else."""
     answer: str = ""
     """Taken over; it is told as soon as the gatekeeper has kept it."""
 

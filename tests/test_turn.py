@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from bayesrace.tracks import Track
 from bayesrace.vehicles import CarParameters
 from controller.native_step import NativeStep
-from tests.conftest import SETTINGS, Circuit
+from controller.path_table import make_path_table
+from tests.conftest import SETTINGS, Circuit, offset_line
 from tests.test_driver import Rig
 
 Floats = NDArray[np.float64]
@@ -61,6 +63,23 @@ def test_it_turns_to_the_side_with_more_room(
     x = standing(circuit, 1.0, middle + to_left_m, turned_rad)
     assert native.step(x, 0.0).usable
     assert np.sign(native.u[1]) == np.sign(to_left_m)
+
+
+def test_a_start_in_a_tight_bend_is_no_turn(native: NativeStep) -> None:
+    """The line ahead is far to one side there, for a car that follows it, too."""
+    angle = np.linspace(0, 2 * np.pi, 80, endpoint=False)
+    track = Track.from_points(
+        "ring", 0.4 * np.column_stack([np.cos(angle), np.sin(angle)]), 0.16, 0.16
+    )
+    line = offset_line(track, offset_m=0.0, lateral_mps2=3.0, v_max=2.0)
+    ring = Circuit(track, line, make_path_table(track, line))
+    native.set_path(ring.table)
+    rig = Rig(native, ring)
+    native.reset()
+    rig.x = ring.start(1.0, 0.0)
+    for _ in range(25):
+        rig.cycle()
+    assert rig.x[3] > 0.8
 
 
 def test_a_speed_limit_is_kept_in_a_turn(native: NativeStep, circuit: Circuit) -> None:

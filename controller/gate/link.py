@@ -57,23 +57,27 @@ class Link:
         store: Path | None,
         watch_from: int,
     ) -> None:
-        """Tells it where things stand."""
-        self.tell(
-            "start",
-            b"".join(one.data for one in history),
-            settings=settings.model_dump(),
-            artefact=str(artefact),
-            car=manifest.car,
-            discretisation=manifest.discretisation,
-            history=[
-                (one.number, one.version, one.proven, one.accepted_utc_ns, len(one.data))
-                for one in history
-            ],
-            next_number=next_number,
-            withdrawn=list(withdrawn),
-            store=None if store is None else str(store.resolve()),
-            watch_from=watch_from,
-        )
+        """Tells it where things stand; ends it if it cannot be told."""
+        try:
+            self.tell(
+                "start",
+                b"".join(one.data for one in history),
+                settings=settings.model_dump(),
+                artefact=str(artefact),
+                car=manifest.car,
+                discretisation=manifest.discretisation,
+                history=[
+                    (one.number, one.version, one.proven, one.accepted_utc_ns, len(one.data))
+                    for one in history
+                ],
+                next_number=next_number,
+                withdrawn=list(withdrawn),
+                store=None if store is None else str(store.resolve()),
+                watch_from=watch_from,
+            )
+        except BaseException:
+            self.close()
+            raise
 
     def tell(self, kind: str, payload: bytes = b"", **fields: Any) -> None:
         """If it is gone, or does not read, hearing tells."""

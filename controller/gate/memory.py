@@ -89,6 +89,12 @@ class Memory:
         """States noted so far."""
         return self._words[0]
 
+    def close(self) -> None:
+        """Gives the file up; this memory itself stays as long as somebody uses it."""
+        if self.fd >= 0:
+            os.close(self.fd)
+            self.fd = -1
+
     # The controller's side -----------------------------------------------------------------------
 
     def note(self, state: State, fallen_back: bool | None) -> None:

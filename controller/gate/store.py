@@ -115,9 +115,8 @@ class Store:
                 f"{discretisation}; choose another folder"
             )
         self._index = self._index.model_copy(update={"discretisation": discretisation})
-        self._write_index(
-            self._index
-        )  # a folder that cannot be written is told now, not while driving
+        # Now, not while driving, it is told that a folder cannot be written.
+        self._write_index(self._index)
 
     @property
     def next_number(self) -> int:

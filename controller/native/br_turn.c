@@ -14,6 +14,7 @@
 #define AWAY_RAD 0.6     /* farther than this to one side, */
 #define FACED_RAD 0.3    /* and ends within this */
 #define AHEAD_M 0.5      /* of the car: the point of the line that it turns to */
+#define TANGENT_M 0.05   /* length of line that its direction beside the car is taken from */
 #define BEHIND_RAD 2.0   /* with that point farther behind than this, either side serves */
 #define WIDER_M 2.0      /* the track to either side, on the way */
 #define PACE_MPS 0.5     /* or the speed limit, if that is lower */
@@ -41,6 +42,16 @@ static double remaining(double turn, double away) {
     return angle < -M_PI / 2 ? angle + 2 * M_PI : angle;
 }
 
+/* The same angle for a car that follows the line: in a tight bend the point is far to one side, and
+ * no turn is needed. */
+static double bearing_on_line(const br_path *path, const double to[2]) {
+    double here[BR_NX] = {0}, next[2];
+    br_path_ahead(path, 0, here);
+    br_path_ahead(path, TANGENT_M, next);
+    here[2] = atan2(next[1] - here[1], next[0] - here[0]);
+    return bearing(here, to);
+}
+
 /* Begins, goes on with and ends a turn. */
 static void decide(br_mpc *mpc, const double target[2]) {
     const double *x = mpc->x0, away = bearing(x, target), speed = fabs(x[3]);
@@ -48,7 +59,8 @@ static void decide(br_mpc *mpc, const double target[2]) {
         mpc->turn = 0;
     } else if (mpc->turn) {
         if (remaining(mpc->turn, away) < FACED_RAD) mpc->turn = 0;
-    } else if (speed < SLOW_MPS && fabs(away) > AWAY_RAD) {
+    } else if (speed < SLOW_MPS && fabs(away) > AWAY_RAD &&
+               fabs(remainder(away - bearing_on_line(&mpc->path, target), 2 * M_PI)) > AWAY_RAD) {
         mpc->turn = side(x, away, &mpc->reference[0]);
         mpc->warm = 0;
     }

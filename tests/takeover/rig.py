@@ -35,6 +35,8 @@ from tests.programs import until
 __all__ = ["DRIVEN_S", "Rig", "digest", "gatekeepers", "make_course", "rigged"]
 
 KINDS = ("rbf", "matern25", "matern15")
+_LATE = 5
+"""Periods without an answer that the car does not mind."""
 DRIVEN_S = 4.0
 """Of plant time: more than a lap of the circuit."""
 
@@ -117,6 +119,12 @@ class Rig:
     def events(self, kind: str) -> list[Event]:
         found = [one for one in self.reader().select(EVENT) if one.source == "controller"]
         return [one for one in found if one.kind == kind]
+
+    def held_up(self, end: Event) -> bool:
+        """Whether a run by the wall clock, the first, was on a machine that stalled: it may have
+        taken the car off the track."""
+        periods = self.counters()["skipped"] + int(end.data["overruns"])
+        return periods > 0 or int(end.data["late"]) > _LATE
 
     def off_track_m(self, run: int) -> float:
         xy = np.array([one.x[:2] for one in self.states(run)])

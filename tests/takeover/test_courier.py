@@ -8,13 +8,16 @@ import os
 import resource
 import shutil
 import signal
+import threading
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from bayesrace.gp.weights import GpWeights
+from bayesrace.gp.weights import GpWeights, encode_weights
 from controller.gate.settings import GateSettings
+from controller.gate.store import Accepted
+from controller.latecomer import encode_answer
 from tests.network.cars import Course
 from tests.programs import until
 from tests.takeover.bench import bench
@@ -79,6 +82,7 @@ def test_a_gatekeeper_that_hangs_is_replaced(
         assert not reply.accepted
         assert "the gatekeeper hung, without a sign of life for 1 s" in reply.text
         assert "send them again in a moment" in reply.text
+        assert reply.data == {"again": True}
         assert made.said("gatekeeper_ended")
         assert made.version == again.version
         made.ready(2)
@@ -101,19 +105,152 @@ def test_an_offer_that_the_control_loop_does_not_take_is_withdrawn(
         refusal = made.send(again).result(60.0)
         assert not refusal.accepted
         assert "the control loop did not take over within" in refusal.text
+        assert refusal.data == {"again": True}
         made.cycle()
         assert made.version == good.version
         monkeypatch.undo()
         assert made.accept(again).data["number"] == 1
 
 
+def test_whoever_comes_when_too_many_wait_may_come_again(
+    course: Course, again: GpWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with bench(course) as made:
+        monkeypatch.setattr("controller.requests._MOST", 0)
+        reply = made.send(again).result(60.0)
+        assert (reply.accepted, reply.data) == (False, {"again": True})
+        assert "try later" in reply.text
+        monkeypatch.undo()
+        assert made.accept(again).data["number"] == 1
+
+
 def test_whoever_waits_when_the_controller_ends_is_told(course: Course, again: GpWeights) -> None:
     with bench(course) as made:
-        answers = [made.send(again), made.roll_back()]
+        answers = [made.send(again)]
         made.offered("weights")
+        answers.append(made.roll_back())
+        until(lambda: made.waiting == 1, "the request to go back waits")
         made.courier.stop()
         replies = [answer.result(60.0) for answer in answers]
         assert [(one.accepted, one.text) for one in replies] == [(False, "the controller ends")] * 2
+        assert [one.data for one in replies] == [{"again": True}] * 2
+
+
+def test_who_asks_after_the_end_is_told(course: Course, again: GpWeights) -> None:
+    with bench(course) as made:
+        made.courier.stop()
+        refusal = made.send(again).result(60.0)
+        assert (refusal.text, refusal.data) == ("the controller ends", {"again": True})
+
+
+def test_an_event_that_cannot_be_published_is_nobodys_trouble(
+    course: Course, again: GpWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with bench(course) as made:
+
+        def fails(*_: object) -> None:
+            raise RuntimeError("no network")
+
+        monkeypatch.setattr(made.courier, "_publish", fails)
+        os.kill(made.gatekeeper, signal.SIGKILL)
+        made.gone()
+        assert made.accept(again).data["number"] == 1
+
+
+# In time -------------------------------------------------------------------------------------
+
+
+def test_who_asks_is_answered_however_long_a_gatekeeper_may_be_silent(
+    course: Course, good: GpWeights, again: GpWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And what is found too late is not taken over, nor taken for the answer to the next."""
+    monkeypatch.setattr("controller.requests._RETURN_S", 14.0)  # a second for the verdict
+    with bench(course, GateSettings(hang_s=3600)) as made:
+        victim = made.gatekeeper
+        os.kill(victim, signal.SIGSTOP)
+        try:
+            answers = [made.send(again), made.roll_back()]
+            replies = [answer.result(60.0) for answer in answers]
+        finally:
+            os.kill(victim, signal.SIGCONT)
+        assert [(one.accepted, one.data) for one in replies] == [(False, {"again": True})] * 2
+        monkeypatch.undo()
+        assert made.accept(replace(good, version="next")).data["number"] == 1
+        assert made.version == "next"
+        assert made.gatekeeper == victim
+
+
+@pytest.mark.slow
+def test_who_asks_is_answered_however_long_keeping_takes(
+    tmp_path: Path, course: Course, again: GpWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("controller.requests._RETURN_S", 12.0)
+    monkeypatch.setattr("controller.courier._KEEP_S", 1.0)
+    with bench(course, GateSettings(hang_s=3600), tmp_path / "store") as made:
+        answer = made.send(again)
+        made.offered("weights")
+        victim = made.gatekeeper
+        os.kill(victim, signal.SIGSTOP)
+        try:
+            reply = made.settle(answer)
+        finally:
+            os.kill(victim, signal.SIGCONT)
+        assert (reply.accepted, made.version) == (True, again.version)
+        assert "; not kept: the gatekeeper did not do so in time" in reply.text
+        until(lambda: made.kept() == [again.version], "they are kept after all")
+
+
+# Others, who are asked -----------------------------------------------------------------------
+
+
+def test_a_controller_that_is_silent_holds_nobody_up(
+    course: Course, again: GpWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, enough = threading.Event(), threading.Event()
+
+    def fetch(*_: object) -> list[bytes]:
+        asked.set()
+        enough.wait(120.0)
+        return []
+
+    monkeypatch.setattr("controller.courier.fetch_all", fetch)
+    with bench(course, fresh=True) as made:
+        assert asked.wait(60.0)
+        try:
+            assert made.accept(again).data["number"] == 1
+            made.drive(25, fallen_back=True)
+            made.offered("give_up")
+            assert not enough.is_set()
+        finally:
+            enough.set()
+    assert not [one for one in threading.enumerate() if one.name in ("question", "courier")]
+
+
+def test_a_gatekeeper_killed_at_what_others_have_accepted_is_no_verdict(
+    course: Course, again: GpWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    theirs = encode_answer(Accepted(1, again.version, encode_weights(again), True, 1), [])
+    stopped = threading.Event()
+
+    def fetch(*_: object) -> list[bytes]:
+        stopped.wait(60.0)
+        return [theirs]
+
+    monkeypatch.setattr("controller.courier.fetch_all", fetch)
+    with bench(course, fresh=True) as made:
+        victim = made.gatekeeper
+        os.kill(victim, signal.SIGSTOP)
+        stopped.set()
+        until(lambda: made.asked, "they are checked")
+        os.kill(victim, signal.SIGKILL)
+        made.gone()
+
+        def taken() -> bool:
+            made.cycle()
+            return made.version == again.version
+
+        until(taken, "they are taken over")
+        assert (made.status("weights_refused"), made.said("weights_refused")) == (0, [])
 
 
 # The watch, and requests at the same time ----------------------------------------------------

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from controller.gate.store import WITHDRAWN, Accepted, digest_of
-from controller.latecomer import Latecomer, encode_answer, newest_first
+from controller.latecomer import Latecomer, Tell, encode_answer, newest_first
 from controller.ledger import Job, Ledger
 from controller.native_step import NativeStep
 from controller.takeover import Offer, WeightsPort
@@ -134,7 +134,10 @@ def test_who_takes_them_over_makes_them_no_newer(accepted_utc_ns: int | None) ->
     before_ns = time.time_ns()
     ledger.accept(Offer("new", 1, "weights", watched=True), job, 0.0)
     at_ns = ledger.newest.accepted_utc_ns
-    assert at_ns == accepted_utc_ns or before_ns <= at_ns <= time.time_ns()
+    if accepted_utc_ns is None:
+        assert before_ns <= at_ns <= time.time_ns()
+    else:
+        assert at_ns == accepted_utc_ns
 
 
 # Over time -----------------------------------------------------------------------------------
@@ -143,26 +146,43 @@ def test_who_takes_them_over_makes_them_no_newer(accepted_utc_ns: int | None) ->
 class Others:
     """What they answer, question by question, at the times of the test."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, *answers: Sequence[bytes]) -> None:
+    def __init__(self, *answers: Sequence[bytes] | None) -> None:
+        """None: they are silent."""
         self._answers = list(answers)
+        self._tell: Tell | None = None
         self.now_s = 100.0
-        monkeypatch.setattr(time, "monotonic", lambda: self.now_s)
-        self.latecomer = Latecomer(lambda: self._answers.pop(0), MOST_BYTES, needed=True)
+        self.latecomer = Latecomer(self._ask, MOST_BYTES, needed=True, clock_s=lambda: self.now_s)
 
-    def after(self, seconds: float, in_use: Accepted) -> Callable[[], bytes]:
-        """What is brought then, one by one."""
+    def _ask(self, tell: Tell) -> None:
+        answers = self._answers.pop(0)
+        if answers is None:
+            self._tell = tell
+        else:
+            tell(answers)
+
+    def say(self, *answers: bytes) -> None:
+        """After a silence."""
+        assert self._tell is not None
+        self._tell(answers)
+
+    def after(self, seconds: float, in_use: Accepted, judged: bool = True) -> Callable[[], bytes]:
+        """What is brought then, one by one; what was before it has a verdict, or has none."""
         self.now_s = 100.0 + seconds
 
         def bring() -> bytes:
+            if judged:
+                self.latecomer.judged()
+            else:
+                self.latecomer.put_back()
             one = self.latecomer.next(in_use)
             return b"" if one is None else one.data
 
         return bring
 
 
-def test_it_asks_three_times_and_takes_what_is_newer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_asks_three_times_and_takes_what_is_newer() -> None:
     """A controller to which the connection takes longer may have newer weights."""
-    others = Others(monkeypatch, [], [OLD, MIDDLE], [OLD, MIDDLE, NEW])
+    others = Others([], [OLD, MIDDLE], [OLD, MIDDLE, NEW])
     assert others.after(0.1, FRESH)() == b""
     assert others.after(0.3, FRESH)() == b""
     in_use = accepted(b"middle", 200)
@@ -173,9 +193,9 @@ def test_it_asks_three_times_and_takes_what_is_newer(monkeypatch: pytest.MonkeyP
     assert not others.latecomer.asking
 
 
-def test_what_the_gate_refuses_is_followed_by_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_the_gate_refuses_is_followed_by_the_next() -> None:
     """And not brought again by the next question."""
-    others = Others(monkeypatch, [OLD, NEW], [NEW, OLD], [NEW])
+    others = Others([OLD, NEW], [NEW, OLD], [NEW])
     bring = others.after(0.3, FRESH)
     assert [bring(), bring(), bring()] == [b"new", b"old, and longer than the others", b""]
     assert others.after(3.1, FRESH)() == b""
@@ -184,8 +204,36 @@ def test_what_the_gate_refuses_is_followed_by_the_next(monkeypatch: pytest.Monke
     assert not others.latecomer.asking
 
 
-def test_who_is_told_what_to_drive_with_asks_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    others = Others(monkeypatch, [OLD, NEW])
+def test_what_had_no_verdict_is_brought_again_but_not_for_ever() -> None:
+    """A gatekeeper that is killed says nothing about weights; one that dies of them, again and
+    again, may."""
+    others = Others([OLD, NEW], [OLD, NEW], [OLD, NEW])
+    bring = others.after(0.3, FRESH, judged=False)
+    assert [bring(), bring()] == [b"new"] * 2
+    assert others.latecomer.put_back()
+    assert others.latecomer.asking
+    assert bring() == b"new"
+    assert not others.latecomer.put_back()
+    assert bring() == b"old, and longer than the others"
+    assert others.after(3.1, FRESH)() == b""
+
+
+def test_who_is_silent_is_not_waited_for() -> None:
+    others = Others(None, None, [NEW])
+    assert others.after(0.3, FRESH)() == b""
+    assert others.after(1.1, FRESH)() == b""  # and not asked again meanwhile
+    assert others.latecomer.asking
+    others.say(OLD)
+    assert others.after(1.2, FRESH)() == b"old, and longer than the others"
+    in_use = accepted(b"old, and longer than the others", 100)
+    assert others.after(1.3, in_use)() == b""
+    others.latecomer.stop()
+    others.say(NEW)
+    assert others.after(9.0, in_use)() == b""
+
+
+def test_who_is_told_what_to_drive_with_asks_no_more() -> None:
+    others = Others([OLD, NEW])
     assert others.after(0.3, FRESH)() == b"new"
     others.latecomer.stop()
     assert not others.latecomer.asking
@@ -193,7 +241,7 @@ def test_who_is_told_what_to_drive_with_asks_no_more(monkeypatch: pytest.MonkeyP
 
 
 def test_who_has_weights_does_not_ask() -> None:
-    def ask() -> list[bytes]:
+    def ask(_: object) -> None:
         raise AssertionError("asked")
 
     latecomer = Latecomer(ask, MOST_BYTES, needed=False)
@@ -201,10 +249,8 @@ def test_who_has_weights_does_not_ask() -> None:
     assert latecomer.next(FRESH) is None
 
 
-def test_what_is_ignored_is_counted_and_logged(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    others = Others(monkeypatch, [b"x", b"y", OLD])
+def test_what_is_ignored_is_counted_and_logged(caplog: pytest.LogCaptureFixture) -> None:
+    others = Others([b"x", b"y", OLD])
     assert others.after(0.3, FRESH)() == b"old, and longer than the others"
     assert others.latecomer.ignored == 2
     assert "ignored 2 answer(s) of other controllers: 1 bytes that are no answer" in caplog.text
