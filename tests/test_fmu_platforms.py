@@ -178,8 +178,12 @@ def drive_program(platform: str, sources: Path, program: Path) -> None:
     """tests/native/fmi3_drive.c for a platform."""
     target = get_platform(platform).zig
     assert target is not None
-    line = [sys.executable, "-m", "ziglang", "cc", "-target", target, "-O2", f"-I{sources}"]
-    line += [str(HERE / "native" / "fmi3_drive.c"), *([] if platform == WINDOWS else ["-ldl"])]
+    line = [sys.executable, "-m", "ziglang", "cc", "-target", target, "-s", "-g0", "-O2"]
+    line += [
+        f"-I{sources}",
+        str(HERE / "native" / "fmi3_drive.c"),
+        *([] if platform == WINDOWS else ["-ldl"]),
+    ]
     subprocess.run([*line, "-o", str(program)], check=True)
 
 
