@@ -1,0 +1,143 @@
+"""Does a car get under way again wherever it stands, and after braking blind?
+
+    python -m benchmarks.standing_start                           built-in track, 200 of each
+    python -m benchmarks.standing_start --track ethz.csv --train-track ethzmobil.csv
+
+First random poses up to .6 m beside the racing line, pointing anywhere, half of them standing:
+after 15 s the car has to drive along its line. Then one long drive in which the states are lost
+time and again, for up to 1.6 s: four seconds after each loss it has to be driving. Driver,
+fallback, compiled step and simulated car in one process; no clock.
+"""
+
+import argparse
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from bayesrace.gp.weights import read_weights
+from bayesrace.messages import State
+from bayesrace.raceline import RaceLine, read_raceline
+from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK, load_track
+from bayesrace.vehicles import get_car
+from bayesrace.vehicles.models import dynamic
+from controller.compensation import CompensationSettings
+from controller.driver import Driver
+from controller.fallback import FallbackSettings
+from controller.mpc import PredictiveController
+from controller.native_step import NativeStep
+from controller.path_table import make_path_table
+from controller.settings import MpcSettings
+from experiments.preparation import PreparationSettings, prepare
+from experiments.progress import stages_on
+from plant.simulator import Simulator
+
+ASIDE_M: Final = 0.6
+LATER: Final = 750
+"""Cycles after which a car has to be under way."""
+BLIND: Final = 80
+"""Longest loss of states, in cycles."""
+AFTER_LOSS: Final = 200
+SECOND: Final = 50
+UNDER_WAY_M: Final = 0.5
+"""Progress along the line within a second."""
+STALE_S: Final = 0.1
+STOP_MPS2: Final = 1.5
+
+
+class Rig:
+    """A driver and its car."""
+
+    def __init__(self, step: NativeStep, length_m: float) -> None:
+        car = get_car("orca")
+        self._step, self._length_m = step, length_m
+        self._driver = Driver(
+            PredictiveController(step), car, FallbackSettings(),
+            CompensationSettings(mode="fixed", delay_s=0.0), STALE_S, STOP_MPS2,
+        )  # fmt: skip
+        self.car = Simulator(dynamic(car))
+        self._run = 0
+
+    def place(self, x: NDArray[np.float64]) -> None:
+        """Begins a new run there."""
+        self.car.reset(x.tolist())
+        self._run += 1
+
+    def cycles(self, count: int, blind: bool = False) -> None:
+        """Drives; ``blind``: no state arrives."""
+        driver = self._driver
+        for _ in range(count):
+            state = State(
+                self.car.steps, 0, 1, self._run, self.car.time_s, tuple(self.car.x),
+                self.car.u_applied, 0, False, (), False,
+            )  # fmt: skip
+            newest = driver.states.newest
+            if blind and newest is not None:
+                driver.decide(newest, state.time_s)
+            else:
+                driver.observe(state)
+                driver.decide(state, state.time_s)
+            decision = driver.settle()
+            self.car.step((decision.d, decision.delta_rate))
+
+    def under_way(self) -> bool:
+        """Whether the next second brings it on along the line."""
+        self.cycles(1)
+        before_m = self._step.info.s_ref_m
+        self.cycles(SECOND)
+        ahead_m = (self._step.info.s_ref_m - before_m) % self._length_m
+        return UNDER_WAY_M < ahead_m < self._length_m / 2
+
+
+def poses(line: RaceLine, count: int, random: np.random.Generator) -> Iterator[NDArray[np.float64]]:
+    """Beside the line, pointing anywhere; half of them stand, the others roll."""
+    for _ in range(count):
+        i = random.integers(len(line.x_m))
+        psi, n = line.psi_rad[i], random.uniform(-ASIDE_M, ASIDE_M)
+        x, y = line.x_m[i] - n * np.sin(psi), line.y_m[i] + n * np.cos(psi)
+        speed = random.choice([0.0, 0.0, 0.3, 1.0])
+        yield np.array(
+            [x, y, psi + random.uniform(-np.pi, np.pi), speed, 0, 0, random.uniform(-0.35, 0.35)]
+        )
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--track", default=DEFAULT_RACE_TRACK)
+    parser.add_argument("--train-track", default=DEFAULT_TRAINING_TRACK)
+    parser.add_argument("--count", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    console = Console()
+    with stages_on(console) as stages:
+        made = prepare(
+            PreparationSettings(track=given.track, train_track=given.train_track), stages
+        )
+    car, track, line = get_car("orca"), load_track(given.track), read_raceline(made.raceline)
+    step = NativeStep(made.artefact, car, MpcSettings())
+    step.set_weights(read_weights(made.weights))
+    step.set_path(make_path_table(track, line))
+    rig, random = Rig(step, line.length_m), np.random.default_rng(given.seed)
+    stood = 0
+    for x in poses(line, given.count, random):
+        rig.place(x)
+        rig.cycles(LATER)
+        if not rig.under_way():
+            stood += 1
+            console.print(f"not under way from {x.round(3).tolist()}")
+    console.print(f"{track.name}: {stood} of {given.count} poses not under way after 15 s")
+    rig.place(np.array([line.x_m[0], line.y_m[0], line.psi_rad[0], 0.0, 0, 0, 0]))
+    stood = 0
+    for _ in range(given.count):
+        rig.cycles(int(random.integers(20, 200)))
+        rig.cycles(int(random.integers(5, BLIND)), blind=True)
+        rig.cycles(AFTER_LOSS)
+        stood += not rig.under_way()
+    console.print(f"{track.name}: {stood} of {given.count} losses of the state not overcome")
+
+
+if __name__ == "__main__":
+    main()
