@@ -221,8 +221,8 @@ def test_each_cycle_names_its_weights_and_the_inputs_do_not_jump(
             for one in (before, after_it)
         )
         explained.append(from_new - from_old)
-        # Where the machine stalls, states skip, and inputs with them; without a clock the test
-        # before this one is exact.
+        # Where the machine stalls, states skip, and inputs with them; in lockstep
+        # test_inputs_jump_by_what_the_new_model_explains is exact.
         assert stalled or (np.abs(jumps[index] - explained[-1]) <= 2 * calm).all()
     assert len(explained) >= 5
     assert np.abs(explained).max() > 1e-3  # or there is nothing to explain
