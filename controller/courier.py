@@ -271,7 +271,7 @@ class Courier:
         return True
 
     def _begin_check(self, job: Job) -> None:
-        self._job, job.until_s = job, job.answer_s - _KEEP_S
+        self._start(job)
         self._keeper.tell("check", job.data, number=self._port.next_number)
 
     def _begin_rollback(self, request: Request, answer_s: float) -> None:
@@ -281,10 +281,12 @@ class Courier:
         if why_not:
             reply(request, False, why_not, {})
             return
-        self._job = Job(
-            "previous", b"", request, message.text, answer_s=answer_s, until_s=answer_s - _KEEP_S
-        )
+        self._start(Job("previous", b"", request, message.text, answer_s=answer_s))
         self._keeper.tell("previous", number=self._ledger.newest.number)
+
+    def _start(self, job: Job) -> None:
+        """The gatekeeper is asked next; what it takes too long for is answered without it."""
+        self._job, job.until_s = job, job.answer_s - _KEEP_S
 
     def _ask_others(self) -> None:
         if self._job is not None or not self.takeover.gatekeeper:

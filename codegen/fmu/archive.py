@@ -1,7 +1,6 @@
 """Writes the FMU file: descriptions, sources that rebuild it, binaries, documentation."""
 
 import hashlib
-import os
 import tempfile
 import zipfile
 from collections.abc import Iterator, Sequence
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from bayesrace.errors import InputError
+from bayesrace.files import replacing
 from codegen.fmu.definition import FmuDefinition
 from codegen.fmu.description import build_description, icon_description, model_description
 from codegen.fmu.icon import car_icon
@@ -151,18 +151,18 @@ def pack(definition: FmuDefinition, out: Path, platforms: Sequence[str] | None =
 
 
 def _write(out: Path, contents: dict[str, bytes]) -> None:
-    part = out.with_name(f".{out.name}.{os.getpid()}.part")
     first = "modelDescription.xml"
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
+        with (
+            replacing(out) as partial,
+            zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive,
+        ):
             for name in sorted(contents, key=lambda name: (name != first, name)):
                 entry = zipfile.ZipInfo(name, date_time=_DATE)
                 entry.compress_type = zipfile.ZIP_DEFLATED
                 entry.external_attr = 0o100644 << 16
                 entry.create_system = 3
                 archive.writestr(entry, contents[name])
-        part.replace(out)
     except OSError as error:
-        part.unlink(missing_ok=True)
         raise InputError(f"cannot write the FMU to {out}: {error.strerror}") from None

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bayesrace.errors import InputError
+from bayesrace.files import replacing
 from bayesrace.gp.weights import KERNELS, GpWeights, zero_weights
 
 __all__ = ["PATH_FILE", "WEIGHTS_FILE", "exchange_weights", "path_resource", "weights_resource"]
@@ -105,8 +106,6 @@ def exchange_weights(fmu: Path, weights: GpWeights | None, out: Path) -> None:
     capacity = _HEAD.unpack_from(before)[4]
     identity = before[_HEAD.size :][:_IDENTITY_BYTES].rstrip(b"\0").decode("utf-8", "replace")
     data = weights_resource(weights, identity, capacity)
-    partial = out.with_name(f".{out.name}.partial")
-    with zipfile.ZipFile(partial, "w") as archive:
+    with replacing(out) as partial, zipfile.ZipFile(partial, "w") as archive:
         for info, content in members:
             archive.writestr(info, data if info.filename == name else content)
-    partial.replace(out)

@@ -5,7 +5,6 @@ last entry of the index is the one in use.
 """
 
 import hashlib
-import os
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from typing import Annotated, Final, Protocol, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from bayesrace.errors import InputError
+from bayesrace.files import write_whole
 from bayesrace.gp.weights import MAX_BYTES, decode_weights
 
 __all__ = ["HISTORY", "WITHDRAWN", "Accepted", "Store", "digest_of", "trimmed"]
@@ -183,14 +183,7 @@ class Store:
 
     def _write(self, name: str, data: bytes) -> None:
         target = self._folder / name
-        partial = target.with_name(f".{name}.{os.getpid()}")
         try:
-            with partial.open("wb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            partial.replace(target)
+            write_whole(target, data)
         except OSError as error:
-            with suppress(OSError):
-                partial.unlink(missing_ok=True)
             raise InputError(f"store {target}: {error.strerror or error}") from None

@@ -52,14 +52,14 @@ static double bearing_on_line(const br_path *path, const double to[2]) {
     return bearing(here, to);
 }
 
-/* Begins, goes on with and ends a turn. */
+/* Begins, goes on with and ends a turn, of a slow or turning car. */
 static void decide(br_mpc *mpc, const double target[2]) {
     const double *x = mpc->x0, away = bearing(x, target), speed = fabs(x[3]);
     if (mpc->path.speed_limit < STOP_MPS || speed > TOO_FAST_MPS) {
         mpc->turn = 0;
     } else if (mpc->turn) {
         if (remaining(mpc->turn, away) < FACED_RAD) mpc->turn = 0;
-    } else if (speed < SLOW_MPS && fabs(away) > AWAY_RAD &&
+    } else if (fabs(away) > AWAY_RAD &&
                fabs(remainder(away - bearing_on_line(&mpc->path, target), 2 * M_PI)) > AWAY_RAD) {
         mpc->turn = side(x, away, &mpc->reference[0]);
         mpc->warm = 0;
@@ -68,6 +68,7 @@ static void decide(br_mpc *mpc, const double target[2]) {
 
 void br_turn(br_mpc *mpc) {
     double target[2], x[BR_NX], next[BR_NX];
+    if (!mpc->turn && fabs(mpc->x0[3]) >= SLOW_MPS) return;
     br_path_ahead(&mpc->path, AHEAD_M, target);
     decide(mpc, target);
     if (!mpc->turn) return;

@@ -22,7 +22,6 @@ import fcntl
 from collections.abc import Mapping
 from itertools import count
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -157,12 +156,7 @@ class Journal:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def path(self, name: str) -> Path:

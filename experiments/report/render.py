@@ -11,6 +11,7 @@ from typing import Any, Final, NamedTuple
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from bayesrace.files import replacing, write_whole
 from bayesrace.vehicles import get_car
 from experiments.analysis import RaceAnalysis, read_race
 from experiments.notation import UNCERTAIN
@@ -76,9 +77,7 @@ def render_report(run_dir: Path, result: RaceResult, analysis: RaceAnalysis | No
         title=_title(analysis, result),
     )
     path = run_dir / REPORT
-    scratch = path.with_name(path.name + ".part")
-    scratch.write_text(page, encoding="utf-8")
-    scratch.replace(path)
+    write_whole(path, page)
     return path
 
 
@@ -171,9 +170,8 @@ def _figures(analysis: RaceAnalysis, picture: Path) -> dict[str, str]:
     with figure_style():
         laps = laps_on_track(driven, track, line)
         figures["laps"] = inline_svg(laps)
-        scratch = picture.with_name(picture.stem + ".part" + picture.suffix)
-        write_png(laps, scratch)
-        scratch.replace(picture)
+        with replacing(picture) as partial:
+            write_png(laps, partial)
         if driven:
             car = get_car(str(analysis.recording.settings.get("car", "orca")))
             figures["speed"] = inline_svg(speed_figure(driven, track, line))
