@@ -9,10 +9,12 @@ import hashlib
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 from typing import Final
 
+from bayesrace.cache import cache_folder, digest, locked, software
 from bayesrace.cpu import cpu_digest, cpu_identity
 from bayesrace.errors import InputError
 from bayesrace.manifest import ABI, LIBRARY, MANIFEST, Manifest, read_manifest
@@ -20,55 +22,34 @@ from bayesrace.vehicles import get_car
 from codegen.compiler import FLAGS, Compiler, find_compiler
 from codegen.settings import BuildSettings
 
-__all__ = ["NATIVE", "build", "build_hash", "cache_folder", "generate"]
+__all__ = ["NATIVE", "build", "build_hash", "generate"]
 
 _ROOT: Final = Path(__file__).resolve().parents[1]
 
 NATIVE: Final = _ROOT / "controller" / "native"
 """The hand-written part of the step: read as files, not imported."""
 
-_SHAPED_BY: Final = ("codegen", "bayesrace/vehicles", "bayesrace/integrators.py")
-
-
-def cache_folder() -> Path:
-    """$BAYESRACE_CACHE, else the user's cache folder."""
-    chosen = os.environ.get("BAYESRACE_CACHE")
-    if chosen:
-        return Path(chosen)
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "bayesrace"
-
-
-def _source_files() -> Iterator[Path]:
-    yield from sorted(NATIVE.glob("*.[ch]"))
-    for name in _SHAPED_BY:
-        path = _ROOT / name
-        yield from sorted(path.glob("*.py")) if path.is_dir() else [path]
-
-
-def _casadi_version() -> str:
-    from importlib.metadata import version
-
-    return version("casadi")
+_SHAPED_BY: Final = (
+    "controller/native",
+    "codegen",
+    "bayesrace/vehicles",
+    "bayesrace/integrators.py",
+)
 
 
 def build_hash(settings: BuildSettings, compiler: Compiler) -> str:
     """Identity of the artefact: settings, car, every source file, CasADi, compiler, CPU."""
-    digest = hashlib.sha256()
-    parts = [
-        settings.model_dump_json(),
-        get_car(settings.car).model_dump_json(),
-        _casadi_version(),
-        *compiler.command,
-        compiler.version,
-        *FLAGS,
-        cpu_identity(),
-    ]
-    for part in parts:
-        digest.update(part.encode() + b"\0")
-    for path in _source_files():
-        digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
-    return digest.hexdigest()[:16]
+    return digest(
+        [
+            settings.model_dump_json(),
+            get_car(settings.car).model_dump_json(),
+            *compiler.command,
+            compiler.version,
+            *FLAGS,
+            cpu_identity(),
+            *software(_SHAPED_BY, ("casadi",)),
+        ]
+    )
 
 
 def generate(settings: BuildSettings, folder: Path) -> None:
@@ -129,46 +110,47 @@ def build(
     compiler = find_compiler()
     identity = build_hash(settings, compiler)
     target = cache_folder() / f"{settings.model}-{identity}"
-    if (target / MANIFEST).is_file():
+
+    def built() -> tuple[Path, Manifest] | None:
         try:
-            manifest = read_manifest(target)
-        except InputError:  # damaged: build it again
-            shutil.rmtree(target, ignore_errors=True)
-        else:
-            progress(f"{settings.model}: cached")
-            return target, manifest
-    progress(f"{settings.model}: generating and compiling")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".build-") as temporary:
-        folder = Path(temporary) / "artefact"
-        folder.mkdir()
-        _compile(settings, compiler, folder)
-        manifest = Manifest(
-            abi=ABI,
-            model=settings.model,
-            car=settings.car,
-            car_digest=get_car(settings.car).digest(),
-            discretisation=settings.discretisation.identity(settings.model, get_car(settings.car)),
-            horizon=settings.horizon,
-            step_s=settings.discretisation.step_s,
-            gp_capacity=settings.gp_capacity,
-            casadi=_casadi_version(),
-            compiler=compiler.version,
-            cpu=cpu_digest(),
-            flags=list(FLAGS),
-            build_hash=identity,
-            library_sha256=hashlib.sha256((folder / LIBRARY).read_bytes()).hexdigest(),
-        )
-        (folder / MANIFEST).write_text(manifest.model_dump_json(indent=1) + "\n")
-        _install(folder, target)
+            found = target, read_manifest(target)
+        except InputError:  # absent or damaged
+            return None
+        progress(f"{settings.model}: cached")
+        return found
+
+    if found := built():
+        return found
+    with locked(target):
+        if found := built():  # by another process, meanwhile
+            return found
+        progress(f"{settings.model}: generating and compiling")
+        shutil.rmtree(target, ignore_errors=True)
+        with tempfile.TemporaryDirectory(dir=target.parent, prefix=".build-") as temporary:
+            folder = Path(temporary) / "artefact"
+            folder.mkdir()
+            _compile(settings, compiler, folder)
+            manifest = _manifest(settings, compiler, identity, folder)
+            (folder / MANIFEST).write_text(manifest.model_dump_json(indent=1) + "\n")
+            folder.rename(target)
     return target, manifest
 
 
-def _install(folder: Path, target: Path) -> None:
-    """Moves the finished folder into place; a concurrent build of the same hash may win."""
-    try:
-        folder.rename(target)
-    except OSError:
-        if not (target / MANIFEST).is_file():
-            shutil.rmtree(target, ignore_errors=True)
-            folder.rename(target)
+def _manifest(settings: BuildSettings, compiler: Compiler, identity: str, folder: Path) -> Manifest:
+    car = get_car(settings.car)
+    return Manifest(
+        abi=ABI,
+        model=settings.model,
+        car=settings.car,
+        car_digest=car.digest(),
+        discretisation=settings.discretisation.identity(settings.model, car),
+        horizon=settings.horizon,
+        step_s=settings.discretisation.step_s,
+        gp_capacity=settings.gp_capacity,
+        casadi=version("casadi"),
+        compiler=compiler.version,
+        cpu=cpu_digest(),
+        flags=list(FLAGS),
+        build_hash=identity,
+        library_sha256=hashlib.sha256((folder / LIBRARY).read_bytes()).hexdigest(),
+    )

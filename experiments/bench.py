@@ -22,7 +22,7 @@ from rich.table import Table
 from bayesrace.gp.corrected import corrected_function
 from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import PREDICTION, Discretisation
-from bayesrace.raceline import RaceLine, compute_raceline
+from bayesrace.raceline import RaceLine
 from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK, Track, load_track
 from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import dynamic, e_kinematic
@@ -32,9 +32,9 @@ from codegen.settings import BuildSettings
 from controller.native_step import NativeStep, StepStatus
 from controller.path_table import make_path_table
 from controller.settings import MpcSettings
-from experiments.preparation import training_samples
+from experiments.preparation import racing_line, trained_weights, training_samples
 from experiments.progress import Stages
-from learning.training import TrainingSettings, train
+from learning.training import TrainingSettings
 from plant.simulator import Simulator
 
 __all__ = ["BenchResult", "BenchSettings", "run_bench"]
@@ -158,11 +158,11 @@ def run_bench(settings: BenchSettings, stages: Stages) -> BenchResult:
     car = get_car(settings.car)
     with stages.stage("racing lines and training drive"):
         training, course = load_track(settings.train_track), load_track(settings.track)
-        line = compute_raceline(course, car)
+        line = racing_line(course, car)
         samples = training_samples(training, car, _COLLECT_S, settings.seed)
     with stages.stage("train the residual") as stage:
         options = TrainingSettings(capacity=settings.points, seed=settings.seed)
-        weights = train(samples, PREDICTION, options, progress=stage.update)
+        weights = trained_weights(samples, PREDICTION, options, stage.update)
     with stages.stage("build"):
         artefact, manifest = build(BuildSettings(car=car.name))
         horizon = manifest.horizon

@@ -17,7 +17,7 @@ from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights, write_weights
 from bayesrace.log import Recorder
 from bayesrace.messages import EVENT, Event
-from bayesrace.raceline import RaceLine, compute_raceline, write_raceline
+from bayesrace.raceline import RaceLine, write_raceline
 from bayesrace.tracks import Track, load_track, write_track
 from bayesrace.transport import Director, Endpoints, Publisher, free_endpoint, open_session
 from bayesrace.vehicles import CarParameters, get_car
@@ -25,6 +25,7 @@ from codegen.build import build
 from codegen.settings import BuildSettings
 from experiments.collect import collect
 from experiments.drive import RunPlan, execute, wait_for_both
+from experiments.preparation import racing_line, trained_weights
 from experiments.processes import Child, child, endings
 from experiments.progress import Stage, Stages
 from experiments.settings import RaceSettings
@@ -81,8 +82,8 @@ class _Race:
     # Preparation -------------------------------------------------------------------------------
 
     def course(self, track: Track, label: str) -> _Course:
-        """Computes the line, writes track and line into the run directory."""
-        line = compute_raceline(track, self.car, self.settings.raceline)
+        """Computes the line if it is not cached; writes track and line into the run directory."""
+        line = racing_line(track, self.car, self.settings.raceline)
         files = self.out / f"{label}.csv", self.out / f"{label}_raceline.csv"
         write_track(files[0], track)
         write_raceline(files[1], line)
@@ -126,14 +127,28 @@ class _Race:
             None if settings.fmu_map is None else self.out / FILES.fmu_map,
         )
 
-    def train(
-        self, dataset: Dataset, name: str, stage: Stage, initial: GpWeights | None = None
-    ) -> GpWeights:
-        """Weights learned from the samples, written to the run directory."""
-        settings = TrainingSettings(capacity=self.settings.points, seed=self.settings.seed)
-        weights = train(dataset, self.settings.discretisation, settings, initial, stage.update)
-        write_weights(self.out / name, weights)
+    def training_settings(self) -> TrainingSettings:
+        """Of the first training and of the update."""
+        return TrainingSettings(capacity=self.settings.points, seed=self.settings.seed)
+
+    def train(self, samples: Dataset, stage: Stage) -> GpWeights:
+        """Weights learned from the training drive, or taken from the cache."""
+        weights = trained_weights(
+            samples, self.settings.discretisation, self.training_settings(), stage.update
+        )
+        write_weights(self.out / FILES.weights, weights)
         return weights
+
+    def update(self, samples: Dataset, initial: GpWeights, stage: Stage) -> None:
+        """Weights learned from all samples, starting from those before."""
+        weights = train(
+            samples,
+            self.settings.discretisation,
+            self.training_settings(),
+            initial,
+            stage.update,
+        )
+        write_weights(self.out / FILES.weights_updated, weights)
 
     def artefact(self, model: str) -> Path:
         """Builds the controller, or takes it from the cache; its manifest goes into the run."""
@@ -258,7 +273,7 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
     with stages.stage("training drive (pure pursuit)"):
         samples = this.training_drive(training)
     with stages.stage("train the residual") as stage:
-        weights = this.train(samples, FILES.weights, stage)
+        weights = this.train(samples, stage)
     with stages.stage("build the controllers"):
         artefact, perfect = this.artefact("e_kinematic"), this.artefact("dynamic")
     with ExitStack() as stack:
@@ -271,8 +286,7 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
                 driven = paddock.drive("bayesrace")
             with stages.stage("update the residual") as stage:
                 lap = paddock.flushed(driven, this.car, settings.discretisation.step_s)
-                both = concatenate([samples, lap])
-                this.train(both, FILES.weights_updated, stage, weights)
+                this.update(concatenate([samples, lap]), weights, stage)
             with stages.stage("drive BayesRace-updated"):
                 paddock.director.send_weights((out / FILES.weights_updated).read_bytes())
                 paddock.drive("bayesrace-updated")

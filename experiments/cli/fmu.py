@@ -115,7 +115,7 @@ def _controller(
     cpu: str,
 ) -> "FmuDefinition":
     from bayesrace.gp.weights import read_weights
-    from bayesrace.raceline import compute_raceline, read_raceline
+    from bayesrace.raceline import read_raceline
     from bayesrace.tracks import load_track
     from bayesrace.vehicles import get_car
     from codegen.build import build
@@ -125,10 +125,11 @@ def _controller(
     from controller.fallback import FallbackSettings
     from controller.path_table import make_path_table
     from controller.settings import MpcSettings
+    from experiments.preparation import racing_line
 
     parameters = get_car(car)
     course = load_track(track, parameters.width_m)
-    line = compute_raceline(course, parameters) if raceline is None else read_raceline(raceline)
+    line = racing_line(course, parameters) if raceline is None else read_raceline(raceline)
     table = make_path_table(course, line)
     return controller_fmu(
         artefact or build(BuildSettings(car=car))[0],

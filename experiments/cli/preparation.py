@@ -82,13 +82,14 @@ def raceline(
     ] = None,
 ) -> None:
     """Compute the minimum-time racing line of a track."""
-    from bayesrace.raceline import RaceLineSettings, compute_raceline, write_raceline
+    from bayesrace.raceline import RaceLineSettings, write_raceline
     from bayesrace.tracks import load_track
     from bayesrace.vehicles import get_car
+    from experiments.preparation import racing_line
 
     parameters = get_car(car)
     settings = RaceLineSettings(friction=friction, margin_m=margin)
-    line = compute_raceline(load_track(track, parameters.width_m), parameters, settings)
+    line = racing_line(load_track(track, parameters.width_m), parameters, settings)
     write_raceline(out, line)
     typer.echo(f"{line.length_m:.2f} m in {line.lap_time_s:.3f} s: {out}")
 

@@ -1,0 +1,81 @@
+"""Results that take seconds to compute, kept in files named after everything that shaped them.
+
+Built controllers, racing lines and trained weights depend on settings, sources and libraries alone.
+Each is made once and read from then on, by every process of the user on this machine.
+"""
+
+import fcntl
+import hashlib
+import os
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from importlib.metadata import version
+from pathlib import Path
+from typing import Final, TypeVar
+
+from bayesrace.errors import InputError
+from bayesrace.files import replacing
+
+__all__ = ["cache_folder", "digest", "kept", "locked", "software"]
+
+Result = TypeVar("Result")
+
+_ROOT: Final = Path(__file__).resolve().parents[1]
+
+
+def cache_folder() -> Path:
+    """$BAYESRACE_CACHE, else the user's cache folder."""
+    chosen = os.environ.get("BAYESRACE_CACHE")
+    if chosen:
+        return Path(chosen)
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "bayesrace"
+
+
+def digest(parts: Iterable[str | bytes]) -> str:
+    """Sixteen hexadecimal digits that change with any part."""
+    sha = hashlib.sha256()
+    for part in parts:
+        data = part.encode() if isinstance(part, str) else part
+        sha.update(len(data).to_bytes(8, "little") + data)
+    return sha.hexdigest()[:16]
+
+
+def software(sources: Iterable[str], packages: Iterable[str]) -> Iterator[str | bytes]:
+    """Contents of our sources, given as files or as folders of files, and package versions.
+
+    Parts for :func:`digest`: a result is made anew when the code that makes it changes.
+    """
+    for name in sources:
+        path = _ROOT / name
+        for source in sorted(path.iterdir()) if path.is_dir() else [path]:
+            if source.suffix in (".py", ".c", ".h"):
+                yield source.name
+                yield source.read_bytes()
+    yield from (f"{name} {version(name)}" for name in packages)
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Holds a lock named after ``path`` against all other processes and threads that ask for it."""
+    locks = path.parent / ".locks"
+    locks.mkdir(parents=True, exist_ok=True)
+    with (locks / path.name).open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def kept(path: Path, make: Callable[[Path], None], read: Callable[[Path], Result]) -> Result:
+    """What ``read`` returns of the file, after ``make`` has written it if there is no usable one.
+
+    ``read`` raises InputError for a file that is absent or damaged. Of several processes that need
+    the file at once, one makes it and the others wait. Raises what ``make`` raises.
+    """
+    with suppress(InputError):
+        return read(path)
+    with locked(path):
+        with suppress(InputError):
+            return read(path)
+        with replacing(path) as partial:
+            make(partial)
+    return read(path)

@@ -1,0 +1,97 @@
+"""The cache of results that take seconds to compute: made once, never read damaged or half."""
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from bayesrace.cache import digest, kept
+from bayesrace.errors import InputError
+from bayesrace.raceline import RaceLine, RaceLineSettings
+from bayesrace.tracks import load_track
+from bayesrace.vehicles import CarParameters
+from experiments import preparation
+from tests.conftest import offset_line
+
+
+def read(path: Path) -> str:
+    """What these tests take for a usable file."""
+    try:
+        text = path.read_text()
+    except OSError as error:
+        raise InputError(str(error)) from error
+    if not text.startswith("good"):
+        raise InputError("damaged")
+    return text
+
+
+def test_a_result_is_made_once_and_again_if_it_is_damaged(tmp_path: Path) -> None:
+    made = []
+
+    def make(path: Path) -> None:
+        made.append(1)
+        path.write_text(f"good {len(made)}")
+
+    path = tmp_path / "folder" / "result"
+    path.parent.mkdir()
+    assert [kept(path, make, read) for _ in range(2)] == ["good 1"] * 2
+    path.write_text("spoilt")
+    assert kept(path, make, read) == "good 2"
+
+
+def test_of_several_that_need_it_at_once_one_makes_it(tmp_path: Path) -> None:
+    started, made = threading.Barrier(4), []
+
+    def make(path: Path) -> None:
+        made.append(1)
+        path.write_text("good")
+
+    def need(_: int) -> str:
+        started.wait(10)
+        return kept(tmp_path / "result", make, read)
+
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(need, range(4))) == ["good"] * 4
+    assert made == [1]
+
+
+def test_what_fails_leaves_nothing(tmp_path: Path) -> None:
+    def make(path: Path) -> None:
+        path.write_text("good, if it were whole")
+        raise RuntimeError("no convergence")
+
+    with pytest.raises(RuntimeError, match="no convergence"):
+        kept(tmp_path / "result", make, read)
+    assert [path.name for path in tmp_path.iterdir()] == [".locks"]
+
+
+def test_parts_do_not_run_into_each_other() -> None:
+    assert digest(["ab", "c"]) != digest(["a", "bc"])
+
+
+def test_a_racing_line_is_kept_for_its_track_car_and_settings(
+    tmp_path: Path, car: CarParameters, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To the bit, as lockstep runs are compared to the bit."""
+    monkeypatch.setenv("BAYESRACE_CACHE", str(tmp_path))
+    track, computed = load_track("paddock", car.width_m), []
+
+    def compute(*arguments: object) -> RaceLine:
+        computed.append(arguments)
+        return offset_line(track, 0.01 * len(computed), 5.0, 2.5)
+
+    monkeypatch.setattr(preparation, "compute_raceline", compute)
+    first, again = (preparation.racing_line(track, car) for _ in range(2))
+    expected = offset_line(track, 0.01, 5.0, 2.5)
+    for line in (first, again):
+        assert line.track_name == "paddock"
+        for name in ("s_m", "x_m", "y_m", "psi_rad", "kappa_radpm", "vx_mps", "ax_mps2"):
+            assert (getattr(line, name) == getattr(expected, name)).all()
+    preparation.racing_line(track, car, RaceLineSettings(margin_m=0.01))
+    preparation.racing_line(load_track("random:1", car.width_m), car)
+    preparation.racing_line(track, car.model_copy(update={"mass_kg": 0.05}))
+    with monkeypatch.context() as patch:
+        patch.setattr("bayesrace.cache.version", lambda _: "9.9")
+        preparation.racing_line(track, car)
+    assert len(computed) == 5
