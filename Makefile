@@ -1,7 +1,7 @@
 # Needs Python >= 3.11 and nothing else: 'make race', 'make test'.
 #
 #   make race ARGS="--track random:7"     arguments of 'bayesrace race'; 'make race ARGS=--help' lists them
-#   make test ARGS="-m 'not slow'"        arguments of pytest
+#   make test ARGS="-k takeover"          arguments of pytest
 #   make race PYTHON=/opt/python/bin/python3.12
 
 VENV := .venv
@@ -13,15 +13,24 @@ PYTHON ?= $(shell for python in python3 python3.14 python3.13 python3.12 python3
 	$$python -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null \
 	&& echo $$python && break; done)
 
+# Packages are compiled to bytecode by the process that first imports them, not while installing,
+# which would compile ten times as many. That needs bytecode to be written.
+unexport PYTHONDONTWRITEBYTECODE
+
 # Versions as tested. The build backend comes from the same list, so pip must not fetch its own.
-PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+PIP_INSTALL := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check \
+	-c constraints.txt
 PROJECT := --no-build-isolation --editable
 
-.PHONY: help race test lint bench clean
+START := $(shell date +%s)
+TOOK = echo "make $@: $$(($$(date +%s) - $(START))) s"
+
+.PHONY: help race test check rest lint coverage bench clean
 
 help:
 	@echo "make race    set up, and drive the whole comparison; leaves runs/DATE-TIME"
-	@echo "make test    set up for development, and run all tests"
+	@echo "make test    set up for testing, and run what takes minutes"
+	@echo "make check   everything: lint, all tests, coverage; names the tools that it needs"
 	@echo "make lint    ruff, mypy, import contracts"
 	@echo "make bench   time the compiled step beside CasADi + IPOPT"
 	@echo "make clean   remove the virtual environment and all caches in this folder"
@@ -32,14 +41,40 @@ race: $(VENV)/.ready
 bench: $(VENV)/.ready
 	$(BIN)/bayesrace bench $(ARGS)
 
-# First what may share the processors, then the rest, test by test; plain pytest does all of them in
-# one go, for debugging. 5 means that ARGS selects no test of a part.
-SIDE_BY_SIDE := --numprocesses auto --maxprocesses 8 --dist loadfile
-test: $(VENV)/.ready-dev
-	@$(BIN)/python -m pytest --part shared $(SIDE_BY_SIDE) $(ARGS); shared=$$?; \
-	$(BIN)/python -m pytest --part alone $(ARGS); alone=$$?; \
-	for code in $$shared $$alone; do [ $$code -eq 0 ] || [ $$code -eq 5 ] || exit $$code; done; \
-	[ $$shared -ne 5 ] || [ $$alone -ne 5 ] || { echo "ARGS selects no test" >&2; exit 5; }
+# First what computes, one test a processor; then what meets in real time and mostly waits. 5 means
+# that ARGS selects no test of a part. RUNNER: 'make check' measures coverage.
+RUNNER ?= $(BIN)/python -m
+TIER = not check
+PYTEST = $(RUNNER) pytest $(ARGS)
+define RUN_TESTS
+	@$(PYTEST) -m "($(TIER)) and not wall_clock" --numprocesses auto --maxprocesses 8 --dist worksteal; computing=$$?; \
+	$(PYTEST) -m "($(TIER)) and wall_clock" --numprocesses 4 --dist loadfile; meeting=$$?; $(TOOK); \
+	for code in $$computing $$meeting; do [ $$code -eq 0 ] || [ $$code -eq 5 ] || exit $$code; done; \
+	[ $$computing -ne 5 ] || [ $$meeting -ne 5 ] || { echo "ARGS selects no test" >&2; exit 5; }
+endef
+
+test: $(VENV)/.ready-test
+	$(RUN_TESTS)
+
+# What 'make test' runs, then the rest; nothing twice.
+check: RUNNER = $(BIN)/coverage run -m
+check: $(VENV)/.ready-dev
+	@.ci/tools
+	@rm -rf build/coverage
+	@$(MAKE) --no-print-directory lint
+	@$(MAKE) --no-print-directory test RUNNER='$(RUNNER)'
+	@$(MAKE) --no-print-directory rest RUNNER='$(RUNNER)'
+	@$(MAKE) --no-print-directory coverage
+	@$(TOOK)
+
+rest: TIER = check
+rest: $(VENV)/.ready-dev
+	$(RUN_TESTS)
+
+coverage: $(VENV)/.ready-dev
+	$(BIN)/coverage combine --quiet
+	$(BIN)/coverage report --skip-covered
+	$(BIN)/python -m tests.native_coverage
 
 lint: $(VENV)/.ready-dev
 	$(BIN)/ruff check .
@@ -48,7 +83,7 @@ lint: $(VENV)/.ready-dev
 	$(BIN)/lint-imports
 
 clean:
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) build .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(VENV)/.created:
@@ -62,15 +97,20 @@ $(VENV)/.created:
 	@touch $@
 
 # A machine without a C compiler gets one from PyPI; codegen finds it by itself.
-$(VENV)/.ready: $(VENV)/.created pyproject.toml constraints.txt
-	$(PIP_INSTALL) hatchling editables
-	@extra='[zig]'; for compiler in "$${CC-}" cc gcc clang; do \
-		[ -n "$$compiler" ] && command -v $$compiler >/dev/null && extra= && break; done; \
-	[ -z "$$extra" ] || echo "no C compiler here: installing ziglang"; \
-	set -x; $(PIP_INSTALL) $(PROJECT) ".$$extra"
+ZIG := $(shell for compiler in "$${CC-}" cc gcc clang; do \
+	[ -n "$$compiler" ] && command -v $$compiler >/dev/null && exit; done; echo ,zig)
+INSTALL = $(PIP_INSTALL) hatchling editables && $(PIP_INSTALL) $(PROJECT)
+SHAPED_BY := $(VENV)/.created pyproject.toml constraints.txt
+
+$(VENV)/.ready: $(SHAPED_BY)
+	$(INSTALL) ".$(ZIG:,%=[%])"
 	@touch $@
 
-# The tests build with ziglang as well as with the system's compiler.
-$(VENV)/.ready-dev: $(VENV)/.ready
-	$(PIP_INSTALL) $(PROJECT) '.[dev,zig]'
-	@touch $@
+$(VENV)/.ready-test: $(SHAPED_BY)
+	$(INSTALL) ".[test$(ZIG)]"
+	@touch $@ $(VENV)/.ready
+
+# ziglang also where there is a compiler: the FMUs for other platforms are built with it.
+$(VENV)/.ready-dev: $(SHAPED_BY)
+	$(INSTALL) ".[dev]"
+	@touch $@ $(VENV)/.ready-test $(VENV)/.ready

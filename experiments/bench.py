@@ -162,7 +162,7 @@ def run_bench(settings: BenchSettings, stages: Stages) -> BenchResult:
         samples = training_samples(training, car, _COLLECT_S, settings.seed)
     with stages.stage("train the residual") as stage:
         options = TrainingSettings(capacity=settings.points, seed=settings.seed)
-        weights = trained_weights(samples, PREDICTION, options, stage.update)
+        weights = trained_weights(samples, PREDICTION, options, progress=stage.update)
     with stages.stage("build"):
         artefact, manifest = build(BuildSettings(car=car.name))
         horizon = manifest.horizon

@@ -96,10 +96,11 @@ def trained_weights(
     samples: Dataset,
     discretisation: Discretisation,
     settings: TrainingSettings,
+    initial: GpWeights | None = None,
     progress: Progress | None = None,
 ) -> GpWeights:
-    """:func:`train`, or what it returned for the same samples and settings before."""
-    return read_weights(_weights_file(samples, discretisation, settings, progress))
+    """:func:`train`, or what it returned for the same samples, settings and beginning before."""
+    return read_weights(_weights_file(samples, discretisation, settings, initial, progress))
 
 
 def training_samples(
@@ -139,7 +140,7 @@ def prepare(
             samples = training_samples(training, car, settings.collect_s, settings.seed)
         with stages.stage("train the residual") as stage:
             options = TrainingSettings(capacity=settings.points, seed=settings.seed)
-            weights = _weights_file(samples, PREDICTION, options, stage.update)
+            weights = _weights_file(samples, PREDICTION, options, None, stage.update)
     if artefact is None:
         with stages.stage("build the controller"):
             artefact, _ = build(BuildSettings(car=car.name))
@@ -164,6 +165,7 @@ def _weights_file(
     samples: Dataset,
     discretisation: Discretisation,
     settings: TrainingSettings,
+    initial: GpWeights | None,
     progress: Progress | None,
 ) -> Path:
     identity = digest(
@@ -171,13 +173,14 @@ def _weights_file(
             samples.digest(),
             discretisation.model_dump_json(),
             settings.model_dump_json(),
+            "" if initial is None else initial.version,  # of its content
             *software(_WEIGHTS_SOURCES, ("numpy", "scipy", "scikit-learn")),
         ]
     )
     path = cache_folder() / f"weights-{identity}.bin"
 
     def make(partial: Path) -> None:
-        weights = train(samples, discretisation, settings, progress=progress)
+        weights = train(samples, discretisation, settings, initial, progress)
         write_weights(partial, weights)
 
     kept(path, make, read_weights)

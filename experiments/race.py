@@ -31,7 +31,7 @@ from experiments.progress import Stage, Stages
 from experiments.settings import RaceSettings
 from learning.dataset import Dataset, concatenate
 from learning.logs import dataset_from_log
-from learning.training import TrainingSettings, train
+from learning.training import TrainingSettings
 from plant.fmu.faults import FmuFault
 from plant.simulator import PLANT
 from plant.vehicle import Vehicle, open_vehicle
@@ -127,28 +127,16 @@ class _Race:
             None if settings.fmu_map is None else self.out / FILES.fmu_map,
         )
 
-    def training_settings(self) -> TrainingSettings:
-        """Of the first training and of the update."""
-        return TrainingSettings(capacity=self.settings.points, seed=self.settings.seed)
-
-    def train(self, samples: Dataset, stage: Stage) -> GpWeights:
-        """Weights learned from the training drive, or taken from the cache."""
+    def train(
+        self, samples: Dataset, name: str, stage: Stage, initial: GpWeights | None = None
+    ) -> GpWeights:
+        """Weights learned from the samples, or taken from the cache; in the run directory, too."""
+        settings = TrainingSettings(capacity=self.settings.points, seed=self.settings.seed)
         weights = trained_weights(
-            samples, self.settings.discretisation, self.training_settings(), stage.update
+            samples, self.settings.discretisation, settings, initial, stage.update
         )
-        write_weights(self.out / FILES.weights, weights)
+        write_weights(self.out / name, weights)
         return weights
-
-    def update(self, samples: Dataset, initial: GpWeights, stage: Stage) -> None:
-        """Weights learned from all samples, starting from those before."""
-        weights = train(
-            samples,
-            self.settings.discretisation,
-            self.training_settings(),
-            initial,
-            stage.update,
-        )
-        write_weights(self.out / FILES.weights_updated, weights)
 
     def artefact(self, model: str) -> Path:
         """Builds the controller, or takes it from the cache; its manifest goes into the run."""
@@ -273,7 +261,7 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
     with stages.stage("training drive (pure pursuit)"):
         samples = this.training_drive(training)
     with stages.stage("train the residual") as stage:
-        weights = this.train(samples, stage)
+        weights = this.train(samples, FILES.weights, stage)
     with stages.stage("build the controllers"):
         artefact, perfect = this.artefact("e_kinematic"), this.artefact("dynamic")
     with ExitStack() as stack:
@@ -286,7 +274,8 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
                 driven = paddock.drive("bayesrace")
             with stages.stage("update the residual") as stage:
                 lap = paddock.flushed(driven, this.car, settings.discretisation.step_s)
-                this.update(concatenate([samples, lap]), weights, stage)
+                both = concatenate([samples, lap])
+                this.train(both, FILES.weights_updated, stage, weights)
             with stages.stage("drive BayesRace-updated"):
                 paddock.director.send_weights((out / FILES.weights_updated).read_bytes())
                 paddock.drive("bayesrace-updated")

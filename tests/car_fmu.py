@@ -1,30 +1,57 @@
-"""The built-in car as an FMU of each version and kind, made once for all tests of a session."""
+"""The built-in car as an FMU of each version and kind, made once for all tests."""
 
-import tempfile
+from functools import cache
 from pathlib import Path
-from typing import Literal
+from typing import Final, Literal
 
 from fmpy import extract
 
+from bayesrace.cache import software
+from bayesrace.cpu import cpu_identity
 from bayesrace.vehicles import get_car
+from codegen.compiler import FLAGS, find_compiler
 from codegen.fmu import pack
 from plant.fmu.export import car_fmu
+from tests.shared import shared_folder
 
 __all__ = ["packed_car", "unpacked_car"]
 
-_FOLDER = tempfile.TemporaryDirectory(prefix="car-fmu-")
+_SOURCES: Final = (
+    "bayesrace",
+    "bayesrace/vehicles",
+    "codegen",
+    "codegen/fmu",
+    "codegen/fmu/native",
+    "plant",
+    "plant/fmu",
+    "plant/fmu/native",
+)
+
+Version = Literal[2, 3]
+Kind = Literal["cs", "me"]
 
 
-def packed_car(version: Literal[2, 3] = 3, kind: Literal["cs", "me"] = "cs") -> Path:
-    """The FMU for this platform; the file lives as long as this process."""
-    out = Path(_FOLDER.name) / f"car{version}-{kind}.fmu"
-    return out if out.exists() else pack(car_fmu(get_car("orca"), version, kind), out)
+def packed_car(version: Version = 3, kind: Kind = "cs") -> Path:
+    """The FMU for this platform."""
+    return _folder(version, kind, None) / "car.fmu"
 
 
-def unpacked_car(version: Literal[2, 3] = 3, kind: Literal["cs", "me"] = "cs") -> Path:
-    """The same as a folder."""
-    fmu = packed_car(version, kind)
-    folder = fmu.with_suffix("")
-    if not folder.exists():
-        extract(str(fmu), unzipdir=str(folder))
-    return folder
+def unpacked_car(
+    version: Version = 3, kind: Kind = "cs", platforms: tuple[str, ...] | None = None
+) -> Path:
+    """The same as a folder named after the version; ``platforms``: others than this one."""
+    return _folder(version, kind, platforms) / str(version)
+
+
+@cache
+def _folder(version: Version, kind: Kind, platforms: tuple[str, ...] | None) -> Path:
+    compiler = find_compiler()
+    made_by = [*compiler.command, compiler.version, *FLAGS, cpu_identity()]
+    packages = ("casadi", "fmpy", *(("ziglang",) if platforms else ()))
+    parts = [str(version), kind, str(platforms), *made_by, *software(_SOURCES, packages)]
+
+    def make(folder: Path) -> None:
+        fmu = pack(car_fmu(get_car("orca"), version, kind), folder / "car.fmu", platforms)
+        extract(str(fmu), unzipdir=str(folder / str(version)))
+
+    return shared_folder("car-fmu", parts, make)

@@ -24,6 +24,9 @@ from controller.native_library import Parameters
 from controller.native_step import NativeStep
 from controller.path_table import PathTable, make_path_table
 from controller.settings import MpcSettings
+from tests.command_line import cli
+
+__all__ = ["cli"]  # a fixture for all tests
 
 Floats = NDArray[np.float64]
 
@@ -52,24 +55,6 @@ TRUTH = Discretisation(scheme="rk4", step_s=0.02, substeps=20)
 
 NOISE = 0.02
 LENGTH_SCALES = np.array([2.0, 1.0, 10.0, 0.5, 1.5, 10.0])
-
-
-def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption(
-        "--part",
-        choices=("shared", "alone"),
-        help="only the tests that may run side by side, or only those marked 'alone'",
-    )
-
-
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    part = config.getoption("--part")
-    if part is None:
-        return
-    alone = [item for item in items if item.get_closest_marker("alone")]
-    shared = [item for item in items if not item.get_closest_marker("alone")]
-    items[:], others = (alone, shared) if part == "alone" else (shared, alone)
-    config.hook.pytest_deselected(items=others)
 
 
 def discrete(

@@ -3,7 +3,6 @@
 import inspect
 import re
 import subprocess
-import tempfile
 import zipfile
 from enum import IntEnum
 from functools import cache
@@ -17,6 +16,7 @@ from fmpy.fmi3 import FMU3Slave
 from bayesrace.vehicles.models import STATES
 from codegen.compiler import find_compiler
 from plant.fmu.host import FmuHost
+from tests.shared import shared_folder
 
 __all__ = ["PATIENCE_S", "STATES", "Mode", "faulty_fmu", "faulty_library", "worker_of"]
 
@@ -24,8 +24,6 @@ SOURCE: Final = Path(__file__).parent / "native" / "faulty_fmu.c"
 HEADERS: Final = Path(fmpy.__file__).parent / "c-code"
 PATIENCE_S: Final = 20.0
 """For what takes a second at most on an idle machine."""
-
-_FOLDER: Final = tempfile.TemporaryDirectory(prefix="faulty-fmu-")
 
 Mode = IntEnum(
     "Mode",
@@ -38,9 +36,8 @@ Mode = IntEnum(
 
 @cache
 def faulty_library(version: int) -> Path:
-    """The library, compiled once a session; functions that the C file lacks answer "error"."""
-    out = Path(_FOLDER.name) / f"faulty{version}.so"
-    source = SOURCE.read_text()
+    """The library; functions that the C file lacks answer "error"."""
+    source, compiler = SOURCE.read_text(), find_compiler()
     slave = FMU3Slave if version == 3 else FMU2Slave
     called = [name for name, _ in inspect.getmembers(slave) if name.startswith(f"fmi{version}")]
     types = re.findall(r"^ACCESS\((\w+),", source, re.MULTILINE)
@@ -52,14 +49,15 @@ def faulty_library(version: int) -> Path:
         for name in called
         if name not in there
     )
-    text = out.with_suffix(".c")
-    text.write_text('#include "' + str(SOURCE) + f'"\n{stubs}')
-    command = [
-        *find_compiler().command, "-shared", "-fPIC", "-O1", f"-DFMI={version}", f"-I{HEADERS}",
-        str(text), "-lm", "-o", str(out),
-    ]  # fmt: skip
-    subprocess.run(command, check=True, capture_output=True, timeout=120)
-    return out
+    line = [*compiler.command, "-shared", "-fPIC", "-O1", f"-DFMI={version}", f"-I{HEADERS}"]
+
+    def make(folder: Path) -> None:
+        text = folder / "faulty.c"
+        text.write_text(source + stubs)
+        command = [*line, str(text), "-lm", "-o", str(folder / "faulty.so")]
+        subprocess.run(command, check=True, capture_output=True, timeout=120)
+
+    return shared_folder("faulty-fmu", [*line, compiler.version, source, stubs], make) / "faulty.so"
 
 
 def faulty_fmu(

@@ -1,11 +1,9 @@
 """C programs around the native step, compiled by gcc: under sanitizers, or with any other flags."""
 
-import atexit
 import os
 import re
 import shutil
 import subprocess
-import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -14,8 +12,10 @@ from typing import Final
 
 import pytest
 
+from bayesrace.cpu import cpu_identity
 from codegen.build import casadi_includes
 from codegen.compiler import FLAGS
+from tests.shared import shared_folder
 
 __all__ = [
     "OPTIMISED",
@@ -67,26 +67,23 @@ def gcc(*words: Word, cwd: Path | None = None) -> str:
 
 
 @cache
-def _folder() -> Path:
-    folder = tempfile.mkdtemp(prefix="native-tests-")
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return Path(folder)
-
-
-@cache
 def artefact_objects(artefact: Path, flags: tuple[str, ...]) -> tuple[Path, ...]:
-    """The artefact's own sources as object files, compiled with these flags once a session."""
-    folder = Path(tempfile.mkdtemp(dir=_folder()))
+    """The artefact's own sources as object files, compiled with these flags."""
+    sources = sorted(artefact.glob("*.c"))
     # -isystem: the warnings are for our own code
     line: list[Word] = [*flags, f"-I{artefact}", "-isystem", casadi_includes()[0], "-c"]
 
-    def compiled(source: Path) -> Path:
-        out = folder / f"{source.stem}.o"
-        gcc(*line, source, "-o", out)
-        return out
+    def make(folder: Path) -> None:
+        def compiled(source: Path) -> None:
+            gcc(*line, source, "-o", folder / f"{source.stem}.o")
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return tuple(pool.map(compiled, sorted(artefact.glob("*.c"))))
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            list(pool.map(compiled, sources))
+
+    parts: list[str | bytes] = [*flags, gcc("-v"), cpu_identity()]
+    parts += [path.read_bytes() for path in [*sources, *sorted(artefact.glob("*.h"))]]
+    folder = shared_folder("objects", parts, make)
+    return tuple(folder / f"{source.stem}.o" for source in sources)
 
 
 def native_program(

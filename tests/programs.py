@@ -46,11 +46,11 @@ def environment() -> dict[str, str]:
 
 def start(*arguments: str | Path, **popen: Any) -> subprocess.Popen[str]:
     """Starts ``bayesrace`` with these arguments, in the checkout, outputs captured as text."""
-    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **popen}
-    command = [*COMMAND, *map(str, arguments)]
-    return subprocess.Popen(
-        command, stdin=subprocess.DEVNULL, text=True, cwd=ROOT, env=environment(), **pipes
-    )
+    options: dict[str, Any] = {
+        "stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE,
+        "cwd": ROOT, "env": environment(), **popen,
+    }  # fmt: skip
+    return subprocess.Popen([*COMMAND, *map(str, arguments)], text=True, **options)
 
 
 def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
@@ -120,9 +120,9 @@ class Race:
     process: subprocess.CompletedProcess[str]
 
     @classmethod
-    def running(cls, out: Path, *arguments: str | Path) -> Callable[[], "Race"]:
-        """Starts a race; call the result to wait for its end."""
-        process = start("race", "--out", out, *arguments)
+    def running(cls, out: Path, *arguments: str | Path, **variables: str) -> Callable[[], "Race"]:
+        """Starts a race, with these variables in its environment; call the result to wait."""
+        process = start("race", "--out", out, *arguments, env={**environment(), **variables})
 
         def wait() -> Race:
             done = finish(process)

@@ -7,7 +7,7 @@ import pytest
 
 from tests.programs import run
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.check
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +21,6 @@ def numbers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return content
 
 
-@pytest.mark.slow
 def test_bench_writes_the_promised_form(numbers: dict[str, Any]) -> None:
     for solver in ("step_us", "ipopt_us"):
         times = numbers[solver]
@@ -39,7 +38,6 @@ def test_bench_writes_the_promised_form(numbers: dict[str, Any]) -> None:
     assert (numbers["problems"], numbers["peers"]) == (60, 2)
 
 
-@pytest.mark.slow
 def test_one_step_is_close_to_the_converged_solution(numbers: dict[str, Any]) -> None:
     """Bounds are those of the honest one-iteration peer, acados' exact RTI; no time is judged."""
     assert numbers["unconverged"] <= 3

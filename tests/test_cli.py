@@ -1,13 +1,11 @@
 """The command line: help that reads well, errors in one line, and the chain of files by hand."""
 
-import logging
 import os
 import re
 import signal
 import socket
 import subprocess
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +19,9 @@ from bayesrace.raceline.line import write_raceline
 from bayesrace.tracks import write_track
 from bayesrace.transport import Director, free_endpoint
 from bayesrace.vehicles import get_car
-from experiments.cli import main
+from tests.command_line import Cli, refused
 from tests.conftest import Circuit
-from tests.programs import finish, run, start, until
+from tests.programs import finish, peanut, run, start, until
 
 SUBCOMMANDS = (
     "race", "drive", "report", "bench", "tracks", "raceline", "collect", "train", "build",
@@ -31,47 +29,6 @@ SUBCOMMANDS = (
     "fmu export", "fmu inspect", "fmu weights",
     "validate", "publish", "rollback", "learn",
 )  # fmt: skip
-
-
-class Outcome:
-    """Exit code and what was said."""
-
-    def __init__(self, code: int, out: str, err: str) -> None:
-        self.code, self.out, self.err = code, out, err
-
-
-Cli = Callable[..., Outcome]
-
-
-@pytest.fixture
-def cli(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path) -> Cli:
-    """Calls the program's entry point here, in an empty folder, which is faster than a process."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "120")
-    monkeypatch.setenv("NO_COLOR", "1")
-    monkeypatch.setattr(logging, "basicConfig", lambda **_: None)
-
-    def call(*arguments: str | Path) -> Outcome:
-        monkeypatch.setattr(sys, "argv", ["bayesrace", *map(str, arguments)])
-        capfd.readouterr()
-        with pytest.raises(SystemExit) as end:
-            main()
-        code = end.value.code
-        assert code is None or isinstance(code, int)
-        out, err = capfd.readouterr()
-        return Outcome(code or 0, out, err)
-
-    return call
-
-
-def refused(outcome: Outcome, *words: str) -> None:
-    """Bad input: code 2 and one line on stderr that names the thing and the remedy."""
-    assert outcome.code == 2, outcome.err
-    assert outcome.err.startswith("bayesrace: ")
-    assert len(outcome.err.strip().splitlines()) == 1, outcome.err
-    assert "Traceback" not in outcome.err + outcome.out
-    for word in words:
-        assert word in outcome.err, outcome.err
 
 
 @pytest.fixture
@@ -304,17 +261,17 @@ def ended() -> Iterator[list[subprocess.Popen[str]]]:
         process.communicate()
 
 
-@pytest.mark.slow
-@pytest.mark.alone
+@pytest.mark.check
 def test_the_chain_by_files_in_four_terminals(
     tmp_path: Path, ended: list[subprocess.Popen[str]]
 ) -> None:
     track, line, log = (tmp_path / name for name in ("track.csv", "line.csv", "collect.mcap"))
     weights, artefact, drive_log = (tmp_path / name for name in ("w.bin", "mpc", "drive.mcap"))
-    assert "paddock" in _succeed("tracks", "paddock", "--out", track)
+    quick = ("--kernel", "rbf", "--restarts", "0")
+    assert "peanut" in _succeed("tracks", peanut(tmp_path / "peanut.csv"), "--out", track)
     assert str(line) in _succeed("raceline", track, "--out", line)
     assert "600 samples" in _succeed("collect", "--track", track, "--raceline", line, "--out", log)
-    assert "samples" in _succeed("train", log, "--out", weights, "--points", "100")
+    assert "samples" in _succeed("train", log, "--out", weights, "--points", "60", *quick)
     assert _succeed("build", "--out", artefact).strip() == str(artefact)
 
     plant_at, controller_at = free_endpoint(), free_endpoint()
@@ -337,7 +294,7 @@ def test_the_chain_by_files_in_four_terminals(
     states, actuations = reader.select(STATE), reader.select(ACTUATION)
     assert not reader.truncated
     assert reader.refused == 0
-    assert len(states) > 200
+    assert len(states) > 100
     assert {state.run for state in states} == {2}
     # the last state of a run needs no answer
     assert states[-1].final
@@ -347,11 +304,12 @@ def test_the_chain_by_files_in_four_terminals(
     kinds = [event.kind for event in reader.select(EVENT)]
     assert kinds == ["run", "run_started", "run_ended"]
     # what was driven can be learned from
-    assert "samples" in _succeed("train", log, drive_log, "--out", weights, "--points", "60")
+    assert "samples" in _succeed(
+        "train", log, drive_log, "--out", weights, "--points", "60", *quick
+    )
 
 
-@pytest.mark.slow
-@pytest.mark.alone
+@pytest.mark.check
 def test_drive_says_when_the_controller_is_lost(
     tmp_path: Path,
     course: tuple[str | Path, ...],

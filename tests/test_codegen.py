@@ -241,6 +241,7 @@ def test_a_folder_that_is_no_controller_and_another_car_are_refused(
         load(artefact, car.model_copy(update={"name": "other"}))
 
 
+@pytest.mark.check
 def test_concurrent_builds_of_the_same_hash_all_succeed(cache: Path) -> None:
     with ThreadPoolExecutor(3) as pool:
         results = list(pool.map(lambda _: build(SMALL), range(3)))
@@ -274,6 +275,7 @@ def test_the_library_cannot_print_exit_or_start_threads(kinematic_artefact: Path
     assert not [name for name in names if any(word in name for word in unwanted)]
 
 
+@pytest.mark.check
 def test_ziglang_builds_the_controller_where_there_is_no_compiler(
     cache: Path, monkeypatch: pytest.MonkeyPatch, car: CarParameters
 ) -> None:

@@ -58,6 +58,7 @@ def test_a_plain_master_drives_the_lockstep_run(
     car.close()
 
 
+@pytest.mark.check
 def test_a_portable_binary_drives_the_same_lap_but_for_rounding(
     exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit
 ) -> None:

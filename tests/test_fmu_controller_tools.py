@@ -76,7 +76,7 @@ def test_a_tool_can_roll_back(
     free(state)
 
 
-@pytest.mark.slow
+@pytest.mark.check
 def test_no_sanitizer_finds_anything_and_c_sees_what_the_master_sees(
     exported: Exported,
     lockstep: Callable[..., Lockstep],

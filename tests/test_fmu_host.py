@@ -15,7 +15,7 @@ from plant.fmu.host import FmuHost
 from tests.faulty_fmu import PATIENCE_S, STATES, Mode, faulty_fmu, faulty_library, worker_of
 from tests.programs import until
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.wall_clock
 
 COMMANDS = ("d", "delta_rate")
 

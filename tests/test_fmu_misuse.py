@@ -231,6 +231,7 @@ def test_reset_is_as_new(version: Version) -> None:
     one.close()
 
 
+@pytest.mark.check
 @pytest.mark.parametrize(("version", "kind"), [(2, "cs"), (3, "cs"), (3, "me")])
 def test_misuse_under_sanitizers(
     version: Version, kind: Kind, car: CarParameters, tmp_path: Path

@@ -116,6 +116,7 @@ def ocp(truth: Model, car: CarParameters) -> RacingOcp:
     return RacingOcp(PERFECT.discretise(truth), car, 20, options=IPOPT)
 
 
+@pytest.mark.check
 def test_best_case_with_the_fmu_has_the_solution_of_the_built_in_equations(
     ocp: RacingOcp, best_case: NativeStep, recorded: list[Problem]
 ) -> None:
@@ -138,7 +139,7 @@ def test_best_case_with_the_fmu_has_the_solution_of_the_built_in_equations(
     assert compared >= 6
 
 
-@pytest.mark.slow
+@pytest.mark.check
 def test_it_drives(
     ocp: RacingOcp, best_case: NativeStep, truth: Model, car: CarParameters, circuit: Circuit
 ) -> None:

@@ -29,7 +29,7 @@ from tests.faulty_fmu import Mode, faulty_fmu, faulty_library
 from tests.programs import until
 from tests.pursuit_rig import PATIENCE_S, PLANT, Rig, Spectator, request, running_rig, start
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.wall_clock
 
 AT_S = 0.4
 """When the faults strike."""
@@ -88,8 +88,19 @@ def with_fault(mode: Mode) -> dict[str, Any]:
 
 @pytest.mark.parametrize(
     ("mode", "lockstep"),
-    [(mode, True) for mode in FAULTS]
-    + [(mode, False) for mode in (Mode.ABORT, Mode.HANG, Mode.NOT_A_NUMBER)],
+    [
+        (Mode.ABORT, True),
+        (Mode.HANG, False),
+        *(
+            pytest.param(mode, True, marks=pytest.mark.check)
+            for mode in FAULTS
+            if mode is not Mode.ABORT
+        ),
+        *(
+            pytest.param(mode, False, marks=pytest.mark.check)
+            for mode in (Mode.ABORT, Mode.NOT_A_NUMBER)
+        ),
+    ],
 )
 def test_a_fault_ends_the_run_and_nothing_else(
     mode: Mode, lockstep: bool, request: pytest.FixtureRequest, tmp_path: Path
@@ -162,7 +173,13 @@ def workers_of(plant: int) -> dict[int, Path]:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="finds processes in /proc")
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize(
+    "how",
+    [
+        signal.SIGKILL,
+        *(pytest.param(how, marks=pytest.mark.check) for how in (signal.SIGTERM, signal.SIGINT)),
+    ],
+)
 def test_nothing_outlives_the_plant(how: signal.Signals, car_fmu: Path, tmp_path: Path) -> None:
     """However it ends, and were the FMU hanging at that moment."""
     at_plant = free_endpoint()

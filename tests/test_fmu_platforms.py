@@ -15,12 +15,11 @@ from fmpy import extract
 
 from bayesrace.errors import InputError
 from bayesrace.vehicles import CarParameters
-from bayesrace.vehicles.parameters import get_car
 from codegen.compiler import find_compiler
 from codegen.fmu import host_platform, pack
-from codegen.fmu.platforms import get_platform
+from codegen.fmu.platforms import FLAGS, get_platform
 from plant.fmu.export import car_fmu
-from tests.car_fmu import packed_car
+from tests.car_fmu import packed_car, unpacked_car
 from tests.fmu_exports import Version, built_in, commands, driven, slave
 from tests.fmu_master import Slave
 
@@ -121,13 +120,9 @@ def pe_exports(data: bytes) -> set[str]:
 
 
 @pytest.fixture(scope="module", params=[2, 3])
-def everywhere(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def everywhere(request: pytest.FixtureRequest) -> Path:
     """The car's FMU with binaries for all platforms that can be built for, unpacked."""
-    version: Version = request.param
-    folder = tmp_path_factory.mktemp("everywhere")
-    fmu = pack(car_fmu(get_car("orca"), version), folder / "all.fmu", list(EVERYWHERE))
-    extract(str(fmu), unzipdir=str(folder / str(version)))
-    return folder / str(version)
+    return unpacked_car(request.param, platforms=EVERYWHERE)
 
 
 def binary(unpacked: Path, name: str) -> Path:
@@ -137,7 +132,7 @@ def binary(unpacked: Path, name: str) -> Path:
 
 
 @zig
-@pytest.mark.slow
+@pytest.mark.check
 @pytest.mark.timeout(1500)  # ziglang builds a C library per target the first time
 def test_cross_compiled_binaries_are_for_their_platform_and_offer_fmi(
     everywhere: Path, tmp_path: Path
@@ -178,7 +173,8 @@ def drive_program(platform: str, sources: Path, program: Path) -> None:
     """tests/native/fmi3_drive.c for a platform."""
     target = get_platform(platform).zig
     assert target is not None
-    line = [sys.executable, "-m", "ziglang", "cc", "-target", target, "-s", "-g0", "-O2"]
+    # The FMUs' own flags: ziglang builds the target's C library for each combination of some.
+    line = [sys.executable, "-m", "ziglang", "cc", "-target", target, "-s", "-g0", *FLAGS]
     line += [
         f"-I{sources}",
         str(HERE / "native" / "fmi3_drive.c"),
@@ -189,7 +185,7 @@ def drive_program(platform: str, sources: Path, program: Path) -> None:
 
 @zig
 @linux
-@pytest.mark.slow
+@pytest.mark.check
 @pytest.mark.timeout(1500)
 @pytest.mark.parametrize("everywhere", [3], indirect=True)
 @pytest.mark.parametrize("platform", ["aarch64-linux", WINDOWS])

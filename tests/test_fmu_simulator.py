@@ -17,8 +17,6 @@ from plant.fmu.simulator import FmuSimulator, communication_step, open_fmu
 from tests.faulty_fmu import PATIENCE_S, STATES, Mode, faulty_fmu, faulty_library, worker_of
 from tests.programs import until
 
-pytestmark = pytest.mark.alone
-
 Array = npt.NDArray[np.float64]
 
 COMMANDS = ("d", "delta_rate")

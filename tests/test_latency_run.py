@@ -22,9 +22,10 @@ from experiments.latency.histograms import new_histogram
 from experiments.latency.legs import LEGS
 from experiments.preparation import PreparationSettings, Prepared, prepare
 from experiments.progress import stages_on
+from tests.command_line import Cli, refused
 from tests.programs import COMMAND, ROOT, environment, finish, leftovers, peanut, run, start, until
 
-pytestmark = [pytest.mark.slow, pytest.mark.alone]
+pytestmark = pytest.mark.wall_clock
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +64,7 @@ def loaded(files: Prepared, tmp_path_factory: pytest.TempPathFactory) -> Run:
     """A short run with a busy process beside."""
     out = tmp_path_factory.mktemp("latency")
     process = start(
-        "latency", *given(files), "--duration", "4", "--load", "1", "--out", out / "run",
+        "latency", *given(files), "--duration", "3", "--load", "1", "--out", out / "run",
         "--json", out / "copy.json",
     )  # fmt: skip
     done = finish(process)
@@ -152,6 +153,7 @@ def _observing(out: Path) -> bool:
     return log.is_file()
 
 
+@pytest.mark.check
 def test_killed_controller_ends_it_with_a_reason_and_a_report(
     files: Prepared, tmp_path: Path
 ) -> None:
@@ -169,6 +171,7 @@ def test_killed_controller_ends_it_with_a_reason_and_a_report(
     assert not leftovers(process.pid)
 
 
+@pytest.mark.check
 def test_interrupt_leaves_a_report_and_no_process(files: Prepared, tmp_path: Path) -> None:
     out = tmp_path / "run"
     process = start("latency", *given(files), "--duration", "60", "--load", "1", "--out", out)
@@ -181,6 +184,7 @@ def test_interrupt_leaves_a_report_and_no_process(files: Prepared, tmp_path: Pat
     until(lambda: not _with_parent(process.pid), "children ended", 20.0)
 
 
+@pytest.mark.check
 def test_killed_measurement_takes_its_children_along(files: Prepared, tmp_path: Path) -> None:
     """The busy processes above all: nobody would look for them."""
     out = tmp_path / "run"
@@ -202,11 +206,8 @@ def test_killed_measurement_takes_its_children_along(files: Prepared, tmp_path: 
         (["--track", "nowhere"], "nowhere"),
     ],
 )
-def test_bad_options_get_one_line(arguments: list[str], words: str, tmp_path: Path) -> None:
-    done = run("latency", "--out", tmp_path / "run", *arguments)
-    assert done.returncode == 2
-    assert words in done.stderr
-    assert "Traceback" not in done.stderr
+def test_bad_options_get_one_line(cli: Cli, arguments: list[str], words: str) -> None:
+    refused(cli("latency", "--out", "run", *arguments), words)
 
 
 # Attached --------------------------------------------------------------------------------------
@@ -253,12 +254,13 @@ def _driving(files: Prepared, track: Track, prefix: list[str]) -> Iterator[list[
 
 def _attached(endpoints: list[str], out: Path) -> dict[str, Any]:
     ends = [word for endpoint in endpoints for word in ("--endpoint", endpoint)]
-    done = run("latency", "--attach", *ends, "--name", "other", "--duration", "4", "--out", out)
+    done = run("latency", "--attach", *ends, "--name", "other", "--duration", "2", "--out", out)
     assert done.returncode == 0, done.stderr
     content: dict[str, Any] = json.loads((out / "latency.json").read_text())
     return content
 
 
+@pytest.mark.check
 def test_a_running_system_is_measured_and_left_running(files: Prepared, tmp_path: Path) -> None:
     with _driving(files, load_track(files.track), []) as endpoints:
         first = _attached(endpoints, tmp_path / "first")
@@ -272,10 +274,11 @@ def test_a_running_system_is_measured_and_left_running(files: Prepared, tmp_path
         assert result["ticks"] > 50
 
 
-def test_nothing_under_way_is_told(tmp_path: Path) -> None:
-    done = run("latency", "--attach", "--endpoint", free_endpoint(), "--out", tmp_path / "run")
-    assert done.returncode == 2
-    assert "no controller and no plant" in done.stderr
+def test_nothing_to_attach_to_is_an_error(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    patient = Director.wait_for
+    monkeypatch.setattr(Director, "wait_for", lambda self, whom, _: patient(self, whom, 0.3))
+    outcome = cli("latency", "--attach", "--endpoint", free_endpoint(), "--out", "run")
+    refused(outcome, "no controller and no plant")
 
 
 def _time_namespaces() -> str:
@@ -290,6 +293,7 @@ def _time_namespaces() -> str:
     return done.stderr.strip()[:200] if done.returncode else ""
 
 
+@pytest.mark.check
 def test_clock_of_another_host_is_found_and_corrected(files: Prepared, tmp_path: Path) -> None:
     """The plant in a time namespace: its monotonic clock is 1000 s ahead of everybody else's."""
     if why_not := _time_namespaces():

@@ -23,7 +23,7 @@ from tests.learning_rig import Rig, learn_arguments, record, rigged
 from tests.network.cars import Course, Program, gentle_course
 from tests.programs import PATIENCE_S, until
 
-pytestmark = [pytest.mark.slow, pytest.mark.alone]
+pytestmark = [pytest.mark.check, pytest.mark.wall_clock]
 
 KEEP = 300
 SMALL = ("--points", "120", "--keep", str(KEEP))

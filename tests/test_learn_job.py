@@ -30,8 +30,6 @@ from tests.driven import CAR, QUICK, drive
 from tests.learning_rig import lap
 from tests.programs import PATIENCE_S
 
-pytestmark = pytest.mark.alone
-
 SETTINGS = LearnSettings(car=CAR.name)
 NAME = PREDICTION.identity("e_kinematic", CAR)
 
@@ -303,7 +301,7 @@ class Workshop:
         return process.pid
 
 
-@pytest.mark.slow
+@pytest.mark.check
 def test_training_is_a_niced_process_that_may_die(tmp_path: Path) -> None:
     workshop = Workshop(tmp_path)
     try:

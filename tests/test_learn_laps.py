@@ -14,8 +14,6 @@ from learning.dataset import Dataset
 from learning.logs import dataset_from_messages
 from tests.driven import CAR, STEP_S, drive, logged, telemetry
 
-pytestmark = pytest.mark.alone
-
 
 @pytest.fixture(scope="module")
 def states() -> list[State]:

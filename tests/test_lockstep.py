@@ -24,8 +24,6 @@ from tests.car_fmu import packed_car
 from tests.programs import until
 from tests.pursuit_rig import CONTROLLER, PATIENCE_S, PLANT, Rig, running_rig, start
 
-pytestmark = pytest.mark.alone
-
 # Drives well, with a plan, for a second; then raises, then gives no number.
 FAILING = """
 class Failing(PurePursuit):
@@ -43,7 +41,9 @@ PurePursuit = Failing
 """
 
 
-@pytest.fixture(scope="module", params=["built-in car", "FMU"])
+@pytest.fixture(
+    scope="module", params=["built-in car", pytest.param("FMU", marks=pytest.mark.check)]
+)
 def player(request: pytest.FixtureRequest) -> dict[str, str]:
     """Plant settings that say what plays the car."""
     return {"fmu": str(packed_car())} if request.param == "FMU" else {}
@@ -102,6 +102,7 @@ def test_the_log_of_a_lockstep_run_is_complete(rig: Rig, tmp_path: Path) -> None
     assert [e.kind for e in log.select(EVENT)] == ["run_started", "run_ended"]
 
 
+@pytest.mark.wall_clock
 def test_free_running_drives_by_the_wall_clock(player: dict[str, str], tmp_path: Path) -> None:
     log = tmp_path / "log.mcap"
     with running_rig(player, low_latency=False) as rig, Recorder(rig.session, "orca", log) as seen:
@@ -124,6 +125,7 @@ def test_a_plant_for_lockstep_refuses_to_run_by_the_wall_clock(rig: Rig) -> None
         rig.start(lockstep=False)
 
 
+@pytest.mark.wall_clock
 def test_a_free_running_car_brakes_when_its_controller_dies(
     player: dict[str, str], tmp_path: Path
 ) -> None:
@@ -148,18 +150,6 @@ def unanswered(rig: Rig) -> int:
     """Periods that were late, and braked."""
     counters = rig.director.status("plant").counters
     return min(int(counters["late"]), int(counters["braked"]))
-
-
-@pytest.mark.slow
-def test_real_time_factor_is_told(
-    rig: Rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A measurement, not a promise: what else the machine does decides it."""
-    begin = time.perf_counter()
-    rig.drive(tmp_path / "log.mcap", laps=0, max_time_s=40.0)
-    factor = 40.0 / (time.perf_counter() - begin)
-    with capsys.disabled():
-        print(f"\nlockstep with recorder: {factor:.1f} x real time")  # noqa: T201
 
 
 def test_a_failing_step_goes_down_the_levels_and_the_car_stops(

@@ -88,7 +88,6 @@ def test_what_is_no_log_is_named(tmp_path: Path) -> None:
         LogWriter(tmp_path / "absent" / "x.mcap")
 
 
-@pytest.mark.alone
 def test_the_recorder_writes_everything_and_counts_gaps(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     path = tmp_path / "log.mcap"
@@ -137,7 +136,6 @@ with open_session(Endpoints(listen=(endpoint,))) as plant:
 """
 
 
-@pytest.mark.alone
 def test_a_killed_recorder_leaves_all_but_the_last_moment(tmp_path: Path) -> None:
     """While it records, the file already holds what came before, and goes on doing so."""
     path = tmp_path / "log.mcap"

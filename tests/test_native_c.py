@@ -104,10 +104,8 @@ def test_the_control_loop_never_allocates_and_python_sees_the_same_bits(
             assert step.u.tobytes() == results[k, 2:].tobytes()
 
 
-@pytest.mark.parametrize(
-    "artefact",
-    ["kinematic_artefact", pytest.param("dynamic_artefact", marks=pytest.mark.slow)],
-)
+@pytest.mark.check
+@pytest.mark.parametrize("artefact", ["kinematic_artefact", "dynamic_artefact"])
 def test_no_sanitizer_finds_anything(
     artefact: str,
     problems: Path,
@@ -132,7 +130,7 @@ def test_no_sanitizer_finds_anything(
     assert (results[:, 0] == 0).all()
 
 
-@pytest.mark.slow
+@pytest.mark.check
 def test_valgrind_finds_nothing(kinematic_artefact: Path, problems: Path, tmp_path: Path) -> None:
     """No use of what was never written, no access outside, nothing left at the end."""
     valgrind = shutil.which("valgrind")

@@ -114,7 +114,7 @@ def test_nearly_every_problem_converges_from_cold(
     assert statuses.count(StepStatus.CONVERGED) >= 0.95 * len(statuses)
 
 
-@pytest.mark.slow
+@pytest.mark.check
 def test_the_cost_is_no_worse_than_that_of_ipopt_from_its_own_start(
     exact: NativeStep, corrected: ca.Function, recorded: list[Problem], car: CarParameters
 ) -> None:

@@ -44,10 +44,11 @@ from experiments.drive import RunPlan, run_request
 from experiments.operation import ask_statuses, command, find, pick
 from experiments.picture import Picture, Process
 from experiments.status_table import COUNTERS_SHOWN, StatusTable
+from tests.command_line import Cli, refused
 from tests.conftest import Circuit
 from tests.programs import ROOT, environment, finish, run, start, until
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.wall_clock
 
 PATIENCE_S = 5.0
 COUNTERS = {"deadline_misses": 3, "shifted_plan": 4, "brake": 5, "stop": 6, "refused": 7,
@@ -234,24 +235,19 @@ def test_a_heartbeat_that_stops_is_no_answer_any_more() -> None:
     assert picture.as_json()["cars"]["a"]["plant"]["fault"] == "silent"
 
 
-@pytest.mark.slow
-def test_status_on_the_command_line(fakes: Fakes) -> None:
+def test_status_on_the_command_line(fakes: Fakes, cli: Cli) -> None:
     one, two = fakes("a", "plant"), fakes("a", "controller")
-    done = run("status", *options(one, two))
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "4/5/6" in done.stdout
-    content = json.loads(run("status", "--json", "--name", "a", *options(one, two)).stdout)
+    done = cli("status", *options(one, two))
+    assert (done.code, done.err) == (0, "")
+    assert "4/5/6" in done.out
+    content = json.loads(cli("status", "--json", "--name", "a", *options(one, two)).out)
     assert set(content["cars"]["a"]["plant"]) == FIELDS
     one.mute = two.mute = True
-    done = run("status", "--json", "--timeout", "0.5", *options(one, two))
-    assert done.returncode == 2
-    assert json.loads(done.stdout)["cars"]["a"]["plant"]["answering"] is False
-    assert len(done.stderr.splitlines()) == 1
-    assert "none of the processes found answers within 0.5 s" in done.stderr
-    done = run("status", "--timeout", "0.3", "--endpoint", free_endpoint())
-    assert done.returncode == 2
-    assert len(done.stderr.splitlines()) == 1
-    assert "nobody answers at" in done.stderr
+    done = cli("status", "--json", "--timeout", "0.5", *options(one, two))
+    refused(done, "none of the processes found answers within 0.5 s")
+    assert json.loads(done.out)["cars"]["a"]["plant"]["answering"] is False
+    done = cli("status", "--timeout", "0.3", "--endpoint", free_endpoint())
+    refused(done, "nobody answers at")
 
 
 def test_watching_prints_a_line_for_each_heartbeat_until_interrupted(fakes: Fakes) -> None:
@@ -278,7 +274,7 @@ def test_a_reader_that_leaves_ends_the_watch_without_complaint(fakes: Fakes) -> 
     watching.stderr.close()
 
 
-@pytest.mark.slow
+@pytest.mark.check
 def test_watching_on_a_terminal_redraws_and_sees_coming_and_going(fakes: Fakes) -> None:
     one = fakes("a", "plant")
     controlling, terminal = os.openpty()
@@ -313,24 +309,24 @@ def test_watching_on_a_terminal_redraws_and_sees_coming_and_going(fakes: Fakes) 
 # stop and go -----------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-def test_stop_and_go_reach_the_controller_with_a_reason(fakes: Fakes) -> None:
+def test_stop_and_go_reach_the_controller_with_a_reason(fakes: Fakes, cli: Cli) -> None:
     one, two = fakes("a", "plant"), fakes("a", "controller")
-    done = run("stop", "--reason", "a cat on the track", *options(one, two))
-    assert (done.returncode, done.stdout) == (0, "a: stop: as you say\n")
-    assert run("go", "--name", "a", *options(two)).returncode == 0
+    done = cli("stop", "--reason", "a cat on the track", *options(one, two))
+    assert (done.code, done.out) == (0, "a: stop: as you say\n")
+    assert cli("go", "--name", "a", *options(two)).code == 0
     assert [(one.command, one.text) for one in two.heard] == [
         ("stop", "a cat on the track"),
         ("go", "bayesrace go"),
     ]
     two.refuses = "no state so far"
-    done = run("go", *options(one, two))
-    assert (done.returncode, done.stdout) == (2, "")
-    assert "go of car 'a' refused: no state so far" in done.stderr
+    done = cli("go", *options(one, two))
+    refused(done, "go of car 'a' refused: no state so far")
+    assert done.out == ""
     two.mute = True
-    done = run("stop", "--timeout", "0.5", *options(one, two))
-    assert done.returncode == 2
-    assert "stop of car 'a' no answer within 0.5 s" in done.stderr
+    refused(
+        cli("stop", "--timeout", "0.5", *options(one, two)),
+        "stop of car 'a' no answer within 0.5 s",
+    )
 
 
 def test_of_several_cars_one_must_be_named(fakes: Fakes) -> None:
@@ -346,7 +342,7 @@ def test_of_several_cars_one_must_be_named(fakes: Fakes) -> None:
             pick(find(session, endpoints, 0.3, "c"), "c", everybody=False)
 
 
-def test_all_are_stopped_though_one_hangs_and_one_refuses(fakes: Fakes) -> None:
+def test_all_are_stopped_though_one_hangs_and_one_refuses(fakes: Fakes, cli: Cli) -> None:
     ones = (
         fakes("a", "controller", mute=True),
         fakes("b", "controller", refuses="no"),
@@ -361,11 +357,9 @@ def test_all_are_stopped_though_one_hangs_and_one_refuses(fakes: Fakes) -> None:
     assert not answers["b"].accepted
     assert isinstance(answers["c"], Reply)
     assert answers["c"].accepted
-    done = run("stop", "--all", "--timeout", "0.5", *options(*ones))
-    assert done.returncode == 2
-    assert "c: stop: as you say" in done.stdout
-    assert "'a' no answer" in done.stderr
-    assert "'b' refused: no" in done.stderr
+    done = cli("stop", "--all", "--timeout", "0.5", *options(*ones))
+    refused(done, "'a' no answer", "'b' refused: no")
+    assert "c: stop: as you say" in done.out
     assert len(ones[2].heard) == 2
 
 
@@ -414,7 +408,7 @@ def test_a_router_forwards_between_plant_controller_and_observer_and_a_peer_does
             take(inbox, Kind.MESSAGE)
 
 
-@pytest.mark.slow
+@pytest.mark.check
 def test_the_router_command_forwards_and_ends_on_sigterm(fakes: Fakes) -> None:
     endpoint = free_endpoint()
     router = start("router", "--listen", endpoint)
@@ -422,9 +416,13 @@ def test_the_router_command_forwards_and_ends_on_sigterm(fakes: Fakes) -> None:
     try:
         fakes("a", "plant", endpoints=through)
         two = fakes("a", "controller", endpoints=through)
-        content = picture_of(through, "a", patience_s=60.0).as_json()["cars"]["a"]
-        assert content["plant"]["answering"]
-        assert content["controller"]["answering"]
+
+        def both_answer() -> bool:
+            """The router hears of one before it hears of the other."""
+            content = picture_of(through, "a", patience_s=60.0).as_json()["cars"]["a"]
+            return all(one is not None and one["answering"] for one in content.values())
+
+        until(both_answer, "answers of both through the router")
         assert run("stop", "--endpoint", endpoint).returncode == 0
         assert [one.command for one in two.heard] == ["stop"]
     finally:
@@ -434,16 +432,14 @@ def test_the_router_command_forwards_and_ends_on_sigterm(fakes: Fakes) -> None:
     assert done.stderr == f"bayesrace.router: router on {endpoint}\n"
 
 
-def test_a_router_that_cannot_listen_says_so() -> None:
-    done = run("router", "--listen", "tcp/localhost")
-    assert done.returncode == 2
-    assert "lacks a port" in done.stderr
+def test_a_router_that_cannot_listen_says_so(cli: Cli) -> None:
+    refused(cli("router", "--listen", "tcp/localhost"), "lacks a port")
 
 
 # With the real processes -------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.check
 def test_real_processes_that_know_only_the_router_are_watched_stopped_and_restarted(
     circuit: Circuit, kinematic_artefact: Path, tmp_path: Path
 ) -> None:

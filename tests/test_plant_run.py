@@ -18,7 +18,7 @@ from plant.simulator import GuardCounters
 from plant.vehicle import Vehicle, open_vehicle
 from tests.car_fmu import packed_car
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.wall_clock
 
 EPOCH = 7
 
@@ -58,7 +58,7 @@ class Controller:
         yield
 
 
-@pytest.fixture(params=["built-in car", "FMU"], autouse=True)
+@pytest.fixture(params=["built-in car", pytest.param("FMU", marks=pytest.mark.check)], autouse=True)
 def _played_by(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Every promise holds whatever plays the car."""
     fmu = packed_car() if request.param == "FMU" else None

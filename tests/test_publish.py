@@ -10,11 +10,12 @@ import pytest
 from bayesrace.gp.weights import GpWeights, encode_weights, read_weights, write_weights
 from bayesrace.transport import free_endpoint
 from bayesrace.transport.client import RefusedError
+from tests.command_line import Cli, refused
 from tests.learning_rig import Rig, rigged
 from tests.network.cars import gentle_course
-from tests.programs import finish, run, start
+from tests.programs import finish, start
 
-pytestmark = [pytest.mark.slow, pytest.mark.alone]
+pytestmark = pytest.mark.wall_clock
 
 
 @pytest.fixture(scope="module")
@@ -31,17 +32,12 @@ def named(rig: Rig, version: str) -> Path:
     return path
 
 
-def one_line(text: str) -> str:
-    lines = text.strip().splitlines()
-    assert len(lines) == 1, text
-    return lines[0]
-
-
-def test_accepted_says_from_when_on(rig: Rig) -> None:
-    done = run("publish", named(rig, "second"), *rig.endpoints)
-    assert done.returncode == 0, done.stderr
-    assert "second taken over at cycle" in one_line(done.stdout)
-    assert "(acceptance " in done.stdout
+def test_accepted_says_from_when_on(rig: Rig, cli: Cli) -> None:
+    done = cli("publish", named(rig, "second"), *rig.endpoints)
+    assert done.code == 0, done.err
+    (line,) = done.out.splitlines()
+    assert "second taken over at cycle" in line
+    assert "(acceptance " in line
     assert rig.version() == "second"
 
 
@@ -54,45 +50,37 @@ def test_accepted_while_driving(rig: Rig) -> None:
     assert rig.version() == "driven"
 
 
-def test_refused_says_why(rig: Rig) -> None:
+def test_refused_says_why(rig: Rig, cli: Cli) -> None:
     before = rig.version()
     damaged = bytearray(encode_weights(read_weights(rig.course.weights_file)))
     damaged[len(damaged) // 2] ^= 1
     path = rig.folder / "damaged.bin"
     path.write_bytes(bytes(damaged))
-    done = run("publish", path, *rig.endpoints)
-    assert done.returncode == 1
-    assert "refused" in one_line(done.stderr)
-    assert "checksum" in done.stderr
+    refused(cli("publish", path, *rig.endpoints), "refused", "checksum", code=1)
     assert rig.version() == before
 
 
-def test_another_model_is_refused(rig: Rig) -> None:
+def test_another_model_is_refused(rig: Rig, cli: Cli) -> None:
     weights: GpWeights = read_weights(rig.course.weights_file)
     path = rig.folder / "foreign.bin"
     write_weights(path, replace(weights, discretisation="bicycle/eulerx1-pose/0.02s/abc"))
-    done = run("publish", path, "--car", "orca", *rig.endpoints)
-    assert done.returncode == 1
-    assert "refused" in one_line(done.stderr)
+    refused(cli("publish", path, "--car", "orca", *rig.endpoints), "refused", code=1)
 
 
-def test_what_is_no_file_is_said_in_a_line(rig: Rig) -> None:
-    done = run("publish", rig.folder / "nowhere.bin", *rig.endpoints)
-    assert done.returncode == 2
-    assert "nowhere.bin: No such file" in one_line(done.stderr)
+def test_what_is_no_file_is_said_in_a_line(rig: Rig, cli: Cli) -> None:
+    done = cli("publish", rig.folder / "nowhere.bin", *rig.endpoints)
+    refused(done, "nowhere.bin: No such file")
 
 
-def test_a_car_that_is_not_there_is_said_in_a_line(rig: Rig) -> None:
+def test_a_car_that_is_not_there_is_said_in_a_line(rig: Rig, cli: Cli) -> None:
     weights = rig.course.weights_file
-    done = run("publish", weights, "--name", "other", "--timeout", "0.5", *rig.endpoints)
-    assert done.returncode == 2
-    assert "no car 'other'" in one_line(done.stderr)
-    assert "orca" in done.stderr
-    done = run("publish", weights, "--timeout", "0.5", "--endpoint", free_endpoint())
-    assert done.returncode == 2
-    assert "nobody answers" in one_line(done.stderr)
+    done = cli("publish", weights, "--name", "other", "--timeout", "0.5", *rig.endpoints)
+    refused(done, "no car 'other'", "orca")
+    done = cli("publish", weights, "--timeout", "0.5", "--endpoint", free_endpoint())
+    refused(done, "nobody answers")
 
 
+@pytest.mark.check
 def test_two_at_once_leave_one_well_defined_version(rig: Rig) -> None:
     names = ("left", "right")
     files = [named(rig, name) for name in names]
@@ -106,17 +94,16 @@ def test_two_at_once_leave_one_well_defined_version(rig: Rig) -> None:
     assert rig.version() == max(numbers, key=lambda name: numbers[name])
 
 
-def test_rollback_returns_to_those_before(rig: Rig) -> None:
+def test_rollback_returns_to_those_before(rig: Rig, cli: Cli) -> None:
     for version in ("older", "newer"):
         rig.director.send_weights(named(rig, version).read_bytes())
-    done = run("rollback", "--reason", "test", *rig.endpoints)
-    assert done.returncode == 0, done.stderr
-    assert "older taken over at cycle" in one_line(done.stdout)
-    assert "instead of newer" in done.stdout
+    done = cli("rollback", "--reason", "test", *rig.endpoints)
+    assert done.code == 0, done.err
+    (line,) = done.out.splitlines()
+    assert "older taken over at cycle" in line
+    assert "instead of newer" in line
     assert rig.version() == "older"
     with suppress(RefusedError):
         while True:
             rig.director.rollback("until there is nothing before")
-    done = run("rollback", *rig.endpoints)
-    assert done.returncode == 1
-    assert "refused" in one_line(done.stderr)
+    refused(cli("rollback", *rig.endpoints), "refused", code=1)

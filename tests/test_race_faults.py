@@ -21,8 +21,8 @@ from bayesrace.messages import EVENT, STATE, Event, State
 from tests.programs import finish, leftovers, peanut, run, start, started_by, until
 
 pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.alone,
+    pytest.mark.check,
+    pytest.mark.wall_clock,
     pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks into /proc"),
 ]
 

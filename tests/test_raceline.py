@@ -120,6 +120,7 @@ def test_lap_time_is_near_that_of_the_true_model(name: str, limit_s: float) -> N
     assert line_on(name).lap_time_s == pytest.approx(limit_s, rel=0.05)
 
 
+@pytest.mark.check
 def test_halving_the_intervals_hardly_changes_the_lap() -> None:
     coarse, fine = line_on("harbour", step_m=0.05), line_on("harbour", step_m=0.025)
     assert coarse.lap_time_s == pytest.approx(fine.lap_time_s, rel=0.01)
@@ -159,6 +160,7 @@ def test_limits_are_those_of_the_reference() -> None:
     assert ((brake > -2.0) & (brake < -1.55)).all()
 
 
+@pytest.mark.check
 def test_less_friction_and_more_margin_cost_time() -> None:
     base = line_on("paddock").lap_time_s
     assert line_on("paddock", friction=0.7).lap_time_s > base + 0.05

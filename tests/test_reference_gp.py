@@ -44,6 +44,7 @@ def test_error_and_coverage_on_published_data(
     assert metrics["coverage"] >= 0.90
 
 
+@pytest.mark.check
 def test_update_with_the_published_lap_improves_each_output() -> None:
     """The paper's model update: pure-pursuit and BayesRace samples, tested on BestCase."""
     first, lap, test = (

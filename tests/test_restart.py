@@ -29,11 +29,11 @@ from tests.network.cars import (
     start_router,
 )
 from tests.network.journey import Journey
-from tests.network.observer import Observer, observing
+from tests.network.observer import Observer, drive_on, observing
 from tests.network.proxy import Proxy
 from tests.programs import until
 
-pytestmark = [pytest.mark.slow, pytest.mark.alone]
+pytestmark = pytest.mark.wall_clock
 
 _log = logging.getLogger(__name__)
 
@@ -64,10 +64,9 @@ class Rig:
         assert newest is not None
         return newest
 
-    def drive_laps(self, count: int) -> None:
-        """Waits until the car has done so many more."""
-        goal = self.state().lap + count
-        until(lambda: self.state().lap >= goal, f"lap {goal}")
+    def drive_on(self) -> None:
+        """Waits until the car has got a good deal further."""
+        drive_on(self.observer)
 
     def journey(self) -> Journey:
         """What has been recorded, after the end."""
@@ -125,11 +124,12 @@ def test_a_controller_started_again_takes_over_the_car(tmp_path: Path) -> None:
 def _take_over(rig: Rig) -> None:
     plant, controller = rig.start_plant(), rig.start_controller()
     rig.observer.start(1)
-    rig.drive_laps(1)
+    rig.drive_on()
     controller.kill()
     killed_ns, last = time.monotonic_ns(), rig.state()
     successor = rig.start_controller()
-    until(lambda: rig.state().lap > last.lap, "a lap by the successor")
+    until(lambda: _answers_since(rig.state(), last.seq + 1), "an answer of the successor")
+    rig.drive_on()
     plant_counters, counters = (
         rig.observer.status(source)["counters"] for source in ("plant", "controller")
     )
@@ -158,12 +158,13 @@ def _answers_since(state: State, seq: int) -> bool:
     return any(answered > seq and acting_s >= 0 for answered, acting_s in rows)
 
 
+@pytest.mark.check
 @pytest.mark.parametrize("fmu", [False, True])
 def test_a_plant_started_again_is_found(rig: Rig, fmu: bool) -> None:
     options = ("--fmu", str(packed_car())) if fmu else ()
     plant, controller = rig.start_plant(*options), rig.start_controller()
     rig.observer.start(1)
-    rig.drive_laps(1)
+    rig.drive_on()
     before = rig.state()
     plant.kill()
     until(
@@ -177,7 +178,7 @@ def test_a_plant_started_again_is_found(rig: Rig, fmu: bool) -> None:
     )
     rig.observer.start(1)  # the same number: the epoch alone tells one from the other
     until(lambda: rig.state().epoch != before.epoch, "a state of the new plant")
-    rig.drive_laps(1)
+    rig.drive_on()
     status = rig.observer.status("controller")
     assert status["phase"] == "driving"
     assert status["epoch"] == rig.state().epoch
@@ -192,11 +193,12 @@ def test_a_plant_started_again_is_found(rig: Rig, fmu: bool) -> None:
         assert journey.off_track_m([s for s in journey.states if s.epoch == epoch]) < 0.0
 
 
+@pytest.mark.check
 def test_an_actuation_for_another_plant_does_not_act(rig: Rig) -> None:
     """A forgery with the right run, state and time acts; with another epoch it is stale."""
     plant, controller = rig.start_plant(), rig.start_controller()
     rig.observer.start(1)
-    rig.drive_laps(1)
+    rig.drive_on()
     marks_ns, stale = [], []
     with open_session(Endpoints(connect=(rig.plant_at,)), "controller") as session:
         publisher = Publisher(session, ACTUATION, "orca")
@@ -242,7 +244,7 @@ def _assert_went_on(
     rig: Rig, broken_ns: int, joined_ns: int, programs: tuple[Program, ...]
 ) -> None:
     """After the break the car has slowed down, then driven another lap, all of it on the track."""
-    rig.drive_laps(1)
+    rig.drive_on()
     assert rig.observer.status("controller")["phase"] == "driving"
     counters = rig.observer.status("plant")["counters"]
     rig.observer.stop()
@@ -258,11 +260,12 @@ def _assert_went_on(
     assert "driving" in journey.phases(joined_ns, after)
 
 
+@pytest.mark.check
 def test_a_broken_connection_is_made_again(tmp_path: Path, course: Course) -> None:
     with rigged(tmp_path, course, "proxy") as rig:
         plant, controller = rig.start_plant(), rig.start_controller()
         rig.observer.start(1)
-        rig.drive_laps(1)
+        rig.drive_on()
         rig.proxy.cut()
         broken_ns = time.monotonic_ns()
         time.sleep(1.0)
@@ -271,18 +274,19 @@ def test_a_broken_connection_is_made_again(tmp_path: Path, course: Course) -> No
         _assert_went_on(rig, broken_ns, joined_ns, (controller, plant))
 
 
+@pytest.mark.check
 def test_a_router_started_again_is_found_by_both(tmp_path: Path, course: Course) -> None:
     with rigged(tmp_path, course, "router") as rig:
         router, plant, controller = rig.start_router(), rig.start_plant(), rig.start_controller()
         rig.observer.start(1)
-        rig.drive_laps(1)
+        rig.drive_on()
         router.kill()
         broken_ns = time.monotonic_ns()
         time.sleep(1.0)
         router = rig.start_router()
         seen = rig.state().seq
         until(lambda: rig.state().seq > seen, "a state through the new router")
-        rig.drive_laps(1)
+        rig.drive_on()
         until(lambda: rig.observer.status("controller")["phase"] == "driving", "it to drive again")
         rig.observer.stop()
         for program in (controller, plant, router):

@@ -21,19 +21,12 @@ from tests.network.cars import (
     start_router,
 )
 from tests.network.journey import Journey
-from tests.network.observer import Observer, observing
-from tests.programs import until
+from tests.network.observer import drive_on, observing
 
-pytestmark = [pytest.mark.slow, pytest.mark.alone]
+pytestmark = [pytest.mark.check, pytest.mark.wall_clock]
 
 CARS = ("red", "green", "blue", "white")
 APART_M = 10.0
-
-
-def newest(observer: Observer) -> tuple[int, float]:
-    """Lap and time of a car."""
-    state = observer.newest()
-    return (0, 0.0) if state is None else (state.lap, state.time_s)
 
 
 def assert_own(journey: Journey, course: Course, run: int, status: Status) -> None:
@@ -79,11 +72,8 @@ def test_four_cars_drive_at_once(tmp_path: Path) -> None:
         for name, observer in observers.items():
             observer.start(runs[name])
         all_driving_s = time.monotonic()
-        laps = {name: newest(observer)[0] for name, observer in observers.items()}
-        until(
-            lambda: all(newest(one)[0] > laps[name] for name, one in observers.items()),
-            "a lap by each car",
-        )
+        for observer in observers.values():
+            drive_on(observer)
         together_s = time.monotonic() - all_driving_s
         status = {
             name: (one.director.status("plant"), one.director.status("controller"))

@@ -44,7 +44,7 @@ from bayesrace.transport import (
     open_session,
 )
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.wall_clock
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ line of JSON; the end of stdin ends it, and the run under way.
 
 import dataclasses
 import json
+import math
 import subprocess
 import sys
 import time
@@ -25,9 +26,9 @@ from bayesrace.tracks import Track, load_track
 from bayesrace.transport import Director, Endpoints, open_session
 from experiments.drive import RunPlan, run_request
 from tests.network.hosts import Host
-from tests.programs import PATIENCE_S, ROOT, environment
+from tests.programs import PATIENCE_S, ROOT, environment, until
 
-__all__ = ["Follower", "Observer", "Remote", "observing", "observing_from"]
+__all__ = ["Follower", "Observer", "Remote", "drive_on", "observing", "observing_from"]
 
 _ENDLESS_S = 1e5
 
@@ -46,6 +47,13 @@ class Follower(Protocol):
 
     def stop(self) -> None:
         """Ends the run."""
+
+
+def drive_on(follower: Follower, away_m: float = 0.8) -> None:
+    """Waits until the car is that far from where it is now: it drives, and by itself."""
+    until(lambda: bool(follower.state()), "a first state")
+    begin = follower.state()["x"]
+    until(lambda: math.dist(follower.state()["x"][:2], begin[:2]) > away_m, f"{away_m} m driven")
 
 
 def _fields(message: Any) -> dict[str, Any]:

@@ -21,10 +21,10 @@ from bayesrace.messages import STATE
 from tests.network.cars import Course, Program, gentle_course, start_controller, start_plant
 from tests.network.hosts import CONTROLLER_IP, PLANT_IP, Network
 from tests.network.journey import STANDING_MPS, Journey
-from tests.network.observer import Remote, observing_from
+from tests.network.observer import Remote, drive_on, observing_from
 from tests.programs import PATIENCE_S, until
 
-pytestmark = [pytest.mark.slow, pytest.mark.alone]
+pytestmark = pytest.mark.wall_clock
 
 NAME = "orca"
 
@@ -41,10 +41,9 @@ class Rig:
     log: Path
     _cleanup: ExitStack
 
-    def drive_laps(self, count: int) -> None:
-        """Waits until the car has done so many more."""
-        goal = self.observer.state().get("lap", 0) + count
-        until(lambda: self.observer.state().get("lap", 0) >= goal, f"lap {goal}")
+    def drive_on(self) -> None:
+        """Waits until the car has got a good deal further."""
+        drive_on(self.observer)
 
     def partition(self, seconds: float, direction: str = "") -> tuple[int, int, dict[str, Any]]:
         """Cuts the link for a while: when it began and ended [ns], and the last state in it."""
@@ -128,9 +127,9 @@ def test_a_car_stops_in_a_partition_and_goes_on(net: Network, start: Start) -> N
     """20 ms delay, 5 ms jitter, 5 % loss, from before the connection on; 2 s of nothing."""
     net.link.set(delay=0.02, jitter=0.005, loss=0.05)
     rig = start()
-    rig.drive_laps(1)
+    rig.drive_on()
     begin_ns, end_ns, last = rig.partition(2.0)
-    rig.drive_laps(1)
+    rig.drive_on()
     journey, plant, controller = rig.finish()
 
     assert journey.off_track_m() < 0.0
@@ -146,6 +145,7 @@ def test_a_car_stops_in_a_partition_and_goes_on(net: Network, start: Start) -> N
     assert all(counts[way]["lost"] > 0 and counts[way]["cut"] > 0 for way in ("forth", "back"))
 
 
+@pytest.mark.check
 def test_a_drive_from_the_command_line_outlasts_a_short_partition(
     net: Network, course: Course, tmp_path: Path
 ) -> None:
@@ -184,14 +184,15 @@ def _laps(log: Path) -> int:
     return max((state.lap for state in LogReader(log).select(STATE)), default=0)
 
 
+@pytest.mark.check
 @pytest.mark.parametrize("direction", ["forth", "back"])
 def test_a_link_that_fails_one_way(net: Network, start: Start, direction: str) -> None:
     """forth: the controller is blind, brakes and falls silent. back: the car hears nothing."""
     net.link.set(delay=0.01)
     rig = start()
-    rig.drive_laps(1)
+    rig.drive_on()
     _, _, last = rig.partition(1.5, direction)
-    rig.drive_laps(1)
+    rig.drive_on()
     journey, plant, controller = rig.finish()
     assert abs(last["x"][3]) < STANDING_MPS
     assert journey.off_track_m() < 0.0
@@ -201,11 +202,13 @@ def test_a_link_that_fails_one_way(net: Network, start: Start, direction: str) -
     assert_nothing_was_broken(plant, controller)
 
 
+@pytest.mark.check
 def test_losses_by_udp_are_counted_and_hold_up_nobody(net: Network, start: Start) -> None:
     rig = start("udp")
-    rig.drive_laps(0)
+    rig.drive_on()
     net.link.set(delay=0.02, jitter=0.005, loss=0.05)
-    rig.drive_laps(2)
+    for _ in range(4):
+        rig.drive_on()
     net.link.set()
     journey, plant, controller = rig.finish()
     assert journey.off_track_m() < 0.0

@@ -19,7 +19,7 @@ from tests.network.emulator import Emulator
 from tests.network.hosts import CONTROLLER_IP, PLANT_IP, Network, network, why_not_here
 from tests.programs import ROOT
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.wall_clock
 
 PORT = 5000
 
@@ -152,7 +152,7 @@ def test_a_stream_gets_through_a_bad_link_whole(net: Network) -> None:
     assert net.link.counts()["forth"]["lost"] > 0
 
 
-@pytest.mark.slow
+@pytest.mark.check
 def test_a_seed_repeats_the_same_losses(namespaces: None) -> None:
     arrived = []
     for seed in (1, 1, 2):

@@ -22,7 +22,7 @@ from tests.network.cars import Course
 from tests.programs import until
 from tests.takeover.bench import bench
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.wall_clock
 
 
 @pytest.mark.parametrize("keeps", [True, False])
@@ -70,7 +70,7 @@ def test_a_gatekeeper_killed_between_takeover_and_keeping(
         assert made.said("weights_accepted") == [reply.text]
 
 
-@pytest.mark.slow
+@pytest.mark.check
 def test_a_gatekeeper_that_hangs_is_replaced(
     course: Course, good: GpWeights, again: GpWeights
 ) -> None:
@@ -180,7 +180,7 @@ def test_who_asks_is_answered_however_long_a_gatekeeper_may_be_silent(
         assert made.gatekeeper == victim
 
 
-@pytest.mark.slow
+@pytest.mark.check
 def test_who_asks_is_answered_however_long_keeping_takes(
     tmp_path: Path, course: Course, again: GpWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,7 +12,7 @@ from controller.gate.link import Link
 from controller.gate.memory import Memory
 from controller.gate.supervisor import Supervisor
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.wall_clock
 
 HANG_S = 10.0
 AGAIN = "weights in use stay and are not watched until it is there again"

@@ -23,7 +23,7 @@ from tests.takeover.oracle import converged, replayed
 from tests.takeover.rig import DRIVEN_S, Rig, digest, rigged
 from tests.takeover.spoilt_weights import SPOILT, spoilt
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.wall_clock
 
 # Lockstep ------------------------------------------------------------------------------------
 
@@ -79,7 +79,7 @@ QUICK = ("flip all", "swap vy omega")
 
 @pytest.mark.parametrize(
     "what",
-    [*QUICK, *(pytest.param(one, marks=pytest.mark.slow) for one in SPOILT if one not in QUICK)],
+    [*QUICK, *(pytest.param(one, marks=pytest.mark.check) for one in SPOILT if one not in QUICK)],
 )
 def test_spoilt_weights_never_take_the_car_off_its_track(
     rig: Rig, good: GpWeights, what: str
@@ -108,7 +108,7 @@ def test_spoilt_weights_never_take_the_car_off_its_track(
     assert rig.status().weights_version == good.version
 
 
-@pytest.mark.slow
+@pytest.mark.check
 def test_two_rollbacks_by_the_watch_are_equal_to_the_bit(
     tmp_path: Path, course: Course, good: GpWeights
 ) -> None:
@@ -228,6 +228,7 @@ def test_each_cycle_names_its_weights_and_the_inputs_do_not_jump(
     assert np.abs(explained).max() > 1e-3  # or there is nothing to explain
 
 
+@pytest.mark.check
 def test_spoilt_weights_are_given_up_by_the_wall_clock(rig: Rig, good: GpWeights) -> None:
     rig.ready()
     rig.send(spoilt(good, "flip all"))
@@ -238,6 +239,7 @@ def test_spoilt_weights_are_given_up_by_the_wall_clock(rig: Rig, good: GpWeights
     assert rig.held_up(end) or rig.off_track_m(1) < 0.0
 
 
+@pytest.mark.check
 def test_two_publishers_at_once_leave_one_order(rig: Rig, good: GpWeights) -> None:
     rig.start(1, lockstep=False, seconds=DRIVEN_S)
     answers: list[dict[str, Any]] = []

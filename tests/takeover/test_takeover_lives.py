@@ -20,7 +20,7 @@ from tests.network.cars import Course, Program, start_controller, start_plant
 from tests.programs import until
 from tests.takeover.rig import Rig, digest, gatekeepers
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.wall_clock
 
 
 def test_the_gatekeepers_end_does_not_touch_the_drive(rig: Rig, good: GpWeights) -> None:
@@ -60,7 +60,7 @@ def test_a_gatekeeper_that_dies_of_a_request_refuses_it(rig: Rig, good: GpWeight
     assert rig.send(good)["number"] == 1
 
 
-@pytest.mark.slow
+@pytest.mark.check
 @pytest.mark.parametrize("sign", [signal.SIGTERM, signal.SIGKILL])
 def test_no_gatekeeper_outlives_its_controller(
     tmp_path: Path, course: Course, sign: signal.Signals
@@ -112,6 +112,7 @@ def test_accepted_weights_survive_a_restart(
             controller.end()
 
 
+@pytest.mark.check
 def test_a_late_controller_takes_the_newest_that_others_have_accepted(
     tmp_path: Path, course: Course, good: GpWeights, again: GpWeights
 ) -> None:

@@ -1,0 +1,55 @@
+"""The command line in the tests' own process, which is faster than a process of its own."""
+
+import logging
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from experiments.cli import main
+
+__all__ = ["Cli", "Outcome", "cli", "refused"]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Exit code and what was printed."""
+
+    code: int
+    out: str
+    err: str
+
+
+Cli = Callable[..., Outcome]
+
+
+@pytest.fixture
+def cli(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path) -> Cli:
+    """Calls the program's entry point in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setenv("NO_COLOR", "1")
+    monkeypatch.setattr(logging, "basicConfig", lambda **_: None)
+
+    def call(*arguments: str | Path) -> Outcome:
+        monkeypatch.setattr(sys, "argv", ["bayesrace", *map(str, arguments)])
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as end:
+            main()
+        code = end.value.code
+        assert code is None or isinstance(code, int)
+        return Outcome(code or 0, *capfd.readouterr())
+
+    return call
+
+
+def refused(outcome: Outcome, *words: str, code: int = 2) -> None:
+    """Bad input: one line on stderr that names the thing and the remedy, and this exit code."""
+    assert outcome.code == code, outcome.err
+    assert outcome.err.startswith("bayesrace: ")
+    assert len(outcome.err.strip().splitlines()) == 1, outcome.err
+    assert "Traceback" not in outcome.err + outcome.out
+    for word in words:
+        assert word in outcome.err, outcome.err
