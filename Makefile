@@ -48,7 +48,7 @@ TIER = not check
 PYTEST = $(RUNNER) pytest $(ARGS)
 define RUN_TESTS
 	@$(PYTEST) -m "($(TIER)) and not wall_clock" --numprocesses auto --maxprocesses 8 --dist worksteal; computing=$$?; \
-	$(PYTEST) -m "($(TIER)) and wall_clock" --numprocesses 4 --dist loadfile; meeting=$$?; $(TOOK); \
+	$(PYTEST) -m "($(TIER)) and wall_clock" --numprocesses 3 --dist loadfile; meeting=$$?; $(TOOK); \
 	for code in $$computing $$meeting; do [ $$code -eq 0 ] || [ $$code -eq 5 ] || exit $$code; done; \
 	[ $$computing -ne 5 ] || [ $$meeting -ne 5 ] || { echo "ARGS selects no test" >&2; exit 5; }
 endef
