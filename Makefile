@@ -45,10 +45,10 @@ bench: $(VENV)/.ready
 # that ARGS selects no test of a part. RUNNER: 'make check' measures coverage.
 RUNNER ?= $(BIN)/python -m
 TIER = not check
-PYTEST = $(RUNNER) pytest $(ARGS)
+PYTEST = $(RUNNER) pytest --dist worksteal $(ARGS)
 define RUN_TESTS
-	@$(PYTEST) -m "($(TIER)) and not wall_clock" --numprocesses auto --maxprocesses 8 --dist worksteal; computing=$$?; \
-	$(PYTEST) -m "($(TIER)) and wall_clock" --numprocesses 3 --dist loadfile; meeting=$$?; $(TOOK); \
+	@$(PYTEST) -m "($(TIER)) and not wall_clock" --numprocesses auto --maxprocesses 8; computing=$$?; \
+	$(PYTEST) -m "($(TIER)) and wall_clock" --numprocesses 3; meeting=$$?; $(TOOK); \
 	for code in $$computing $$meeting; do [ $$code -eq 0 ] || [ $$code -eq 5 ] || exit $$code; done; \
 	[ $$computing -ne 5 ] || [ $$meeting -ne 5 ] || { echo "ARGS selects no test" >&2; exit 5; }
 endef

@@ -1,22 +1,34 @@
-"""What many tests need and none changes: made once, then shared by all workers and later runs.
+"""What many tests need and none changes: made once, then shared by all workers."""
 
-Each thing lies in a folder of the product's cache, named after all that shaped it.
-"""
-
+import os
 import shutil
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+import pytest
+
 from bayesrace.cache import cache_folder, digest, locked
 
-__all__ = ["shared_folder"]
+__all__ = ["session_folder", "shared_folder"]
 
 
 def shared_folder(name: str, parts: Iterable[str | bytes], make: Callable[[Path], object]) -> Path:
-    """A folder that ``make`` has filled; ``parts``: everything that its content depends on."""
-    folder = cache_folder() / "tests" / f"{name}-{digest(parts)}"
-    if folder.exists():
-        return folder
+    """A folder of the product's cache that ``make`` has filled, for later runs, too.
+
+    ``parts``: everything that its content depends on.
+    """
+    return _made(cache_folder() / "tests" / f"{name}-{digest(parts)}", make)
+
+
+def session_folder(
+    factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]
+) -> Path:
+    """A folder that ``make`` has filled, for this run alone: each run makes it anew."""
+    own = factory.getbasetemp()
+    return _made((own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / name, make)
+
+
+def _made(folder: Path, make: Callable[[Path], object]) -> Path:
     with locked(folder):
         if not folder.exists():
             partial = folder.with_name(f"{folder.name}.part")

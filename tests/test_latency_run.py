@@ -24,6 +24,7 @@ from experiments.preparation import PreparationSettings, Prepared, prepare
 from experiments.progress import stages_on
 from tests.command_line import Cli, refused
 from tests.programs import COMMAND, ROOT, environment, finish, leftovers, peanut, run, start, until
+from tests.shared import session_folder
 
 pytestmark = pytest.mark.wall_clock
 
@@ -50,8 +51,7 @@ class Run:
     """One measurement."""
 
     out: Path
-    pid: int
-    process: subprocess.CompletedProcess[str]
+    printed: str
 
     @property
     def result(self) -> dict[str, Any]:
@@ -61,16 +61,23 @@ class Run:
 
 @pytest.fixture(scope="module")
 def loaded(files: Prepared, tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """A short run with a busy process beside."""
-    out = tmp_path_factory.mktemp("latency")
-    process = start(
-        "latency", *given(files), "--duration", "3", "--load", "1", "--out", out / "run",
-        "--json", out / "copy.json",
-    )  # fmt: skip
-    done = finish(process)
-    assert done.returncode == 0, done.stderr
-    assert json.loads((out / "copy.json").read_text()) is not None
-    return Run(out / "run", process.pid, done)
+    """A short run with a busy process beside, measured once for all workers."""
+
+    def make(folder: Path) -> None:
+        process = start(
+            "latency", *given(files), "--duration", "3", "--load", "1", "--out", folder / "run",
+            "--json", folder / "copy.json",
+        )  # fmt: skip
+        done = finish(process)
+        assert done.returncode == 0, done.stderr
+        assert json.loads((folder / "copy.json").read_text()) is not None
+        # plant, controller, bare loop and load carry its process number
+        assert not leftovers(process.pid)
+        assert not _with_parent(process.pid)
+        (folder / "stdout").write_text(done.stdout.replace(str(folder / "run"), "RUN"))
+
+    folder = session_folder(tmp_path_factory, "latency", make)
+    return Run(folder / "run", (folder / "stdout").read_text())
 
 
 def test_every_leg_is_measured(loaded: Run) -> None:
@@ -101,8 +108,8 @@ def test_memory_laps_and_clocks_are_told(loaded: Run) -> None:
     assert result["clocks"]["uncertainty_us"] == 0
     assert result["states"] > 100
     assert result["off_track_samples"] is not None
-    for words in ("state → actuation", "bare loop", "sent =", "one clock", str(loaded.out)):
-        assert words in loaded.process.stdout.replace("\n", " "), words
+    for words in ("state → actuation", "bare loop", "sent =", "one clock", "RUN"):
+        assert words in loaded.printed.replace("\n", " "), words
 
 
 def test_files_are_those_of_the_documentation(loaded: Run) -> None:
@@ -117,12 +124,6 @@ def test_files_are_those_of_the_documentation(loaded: Run) -> None:
         leg = loaded.result["legs_us"].get(name.removesuffix(".hlog"))
         expected = loaded.result["bare_loop_us"] if leg is None else leg
         assert total == expected["count"], name
-
-
-def test_nothing_outlives_it(loaded: Run) -> None:
-    """Plant, controller, bare loop and load carry its process number."""
-    assert not leftovers(loaded.pid)
-    assert not _with_parent(loaded.pid)
 
 
 def _with_parent(pid: int) -> list[str]:

@@ -23,7 +23,7 @@ from tests.learning_rig import Rig, learn_arguments, record, rigged
 from tests.network.cars import Course, Program, gentle_course
 from tests.programs import PATIENCE_S, until
 
-pytestmark = [pytest.mark.check, pytest.mark.wall_clock]
+pytestmark = pytest.mark.wall_clock
 
 KEEP = 300
 SMALL = ("--points", "120", "--keep", str(KEEP))
@@ -85,6 +85,7 @@ def test_laps_in_lockstep_get_faster_and_stay_on_the_track(tmp_path: Path, cours
     assert "Traceback" not in job.said()
 
 
+@pytest.mark.check
 def test_everything_may_be_killed_and_started_again(tmp_path: Path, course: Course) -> None:
     """Job, then plant and controller; the second controller, without a store, is given again what
     the first had accepted. Given weights and their samples are the beginning, once. SIGINT ends

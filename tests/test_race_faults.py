@@ -20,11 +20,7 @@ from bayesrace.log import LogReader
 from bayesrace.messages import EVENT, STATE, Event, State
 from tests.programs import finish, leftovers, peanut, run, start, started_by, until
 
-pytestmark = [
-    pytest.mark.check,
-    pytest.mark.wall_clock,
-    pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks into /proc"),
-]
+pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks into /proc")
 
 ENOUGH = 60
 """States in the log after which a lap is under way."""
@@ -120,12 +116,14 @@ def test_a_race_is_two_more_processes(racing: Racing) -> None:
     racing.assert_report_shows_it()
 
 
+@pytest.mark.check
 def test_an_interrupt_of_the_race_alone_ends_all(racing: Racing) -> None:
     racing.spoil("race", signal.SIGINT)
     assert racing.end() == (130, "bayesrace: interrupted")
     racing.assert_log_tells(ended_by_plant=True)
 
 
+@pytest.mark.check
 def test_a_killed_plant_ends_the_race(racing: Racing) -> None:
     racing.spoil("plant", signal.SIGKILL)
     code, said = racing.end()
@@ -135,6 +133,7 @@ def test_a_killed_plant_ends_the_race(racing: Racing) -> None:
     racing.assert_report_shows_it()
 
 
+@pytest.mark.check
 def test_a_killed_controller_ends_the_race(racing: Racing) -> None:
     racing.spoil("controller", signal.SIGKILL)
     code, said = racing.end()
@@ -148,6 +147,7 @@ def test_a_killed_controller_ends_the_race(racing: Racing) -> None:
     racing.assert_report_shows_it()
 
 
+@pytest.mark.check
 def test_a_terminated_plant_ends_the_race_with_its_word(racing: Racing) -> None:
     racing.spoil("plant", signal.SIGTERM)
     code, said = racing.end()
@@ -156,6 +156,7 @@ def test_a_terminated_plant_ends_the_race_with_its_word(racing: Racing) -> None:
     racing.assert_log_tells(ended_by_plant=True)
 
 
+@pytest.mark.check
 def test_a_killed_race_takes_its_processes_along(racing: Racing) -> None:
     racing.spoil("race", signal.SIGKILL)
     code, said = racing.end()
@@ -164,6 +165,7 @@ def test_a_killed_race_takes_its_processes_along(racing: Racing) -> None:
     racing.assert_report_shows_it()
 
 
+@pytest.mark.check
 def test_an_interrupt_before_the_first_lap(tmp_path: Path) -> None:
     track = peanut(tmp_path / "peanut.csv")
     process = start("race", "--out", tmp_path / "out", "--track", track, "--train-track", track)
