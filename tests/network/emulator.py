@@ -165,10 +165,11 @@ def _forward(direction: Direction, to: socket.socket) -> None:
 
 
 def _take(direction: Direction, source: socket.socket) -> None:
-    now = time.monotonic()
     while True:
         try:
-            direction.enter(source.recv(_LARGEST_FRAME), now)
+            frame = source.recv(_LARGEST_FRAME)
+            # Read after the frame: a frame must not have set off before it was sent.
+            direction.enter(frame, time.monotonic())
         except BlockingIOError:
             return
         except OSError:  # the interface went down
