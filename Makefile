@@ -25,11 +25,11 @@ PROJECT := --no-build-isolation --editable
 START := $(shell date +%s)
 TOOK = echo "make $@: $$(($$(date +%s) - $(START))) s"
 
-.PHONY: help race test check rest lint coverage bench clean
+.PHONY: help race test check tools rest lint coverage bench clean
 
 help:
 	@echo "make race    set up, and drive the whole comparison; leaves runs/DATE-TIME"
-	@echo "make test    set up for testing, and run what takes minutes"
+	@echo "make test    set up for testing, and run most tests, in a few minutes"
 	@echo "make check   everything: lint, all tests, coverage; names the tools that it needs"
 	@echo "make lint    ruff, mypy, import contracts"
 	@echo "make bench   time the compiled step beside CasADi + IPOPT"
@@ -41,14 +41,16 @@ race: $(VENV)/.ready
 bench: $(VENV)/.ready
 	$(BIN)/bayesrace bench $(ARGS)
 
-# First what computes, one test a processor; then what meets in real time and mostly waits. 5 means
-# that ARGS selects no test of a part. RUNNER: 'make check' measures coverage.
-RUNNER ?= $(BIN)/python -m
+# First the tests that compute, one a processor; then those with processes in real time, which mostly
+# wait. -m selects the tier and comes last. 5 means that ARGS selects no test of a part.
+# RUNNER: 'make check' measures coverage.
+RUNNER = $(BIN)/python -m
 TIER = not check
-PYTEST = $(RUNNER) pytest --dist worksteal $(ARGS)
+PYTEST = $(RUNNER) pytest --dist worksteal
 define RUN_TESTS
-	@$(PYTEST) -m "($(TIER)) and not wall_clock" --numprocesses auto --maxprocesses 8; computing=$$?; \
-	$(PYTEST) -m "($(TIER)) and wall_clock" --numprocesses 3; meeting=$$?; $(TOOK); \
+	@$(PYTEST) --numprocesses auto --maxprocesses 8 $(ARGS) -m "($(TIER)) and not wall_clock"; \
+	computing=$$?; \
+	$(PYTEST) --numprocesses 3 $(ARGS) -m "($(TIER)) and wall_clock"; meeting=$$?; $(TOOK); \
 	for code in $$computing $$meeting; do [ $$code -eq 0 ] || [ $$code -eq 5 ] || exit $$code; done; \
 	[ $$computing -ne 5 ] || [ $$meeting -ne 5 ] || { echo "ARGS selects no test" >&2; exit 5; }
 endef
@@ -56,16 +58,18 @@ endef
 test: $(VENV)/.ready-test
 	$(RUN_TESTS)
 
-# What 'make test' runs, then the rest; nothing twice.
+# What 'make test' runs, then the rest of the tests.
 check: RUNNER = $(BIN)/coverage run -m
-check: $(VENV)/.ready-dev
-	@.ci/tools
+check: tools $(VENV)/.ready-dev
 	@rm -rf build/coverage
 	@$(MAKE) --no-print-directory lint
 	@$(MAKE) --no-print-directory test RUNNER='$(RUNNER)'
 	@$(MAKE) --no-print-directory rest RUNNER='$(RUNNER)'
 	@$(MAKE) --no-print-directory coverage
 	@$(TOOK)
+
+tools:
+	@.ci/tools
 
 rest: TIER = check
 rest: $(VENV)/.ready-dev

@@ -57,10 +57,20 @@ def software(sources: Iterable[str], packages: Iterable[str]) -> Iterator[str | 
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Holds a lock named after ``path`` against all other processes and threads that ask for it."""
+    """Holds a lock named after ``path`` against all other processes and threads that ask for it.
+
+    Raises InputError if there can be no lock beside ``path``.
+    """
     locks = path.parent / ".locks"
-    locks.mkdir(parents=True, exist_ok=True)
-    with (locks / path.name).open("w") as file:
+    try:
+        locks.mkdir(parents=True, exist_ok=True)
+        file = (locks / path.name).open("w")
+    except OSError as error:
+        raise InputError(
+            f"cache {path.parent}: {error.strerror or error}; set BAYESRACE_CACHE to a folder "
+            "that can be written"
+        ) from None
+    with file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield
 

@@ -23,6 +23,7 @@ from bayesrace.gp.corrected import corrected_function
 from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.raceline import RaceLine
+from bayesrace.raceline.cached import racing_line
 from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK, Track, load_track
 from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import dynamic, e_kinematic
@@ -32,7 +33,7 @@ from codegen.settings import BuildSettings
 from controller.native_step import NativeStep, StepStatus
 from controller.path_table import make_path_table
 from controller.settings import MpcSettings
-from experiments.preparation import racing_line, trained_weights, training_samples
+from experiments.preparation import trained_weights, training_samples
 from experiments.progress import Stages
 from learning.training import TrainingSettings
 from plant.simulator import Simulator

@@ -1,26 +1,23 @@
 """What a controller needs before it can drive: line, weights, artefact; kept for the next time.
 
-Racing lines, the training drive and the training take most of a minute, and their outcome depends
-on settings, samples and code alone, so it is kept in the cache beside the built controllers.
+Training takes seconds, and its outcome depends on samples, settings and code alone, so it is kept
+in the cache, as racing lines and built controllers are. The training drive takes a tenth of a
+second, given its line, and is driven again.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.cache import cache_folder, digest, kept, software
+from bayesrace.cpu import cpu_identity
 from bayesrace.files import replacing
-from bayesrace.gp.weights import GpWeights, read_weights, write_weights
+from bayesrace.gp.weights import GpWeights, encode_weights, read_weights, write_weights
 from bayesrace.integrators import PREDICTION, Discretisation
-from bayesrace.raceline import (
-    RaceLine,
-    RaceLineSettings,
-    compute_raceline,
-    read_raceline,
-    write_raceline,
-)
+from bayesrace.raceline import RaceLineSettings
+from bayesrace.raceline.cached import raceline_file, racing_line
 from bayesrace.tracks import (
     DEFAULT_RACE_TRACK,
     DEFAULT_TRAINING_TRACK,
@@ -41,12 +38,10 @@ __all__ = [
     "PreparationSettings",
     "Prepared",
     "prepare",
-    "racing_line",
     "trained_weights",
     "training_samples",
 ]
 
-_LINE_SOURCES: Final = ("bayesrace/vehicles", "bayesrace/tracks", "bayesrace/raceline")
 _WEIGHTS_SOURCES: Final = (
     "bayesrace/vehicles",
     "bayesrace/integrators.py",
@@ -54,7 +49,7 @@ _WEIGHTS_SOURCES: Final = (
     "learning",
 )
 
-_TRACK, _LINE = "race.csv", "race_raceline.csv"
+_TRACK: Final = "race.csv"
 
 
 class PreparationSettings(BaseModel):
@@ -80,18 +75,6 @@ class Prepared:
     artefact: Path
 
 
-def racing_line(
-    track: Track, car: CarParameters, settings: RaceLineSettings | None = None
-) -> RaceLine:
-    """:func:`compute_raceline`, or what it returned for the same track, car and settings before."""
-    settings = settings or RaceLineSettings()
-    return kept(
-        _line_folder(track, car, settings) / _LINE,
-        lambda path: write_raceline(path, compute_raceline(track, car, settings)),
-        lambda path: read_raceline(path, track.name),
-    )
-
-
 def trained_weights(
     samples: Dataset,
     discretisation: Discretisation,
@@ -99,7 +82,7 @@ def trained_weights(
     initial: GpWeights | None = None,
     progress: Progress | None = None,
 ) -> GpWeights:
-    """:func:`train`, or what it returned for the same samples, settings and beginning before."""
+    """What :func:`train` returns; trained only if these arguments are new."""
     return read_weights(_weights_file(samples, discretisation, settings, initial, progress))
 
 
@@ -126,14 +109,15 @@ def prepare(
     """
     car = get_car(settings.car)
     track = load_track(settings.track, car.width_m)
-    folder = _line_folder(track, car, RaceLineSettings())
-    folder.mkdir(parents=True, exist_ok=True)
-    with replacing(folder / _TRACK) as partial:
+    line_file = raceline_file(track, car, RaceLineSettings())
+    track_file = line_file.with_name(_TRACK)
+    track_file.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(track_file) as partial:
         write_track(partial, track)
     if raceline is None:
         with stages.stage("racing line"):
             racing_line(track, car)
-        raceline = folder / _LINE
+        raceline = line_file
     if weights is None:
         with stages.stage("training drive (pure pursuit)"):
             training = load_track(settings.train_track, car.width_m)
@@ -144,21 +128,7 @@ def prepare(
     if artefact is None:
         with stages.stage("build the controller"):
             artefact, _ = build(BuildSettings(car=car.name))
-    return Prepared(folder / _TRACK, raceline, weights, artefact)
-
-
-def _line_folder(track: Track, car: CarParameters, settings: RaceLineSettings) -> Path:
-    """Where the line is kept, named after the car, the track's shape, settings and code."""
-    columns = (track.x_m, track.y_m, track.width_right_m, track.width_left_m)
-    identity = digest(
-        [
-            car.model_dump_json(),
-            settings.model_dump_json(),
-            *(column.tobytes() for column in columns),
-            *software(_LINE_SOURCES, ("casadi", "numpy")),
-        ]
-    )
-    return cache_folder() / f"line-{identity}"
+    return Prepared(track_file, raceline, weights, artefact)
 
 
 def _weights_file(
@@ -173,7 +143,8 @@ def _weights_file(
             samples.digest(),
             discretisation.model_dump_json(),
             settings.model_dump_json(),
-            "" if initial is None else initial.version,  # of its content
+            b"" if initial is None else encode_weights(replace(initial, created_utc_ns=0)),
+            cpu_identity(),
             *software(_WEIGHTS_SOURCES, ("numpy", "scipy", "scikit-learn")),
         ]
     )

@@ -18,6 +18,7 @@ from bayesrace.gp.weights import GpWeights, write_weights
 from bayesrace.log import Recorder
 from bayesrace.messages import EVENT, Event
 from bayesrace.raceline import RaceLine, write_raceline
+from bayesrace.raceline.cached import racing_line
 from bayesrace.tracks import Track, load_track, write_track
 from bayesrace.transport import Director, Endpoints, Publisher, free_endpoint, open_session
 from bayesrace.vehicles import CarParameters, get_car
@@ -25,7 +26,7 @@ from codegen.build import build
 from codegen.settings import BuildSettings
 from experiments.collect import collect
 from experiments.drive import RunPlan, execute, wait_for_both
-from experiments.preparation import racing_line, trained_weights
+from experiments.preparation import trained_weights
 from experiments.processes import Child, child, endings
 from experiments.progress import Stage, Stages
 from experiments.settings import RaceSettings

@@ -13,6 +13,7 @@ import fmpy
 from fmpy.fmi2 import FMU2Slave
 from fmpy.fmi3 import FMU3Slave
 
+from bayesrace.cache import software
 from bayesrace.vehicles.models import STATES
 from codegen.compiler import find_compiler
 from plant.fmu.host import FmuHost
@@ -57,7 +58,8 @@ def faulty_library(version: int) -> Path:
         command = [*line, str(text), "-lm", "-o", str(folder / "faulty.so")]
         subprocess.run(command, check=True, capture_output=True, timeout=120)
 
-    return shared_folder("faulty-fmu", [*line, compiler.version, source, stubs], make) / "faulty.so"
+    parts = [*line, compiler.version, source, stubs, *software((), ("fmpy",))]
+    return shared_folder("faulty-fmu", parts, make) / "faulty.so"
 
 
 def faulty_fmu(

@@ -50,15 +50,15 @@ def run_tests() -> None:
 
 
 def counted() -> Iterator[dict[str, Any]]:
-    """What gcov says of each source file of each build."""
-    for counts in (OUT / "notes").rglob("*.gcda"):
-        line = ["gcov", "--json-format", "--stdout", "--branch-probabilities", counts.name]
-        done = subprocess.run(line, cwd=counts.parent, capture_output=True, check=True)
+    """What gcov says of each source file of each build, executed or not."""
+    for notes in (OUT / "notes").rglob("*.gcno"):
+        line = ["gcov", "--json-format", "--stdout", "--branch-probabilities", notes.name]
+        done = subprocess.run(line, cwd=notes.parent, capture_output=True, check=True)
         yield from json.loads(done.stdout)["files"]
 
 
 def main() -> None:
-    """Runs the tests and prints a table; fails where they do."""
+    """Runs the tests and prints a table; fails if they fail, or leave a source of ours unbuilt."""
     run_tests()
     lines: dict[str, Counter[int]] = defaultdict(Counter)
     branches: dict[str, Counter[tuple[int, int]]] = defaultdict(Counter)
@@ -71,6 +71,8 @@ def main() -> None:
             lines[name][number] += line["count"]
             for index, branch in enumerate(line["branches"]):
                 branches[name][number, index] += branch["count"]
+    if unbuilt := sorted(name for name in OURS - set(lines) if name.endswith(".c")):
+        sys.exit(f"no test builds {', '.join(unbuilt)}")
     print(f"{'C source':26} {'lines':>12} {'branches':>12}  not executed")
     rows = [[0, 0, 0, 0]]
     for name in sorted(lines):

@@ -12,6 +12,7 @@ from typing import Final
 
 import pytest
 
+from bayesrace.cache import software
 from bayesrace.cpu import cpu_identity
 from codegen.build import casadi_includes
 from codegen.compiler import FLAGS
@@ -80,7 +81,7 @@ def artefact_objects(artefact: Path, flags: tuple[str, ...]) -> tuple[Path, ...]
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             list(pool.map(compiled, sources))
 
-    parts: list[str | bytes] = [*flags, gcc("-v"), cpu_identity()]
+    parts: list[str | bytes] = [*flags, gcc("-v"), cpu_identity(), *software((), ("casadi",))]
     parts += [path.read_bytes() for path in [*sources, *sorted(artefact.glob("*.h"))]]
     folder = shared_folder("objects", parts, make)
     return tuple(folder / f"{source.stem}.o" for source in sources)

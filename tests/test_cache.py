@@ -2,17 +2,24 @@
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from bayesrace.cache import digest, kept
 from bayesrace.errors import InputError
-from bayesrace.raceline import RaceLine, RaceLineSettings
+from bayesrace.gp.weights import GpWeights
+from bayesrace.integrators import PREDICTION
+from bayesrace.raceline import RaceLine, RaceLineSettings, cached
 from bayesrace.tracks import load_track
 from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles.models import dynamic
 from experiments import preparation
-from tests.conftest import offset_line
+from learning.training import TrainingSettings
+from tests.conftest import mirrored_weights, offset_line
+from tests.driven import CAR, drive
 
 
 def read(path: Path) -> str:
@@ -81,17 +88,56 @@ def test_a_racing_line_is_kept_for_its_track_car_and_settings(
         computed.append(arguments)
         return offset_line(track, 0.01 * len(computed), 5.0, 2.5)
 
-    monkeypatch.setattr(preparation, "compute_raceline", compute)
-    first, again = (preparation.racing_line(track, car) for _ in range(2))
+    monkeypatch.setattr(cached, "compute_raceline", compute)
+    first, again = (cached.racing_line(track, car) for _ in range(2))
     expected = offset_line(track, 0.01, 5.0, 2.5)
     for line in (first, again):
         assert line.track_name == "paddock"
         for name in ("s_m", "x_m", "y_m", "psi_rad", "kappa_radpm", "vx_mps", "ax_mps2"):
             assert (getattr(line, name) == getattr(expected, name)).all()
-    preparation.racing_line(track, car, RaceLineSettings(margin_m=0.01))
-    preparation.racing_line(load_track("random:1", car.width_m), car)
-    preparation.racing_line(track, car.model_copy(update={"mass_kg": 0.05}))
+    cached.racing_line(track, car, RaceLineSettings(margin_m=0.01))
+    cached.racing_line(load_track("random:1", car.width_m), car)
+    cached.racing_line(track, car.model_copy(update={"mass_kg": 0.05}))
     with monkeypatch.context() as patch:
         patch.setattr("bayesrace.cache.version", lambda _: "9.9")
-        preparation.racing_line(track, car)
+        cached.racing_line(track, car)
     assert len(computed) == 5
+
+
+def test_weights_are_kept_for_their_samples_settings_and_beginning(
+    tmp_path: Path, weights: GpWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("BAYESRACE_CACHE", str(tmp_path))
+    trained: list[object] = []
+
+    def train(*arguments: object) -> GpWeights:
+        trained.append(arguments)
+        return replace(weights, version=f"{len(trained)}")
+
+    monkeypatch.setattr(preparation, "train", train)
+    samples, settings = drive(dynamic(CAR), 30, seed=1), TrainingSettings()
+
+    def version(*changes: object) -> str:
+        arguments: list[Any] = [samples, PREDICTION, settings, None]
+        for position, change in zip(changes[::2], changes[1::2], strict=True):
+            assert isinstance(position, int)
+            arguments[position] = change
+        return preparation.trained_weights(*arguments).version
+
+    assert version() == version() == "1"
+    others = [
+        version(0, drive(dynamic(CAR), 30, seed=2)),
+        version(1, PREDICTION.model_copy(update={"substeps": 2})),
+        version(2, TrainingSettings(seed=1)),
+        version(3, weights),
+        version(3, replace(weights, outputs=mirrored_weights(weights).outputs)),
+    ]
+    assert others == ["2", "3", "4", "5", "6"]
+    assert version(3, replace(weights, created_utc_ns=7)) == "5"
+    assert version() == "1"
+
+
+def test_a_cache_that_cannot_be_written_is_named_with_the_remedy(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match=r"cache .*file: .*set BAYESRACE_CACHE"):
+        kept(tmp_path / "file" / "result", lambda _: None, read)

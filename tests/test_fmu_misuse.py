@@ -182,18 +182,19 @@ def test_numbers_of_values_that_do_not_fit_are_refused() -> None:
 
 
 @VERSIONS
-def test_the_token_of_another_fmu_gives_no_instance(version: Version) -> None:
+def test_the_token_of_another_fmu_gives_no_instance(version: Version, tmp_path: Path) -> None:
     other = slave(version)
     other.description.guid = "{0}"
+    unknown = "{00000000-0000-0000-0000-000000000000}"
+    arguments = _with_token(other, version, unknown, tmp_path / "foreign")
     with pytest.raises(Exception, match="instantiate"):
-        Slave.__init__(*_with_token(other, version, "{00000000-0000-0000-0000-000000000000}"))
+        Slave.__init__(*arguments)
     other.fmu.freeInstance()
 
 
-def _with_token(one: Slave, version: Version, token: str) -> tuple[Slave, Path, Path]:
+def _with_token(one: Slave, version: Version, token: str, folder: Path) -> tuple[Slave, Path, Path]:
     """Arguments of an instance whose description has another token."""
-    folder = unpacked_car(version).with_name(f"foreign-{version}")
-    shutil.copytree(unpacked_car(version), folder, dirs_exist_ok=True)
+    shutil.copytree(unpacked_car(version), folder)
     path = folder / "modelDescription.xml"
     text = path.read_text()
     start = text.index("{")

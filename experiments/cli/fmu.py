@@ -116,6 +116,7 @@ def _controller(
 ) -> "FmuDefinition":
     from bayesrace.gp.weights import read_weights
     from bayesrace.raceline import read_raceline
+    from bayesrace.raceline.cached import racing_line
     from bayesrace.tracks import load_track
     from bayesrace.vehicles import get_car
     from codegen.build import build
@@ -125,7 +126,6 @@ def _controller(
     from controller.fallback import FallbackSettings
     from controller.path_table import make_path_table
     from controller.settings import MpcSettings
-    from experiments.preparation import racing_line
 
     parameters = get_car(car)
     course = load_track(track, parameters.width_m)

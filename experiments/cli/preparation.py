@@ -83,9 +83,9 @@ def raceline(
 ) -> None:
     """Compute the minimum-time racing line of a track."""
     from bayesrace.raceline import RaceLineSettings, write_raceline
+    from bayesrace.raceline.cached import racing_line
     from bayesrace.tracks import load_track
     from bayesrace.vehicles import get_car
-    from experiments.preparation import racing_line
 
     parameters = get_car(car)
     settings = RaceLineSettings(friction=friction, margin_m=margin)

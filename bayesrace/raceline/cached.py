@@ -1,0 +1,43 @@
+"""Racing lines that were computed before, from the cache."""
+
+from pathlib import Path
+from typing import Final
+
+from bayesrace.cache import cache_folder, digest, kept, software
+from bayesrace.cpu import cpu_identity
+from bayesrace.raceline import compute_raceline
+from bayesrace.raceline.line import RaceLine, read_raceline, write_raceline
+from bayesrace.raceline.settings import RaceLineSettings
+from bayesrace.tracks import Track
+from bayesrace.vehicles.parameters import CarParameters
+
+__all__ = ["raceline_file", "racing_line"]
+
+_SOURCES: Final = ("bayesrace/vehicles", "bayesrace/tracks", "bayesrace/raceline")
+
+
+def racing_line(
+    track: Track, car: CarParameters, settings: RaceLineSettings | None = None
+) -> RaceLine:
+    """:func:`compute_raceline`, or what it returned for the same track, car and settings before."""
+    settings = settings or RaceLineSettings()
+    return kept(
+        raceline_file(track, car, settings),
+        lambda path: write_raceline(path, compute_raceline(track, car, settings)),
+        lambda path: read_raceline(path, track.name),
+    )
+
+
+def raceline_file(track: Track, car: CarParameters, settings: RaceLineSettings) -> Path:
+    """Where the line is kept, in a folder named after car, the track's shape, settings and code."""
+    columns = (track.x_m, track.y_m, track.width_right_m, track.width_left_m)
+    identity = digest(
+        [
+            car.model_dump_json(),
+            settings.model_dump_json(),
+            *(column.tobytes() for column in columns),
+            cpu_identity(),  # on which the last bits depend
+            *software(_SOURCES, ("casadi", "numpy")),
+        ]
+    )
+    return cache_folder() / f"line-{identity}" / "race_raceline.csv"
