@@ -26,8 +26,9 @@ from controller.native_step import NativeStep
 from controller.path_table import PathTable, make_path_table
 from controller.settings import MpcSettings
 from tests.command_line import cli
+from tests.zig import ziglang
 
-__all__ = ["cli"]  # a fixture for all tests
+__all__ = ["cli", "ziglang"]  # fixtures for all tests
 
 Floats = NDArray[np.float64]
 

@@ -6,7 +6,6 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from importlib.util import find_spec
 from pathlib import Path
 
 import casadi as ca
@@ -277,10 +276,8 @@ def test_the_library_cannot_print_exit_or_start_threads(kinematic_artefact: Path
 
 @pytest.mark.check
 def test_ziglang_builds_the_controller_where_there_is_no_compiler(
-    cache: Path, monkeypatch: pytest.MonkeyPatch, car: CarParameters
+    ziglang: None, cache: Path, monkeypatch: pytest.MonkeyPatch, car: CarParameters
 ) -> None:
-    if not find_spec("ziglang"):
-        pytest.skip("ziglang is not installed (pip install ziglang)")
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.setattr("codegen.compiler.shutil.which", lambda _: None)
     compiler = find_compiler()

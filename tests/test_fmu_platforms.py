@@ -1,6 +1,5 @@
 """Binaries of an FMU: rebuilt from its own sources, and for processors and systems not this one."""
 
-import importlib.util
 import os
 import shlex
 import shutil
@@ -32,7 +31,6 @@ ARM_LIBRARIES = Path("/usr/aarch64-linux-gnu")
 """Where Debian's libc6-arm64-cross lies."""
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="the line in the archive is for Linux")
-zig = pytest.mark.skipif(importlib.util.find_spec("ziglang") is None, reason="ziglang is missing")
 
 
 def readme_line(sources: Path) -> list[str]:
@@ -120,7 +118,7 @@ def pe_exports(data: bytes) -> set[str]:
 
 
 @pytest.fixture(scope="module", params=[2, 3])
-def everywhere(request: pytest.FixtureRequest) -> Path:
+def everywhere(ziglang: None, request: pytest.FixtureRequest) -> Path:
     """The car's FMU with binaries for all platforms that can be built for, unpacked."""
     return unpacked_car(request.param, platforms=EVERYWHERE)
 
@@ -131,7 +129,6 @@ def binary(unpacked: Path, name: str) -> Path:
     return found
 
 
-@zig
 @pytest.mark.check
 @pytest.mark.timeout(1500)  # ziglang builds a C library per target the first time
 def test_cross_compiled_binaries_are_for_their_platform_and_offer_fmi(
@@ -183,7 +180,6 @@ def drive_program(platform: str, sources: Path, program: Path) -> None:
     subprocess.run([*line, "-o", str(program)], check=True)
 
 
-@zig
 @linux
 @pytest.mark.check
 @pytest.mark.timeout(1500)
