@@ -6,6 +6,7 @@ interpreter is a failure of the test; then a shorter hunt guided by coverage, wh
 
 import math
 import multiprocessing
+import os
 import subprocess
 import sys
 import tracemalloc
@@ -26,7 +27,7 @@ from bayesrace.gp.weights import GpWeights, decode_weights, encode_weights
 from bayesrace.messages import Message, decode, encode, json_schema
 from bayesrace.messages.codec import largest_bytes
 from tests.mutations import FRAGMENTS, KINDS, MessageMutator, WeightsMutator, bombs
-from tests.programs import ROOT, environment
+from tests.programs import ROOT, unmeasured
 from tests.test_gp_weights import BODY, make_weights, reseal
 
 MESSAGES = 380_000
@@ -137,7 +138,9 @@ def hunt(seed: int, messages: int, weights: int) -> Outcome:
 
 
 @pytest.mark.check
-def test_damaged_inputs_are_valid_or_refused() -> None:
+def test_damaged_inputs_are_valid_or_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in os.environ.keys() - unmeasured().keys():
+        monkeypatch.delenv(name)
     share = (MESSAGES // WORKERS, WEIGHTS // WORKERS)
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(WORKERS, mp_context=spawn) as pool:
@@ -212,7 +215,7 @@ def test_coverage_guided_fuzzing_finds_nothing(target: str, tmp_path: Path) -> N
     done = subprocess.run(
         [*command, *limits],
         cwd=ROOT,
-        env=environment(),
+        env=unmeasured(),
         capture_output=True,
         text=True,
         check=False,

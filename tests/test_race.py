@@ -57,9 +57,11 @@ def short(peanut_track: Path, tmp_path_factory: pytest.TempPathFactory) -> Short
     """Starts a race on the shortest track, in lockstep unless told otherwise."""
     folder = tmp_path_factory.mktemp("race")
 
-    def begin(name: str, *options: str | Path, **environment: str) -> Callable[[], Race]:
+    def begin(
+        name: str, *options: str | Path, measured: bool = False, **environment: str
+    ) -> Callable[[], Race]:
         tracks = ("--track", peanut_track, "--train-track", peanut_track)
-        return Race.running(folder / name, *tracks, *options, **environment)
+        return Race.running(folder / name, *tracks, *options, measured=measured, **environment)
 
     return begin
 
@@ -69,7 +71,7 @@ def driven(short: ShortRace, tmp_path_factory: pytest.TempPathFactory) -> Race:
     """The race that most tests look at, driven once for all workers."""
 
     def make(folder: Path) -> None:
-        race = short("driven")()
+        race = short("driven", measured=True)()
         assert leftovers(race.pid) == {}
         shutil.copytree(race.out, folder / "run")
         (folder / "stdout").write_text(race.process.stdout)
