@@ -58,10 +58,11 @@ endef
 test: $(VENV)/.ready-test
 	$(RUN_TESTS)
 
-# What 'make test' runs, then the rest of the tests.
+# What 'make test' runs, then the rest of the tests, which finds again what the former has driven.
 check: RUNNER = $(BIN)/coverage run -m
+check: export TEST_SESSION = $(CURDIR)/build/session
 check: tools $(VENV)/.ready-dev
-	@rm -rf build/coverage
+	@rm -rf build/coverage build/session
 	@$(MAKE) --no-print-directory lint
 	@$(MAKE) --no-print-directory test RUNNER='$(RUNNER)'
 	@$(MAKE) --no-print-directory rest RUNNER='$(RUNNER)'
@@ -106,11 +107,15 @@ ZIG := $(shell for compiler in "$${CC-}" cc gcc clang; do \
 INSTALL = $(PIP_INSTALL) hatchling editables && $(PIP_INSTALL) $(PROJECT)
 SHAPED_BY := $(VENV)/.created pyproject.toml constraints.txt
 
+NO_COMPILER = $(if $(ZIG:,%=%),@echo "no C compiler here: installing ziglang, which is one")
+
 $(VENV)/.ready: $(SHAPED_BY)
+	$(NO_COMPILER)
 	$(INSTALL) ".$(ZIG:,%=[%])"
 	@touch $@
 
 $(VENV)/.ready-test: $(SHAPED_BY)
+	$(NO_COMPILER)
 	$(INSTALL) ".[test$(ZIG)]"
 	@touch $@ $(VENV)/.ready
 

@@ -23,9 +23,13 @@ def shared_folder(name: str, parts: Iterable[str | bytes], make: Callable[[Path]
 def session_folder(
     factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]
 ) -> Path:
-    """A folder that ``make`` has filled, for this run alone: each run makes it anew."""
+    """A folder that ``make`` has filled, for this run alone: each run makes it anew.
+
+    TEST_SESSION names a folder for several runs of pytest that are one, as in ``make check``.
+    """
     own = factory.getbasetemp()
-    return _made((own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / name, make)
+    run = own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
+    return _made(Path(os.environ.get("TEST_SESSION", run)) / name, make)
 
 
 def _made(folder: Path, make: Callable[[Path], object]) -> Path:
@@ -33,7 +37,7 @@ def _made(folder: Path, make: Callable[[Path], object]) -> Path:
         if not folder.exists():
             partial = folder.with_name(f"{folder.name}.part")
             shutil.rmtree(partial, ignore_errors=True)  # of a process that was killed
-            partial.mkdir()
+            partial.mkdir(parents=True)
             make(partial)
             partial.rename(folder)
     return folder

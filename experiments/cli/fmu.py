@@ -41,7 +41,7 @@ fmu = typer.Typer(
 def export(
     out: OutFile,
     car: Car = "orca",
-    version: Annotated[Version, typer.Option(help="FMI standard: 2.0 or 3.0.")] = Version.three,
+    version: Annotated[Version, typer.Option(help="Of the FMI standard: 2 or 3.")] = Version.three,
     kind: Annotated[
         Kind, typer.Option(help="Co-Simulation, or Model Exchange (the car, FMI 3.0).")
     ] = Kind.cs,
