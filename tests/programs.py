@@ -30,7 +30,6 @@ __all__ = [
     "run",
     "start",
     "started_by",
-    "unmeasured",
     "until",
 ]
 
@@ -43,14 +42,6 @@ PATIENCE_S: Final = 240.0
 def environment() -> dict[str, str]:
     """A wide terminal without colours, so that no cell of a table is wrapped."""
     return {**os.environ, "COLUMNS": "200", "NO_COLOR": "1", "TERM": "dumb"}
-
-
-def unmeasured() -> dict[str, str]:
-    """The environment of what computes for long and executes nothing that others do not.
-
-    Measuring coverage makes Python two to three times slower.
-    """
-    return {name: one for name, one in environment().items() if not name.startswith("COVERAGE_")}
 
 
 def start(*arguments: str | Path, **popen: Any) -> subprocess.Popen[str]:
@@ -129,15 +120,9 @@ class Race:
     process: subprocess.CompletedProcess[str]
 
     @classmethod
-    def running(
-        cls, out: Path, *arguments: str | Path, measured: bool = False, **variables: str
-    ) -> Callable[[], "Race"]:
-        """Starts a race, with these variables in its environment; call the result to wait.
-
-        ``measured``: its coverage is, where that of the tests is.
-        """
-        around = environment() if measured else unmeasured()
-        process = start("race", "--out", out, *arguments, env={**around, **variables})
+    def running(cls, out: Path, *arguments: str | Path, **variables: str) -> Callable[[], "Race"]:
+        """Starts a race, with these variables in its environment; call the result to wait."""
+        process = start("race", "--out", out, *arguments, env={**environment(), **variables})
 
         def wait() -> Race:
             done = finish(process)

@@ -21,7 +21,7 @@ from bayesrace.transport import Director, free_endpoint
 from bayesrace.vehicles import get_car
 from tests.command_line import Cli, refused
 from tests.conftest import Circuit
-from tests.programs import finish, peanut, run, start, unmeasured, until
+from tests.programs import finish, peanut, run, start, until
 
 SUBCOMMANDS = (
     "race", "drive", "report", "bench", "tracks", "raceline", "collect", "train", "build",
@@ -245,7 +245,7 @@ def test_the_program_itself_fails_as_its_entry_point(tmp_path: Path) -> None:
 
 
 def _succeed(*arguments: str | Path) -> str:
-    done = finish(start(*arguments, env=unmeasured()))
+    done = run(*arguments)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -276,10 +276,8 @@ def test_the_chain_by_files_in_four_terminals(
 
     plant_at, controller_at = free_endpoint(), free_endpoint()
     files = ("--artefact", artefact, "--track", track, "--raceline", line, "--weights", weights)
-    alone = {"env": unmeasured()}
-    plant = start("plant", "--endpoint", plant_at, **alone)
-    listen = ("--endpoint", plant_at, "--listen", controller_at)
-    controller = start("controller", *files, *listen, **alone)
+    plant = start("plant", "--endpoint", plant_at)
+    controller = start("controller", *files, "--endpoint", plant_at, "--listen", controller_at)
     ended += [plant, controller]
     where = ("--endpoint", plant_at, "--endpoint", controller_at)
     # Twice: a plant waits for the next run.

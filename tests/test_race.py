@@ -57,11 +57,9 @@ def short(peanut_track: Path, tmp_path_factory: pytest.TempPathFactory) -> Short
     """Starts a race on the shortest track; ``options`` are those of the command line."""
     folder = tmp_path_factory.mktemp("race")
 
-    def begin(
-        name: str, *options: str | Path, measured: bool = False, **environment: str
-    ) -> Callable[[], Race]:
+    def begin(name: str, *options: str | Path, **environment: str) -> Callable[[], Race]:
         tracks = ("--track", peanut_track, "--train-track", peanut_track)
-        return Race.running(folder / name, *tracks, *options, measured=measured, **environment)
+        return Race.running(folder / name, *tracks, *options, **environment)
 
     return begin
 
@@ -71,7 +69,7 @@ def driven(short: ShortRace, tmp_path_factory: pytest.TempPathFactory) -> Race:
     """The race that most tests look at, driven once for all workers."""
 
     def make(folder: Path) -> None:
-        race = short("driven", measured=True)()
+        race = short("driven")()
         assert leftovers(race.pid) == {}
         shutil.copytree(race.out, folder / "run")
         (folder / "stdout").write_text(race.process.stdout)
