@@ -15,7 +15,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
     It is on the disk before it does: after a power failure ``path`` is the old file or the new one.
     It lies beside ``path`` and has the same suffix, as some writers add what they miss. OSError as
-    of the block, or of the system; what was begun is deleted then.
+    of the block, or of the system, but about ``path``; what was begun is deleted then.
     """
     unique = f"{os.getpid()}.{time.monotonic_ns()}"
     partial = path.with_name(f".{path.stem}.{unique}.part{path.suffix}")
@@ -23,6 +23,8 @@ def replacing(path: Path) -> Iterator[Path]:
         yield partial
         _sync(partial)
         partial.replace(path)
+    except OSError as error:  # of a full disk it does not say which file
+        raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         with suppress(OSError):
             partial.unlink(missing_ok=True)

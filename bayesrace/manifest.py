@@ -4,6 +4,9 @@ The manifest names everything that shaped the artefact. Weights learned for anot
 or scheme are refused by comparing :attr:`Manifest.discretisation`.
 """
 
+import hashlib
+import os
+import stat
 from pathlib import Path
 from typing import Final
 
@@ -11,9 +14,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.errors import InputError
 
-__all__ = ["ABI", "LIBRARY", "MANIFEST", "Manifest", "read_manifest"]
+__all__ = ["ABI", "LIBRARY", "MANIFEST", "Manifest", "check_library", "read_manifest"]
 
-ABI: Final = 4
+ABI: Final = 5
 """Version of the C interface in controller/native/bayesrace_mpc.h."""
 
 LIBRARY: Final = "libmpc.so"
@@ -66,3 +69,34 @@ def read_manifest(artefact: Path) -> Manifest:
             "run 'bayesrace build'"
         )
     return manifest
+
+
+def check_library(artefact: Path, manifest: Manifest) -> Path:
+    """The library of the artefact, which is code that will be executed.
+
+    InputError if it is not the one that the manifest describes, or others may have put it there:
+    it has to belong to this user or to root, and nobody else may write it.
+    """
+    path = artefact / LIBRARY
+    try:
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        for one in (artefact, path):
+            _check_owner(one)
+    except OSError as error:
+        raise InputError(
+            f"{path} cannot be read ({error.strerror or error}): run 'bayesrace build'"
+        ) from None
+    if digest != manifest.library_sha256:
+        raise InputError(f"{path} is not the library its manifest describes: run 'bayesrace build'")
+    return path
+
+
+def _check_owner(path: Path) -> None:
+    status = path.stat()
+    if status.st_uid not in (os.geteuid(), 0):
+        raise InputError(
+            f"{path} belongs to another user (number {status.st_uid}), whose code is not executed: "
+            "build your own, or set BAYESRACE_CACHE to a folder of yours"
+        )
+    if status.st_mode & stat.S_IWOTH:
+        raise InputError(f"{path} may be written by anybody: remove it, or 'chmod o-w' it")

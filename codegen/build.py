@@ -17,7 +17,14 @@ from typing import Final
 from bayesrace.cache import cache_folder, digest, locked, software
 from bayesrace.cpu import cpu_digest, cpu_identity
 from bayesrace.errors import InputError
-from bayesrace.manifest import ABI, LIBRARY, MANIFEST, Manifest, read_manifest
+from bayesrace.manifest import (
+    ABI,
+    LIBRARY,
+    MANIFEST,
+    Manifest,
+    check_library,
+    read_manifest,
+)
 from bayesrace.vehicles import get_car
 from codegen.compiler import FLAGS, Compiler, find_compiler
 from codegen.settings import BuildSettings
@@ -112,12 +119,14 @@ def build(
     target = cache_folder() / f"{settings.model}-{identity}"
 
     def built() -> tuple[Path, Manifest] | None:
+        """What the cache has; None if it is absent, damaged, or somebody else's."""
         try:
-            found = target, read_manifest(target)
-        except InputError:  # absent or damaged
+            manifest = read_manifest(target)
+            check_library(target, manifest)
+        except InputError:
             return None
         progress(f"{settings.model}: cached")
-        return found
+        return target, manifest
 
     if found := built():
         return found
@@ -125,8 +134,8 @@ def build(
         if found := built():  # by another process, meanwhile
             return found
         progress(f"{settings.model}: generating and compiling")
-        shutil.rmtree(target, ignore_errors=True)
-        with tempfile.TemporaryDirectory(dir=target.parent, prefix=".build-") as temporary:
+        _clear(target)
+        with tempfile.TemporaryDirectory(dir=target.parent, prefix=_partial(target)) as temporary:
             folder = Path(temporary) / "artefact"
             folder.mkdir()
             _compile(settings, compiler, folder)
@@ -134,6 +143,27 @@ def build(
             (folder / MANIFEST).write_text(manifest.model_dump_json(indent=1) + "\n")
             folder.rename(target)
     return target, manifest
+
+
+def _partial(target: Path) -> str:
+    """How the folders begin in which this artefact, and no other, is built."""
+    return f".{target.name}-"
+
+
+def _clear(target: Path) -> None:
+    """Removes the artefact, and what killed builds of it have left; with its lock.
+
+    InputError if it cannot be removed.
+    """
+    try:
+        for old in (target, *target.parent.glob(f"{_partial(target)}*")):
+            if old.exists():
+                shutil.rmtree(old)
+    except OSError as error:
+        raise InputError(
+            f"{target} is not usable and cannot be replaced ({error.strerror}): remove it, or set "
+            "BAYESRACE_CACHE to a folder of yours"
+        ) from None
 
 
 def _manifest(settings: BuildSettings, compiler: Compiler, identity: str, folder: Path) -> Manifest:

@@ -5,7 +5,6 @@ import platform
 import shlex
 import shutil
 import subprocess
-import sys
 import tempfile
 from dataclasses import dataclass
 from functools import cache
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from bayesrace.errors import InputError
+from bayesrace.interpreter import RUN_MODULE
 
 __all__ = ["FLAGS", "CompileError", "Compiler", "find_compiler"]
 
@@ -84,12 +84,15 @@ def _shortened(text: str, most: int = 4000) -> str:
 def _candidates() -> list[tuple[str, ...]]:
     chosen = os.environ.get("CC")
     if chosen:
-        return [tuple(shlex.split(chosen))]
+        try:
+            return [tuple(shlex.split(chosen))]
+        except ValueError as error:
+            raise InputError(f"CC={chosen}: {error}; set it to a command such as 'gcc'") from None
     found: list[tuple[str, ...]] = [
         (name,) for name in ("cc", "gcc", "clang") if shutil.which(name)
     ]
     if find_spec("ziglang"):
-        found.append((sys.executable, "-m", "ziglang", "cc"))
+        found.append((*RUN_MODULE, "ziglang", "cc"))
     return found
 
 

@@ -36,6 +36,9 @@ HALTED = 253
 _STANDING_MPS = 0.1
 """Speed below which a stop ends in holding the brake."""
 
+_JUMP, _JUMP_BY = 2.0, 0.01
+"""A plan that costs more than so many times the one before, shifted, and so much more (m^2)."""
+
 _LONGEST_S = 1.0
 """Longest piece of dead reckoning."""
 
@@ -104,6 +107,10 @@ class Driver:
         self.raised = 0
         """Steps that raised an exception."""
         self.last_error = ""
+        self.second_starts = 0
+        """Steps that looked for another plan beside the one that went on from before."""
+        self.cost_jumps = 0
+        """Steps whose plan costs much more than to go on with the one before."""
 
     @property
     def delay_s(self) -> float:
@@ -133,10 +140,14 @@ class Driver:
         self._halted = self._stopping_from = None
         self._controller.limit_speed(math.inf, 0.0)
 
-    def lost(self) -> None:
-        """The plant has gone, or fallen silent: any other may follow."""
+    def lost(self, silent: bool) -> State | None:
+        """The run is over, its plant has gone, or, ``silent``, nothing has come for long.
+
+        Any other may follow, such as the state that is returned: see :meth:`StateStream.forget`.
+        """
         self.phase = Phase.WAITING
-        self.states.forget()
+        self.states.end()
+        return self.states.forget() if silent else None
 
     def observe(self, state: State) -> bool:
         """Takes a state that has arrived; False if it is an old one."""
@@ -271,3 +282,6 @@ class Driver:
             decision.status = STEP_RAISED
         else:
             decision.output, decision.status = output, output.status
+            self.second_starts += output.second_start > 0
+            if output.cost_shifted >= 0:
+                self.cost_jumps += output.cost > _JUMP * output.cost_shifted + _JUMP_BY

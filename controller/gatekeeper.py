@@ -109,7 +109,10 @@ class Gatekeeper:
 
     def _push(self, accepted: Accepted) -> None:
         weights = decode_weights(accepted.data) if accepted.data else None
-        incumbent = Incumbent(accepted.number, accepted.version, weights, accepted.proven)
+        accepted_utc_ns = accepted.accepted_utc_ns or time.time_ns()  # by the start, if by none
+        incumbent = Incumbent(
+            accepted.number, accepted.version, weights, accepted.proven, accepted_utc_ns
+        )
         self._files = trimmed([*self._files, accepted])
         self._incumbents = trimmed([*self._incumbents, incumbent])
 

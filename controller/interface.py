@@ -42,6 +42,9 @@ class StepOutput:
     residual_dynamics: float = -1.0
     residual_bounds: float = -1.0
     residual_stationarity: float = -1.0
+    cost: float = -1.0
+    cost_shifted: float = -1.0
+    second_start: int = 0
     """As in :class:`bayesrace.messages.Telemetry`; -1 if there is none."""
     s_ref_m: float = 0.0
     n_ref_m: float = 0.0

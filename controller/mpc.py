@@ -82,6 +82,9 @@ class PredictiveController:
         output.residual_dynamics = info.defect
         output.residual_bounds = max(info.bound, 0.0)
         output.residual_stationarity = info.stationarity
+        output.cost = info.cost
+        output.cost_shifted = info.shifted_cost if info.shifts >= 0 else -1.0
+        output.second_start = info.second_start
         output.s_ref_m = info.s_ref_m
         output.n_ref_m = info.lateral_m
         return output

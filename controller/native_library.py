@@ -4,14 +4,13 @@ Mirrors controller/native/bayesrace_mpc.h; :data:`bayesrace.manifest.ABI` says w
 """
 
 import ctypes as ct
-import hashlib
 from enum import IntEnum
 from pathlib import Path
 from typing import Final
 
 from bayesrace.cpu import cpu_digest
 from bayesrace.errors import InputError
-from bayesrace.manifest import ABI, LIBRARY, Manifest
+from bayesrace.manifest import ABI, Manifest, check_library
 
 __all__ = ["Gp", "Parameters", "StepInfo", "StepStatus", "load_library"]
 
@@ -100,6 +99,7 @@ class StepInfo(ct.Structure):
         ("qp_iterations", ct.c_int),
         ("regularised", ct.c_int),
         ("shortened", ct.c_int),
+        ("second_start", ct.c_int),
         ("shifts", ct.c_int),
         ("prepared", ct.c_int),
         ("prepared_iterations", ct.c_int),
@@ -107,6 +107,7 @@ class StepInfo(ct.Structure):
         ("stationarity", ct.c_double),
         ("defect", ct.c_double),
         ("bound", ct.c_double),
+        ("shifted_cost", ct.c_double),
         ("cost", ct.c_double),
         ("slack_max_m", ct.c_double),
         ("s_ref_m", ct.c_double),
@@ -116,6 +117,8 @@ class StepInfo(ct.Structure):
     qp_iterations: int
     regularised: int
     shortened: int
+    second_start: int
+    """1: the plan from before was doubtful, and a new one no better; 2: the new one is better."""
     shifts: int
     """Stages by which the plan before was shifted; -1: there was none."""
     prepared: int
@@ -124,6 +127,8 @@ class StepInfo(ct.Structure):
     stationarity: float
     defect: float
     bound: float
+    shifted_cost: float
+    """Of the plan before, shifted, under the same reference; 0 cold."""
     cost: float
     slack_max_m: float
     s_ref_m: float
@@ -132,16 +137,7 @@ class StepInfo(ct.Structure):
 
 def load_library(artefact: Path, manifest: Manifest) -> ct.CDLL:
     """The artefact's library with its functions' types; InputError if it cannot be used here."""
-    path = artefact / LIBRARY
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path} cannot be read ({error}): run 'bayesrace build'") from None
-    if hashlib.sha256(data).hexdigest() != manifest.library_sha256:
-        raise InputError(
-            f"{path} is not the library its manifest describes: remove the folder and run "
-            "'bayesrace build'"
-        )
+    path = check_library(artefact, manifest)
     if manifest.cpu != cpu_digest():
         raise InputError(
             f"{path} was compiled for another CPU: remove the folder and run 'bayesrace build' here"
@@ -153,10 +149,13 @@ def load_library(artefact: Path, manifest: Manifest) -> ct.CDLL:
             f"{path} cannot be loaded here ({error}): it was built for another machine; "
             "remove the folder and run 'bayesrace build'"
         ) from None
-    if library.br_mpc_abi() != ABI:
-        raise InputError(f"{artefact}: library and manifest disagree: run 'bayesrace build'")
-    _declare(library)
-    return library
+    try:
+        if library.br_mpc_abi() == ABI:
+            _declare(library)
+            return library
+    except AttributeError as error:
+        raise InputError(f"{path} lacks a function ({error}): run 'bayesrace build'") from None
+    raise InputError(f"{artefact}: library and manifest disagree: run 'bayesrace build'")
 
 
 def _declare(library: ct.CDLL) -> None:

@@ -139,6 +139,8 @@ class ControllerProcess:
         item = self.inbox.get(HEARTBEAT_S)
         if self._takeover is not None:
             self._takeover.between_cycles(self._next_cycle)
+        if item is None and (left := self._left_over()) is not None:
+            return left
         if item is None:
             self._decoder.report(_log)
             if not self._service.plant_there and not self._told:
@@ -157,19 +159,30 @@ class ControllerProcess:
         self._timing.decode_us = (time.perf_counter_ns() - begin_ns) * 1e-3
         if state is None or not self._driver.observe(state):
             return None
+        self._payload = item.value
+        return self._noted(state, item.received_ns)
+
+    def _noted(self, state: State, arrived_ns: int) -> State:
         if self._takeover is not None:
             self._takeover.note(state, self._driver.fallen_back)
-        self._arrived_ns = item.received_ns
-        self._payload = item.value
-        self._service.arrived_ns = item.received_ns
+        self._arrived_ns = self._service.arrived_ns = arrived_ns
         return state
 
     def _silent(self) -> bool:
         return time.monotonic_ns() - self._arrived_ns > _SILENT_S * 1e9
 
-    def _silence(self) -> None:
-        self._driver.lost()
+    def _left_over(self) -> State | None:
+        """After silence: a state that was not driven on, to which its plant may want an answer."""
+        left = self._driver.lost(silent=True) if self._silent() else None
+        if left is None or not self._driver.observe(left):
+            return None
+        return self._noted(left, time.monotonic_ns())
+
+    def _leave(self, state: State | None) -> State | None:
+        """Ends a loop, for want of states or with one that is not for it: the next one to drive."""
+        self._driver.lost(silent=False)
         gc.collect()
+        return state or self._left_over()
 
     # Lockstep ----------------------------------------------------------------------------------
 
@@ -196,8 +209,7 @@ class ControllerProcess:
             item = inbox.get(HEARTBEAT_S)
             state = None if item is None else self._take(item)
         inbox.spin_s = 0.0
-        self._silence()
-        return state
+        return self._leave(state)
 
     # Free-running ------------------------------------------------------------------------------
 
@@ -220,8 +232,7 @@ class ControllerProcess:
             newer = self._next_state()
             fresh = newer is not None
             state = newer or state
-        self._silence()
-        return state if fresh else None
+        return self._leave(state if fresh else None)
 
     def _tick(self, state: State) -> None:
         """One cycle: decide, send, report."""
@@ -352,6 +363,7 @@ class ControllerProcess:
             "states_received": states.received,
             "states_lost": states.lost,
             "states_stale": states.stale,
+            "states_foreign": states.foreign,
             "refused": self._decoder.refused,
             "overflowed": self.inbox.overflowed,
             **({} if self._courier is None else self._courier.status()),

@@ -167,5 +167,7 @@ class Service:
             "brake": counts[Level.BRAKE],
             "stop": counts[Level.STOP],
             "raised": self._driver.raised,
+            "second_starts": self._driver.second_starts,
+            "cost_jumps": self._driver.cost_jumps,
             **({} if self._takes_weights else {"weights_refused": self._weights_refused}),
         }

@@ -18,16 +18,21 @@ class MpcSettings(BaseModel):
     margin_m: float = Field(0.01, ge=0, description="distance kept from the track edges")
     tolerance: float = Field(1e-6, gt=0, description="KKT residual of a converged step")
     defect_max: float = Field(
-        0.1, gt=0, description="largest dynamics defect (m, rad, m/s, 10 rad/s) of a usable plan"
+        0.03, gt=0, description="largest dynamics defect (m, rad, m/s, 10 rad/s) of a usable plan"
     )
     settle: float = Field(
         1e-4,
         ge=0,
         description="a step stops iterating at this stationarity and tenth of the defect, or, "
-        "warm started and without a time budget, when they fall by less than half; 0: neither",
+        "warm started and without a time budget, when they fall by less than half and the defect "
+        "is below 0.01; 0: neither",
     )
     iterations: int = Field(
-        3, ge=1, le=1000, description="SQP iterations a step without time budget may use"
+        3,
+        ge=1,
+        le=1000,
+        description="SQP iterations a step without time budget may use, once the defect is below "
+        "0.01",
     )
     iterations_cold: int = Field(
         30,

@@ -64,6 +64,9 @@ def telemetry_of(seq: int, state: State, decision: Decision, timing: Timing) -> 
         _known(output.residual_dynamics),
         _known(output.residual_bounds),
         _known(output.residual_stationarity),
+        _known(output.cost),
+        _known(output.cost_shifted),
+        output.second_start,
         output.s_ref_m if math.isfinite(output.s_ref_m) else 0.0,
         output.n_ref_m if math.isfinite(output.n_ref_m) else 0.0,
     )

@@ -3,9 +3,10 @@
 import contextlib
 import signal
 import subprocess
-import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+
+from bayesrace.interpreter import RUN_MODULE
 
 __all__ = ["Child", "child", "endings"]
 
@@ -19,7 +20,7 @@ class Child:
         self.output = output
         self._file = output.open("ab")
         self._process = subprocess.Popen(
-            [sys.executable, "-m", module, *arguments],
+            [*RUN_MODULE, module, *arguments],
             stdin=subprocess.DEVNULL,
             stdout=self._file,
             stderr=subprocess.STDOUT,

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from bayesrace.errors import InputError
+from bayesrace.files import write_whole
 from bayesrace.gp.weights import GpWeights, write_weights
 from bayesrace.log import Recorder
 from bayesrace.messages import EVENT, Event
@@ -146,7 +147,7 @@ class _Race:
         else:
             settings = BuildSettings(car=self.car.name, discretisation=self.settings.discretisation)
         folder, manifest = build(settings)
-        (self.out / f"manifest-{model}.json").write_text(manifest.model_dump_json(indent=1) + "\n")
+        write_whole(self.out / f"manifest-{model}.json", manifest.model_dump_json(indent=1) + "\n")
         return folder
 
     # Driving -----------------------------------------------------------------------------------
@@ -213,7 +214,7 @@ class _Paddock:
         """A controller process for the block; ready for its first run."""
         race, course = self._race, self._course
         settings_file = race.out / FILES.mpc
-        settings_file.write_text(race.settings.mpc.model_dump_json(indent=1) + "\n")
+        write_whole(settings_file, race.settings.mpc.model_dump_json(indent=1) + "\n")
         arguments = [
             "controller", "--car", race.car.name, "--artefact", str(artefact),
             "--track", str(course.track_file), "--raceline", str(course.line_file),
@@ -254,7 +255,7 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
     )
     out.mkdir(parents=True, exist_ok=True)
     this.keep_fmu()
-    (out / FILES.settings).write_text(settings.model_dump_json(indent=1) + "\n")
+    write_whole(out / FILES.settings, settings.model_dump_json(indent=1) + "\n")
     with stages.stage("racing line, training track"):
         training = this.course(train_track, "train")
     with stages.stage("racing line, race track"):

@@ -123,7 +123,24 @@ class _Log:
         number = self.seq("telemetry")
         timing = (number, self.now_ns, self.now_ns, False, 0.0, 0.0, 0.0, solve_us, 0.0, 0.0)
         return Telemetry(
-            number, self.now_ns, run, seq, 0, level, 1, *timing, (), (), 0.0, 0.0, 0.0, 0.0, 0.0
+            number,
+            self.now_ns,
+            run,
+            seq,
+            0,
+            level,
+            1,
+            *timing,
+            (),
+            (),
+            0.0,
+            0.0,
+            0.0,
+            0.0,
+            0.0,
+            0,
+            0.0,
+            0.0,
         )
 
     def close(self) -> None:

@@ -3,7 +3,6 @@
 import os
 import shutil
 import subprocess
-import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -16,6 +15,7 @@ import codegen.build as build_module
 from bayesrace.cache import cache_folder
 from bayesrace.errors import InputError
 from bayesrace.integrators import PERFECT, PREDICTION, Discretisation
+from bayesrace.interpreter import RUN_MODULE
 from bayesrace.manifest import LIBRARY, MANIFEST, read_manifest
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import MODELS
@@ -281,7 +281,7 @@ def test_ziglang_builds_the_controller_where_there_is_no_compiler(
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.setattr("codegen.compiler.shutil.which", lambda _: None)
     compiler = find_compiler()
-    assert compiler.command == (sys.executable, "-m", "ziglang", "cc")
+    assert compiler.command == (*RUN_MODULE, "ziglang", "cc")
     folder, manifest = build(BuildSettings(gp_capacity=8))
     assert manifest.compiler == compiler.version
     step = load(folder, car)

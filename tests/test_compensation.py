@@ -1,5 +1,6 @@
 """With an exact model, the predicted state is the true one at the moment the input acts."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -116,7 +117,7 @@ def test_no_prediction_goes_farther_than_its_limit() -> None:
     assert x == pytest.approx(exact(moving, np.zeros(2), 0.5))
 
 
-def test_old_numbers_after_a_restart_are_new_and_new_ones_from_before_are_old() -> None:
+def test_a_run_goes_on_with_rising_numbers_and_another_plant_begins_anew() -> None:
     stream = StateStream()
     zero = np.zeros(7), np.zeros(2)
     for seq in (100, 101, 104, 103, 104):
@@ -125,21 +126,59 @@ def test_old_numbers_after_a_restart_are_new_and_new_ones_from_before_are_old() 
     assert (stream.received, stream.stale) == (5, 2)
     assert stream.newest is not None
     assert stream.newest.seq == 104
+    stream.end()
     assert stream.accept(state(0, *zero, epoch=2))
     assert not stream.accept(state(105, *zero, epoch=1))
     assert stream.accept(state(1, *zero, epoch=2))
     assert stream.newest.epoch == 2
+    assert (stream.stale, stream.foreign) == (2, 1)
     assert stream.interval_s == pytest.approx(STEP_S)
 
 
-def test_a_stray_plant_locks_the_real_one_out_no_longer_than_it_is_heard() -> None:
+@pytest.mark.parametrize(
+    "odd",
+    [{"seq": 1100}, {"seq": 2**63 - 1}, {"epoch": 2}, {"run": 2}, {"seq": 0}],
+    ids=["ahead", "far ahead", "epoch", "run", "behind"],
+)
+def test_one_foreign_state_is_counted_and_nothing_else(odd: dict[str, Any]) -> None:
     stream = StateStream()
     zero = np.zeros(7), np.zeros(2)
-    assert stream.accept(state(100, *zero, epoch=1))
-    assert stream.accept(state(0, *zero, epoch=2))
-    assert not stream.accept(state(101, *zero, epoch=1))
-    stream.forget()  # silence
-    assert stream.accept(state(102, *zero, epoch=1))
+    assert stream.accept(state(100, *zero))
+    assert not stream.accept(replace(state(101, *zero), **odd))
+    assert stream.stale + stream.foreign == 1
+    assert stream.accept(state(101, *zero))
+    assert stream.accept(state(102, *zero))
+    assert (stream.lost, stream.stale + stream.foreign) == (0, 1)
+
+
+@pytest.mark.parametrize("left", [{"seq": 101}, {"epoch": 2, "seq": 0}, {"seq": 40}])
+def test_several_in_a_row_are_followed_at_once_and_anything_after_silence(
+    left: dict[str, Any],
+) -> None:
+    """What is taken for the run's newest state may have been the foreign one."""
+    zero = np.zeros(7), np.zeros(2)
+    for silence in (False, True):
+        stream = StateStream()
+        stream.accept(state(100, *zero))
+        assert stream.accept(state(110, *zero))  # lost nine, or was deceived
+        first = replace(state(0, *zero), **left)
+        if silence:
+            assert not stream.accept(first)
+            assert stream.forget() == first
+            assert stream.forget() is None
+            assert stream.accept(first)
+        else:
+            row = [replace(first, seq=first.seq + k) for k in range(5)]
+            assert [stream.accept(one) for one in row] == [False, False, False, True, True]
+
+
+def test_two_plants_at_once_are_not_mixed() -> None:
+    stream = StateStream()
+    zero = np.zeros(7), np.zeros(2)
+    for seq in range(50):
+        assert stream.accept(state(seq, *zero, epoch=1))
+        assert not stream.accept(state(seq, *zero, epoch=2))
+    assert stream.foreign == 50
 
 
 def test_losses_are_told_also_when_the_first_message_of_a_restarted_sender_is_lost() -> None:
@@ -147,6 +186,10 @@ def test_losses_are_told_also_when_the_first_message_of_a_restarted_sender_is_lo
     for seq in (0, 1, 2, 5000, 5001, 3, 4, 6):
         numbering.note(seq)
     assert (numbering.received, numbering.lost) == (8, 4997 + 1)
+    odd = Numbering()
+    for seq in (0, 1, 2**63 - 1, 2, 3):
+        odd.note(seq)
+    assert (odd.received, odd.lost) == (5, 0)
     overtaken = Numbering()
     for seq in (0, 1, 3, 2, 4):
         overtaken.note(seq)

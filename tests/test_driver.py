@@ -229,6 +229,7 @@ def test_a_stopped_car_stays_stopped_in_the_next_run(rig: Rig, change: dict[str,
     rig.driver.stop()
     while rig.cycle().status != HALTED:
         pass
+    rig.driver.lost(silent=False)
     rig.seq, rig.epoch = 0, change.get("epoch", 1)
     rig.seq += 1000 * (rig.epoch == 1)
     for _ in range(50):
@@ -267,8 +268,9 @@ def test_on_hold_it_stands_until_go(native: NativeStep, circuit: Circuit) -> Non
 def test_another_plant_begins_anew_and_its_forerunner_is_not_heard(rig: Rig) -> None:
     driving(rig)
     left_over = rig.state()
+    rig.driver.lost(silent=False)
     rig.epoch, rig.seq = 2, 0
     assert rig.cycle().level is Level.SOLUTION
     assert not rig.driver.observe(left_over)
-    assert rig.driver.states.stale == 1
+    assert rig.driver.states.foreign == 1
     assert rig.cycle().level is Level.SOLUTION

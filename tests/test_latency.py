@@ -55,7 +55,7 @@ class Loop:
         telemetry = Telemetry(
             self.sent, sent_ns, 1, seq, 0, 0, 3, self.ticks, sampled_ns + released_ns,
             sampled_ns + 600_000, False, 31.0, 42.0, 150.0, 250.0, 53.0, 0.0, (), (), 0.0, 0.0,
-            0.0, 0.0, 0.0,
+            0.0, 0.0, 0.0, 0, 0.0, 0.0,
         )  # fmt: skip
         actuation = Actuation(self.sent, sent_ns, self.epoch, 1, seq, 0.0, (0.0, 0.0), "", 0)
         self.sent, self.ticks = self.sent + 1, self.ticks + 1

@@ -133,7 +133,7 @@ def test_a_budget_converges_the_last_problem(make: Make, recorded: list[Problem]
         step.prepare(0.0, 1.0)
         solve(step, p, elapsed_s=0.0)
         iterations += step.info.prepared_iterations
-        assert step.info.iterations == 1
+        assert step.info.iterations == 1 or step.info.second_start
         converged += residual(step) <= 1e-6
         step.prepare(TS)
     assert iterations > 60

@@ -166,7 +166,7 @@ def test_with_a_budget_the_step_iterates_until_it_settles(
         assert solve(step, p, budget_s=1.0).usable
         settled += residual(step) <= 1e-7
         assert step.info.time_limited == 0
-        assert residual(step) <= 1e-7 or step.info.iterations == SETTINGS.iterations_cold
+        assert residual(step) <= 1e-7 or step.info.iterations >= SETTINGS.iterations_cold
     assert settled >= 55  # not where the Hessian is indefinite
 
 
@@ -246,7 +246,7 @@ def test_a_clock_that_is_broken_does_no_harm(
     usable = []
     for p in recorded[:20]:
         usable.append(solve(step, p, budget_s=1e-3).usable)
-        assert 1 <= step.info.iterations <= SETTINGS.iterations_cold
+        assert 1 <= step.info.iterations <= 2 * SETTINGS.iterations_cold  # of a second start, too
         step.prepare(TS, 1e-3)
     assert all(usable[5:])
 

@@ -124,6 +124,8 @@ class Actuation(Message):
 class Telemetry(Message):
     """How the actuation came about: ``bayesrace/{car}/telemetry``."""
 
+    SCHEMA: ClassVar[int] = 2
+
     run: Count
     state_seq: Count
     status: Annotated[int, Integer(0, 255)]
@@ -160,6 +162,13 @@ class Telemetry(Message):
     """Largest violation of a bound."""
     residual_stationarity: Annotated[float, Real(-1.0, 1e12)]
     """Norm of the gradient of the Lagrangian."""
+    cost: Annotated[float, Real(-1.0, 1e12)]
+    """Objective of the plan; -1 without."""
+    cost_shifted: Annotated[float, Real(-1.0, 1e12)]
+    """Of the plan before, shifted, for the same state and reference; -1 without: a plan that costs
+    much more has jumped to another local minimum."""
+    second_start: Annotated[int, Integer(0, 2)]
+    """1: the plan before was doubtful, and a plan from anew no better; 2: that one is used."""
     s_ref_m: Annotated[float, Real(-1e6, 1e6)]
     """Arc length of the reference point on the racing line."""
     n_ref_m: Annotated[float, Real(-1e6, 1e6)]

@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 
 from bayesrace.errors import InputError
+from bayesrace.files import write_whole
 from bayesrace.tracks.files import read_table
 from bayesrace.tracks.spline import FloatArray
 
@@ -62,7 +63,7 @@ def write_raceline(path: Path | str, line: RaceLine) -> None:
     rows = np.concatenate([table, closing]).tolist()
     lines = [f"# {'; '.join(RACELINE_COLUMNS)}"]
     lines += ["; ".join(repr(value) for value in row) for row in rows]
-    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_whole(Path(path), "\n".join(lines) + "\n")
 
 
 def read_raceline(path: Path | str, track_name: str | None = None) -> RaceLine:

@@ -4,33 +4,43 @@ from typing import Final
 
 __all__ = ["Numbering"]
 
-_OVERTAKEN: Final = 1024
-"""No message is overtaken by more: a number farther back is that of a sender that began again."""
+_FAR: Final = 1024
+"""No message is overtaken by more, and few losses are longer: a number farther from the one that is
+due, either way, or 0, counts once the next one confirms it."""
 
 
 class Numbering:
     """Received and lost messages of one sender, by their numbers.
 
     A message that was overtaken counts as lost until it arrives after all. A sender that begins
-    again starts afresh.
+    again starts afresh. One odd number, whoever sent it, changes no count of losses.
     """
 
     def __init__(self) -> None:
         self.received = 0
         self.lost = 0
         self._next: int | None = None
+        self._far: int | None = None
+        """Number of the message before, if it waits to be confirmed."""
 
     def restart(self) -> None:
         """Whatever number comes next is the first of another sender."""
-        self._next = None
+        self._next = self._far = None
 
     def note(self, seq: int) -> None:
         """The next message, in the order of arrival."""
         self.received += 1
-        if self._next is None or seq == 0 or seq < self._next - _OVERTAKEN:
+        far, self._far = self._far, None
+        due = self._next
+        if due is None:
             self._next = seq + 1
-        elif seq >= self._next:
-            self.lost += seq - self._next
+        elif far is not None and seq == far + 1 != due:
+            self.lost += max(seq - due - 1, 0)
+            self._next = seq + 1
+        elif abs(seq - due) > _FAR or seq == 0:
+            self._far = seq
+        elif seq >= due:
+            self.lost += seq - due
             self._next = seq + 1
         elif self.lost > 0:
             self.lost -= 1

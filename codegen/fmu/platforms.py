@@ -3,7 +3,6 @@
 import platform
 import shlex
 import subprocess
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from bayesrace.errors import InputError
+from bayesrace.interpreter import RUN_MODULE
 from codegen.compiler import CompileError, find_compiler
 
 __all__ = [
@@ -87,7 +87,7 @@ def _command(target: Platform) -> list[str]:
             "'pip install ziglang', or leave this platform out"
         )
     # stripped: what it strips names temporary files, which differ from build to build
-    return [sys.executable, "-m", "ziglang", "cc", "-target", target.zig, "-s", "-g0"]
+    return [*RUN_MODULE, "ziglang", "cc", "-target", target.zig, "-s", "-g0"]
 
 
 def arguments(

@@ -90,7 +90,16 @@ class Incumbent:
     """None: without correction."""
     proven: bool
     """Watched to the end, or from the start."""
+    accepted_utc_ns: int
+    """By this host's calendar."""
     _model: OneStepModel | None = field(default=None, repr=False)
+
+    @property
+    def made_utc_ns(self) -> int:
+        """No later than they were accepted, whatever they say: else all others would be stale."""
+        if self.weights is None:
+            return 0
+        return min(self.weights.created_utc_ns, self.accepted_utc_ns)
 
     def model(self, gate: "Gate") -> OneStepModel:
         """Predicts with them."""
@@ -181,7 +190,7 @@ class Gate:
             )
         if in_use.weights is None or not weights.created_utc_ns:
             return
-        older_s = (in_use.weights.created_utc_ns - weights.created_utc_ns) * 1e-9
+        older_s = (in_use.made_utc_ns - weights.created_utc_ns) * 1e-9
         if older_s > 0:
             raise InputError(
                 f"weights '{weights.version}' are stale: made {older_s:.3g} s before those in use, "

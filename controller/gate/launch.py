@@ -12,6 +12,8 @@ import time
 from collections.abc import Sequence
 from typing import Final
 
+from bayesrace.interpreter import RUN_MODULE
+
 __all__ = ["ended", "spawn"]
 
 _SETPGROUP: Final = 0x02
@@ -26,9 +28,9 @@ def spawn(module: str, arguments: Sequence[str]) -> int:
     system does not start it.
     """
     libc = ct.CDLL(None, use_errno=True)
-    path = os.pathsep.join(os.path.abspath(entry) for entry in sys.path)  # noqa: PTH100
+    path = os.pathsep.join(os.path.abspath(entry) for entry in sys.path if entry)  # noqa: PTH100
     environment = {**os.environ, "PYTHONPATH": path}
-    words = [sys.executable, "-m", module, *arguments]
+    words = [*RUN_MODULE, module, *arguments]
     pairs = [f"{name}={value}" for name, value in environment.items()]
     attributes = ct.create_string_buffer(_ATTRIBUTES_BYTES)
     pid = ct.c_int()

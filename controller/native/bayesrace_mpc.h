@@ -28,7 +28,7 @@
 extern "C" {
 #endif
 
-#define BR_ABI 4
+#define BR_ABI 5
 #define BR_NX 7
 #define BR_NU 2
 #define BR_NV (BR_NX + BR_NU)      /* stage variables v = [x; u] */
@@ -122,6 +122,8 @@ typedef struct {
     int qp_iterations;       /* active-set iterations, summed */
     int regularised;         /* iterations whose Hessian had to be made positive definite */
     int shortened;           /* steps that the line search halved */
+    int second_start;        /* 1: the plan from before was doubtful, and a new one no better;
+                                2: the new one is better */
     int shifts;              /* stages by which the plan was shifted; -1: there was no plan */
     int prepared;            /* 1: br_mpc_prepare had the linearisation and factorisation ready */
     int prepared_iterations; /* SQP iterations of br_mpc_prepare since the step before */
@@ -129,6 +131,7 @@ typedef struct {
     double stationarity;     /* scaled infinity norms at the returned plan */
     double defect;
     double bound;
+    double shifted_cost;     /* of the plan before, shifted, under the same reference; 0 cold */
     double cost;             /* objective at the returned plan, slack included */
     double slack_max_m;
     double s_ref_m;          /* projection of the car on the racing line */

@@ -14,6 +14,7 @@
 #define BR_COLS ((((BR_ROWS + 1) + 7) / 8) * 8)  /* right-hand sides of one substitution */
 #define BR_HORIZON_S (BR_N * BR_TS)
 #define BR_LINE_SEARCH_TRIALS 5
+#define BR_DEFECT_FINE 0.01 /* m, m, rad, m/s, m/s, 10 rad/s, rad: not worth another iteration */
 #define BR_GP_PADDED (((BR_GP_CAPACITY + 7) / 8) * 8)
 
 /* One output of the residual as the kernel wants it: scaled features, structure of arrays. */
@@ -88,7 +89,7 @@ typedef struct {
     br_plan plan;
     br_mpc_info info;
     br_mpc_status status;
-    double residual;
+    double residual, worth;
 } br_best;
 
 /* Time within a call, by the host's clock. */
@@ -132,13 +133,17 @@ struct br_mpc {
     br_plan plan;
     br_plan before;      /* the plan that the iteration at hand started from */
     br_best best;
+    br_best first;       /* the plan that a second start has to beat */
+    unsigned doubts;     /* second starts in a row */
     br_plan kept;        /* the plan, and the QP's working set, before those shifts */
     int kept_sense[BR_ROWS];
     double answer_x[BR_N + 1][BR_NX], answer_u[BR_N][BR_NU]; /* plan of the last step */
     br_timer timer;
     br_stage stage[BR_N];
     br_qp qp;
-    double merit;        /* of the plan, see br_residuals */
+    double penalty;      /* on the sum of the plan's defects ... */
+    double merit;        /* ... beside its cost */
+    double worth;        /* cost, to first order, once the defects are gone: costates price them */
     br_mpc_info info;
 };
 
@@ -182,8 +187,9 @@ void br_timer_note(const br_timer *timer, double begin, double *longest);
 /* br_sqp.c: the plan's start, shift and iteration */
 void br_sqp_linearise(br_mpc *mpc);
 void br_sqp_cold_start(br_mpc *mpc);
+void br_sqp_roll_out(br_mpc *mpc, double throttle);
 void br_sqp_shift(br_mpc *mpc);
-br_mpc_status br_sqp_iterate(br_mpc *mpc, int warm, int any_step);
+br_mpc_status br_sqp_iterate(br_mpc *mpc, int warm, int first_of_warm);
 
 /* br_prepare.c: in step with time */
 int br_plausible_state(const double x[BR_NX]);
@@ -198,12 +204,14 @@ int br_iteration_limit(const br_mpc *mpc);
 void br_best_begin(br_mpc *mpc);
 void br_best_keep(br_mpc *mpc, br_mpc_status status, int lowest);
 br_mpc_status br_best_restore(br_mpc *mpc, br_mpc_status status);
+void br_first_keep(br_mpc *mpc, br_mpc_status status);
+br_mpc_status br_first_compare(br_mpc *mpc, br_mpc_status status, int *second);
 
 /* br_residuals.c */
 int br_all_finite(const double *values, int n);
 /* The larger one, and NaN if either is: fmax would lose a NaN and with it a bad solution. */
 static inline double br_worse(double a, double b) { return b > a || b != b ? b : a; }
-void br_residuals(br_mpc *mpc, double penalty);
+void br_residuals(br_mpc *mpc);
 double br_residual(const br_mpc *mpc);
 br_mpc_status br_judge(const br_mpc *mpc);
 static inline int br_usable(br_mpc_status status) { return status <= BR_ACCEPTABLE; }

@@ -42,7 +42,8 @@ static void improve(br_mpc *mpc) {
     if (!br_timer_allows(timer, br_timer_now(timer), 2 * timer->iteration)) return;
     if (!mpc->linearised) br_sqp_linearise(mpc);
     memset(&mpc->info, 0, sizeof mpc->info);
-    br_residuals(mpc, 0);
+    mpc->penalty = 0;
+    br_residuals(mpc);
     br_mpc_status status = br_judge(mpc);
     br_best_begin(mpc);
     br_best_keep(mpc, status, 1);

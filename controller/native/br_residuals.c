@@ -69,11 +69,11 @@ static double stationarity(const br_mpc *mpc) {
     return worst / size;
 }
 
-/* Fills mpc->info and mpc->merit for the plan, whose linearisation must be in store.
+/* Fills mpc->info, gap and merit for the plan, whose linearisation must be in store.
  * merit = objective + penalty * |defects|_1, the distance to the measured state included. */
-void br_residuals(br_mpc *mpc, double penalty) {
+void br_residuals(br_mpc *mpc) {
     br_mpc_info *info = &mpc->info;
-    double sum = 0, bound = 0;
+    double sum = 0, bound = 0, priced = 0;
     info->defect = info->cost = info->slack_max_m = 0;
     for (int k = 0; k <= BR_N; ++k) {
         const double *model = k ? mpc->stage[k - 1].f : mpc->x0;
@@ -81,6 +81,7 @@ void br_residuals(br_mpc *mpc, double penalty) {
             const double gap = fabs(model[i] - mpc->plan.x[k][i]);
             info->defect = br_worse(info->defect, gap / STATE_SCALE[i]);
             sum += gap;
+            if (k) priced += mpc->plan.costate[k][i] * (model[i] - mpc->plan.x[k][i]);
         }
         if (k == 0) continue;
         bound = br_worse(bound, bound_violation(mpc, k));
@@ -88,7 +89,8 @@ void br_residuals(br_mpc *mpc, double penalty) {
     }
     info->bound = bound;
     info->stationarity = stationarity(mpc);
-    mpc->merit = info->cost + penalty * sum;
+    mpc->worth = info->cost + priced;
+    mpc->merit = info->cost + mpc->penalty * sum;
 }
 
 /* One number for a plan, from info: how far it is from a solution. */

@@ -1,8 +1,9 @@
 /* Real-time SQP: the plan's start, its shift, and one iteration.
  *
  * An iteration solves the QP at the linearisation in store, takes a step (the full one unless the
- * plan gets worse) and linearises at the new plan. That linearisation gives the residuals from which the status is derived, and,
- * shifted by a stage, it is what the next control step starts from: only its last stage is new.
+ * plan gets worse) and linearises at the new plan. That linearisation gives the residuals from
+ * which the status is derived, and, shifted by a stage, it is what the next control step starts
+ * from: only its last stage is new.
  */
 #include <math.h>
 
@@ -23,7 +24,11 @@ void br_sqp_linearise(br_mpc *mpc) { linearise(mpc, 0); }
 void br_sqp_cold_start(br_mpc *mpc) {
     static const double throttles[] = {0.5, 0.5, 1.0, 0.25};
     const double share = throttles[mpc->attempts % 4], d_max = mpc->parameters.d_max;
-    const double throttle = fmin(fmax(mpc->d_previous, share * d_max), d_max);
+    br_sqp_roll_out(mpc, fmin(fmax(mpc->d_previous, share * d_max), d_max));
+}
+
+/* The plan that holds the steering and this throttle, or turns. */
+void br_sqp_roll_out(br_mpc *mpc, double throttle) {
     memcpy(mpc->plan.x[0], mpc->x0, sizeof mpc->x0);
     memset(mpc->plan.costate, 0, sizeof mpc->plan.costate);
     memset(mpc->plan.multiplier, 0, sizeof mpc->plan.multiplier);
@@ -121,8 +126,8 @@ static double penalty(const br_qp *qp) {
 static void line_search(br_mpc *mpc, int first_of_warm) {
     br_timer *timer = &mpc->timer;
     direction(mpc);
-    const double weight = penalty(&mpc->qp);
-    br_residuals(mpc, weight);
+    mpc->penalty = penalty(&mpc->qp);
+    br_residuals(mpc);
     const double merit = mpc->merit, residual = br_worse(mpc->info.stationarity, mpc->info.defect);
     mpc->before = mpc->plan;
     double t = 1.0;
@@ -130,7 +135,7 @@ static void line_search(br_mpc *mpc, int first_of_warm) {
         const double begin = br_timer_now(timer);
         if (trial && !br_timer_allows(timer, begin, timer->trial)) return;
         move(mpc, t);
-        br_residuals(mpc, weight);
+        br_residuals(mpc);
         br_timer_note(timer, begin, &timer->trial);
         if (first_of_warm && br_judge(mpc) <= BR_ACCEPTABLE) return;
         if (mpc->merit <= merit || br_worse(mpc->info.stationarity, mpc->info.defect) <= 0.9 * residual) return;
@@ -139,14 +144,14 @@ static void line_search(br_mpc *mpc, int first_of_warm) {
 }
 
 /* One iteration from the plan and its linearisation. warm: the QP starts from the working set
- * before. any_step: see line_search. The time it took is noted. */
-br_mpc_status br_sqp_iterate(br_mpc *mpc, int warm, int any_step) {
+ * before. first_of_warm: see line_search. The time it took is noted. */
+br_mpc_status br_sqp_iterate(br_mpc *mpc, int warm, int first_of_warm) {
     br_timer *timer = &mpc->timer;
     const double begin = br_timer_now(timer);
     br_mpc_status status = br_qp_condense(mpc);
     if (status == BR_CONVERGED) status = br_qp_solve(mpc, warm);
     if (status == BR_CONVERGED) {
-        line_search(mpc, any_step);
+        line_search(mpc, first_of_warm);
         mpc->info.iterations += 1;
         status = br_judge(mpc);
     }

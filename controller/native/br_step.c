@@ -32,30 +32,77 @@ static int settled(const br_mpc *mpc, double *residual) {
     const double before = *residual, settle = mpc->parameters.settle;
     *residual = br_residual(mpc);
     if (settle == 0) return 0;
-    return *residual <= settle || (mpc->warm && !mpc->timer.limited && *residual > 0.5 * before);
+    if (*residual <= settle) return 1;
+    if (mpc->timer.limited || !mpc->warm || mpc->info.defect > BR_DEFECT_FINE) return 0;
+    return *residual > 0.5 * before;
 }
 
-static br_mpc_status optimise(br_mpc *mpc) {
-    begin_plan(mpc);
+/* Whether the plan is not what the model does, to within millimetres. */
+static int rough(const br_mpc *mpc, br_mpc_status status) {
+    return status == BR_DEFECT || mpc->info.defect > BR_DEFECT_FINE;
+}
+
+/* Iterates until settled or out of time. What is rough yet may take as many iterations as a cold
+ * start. */
+static br_mpc_status iterate(br_mpc *mpc, int warm) {
     br_timer *timer = &mpc->timer;
     const br_mpc_parameters *p = &mpc->parameters;
-    const int warm = mpc->warm, own_limit = warm ? p->iterations : p->iterations_cold;
-    const int limit = timer->limited ? br_iteration_limit(mpc) : own_limit;
+    const int most = br_iteration_limit(mpc);
+    const int own_limit = warm ? p->iterations : p->iterations_cold;
+    const int limit = timer->limited ? most : own_limit;
     br_mpc_status status = BR_DEFECT;
     double residual = INFINITY;
     br_best_begin(mpc);
-    timer->iteration = timer->trial = 0; /* one stall of the host must not be remembered for ever */
-    for (int i = 0; i < limit && (status == BR_ACCEPTABLE || status == BR_DEFECT); ++i) {
+    for (int i = 0; i < (rough(mpc, status) ? most : limit); ++i) {
         if (i && !br_timer_allows(timer, br_timer_now(timer), timer->iteration)) {
             mpc->info.time_limited = 1;
             break;
         }
         status = br_sqp_iterate(mpc, i > 0 || warm, i == 0 && warm);
         br_best_keep(mpc, status, timer->limited);
+        if (status != BR_ACCEPTABLE && status != BR_DEFECT) break;
         if (status == BR_ACCEPTABLE && settled(mpc, &residual)) break;
     }
     status = br_best_restore(mpc, status);
     return status == BR_DEFECT && mpc->info.time_limited ? BR_TIME_LIMIT : status;
+}
+
+/* Signs that the plan from before is on its way to another local minimum, often a bad one: the exact
+ * Hessian is indefinite, or Newton's steps had to be shortened. Typically the horizon has reached a
+ * bend for which the plan is too fast: the tyres slide, and neither more nor less steering helps.
+ * Such a plan satisfies every residual and costs more with each step. */
+static int doubtful(const br_mpc *mpc, br_mpc_status status) {
+    return mpc->qp.regularised || mpc->info.shortened || !br_usable(status);
+}
+
+/* Iterates from another start, with another throttle each time in a row; leaves the better plan of
+ * that and the one at hand. To coast from the measured state most often leads to the good minimum in
+ * a few iterations (docs/decisions/2026-11-22-second-start.md). */
+static br_mpc_status start_again(br_mpc *mpc, br_mpc_status status) {
+    static const double throttles[] = {0, 0.5, 1, 0.25};
+    int better;
+    br_first_keep(mpc, status);
+    br_sqp_roll_out(mpc, throttles[mpc->doubts % 4] * mpc->parameters.d_max);
+    status = br_first_compare(mpc, iterate(mpc, 0), &better);
+    mpc->info.second_start = better ? 2 : 1;
+    return status;
+}
+
+static br_mpc_status optimise(br_mpc *mpc) {
+    br_timer *timer = &mpc->timer;
+    begin_plan(mpc);
+    timer->iteration = timer->trial = 0; /* a stall must not be remembered for ever */
+    if (!mpc->warm) return iterate(mpc, 0);
+    br_residuals(mpc);
+    const double shifted_cost = mpc->info.cost;
+    br_mpc_status status = iterate(mpc, 1);
+    if (!doubtful(mpc, status)) mpc->doubts = 0;
+    else if (!mpc->info.time_limited && br_timer_allows(timer, br_timer_now(timer), 3 * timer->iteration)) {
+        status = start_again(mpc, status);
+        mpc->doubts += 1;
+    }
+    mpc->info.shifted_cost = shifted_cost;
+    return status;
 }
 
 static void solve(br_mpc *mpc, double u[BR_NU], br_mpc_status *status, br_mpc_info *info) {

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from bayesrace.files import write_whole
 from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK
 from experiments.cli.options import (
     Car,
@@ -161,7 +162,7 @@ def bench(
         result = run_bench(settings, stages)
     result.print(console)
     if json_file:
-        json_file.write_text(result.model_dump_json(indent=1) + "\n")
+        write_whole(json_file, result.model_dump_json(indent=1) + "\n")
 
 
 def register(app: typer.Typer) -> None:

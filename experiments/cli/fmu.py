@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from bayesrace.errors import InputError
+from bayesrace.files import write_whole
 from bayesrace.tracks import DEFAULT_RACE_TRACK
 from experiments.cli.options import Car, OutFile, writable
 
@@ -180,7 +181,7 @@ def inspect(
     if map_file is not None:
         if map_file.exists():
             raise InputError(f"{map_file} exists already; choose another name or remove it")
-        map_file.write_text(starting_map(description))
+        write_whole(map_file, starting_map(description))
         typer.echo(f"map to start from: {map_file}")
 
 

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from bayesrace.errors import InputError
+from bayesrace.files import write_whole
 from experiments.cli.options import Car, CarName, connect_to, writable
 
 __all__ = ["register"]
@@ -82,7 +83,7 @@ def latency(
         measured = measure(settings, out, stages)
     print_report(measured.result, console)
     if json_file:
-        json_file.write_text(measured.result.model_dump_json(indent=1) + "\n")
+        write_whole(json_file, measured.result.model_dump_json(indent=1) + "\n")
     console.print(f"{out}", highlight=False, soft_wrap=True)
     measured.raise_if_broken()
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from bayesrace.files import write_whole
 from experiments.cli.options import Car, CarName, Endpoint, connect_to, writable
 from experiments.notation import UNCERTAIN
 
@@ -72,7 +73,7 @@ def validate(
     text = judged.result.model_dump_json(indent=1) + "\n"
     for path in (json_file, out and out / "validation.json"):
         if path is not None:
-            path.write_text(text, encoding="utf-8")
+            write_whole(path, text)
     if plot is not None or out is not None:
         from experiments.report.canvas import write_png
         from experiments.report.style import figure_style

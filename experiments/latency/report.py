@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from bayesrace.files import replacing, write_whole
 from experiments.latency.bare_loop import BareRun
 from experiments.latency.legs import ANSWER, LEGS
 from experiments.latency.plot import plot
@@ -32,9 +33,9 @@ def write_files(
     bare: BareRun | None,
 ) -> None:
     """``latency.json``, ``latency.png``, and the bare loop's histogram log beside the legs'."""
-    (out / RESULT).write_text(result.model_dump_json(indent=1) + "\n", encoding="utf-8")
+    write_whole(out / RESULT, result.model_dump_json(indent=1) + "\n")
     if bare is not None:
-        with (out / _BARE).open("w", encoding="ascii") as file:
+        with replacing(out / _BARE) as part, part.open("w", encoding="ascii") as file:
             log = HistogramLogWriter(file)
             log.output_comment("[bayesrace latency: bare loop, wake-up error; values in ns]")
             log.output_log_format_version()

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from bayesrace.errors import InputError
+from bayesrace.files import write_whole
 from bayesrace.tracks import Track
 from bayesrace.transport import Director
 from experiments.latency.bare_loop import BareRun, arguments, read_bare_run
@@ -75,7 +76,7 @@ def check_new(out: Path) -> None:
 def open_folder(out: Path, settings: LatencySettings) -> None:
     """Makes the folder, with the settings as resolved."""
     out.mkdir(parents=True, exist_ok=True)
-    (out / "settings.json").write_text(settings.model_dump_json(indent=1) + "\n")
+    write_whole(out / "settings.json", settings.model_dump_json(indent=1) + "\n")
 
 
 def measurement(

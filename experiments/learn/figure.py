@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
-from bayesrace.files import replacing
 from experiments.learn.journal import LapRecord, Record
 from experiments.report.canvas import write_png
 from experiments.report.style import INK, MUTED, WARNING, figure_style, look
@@ -41,8 +40,8 @@ def draw(record: Record, beside: References, path: Path) -> None:
     """Writes the picture (PNG), whole or not at all; none without a timed lap."""
     if not any(lap.time_s is not None for lap in record.laps):
         return
-    with figure_style(), replacing(path) as partial:
-        write_png(lap_figure(record, beside), partial)
+    with figure_style():
+        write_png(lap_figure(record, beside), path)
 
 
 def lap_figure(record: Record, beside: References) -> Figure:

@@ -3,7 +3,6 @@
 import json
 import os
 import subprocess
-import sys
 import threading
 from collections.abc import Callable
 from contextlib import suppress
@@ -12,6 +11,7 @@ from typing import IO, Final
 
 from pydantic import ValidationError
 
+from bayesrace.interpreter import RUN_MODULE
 from learning.worker import Outcome, Task
 
 __all__ = ["NICE", "Trainer"]
@@ -85,7 +85,7 @@ class Trainer:
         threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         with self._output.open("ab") as output:
             process = subprocess.Popen(
-                [sys.executable, "-m", "learning.worker", str(os.getpid())],
+                [*RUN_MODULE, "learning.worker", str(os.getpid())],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=output,

@@ -9,6 +9,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
+from bayesrace.files import replacing
+
 __all__ = ["inline_svg", "write_png"]
 
 _PROLOGUE: Final = re.compile(r"^.*?(?=<svg )", re.DOTALL)
@@ -39,6 +41,7 @@ def inline_svg(figure: Figure) -> str:
 
 
 def write_png(figure: Figure, path: Path, dpi: int = 120) -> None:
-    """The figure as a PNG file."""
+    """The figure as a PNG file, whole or not at all."""
     FigureCanvasAgg(figure)
-    figure.savefig(path, dpi=dpi, metadata={"Software": None})
+    with replacing(path) as partial:
+        figure.savefig(partial, dpi=dpi, metadata={"Software": None})

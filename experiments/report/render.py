@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from bayesrace.files import replacing, write_whole
+from bayesrace.files import write_whole
 from bayesrace.vehicles import get_car
 from experiments.analysis import RaceAnalysis, read_race
 from experiments.notation import UNCERTAIN
@@ -170,8 +170,7 @@ def _figures(analysis: RaceAnalysis, picture: Path) -> dict[str, str]:
     with figure_style():
         laps = laps_on_track(driven, track, line)
         figures["laps"] = inline_svg(laps)
-        with replacing(picture) as partial:
-            write_png(laps, partial)
+        write_png(laps, picture)
         if driven:
             car = get_car(str(analysis.recording.settings.get("car", "orca")))
             figures["speed"] = inline_svg(speed_figure(driven, track, line))

@@ -12,7 +12,6 @@ import shutil
 import signal
 import socket
 import subprocess
-import sys
 import tempfile
 import time
 from array import array
@@ -23,6 +22,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from bayesrace.errors import InputError
+from bayesrace.interpreter import RUN_MODULE
 from plant.fmu.channel import (
     DOUBLE,
     FAULT,
@@ -84,7 +84,7 @@ class _Process:
                 "words": page.fileno(),
             }
             self._popen = subprocess.Popen(
-                [sys.executable, "-m", "plant.fmu.worker", json.dumps(told)],
+                [*RUN_MODULE, "plant.fmu.worker", json.dumps(told)],
                 cwd=_ROOT,
                 stdin=subprocess.DEVNULL,
                 stdout=write,

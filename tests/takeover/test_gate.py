@@ -5,6 +5,7 @@ another car, older than those in use, absurd or overflowing never pass, honest o
 watch gives the former up within a second of driving and the latter never.
 """
 
+import time
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -63,9 +64,11 @@ def gate(kinematic_artefact: Path, car: CarParameters) -> Gate:
     return Gate(GateSettings(), kinematic_artefact, car)
 
 
-def incumbent(weights: GpWeights | None, number: int = 1, proven: bool = True) -> Incumbent:
+def incumbent(
+    weights: GpWeights | None, number: int = 1, proven: bool = True, accepted_utc_ns: int = 2**62
+) -> Incumbent:
     version = "" if weights is None else weights.version
-    return Incumbent(number, version, weights, proven)
+    return Incumbent(number, version, weights, proven, accepted_utc_ns)
 
 
 NOTHING = incumbent(None, 0)
@@ -134,6 +137,15 @@ def test_stale_weights_are_refused(gate: Gate, honest: GpWeights, drive: list[Sa
             verdict = gate.check(weights, [newer], samples)
             assert verdict.accepted is accepted
             assert accepted or "stale: made 1 s before those in use, 'newer'" in verdict.text
+
+
+def test_weights_dated_ahead_do_not_make_later_ones_stale(gate: Gate, honest: GpWeights) -> None:
+    now_ns = time.time_ns()
+    ahead = replace(honest, version="ahead", created_utc_ns=now_ns + 3000 * 10**9)
+    assert gate.check(ahead, [NOTHING], []).accepted
+    in_use = incumbent(ahead, accepted_utc_ns=now_ns)
+    assert gate.check(replace(honest, created_utc_ns=now_ns + 10**9), [in_use], []).accepted
+    assert not gate.check(replace(honest, created_utc_ns=now_ns - 10**9), [in_use], []).accepted
 
 
 def test_weights_of_another_car_or_model_are_refused(gate: Gate, honest: GpWeights) -> None:
