@@ -3,6 +3,7 @@
 What the benchmarks of decisions share; lap times are those of ``bayesrace race`` in lockstep.
 """
 
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,6 +43,9 @@ class Drive:
     off_track_max_m: float
     unusable: int
     """Steps without a usable solution; the car braked."""
+    step_us: NDArray[np.float64]
+    second_starts: int
+    """Steps that looked for another plan beside the one that went on from before."""
 
     def samples(self, car: CarParameters, step_s: float) -> Dataset:
         """What can be learned from."""
@@ -75,12 +79,16 @@ def drive(
     step.reset()
     x, y, psi = track.start_pose()
     simulator.reset([x, y, psi, START_MPS, 0.0, 0.0, 0.0])
-    states, inputs, unusable = [simulator.x.copy()], [], 0
+    states, inputs, unusable, second = [simulator.x.copy()], [], 0, 0
+    step_us: list[float] = []
     times: tuple[float, ...] = ()
     after = 0
     while len(times) < laps and simulator.time_s < LIMIT * line.lap_time_s * laps:
+        begin_ns = time.perf_counter_ns()
         status = step.step(simulator.x, simulator.u_applied[0])
+        step_us.append((time.perf_counter_ns() - begin_ns) * 1e-3)
         unusable += not status.usable
+        second += step.info.second_start > 0
         simulator.step(step.u.tolist() if status.usable else None)
         states.append(simulator.x.copy())
         inputs.append(simulator.u_applied)
@@ -90,7 +98,7 @@ def drive(
     off = track.project_path(np.array(states)[:after, :2]).off_track_m
     return Drive(
         np.array(states), np.array(inputs), times, int((off > 0).sum()),
-        max(0.0, float(off.max())), unusable,
+        max(0.0, float(off.max())), unusable, np.array(step_us), second,
     )  # fmt: skip
 
 

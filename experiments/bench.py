@@ -1,10 +1,11 @@
 """The compiled step beside the paper's formulation in CasADi + IPOPT, on the same problems.
 
-A closed loop on the race track gives the problems. Each is solved by the real-time step, which is
-timed, and by a second copy that iterates to convergence, from which the first input's and the
-cost's distance are taken. Evenly spread among them, ``peers`` are solved as the published code
-does: forward Euler, expanded to scalars, IPOPT with its default options, from zeros. (With our
-discretisation, whose pose depends on the GP too, that takes four times as long: no fair peer.)
+Closed loops on several tracks, with hairpins, give the problems; the weights come from another one.
+Each is solved by the real-time step, which is timed, and by a second copy that iterates to
+convergence, from which the first input's and the cost's distance are taken. Evenly spread among
+them, ``peers`` are solved as the published code does: forward Euler, expanded to scalars, IPOPT
+with its default options, from zeros. (With our discretisation, whose pose depends on the GP too,
+that takes four times as long: no fair peer.)
 """
 
 import time
@@ -22,7 +23,6 @@ from rich.table import Table
 from bayesrace.gp.corrected import corrected_function
 from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import PREDICTION, Discretisation
-from bayesrace.raceline import RaceLine
 from bayesrace.raceline.cached import racing_line
 from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK, Track, load_track
 from bayesrace.vehicles import CarParameters, get_car
@@ -58,10 +58,12 @@ class BenchSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    track: str = DEFAULT_RACE_TRACK
+    tracks: tuple[str, ...] = Field(
+        (DEFAULT_RACE_TRACK, "random:11", "random:15"), min_length=1, description="driven on"
+    )
     train_track: str = DEFAULT_TRAINING_TRACK
     car: str = "orca"
-    problems: int = Field(400, ge=10, description="control steps in closed loop")
+    problems: int = Field(900, ge=10, description="control steps in closed loop, all tracks")
     peers: int = Field(25, ge=1, description="of these, solved by IPOPT")
     points: int = Field(400, ge=20, le=1024, description="training points per output")
     seed: int = Field(0, ge=0)
@@ -111,6 +113,8 @@ class BenchResult(BaseModel):
     """Peers for which IPOPT reported success."""
     unconverged: int
     """Problems without a converged solution to compare with; left out of the errors."""
+    second_starts: int
+    """Steps that looked for another plan beside the one that went on from before."""
     ipopt_agreement: float
     """Largest difference of first inputs between IPOPT, started from our converged plan, and it."""
 
@@ -130,7 +134,7 @@ class BenchResult(BaseModel):
             f"solution: d p95 {d.p95:.2g}, p99 {d.p99:.2g}; delta_rate p95 {rate.p95:.2g}, "
             f"p99 {rate.p99:.2g} rad/s. Cost gap p50 {self.cost_gap.p50:.1e}, "
             f"p95 {self.cost_gap.p95:.1e}. IPOPT from the converged plan differs by at most "
-            f"{self.ipopt_agreement:.1e}.",
+            f"{self.ipopt_agreement:.1e}. Second starts: {self.second_starts}.",
             highlight=False,
         )
 
@@ -152,25 +156,38 @@ class _Problem:
 class _Recording:
     problems: list[_Problem] = field(default_factory=list)
     step_us: list[float] = field(default_factory=list)
+    second_starts: int = 0
+
+    def __iadd__(self, other: "_Recording") -> "_Recording":
+        self.problems += other.problems
+        self.step_us += other.step_us
+        self.second_starts += other.second_starts
+        return self
 
 
 def run_bench(settings: BenchSettings, stages: Stages) -> BenchResult:
     """Measures; takes about a minute, most of it IPOPT's."""
     car = get_car(settings.car)
     with stages.stage("racing lines and training drive"):
-        training, course = load_track(settings.train_track), load_track(settings.track)
-        line = racing_line(course, car)
-        samples = training_samples(training, car, _COLLECT_S, settings.seed)
+        courses = [load_track(name) for name in settings.tracks]
+        lines = [racing_line(course, car) for course in courses]
+        samples = training_samples(load_track(settings.train_track), car, _COLLECT_S, settings.seed)
     with stages.stage("train the residual") as stage:
         options = TrainingSettings(capacity=settings.points, seed=settings.seed)
         weights = trained_weights(samples, PREDICTION, options, progress=stage.update)
     with stages.stage("build"):
         artefact, manifest = build(BuildSettings(car=car.name))
         horizon = manifest.horizon
-        steps = [_controller(artefact, car, s, course, line, weights) for s in _pair()]
+        step, converged = (_controller(artefact, car, s, weights) for s in _pair())
     with stages.stage("closed loop"):
-        _record(steps[0], steps[1], course, car, 50)  # caches, branch predictors, clock frequency
-        recording = _record(steps[0], steps[1], course, car, settings.problems)
+        recording = _Recording()
+        for course, line in zip(courses, lines, strict=True):
+            for one in (step, converged):
+                one.set_path(make_path_table(course, line))
+            _record(step, converged, course, car, 50)  # caches, branch predictors, clock frequency
+            recording += _record(
+                step, converged, course, car, -(-settings.problems // len(courses))
+            )
     with stages.stage("IPOPT, expanded (builds for some 15 s)") as stage:
         peers = _peers(recording, settings.peers)
         published = corrected_function(e_kinematic(car), _PUBLISHED, weights, check_identity=False)
@@ -189,7 +206,7 @@ def run_bench(settings: BenchSettings, stages: Stages) -> BenchResult:
         f = corrected_function(e_kinematic(car), PREDICTION, weights)
         oracle = RacingOcp(f, car, horizon, options=strict)
         agreement = _agreement(oracle, peers)
-        gaps = [_gap(oracle, steps[0], p) for p in recording.problems if p.has_converged]
+        gaps = [_gap(oracle, step, p) for p in recording.problems if p.has_converged]
     return _result(settings, weights, recording, times, solved, agreement, gaps)
 
 
@@ -198,11 +215,9 @@ def _pair() -> tuple[MpcSettings, MpcSettings]:
 
 
 def _controller(
-    artefact: Path, car: CarParameters, mpc: MpcSettings, track: Track, line: RaceLine,
-    weights: GpWeights,
-) -> NativeStep:  # fmt: skip
+    artefact: Path, car: CarParameters, mpc: MpcSettings, weights: GpWeights
+) -> NativeStep:
     step = NativeStep(artefact, car, mpc)
-    step.set_path(make_path_table(track, line))
     step.set_weights(weights)
     return step
 
@@ -221,6 +236,7 @@ def _record(
         begin_ns = time.perf_counter_ns()
         status = step.step(state, d_previous)
         recording.step_us.append((time.perf_counter_ns() - begin_ns) * 1e-3)
+        recording.second_starts += step.info.second_start > 0
         plan = tuple(part.copy() for part in step.read_plan())
         other = converged.step(state, d_previous)
         best = tuple(part.copy() for part in converged.read_plan())
@@ -308,5 +324,6 @@ def _result(
         peers=len(ipopt_us),
         ipopt_solved=solved,
         unconverged=len(recording.problems) - len(good),
+        second_starts=recording.second_starts,
         ipopt_agreement=agreement,
     )

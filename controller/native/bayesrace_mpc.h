@@ -29,6 +29,7 @@ extern "C" {
 #endif
 
 #define BR_ABI 5
+#define BR_SECOND_START_ITERATIONS 12 /* at most; most often it needs eight */
 #define BR_NX 7
 #define BR_NU 2
 #define BR_NV (BR_NX + BR_NU)      /* stage variables v = [x; u] */
@@ -92,8 +93,10 @@ typedef struct {
     double tolerance;        /* of the scaled KKT residual for BR_CONVERGED */
     double defect_max;       /* largest dynamics defect of an acceptable plan */
     double settle;           /* a step ends at this stationarity and tenth of the defect, or, warm,
-                                when they fall by less than half; 0: neither */
-    int iterations;          /* SQP iterations a step without budget may use */
+                                when they fall by less than half and the defect is below 0.01;
+                                0: neither */
+    int iterations;          /* SQP iterations a step without budget may use, once the defect is
+                                below 0.01 */
     int iterations_cold;     /* the same for the first step after a reset; with a budget the larger
                                 of the two is the limit of every step */
 } br_mpc_parameters;
@@ -118,7 +121,7 @@ typedef struct {
 } br_mpc_reference;
 
 typedef struct {
-    int iterations;          /* SQP iterations used */
+    int iterations;          /* SQP iterations used, those of a second start included */
     int qp_iterations;       /* active-set iterations, summed */
     int regularised;         /* iterations whose Hessian had to be made positive definite */
     int shortened;           /* steps that the line search halved */

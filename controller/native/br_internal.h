@@ -134,7 +134,7 @@ struct br_mpc {
     br_plan before;      /* the plan that the iteration at hand started from */
     br_best best;
     br_best first;       /* the plan that a second start has to beat */
-    unsigned doubts;     /* second starts in a row */
+    unsigned starts;     /* second ones so far */
     br_plan kept;        /* the plan, and the QP's working set, before those shifts */
     int kept_sense[BR_ROWS];
     double answer_x[BR_N + 1][BR_NX], answer_u[BR_N][BR_NU]; /* plan of the last step */
@@ -198,6 +198,7 @@ void br_align(br_mpc *mpc, int shifts);
 void br_undo_preparation(br_mpc *mpc);
 
 /* br_step.c */
+br_mpc_status br_start_again(br_mpc *mpc, br_mpc_status status);
 int br_iteration_limit(const br_mpc *mpc);
 
 /* br_best.c */

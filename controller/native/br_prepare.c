@@ -35,11 +35,12 @@ void br_undo_preparation(br_mpc *mpc) {
 }
 
 /* Further iterations at the last problem, towards tolerance. The time of a second iteration is
- * left for what follows: restoring the best plan, shift and factorisation. */
-static void improve(br_mpc *mpc) {
+ * left for what follows: restoring the best plan, shift and factorisation. Returns whether there
+ * may be time left. */
+static int improve(br_mpc *mpc) {
     const br_timer *timer = &mpc->timer;
-    if (!(timer->iteration > 0)) return; /* no step has shown yet how long that takes */
-    if (!br_timer_allows(timer, br_timer_now(timer), 2 * timer->iteration)) return;
+    if (!(timer->iteration > 0)) return 0; /* no step has shown yet how long that takes */
+    if (!br_timer_allows(timer, br_timer_now(timer), 2 * timer->iteration)) return 0;
     if (!mpc->linearised) br_sqp_linearise(mpc);
     memset(&mpc->info, 0, sizeof mpc->info);
     mpc->penalty = 0;
@@ -48,13 +49,30 @@ static void improve(br_mpc *mpc) {
     br_best_begin(mpc);
     br_best_keep(mpc, status, 1);
     const int limit = br_iteration_limit(mpc);
-    while (mpc->info.iterations < limit && (status == BR_ACCEPTABLE || status == BR_DEFECT) &&
-           br_timer_allows(timer, br_timer_now(timer), 2 * timer->iteration)) {
+    int time = 1;
+    while (mpc->info.iterations < limit && (status == BR_ACCEPTABLE || status == BR_DEFECT)) {
+        time = br_timer_allows(timer, br_timer_now(timer), 2 * timer->iteration);
+        if (!time) break;
         status = br_sqp_iterate(mpc, 1, 0);
         br_best_keep(mpc, status, 1);
     }
     mpc->prepared_iterations += mpc->info.iterations;
     br_best_restore(mpc, status);
+    return time;
+}
+
+/* Looks for a better local minimum of the last problem from another start, if there is time for
+ * that and for what follows. */
+static void look_elsewhere(br_mpc *mpc) {
+    br_timer *timer = &mpc->timer;
+    timer->deadline -= 2 * timer->iteration;
+    if (!br_timer_allows(timer, br_timer_now(timer), BR_SECOND_START_ITERATIONS * timer->iteration)) return;
+    if (!mpc->linearised) br_sqp_linearise(mpc);
+    memset(&mpc->info, 0, sizeof mpc->info);
+    br_residuals(mpc);
+    const br_mpc_status status = br_judge(mpc);
+    if (br_usable(status)) br_start_again(mpc, status);
+    mpc->prepared_iterations += mpc->info.iterations;
 }
 
 br_mpc_error br_mpc_prepare(br_mpc *mpc, double elapsed_s, double budget_s) {
@@ -64,7 +82,7 @@ br_mpc_error br_mpc_prepare(br_mpc *mpc, double elapsed_s, double budget_s) {
     if (!(elapsed_s >= 0 && isfinite(elapsed_s))) return BR_ERROR_TIME;
     double lag = mpc->lag + elapsed_s;
     if (!mpc->warm || lag >= BR_HORIZON_S) return BR_OK;
-    if (!mpc->ahead && mpc->timer.limited) improve(mpc);
+    if (!mpc->ahead && mpc->timer.limited && improve(mpc)) look_elsewhere(mpc);
     if (!mpc->ahead) {
         mpc->kept = mpc->plan;
         memcpy(mpc->kept_sense, mpc->qp.sense, sizeof mpc->kept_sense);

@@ -13,7 +13,8 @@ static void linearise(br_mpc *mpc, int first) {
     mpc->qp.factorised = 0;
     mpc->linearised = 1;
     for (int k = first; k < BR_N; ++k)
-        br_stage_linearise(&mpc->gp[mpc->gp_in_use], mpc->plan.x[k], mpc->plan.u[k], mpc->plan.costate[k + 1], &mpc->stage[k]);
+        br_stage_linearise(&mpc->gp[mpc->gp_in_use], mpc->plan.x[k], mpc->plan.u[k],
+                           mpc->plan.costate[k + 1], &mpc->stage[k]);
 }
 
 void br_sqp_linearise(br_mpc *mpc) { linearise(mpc, 0); }
@@ -35,7 +36,8 @@ void br_sqp_roll_out(br_mpc *mpc, double throttle) {
     for (int k = 0; k < BR_N; ++k) {
         mpc->plan.u[k][0] = mpc->turn ? mpc->turn_u[k][0] : throttle;
         mpc->plan.u[k][1] = mpc->turn ? mpc->turn_u[k][1] : 0;
-        br_stage_linearise(&mpc->gp[mpc->gp_in_use], mpc->plan.x[k], mpc->plan.u[k], mpc->plan.costate[k + 1], &mpc->stage[k]);
+        br_stage_linearise(&mpc->gp[mpc->gp_in_use], mpc->plan.x[k], mpc->plan.u[k],
+                           mpc->plan.costate[k + 1], &mpc->stage[k]);
         memcpy(mpc->plan.x[k + 1], mpc->stage[k].f, sizeof mpc->plan.x[k + 1]);
     }
     br_qp_forget_working_set(&mpc->qp);

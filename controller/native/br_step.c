@@ -44,12 +44,9 @@ static int rough(const br_mpc *mpc, br_mpc_status status) {
 
 /* Iterates until settled or out of time. What is rough yet may take as many iterations as a cold
  * start. */
-static br_mpc_status iterate(br_mpc *mpc, int warm) {
+static br_mpc_status iterate(br_mpc *mpc, int warm, int most) {
     br_timer *timer = &mpc->timer;
-    const br_mpc_parameters *p = &mpc->parameters;
-    const int most = br_iteration_limit(mpc);
-    const int own_limit = warm ? p->iterations : p->iterations_cold;
-    const int limit = timer->limited ? most : own_limit;
+    const int limit = timer->limited || !warm ? most : mpc->parameters.iterations;
     br_mpc_status status = BR_DEFECT;
     double residual = INFINITY;
     br_best_begin(mpc);
@@ -78,12 +75,12 @@ static int doubtful(const br_mpc *mpc, br_mpc_status status) {
 /* Iterates from another start, with another throttle each time in a row; leaves the better plan of
  * that and the one at hand. To coast from the measured state most often leads to the good minimum in
  * a few iterations (docs/decisions/2026-11-22-second-start.md). */
-static br_mpc_status start_again(br_mpc *mpc, br_mpc_status status) {
+br_mpc_status br_start_again(br_mpc *mpc, br_mpc_status status) {
     static const double throttles[] = {0, 0.5, 1, 0.25};
     int better;
     br_first_keep(mpc, status);
-    br_sqp_roll_out(mpc, throttles[mpc->doubts % 4] * mpc->parameters.d_max);
-    status = br_first_compare(mpc, iterate(mpc, 0), &better);
+    br_sqp_roll_out(mpc, throttles[mpc->starts++ % 4] * mpc->parameters.d_max);
+    status = br_first_compare(mpc, iterate(mpc, 0, BR_SECOND_START_ITERATIONS), &better);
     mpc->info.second_start = better ? 2 : 1;
     return status;
 }
@@ -92,15 +89,14 @@ static br_mpc_status optimise(br_mpc *mpc) {
     br_timer *timer = &mpc->timer;
     begin_plan(mpc);
     timer->iteration = timer->trial = 0; /* a stall must not be remembered for ever */
-    if (!mpc->warm) return iterate(mpc, 0);
+    const int most = br_iteration_limit(mpc);
+    if (!mpc->warm) return iterate(mpc, 0, timer->limited ? most : mpc->parameters.iterations_cold);
     br_residuals(mpc);
     const double shifted_cost = mpc->info.cost;
-    br_mpc_status status = iterate(mpc, 1);
-    if (!doubtful(mpc, status)) mpc->doubts = 0;
-    else if (!mpc->info.time_limited && br_timer_allows(timer, br_timer_now(timer), 3 * timer->iteration)) {
-        status = start_again(mpc, status);
-        mpc->doubts += 1;
-    }
+    br_mpc_status status = iterate(mpc, 1, most);
+    if (doubtful(mpc, status) && !mpc->info.time_limited &&
+        br_timer_allows(timer, br_timer_now(timer), 3 * timer->iteration))
+        status = br_start_again(mpc, status);
     mpc->info.shifted_cost = shifted_cost;
     return status;
 }

@@ -140,10 +140,15 @@ def bench(
         Path | None,
         typer.Option("--json", callback=writable, help="Write the numbers to this file."),
     ] = None,
-    track: TrackName = DEFAULT_RACE_TRACK,
+    track: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Track to record on, as everywhere; may be repeated [three, with hairpins]."
+        ),
+    ] = None,
     problems: Annotated[
         int, typer.Option(min=10, help="Problems to record, all solved by the compiled step.")
-    ] = 400,
+    ] = 900,
     peers: Annotated[int, typer.Option(min=1, help="How many of them IPOPT solves too.")] = 25,
     points: Annotated[int, typer.Option(min=20, max=1024, help="Training points per GP.")] = 400,
     seed: Annotated[int, typer.Option(min=0, help="Of the training drive and the GP.")] = 0,
@@ -156,9 +161,8 @@ def bench(
 
     console = Console()
     with stages_on(console) as stages:
-        settings = BenchSettings(
-            track=track, problems=problems, peers=peers, points=points, seed=seed
-        )
+        chosen = {} if not track else {"tracks": tuple(track)}
+        settings = BenchSettings(problems=problems, peers=peers, points=points, seed=seed, **chosen)
         result = run_bench(settings, stages)
     result.print(console)
     if json_file:

