@@ -107,7 +107,7 @@ ZIG := $(shell for compiler in "$${CC-}" cc gcc clang; do \
 INSTALL = $(PIP_INSTALL) hatchling editables && $(PIP_INSTALL) $(PROJECT)
 SHAPED_BY := $(VENV)/.created pyproject.toml constraints.txt
 
-NO_COMPILER = $(if $(ZIG:,%=%),@echo "no C compiler here: installing ziglang, which is one")
+NO_COMPILER = $(if $(ZIG:,%=%),@echo "no C compiler here: installing ziglang")
 
 $(VENV)/.ready: $(SHAPED_BY)
 	$(NO_COMPILER)
