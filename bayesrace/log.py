@@ -10,19 +10,31 @@ import threading
 import time
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any, Final, Generic, Self, TypeVar, cast
 
+import lz4.frame
 import zenoh
+import zstandard
 from mcap.exceptions import EndOfFile, McapError
-from mcap.records import Channel, Metadata
+from mcap.records import Channel, Chunk, Metadata
 from mcap.records import Message as Record
-from mcap.stream_reader import StreamReader
+from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, IndexType, Writer
 
 from bayesrace.errors import InputError
-from bayesrace.messages import TOPICS, Decoder, Message, Topic, car_key, json_schema
+from bayesrace.messages import (
+    EVENT,
+    TOPICS,
+    Decoder,
+    Event,
+    Message,
+    Topic,
+    car_key,
+    encode,
+    json_schema,
+)
 from bayesrace.messages.codec import peek_seq
 
 __all__ = ["Entry", "LogReader", "LogWriter", "Recorder", "RecorderCounters"]
@@ -32,7 +44,13 @@ M = TypeVar("M", bound=Message)
 FLUSH_PERIOD_S: Final = 0.2
 _BATCH_S: Final = 0.002
 _CHANNEL_CAPACITY: Final = 1 << 16
+_MOST_KEYS: Final = 256
+"""A log's own keys are eight; the format has room for 65,535."""
 _LARGEST_RECORD: Final = 1 << 27
+_MOST_UNPACKED, _RATIO = 1 << 26, 200
+"""Bytes that all chunks of a log may unpack to: so many, and this multiple of the file."""
+_DAMAGED: Final = (McapError, struct.error, ValueError, RuntimeError, zstandard.ZstdError)
+"""What unpacking raises at a file that is cut off or spoilt."""
 _MESSAGE_ENCODING: Final = "msgpack"
 _MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
 _BY_PREFIX: Final = {topic.key.split("/")[2]: topic for topic in TOPICS}
@@ -122,6 +140,8 @@ class RecorderCounters:
     """Times that a sender began again at 0."""
     unnumbered: int = 0
     """Messages without a readable number; written all the same."""
+    unrecorded: int = 0
+    """Messages on more keys than a log has room for, let go."""
 
 
 class Recorder:
@@ -146,6 +166,9 @@ class Recorder:
         self.gaps: list[str] = []
         """The first few gaps in the numbering, in words."""
         self._last: dict[str, int] = {}
+        self._keys: set[str] = set()
+        self._path, self._session = path, session
+        self._event_key = car_key(EVENT.key, car, "recorder")
         self._writer = LogWriter(path, metadata)
         self._lock = threading.Lock()
         self._subscriber = session.declare_subscriber(
@@ -213,6 +236,9 @@ class Recorder:
         if not data:  # an inbox of the same session waking itself
             return
         self._quiet_since_ns = now_ns
+        if not self._known(key):
+            self.counters.unrecorded += 1
+            return
         seq = peek_seq(data)
         self._account(key, seq)
         if self.failed:
@@ -220,17 +246,34 @@ class Recorder:
         try:
             with self._lock:
                 self._writer.write(key, data, now_ns, 0 if seq is None else seq & 0xFFFFFFFF)
-        except OSError as error:
+        except Exception as error:
             self._fail(error)
 
-    def _fail(self, error: OSError) -> None:
-        self.failed = f"cannot write the log: {error.strerror}; make room and drive again"
+    def _known(self, key: str) -> bool:
+        """Whether messages on this key are written: whoever invents keys must not fill the log."""
+        if key not in self._keys and len(self._keys) < _MOST_KEYS:
+            self._keys.add(key)
+        return key in self._keys
+
+    def _fail(self, error: Exception) -> None:
+        """Whoever waits for a run looks at :attr:`failed`; everybody else hears it once."""
+        if self.failed:
+            return
+        why = error.strerror if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
+        self.failed = f"cannot write the log {self._path}: {why}; make room and drive again"
+        now_ns = time.monotonic_ns()
+        event = Event(0, now_ns, 0, "recorder", "recorder_failed", self.failed[:2000], {})
+        with suppress(zenoh.ZError):
+            # Not to itself, who takes nothing from its channel at this moment.
+            self._session.put(
+                self._event_key, encode(event), allowed_destination=zenoh.Locality.REMOTE
+            )
 
     def _flush(self) -> None:
         try:
             with self._lock:
                 self._writer.flush()
-        except OSError as error:
+        except (OSError, ValueError) as error:
             self._fail(error)
 
     def _flush_often(self) -> None:
@@ -319,12 +362,39 @@ class LogReader:
             file.seek(0)
             if not _MCAP_MAGIC.startswith(head):
                 raise InputError(f"{self.path} is not an MCAP log; give the log of a run")
+            left = _MOST_UNPACKED + _RATIO * self.path.stat().st_size
             try:
-                yield from StreamReader(
-                    cast(Any, _Whole(file)), record_size_limit=_LARGEST_RECORD
-                ).records
-            except (McapError, struct.error, ValueError):
+                for record in StreamReader(
+                    cast(Any, _Whole(file)), emit_chunks=True, record_size_limit=_LARGEST_RECORD
+                ).records:
+                    if not isinstance(record, Chunk):
+                        yield record
+                        continue
+                    left -= record.uncompressed_size
+                    if left < 0:
+                        raise InputError(
+                            f"{self.path} would unpack to many times its size: no log of a run"
+                        )
+                    yield from breakup_chunk(_unpacked(record))
+            except _DAMAGED:
                 self.truncated = True
+
+
+def _unpacked(chunk: Chunk) -> Chunk:
+    """The chunk of another tool's log, uncompressed; ValueError if it is longer than it says."""
+    size = chunk.uncompressed_size
+    if size > _LARGEST_RECORD:
+        raise ValueError("a chunk too large")
+    if chunk.compression == "zstd":
+        with zstandard.ZstdDecompressor().stream_reader(chunk.data) as stream:
+            data = stream.read(size + 1)
+    elif chunk.compression == "lz4":
+        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, size + 1)
+    else:
+        data = chunk.data
+    if len(data) != size:
+        raise ValueError("a chunk of another length")
+    return replace(chunk, compression="", data=data)
 
 
 class _Whole:

@@ -66,6 +66,10 @@ _GRACE: Final = 0.25
 """How long after a release the loop still waits for the state that is due (fraction of the
 period)."""
 
+_SERVE_NS: Final = 40_000_000
+"""Between two requests that are served while driving: each takes as long as a cycle, and whoever
+asks without end must not hold up the loop."""
+
 _SWITCH_S: Final = 1e-4
 
 _LEAST_BUDGET: Final = 0.1
@@ -95,6 +99,8 @@ class ControllerProcess:
         self._timing = Timing()
         self._arrived_ns = 0
         self._payload = b""
+        self._serve_ns = 0
+        """When the next request may be served."""
         self._told = False
         inbox = self.inbox = Inbox(session, self.name)
         inbox.subscribe(STATE, newest=NEWEST)
@@ -255,8 +261,11 @@ class ControllerProcess:
         end_ns = self._schedule.release_ns + round(self._settings.budget * self._schedule.period_ns)
         if self._takeover is not None:
             self._takeover.between_cycles(self._next_cycle)
-        while time.monotonic_ns() < end_ns and (item := self.inbox.other()) is not None:
-            self._service.react(item)
+        if min(end_ns, time.monotonic_ns()) >= self._serve_ns:
+            item = self.inbox.other()
+            if item is not None:
+                self._service.react(item)
+                self._serve_ns = time.monotonic_ns() + _SERVE_NS
         self._service.beat()
         left_s = (end_ns - time.monotonic_ns()) * 1e-9
         if left_s > 0:
@@ -366,6 +375,7 @@ class ControllerProcess:
             "states_foreign": states.foreign,
             "refused": self._decoder.refused,
             "overflowed": self.inbox.overflowed,
+            "turned_away": self.inbox.turned_away,
             **({} if self._courier is None else self._courier.status()),
             "actuations_sent": self._actuations.next_seq,
         }

@@ -1,11 +1,12 @@
 """Directs one run of a waiting plant and controller, from the start line to the last lap."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
 from bayesrace.errors import InputError
+from bayesrace.log import Recorder
 from bayesrace.messages import Event, RunRequest, Scalar
 from bayesrace.tracks import StartLine, Track
 from bayesrace.transport import Director, Publisher
@@ -16,6 +17,9 @@ __all__ = ["RunPlan", "execute", "run_request", "wait_for_both"]
 _ABSENCE_S = 10.0
 """By the wall clock a process may be away for so long: a link comes back, a controller is started
 again, and the car waits at standstill."""
+
+_UNDRIVEN = 0.5
+"""Share of periods without a command from which a run has not been one of the controller."""
 
 _REGULAR = ("laps", "max_time", "left_world")
 """Ends of a run that the car's driving, not a fault, has brought about."""
@@ -81,22 +85,53 @@ def _announce(publisher: Publisher[Event], plan: RunPlan, weights_version: str) 
     publisher.put(event, lockstep=True)
 
 
-def execute(director: Director, publisher: Publisher[Event], track: Track, plan: RunPlan) -> Event:
+def execute(
+    director: Director,
+    publisher: Publisher[Event],
+    track: Track,
+    plan: RunPlan,
+    recorder: Recorder | None = None,
+) -> Event:
     """Announces and starts the run and waits for its end; the plant's ``run_ended`` event.
 
-    InputError if the plant refuses, or the run ended by anything but its laps, its time limit or
-    the car's leaving the world; KeyboardInterrupt on a signal.
+    InputError if the plant refuses, the recorder fails, the car was not driven, or the run ended by
+    anything but its laps, its time limit or the car's leaving the world; KeyboardInterrupt on a
+    signal.
     """
     _announce(publisher, plan, director.status("controller").weights_version)
+    before = director.status("plant").counters
     director.start(run_request(track, plan))
     try:
         # In lockstep simulated time passes faster than the clock's, but nobody promises it.
         absence_s = 1.0 if plan.lockstep else _ABSENCE_S
-        end = director.wait_for_end(plan.run, 30.0 + 3.0 * plan.max_time_s, absence_s)
+        end = director.wait_for_end(
+            plan.run,
+            30.0 + 3.0 * plan.max_time_s,
+            absence_s,
+            lambda: recorder.failed if recorder else "",
+        )
     except (InputError, KeyboardInterrupt):
         with suppress(InputError):  # a car must not drive on when nobody watches it
             director.stop("who started the run has left")
         raise
     if end.data.get("reason") not in _REGULAR:
         raise InputError(f"run {plan.run} ({plan.controller}) ended early: {end.text}")
+    _check_driven(plan, end, before)
     return end
+
+
+def _check_driven(plan: RunPlan, end: Event, before: Mapping[str, Scalar]) -> None:
+    """InputError if the car, for want of commands, braked in most periods."""
+    braked, states = (
+        _number(end.data.get(name)) - _number(before.get(name))
+        for name in ("braked", "states_sent")
+    )
+    if braked > _UNDRIVEN * states:
+        raise InputError(
+            f"run {plan.run} ({plan.controller}): the car was not driven in {braked} of {states} "
+            "periods, for want of commands that were new enough; see the controller's status"
+        )
+
+
+def _number(value: Scalar | None) -> int:
+    return value if type(value) is int else 0

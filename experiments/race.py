@@ -232,7 +232,7 @@ class _Paddock:
     def drive(self, controller: str) -> RunPlan:
         """One run; InputError if it broke off."""
         plan = self._race.plan(controller, self._course)
-        execute(self.director, self._events, self._course.track, plan)
+        execute(self.director, self._events, self._course.track, plan, self.recorder)
         return plan
 
     def flushed(self, plan: RunPlan, car: CarParameters, step_s: float) -> Dataset:

@@ -53,6 +53,9 @@ __all__ = ["PlantProcess", "PlantSettings", "main"]
 
 _log = logging.getLogger("bayesrace.plant")
 
+_ABANDONED_S = 10.0
+"""Nobody watches or records a run whose director is gone for so long; a link may come back."""
+
 
 class PlantSettings(BaseModel):
     """How a plant process is started; what a run is like comes with its request."""
@@ -103,10 +106,14 @@ class PlantProcess:
         self._decoder: Decoder[Actuation] = Decoder(Actuation, _log)
         self._counters = RunCounters()
         self._run: Run | None = None
+        self._asked: RunRequest | None = None
+        """The request that has started the run under way: asked again, it is answered again."""
         self._run_number = 0
         self._runs = 0
         self._text = f"no run so far with {_played_by(settings)}"
         self._stopping = False
+        self._director_gone_ns: int | None = None
+        """Since when whoever directs is gone; None: is there, or never was."""
         inbox = self.inbox = Inbox(session, self.name)
         inbox.subscribe(ACTUATION, newest=NEWEST)
         for service in (RUN, STOP):
@@ -114,6 +121,7 @@ class PlantProcess:
         inbox.serve(STATUS, "plant")
         inbox.tell_time("plant")
         inbox.watch("controller")
+        inbox.watch("director")
         inbox.announce("plant")
 
     def serve(self) -> None:
@@ -176,8 +184,9 @@ class PlantProcess:
             )
         except (InputError, FmuFault) as error:
             return str(error)
-        self._run_number = message.run
+        self._run_number, self._asked = message.run, message
         self._runs += 1
+        self._director_gone_ns = None
         return ""
 
     def _overheard(self, item: Item) -> None:
@@ -221,17 +230,23 @@ class PlantProcess:
         if item.kind is Kind.SIGNAL:
             self._stopping = True
             return End("interrupted", "the plant process was told to end")
-        if item.kind is Kind.GONE:
+        if item.name == "director":
+            self._director_gone_ns = item.received_ns if item.kind is Kind.GONE else None
+        elif item.kind is Kind.GONE:
             _log.warning("the controller of car '%s' is gone", self.name)
         elif item.kind is Kind.REQUEST:
             return self._serve(item.value)
         return None
 
     def _serve(self, request: Request) -> End | None:
-        if request.service is RUN:
-            request.answer(self._reply(False, f"busy: {self._text}"))
-            return None
         message, why_not = decode_request(request)
+        if request.service is RUN and message is not None and message == self._asked:
+            request.answer(self._reply(True, f"run {message.run} started"))
+            return None
+        if request.service is RUN:
+            words = f"busy: {self._text}; 'bayesrace stop --run' ends it"
+            request.answer(self._reply(False, words))
+            return None
         if request.service is STATUS:
             request.answer(self._status())
             return None
@@ -263,9 +278,13 @@ class PlantProcess:
     def _reply(self, accepted: bool, text: str) -> Reply:
         return Reply(0, time.monotonic_ns(), accepted, text[:2000], {})
 
-    def _beat(self) -> None:
-        """Publishes the status, if it is time to."""
+    def _beat(self) -> End | None:
+        """Publishes the status, if it is time to; what ends a run under way."""
         self._heartbeat.beat(self._status)
+        gone_ns = self._director_gone_ns
+        if gone_ns is None or time.monotonic_ns() - gone_ns < _ABANDONED_S * 1e9:
+            return None
+        return End("abandoned", f"who started the run has been gone for {_ABANDONED_S:g} s")
 
     def _status(self, seq: int = 0) -> Status:
         phase = "idle" if self._run is None else "running"

@@ -66,7 +66,7 @@ class Run:
     """Executes one accepted request.
 
     ``react`` handles what is neither an actuation nor the controller's going (requests, signals);
-    what it returns, if anything, ends the run. ``beat`` is called once a period.
+    what it returns, if anything, ends the run. ``beat``, called once a period, does so, too.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class Run:
         counters: RunCounters,
         numbering: Numbering,
         react: Callable[[Item], End | None],
-        beat: Callable[[], None],
+        beat: Callable[[], End | None],
         epoch: int,
         delay_s: float = 0.0,
     ) -> None:
@@ -174,7 +174,8 @@ class Run:
             answer = self._answer_to(seq)
             if isinstance(answer, End):
                 return answer
-            self._beat()
+            if (end := self._beat()) is not None:
+                continue
             try:
                 self._simulator.step(answer)
             except FmuFault as fault:
@@ -200,7 +201,7 @@ class Run:
                 if (actuation.epoch, actuation.run, actuation.state_seq) == (self._epoch, run, seq):
                     return actuation.u
                 self._counters.stale += 1
-            elif item.kind is Kind.GONE:
+            elif item.kind is Kind.GONE and item.name == "controller":
                 return End("controller_lost", "the controller vanished: killed or unreachable")
             elif (end := self._react(item)) is not None:
                 return end
@@ -237,7 +238,8 @@ class Run:
                 if self._outbox:
                     self._sleep_and_send(self._outbox[-1][0])
                 return end
-            self._beat()
+            if (end := self._beat()) is not None:
+                return end
 
     def _enqueue(self, state: State) -> None:
         """Send the state when its delay is over; keep in mind when it was sampled."""
@@ -273,7 +275,7 @@ class Run:
                     item.received_ns + self._delay_ns, self._numbering.received, actuation
                 )
                 heapq.heappush(self._waiting, waiting)
-            elif item.kind is not Kind.GONE and (end := self._react(item)) is not None:
+            elif (end := self._react(item)) is not None:
                 return end
         return None
 

@@ -166,7 +166,7 @@ def workers_of(plant: int) -> dict[int, Path]:
         with contextlib.suppress(OSError, ValueError):
             words = (entry / "cmdline").read_bytes().decode().split("\0")
             if "plant.fmu.worker" in words:
-                told = json.loads(words[3])
+                told = json.loads(words[words.index("plant.fmu.worker") + 1])
                 if told["parent"] == plant:
                     found[int(entry.name)] = Path(told["folder"])
     return found

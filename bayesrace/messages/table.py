@@ -48,7 +48,7 @@ __all__ = [
 M = TypeVar("M", bound=Message)
 A = TypeVar("A", bound=Message)
 
-Source = Literal["plant", "controller", "race"]
+Source = Literal["plant", "controller", "race", "recorder"]
 
 _CAR_NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")
 
@@ -91,6 +91,8 @@ class Service(Generic[M, A]):
     request: type[M] | None
     answer: type[A] | None
     timeout_s: float
+    repeatable: bool = True
+    """Asked twice, it does what it does once: a question that a link has lost is asked again."""
 
 
 _CONTROL: Final = Qos("real_time", express=True, reliable=True, wall_clock_blocks=False)
@@ -110,7 +112,7 @@ EVENT: Final = Topic(
     "event",
     "bayesrace/{car}/event/{source}",
     Event,
-    ("plant", "controller", "race"),
+    ("plant", "controller", "race", "recorder"),
     "when something happens",
     _NEWS,
 )
@@ -133,7 +135,7 @@ WEIGHTS: Final[Service[Message, Reply]] = Service(
 """The payload is a weights file (:mod:`bayesrace.gp.weights`). Answered once it is in use, or
 refused; waits for a first cycle, for others that sent theirs before, and for the checks."""
 ROLLBACK: Final = Service(
-    "rollback", "bayesrace/{car}/controller/rollback", RollbackRequest, Reply, 20.0
+    "rollback", "bayesrace/{car}/controller/rollback", RollbackRequest, Reply, 20.0, False
 )
 ACCEPTED: Final[Service[Message, Message]] = Service(
     "accepted", "bayesrace/{car}/controller/accepted", None, None, 2.0

@@ -41,10 +41,11 @@ __all__ = [
 
 END_REASONS: Final = (
     "laps", "max_time", "stopped", "controller_lost", "actuation_timeout", "left_world",
-    "interrupted", "plant_fault",
+    "interrupted", "plant_fault", "abandoned",
 )  # fmt: skip
 """Why a run ended, in the ``kind="run_ended"`` event's data under ``reason``; plant_fault: what
-plays the car has failed, and its last good state is sent once more as the final one."""
+plays the car has failed, and its last good state is sent once more as the final one; abandoned: who
+started it has been gone for long."""
 
 PHASES: Final = ("idle", "running", "waiting", "ready", "driving", "fallback", "stopped")
 """Of a process, see :class:`Status`."""
@@ -180,7 +181,7 @@ class Event(Message):
     """Something happened that a person may want to know: ``bayesrace/{car}/event/{source}``."""
 
     run: Count
-    source: Annotated[str, Choice(("plant", "controller", "race"))]
+    source: Annotated[str, Choice(("plant", "controller", "race", "recorder"))]
     kind: Short
     text: Long
     data: DataMap

@@ -7,15 +7,22 @@ repeated at the end.
 
 import math
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
 from bayesrace.errors import InputError
+from bayesrace.files import write_whole
 from bayesrace.tracks.checks import find_fault
 from bayesrace.tracks.spline import FloatArray
 from bayesrace.tracks.track import Track, drop_repeated
 
 __all__ = ["read_table", "read_track", "write_track"]
+
+_LARGEST: Final = 4_000_000
+"""Bytes, and ..."""
+_MOST_POINTS: Final = 20_000
+"""... rows of a file: a point each centimetre of a track ten times as long as any here."""
 
 COLUMNS = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")
 
@@ -40,7 +47,7 @@ def write_track(path: Path | str, track: Track) -> None:
     nodes = np.column_stack([track.x_m, track.y_m, track.width_right_m, track.width_left_m])
     lines = [f"# {','.join(COLUMNS)}"]
     lines += [",".join(repr(value) for value in row) for row in nodes.tolist()]
-    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_whole(Path(path), "\n".join(lines) + "\n")
 
 
 def default_car_width_m(car_width_m: float | None) -> float:
@@ -59,6 +66,12 @@ def read_table(path: Path, columns: tuple[str, ...]) -> tuple[FloatArray, list[i
     number; what the numbers mean is checked by the caller.
     """
     try:
+        size = path.stat().st_size
+        if size > _LARGEST:
+            raise InputError(
+                f"{path}: {size / 1e6:.0f} MB, at most {_LARGEST / 1e6:.0f} are read; "
+                "give fewer points"
+            )
         text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
         reason = error.strerror or type(error).__name__
@@ -74,6 +87,11 @@ def read_table(path: Path, columns: tuple[str, ...]) -> tuple[FloatArray, list[i
         cells = [cell.strip() for cell in content.split(";" if ";" in content else ",")]
         if not rows and tuple(cells) == columns:
             continue
+        if len(rows) == _MOST_POINTS:
+            raise InputError(
+                f"{path}, row {row}: more than {_MOST_POINTS} points; "
+                "give fewer, some centimetres apart"
+            )
         values.append(_numbers(path, row, cells, columns))
         rows.append(row)
     return np.array(values, dtype=float).reshape(-1, len(columns)), rows

@@ -1,8 +1,8 @@
 """Asking other processes, and following a run from outside."""
 
 import time
-from collections.abc import Collection, Sequence
-from typing import Any, TypeVar
+from collections.abc import Callable, Collection, Sequence
+from typing import Any, Final, TypeVar
 
 import zenoh
 
@@ -43,6 +43,9 @@ __all__ = [
 
 A = TypeVar("A", bound=Message)
 
+_AGAIN_S: Final = 0.2
+"""Until a lost question is asked again."""
+
 
 class RefusedError(InputError):
     """A process has answered no."""
@@ -63,14 +66,19 @@ def ask(
 ) -> A:
     """Ask a process and wait for its answer, as long as the table says unless told otherwise.
 
-    Of several that answer to one name, :func:`decisive` chooses among the valid answers. Raises
-    InputError if nobody answers in time, or nobody validly.
+    A link that breaks, as when a machine stalls for longer than its lease, loses the questions that
+    are under way: they are asked again. Of several that answer to one name, :func:`decisive`
+    chooses among the valid answers. Raises InputError if nobody answers in time, or nobody validly.
     """
     if service.answer is None:
         raise TypeError(f"the answer of '{service.name}' is not a message; use fetch_all")
     key = car_key(service.key, car, source)
     limit_s = service.timeout_s if timeout_s is None else timeout_s
+    deadline = time.monotonic() + limit_s
     answers = ask_all(session, (key,), request, limit_s)[key]
+    while not answers and service.repeatable and (left_s := deadline - time.monotonic()) > 0:
+        time.sleep(min(_AGAIN_S, left_s))
+        answers = ask_all(session, (key,), request, max(left_s - _AGAIN_S, _AGAIN_S))[key]
     answer = decisive(_valid(service.answer, answers))
     if answer is None:
         # Who gives a time has it from an option of that name.
@@ -178,6 +186,8 @@ class Director:
         self.inbox.subscribe(EVENT)
         self.inbox.watch("plant")
         self.inbox.watch("controller")
+        # The plant ends a run whose director is gone for long.
+        self.inbox.announce("director")
 
     def wait_for(self, sources: Collection[str], timeout_s: float) -> None:
         """Wait until these processes are there and know of this one's subscriptions."""
@@ -222,18 +232,28 @@ class Director:
         """:func:`send_rollback`; RefusedError if there is nothing to go back to."""
         return self._accepted("rollback", send_rollback(self._session, self._car, text))
 
-    def wait_for_end(self, run: int, timeout_s: float, absence_s: float = 1.0) -> Event:
+    def wait_for_end(
+        self,
+        run: int,
+        timeout_s: float,
+        absence_s: float = 1.0,
+        trouble: Callable[[], str] = str,
+    ) -> Event:
         """The ``run_ended`` event of a run.
 
         In lockstep the plant ends the run itself when the controller vanishes; by the wall clock
-        it brakes and goes on. A process, or the link to it, may be away for ``absence_s``. Raises
-        InputError if one is for longer or the time is over; KeyboardInterrupt on a signal.
+        it brakes and goes on. A process, or the link to it, may be away for ``absence_s``.
+        ``trouble``: why it makes no sense to wait on, such as a log that cannot be written; empty
+        while it does. Raises InputError if one is away for longer, the time is over, or of that
+        trouble; KeyboardInterrupt on a signal.
         """
         deadline = last = time.monotonic() + timeout_s
         lost: dict[str, str] = {}
         with self.inbox.catching_signals():
             while (left_s := deadline - time.monotonic()) > 0:
                 item = self.inbox.get(min(left_s, 1.0))
+                if why_not := trouble():
+                    raise InputError(f"run {run} is broken off: {why_not}")
                 if item is None:
                     continue
                 self._raise_on_signal(item)

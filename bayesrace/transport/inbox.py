@@ -48,6 +48,10 @@ _CAPACITY: Final = 10_000
 """Items, and messages, waiting at most; a thread this far behind is broken, and memory must not
 follow it. A full channel holds back the senders: those of the wall clock drop, by the table."""
 
+_REQUESTS: Final = 16
+"""Items with which no more requests are taken: whoever asks more often than a loop serves would
+else be served for minutes after."""
+
 NEWEST: Final = 1024
 """Messages of the control path that wait at most: a thread this far behind wants the newest."""
 
@@ -97,6 +101,11 @@ class Request:
         """Send the answer; one that nobody waits for any more is dropped."""
         self.answer_raw(encode(message))
 
+    def drop(self) -> None:
+        """No answer: whoever asks is told so at once, and may ask again."""
+        self._query.drop()
+        self._query = None
+
     def answer_raw(self, data: bytes) -> None:
         """The same where the answer is not a message."""
         query, self._query = self._query, None
@@ -141,6 +150,8 @@ class Inbox:
         """Sources whose liveliness token is there, as of the items taken so far."""
         self.overflowed = 0
         """Items lost because nobody took them."""
+        self.turned_away = 0
+        """Requests that were not answered because too many waited."""
         self.spin_s = 0.0
         """How long :meth:`get` polls before it sleeps; 0 wherever others need the CPU."""
 
@@ -167,8 +178,15 @@ class Inbox:
         threading.Thread(target=self._tick, name="inbox-clock").start()
 
     def serve(self, service: Service[Any, Any], source: str = "") -> None:
-        """Let the service's requests arrive."""
-        arrived = self._putter(Kind.REQUEST, service.name, lambda request: request)
+        """Let the service's requests arrive; what comes when many wait is turned away, counted."""
+
+        def arrived(request: Request) -> None:
+            if self._items.qsize() >= _REQUESTS:
+                self.turned_away += 1
+                request.drop()
+                return
+            self._add(Item(Kind.REQUEST, service.name, request, time.monotonic_ns()))
+
         self._declared.append(
             declare_service(self._session, service, self._car, arrived, source=source)
         )
@@ -318,12 +336,6 @@ class Inbox:
                 time.sleep(_TICK_S)
                 if self._waiting:
                     self._bell.put(b"")
-
-    def _putter(self, kind: Kind, name: str, convert: Callable[[Any], Any]) -> Any:
-        def on_arrival(thing: Any) -> None:
-            self._add(Item(kind, name, convert(thing), time.monotonic_ns()))
-
-        return on_arrival
 
 
 def _direct(callback: Callable[[Any], None]) -> Any:

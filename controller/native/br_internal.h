@@ -14,6 +14,7 @@
 #define BR_COLS ((((BR_ROWS + 1) + 7) / 8) * 8)  /* right-hand sides of one substitution */
 #define BR_HORIZON_S (BR_N * BR_TS)
 #define BR_LINE_SEARCH_TRIALS 5
+#define BR_FUTILE 8
 #define BR_DEFECT_FINE 0.01 /* m, m, rad, m/s, m/s, 10 rad/s, rad: not worth another iteration */
 #define BR_GP_PADDED (((BR_GP_CAPACITY + 7) / 8) * 8)
 
@@ -135,6 +136,7 @@ struct br_mpc {
     br_best best;
     br_best first;       /* the plan that a second start has to beat */
     unsigned starts;     /* second ones so far */
+    unsigned futile;     /* doubtful steps since one was better */
     br_plan kept;        /* the plan, and the QP's working set, before those shifts */
     int kept_sense[BR_ROWS];
     double answer_x[BR_N + 1][BR_NX], answer_u[BR_N][BR_NU]; /* plan of the last step */

@@ -72,6 +72,13 @@ static int doubtful(const br_mpc *mpc, br_mpc_status status) {
     return mpc->qp.regularised || mpc->info.shortened || !br_usable(status);
 }
 
+/* Whether to try: where nothing has been better for long, as with a model that is wrong all over,
+ * only now and then. */
+static int worth_a_try(br_mpc *mpc) {
+    const unsigned futile = mpc->futile++;
+    return futile < BR_FUTILE || futile % BR_FUTILE == 0;
+}
+
 /* Iterates from another start, with another throttle each time in a row; leaves the better plan of
  * that and the one at hand. To coast from the measured state most often leads to the good minimum in
  * a few iterations (docs/decisions/2026-11-22-second-start.md). */
@@ -82,6 +89,7 @@ br_mpc_status br_start_again(br_mpc *mpc, br_mpc_status status) {
     br_sqp_roll_out(mpc, throttles[mpc->starts++ % 4] * mpc->parameters.d_max);
     status = br_first_compare(mpc, iterate(mpc, 0, BR_SECOND_START_ITERATIONS), &better);
     mpc->info.second_start = better ? 2 : 1;
+    if (better) mpc->futile = 0;
     return status;
 }
 
@@ -94,8 +102,9 @@ static br_mpc_status optimise(br_mpc *mpc) {
     br_residuals(mpc);
     const double shifted_cost = mpc->info.cost;
     br_mpc_status status = iterate(mpc, 1, most);
-    if (doubtful(mpc, status) && !mpc->info.time_limited &&
-        br_timer_allows(timer, br_timer_now(timer), 3 * timer->iteration))
+    if (!doubtful(mpc, status)) mpc->futile = 0;
+    else if (!mpc->info.time_limited && worth_a_try(mpc) &&
+             br_timer_allows(timer, br_timer_now(timer), 3 * timer->iteration))
         status = br_start_again(mpc, status);
     mpc->info.shifted_cost = shifted_cost;
     return status;

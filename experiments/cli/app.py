@@ -1,5 +1,6 @@
 """The Typer application: one module per group of subcommands, and errors as one line."""
 
+import io
 import logging
 import sys
 from typing import Annotated, Final
@@ -47,6 +48,9 @@ for group in (evaluation, latency, preparation, learning, parts, operation, fmu)
 
 def main() -> None:
     """Runs the command line; bad input and lost processes end in one line, not in a traceback."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal may lack characters that we print
+            stream.reconfigure(errors="replace")
     try:
         # Typer turns Ctrl-C and Exit into the value it returns, and older ones Ctrl-C into Abort.
         with remembering_interrupts():
@@ -54,33 +58,41 @@ def main() -> None:
             if code == _INTERRUPTED:
                 raise KeyboardInterrupt
         sys.exit(code)
-    except InputError as error:
-        _fail(str(error))
-    except ValidationError as error:
-        words = "; ".join(
-            f"{'.'.join(str(part) for part in one['loc']) or 'settings'}: {one['msg']}"
-            for one in error.errors()
-        )
-        _fail(words)
-    except OSError as error:
-        where = error.filename or "system"
-        _fail(f"{where}: {error.strerror or error}; choose a path that can be read or written")
     except (typer.Abort, KeyboardInterrupt):
         _fail("interrupted", _INTERRUPTED)
-    except RuntimeError as error:
-        # our own: RaceError, RaceLineError, CompileError, FmuFault
-        if type(error).__module__.split(".")[0] not in _OUR_OWN:
-            raise
-        _fail(str(error), 1)
     except Exception as error:
-        click_error = getattr(error, "format_message", None)
-        if click_error is None:
+        told = _in_words(error)
+        if told is None:
             raise
-        _fail(click_error())
+        ours = isinstance(error, RuntimeError) and not isinstance(error, RecursionError)
+        _fail(told, 1 if ours else 2)
+
+
+def _in_words(error: Exception) -> str | None:
+    """What a user is told; None for a fault of the program's own, which gets a traceback."""
+    match error:
+        case InputError():
+            return str(error)
+        case ValidationError():
+            return "; ".join(
+                f"{'.'.join(str(part) for part in one['loc']) or 'settings'}: {one['msg']}"
+                for one in error.errors()
+            )
+        case OSError():
+            where = error.filename or "system"
+            return f"{where}: {error.strerror or error}; choose a path that can be read or written"
+        case RecursionError():
+            return "a file or an option is nested too deeply to be read"
+        case RuntimeError():  # our own: RaceError, RaceLineError, CompileError, FmuFault
+            return str(error) if type(error).__module__.split(".")[0] in _OUR_OWN else None
+    explain = getattr(error, "format_message", None)  # Click's
+    return None if explain is None else str(explain())
 
 
 def _fail(text: str, code: int = 2) -> None:
-    lines = list(filter(None, map(str.strip, text.splitlines())))
+    from experiments.picture import printable
+
+    lines = [printable(line.strip()) for line in text.splitlines() if line.strip()]
     several = any(line.startswith("- ") for line in lines)  # faults, as of a map: a line each
     line = ("\n  " if several else "; ").join(lines)
     if not line:  # no command given: the help has been shown

@@ -124,14 +124,14 @@ def drive(
     name = name or car
     with (
         open_session(connect_to(endpoint)) as session,
-        Recorder(session, name, log, {"drive": {"car": car, "track": course.name}}),
+        Recorder(session, name, log, {"drive": {"car": car, "track": course.name}}) as recorder,
     ):
         director = Director(session, name)
         director.wait_for(("plant", "controller"), 10.0)
         publisher: Publisher[Event] = Publisher(session, EVENT, name, "race")
         number = director.status("plant").run + 1
         plan = RunPlan(number, "manual", laps, max_time, mode is Mode.lockstep)
-        end = execute(director, publisher, course, plan)
+        end = execute(director, publisher, course, plan, recorder)
     typer.echo(f"{end.text}; log: {log}")
 
 

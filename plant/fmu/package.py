@@ -18,6 +18,9 @@ __all__ = ["extract", "library", "read_description"]
 _MOST_BYTES: Final = 2 << 30
 """Unpacked; an archive that claims more is damaged or an attack on the disk."""
 
+_LARGEST_XML: Final = 16_000_000
+"""Bytes of a model description; a hundred thousand variables."""
+
 _UNREADABLE: Final = (
     OSError, RuntimeError, NotImplementedError, EOFError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
@@ -47,6 +50,12 @@ def read_description(path: str | os.PathLike[str]) -> Any:
     with _opened(path) as archive:
         if "modelDescription.xml" not in archive.namelist():
             raise InputError(f"{path} is an archive without a modelDescription.xml: no FMU")
+        size = archive.getinfo("modelDescription.xml").file_size
+        if size > _LARGEST_XML:
+            raise InputError(
+                f"{path}: its modelDescription.xml has {size / 1e6:.0f} MB, at most "
+                f"{_LARGEST_XML / 1e6:.0f} are read: export it with fewer variables"
+            )
         with archive.open("modelDescription.xml") as xml:
             head = xml.read(1 << 16)
     version = re.search(rb"fmiVersion\s*=\s*[\"']([^\"']*)[\"']", head)
