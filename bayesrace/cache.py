@@ -24,11 +24,14 @@ _ROOT: Final = Path(__file__).resolve().parents[1]
 
 
 def cache_folder() -> Path:
-    """$BAYESRACE_CACHE, else the user's cache folder."""
+    """$BAYESRACE_CACHE, else the user's cache folder; InputError if there is none."""
     chosen = os.environ.get("BAYESRACE_CACHE")
     if chosen:
         return Path(chosen)
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    try:
+        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    except RuntimeError:  # no HOME, and a user whom the system does not know
+        raise InputError("there is no home folder for the cache; set BAYESRACE_CACHE") from None
     return Path(base) / "bayesrace"
 
 

@@ -376,6 +376,8 @@ class LogReader:
                             f"{self.path} would unpack to many times its size: no log of a run"
                         )
                     yield from breakup_chunk(_unpacked(record))
+            except InputError:
+                raise
             except _DAMAGED:
                 self.truncated = True
 

@@ -19,6 +19,8 @@ __all__ = ["ABI", "LIBRARY", "MANIFEST", "Manifest", "check_library", "read_mani
 ABI: Final = 5
 """Version of the C interface in controller/native/bayesrace_mpc.h."""
 
+_ROOT: Final = 0
+
 LIBRARY: Final = "libmpc.so"
 MANIFEST: Final = "manifest.json"
 
@@ -93,7 +95,7 @@ def check_library(artefact: Path, manifest: Manifest) -> Path:
 
 def _check_owner(path: Path) -> None:
     status = path.stat()
-    if status.st_uid not in (os.geteuid(), 0):
+    if status.st_uid not in (os.geteuid(), _ROOT):
         raise InputError(
             f"{path} belongs to another user (number {status.st_uid}), whose code is not executed: "
             "build your own, or set BAYESRACE_CACHE to a folder of yours"

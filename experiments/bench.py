@@ -28,6 +28,7 @@ from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK, Track, 
 from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from codegen.build import build
+from codegen.compiler import find_compiler
 from codegen.ocp import OcpParameters, RacingOcp
 from codegen.settings import BuildSettings
 from controller.native_step import NativeStep, StepStatus
@@ -167,6 +168,7 @@ class _Recording:
 
 def run_bench(settings: BenchSettings, stages: Stages) -> BenchResult:
     """Measures; takes about a minute, most of it IPOPT's."""
+    find_compiler()  # what is missing is told now, not after the training
     car = get_car(settings.car)
     with stages.stage("racing lines and training drive"):
         courses = [load_track(name) for name in settings.tracks]

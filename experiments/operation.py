@@ -15,23 +15,28 @@ from bayesrace.messages import (
     COMMAND,
     HEARTBEAT,
     STATUS,
+    STOP,
     Command,
     Decoder,
+    Message,
     Reply,
     Status,
     StatusRequest,
+    StopRequest,
     car_key,
     decode,
 )
 from bayesrace.transport import Endpoints, ask_all, decisive, open_session
 from experiments.picture import SOURCES, Picture, Process
 
-__all__ = ["Found", "ask_statuses", "command", "find", "follow", "pick", "route"]
+__all__ = ["Found", "Word", "ask_statuses", "command", "find", "follow", "pick", "route"]
 
 _log = logging.getLogger("bayesrace.router")
 
 Found = Mapping[str, Collection[str]]
 """Name of a car to those of its processes whose liveliness token is there."""
+
+Word = Literal["stop", "go", "end"]
 
 _SETTLING_S: Final = 0.1
 """After the last link is up, a moment for what is declared behind it."""
@@ -136,13 +141,14 @@ def _process(answers: list[bytes], fault: str) -> Process:
     return Process(status, "" if status else fault, len(answers))
 
 
-def pick(found: Found, name: str, everybody: bool) -> list[str]:
+def pick(found: Found, name: str, everybody: bool, source: str = "controller") -> list[str]:
     """The cars to command: the named one, all, or the only one; InputError if that is unclear."""
-    cars = sorted(car for car, sources in found.items() if "controller" in sources)
+    cars = sorted(car for car, sources in found.items() if source in sources)
     if not cars:
+        other = "plant" if source == "controller" else "controller"
         raise InputError(
-            f"no controller can be reached, only the plant of {', '.join(sorted(found))}; "
-            "start 'bayesrace controller', or name its endpoint: --endpoint"
+            f"no {source} can be reached, only the {other} of {', '.join(sorted(found))}; "
+            f"start 'bayesrace {source}', or name its endpoint: --endpoint"
         )
     if name or everybody or len(cars) == 1:
         return cars
@@ -150,11 +156,18 @@ def pick(found: Found, name: str, everybody: bool) -> list[str]:
 
 
 def command(
-    session: Any, cars: Collection[str], word: Literal["stop", "go"], text: str, timeout_s: float
+    session: Any, cars: Collection[str], word: Word, text: str, timeout_s: float
 ) -> dict[str, Reply | str]:
-    """Tell the controllers of these cars, all at once; each one's answer, or why there is none."""
-    keys = {car: car_key(COMMAND.key, car) for car in cars}
-    request = Command(0, time.monotonic_ns(), word, text)
+    """Tell the controllers of these cars, all at once; each one's answer, or why there is none.
+
+    "end" is for their plants: it ends the run under way.
+    """
+    service = STOP if word == "end" else COMMAND
+    keys = {car: car_key(service.key, car) for car in cars}
+    now_ns = time.monotonic_ns()
+    request: Message = (
+        StopRequest(0, now_ns, text) if word == "end" else Command(0, now_ns, word, text)
+    )
     answers = ask_all(session, keys.values(), request, timeout_s)
     return {car: _reply(answers[key], timeout_s) for car, key in keys.items()}
 

@@ -24,6 +24,7 @@ from bayesrace.tracks import Track, load_track, write_track
 from bayesrace.transport import Director, Endpoints, Publisher, free_endpoint, open_session
 from bayesrace.vehicles import CarParameters, get_car
 from codegen.build import build
+from codegen.compiler import find_compiler
 from codegen.settings import BuildSettings
 from experiments.collect import collect
 from experiments.drive import RunPlan, execute, wait_for_both
@@ -249,6 +250,7 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
     """
     if (out / FILES.log).exists():
         raise InputError(f"{out} holds a run already; choose another folder or remove it")
+    find_compiler()  # what is missing is told now, not after the training
     this = _Race(settings, out, stages)
     train_track, track = (
         load_track(name, this.car.width_m) for name in (settings.train_track, settings.track)

@@ -72,11 +72,11 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
-    """Processes of tests in the check tier are not measured, unless marked so.
+    """Processes of some long tests in the check tier are not measured for coverage.
 
     Measuring makes Python two to three times slower, and what they execute the others do, too.
     """
-    if item.get_closest_marker("measured") or not item.get_closest_marker("check"):
+    if not (item.get_closest_marker("unmeasured") and item.get_closest_marker("check")):
         return (yield)
     measuring = {name: os.environ.pop(name) for name in [*os.environ] if "COVERAGE_" in name}
     try:

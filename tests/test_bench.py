@@ -7,7 +7,7 @@ import pytest
 
 from tests.programs import run
 
-pytestmark = pytest.mark.check
+pytestmark = [pytest.mark.check, pytest.mark.unmeasured]
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,6 @@
 """The command line: help that reads well, errors in one line, and the chain of files by hand."""
 
+import json
 import os
 import re
 import signal
@@ -19,9 +20,10 @@ from bayesrace.raceline.line import write_raceline
 from bayesrace.tracks import write_track
 from bayesrace.transport import Director, free_endpoint
 from bayesrace.vehicles import get_car
+from experiments.processes import child
 from tests.command_line import Cli, refused
 from tests.conftest import Circuit
-from tests.programs import finish, peanut, run, start, until
+from tests.programs import environment, finish, peanut, run, start, until
 
 SUBCOMMANDS = (
     "race", "drive", "report", "bench", "tracks", "raceline", "collect", "train", "build",
@@ -334,3 +336,97 @@ def test_drive_says_when_the_controller_is_lost(
     assert len(done.stderr.strip().splitlines()) == 1
     assert LogReader(log).select(STATE)
     assert plant.poll() is None
+
+
+@pytest.mark.check
+@pytest.mark.wall_clock
+def test_a_run_whose_director_is_gone_ends_by_itself_or_by_a_command(
+    tmp_path: Path,
+    course: tuple[str | Path, ...],
+    kinematic_artefact: Path,
+    ended: list[subprocess.Popen[str]],
+) -> None:
+    """Nobody watches or records it any more; until then a new one is refused with the remedy."""
+    plant_at, controller_at = free_endpoint(), free_endpoint()
+    plant = start("plant", "--endpoint", plant_at)
+    files = ("--artefact", kinematic_artefact, *course)
+    controller = start("controller", *files, "--endpoint", plant_at, "--listen", controller_at)
+    where = ("--endpoint", plant_at, "--endpoint", controller_at)
+    long = ("drive", *course[:2], "--laps", "10000", "--max-time", "3600", "--mode", "realtime")
+    ended += [plant, controller]
+
+    def words() -> str:
+        state = json.loads(run("status", "--json", *where).stdout)["cars"]["orca"]["plant"]
+        return f"{state['phase']}: {state['text']}"
+
+    def killed(log: Path) -> None:
+        drive = start(*long, *where, "--log", log)
+        ended.append(drive)
+        until(lambda: log.exists() and log.stat().st_size > 50_000, "a run under way")
+        drive.kill()
+
+    killed(tmp_path / "one.mcap")
+    busy = run(*long, *where, "--log", tmp_path / "two.mcap")
+    assert busy.returncode == 2
+    assert "'bayesrace stop --run' ends it" in busy.stderr
+    done = run("stop", "--run", "--endpoint", plant_at)
+    assert (done.returncode, "stops" in done.stdout) == (0, True), done.stderr
+    until(lambda: words().startswith("idle"), "the end of the run")
+    killed(tmp_path / "three.mcap")
+    until(lambda: "has been gone for 10 s" in words(), "the end of another")
+    assert words().startswith("idle")
+
+
+@pytest.mark.check
+@pytest.mark.wall_clock
+def test_a_run_in_which_the_car_was_not_driven_is_no_success(
+    tmp_path: Path,
+    course: tuple[str | Path, ...],
+    kinematic_artefact: Path,
+    ended: list[subprocess.Popen[str]],
+) -> None:
+    plant_at, controller_at = free_endpoint(), free_endpoint()
+    plant = start("plant", "--endpoint", plant_at)
+    files = ("--artefact", kinematic_artefact, *course)
+    controller = start("controller", *files, "--endpoint", plant_at, "--listen", controller_at)
+    ended += [plant, controller]
+    where = ("--endpoint", plant_at, "--endpoint", controller_at)
+    log = tmp_path / "drive.mcap"
+    drive = start(
+        "drive", *course[:2], "--laps", "1000", "--max-time", "4", "--mode", "realtime",
+        *where, "--log", log,
+    )  # fmt: skip
+    ended.append(drive)
+    until(lambda: log.exists() and log.stat().st_size > 20_000, "a run under way")
+    controller.send_signal(signal.SIGSTOP)
+    try:
+        done = finish(drive)
+    finally:
+        controller.send_signal(signal.SIGCONT)
+    assert done.returncode == 2
+    assert "the car was not driven in" in done.stderr
+
+
+@pytest.mark.parametrize("command", ["tracks", "train"])
+def test_a_terminal_without_our_characters_gets_others(tmp_path: Path, command: str) -> None:
+    more = {"tracks": (), "train": (tmp_path / "nö.mcap", "--out", tmp_path / "weights.bin")}
+    around = {**environment(), "PYTHONIOENCODING": "ascii"}
+    done = finish(start(command, *more[command], env=around))
+    assert "Traceback" not in done.stderr
+    assert done.returncode == {"tracks": 0, "train": 2}[command]
+
+
+def test_names_do_not_command_the_terminal(cli: Cli) -> None:
+    refused(cli("tracks", "evil\x1b[2Jname.csv"), "evil·[2Jname.csv")
+
+
+def test_programs_that_are_started_import_nothing_from_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A user's random.py, or somebody's zenoh.py in a shared folder."""
+    for name in ("random", "zenoh", "json"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('imported from the folder')")
+    monkeypatch.chdir(tmp_path)
+    with child(["plant", "--help"], tmp_path / "child.log") as process:
+        assert process.wait(60.0)
+    assert "imported from the folder" not in (tmp_path / "child.log").read_text()

@@ -1,9 +1,10 @@
 """Code generation: the cache's hash sees everything, and what cannot be built or loaded is told."""
 
+import hashlib
 import os
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -214,6 +215,61 @@ def test_a_damaged_library_is_refused(artefact: Path, car: CarParameters) -> Non
     (artefact / LIBRARY).unlink()
     with pytest.raises(InputError, match="cannot be read"):
         load(artefact, car)
+
+
+def _cut(library: Path) -> None:
+    data = library.read_bytes()
+    library.unlink()
+    library.write_bytes(data[:-100])
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [_cut, Path.unlink, lambda library: library.chmod(0o777)],
+    ids=["cut", "missing", "for anybody"],
+)
+def test_an_artefact_that_cannot_be_trusted_is_built_again(
+    cache: Path, car: CarParameters, spoil: Callable[[Path], None]
+) -> None:
+    folder, _ = build(SMALL)
+    left = folder.with_name(f".{folder.name}-killed")
+    left.mkdir()
+    spoil(folder / LIBRARY)
+    assert build(SMALL)[0] == folder
+    load(folder, car)
+    assert contents(cache) == [folder]
+
+
+def test_what_anybody_may_write_or_others_own_is_not_loaded(
+    artefact: Path, car: CarParameters, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (artefact / LIBRARY).chmod(0o777)
+    with pytest.raises(InputError, match=r"may be written by anybody.*chmod"):
+        load(artefact, car)
+    (artefact / LIBRARY).chmod(0o755)
+    monkeypatch.setattr("os.geteuid", lambda: 12345)
+    monkeypatch.setattr("bayesrace.manifest._ROOT", 54321)
+    with pytest.raises(InputError, match=r"belongs to another user.*BAYESRACE_CACHE"):
+        load(artefact, car)
+
+
+def test_a_library_without_its_functions_is_refused(artefact: Path, car: CarParameters) -> None:
+    source = artefact / "empty.c"
+    source.write_text("int br_mpc_abi(void) { return 5; }\n")
+    (artefact / LIBRARY).unlink()
+    line = [*find_compiler().command, "-shared", "-fPIC", str(source), "-o"]
+    subprocess.run([*line, str(artefact / LIBRARY)], check=True)
+    digest = hashlib.sha256((artefact / LIBRARY).read_bytes()).hexdigest()
+    manifest = read_manifest(artefact).model_copy(update={"library_sha256": digest})
+    (artefact / MANIFEST).write_text(manifest.model_dump_json())
+    with pytest.raises(InputError, match=r"lacks a function.*build"):
+        load(artefact, car)
+
+
+def test_a_compiler_command_that_cannot_be_read_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CC", "gcc 'unbalanced")
+    with pytest.raises(InputError, match=r"CC=gcc 'unbalanced: No closing quotation"):
+        find_compiler()
 
 
 def test_a_manifest_of_another_interface_is_refused(artefact: Path, car: CarParameters) -> None:

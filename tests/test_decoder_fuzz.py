@@ -29,6 +29,8 @@ from tests.mutations import FRAGMENTS, KINDS, MessageMutator, WeightsMutator, bo
 from tests.programs import ROOT
 from tests.test_gp_weights import BODY, make_weights, reseal
 
+pytestmark = pytest.mark.unmeasured
+
 MESSAGES = 380_000
 WEIGHTS = 20_000
 WORKERS = 2

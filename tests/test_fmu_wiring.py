@@ -1,14 +1,18 @@
 """A map turns what a foreign model says into the car's state: conventions in use, to rounding."""
 
 import math
+import zipfile
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given as those
 from hypothesis import strategies as st
 
+from bayesrace.errors import InputError
 from plant.fmu.map import parse_map, wire
+from plant.fmu.package import read_description
 from tests.fmu_variables import (
     STATE,
     TOLERANCE,
@@ -212,3 +216,10 @@ def test_steering_angle_from_the_rate_that_acted_and_afresh_each_run() -> None:
         wiring.begin(values(wiring, our_names(STATE)), STATE)
         deltas = [wiring.state(values(wiring, our_names(STATE)), U, 0.01)[6] for _ in range(3)]
         assert deltas == pytest.approx([0.18, 0.16, 0.14], abs=TOLERANCE)
+
+
+def test_a_description_beyond_measure_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "huge.fmu", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("modelDescription.xml", " " * 20_000_000)
+    with pytest.raises(InputError, match=r"huge\.fmu: its modelDescription\.xml has 20 MB"):
+        read_description(tmp_path / "huge.fmu")

@@ -26,7 +26,7 @@ from tests.command_line import Cli, refused
 from tests.programs import COMMAND, ROOT, environment, finish, leftovers, peanut, run, start, until
 from tests.shared import session_folder
 
-pytestmark = [pytest.mark.wall_clock, pytest.mark.measured]
+pytestmark = pytest.mark.wall_clock
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ from tests.programs import Race
 
 
 @pytest.mark.check
+@pytest.mark.unmeasured
 def test_with_a_model_that_is_right_the_laps_stay_on_the_track(tmp_path: Path) -> None:
     """Before there were second starts, the updated laps left this track, 5 % slower."""
     pair = ("--track", "random:11", "--train-track", "random:3")

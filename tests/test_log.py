@@ -1,17 +1,21 @@
 """The log's promise: complete, typed, and readable up to the last second whatever happened."""
 
+import errno
 import subprocess
 import sys
 import time
 from pathlib import Path
 
 import pytest
+import zstandard
 from mcap.reader import make_reader
+from mcap.records import Chunk
+from mcap.writer import CompressionType, Writer
 
 from bayesrace.errors import InputError
-from bayesrace.log import LogReader, LogWriter, Recorder
-from bayesrace.messages import EVENT, STATE, Event, State, encode
-from bayesrace.transport import Endpoints, Publisher, free_endpoint, open_session
+from bayesrace.log import LogReader, LogWriter, Recorder, _unpacked
+from bayesrace.messages import EVENT, STATE, Event, State, decode, encode
+from bayesrace.transport import Endpoints, Inbox, Publisher, free_endpoint, open_session
 from tests.programs import ROOT, until
 
 KEY = "bayesrace/orca/state"
@@ -86,6 +90,101 @@ def test_what_is_no_log_is_named(tmp_path: Path) -> None:
         LogReader(tmp_path / "absent.mcap")
     with pytest.raises(InputError, match="cannot write the log"):
         LogWriter(tmp_path / "absent" / "x.mcap")
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_logs_that_other_tools_have_compressed_are_read(
+    tmp_path: Path, compression: CompressionType
+) -> None:
+    write(tmp_path / "plain.mcap", 20)
+    with (tmp_path / "log.mcap").open("wb") as file:
+        writer = Writer(file, compression=compression)
+        writer.start()
+        channel = writer.register_channel("bayesrace/orca/state", "msgpack", 0)
+        for seq in range(20):
+            writer.add_message(channel, seq, encode(state(seq)), seq)
+        writer.finish()
+    log = LogReader(tmp_path / "log.mcap")
+    assert log.select(STATE) == [state(seq) for seq in range(20)]
+    assert not log.truncated
+
+
+@pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4])
+def test_a_log_that_unpacks_to_gigabytes_is_refused_at_little_cost(
+    tmp_path: Path, compression: CompressionType
+) -> None:
+    with (tmp_path / "bomb.mcap").open("wb") as file:
+        writer = Writer(file, compression=compression, chunk_size=1 << 26)
+        writer.start()
+        channel = writer.register_channel("bayesrace/orca/state", "msgpack", 0)
+        for k in range(6):
+            writer.add_message(channel, k, bytes(1 << 26), k)
+        writer.finish()
+    assert (tmp_path / "bomb.mcap").stat().st_size < 1 << 22
+    with pytest.raises(InputError, match=r"bomb\.mcap would unpack to many times its size"):
+        LogReader(tmp_path / "bomb.mcap").select(STATE)
+
+
+def test_a_chunk_that_lies_about_its_size_ends_the_log(tmp_path: Path) -> None:
+    data = zstandard.ZstdCompressor().compress(bytes(1 << 28))
+    chunk = Chunk("zstd", data, 0, 0, 0, 1000)
+    with pytest.raises(ValueError, match="another length"):
+        _unpacked(chunk)
+
+
+def test_keys_without_end_do_not_fill_the_log(tmp_path: Path) -> None:
+    endpoint, path = free_endpoint(), tmp_path / "log.mcap"
+    with (
+        open_session(Endpoints(listen=(endpoint,))) as other,
+        open_session(Endpoints(connect=(endpoint,))) as session,
+        Recorder(session, "orca", path) as recorder,
+    ):
+        publisher = Publisher(other, STATE, "orca")
+
+        def connected() -> int:
+            publisher.put(state(0), lockstep=True)
+            return recorder.counters.written
+
+        until(connected, "the recorder hears the other")
+        for k in range(1000):
+            other.put(f"bayesrace/orca/nonsense/{k}", b"x")
+        publisher.put(state(1), lockstep=True)
+        until(lambda: recorder.counters.unrecorded, "keys beyond measure")
+        recorder.settle()
+        assert recorder.failed == ""
+        assert recorder.counters.unrecorded > 700
+    assert LogReader(path).select(STATE)[-1] == state(1)
+
+
+def test_a_log_that_cannot_be_written_is_an_event(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    endpoint, path = free_endpoint(), tmp_path / "log.mcap"
+    with (
+        open_session(Endpoints(listen=(endpoint,))) as other,
+        open_session(Endpoints(connect=(endpoint,))) as session,
+    ):
+        inbox = Inbox(other, "orca")
+        inbox.subscribe(EVENT)
+        recorder = Recorder(session, "orca", path)
+        publisher = Publisher(other, STATE, "orca")
+        monkeypatch.setattr(LogWriter, "write", full)
+
+        def failed() -> str:
+            publisher.put(state(0), lockstep=True)
+            return recorder.failed
+
+        until(failed, "the failure")
+        item = inbox.get(20.0)
+        assert item is not None
+        event = decode(Event, item.value)
+        assert (event.source, event.kind) == ("recorder", "recorder_failed")
+        assert f"cannot write the log {path}: No space left on device" in event.text
+        with pytest.raises(InputError, match="No space left"):
+            recorder.close()
 
 
 def test_the_recorder_writes_everything_and_counts_gaps(tmp_path: Path) -> None:

@@ -25,6 +25,8 @@ from tests.programs import Race, leftovers, peanut
 from tests.reference import reference_file
 from tests.shared import session_folder
 
+pytestmark = pytest.mark.unmeasured
+
 CONTROLLERS = ["worstcase", "bayesrace", "bayesrace-updated", "bestcase"]
 LAP_FORM: dict[str, type | tuple[type, ...]] = {
     "controller": str,

@@ -5,6 +5,7 @@ Each test starts a real race on a short track and spoils it in the middle of a l
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -174,3 +175,21 @@ def test_an_interrupt_before_the_first_lap(tmp_path: Path) -> None:
     assert done.returncode == 130
     assert done.stderr.strip() == "bayesrace: interrupted"
     assert leftovers(process.pid) == {}
+
+
+@pytest.mark.check
+def test_a_full_disk_ends_the_race_at_once_and_the_file_is_named(tmp_path: Path) -> None:
+    """Instead of a disk: no file may be larger."""
+    limit = 1_500_000
+
+    def limited() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+
+    track = peanut(tmp_path / "peanut.csv")
+    arguments = ("--track", track, "--train-track", track, "--out", tmp_path / "race")
+    process = start("race", *arguments, "--laps", "100", preexec_fn=limited)
+    done = finish(process)
+    assert done.returncode == 2
+    assert f"cannot write the log {tmp_path / 'race' / 'run.mcap'}: File too large" in done.stderr
+    assert leftovers(process.pid) == {}
+    assert states_of(tmp_path / "race" / "run.mcap")

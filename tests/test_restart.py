@@ -10,14 +10,23 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import pytest
 
-from bayesrace.messages import ACTUATION, Actuation, State
+from bayesrace.messages import (
+    ACTUATION,
+    COMMAND,
+    STATE,
+    Actuation,
+    Command,
+    State,
+    car_key,
+    encode,
+)
 from bayesrace.transport import Endpoints, Publisher, free_endpoint, open_session
 from tests.car_fmu import packed_car
 from tests.network.cars import (
@@ -53,6 +62,7 @@ class Rig:
     proxy: Proxy
     observer: Observer
     plant_at: str
+    controller_at: str
     log: Path
     course: Course
     _following: ExitStack
@@ -101,7 +111,16 @@ def rigged(
         following = programs.enter_context(ExitStack())
         observer = following.enter_context(observing(watched, "orca", course.track, log))
         yield Rig(
-            a_plant, a_controller, a_router, proxy, observer, plant_at, log, course, following
+            a_plant,
+            a_controller,
+            a_router,
+            proxy,
+            observer,
+            plant_at,
+            controller_at,
+            log,
+            course,
+            following,
         )
 
 
@@ -191,6 +210,59 @@ def test_a_plant_started_again_is_found(rig: Rig, fmu: bool) -> None:
     assert {state.run for state in journey.states} == {1}
     for epoch in (before.epoch, status["epoch"]):
         assert journey.off_track_m([s for s in journey.states if s.epoch == epoch]) < 0.0
+
+
+def test_foreign_states_are_counted_and_the_car_drives_on(rig: Rig) -> None:
+    """Numbers ahead, another plant's: each once silenced the controller."""
+    plant, controller = rig.start_plant(), rig.start_controller()
+    rig.observer.start(1)
+    rig.drive_on()
+    with open_session(Endpoints(connect=(rig.controller_at,)), "plant") as session:
+        publisher = Publisher(session, STATE, "orca")
+
+        def foreign() -> int:
+            state = rig.state()
+            oddities: tuple[dict[str, Any], ...] = (
+                {"seq": state.seq + 1000}, {"seq": 2**63 - 1}, {"epoch": state.epoch + 1},
+                {"run": 7}, {"seq": state.seq + 1000, "final": True},
+            )  # fmt: skip
+            for odd in oddities:
+                publisher.put(replace(state, **odd), lockstep=False)
+            return int(rig.observer.status("controller")["counters"]["states_foreign"])
+
+        until(lambda: foreign() > 20, "a controller that hears the forger")
+        rig.drive_on()
+        status = rig.observer.status("controller")
+    assert status["phase"] == "driving"
+    assert status["epoch"] == rig.state().epoch
+    assert status["counters"]["states_lost"] < 20
+    rig.observer.stop()
+    controller.end()
+    plant.end()
+    assert rig.journey().off_track_m() < 0.0
+
+
+@pytest.mark.check
+def test_whoever_asks_without_end_does_not_hold_up_the_loop(rig: Rig) -> None:
+    plant, controller = rig.start_plant(), rig.start_controller()
+    rig.observer.start(1)
+    rig.drive_on()
+    with open_session(Endpoints(connect=(rig.controller_at,))) as session:
+        request = encode(Command(0, 0, "go", "again"))
+        key, end_s = car_key(COMMAND.key, "orca"), time.monotonic() + 3.0
+        answers = []
+        while time.monotonic() < end_s:
+            answers.append(session.get(key, payload=request, timeout=5.0))
+            time.sleep(0.002)
+        accepted = sum(1 for one in answers for reply in one if reply.ok is not None)
+    rig.drive_on()
+    counters = rig.observer.status("controller")["counters"]
+    assert 10 <= accepted <= 200
+    assert counters["turned_away"] > 200
+    rig.observer.stop()
+    controller.end()
+    plant.end()
+    assert rig.journey().off_track_m() < 0.0
 
 
 @pytest.mark.check

@@ -23,7 +23,7 @@ from tests.network.cars import (
 from tests.network.journey import Journey
 from tests.network.observer import drive_on, observing
 
-pytestmark = [pytest.mark.check, pytest.mark.wall_clock]
+pytestmark = [pytest.mark.check, pytest.mark.wall_clock, pytest.mark.unmeasured]
 
 CARS = ("red", "green", "blue", "white")
 APART_M = 10.0

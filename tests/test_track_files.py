@@ -177,3 +177,13 @@ def test_ethz_starts_south_east() -> None:
     assert load_track(reference_file("tracks/ethz.csv")).start_pose()[2] == pytest.approx(
         np.radians(-45), abs=np.radians(0.5)
     )
+
+
+def test_a_file_that_no_track_needs_is_refused_before_the_work(tmp_path: Path) -> None:
+    path = tmp_path / "huge.csv"
+    path.write_text("0.1,0.2,1,1\n" * 30_000)
+    with pytest.raises(InputError, match=r"huge\.csv, row 20001: more than 20000 points"):
+        read_track(path)
+    path.write_text("0.1,0.2,1,1\n" * 400_000)
+    with pytest.raises(InputError, match=r"huge\.csv: 5 MB, at most 4 are read"):
+        read_track(path)

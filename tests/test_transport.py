@@ -13,12 +13,14 @@ from bayesrace.errors import InputError
 from bayesrace.messages import (
     ACCEPTED,
     EVENT,
+    ROLLBACK,
     STATE,
     STATUS,
     STOP,
     WEIGHTS,
     Event,
     Reply,
+    RollbackRequest,
     Service,
     State,
     Status,
@@ -195,6 +197,27 @@ def test_a_malformed_request_is_refused_with_a_reason(pair: tuple[Any, Any]) -> 
     thread.join()
     assert message is None
     assert why_not.startswith("StopRequest: ")
+
+
+def test_a_question_that_was_lost_is_asked_again_but_for_a_rollback(pair: tuple[Any, Any]) -> None:
+    """As when a link breaks because a machine stalls."""
+    asker, answerer = pair
+    heard: list[str] = []
+
+    def answer(request: Request) -> None:
+        heard.append(request.service.name)
+        if len(heard) % 2:
+            threading.Timer(0.8, request.drop).start()
+        else:
+            request.answer(Reply(0, 0, True, "yes", {}))
+
+    _kept = [declare_service(answerer, one, "orca", answer) for one in (STOP, ROLLBACK)]
+    time.sleep(0.5)  # the declarations travel
+    assert ask(asker, STOP, "orca", StopRequest(0, 0, "")).text == "yes"
+    assert heard == ["stop", "stop"]
+    with pytest.raises(InputError, match="nobody answered"):
+        ask(asker, ROLLBACK, "orca", RollbackRequest(0, 0, ""))
+    assert heard == ["stop", "stop", "rollback"]
 
 
 def test_coming_and_going_is_seen() -> None:

@@ -11,6 +11,7 @@ from bayesrace.tracks.track import Track
 __all__ = ["load_track"]
 
 _RANDOM = "random:"
+_SEED_DIGITS = 18
 
 
 def load_track(name_or_path: str | Path, car_width_m: float | None = None) -> Track:
@@ -35,8 +36,11 @@ def load_track(name_or_path: str | Path, car_width_m: float | None = None) -> Tr
 
 def _seed(text: str) -> int:
     digits = text[len(_RANDOM) :]
-    if not (digits.isascii() and digits.isdigit()):
-        raise InputError(f"'{text}': the seed must be a whole number from 0 on, as in random:7")
+    if not (digits.isascii() and digits.isdigit() and len(digits) <= _SEED_DIGITS):
+        raise InputError(
+            f"'{text[:40]}': the seed must be a whole number from 0 on, of at most {_SEED_DIGITS} "
+            "digits, as in random:7"
+        )
     return int(digits)
 
 

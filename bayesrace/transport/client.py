@@ -43,8 +43,10 @@ __all__ = [
 
 A = TypeVar("A", bound=Message)
 
+_LOST_S: Final = 0.5
+"""A question that ends without an answer after this has been lost with its link."""
 _AGAIN_S: Final = 0.2
-"""Until a lost question is asked again."""
+"""Until it is asked again."""
 
 
 class RefusedError(InputError):
@@ -74,11 +76,13 @@ def ask(
         raise TypeError(f"the answer of '{service.name}' is not a message; use fetch_all")
     key = car_key(service.key, car, source)
     limit_s = service.timeout_s if timeout_s is None else timeout_s
-    deadline = time.monotonic() + limit_s
+    begin = time.monotonic()
     answers = ask_all(session, (key,), request, limit_s)[key]
-    while not answers and service.repeatable and (left_s := deadline - time.monotonic()) > 0:
-        time.sleep(min(_AGAIN_S, left_s))
-        answers = ask_all(session, (key,), request, max(left_s - _AGAIN_S, _AGAIN_S))[key]
+    # Where nobody is, that is known at once.
+    lost = not answers and service.repeatable and time.monotonic() - begin > _LOST_S
+    while lost and not answers and (left_s := begin + limit_s - time.monotonic()) > _AGAIN_S:
+        time.sleep(_AGAIN_S)
+        answers = ask_all(session, (key,), request, left_s - _AGAIN_S)[key]
     answer = decisive(_valid(service.answer, answers))
     if answer is None:
         # Who gives a time has it from an option of that name.

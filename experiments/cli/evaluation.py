@@ -14,6 +14,7 @@ from experiments.cli.options import (
     CarName,
     FmuFile,
     FmuMap,
+    Seed,
     TrackName,
     connect_to,
     writable,
@@ -43,7 +44,7 @@ def race(
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Run directory [runs/DATE-TIME].")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the training drive and the GP.")] = 0,
+    seed: Seed = 0,
     fmu: FmuFile = None,
     fmu_map: FmuMap = None,
 ) -> None:
@@ -106,7 +107,7 @@ def drive(
         list[str] | None,
         typer.Option(help="Plant and controller, one each; the defaults of both without."),
     ] = None,
-    max_time: Annotated[float, typer.Option(min=1, help="Time limit [s].")] = 60.0,
+    max_time: Annotated[float, typer.Option(min=1, max=1e6, help="Time limit [s].")] = 60.0,
     log: Annotated[Path, typer.Option(callback=writable, help="Log to write (MCAP).")] = Path(
         "run.mcap"
     ),
@@ -151,7 +152,7 @@ def bench(
     ] = 900,
     peers: Annotated[int, typer.Option(min=1, help="How many of them IPOPT solves too.")] = 25,
     points: Annotated[int, typer.Option(min=20, max=1024, help="Training points per GP.")] = 400,
-    seed: Annotated[int, typer.Option(min=0, help="Of the training drive and the GP.")] = 0,
+    seed: Seed = 0,
 ) -> None:
     """Time the compiled step beside the paper's formulation in CasADi + IPOPT, same problems."""
     from rich.console import Console

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bayesrace.files import write_whole
-from experiments.cli.options import Car, CarName, Endpoint, connect_to, writable
+from experiments.cli.options import Car, CarName, Endpoint, Seed, connect_to, writable
 from experiments.notation import UNCERTAIN
 
 if TYPE_CHECKING:
@@ -175,7 +175,7 @@ def learn(
         Path | None, typer.Option(help="Built controller to learn for; the default one without.")
     ] = None,
     endpoint: Endpoint = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the optimiser's starts.")] = 0,
+    seed: Seed = 0,
     car: Car = "orca",
     name: CarName = "",
 ) -> None:

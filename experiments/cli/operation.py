@@ -14,6 +14,7 @@ from bayesrace.errors import InputError
 from experiments.cli.options import Endpoint, ParentPid, connect_to
 
 if TYPE_CHECKING:
+    from experiments.operation import Word
     from experiments.picture import Picture
 
 __all__ = ["register"]
@@ -117,6 +118,10 @@ def stop(
     endpoint: Endpoint = None,
     reason: Reason = "",
     everybody: Annotated[bool, typer.Option("--all", help="Stop all cars that are found.")] = False,
+    run: Annotated[
+        bool,
+        typer.Option("--run", help="End the plant's run instead, as when who started it is gone."),
+    ] = False,
     timeout: Timeout = 2.0,
 ) -> None:
     """Tell a controller to brake to standstill and stay there.
@@ -125,7 +130,8 @@ def stop(
     """
     if name and everybody:
         raise InputError("--name and --all contradict each other; give one of them")
-    _command("stop", name, endpoint, reason or "bayesrace stop", everybody, timeout)
+    word: Literal["stop", "end"] = "end" if run else "stop"
+    _command(word, name, endpoint, reason or "bayesrace stop", everybody, timeout)
 
 
 def go(
@@ -139,7 +145,7 @@ def go(
 
 
 def _command(
-    word: Literal["stop", "go"],
+    word: "Word",
     name: str,
     endpoint: list[str] | None,
     reason: str,
@@ -153,7 +159,8 @@ def _command(
 
     endpoints = connect_to(endpoint)
     with open_session(endpoints) as session:
-        cars = pick(find(session, endpoints, timeout, name, ("controller",)), name, everybody)
+        source = "plant" if word == "end" else "controller"
+        cars = pick(find(session, endpoints, timeout, name, (source,)), name, everybody, source)
         answers = command(session, cars, word, reason, timeout)
     failures = []
     for car, answer in answers.items():

@@ -20,6 +20,7 @@ __all__ = [
     "OutFile",
     "ParentPid",
     "RaceLineFile",
+    "Seed",
     "TrackName",
     "connect_to",
     "writable",
@@ -28,6 +29,9 @@ __all__ = [
 Car = Annotated[str, typer.Option(help="Built-in car.")]
 CarName = Annotated[
     str, typer.Option("--name", help="Name of the car in the network; the car's own without.")
+]
+Seed = Annotated[
+    int, typer.Option(min=0, max=2**32 - 1, help="Of training drive and training alike.")
 ]
 TrackName = Annotated[str, typer.Option(help="Track: built-in name, random:SEED or CSV file.")]
 RaceLineFile = Annotated[

@@ -15,6 +15,7 @@ from experiments.cli.options import (
     FmuMap,
     OutFile,
     RaceLineFile,
+    Seed,
     TrackName,
     writable,
 )
@@ -98,8 +99,10 @@ def collect(
     track: TrackName,
     raceline: RaceLineFile,
     out: OutFile = Path("collect.mcap"),
-    duration: Annotated[float, typer.Option(min=1, help="Length of the drive [s].")] = 12.0,
-    seed: Annotated[int, typer.Option(min=0, help="Of the excitation.")] = 0,
+    duration: Annotated[
+        float, typer.Option(min=1, max=3600, help="Length of the drive [s].")
+    ] = 12.0,
+    seed: Seed = 0,
     fmu: FmuFile = None,
     fmu_map: FmuMap = None,
     car: Car = "orca",
@@ -141,7 +144,7 @@ def train(
     artefact: Annotated[
         Path | None, typer.Option(help="Built controller to learn for; the default one without.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the optimiser's starts.")] = 0,
+    seed: Seed = 0,
     car: Annotated[str, typer.Option(help="Built-in car, where the files do not name it.")] = "",
     name: CarName = "",
 ) -> None:

@@ -24,7 +24,7 @@ from tests.network.journey import STANDING_MPS, Journey
 from tests.network.observer import Remote, drive_on, observing_from
 from tests.programs import PATIENCE_S, until
 
-pytestmark = pytest.mark.wall_clock
+pytestmark = [pytest.mark.wall_clock, pytest.mark.unmeasured]
 
 NAME = "orca"
 

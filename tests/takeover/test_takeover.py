@@ -23,7 +23,7 @@ from tests.takeover.oracle import converged, replayed
 from tests.takeover.rig import DRIVEN_S, Rig, digest, rigged
 from tests.takeover.spoilt_weights import SPOILT, spoilt
 
-pytestmark = pytest.mark.wall_clock
+pytestmark = [pytest.mark.wall_clock, pytest.mark.unmeasured]
 
 # Lockstep ------------------------------------------------------------------------------------
 

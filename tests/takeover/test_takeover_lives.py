@@ -20,7 +20,7 @@ from tests.network.cars import Course, Program, start_controller, start_plant
 from tests.programs import until
 from tests.takeover.rig import Rig, digest, gatekeepers
 
-pytestmark = pytest.mark.wall_clock
+pytestmark = [pytest.mark.wall_clock, pytest.mark.unmeasured]
 
 
 def test_the_gatekeepers_end_does_not_touch_the_drive(rig: Rig, good: GpWeights) -> None:
