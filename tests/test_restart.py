@@ -7,6 +7,7 @@ car brakes, and stays on its track.
 """
 
 import logging
+import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -240,6 +241,25 @@ def test_foreign_states_are_counted_and_the_car_drives_on(rig: Rig) -> None:
     controller.end()
     plant.end()
     assert rig.journey().off_track_m() < 0.0
+
+
+@pytest.mark.check
+def test_connections_that_stay_silent_do_not_hold_up_the_states(rig: Rig) -> None:
+    """A port scan: it cost some 45 cycles without a state."""
+    plant, controller = rig.start_plant(), rig.start_controller()
+    rig.observer.start(1)
+    rig.drive_on()
+    before = rig.observer.status("controller")["counters"]
+    host, port = rig.controller_at.removeprefix("tcp/").split(":")
+    with ExitStack() as stack:
+        for _ in range(400):
+            stack.enter_context(socket.create_connection((host, int(port)), timeout=5.0))
+        rig.drive_on()
+        after = rig.observer.status("controller")["counters"]
+    assert after["brake"] + after["stop"] - before["brake"] - before["stop"] < 20
+    rig.observer.stop()
+    controller.end()
+    plant.end()
 
 
 @pytest.mark.check

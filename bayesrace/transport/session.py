@@ -50,7 +50,13 @@ _INTERNET: Final = re.compile(r"[a-z]+/(\[[^\]]+\]|[^:/\s]+):(\d{1,5})([?#]\S*)?
 
 # One receiving worker hands over between threads less often than the default of two.
 _RUNTIME: Final = "(rx: (worker_threads: 1))"
-_LEASE_MS: Final = 2000
+_LEASE_MS: Final = 5000
+"""Without a sign of life for so long a link is given up: a machine may stall for less."""
+_HANDSHAKE_MS: Final = 2000
+"""For who connects, and for who is connected to and stays silent."""
+_MOST_PENDING: Final = 10_000
+"""Connections that may be silent at once. With Zenoh's default of 100, a port scan held up the
+states of a car that was driving for a second."""
 _RETRY: Final = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
 
 # Zenoh's own tools tell no region: they form one more, and clients another.
@@ -114,6 +120,9 @@ def _config(endpoints: Endpoints, role: Role) -> Any:
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/link/tx/lease": _LEASE_MS,
+        "transport/unicast/open_timeout": _HANDSHAKE_MS,
+        "transport/unicast/accept_timeout": _HANDSHAKE_MS,
+        "transport/unicast/accept_pending": _MOST_PENDING,
         # Each message of the control path is a batch of its own: with the default of two, a
         # receiver held up for two periods of 500 Hz loses states instead of getting them late.
         "transport/link/tx/queue/size/real_time": 16,
