@@ -39,6 +39,9 @@ _OFFERED_MS: Final = 5
 """How often the thread looks whether an offer has been taken: the control thread wakes nobody."""
 _HURRY_MS: Final = 200
 
+_NOT_KEPT: Final = "not_kept"
+"""In the data of an answer: why a controller started again would not have these weights."""
+
 _FILE_BYTES: Final = 100_000
 """Of a weights file, beyond its arrays."""
 
@@ -387,12 +390,16 @@ class Courier:
         if job is None or not job.answer:
             return
         self._job = None
-        keeps = self._port.store is not None
-        answer = f"{job.answer}; not kept: {why_not_kept}" if why_not_kept and keeps else job.answer
+        answer, facts = job.answer, job.facts
+        if why_not_kept and self._port.store is not None:
+            answer, facts = (
+                f"{answer}; not kept: {why_not_kept}",
+                {**facts, _NOT_KEPT: why_not_kept},
+            )
         if job.request is not None:
-            reply(job.request, True, answer, job.facts)
+            reply(job.request, True, answer, facts)
         event = "weights_accepted" if job.kind == "weights" else "weights_rolled_back"
-        self._announce(event, answer, job.facts)
+        self._announce(event, answer, facts)
 
     def _complain(self, kind: str, text: str) -> None:
         self._trouble = text

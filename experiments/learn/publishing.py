@@ -31,6 +31,8 @@ class Answer:
     """Number of this takeover among all of the car's."""
     again: bool = False
     """Not accepted for a reason that passes: the same may be accepted later."""
+    not_kept: str = ""
+    """Why the controller would not have them after a restart; empty if it has them or no store."""
 
     @classmethod
     def of(cls, reply: Reply) -> "Answer":
@@ -43,6 +45,7 @@ class Answer:
             _count(reply.data.get("cycle")),
             _count(reply.data.get("number")),
             not reply.accepted and reply.data.get("again") is True,
+            str(reply.data.get("not_kept", "")),
         )
 
     @property
@@ -53,7 +56,8 @@ class Answer:
         if self.cycle is None:
             return f"taken over: {self.text}"
         which = "" if self.acceptance is None else f" (acceptance {self.acceptance})"
-        return f"taken over at cycle {self.cycle}{which}"
+        kept = f", but not kept: {self.not_kept}" if self.not_kept else ""
+        return f"taken over at cycle {self.cycle}{which}{kept}"
 
 
 def read_bytes(path: Path) -> bytes:
