@@ -67,6 +67,12 @@ def _topic_of(key: str) -> Topic[Any] | None:
     return topic
 
 
+def _in_table(key: str) -> bool:
+    """Whether the table has this very key, of whatever car."""
+    topic, source = _topic_of(key), key.rsplit("/", 1)[-1]
+    return topic is not None and ("{source}" not in topic.key or source in topic.sources)
+
+
 class LogWriter:
     """Appends messages, as they were on the wire, and metadata to an MCAP file. One thread only."""
 
@@ -208,7 +214,7 @@ class Recorder:
             self._subscriber.undeclare()
             for thread in self._threads:
                 thread.join()
-            with suppress(OSError):
+            with suppress(OSError, ValueError):
                 self._writer.close()
 
     def __enter__(self) -> Self:
@@ -251,7 +257,7 @@ class Recorder:
 
     def _known(self, key: str) -> bool:
         """Whether messages on this key are written: whoever invents keys must not fill the log."""
-        if key not in self._keys and len(self._keys) < _MOST_KEYS:
+        if key not in self._keys and (len(self._keys) < _MOST_KEYS or _in_table(key)):
             self._keys.add(key)
         return key in self._keys
 
@@ -259,8 +265,10 @@ class Recorder:
         """Whoever waits for a run looks at :attr:`failed`; everybody else hears it once."""
         if self.failed:
             return
-        why = error.strerror if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
-        self.failed = f"cannot write the log {self._path}: {why}; make room and drive again"
+        why = f"{type(error).__name__}: {error}"
+        if isinstance(error, OSError):
+            why = f"{error.strerror}; make room and drive again"
+        self.failed = f"cannot write the log {self._path}: {why}"
         now_ns = time.monotonic_ns()
         event = Event(0, now_ns, 0, "recorder", "recorder_failed", self.failed[:2000], {})
         with suppress(zenoh.ZError):

@@ -141,6 +141,8 @@ def build(
             _compile(settings, compiler, folder)
             manifest = _manifest(settings, compiler, identity, folder)
             (folder / MANIFEST).write_text(manifest.model_dump_json(indent=1) + "\n")
+            for one in (folder, folder / LIBRARY):
+                one.chmod(0o755)  # whatever the umask: what others may write is not loaded
             folder.rename(target)
     return target, manifest
 

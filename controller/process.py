@@ -264,8 +264,8 @@ class ControllerProcess:
         if min(end_ns, time.monotonic_ns()) >= self._serve_ns:
             item = self.inbox.other()
             if item is not None:
-                self._service.react(item)
                 self._serve_ns = time.monotonic_ns() + _SERVE_NS
+                self._service.react(item)
         self._service.beat()
         left_s = (end_ns - time.monotonic_ns()) * 1e-9
         if left_s > 0:

@@ -70,14 +70,15 @@ class StateStream:
         self._ended = True
 
     def forget(self) -> State | None:
-        """Nothing has come for long: anything may follow. The newest state that was not driven on.
+        """Nothing has come for long: anything may follow.
 
-        In lockstep it may be the one that its plant still wants an answer to.
+        Returns the last state that was refused, if it is one of a lockstep run: its plant may still
+        want an answer.
         """
         self._ended = self._silent = True
         self.interval_s = 0.0
         other, self._other = self._other, None
-        return other
+        return other if other is not None and other.lockstep else None
 
     def _welcome(self, state: State) -> bool:
         """Whether it continues the stream, or nothing speaks against another one."""

@@ -9,7 +9,7 @@ from bayesrace.errors import InputError
 from bayesrace.log import Recorder
 from bayesrace.messages import Event, RunRequest, Scalar
 from bayesrace.tracks import StartLine, Track
-from bayesrace.transport import Director, Publisher
+from bayesrace.transport import Director, Publisher, RefusedError
 from experiments.processes import Child, endings
 
 __all__ = ["RunPlan", "execute", "run_request", "wait_for_both"]
@@ -100,8 +100,8 @@ def execute(
     """
     _announce(publisher, plan, director.status("controller").weights_version)
     before = director.status("plant").counters
-    director.start(run_request(track, plan))
     try:
+        director.start(run_request(track, plan))
         # In lockstep simulated time passes faster than the clock's, but nobody promises it.
         absence_s = 1.0 if plan.lockstep else _ABSENCE_S
         end = director.wait_for_end(
@@ -110,6 +110,8 @@ def execute(
             absence_s,
             lambda: recorder.failed if recorder else "",
         )
+    except RefusedError:  # the plant may be driving for somebody else
+        raise
     except (InputError, KeyboardInterrupt):
         with suppress(InputError):  # a car must not drive on when nobody watches it
             director.stop("who started the run has left")

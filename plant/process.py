@@ -106,8 +106,6 @@ class PlantProcess:
         self._decoder: Decoder[Actuation] = Decoder(Actuation, _log)
         self._counters = RunCounters()
         self._run: Run | None = None
-        self._asked: RunRequest | None = None
-        """The request that has started the run under way: asked again, it is answered again."""
         self._run_number = 0
         self._runs = 0
         self._text = f"no run so far with {_played_by(settings)}"
@@ -157,6 +155,7 @@ class PlantProcess:
 
     def _prepare(self, message: RunRequest) -> str:
         """Make the run; returns why it cannot be, or ""."""
+        self._director_gone_ns = None  # of a run before
         if self._settings.endpoints.low_latency and not message.lockstep:
             # Without priorities a message that Zenoh drops may be the last of its kind on a link.
             return (
@@ -184,9 +183,8 @@ class PlantProcess:
             )
         except (InputError, FmuFault) as error:
             return str(error)
-        self._run_number, self._asked = message.run, message
+        self._run_number = message.run
         self._runs += 1
-        self._director_gone_ns = None
         return ""
 
     def _overheard(self, item: Item) -> None:
@@ -204,7 +202,7 @@ class PlantProcess:
             item = self.inbox.get(left_s)
             if item is not None and item.kind is Kind.MESSAGE:
                 self._overheard(item)
-            elif item is not None and item.kind in (Kind.REQUEST, Kind.SIGNAL):
+            elif item is not None:
                 self._react(item)
         return True
 
@@ -240,9 +238,6 @@ class PlantProcess:
 
     def _serve(self, request: Request) -> End | None:
         message, why_not = decode_request(request)
-        if request.service is RUN and message is not None and message == self._asked:
-            request.answer(self._reply(True, f"run {message.run} started"))
-            return None
         if request.service is RUN:
             words = f"busy: {self._text}; 'bayesrace stop --run' ends it"
             request.answer(self._reply(False, words))
@@ -268,6 +263,7 @@ class PlantProcess:
             "runs": self._runs,
             "refused": self._decoder.refused,
             "overflowed": self.inbox.overflowed,
+            "turned_away": self.inbox.turned_away,
             "states_sent": self._states.next_seq,
             "actuations_received": self._numbering.received,
             "actuations_lost": self._numbering.lost,

@@ -17,7 +17,7 @@ from bayesrace.cache import cache_folder
 from bayesrace.errors import InputError
 from bayesrace.integrators import PERFECT, PREDICTION, Discretisation
 from bayesrace.interpreter import RUN_MODULE
-from bayesrace.manifest import LIBRARY, MANIFEST, read_manifest
+from bayesrace.manifest import ABI, LIBRARY, MANIFEST, read_manifest
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import MODELS
 from codegen.build import build, build_hash, generate
@@ -255,7 +255,7 @@ def test_what_anybody_may_write_or_others_own_is_not_loaded(
 
 def test_a_library_without_its_functions_is_refused(artefact: Path, car: CarParameters) -> None:
     source = artefact / "empty.c"
-    source.write_text("int br_mpc_abi(void) { return 5; }\n")
+    source.write_text(f"int br_mpc_abi(void) {{ return {ABI}; }}\n")
     (artefact / LIBRARY).unlink()
     line = [*find_compiler().command, "-shared", "-fPIC", str(source), "-o"]
     subprocess.run([*line, str(artefact / LIBRARY)], check=True)

@@ -161,7 +161,7 @@ def test_several_in_a_row_are_followed_at_once_and_anything_after_silence(
         stream = StateStream()
         stream.accept(state(100, *zero))
         assert stream.accept(state(110, *zero))  # lost nine, or was deceived
-        first = replace(state(0, *zero), **left)
+        first = replace(state(0, *zero), lockstep=silence, **left)
         if silence:
             assert not stream.accept(first)
             assert stream.forget() == first

@@ -211,13 +211,13 @@ def test_a_question_that_was_lost_is_asked_again_but_for_a_rollback(pair: tuple[
         else:
             request.answer(Reply(0, 0, True, "yes", {}))
 
-    _kept = [declare_service(answerer, one, "orca", answer) for one in (STOP, ROLLBACK)]
+    _kept = [declare_service(answerer, one, "orca", answer) for one in (WEIGHTS, ROLLBACK)]
     time.sleep(0.5)  # the declarations travel
-    assert ask(asker, STOP, "orca", StopRequest(0, 0, "")).text == "yes"
-    assert heard == ["stop", "stop"]
+    assert ask(asker, WEIGHTS, "orca", b"weights").text == "yes"
+    assert heard == ["weights", "weights"]
     with pytest.raises(InputError, match="nobody answered"):
         ask(asker, ROLLBACK, "orca", RollbackRequest(0, 0, ""))
-    assert heard == ["stop", "stop", "rollback"]
+    assert heard == ["weights", "weights", "rollback"]
 
 
 def test_coming_and_going_is_seen() -> None:

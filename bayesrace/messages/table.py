@@ -126,8 +126,8 @@ HEARTBEAT: Final = Topic(
 )
 TOPICS: Final[tuple[Topic[Any], ...]] = (STATE, ACTUATION, TELEMETRY, EVENT, HEARTBEAT)
 
-RUN: Final = Service("run", "bayesrace/{car}/plant/run", RunRequest, Reply, 20.0)
-STOP: Final = Service("stop", "bayesrace/{car}/plant/stop", StopRequest, Reply, 5.0)
+RUN: Final = Service("run", "bayesrace/{car}/plant/run", RunRequest, Reply, 20.0, False)
+STOP: Final = Service("stop", "bayesrace/{car}/plant/stop", StopRequest, Reply, 5.0, False)
 STATUS: Final = Service("status", "bayesrace/{car}/{source}/status", StatusRequest, Status, 5.0)
 WEIGHTS: Final[Service[Message, Reply]] = Service(
     "weights", "bayesrace/{car}/controller/weights", None, Reply, 20.0

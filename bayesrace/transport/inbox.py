@@ -49,8 +49,8 @@ _CAPACITY: Final = 10_000
 follow it. A full channel holds back the senders: those of the wall clock drop, by the table."""
 
 _REQUESTS: Final = 16
-"""Items with which no more requests are taken: whoever asks more often than a loop serves would
-else be served for minutes after."""
+"""That wait at most: whoever asks more often than a loop serves would else be served for minutes
+after."""
 
 NEWEST: Final = 1024
 """Messages of the control path that wait at most: a thread this far behind wants the newest."""
@@ -148,6 +148,7 @@ class Inbox:
         self._stamping = False
         self.alive: set[str] = set()
         """Sources whose liveliness token is there, as of the items taken so far."""
+        self._room = threading.Semaphore(_REQUESTS)
         self.overflowed = 0
         """Items lost because nobody took them."""
         self.turned_away = 0
@@ -181,7 +182,7 @@ class Inbox:
         """Let the service's requests arrive; what comes when many wait is turned away, counted."""
 
         def arrived(request: Request) -> None:
-            if self._items.qsize() >= _REQUESTS:
+            if not self._room.acquire(blocking=False):
                 self.turned_away += 1
                 request.drop()
                 return
@@ -312,6 +313,8 @@ class Inbox:
             self.alive.add(item.name)
         elif item is not None and item.kind is Kind.GONE:
             self.alive.discard(item.name)
+        elif item is not None and item.kind is Kind.REQUEST:
+            self._room.release()
         return item
 
     def _enqueue(self, item: Item) -> None:

@@ -98,7 +98,7 @@ typedef struct {
     int iterations;          /* SQP iterations a step without budget may use, once the defect is
                                 below 0.01 */
     int iterations_cold;     /* the same for the first step after a reset; with a budget the larger
-                                of the two is the limit of every step */
+                                of the two is the limit of every step, second starts aside */
 } br_mpc_parameters;
 
 /* Time in seconds since any fixed moment, never going backwards. */

@@ -63,7 +63,7 @@ void br_mpc_reset(br_mpc *mpc) {
     mpc->ahead = mpc->prepared = mpc->prepared_iterations = 0;
     mpc->path.known = 0;
     mpc->turn = 0;
-    mpc->attempts = mpc->starts = mpc->futile = 0;
+    mpc->attempts = mpc->starts = mpc->futile = mpc->looks = 0;
 }
 
 br_mpc_error br_mpc_get_plan(const br_mpc *mpc, double *x, double *u) {

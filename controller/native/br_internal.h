@@ -14,7 +14,7 @@
 #define BR_COLS ((((BR_ROWS + 1) + 7) / 8) * 8)  /* right-hand sides of one substitution */
 #define BR_HORIZON_S (BR_N * BR_TS)
 #define BR_LINE_SEARCH_TRIALS 5
-#define BR_FUTILE 8
+#define BR_FUTILE 8 /* second starts in vain from which they are made only each so many steps */
 #define BR_DEFECT_FINE 0.01 /* m, m, rad, m/s, m/s, 10 rad/s, rad: not worth another iteration */
 #define BR_GP_PADDED (((BR_GP_CAPACITY + 7) / 8) * 8)
 
@@ -135,8 +135,9 @@ struct br_mpc {
     br_plan before;      /* the plan that the iteration at hand started from */
     br_best best;
     br_best first;       /* the plan that a second start has to beat */
-    unsigned starts;     /* second ones so far */
-    unsigned futile;     /* doubtful steps since one was better */
+    unsigned starts;     /* second ones in a row */
+    unsigned futile;     /* tries in a row since one was better */
+    unsigned looks;      /* second starts of br_mpc_prepare */
     br_plan kept;        /* the plan, and the QP's working set, before those shifts */
     int kept_sense[BR_ROWS];
     double answer_x[BR_N + 1][BR_NX], answer_u[BR_N][BR_NU]; /* plan of the last step */
@@ -200,7 +201,7 @@ void br_align(br_mpc *mpc, int shifts);
 void br_undo_preparation(br_mpc *mpc);
 
 /* br_step.c */
-br_mpc_status br_start_again(br_mpc *mpc, br_mpc_status status);
+br_mpc_status br_start_again(br_mpc *mpc, br_mpc_status status, unsigned turn);
 int br_iteration_limit(const br_mpc *mpc);
 
 /* br_best.c */

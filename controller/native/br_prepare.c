@@ -65,13 +65,14 @@ static int improve(br_mpc *mpc) {
  * that and for what follows. */
 static void look_elsewhere(br_mpc *mpc) {
     br_timer *timer = &mpc->timer;
+    if (mpc->turn) return; /* there is one way to turn */
     timer->deadline -= 2 * timer->iteration;
     if (!br_timer_allows(timer, br_timer_now(timer), BR_SECOND_START_ITERATIONS * timer->iteration)) return;
     if (!mpc->linearised) br_sqp_linearise(mpc);
     memset(&mpc->info, 0, sizeof mpc->info);
     br_residuals(mpc);
     const br_mpc_status status = br_judge(mpc);
-    if (br_usable(status)) br_start_again(mpc, status);
+    if (br_usable(status)) br_start_again(mpc, status, mpc->looks++);
     mpc->prepared_iterations += mpc->info.iterations;
 }
 

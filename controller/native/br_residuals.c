@@ -69,7 +69,7 @@ static double stationarity(const br_mpc *mpc) {
     return worst / size;
 }
 
-/* Fills mpc->info, gap and merit for the plan, whose linearisation must be in store.
+/* Fills mpc->info, worth and merit for the plan, whose linearisation must be in store.
  * merit = objective + penalty * |defects|_1, the distance to the measured state included. */
 void br_residuals(br_mpc *mpc) {
     br_mpc_info *info = &mpc->info;

@@ -37,7 +37,7 @@ static int settled(const br_mpc *mpc, double *residual) {
     return *residual > 0.5 * before;
 }
 
-/* Whether the plan is not what the model does, to within millimetres. */
+/* Whether the plan is not what the model does, to within a centimetre or so. */
 static int rough(const br_mpc *mpc, br_mpc_status status) {
     return status == BR_DEFECT || mpc->info.defect > BR_DEFECT_FINE;
 }
@@ -82,14 +82,16 @@ static int worth_a_try(br_mpc *mpc) {
 /* Iterates from another start, with another throttle each time in a row; leaves the better plan of
  * that and the one at hand. To coast from the measured state most often leads to the good minimum in
  * a few iterations (docs/decisions/2026-11-22-second-start.md). */
-br_mpc_status br_start_again(br_mpc *mpc, br_mpc_status status) {
+br_mpc_status br_start_again(br_mpc *mpc, br_mpc_status status, unsigned turn) {
     static const double throttles[] = {0, 0.5, 1, 0.25};
+    const int time_limited = mpc->info.time_limited;
     int better;
     br_first_keep(mpc, status);
-    br_sqp_roll_out(mpc, throttles[mpc->starts++ % 4] * mpc->parameters.d_max);
+    br_sqp_roll_out(mpc, throttles[turn % 4] * mpc->parameters.d_max);
     status = br_first_compare(mpc, iterate(mpc, 0, BR_SECOND_START_ITERATIONS), &better);
     mpc->info.second_start = better ? 2 : 1;
-    if (better) mpc->futile = 0;
+    if (better) mpc->futile = mpc->starts = 0;
+    else mpc->info.time_limited = time_limited;
     return status;
 }
 
@@ -102,10 +104,10 @@ static br_mpc_status optimise(br_mpc *mpc) {
     br_residuals(mpc);
     const double shifted_cost = mpc->info.cost;
     br_mpc_status status = iterate(mpc, 1, most);
-    if (!doubtful(mpc, status)) mpc->futile = 0;
-    else if (!mpc->info.time_limited && worth_a_try(mpc) &&
-             br_timer_allows(timer, br_timer_now(timer), 3 * timer->iteration))
-        status = br_start_again(mpc, status);
+    if (!doubtful(mpc, status)) mpc->futile = mpc->starts = 0;
+    else if (!mpc->info.time_limited &&
+             br_timer_allows(timer, br_timer_now(timer), 3 * timer->iteration) && worth_a_try(mpc))
+        status = br_start_again(mpc, status, mpc->starts++);
     mpc->info.shifted_cost = shifted_cost;
     return status;
 }
