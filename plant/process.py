@@ -237,7 +237,6 @@ class PlantProcess:
         return None
 
     def _serve(self, request: Request) -> End | None:
-        message, why_not = decode_request(request)
         if request.service is RUN:
             words = f"busy: {self._text}; 'bayesrace stop --run' ends it"
             request.answer(self._reply(False, words))
@@ -245,6 +244,7 @@ class PlantProcess:
         if request.service is STATUS:
             request.answer(self._status())
             return None
+        message, why_not = decode_request(request)
         if message is None or self._run is None:
             request.answer(self._reply(False, why_not or "no run to stop"))
             return None
