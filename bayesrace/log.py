@@ -256,13 +256,13 @@ class Recorder:
             self._fail(error)
 
     def _known(self, key: str) -> bool:
-        """Whether messages on this key are written: whoever invents keys must not fill the log."""
+        """Whether messages on this key are written: the table's, and a bounded number of others."""
         if key not in self._keys and (len(self._keys) < _MOST_KEYS or _in_table(key)):
             self._keys.add(key)
         return key in self._keys
 
     def _fail(self, error: Exception) -> None:
-        """Whoever waits for a run looks at :attr:`failed`; everybody else hears it once."""
+        """Notes the failure in :attr:`failed`, and publishes one event about it."""
         if self.failed:
             return
         why = f"{type(error).__name__}: {error}"

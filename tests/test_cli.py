@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -311,31 +312,51 @@ def test_the_chain_by_files_in_four_terminals(
     )
 
 
+@dataclass
+class Waiting:
+    """A plant and a controller that wait for a run."""
+
+    plant: subprocess.Popen[str]
+    controller: subprocess.Popen[str]
+    plant_at: str
+    where: tuple[str, ...]
+    """Endpoints of both, as options."""
+
+
+@pytest.fixture
+def waiting(
+    course: tuple[str | Path, ...], kinematic_artefact: Path, ended: list[subprocess.Popen[str]]
+) -> Waiting:
+    plant_at, controller_at = free_endpoint(), free_endpoint()
+    plant = start("plant", "--endpoint", plant_at)
+    files = ("--artefact", kinematic_artefact, *course)
+    controller = start("controller", *files, "--endpoint", plant_at, "--listen", controller_at)
+    ended += [plant, controller]
+    where = ("--endpoint", plant_at, "--endpoint", controller_at)
+    return Waiting(plant, controller, plant_at, where)
+
+
 @pytest.mark.check
 def test_drive_says_when_the_controller_is_lost(
     tmp_path: Path,
     course: tuple[str | Path, ...],
-    kinematic_artefact: Path,
+    waiting: Waiting,
     ended: list[subprocess.Popen[str]],
 ) -> None:
     """The run breaks off, so drive fails; the plant is ready for the next controller."""
-    plant_at, controller_at, log = free_endpoint(), free_endpoint(), tmp_path / "drive.mcap"
-    plant = start("plant", "--endpoint", plant_at)
-    files = ("--artefact", kinematic_artefact, *course)
-    controller = start("controller", *files, "--endpoint", plant_at, "--listen", controller_at)
-    where = ("--endpoint", plant_at, "--endpoint", controller_at)
+    log = tmp_path / "drive.mcap"
     many = ("--laps", "10000", "--max-time", "3600")
-    drive = start("drive", *course[:2], *many, *where, "--log", log)
-    ended += [plant, controller, drive]
+    drive = start("drive", *course[:2], *many, *waiting.where, "--log", log)
+    ended.append(drive)
     until(lambda: log.exists() and log.stat().st_size > 100_000, "a lap under way")
-    controller.kill()
+    waiting.controller.kill()
     done = finish(drive)
     assert done.returncode not in (0, None)
     assert "Traceback" not in done.stderr
     assert "controller vanished" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
     assert LogReader(log).select(STATE)
-    assert plant.poll() is None
+    assert waiting.plant.poll() is None
 
 
 @pytest.mark.check
@@ -343,33 +364,27 @@ def test_drive_says_when_the_controller_is_lost(
 def test_a_run_whose_director_is_gone_ends_by_itself_or_by_a_command(
     tmp_path: Path,
     course: tuple[str | Path, ...],
-    kinematic_artefact: Path,
+    waiting: Waiting,
     ended: list[subprocess.Popen[str]],
 ) -> None:
     """Nobody watches or records it any more; until then a new one is refused with the remedy."""
-    plant_at, controller_at = free_endpoint(), free_endpoint()
-    plant = start("plant", "--endpoint", plant_at)
-    files = ("--artefact", kinematic_artefact, *course)
-    controller = start("controller", *files, "--endpoint", plant_at, "--listen", controller_at)
-    where = ("--endpoint", plant_at, "--endpoint", controller_at)
     long = ("drive", *course[:2], "--laps", "10000", "--max-time", "3600", "--mode", "realtime")
-    ended += [plant, controller]
 
     def words() -> str:
-        state = json.loads(run("status", "--json", *where).stdout)["cars"]["orca"]["plant"]
+        state = json.loads(run("status", "--json", *waiting.where).stdout)["cars"]["orca"]["plant"]
         return f"{state['phase']}: {state['text']}"
 
     def killed(log: Path) -> None:
-        drive = start(*long, *where, "--log", log)
+        drive = start(*long, *waiting.where, "--log", log)
         ended.append(drive)
         until(lambda: log.exists() and log.stat().st_size > 50_000, "a run under way")
         drive.kill()
 
     killed(tmp_path / "one.mcap")
-    busy = run(*long, *where, "--log", tmp_path / "two.mcap")
+    busy = run(*long, *waiting.where, "--log", tmp_path / "two.mcap")
     assert busy.returncode == 2
     assert "'bayesrace stop --run' ends it" in busy.stderr
-    done = run("stop", "--run", "--endpoint", plant_at)
+    done = run("stop", "--run", "--endpoint", waiting.plant_at)
     assert (done.returncode, "stops" in done.stdout) == (0, True), done.stderr
     until(lambda: words().startswith("idle"), "the end of the run")
     killed(tmp_path / "three.mcap")
@@ -382,27 +397,21 @@ def test_a_run_whose_director_is_gone_ends_by_itself_or_by_a_command(
 def test_a_run_in_which_the_car_was_not_driven_is_no_success(
     tmp_path: Path,
     course: tuple[str | Path, ...],
-    kinematic_artefact: Path,
+    waiting: Waiting,
     ended: list[subprocess.Popen[str]],
 ) -> None:
-    plant_at, controller_at = free_endpoint(), free_endpoint()
-    plant = start("plant", "--endpoint", plant_at)
-    files = ("--artefact", kinematic_artefact, *course)
-    controller = start("controller", *files, "--endpoint", plant_at, "--listen", controller_at)
-    ended += [plant, controller]
-    where = ("--endpoint", plant_at, "--endpoint", controller_at)
     log = tmp_path / "drive.mcap"
     drive = start(
         "drive", *course[:2], "--laps", "1000", "--max-time", "4", "--mode", "realtime",
-        *where, "--log", log,
+        *waiting.where, "--log", log,
     )  # fmt: skip
     ended.append(drive)
     until(lambda: log.exists() and log.stat().st_size > 20_000, "a run under way")
-    controller.send_signal(signal.SIGSTOP)
+    waiting.controller.send_signal(signal.SIGSTOP)
     try:
         done = finish(drive)
     finally:
-        controller.send_signal(signal.SIGCONT)
+        waiting.controller.send_signal(signal.SIGCONT)
     assert done.returncode == 2
     assert "the car was not driven in" in done.stderr
 

@@ -68,9 +68,9 @@ def ask(
 ) -> A:
     """Ask a process and wait for its answer, as long as the table says unless told otherwise.
 
-    A link that breaks, as when a machine stalls for longer than its lease, loses the questions that
-    are under way: they are asked again. Of several that answer to one name, :func:`decisive`
-    chooses among the valid answers. Raises InputError if nobody answers in time, or nobody validly.
+    Repeats the request if the link broke while it was pending, as when a machine stalls for longer
+    than the lease, and the service is repeatable. If several processes answer to one name,
+    :func:`decisive` chooses among the valid answers. Raises InputError if nobody answers in time, or nobody validly.
     """
     if service.answer is None:
         raise TypeError(f"the answer of '{service.name}' is not a message; use fetch_all")
@@ -78,7 +78,7 @@ def ask(
     limit_s = service.timeout_s if timeout_s is None else timeout_s
     begin = time.monotonic()
     answers = ask_all(session, (key,), request, limit_s)[key]
-    # Where nobody is, that is known at once.
+    # Without a process to answer, the first request returns at once and is not repeated.
     lost = not answers and service.repeatable and time.monotonic() - begin > _LOST_S
     while lost and not answers and (left_s := begin + limit_s - time.monotonic()) > _AGAIN_S:
         time.sleep(_AGAIN_S)

@@ -49,8 +49,7 @@ _CAPACITY: Final = 10_000
 follow it. A full channel holds back the senders: those of the wall clock drop, by the table."""
 
 _REQUESTS: Final = 16
-"""That wait at most: whoever asks more often than a loop serves would else be served for minutes
-after."""
+"""At most so many requests wait; more are dropped, so that no backlog builds up."""
 
 NEWEST: Final = 1024
 """Messages of the control path that wait at most: a thread this far behind wants the newest."""
@@ -102,7 +101,7 @@ class Request:
         self.answer_raw(encode(message))
 
     def drop(self) -> None:
-        """No answer: whoever asks is told so at once, and may ask again."""
+        """Ends the request without an answer."""
         self._query.drop()
         self._query = None
 

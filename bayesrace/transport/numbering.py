@@ -13,7 +13,7 @@ class Numbering:
     """Received and lost messages of one sender, by their numbers.
 
     A message that was overtaken counts as lost until it arrives after all. A sender that begins
-    again starts afresh. One odd number, whoever sent it, changes no count of losses.
+    again starts afresh. A single number far off does not change the losses.
     """
 
     def __init__(self) -> None:
