@@ -4,8 +4,21 @@ Every reader of files, messages, options and numbers raises :class:`InputError`;
 turns it into one line on stderr and exit code 2, so its message must name the thing and the remedy.
 """
 
-__all__ = ["InputError"]
+from pydantic import ValidationError
+
+__all__ = ["InputError", "faults_in"]
 
 
 class InputError(ValueError):
     """Something given from outside is unusable; the message names it and says what would help."""
+
+
+def faults_in(error: ValidationError, whole: str = "the content") -> str:
+    """What is wrong with data that do not fit a pydantic model: field and fault of each, one line.
+
+    ``whole``: the name of what has no field of its own, such as text that is no JSON.
+    """
+    return "; ".join(
+        f"{'.'.join(str(part) for part in one['loc']) or whole}: {one['msg']}"
+        for one in error.errors()
+    )

@@ -1,12 +1,44 @@
-"""Files that appear whole or not at all, whoever is killed and whenever the power fails."""
+"""Files that appear whole or not at all, and are read whole or refused."""
 
 import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Final
 
-__all__ = ["clear_partials", "replacing", "write_whole"]
+from bayesrace.errors import InputError
+
+__all__ = ["clear_partials", "read_text", "read_whole", "replacing", "write_whole"]
+
+_LARGEST: Final = 1 << 22
+
+
+def read_whole(
+    path: Path, what: str, most: int = _LARGEST, remedy: str = "give an existing file"
+) -> bytes:
+    """The content of a file of at most ``most`` bytes.
+
+    InputError, about ``what`` the file is, if it cannot be read or is longer, as a device may be.
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(most + 1)
+    except (OSError, ValueError) as error:  # a null byte in a path is a ValueError
+        reason = (isinstance(error, OSError) and error.strerror) or str(error)
+        raise InputError(f"cannot read {what} {path}: {reason}; {remedy}") from None
+    if len(data) > most:
+        raise InputError(f"{what} {path} is longer than {most >> 20} MB; {remedy}")
+    return data
+
+
+def read_text(path: Path, what: str, remedy: str = "give an existing file") -> str:
+    """The same of a text in UTF-8, with or without a byte order mark."""
+    data = read_whole(path, what, remedy=remedy)
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise InputError(f"{what} {path} is not text in UTF-8; {remedy}") from None
 
 
 @contextmanager

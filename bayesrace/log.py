@@ -1,21 +1,18 @@
-"""Every message of a run in one MCAP file that is readable whatever happened to the writer.
+"""The MCAP file with the messages of a run: writer and reader.
 
-Records are written one by one, not in chunks, and handed to the system at least every .2 s: a
-killed process loses at most that, and the reader takes a file that ends anywhere.
+Records are written one by one, not in chunks, so that the reader can take a file that ends
+anywhere.
 """
 
 import json
 import struct
-import threading
 import time
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, Any, Final, Generic, Self, TypeVar, cast
+from typing import IO, Any, Final, Generic, TypeVar, cast
 
 import lz4.frame
-import zenoh
 import zstandard
 from mcap.exceptions import EndOfFile, McapError
 from mcap.records import Channel, Chunk, Metadata
@@ -25,27 +22,17 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from bayesrace.errors import InputError
 from bayesrace.messages import (
-    EVENT,
     TOPICS,
     Decoder,
-    Event,
     Message,
     Topic,
-    car_key,
-    encode,
     json_schema,
 )
-from bayesrace.messages.codec import peek_seq
 
-__all__ = ["Entry", "LogReader", "LogWriter", "Recorder", "RecorderCounters"]
+__all__ = ["Entry", "LogReader", "LogWriter", "topic_of"]
 
 M = TypeVar("M", bound=Message)
 
-FLUSH_PERIOD_S: Final = 0.2
-_BATCH_S: Final = 0.002
-_CHANNEL_CAPACITY: Final = 1 << 16
-_MOST_KEYS: Final = 256
-"""A log's own keys are eight; the format has room for 65,535."""
 _LARGEST_RECORD: Final = 1 << 27
 _MOST_UNPACKED, _RATIO = 1 << 26, 200
 """Bytes that all chunks of a log may unpack to: so many, and this multiple of the file."""
@@ -56,7 +43,7 @@ _MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
 _BY_PREFIX: Final = {topic.key.split("/")[2]: topic for topic in TOPICS}
 
 
-def _topic_of(key: str) -> Topic[Any] | None:
+def topic_of(key: str) -> Topic[Any] | None:
     """The table's row for a key such as ``bayesrace/orca/state``; None for any other key."""
     parts = key.split("/")
     if len(parts) < 3 or parts[0] != "bayesrace":
@@ -65,12 +52,6 @@ def _topic_of(key: str) -> Topic[Any] | None:
     if topic is None or len(parts) != len(topic.key.split("/")):
         return None
     return topic
-
-
-def _in_table(key: str) -> bool:
-    """Whether the table has this very key, of whatever car."""
-    topic, source = _topic_of(key), key.rsplit("/", 1)[-1]
-    return topic is not None and ("{source}" not in topic.key or source in topic.sources)
 
 
 class LogWriter:
@@ -109,7 +90,7 @@ class LogWriter:
         self._writer.add_message(channel, time_ns, data, time_ns, seq)
 
     def _register(self, key: str) -> int:
-        topic = _topic_of(key)
+        topic = topic_of(key)
         schema = 0 if topic is None else self._schema(topic)
         channel: int = self._writer.register_channel(key, _MESSAGE_ENCODING, schema)
         self._channels[key] = channel
@@ -131,181 +112,6 @@ class LogWriter:
         if not self._file.closed:
             self._writer.finish()
             self._file.close()
-
-
-@dataclass(slots=True)
-class RecorderCounters:
-    """What a recorder saw."""
-
-    written: int = 0
-    missing: int = 0
-    """Messages that must have been sent, by their numbers, and did not arrive."""
-    disordered: int = 0
-    """Messages with a number not above the one before, restarts from 0 aside."""
-    restarts: int = 0
-    """Times that a sender began again at 0."""
-    unnumbered: int = 0
-    """Messages without a readable number; written all the same."""
-    unrecorded: int = 0
-    """Messages on more keys than a log has room for, let go."""
-
-
-class Recorder:
-    """Writes every message of a car (``bayesrace/{car}/**``) from a thread of its own.
-
-    Log times are those of writing, some milliseconds after arrival; the messages carry the times
-    at which they were made.
-    Its channel holds more than any stall needs and then blocks the senders: in lockstep it never
-    loses a message. ``with`` it; on the way out it waits for stragglers and finishes the file.
-    """
-
-    def __init__(
-        self,
-        session: Any,
-        car: str,
-        path: Path,
-        metadata: Mapping[str, Mapping[str, str]] | None = None,
-    ) -> None:
-        self.counters = RecorderCounters()
-        self.failed = ""
-        """Why the log cannot be written; empty while it can. Messages are then let go."""
-        self.gaps: list[str] = []
-        """The first few gaps in the numbering, in words."""
-        self._last: dict[str, int] = {}
-        self._keys: set[str] = set()
-        self._path, self._session = path, session
-        self._event_key = car_key(EVENT.key, car, "recorder")
-        self._writer = LogWriter(path, metadata)
-        self._lock = threading.Lock()
-        self._subscriber = session.declare_subscriber(
-            car_key("bayesrace/{car}/**", car), zenoh.handlers.FifoChannel(_CHANNEL_CAPACITY)
-        )
-        self._quiet_since_ns = time.monotonic_ns()
-        self._stop = threading.Event()
-        self._threads = [
-            threading.Thread(target=run, name=f"recorder-{name}", daemon=True)
-            for name, run in (("write", self._write_all), ("flush", self._flush_often))
-        ]
-        for thread in self._threads:
-            thread.start()
-
-    def settle(self, quiet_s: float = 0.1, at_most_s: float = 2.0) -> None:
-        """Wait until nothing has arrived for a while; then all of it can be read from the file.
-
-        Raises InputError if the log cannot be written any more, such as on a full disk.
-        """
-        give_up_ns = time.monotonic_ns() + int(at_most_s * 1e9)
-        while (now_ns := time.monotonic_ns()) < give_up_ns:
-            if now_ns - self._quiet_since_ns >= quiet_s * 1e9:
-                break
-            time.sleep(quiet_s / 5)
-        self._flush()
-        if self.failed:
-            raise InputError(self.failed)
-
-    def close(self) -> None:
-        """Wait for stragglers, stop, finish the file; a second call does nothing."""
-        if self._stop.is_set():
-            return
-        try:
-            self.settle()
-        finally:
-            self._stop.set()
-            self._subscriber.undeclare()
-            for thread in self._threads:
-                thread.join()
-            with suppress(OSError, ValueError):
-                self._writer.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def _write_all(self) -> None:
-        handler = self._subscriber.handler
-        while True:
-            try:
-                sample = handler.recv()
-                while sample is not None:
-                    self._write(sample)
-                    sample = handler.try_recv()
-            except zenoh.ZError:  # undeclared and drained
-                return
-            # Waking for a batch instead of each message leaves the CPU to who is recorded.
-            time.sleep(_BATCH_S)
-
-    def _write(self, sample: Any) -> None:
-        now_ns = time.monotonic_ns()
-        key, data = str(sample.key_expr), sample.payload.to_bytes()
-        if not data:  # an inbox of the same session waking itself
-            return
-        self._quiet_since_ns = now_ns
-        if not self._known(key):
-            self.counters.unrecorded += 1
-            return
-        seq = peek_seq(data)
-        self._account(key, seq)
-        if self.failed:
-            return
-        try:
-            with self._lock:
-                self._writer.write(key, data, now_ns, 0 if seq is None else seq & 0xFFFFFFFF)
-        except Exception as error:
-            self._fail(error)
-
-    def _known(self, key: str) -> bool:
-        """Whether messages on this key are written: the table's, and a bounded number of others."""
-        if key not in self._keys and (len(self._keys) < _MOST_KEYS or _in_table(key)):
-            self._keys.add(key)
-        return key in self._keys
-
-    def _fail(self, error: Exception) -> None:
-        """Notes the failure in :attr:`failed`, and publishes one event about it."""
-        if self.failed:
-            return
-        why = f"{type(error).__name__}: {error}"
-        if isinstance(error, OSError):
-            why = f"{error.strerror}; make room and drive again"
-        self.failed = f"cannot write the log {self._path}: {why}"
-        now_ns = time.monotonic_ns()
-        event = Event(0, now_ns, 0, "recorder", "recorder_failed", self.failed[:2000], {})
-        with suppress(zenoh.ZError):
-            # Not to itself, who takes nothing from its channel at this moment.
-            self._session.put(
-                self._event_key, encode(event), allowed_destination=zenoh.Locality.REMOTE
-            )
-
-    def _flush(self) -> None:
-        try:
-            with self._lock:
-                self._writer.flush()
-        except (OSError, ValueError) as error:
-            self._fail(error)
-
-    def _flush_often(self) -> None:
-        while not self._stop.wait(FLUSH_PERIOD_S):
-            self._flush()
-
-    def _account(self, key: str, seq: int | None) -> None:
-        counters = self.counters
-        counters.written += 1
-        if seq is None:
-            counters.unnumbered += 1
-            return
-        last = self._last.get(key)
-        self._last[key] = seq
-        if last is None or seq == last + 1:
-            return
-        if seq == 0:
-            counters.restarts += 1
-        elif seq <= last:
-            counters.disordered += 1
-        else:
-            counters.missing += seq - last - 1
-            if len(self.gaps) < 20:
-                self.gaps.append(f"{key}: {last + 1} to {seq - 1} missing")
 
 
 @dataclass(frozen=True, slots=True)
@@ -345,7 +151,7 @@ class LogReader:
         self.refused = 0
         for record in self._records():
             if isinstance(record, Channel):
-                topic = _topic_of(record.topic)
+                topic = topic_of(record.topic)
                 decoder = None if topic is None else decoders.get(topic.name)
                 channels[record.id] = (record.topic, decoder)
             elif isinstance(record, Record):

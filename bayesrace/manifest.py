@@ -10,9 +10,10 @@ import stat
 from pathlib import Path
 from typing import Final
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from bayesrace.errors import InputError
+from bayesrace.errors import InputError, faults_in
+from bayesrace.files import read_whole
 
 __all__ = ["ABI", "LIBRARY", "MANIFEST", "Manifest", "check_library", "read_manifest"]
 
@@ -57,14 +58,16 @@ class Manifest(BaseModel):
 def read_manifest(artefact: Path) -> Manifest:
     """Manifest of the artefact folder; InputError if it is not one or belongs to another ABI."""
     path = artefact / MANIFEST
-    try:
-        manifest = Manifest.model_validate_json(path.read_text())
-    except (FileNotFoundError, NotADirectoryError):
+    if not path.is_file():
         raise InputError(
             f"{artefact} is not a built controller (no {MANIFEST}): run 'bayesrace build'"
+        )
+    try:
+        manifest = Manifest.model_validate_json(read_whole(path, "the manifest"))
+    except ValidationError as error:
+        raise InputError(
+            f"{path} is no manifest ({faults_in(error)}): run 'bayesrace build'"
         ) from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be read: {error}; run 'bayesrace build'") from None
     if manifest.abi != ABI:
         raise InputError(
             f"{path} was built for interface {manifest.abi}, this program has {ABI}: "

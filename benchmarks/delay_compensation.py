@@ -17,9 +17,10 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from bayesrace.log import LogReader, Recorder
+from bayesrace.log import LogReader
 from bayesrace.messages import EVENT, STATE, TELEMETRY, Event
 from bayesrace.raceline import read_raceline
+from bayesrace.recorder import Recorder
 from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK, Track, load_track
 from bayesrace.transport import Director, Endpoints, Publisher, free_endpoint, open_session
 from bayesrace.vehicles import get_car

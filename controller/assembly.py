@@ -5,7 +5,8 @@ from typing import TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from bayesrace.errors import InputError
+from bayesrace.errors import InputError, faults_in
+from bayesrace.files import read_whole
 from bayesrace.gp.weights import decode_weights, encode_weights, read_weights
 from bayesrace.raceline.line import read_raceline
 from bayesrace.tracks import load_track
@@ -27,15 +28,10 @@ def read_settings(path: Path | None, form: type[Settings]) -> Settings:
     if path is None:
         return form()
     try:
-        return form.model_validate_json(path.read_text())
-    except OSError as error:
-        raise InputError(f"cannot read the settings {path}: {error.strerror}") from None
+        return form.model_validate_json(read_whole(path, "the settings"))
     except ValidationError as error:
-        faults = "; ".join(
-            f"{'.'.join(str(part) for part in one['loc'])}: {one['msg']}" for one in error.errors()
-        )
         where = form.__module__.replace(".", "/")
-        raise InputError(f"{path}: {faults}; {where}.py has the form") from None
+        raise InputError(f"{path}: {faults_in(error)}; {where}.py has the form") from None
 
 
 def predictive_controller(

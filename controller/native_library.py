@@ -146,8 +146,9 @@ def load_library(artefact: Path, manifest: Manifest) -> ct.CDLL:
         library = ct.CDLL(str(path))
     except OSError as error:
         raise InputError(
-            f"{path} cannot be loaded here ({error}): it was built for another machine; "
-            "remove the folder and run 'bayesrace build'"
+            f"{path} cannot be loaded here ({error}): it was built for another machine, or its "
+            "file system allows no programs (noexec); remove the folder and run 'bayesrace build', "
+            "with BAYESRACE_CACHE set to another folder if need be"
         ) from None
     try:
         if library.br_mpc_abi() == ABI:

@@ -9,6 +9,10 @@ __all__ = ["StateStream"]
 
 _AHEAD: Final = 16
 """A number farther ahead than this is not taken for the next of the run under way at once."""
+_AHEAD_S: Final = 0.3
+"""The same as a time, where the interval of the states is known and this allows more of them ..."""
+_FARTHEST: Final = 256
+"""... but no more than these."""
 
 _CONFIRMED: Final = 4
 """States in a row that belong together, and nothing else, are a stream of their own."""
@@ -87,7 +91,7 @@ class StateStream:
             return True
         if (state.epoch, state.run) != (newest.epoch, newest.run):
             return self._ended
-        return _follows(state, newest)
+        return self._follows(state, newest)
 
     def _confirmed(self, state: State) -> bool:
         """Whether it is the last of several in a row that are a stream of their own."""
@@ -95,7 +99,7 @@ class StateStream:
         belongs = (
             other is not None
             and (state.epoch, state.run) == (other.epoch, other.run)
-            and _follows(state, other)
+            and self._follows(state, other)
         )
         self._others = self._others + 1 if belongs else 1
         self._other = state
@@ -108,6 +112,6 @@ class StateStream:
         else:
             self.foreign += 1
 
-
-def _follows(state: State, before: State) -> bool:
-    return 0 < state.seq - before.seq <= _AHEAD
+    def _follows(self, state: State, before: State) -> bool:
+        in_time = _AHEAD_S / self.interval_s if self.interval_s > 0 else 0.0
+        return 0 < state.seq - before.seq <= min(max(in_time, _AHEAD), _FARTHEST)

@@ -6,8 +6,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from bayesrace.errors import InputError
-from bayesrace.log import Recorder
 from bayesrace.messages import Event, RunRequest, Scalar
+from bayesrace.recorder import Recorder
 from bayesrace.tracks import StartLine, Track
 from bayesrace.transport import Director, Publisher, RefusedError
 from experiments.processes import Child, endings
@@ -95,9 +95,10 @@ def execute(
     """Announces and starts the run and waits for its end; the plant's ``run_ended`` event.
 
     InputError if the plant refuses, the recorder fails, the car was not driven, or the run ended by
-    anything but its laps, its time limit or the car's leaving the world; KeyboardInterrupt on a
-    signal.
+    anything but its laps, its time limit or the car's leaving the world, or several plants or
+    controllers of one name are there, before or after; KeyboardInterrupt on a signal.
     """
+    director.check_alone()
     _announce(publisher, plan, director.status("controller").weights_version)
     before = director.status("plant").counters
     try:
@@ -119,6 +120,7 @@ def execute(
     if end.data.get("reason") not in _REGULAR:
         raise InputError(f"run {plan.run} ({plan.controller}) ended early: {end.text}")
     _check_driven(plan, end, before)
+    director.check_alone()
     return end
 
 

@@ -9,7 +9,7 @@ from rich.console import Console, ConsoleOptions, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from experiments.picture import printable
+from experiments.printable import printable
 from plant.fmu.inspection import FmuDescription, Variable
 
 __all__ = ["FmuTable"]

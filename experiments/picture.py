@@ -24,7 +24,7 @@ from typing import Any, Final
 
 from bayesrace.messages import Status
 
-__all__ = ["SOURCES", "Picture", "Process", "printable"]
+__all__ = ["SOURCES", "Picture", "Process"]
 
 SOURCES: Final = ("plant", "controller")
 """Processes that a car consists of."""
@@ -110,8 +110,3 @@ class Picture:
 
 def _json(process: Process | None, now_s: float) -> dict[str, Any] | None:
     return None if process is None else process.as_json(now_s)
-
-
-def printable(text: str) -> str:
-    """Text from the network without what a terminal would obey."""
-    return "".join(c if c.isprintable() else "·" for c in text)

@@ -16,10 +16,10 @@ from typing import Any, Final
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from bayesrace.gp.weights import GpWeights, write_weights
-from bayesrace.log import Recorder
 from bayesrace.messages import EVENT, Event
 from bayesrace.raceline import RaceLine, write_raceline
 from bayesrace.raceline.cached import racing_line
+from bayesrace.recorder import Recorder
 from bayesrace.tracks import Track, load_track, write_track
 from bayesrace.transport import Director, Endpoints, Publisher, free_endpoint, open_session
 from bayesrace.vehicles import CarParameters, get_car

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from bayesrace.errors import InputError
+from bayesrace.errors import InputError, faults_in
+from bayesrace.files import read_text
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.log import LogReader
 from bayesrace.messages import (
@@ -158,7 +159,7 @@ class Recording:
         try:
             return PREDICTION if given is None else Discretisation.model_validate(given)
         except ValidationError as error:
-            raise InputError(f"settings.json, discretisation: {error}") from None
+            raise InputError(f"settings.json, discretisation: {faults_in(error)}") from None
 
     def run_of(self, controller: str) -> RunRecord | None:
         """The last run of that controller, None if it did not drive."""
@@ -205,12 +206,9 @@ def _sort_in(runs: dict[int, RunRecord], message: Any) -> None:
 
 
 def _read_settings(path: Path) -> dict[str, Any]:
+    text = read_text(path, "the settings", "give the directory of a race")
     try:
-        settings = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(
-            f"cannot read {path}: {error.strerror}; give the directory of a race"
-        ) from None
+        settings = json.loads(text)
     except ValueError as error:
         raise InputError(f"{path} is no JSON: {error}") from None
     if not isinstance(settings, dict):

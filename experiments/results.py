@@ -4,8 +4,8 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from bayesrace.errors import InputError
-from bayesrace.files import write_whole
+from bayesrace.errors import InputError, faults_in
+from bayesrace.files import read_whole, write_whole
 
 __all__ = [
     "GpMetrics",
@@ -107,8 +107,6 @@ def write_result(path: Path, result: RaceResult) -> None:
 def read_result(path: Path) -> RaceResult:
     """The result in a file; InputError if it is not one."""
     try:
-        return RaceResult.model_validate_json(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from None
+        return RaceResult.model_validate_json(read_whole(path, "the result", 1 << 26))
     except ValidationError as error:
-        raise InputError(f"{path} is no result of a race: {error}") from None
+        raise InputError(f"{path} is no result of a race: {faults_in(error)}") from None

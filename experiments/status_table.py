@@ -9,7 +9,8 @@ from rich.table import Table
 from rich.text import Text
 
 from bayesrace.messages import Status
-from experiments.picture import SOURCES, Picture, Process, printable
+from experiments.picture import SOURCES, Picture, Process
+from experiments.printable import printable
 
 __all__ = ["COUNTERS_SHOWN", "StatusTable"]
 

@@ -26,6 +26,8 @@ from bayesrace.messages import (
     RunRequest,
     Scalar,
     Status,
+    StatusRequest,
+    car_key,
     peek_seq,
 )
 from bayesrace.realtime import RealtimeSettings, prepare_thread
@@ -41,6 +43,7 @@ from bayesrace.transport import (
     Numbering,
     Publisher,
     Request,
+    ask_all,
     decode_request,
     open_session,
 )
@@ -55,6 +58,10 @@ _log = logging.getLogger("bayesrace.plant")
 
 _ABANDONED_S = 10.0
 """Nobody watches or records a run whose director is gone for so long; a link may come back."""
+
+
+_STATUS_S = 1.0
+"""How long a controller may take to answer before a run begins, and after it has ended."""
 
 
 class PlantSettings(BaseModel):
@@ -94,7 +101,7 @@ class PlantProcess:
     """Serves one car's runs over an open session."""
 
     def __init__(self, session: Any, settings: PlantSettings, vehicle: Vehicle) -> None:
-        self._settings = settings
+        self._session, self._settings = session, settings
         self.name = settings.name or settings.car
         self._simulator = vehicle
         # Two processes started in one nanosecond on two machines must differ too.
@@ -167,6 +174,8 @@ class PlantProcess:
                 f"no controller for car '{self.name}': start one that connects to this plant "
                 "(bayesrace controller)"
             )
+        if (count := self._controllers()) > 1:
+            return f"{count} controllers drive car '{self.name}'; end all but one"
         try:
             self._run = Run(
                 message,
@@ -186,6 +195,12 @@ class PlantProcess:
         self._run_number = message.run
         self._runs += 1
         return ""
+
+    def _controllers(self) -> int:
+        """How many answer under this car's name; their actuations could not be told apart."""
+        key = car_key(STATUS.key, self.name, "controller")
+        request = StatusRequest(0, time.monotonic_ns())
+        return len(ask_all(self._session, (key,), request, _STATUS_S)[key])
 
     def _overheard(self, item: Item) -> None:
         """An actuation when nothing is driven: received, and no more."""
@@ -211,6 +226,8 @@ class PlantProcess:
         self._run = None
         if run is None:
             return
+        if end.reason in ("laps", "max_time") and (count := self._controllers()) > 1:
+            end = End("several_controllers", f"{end.text}, but {count} controllers drove the car")
         self._text = f"run {message.run} ended after {run.time_s:.2f} s: {end.text}"
         # A fault is the FMU's, and its last words are in the text.
         level = logging.ERROR if end.reason == "plant_fault" else logging.INFO

@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bayesrace.log import Recorder
 from bayesrace.messages import STATE, Event, RunRequest, State, car_key, decode
+from bayesrace.recorder import Recorder
 from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
 from tests.programs import ROOT, until
 
@@ -104,6 +104,8 @@ class Rig:
     """Both processes, and a session that is connected to both; each run has its own number."""
 
     plant: subprocess.Popen[str]
+    at_plant: str
+    """Its endpoint."""
     controller: subprocess.Popen[str]
     session: Any
     director: Director
@@ -155,7 +157,7 @@ def running_rig(
         with open_session(Endpoints(connect=(at_plant, at_controller))) as session:
             director = Director(session, "orca")
             director.wait_for(("plant", "controller"), PATIENCE_S)
-            yield Rig(plant, controller, session, director, Spectator(session))
+            yield Rig(plant, at_plant, controller, session, director, Spectator(session))
     finally:
         for process in (controller, plant):
             process.send_signal(signal.SIGTERM)

@@ -7,7 +7,7 @@ import pytest
 
 from tests.programs import run
 
-pytestmark = [pytest.mark.check, pytest.mark.unmeasured]
+pytestmark = pytest.mark.check
 
 
 @pytest.fixture(scope="module")

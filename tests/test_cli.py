@@ -439,3 +439,18 @@ def test_programs_that_are_started_import_nothing_from_the_current_folder(
     with child(["plant", "--help"], tmp_path / "child.log") as process:
         assert process.wait(60.0)
     assert "imported from the folder" not in (tmp_path / "child.log").read_text()
+
+
+def test_settings_that_are_nested_without_end_are_refused(
+    cli: Cli, course: tuple[str | Path, ...], kinematic_artefact: Path, tmp_path: Path
+) -> None:
+    settings = tmp_path / "mpc.json"
+    settings.write_text("[" * 100_000)
+    arguments = ("controller", "--artefact", kinematic_artefact, *course)
+    refused(cli(*arguments, "--settings", settings), "mpc.json")
+
+
+def test_devices_are_not_read_without_end(cli: Cli, tmp_path: Path) -> None:
+    refused(cli("publish", "/dev/zero"), "weights file /dev/zero is longer than 16 MB")
+    refused(cli("fmu", "inspect", "/dev/zero"), "no FMU at /dev/zero")
+    refused(cli("train", "/dev/zero", "--out", tmp_path / "weights.bin"), "no log at /dev/zero")

@@ -151,6 +151,14 @@ def test_one_foreign_state_is_counted_and_nothing_else(odd: dict[str, Any]) -> N
     assert (stream.lost, stream.stale + stream.foreign) == (0, 1)
 
 
+def test_a_gap_of_a_quarter_second_is_a_loss_at_any_rate() -> None:
+    zero = np.zeros(7), np.zeros(2)
+    fast = [replace(state(seq, *zero), time_s=seq * 0.002) for seq in (100, 101, 226, 527)]
+    stream = StateStream()
+    assert [stream.accept(one) for one in fast] == [True, True, True, False]
+    assert (stream.lost, stream.foreign) == (124, 1)
+
+
 @pytest.mark.parametrize("left", [{"seq": 101}, {"epoch": 2, "seq": 0}, {"seq": 40}])
 def test_several_in_a_row_are_followed_at_once_and_anything_after_silence(
     left: dict[str, Any],

@@ -25,6 +25,7 @@ from bayesrace.vehicles.parameters import get_car
 from experiments.recording import PlannedRun, RunRecord, _sort_in
 from learning.logs import dataset_from_messages
 from tests import programs
+from tests.car_fmu import Version, packed_car
 from tests.faulty_fmu import Mode, faulty_fmu, faulty_library
 from tests.programs import until
 from tests.pursuit_rig import PATIENCE_S, PLANT, Rig, Spectator, request, running_rig, start
@@ -203,6 +204,18 @@ def test_nothing_outlives_the_plant(how: signal.Signals, car_fmu: Path, tmp_path
     until(
         lambda: not (folder.exists() or workers_of(plant.pid)), "the end of all of it", PATIENCE_S
     )
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_plant_that_has_not_driven_ends_without_an_error_of_the_fmu(version: Version) -> None:
+    endpoint = free_endpoint()
+    plant = programs.start("plant", "--fmu", packed_car(version), "--endpoint", endpoint)
+    with open_session(Endpoints(connect=(endpoint,))) as session:
+        Director(session, "orca").wait_for(("plant",), PATIENCE_S)
+    plant.send_signal(signal.SIGINT)
+    done = programs.finish(plant)
+    assert done.returncode == 0
+    assert "FMU error" not in done.stdout + done.stderr
 
 
 def test_the_command_refuses_an_unusable_fmu_in_a_line_a_fault(

@@ -231,8 +231,10 @@ def _process(line: list[str]) -> Iterator[None]:
 
 
 @contextmanager
-def _driving(files: Prepared, track: Track, prefix: list[str]) -> Iterator[list[str]]:
-    """A system that somebody else has started, the plant by way of ``prefix``; its endpoints."""
+def _driving(
+    files: Prepared, track: Track, prefix: list[str]
+) -> Iterator[tuple[list[str], Director]]:
+    """A running system, the plant started by way of ``prefix``: its endpoints and its director."""
     plant, controller = free_endpoint(), free_endpoint()
     with ExitStack() as stack:
         stack.enter_context(
@@ -250,7 +252,7 @@ def _driving(files: Prepared, track: Track, prefix: list[str]) -> Iterator[list[
         director = Director(session, "other")
         director.wait_for(("plant", "controller"), 60.0)
         director.start(run_request(track, RunPlan(1, "test", 0, 1e5, lockstep=False)))
-        yield [plant, controller]
+        yield [plant, controller], director
 
 
 def _attached(endpoints: list[str], out: Path) -> dict[str, Any]:
@@ -263,16 +265,16 @@ def _attached(endpoints: list[str], out: Path) -> dict[str, Any]:
 
 @pytest.mark.check
 def test_a_running_system_is_measured_and_left_running(files: Prepared, tmp_path: Path) -> None:
-    with _driving(files, load_track(files.track), []) as endpoints:
-        first = _attached(endpoints, tmp_path / "first")
-        second = _attached(endpoints, tmp_path / "second")
-    for result in (first, second):
-        assert result["attached"] is True
-        assert result["clocks"]["shared"] is True
-        assert set(result["legs_us"]) == {leg.name for leg in LEGS}
-        assert result["rss_growth_bytes"] is None
-        assert result["off_track_samples"] is None
-        assert result["ticks"] > 50
+    with _driving(files, load_track(files.track), []) as (endpoints, director):
+        result = _attached(endpoints, tmp_path / "run")
+        assert director.status("plant").phase == "running"
+        assert director.status("controller").phase == "driving"
+    assert result["attached"] is True
+    assert result["clocks"]["shared"] is True
+    assert set(result["legs_us"]) == {leg.name for leg in LEGS}
+    assert result["rss_growth_bytes"] is None
+    assert result["off_track_samples"] is None
+    assert result["ticks"] > 50
 
 
 def test_nothing_to_attach_to_is_an_error(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -300,7 +302,7 @@ def test_clock_of_another_host_is_found_and_corrected(files: Prepared, tmp_path:
     if why_not := _time_namespaces():
         pytest.skip(f"time namespaces are not allowed here: {why_not}")
     prefix = ["unshare", "--time", "--monotonic=1000", "--fork", "--kill-child"]
-    with _driving(files, load_track(files.track), prefix) as endpoints:
+    with _driving(files, load_track(files.track), prefix) as (endpoints, _):
         result = _attached(endpoints, tmp_path / "run")
     clocks = result["clocks"]
     assert clocks["shared"] is False

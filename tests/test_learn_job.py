@@ -20,7 +20,6 @@ from experiments.learn.desk import Desk
 from experiments.learn.feed import What
 from experiments.learn.figure import draw, references
 from experiments.learn.journal import Journal, LapRecord, Record, UpdateRecord
-from experiments.learn.publishing import read_bytes
 from experiments.learn.settings import LearnSettings
 from experiments.learn.table import print_laps
 from experiments.learn.trainer import NICE, Trainer
@@ -61,7 +60,7 @@ class Office:
 
     def _send(self, _session: Any, _car: str, data: bytes) -> Reply:
         version = next(one.version for one in self.journal.record.updates
-                       if read_bytes(self.journal.path(one.file)) == data)  # fmt: skip
+                       if self.journal.path(one.file).read_bytes() == data)  # fmt: skip
         self.sent.append(version)
         if version not in self.answers:
             raise InputError("nobody answers")

@@ -5,6 +5,7 @@ lockstep; a killed plant or controller and Ctrl-C end the run with a clear messa
 and no process left over. All of it with the built-in car, and with an FMU in its place.
 """
 
+import contextlib
 import hashlib
 import itertools
 import json
@@ -18,8 +19,10 @@ import numpy as np
 import pytest
 
 from bayesrace.errors import InputError
-from bayesrace.log import LogReader, Recorder
-from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY
+from bayesrace.log import LogReader
+from bayesrace.messages import ACTUATION, EVENT, STATE, STATUS, TELEMETRY, Status
+from bayesrace.recorder import Recorder
+from bayesrace.transport import Endpoints, Request, declare_service, open_session
 from tests.car_fmu import packed_car
 from tests.programs import until
 from tests.pursuit_rig import CONTROLLER, PATIENCE_S, PLANT, Rig, running_rig, start
@@ -226,6 +229,29 @@ def test_a_run_is_stopped_on_request_and_another_refused_meanwhile(rig: Rig) -> 
     assert end.data["reason"] == "stopped"
     assert "enough" in end.text
     assert not rig.director.stop("again").accepted
+
+
+def test_a_run_of_two_controllers_is_refused_or_no_success(rig: Rig) -> None:
+    """Only the plant is connected to both: each would drive now and then."""
+    status = Status(0, 0, "controller", "waiting", 0, 0, "", "", 0.0, -1.0, 0.0, {})
+
+    @contextlib.contextmanager
+    def another() -> Iterator[None]:
+        def answer(request: Request) -> None:
+            request.answer(status)
+
+        with open_session(Endpoints(connect=(rig.at_plant,), low_latency=True)) as session:
+            _kept = declare_service(session, STATUS, "orca", answer, source="controller")
+            time.sleep(0.3)  # the declaration travels
+            yield
+
+    with another(), pytest.raises(InputError, match="2 controllers drive car 'orca'; end all but"):
+        rig.start()
+    run = rig.start(laps=10)
+    with another():
+        end = rig.director.wait_for_end(run, 60.0)
+    assert end.data["reason"] == "several_controllers"
+    assert "but 2 controllers drove the car" in end.text
 
 
 def test_weights_for_a_controller_without_any_are_refused_with_a_reason(rig: Rig) -> None:

@@ -13,8 +13,9 @@ from mcap.records import Chunk
 from mcap.writer import CompressionType, Writer
 
 from bayesrace.errors import InputError
-from bayesrace.log import LogReader, LogWriter, Recorder, _unpacked
+from bayesrace.log import LogReader, LogWriter, _unpacked
 from bayesrace.messages import EVENT, STATE, Event, State, decode, encode
+from bayesrace.recorder import Recorder
 from bayesrace.transport import Endpoints, Inbox, Publisher, free_endpoint, open_session
 from tests.programs import ROOT, until
 
@@ -154,6 +155,17 @@ def test_keys_without_end_do_not_fill_the_log(tmp_path: Path) -> None:
         assert recorder.failed == ""
         assert recorder.counters.unrecorded > 700
     assert LogReader(path).select(STATE)[-1] == state(1)
+    assert int(LogReader(path).metadata()["recorder"]["unrecorded"]) > 700
+
+
+def test_a_log_that_is_deleted_is_a_failure(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    with open_session(Endpoints(listen=(free_endpoint(),))) as session:
+        recorder = Recorder(session, "orca", path)
+        path.unlink()
+        until(lambda: recorder.failed, "the recorder notices")
+        with pytest.raises(InputError, match=r"log\.mcap: it has been deleted"):
+            recorder.close()
 
 
 def test_a_log_that_cannot_be_written_is_an_event(
@@ -220,7 +232,7 @@ def test_the_recorder_writes_everything_and_counts_gaps(tmp_path: Path) -> None:
 WRITER = """
 import sys, time
 from pathlib import Path
-from bayesrace.log import Recorder
+from bayesrace.recorder import Recorder
 from bayesrace.messages import STATE, State
 from bayesrace.transport import Endpoints, Publisher, free_endpoint, open_session
 endpoint = free_endpoint()

@@ -146,8 +146,11 @@ def _take_over(rig: Rig) -> None:
     rig.observer.start(1)
     until(lambda: rig.state().x[3] > 1.5, "speed")
     controller.kill()
-    killed_ns, last = time.monotonic_ns(), rig.state()
+    killed_ns, seen = time.monotonic_ns(), rig.state().seq
     successor = rig.start_controller()
+    # Answers of the killed one may still arrive; the new one cannot have started in that time.
+    until(lambda: rig.state().seq > seen + 10, "states after the end of the controller")
+    last = rig.state()
     until(lambda: _answers_since(rig.state(), last.seq + 1), "an answer of the successor")
     for _ in range(3):
         rig.drive_on()

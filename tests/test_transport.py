@@ -185,6 +185,42 @@ def test_what_others_have_is_fetched_and_not_the_own(pair: tuple[Any, Any]) -> N
         assert fetch_all(pair[1], ACCEPTED, "other") == []
 
 
+def test_several_processes_of_one_name_are_told(pair: tuple[Any, Any]) -> None:
+    """Their messages would be mixed, in the car and in the log."""
+    status = encode(Status(0, 0, "controller", "waiting", 0, 0, "", "", 0.0, -1.0, 0.0, {}))
+
+    def there(number: int) -> None:
+        with ExitStack() as stack:
+            for session in pair[:number]:
+                told = partial(Request.answer_raw, data=status)
+                stack.enter_context(
+                    declare_service(session, STATUS, "orca", told, None, "controller")
+                )
+            inboxes = [Inbox(session, "orca") for session in pair]
+            meet(*inboxes)
+            Director(pair[1], "orca").check_alone()
+
+    there(1)
+    with pytest.raises(InputError, match="2 processes are the controller of car 'orca'; end all"):
+        there(2)
+
+
+def test_a_request_that_is_turned_away_hears_that_the_process_is_busy(
+    pair: tuple[Any, Any],
+) -> None:
+    server, client = Inbox(pair[0], "orca"), Inbox(pair[1], "orca")
+    server.serve(STOP)
+    meet(server, client)
+    key, request = car_key(STOP.key, "orca"), encode(StopRequest(0, 0, ""))
+    waiting = [pair[1].get(key, payload=request, timeout=10.0) for _ in range(16)]
+    with pytest.raises(InputError, match=f"on {key} is busy: 16 requests wait already; try again"):
+        ask(pair[1], STOP, "orca", request)
+    assert server.turned_away == 1
+    for _ in waiting:
+        take(server, Kind.REQUEST).value.answer(Reply(0, 0, True, "", {}))
+    assert all(len(list(answers)) == 1 for answers in waiting)
+
+
 def test_a_malformed_request_is_refused_with_a_reason(pair: tuple[Any, Any]) -> None:
     server, client = Inbox(pair[0], "orca"), Inbox(pair[1], "orca")
     server.serve(STOP)
@@ -207,7 +243,7 @@ def test_a_question_that_was_lost_is_asked_again_but_for_a_rollback(pair: tuple[
     def answer(request: Request) -> None:
         heard.append(request.service.name)
         if len(heard) % 2:
-            threading.Timer(0.8, request.drop).start()
+            threading.Timer(0.8, request._query.drop).start()
         else:
             request.answer(Reply(0, 0, True, "yes", {}))
 

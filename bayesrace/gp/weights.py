@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesrace.errors import InputError
-from bayesrace.files import write_whole
+from bayesrace.files import read_whole, write_whole
 
 __all__ = [
     "FEATURES",
@@ -355,11 +355,7 @@ def write_weights(path: str | os.PathLike[str], weights: GpWeights) -> None:
 
 def read_weights(path: str | os.PathLike[str]) -> GpWeights:
     """Weights from a file; InputError names the file and what is wrong with it."""
-    try:
-        with Path(path).open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise InputError(f"cannot read weights file {path}: {error.strerror}") from error
+    data = read_whole(Path(path), "weights file", MAX_BYTES)
     try:
         return decode_weights(data)
     except InputError as error:

@@ -157,6 +157,7 @@ def car_key(template: str, car: str, source: str = "") -> str:
     """A key expression of the table for one car (and one source, where the key has it)."""
     if not _CAR_NAME.fullmatch(car):
         raise InputError(
-            f"car name '{car}' cannot be part of a key; use up to 40 letters, digits, '-' or '_'"
+            f"car name '{car[:60]}' cannot be part of a key; "
+            "use up to 40 letters, digits, '-' or '_'"
         )
     return template.format(car=car, source=source)

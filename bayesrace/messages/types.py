@@ -41,11 +41,12 @@ __all__ = [
 
 END_REASONS: Final = (
     "laps", "max_time", "stopped", "controller_lost", "actuation_timeout", "left_world",
-    "interrupted", "plant_fault", "abandoned",
+    "interrupted", "plant_fault", "abandoned", "several_controllers",
 )  # fmt: skip
 """Why a run ended, in the ``kind="run_ended"`` event's data under ``reason``; plant_fault: what
 plays the car has failed, and its last good state is sent once more as the final one; abandoned: who
-started it has been gone for long."""
+started it has been gone for long; several_controllers: at its regular end more than one was there,
+so that nobody knows which one has driven."""
 
 PHASES: Final = ("idle", "running", "waiting", "ready", "driving", "fallback", "stopped")
 """Of a process, see :class:`Status`."""

@@ -5,24 +5,23 @@ column names without # is accepted; comma or semicolon; spaces anywhere; the fir
 repeated at the end.
 """
 
-import math
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from bayesrace.errors import InputError
-from bayesrace.files import write_whole
+from bayesrace.files import read_text, write_whole
 from bayesrace.tracks.checks import find_fault
 from bayesrace.tracks.spline import FloatArray
 from bayesrace.tracks.track import Track, drop_repeated
 
 __all__ = ["read_table", "read_track", "write_track"]
 
-_LARGEST: Final = 4_000_000
-"""Bytes, and ..."""
 _MOST_POINTS: Final = 20_000
-"""... rows of a file: a point each centimetre of a track ten times as long as any here."""
+"""Rows of a file: a point each centimetre of a track ten times as long as any here."""
+_LARGEST: Final = 1e6
+"""Of the numbers in a file: above it, no SI unit of a track or a racing line makes sense."""
 
 COLUMNS = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")
 
@@ -65,19 +64,7 @@ def read_table(path: Path, columns: tuple[str, ...]) -> tuple[FloatArray, list[i
     Raises InputError for a file that can't be read, a wrong column count or a cell that is no
     number; what the numbers mean is checked by the caller.
     """
-    try:
-        size = path.stat().st_size
-        if size > _LARGEST:
-            raise InputError(
-                f"{path}: {size / 1e6:.0f} MB, at most {_LARGEST / 1e6:.0f} are read; "
-                "give fewer points"
-            )
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        reason = error.strerror or type(error).__name__
-        raise InputError(f"{path}: can't be read ({reason}); give an existing CSV file") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: is not a text file; give a CSV file in UTF-8") from None
+    text = read_text(path, "the CSV file", "give an existing one, of at most 20,000 points")
     values: list[list[float]] = []
     rows: list[int] = []
     for row, line in enumerate(text.splitlines(), start=1):
@@ -104,22 +91,30 @@ def _numbers(path: Path, row: int, cells: list[str], columns: tuple[str, ...]) -
             f"each row needs {', '.join(columns)}, separated by commas or semicolons"
         )
     try:
-        numbers = [float(cell) for cell in cells]
+        numbers = [_number(cell) for cell in cells]
     except ValueError as error:
         bad = next((cell for cell in cells if not _is_number(cell)), str(error))
         raise InputError(
             f"{path}, row {row}: '{bad[:40]}' is not a number; write numbers with a decimal point"
         ) from None
-    if not all(math.isfinite(number) for number in numbers):
+    if not all(abs(number) <= _LARGEST for number in numbers):
         raise InputError(
-            f"{path}, row {row}: a value is not finite; give every value as a finite number"
+            f"{path}, row {row}: a value is not finite or beyond {_LARGEST:.0f}; "
+            "give every value as a finite number in SI units"
         )
     return numbers
 
 
+def _number(cell: str) -> float:
+    """ValueError for what is no number to other programs, such as '1_0', either."""
+    if "_" in cell:
+        raise ValueError(cell)
+    return float(cell)
+
+
 def _is_number(cell: str) -> bool:
     try:
-        float(cell)
+        _number(cell)
     except ValueError:
         return False
     return True

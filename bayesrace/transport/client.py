@@ -28,7 +28,7 @@ from bayesrace.messages import (
     decode,
     encode,
 )
-from bayesrace.transport.inbox import Inbox, Kind
+from bayesrace.transport.inbox import BUSY, Inbox, Kind
 
 __all__ = [
     "Director",
@@ -78,13 +78,17 @@ def ask(
     key = car_key(service.key, car, source)
     limit_s = service.timeout_s if timeout_s is None else timeout_s
     begin = time.monotonic()
-    answers = ask_all(session, (key,), request, limit_s)[key]
+    turned_away: list[str] = []
+    answers = ask_all(session, (key,), request, limit_s, turned_away=turned_away)[key]
     # Without a process to answer, the first request returns at once and is not repeated.
-    lost = not answers and service.repeatable and time.monotonic() - begin > _LOST_S
+    lost = service.repeatable and (turned_away or time.monotonic() - begin > _LOST_S)
     while lost and not answers and (left_s := begin + limit_s - time.monotonic()) > _AGAIN_S:
         time.sleep(_AGAIN_S)
-        answers = ask_all(session, (key,), request, left_s - _AGAIN_S)[key]
+        left_s -= _AGAIN_S
+        answers = ask_all(session, (key,), request, left_s, turned_away=turned_away)[key]
     answer = decisive(_valid(service.answer, answers))
+    if answer is None and turned_away:
+        raise InputError(f"the process that answers on {key} is {turned_away[-1][:200]}; try again")
     if answer is None:
         # Who gives a time has it from an option of that name.
         longer = "" if timeout_s is None else " Or wait longer (--timeout)."
@@ -115,11 +119,13 @@ def ask_all(
     request: Message | bytes,
     timeout_s: float,
     where: zenoh.Locality = zenoh.Locality.ANY,
+    turned_away: list[str] | None = None,
 ) -> dict[str, list[bytes]]:
     """Every answer to one request, by key; all keys are asked at once.
 
     Returns when all have answered or the time is over. A key nobody answers on has none; one with
-    several answers belongs to several processes.
+    several answers belongs to several processes. Puts into ``turned_away`` why the request was not
+    looked at, where a process was too busy.
     """
     payload = request if isinstance(request, bytes) else encode(request)
     pending = {
@@ -136,10 +142,16 @@ def ask_all(
         )
         for key in keys
     }
-    return {
-        key: [one.ok.payload.to_bytes() for one in replies if one.ok is not None]
-        for key, replies in pending.items()
-    }
+    answers: dict[str, list[bytes]] = {key: [] for key in pending}
+    for key, replies in pending.items():
+        for one in replies:
+            if one.ok is not None:
+                answers[key].append(one.ok.payload.to_bytes())
+            elif turned_away is not None and one.err is not None:
+                text = one.err.payload.to_bytes().decode(errors="replace")
+                if text.startswith(BUSY):  # not an error of Zenoh's own, such as a timeout
+                    turned_away.append(text)
+    return answers
 
 
 def fetch_all(session: Any, service: Service[Any, Any], car: str) -> list[bytes]:
@@ -220,6 +232,21 @@ class Director:
         """What the process says of itself."""
         request = StatusRequest(0, time.monotonic_ns())
         return ask(self._session, STATUS, self._car, request, source)
+
+    def check_alone(self) -> None:
+        """InputError if several plants or controllers of this name are there.
+
+        Their messages cannot be told apart: each would drive, or be driven, now and then.
+        """
+        request = StatusRequest(0, time.monotonic_ns())
+        sources = {car_key(STATUS.key, self._car, one): one for one in ("plant", "controller")}
+        answers = ask_all(self._session, sources, request, STATUS.timeout_s)
+        for key, source in sources.items():
+            if (count := len(answers[key])) > 1:
+                raise InputError(
+                    f"{count} processes are the {source} of car '{self._car}'; end all but one, or "
+                    "give each car a name of its own (--name)"
+                )
 
     def start(self, request: RunRequest) -> Reply:
         """Start a run; InputError with the plant's reason if it refuses."""

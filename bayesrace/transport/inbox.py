@@ -34,6 +34,7 @@ from bayesrace.messages import (
 )
 
 __all__ = [
+    "BUSY",
     "LOCKSTEP_SPIN_S",
     "NEWEST",
     "Inbox",
@@ -49,7 +50,10 @@ _CAPACITY: Final = 10_000
 follow it. A full channel holds back the senders: those of the wall clock drop, by the table."""
 
 _REQUESTS: Final = 16
-"""At most so many requests wait; more are dropped, so that no backlog builds up."""
+"""At most so many requests wait; more are turned away, so that no backlog builds up."""
+
+BUSY: Final = "busy: "
+"""How the error begins that ends a request which is turned away."""
 
 NEWEST: Final = 1024
 """Messages of the control path that wait at most: a thread this far behind wants the newest."""
@@ -100,16 +104,18 @@ class Request:
         """Send the answer; one that nobody waits for any more is dropped."""
         self.answer_raw(encode(message))
 
-    def drop(self) -> None:
-        """Ends the request without an answer."""
-        self._query.drop()
-        self._query = None
-
     def answer_raw(self, data: bytes) -> None:
         """The same where the answer is not a message."""
+        self._end(lambda query: query.reply(query.key_expr, data))
+
+    def turn_away(self, why: str) -> None:
+        """Ends the request with an error in place of an answer: busy, and ``why``."""
+        self._end(lambda query: query.reply_err(BUSY + why))
+
+    def _end(self, reply: Callable[[Any], None]) -> None:
         query, self._query = self._query, None
         try:
-            query.reply(query.key_expr, data)
+            reply(query)
         except zenoh.ZError:
             pass
         finally:
@@ -183,7 +189,7 @@ class Inbox:
         def arrived(request: Request) -> None:
             if not self._room.acquire(blocking=False):
                 self.turned_away += 1
-                request.drop()
+                request.turn_away(f"{_REQUESTS} requests wait already")
                 return
             self._add(Item(Kind.REQUEST, service.name, request, time.monotonic_ns()))
 

@@ -14,7 +14,7 @@ from typing import Annotated, Final, Protocol, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from bayesrace.errors import InputError
-from bayesrace.files import write_whole
+from bayesrace.files import read_text, read_whole, write_whole
 from bayesrace.gp.weights import MAX_BYTES, decode_weights
 
 __all__ = ["HISTORY", "WITHDRAWN", "Accepted", "Store", "digest_of", "trimmed"]
@@ -99,9 +99,10 @@ class Store:
         self._folder = folder
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            text = (folder / _INDEX).read_text() if (folder / _INDEX).exists() else ""
         except OSError as error:
             raise InputError(f"store {folder}: {error.strerror}; choose another folder") from None
+        there = (folder / _INDEX).exists()
+        text = read_text(folder / _INDEX, "the store's index") if there else ""
         try:
             self._index = _Index.model_validate_json(text) if text else _Index()
         except ValidationError:
@@ -133,12 +134,11 @@ class Store:
         found = []
         for entry in self._index.entries:
             try:
-                path = self._folder / entry.file
-                data = path.read_bytes() if path.stat().st_size <= MAX_BYTES else b""
+                data = read_whole(self._folder / entry.file, "weights file", MAX_BYTES)
                 if digest_of(data) == entry.digest and decode_weights(data):
                     how = entry.proven, entry.accepted_utc_ns
                     found.append(Accepted(entry.number, entry.version, data, *how))
-            except (OSError, InputError):
+            except InputError:
                 continue
         return found
 

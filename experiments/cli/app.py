@@ -2,14 +2,16 @@
 
 import io
 import logging
+import shutil
 import sys
+from tempfile import gettempdir
 from typing import Annotated, Final
 
 import typer
 from pydantic import ValidationError
 
 from bayesrace import __version__
-from bayesrace.errors import InputError
+from bayesrace.errors import InputError, faults_in
 from bayesrace.interrupts import remembering_interrupts
 from experiments.cli import evaluation, fmu, latency, learning, operation, parts, preparation
 
@@ -39,7 +41,11 @@ def _options(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print and exit.")
     ] = False,
 ) -> None:
-    logging.basicConfig(level=logging.INFO, format="%(name)s: %(message)s", stream=sys.stderr)
+    from experiments.printable import PrintableFormatter
+
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(PrintableFormatter("%(name)s: %(message)s"))
+    logging.basicConfig(level=logging.INFO, handlers=[handler])
 
 
 for group in (evaluation, latency, preparation, learning, parts, operation, fmu):
@@ -74,12 +80,12 @@ def _in_words(error: Exception) -> str | None:
         case InputError():
             return str(error)
         case ValidationError():
-            return "; ".join(
-                f"{'.'.join(str(part) for part in one['loc']) or 'settings'}: {one['msg']}"
-                for one in error.errors()
-            )
+            return faults_in(error, "settings")
+        case shutil.Error():  # of several files: source, target, why
+            _, target, why = error.args[0][0]
+            return f"{target}: {why}; choose a path that can be written, or make room"
         case OSError():
-            where = error.filename or "system"
+            where = error.filename or f"the cache, {gettempdir()} or the output"
             return f"{where}: {error.strerror or error}; choose a path that can be read or written"
         case RecursionError():
             return "a file or an option is nested too deeply to be read"
@@ -90,7 +96,7 @@ def _in_words(error: Exception) -> str | None:
 
 
 def _fail(text: str, code: int = 2) -> None:
-    from experiments.picture import printable
+    from experiments.printable import printable
 
     lines = [printable(line.strip()) for line in text.splitlines() if line.strip()]
     several = any(line.startswith("- ") for line in lines)  # faults, as of a map: a line each

@@ -54,7 +54,6 @@ def race(
     controllers, and drives them as two processes over Zenoh. Leaves a run directory with the log,
     result.json and report.html.
     """
-    from rich.console import Console
 
     from experiments.analysis import read_race, write_result
     from experiments.progress import stages_on
@@ -63,6 +62,7 @@ def race(
     from experiments.report import render_report
     from experiments.settings import RaceSettings
     from experiments.table import print_table
+    from experiments.terminal import Terminal
 
     settings = RaceSettings(
         car=car, track=track, train_track=train_track, laps=laps, mode=mode.value, seed=seed,
@@ -71,7 +71,7 @@ def race(
     mpc = settings.mpc.model_copy(update={"constraints": constraints})
     settings = settings.model_copy(update={"mpc": mpc})
     out = out or Path("runs") / datetime.now(UTC).astimezone().strftime("%Y%m%d-%H%M%S")
-    console = Console()
+    console = Terminal()
     with stages_on(console) as stages:
         drive_all(settings, out, stages)
         with stages.stage("result and report"):
@@ -86,16 +86,16 @@ def report(
     run: Annotated[Path, typer.Argument(help="Run directory; a broken-off run will do.")],
 ) -> None:
     """Make result.json, the table and report.html again from a run's log."""
-    from rich.console import Console
 
     from experiments.analysis import read_race, write_result
     from experiments.race import FILES
     from experiments.report import render_report
     from experiments.table import print_table
+    from experiments.terminal import Terminal
 
     analysis = read_race(run)
     write_result(run / FILES.result, analysis.result)
-    print_table(analysis.result, Console())
+    print_table(analysis.result, Terminal())
     typer.echo(str(render_report(run, analysis.result, analysis)))
 
 
@@ -115,8 +115,8 @@ def drive(
     name: CarName = "",
 ) -> None:
     """Start a run on a plant and a controller that are waiting elsewhere, and record it."""
-    from bayesrace.log import Recorder
     from bayesrace.messages import EVENT, Event
+    from bayesrace.recorder import Recorder
     from bayesrace.tracks import load_track
     from bayesrace.transport import Director, Publisher, open_session
     from experiments.drive import RunPlan, execute
@@ -155,12 +155,12 @@ def bench(
     seed: Seed = 0,
 ) -> None:
     """Time the compiled step beside the paper's formulation in CasADi + IPOPT, same problems."""
-    from rich.console import Console
 
     from experiments.bench import BenchSettings, run_bench
     from experiments.progress import stages_on
+    from experiments.terminal import Terminal
 
-    console = Console()
+    console = Terminal()
     with stages_on(console) as stages:
         chosen = {} if not track else {"tracks": tuple(track)}
         settings = BenchSettings(problems=problems, peers=peers, points=points, seed=seed, **chosen)

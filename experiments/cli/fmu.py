@@ -170,14 +170,14 @@ def inspect(
     every: Annotated[bool, typer.Option("--all", help="Local variables, too.")] = False,
 ) -> None:
     """Print an FMU's variables; write a map for 'bayesrace plant --fmu' to start from."""
-    from rich.console import Console
 
     from experiments.fmu_table import FmuTable
+    from experiments.terminal import Terminal
     from plant.fmu.inspection import inspect as read
     from plant.fmu.proposal import starting_map
 
     description = read(file)
-    Console().print(FmuTable(description, all_=every))
+    Terminal().print(FmuTable(description, all_=every))
     if map_file is not None:
         if map_file.exists():
             raise InputError(f"{map_file} exists already; choose another name or remove it")

@@ -56,13 +56,13 @@ def latency(
         raise InputError("--endpoint is of a running system: add --attach, or leave it out")
     if attach and (weights or artefact or raceline):
         raise InputError("--weights, --artefact and --raceline are for what is started here")
-    from rich.console import Console
 
     from bayesrace.realtime import RealtimeSettings
     from bayesrace.tracks import DEFAULT_RACE_TRACK
     from experiments.latency.report import print_report
     from experiments.latency.settings import LatencySettings
     from experiments.progress import stages_on
+    from experiments.terminal import Terminal
 
     ends = connect_to(endpoint).connect if attach else ()
     settings = LatencySettings(
@@ -78,7 +78,7 @@ def latency(
         from experiments.latency.attach import measure_attached as measure
     else:
         from experiments.latency.run import measure_latency as measure
-    console = Console()
+    console = Terminal()
     with stages_on(console) as stages:
         measured = measure(settings, out, stages)
     print_report(measured.result, console)

@@ -58,11 +58,11 @@ def validate(
     Compare drives that the weights have not seen. Samples that training would leave out are left
     out here too.
     """
-    from rich.console import Console
 
     from bayesrace.gp.weights import read_weights
     from bayesrace.tracks import load_track
     from experiments.learning_table import print_validation
+    from experiments.terminal import Terminal
     from experiments.validation import validate_weights
 
     course = None if track is None else load_track(track)
@@ -87,7 +87,7 @@ def validate(
             if out is not None:
                 driven = track_figure(judged.dataset, judged.validation, threshold, course)
                 write_png(driven, out / "track.png")
-    print_validation(judged.result, Console())
+    print_validation(judged.result, Terminal())
 
 
 def publish(
@@ -101,10 +101,12 @@ def publish(
     Exit code 0 once it drives with them, 1 if it refuses (and says so if only for now), 2 if it
     cannot be asked.
     """
+    from bayesrace.files import read_whole
+    from bayesrace.gp.weights import MAX_BYTES
     from bayesrace.transport import open_session, send_weights
-    from experiments.learn.publishing import Answer, NotTakenOverError, read_bytes
+    from experiments.learn.publishing import Answer, NotTakenOverError
 
-    data = read_bytes(weights)
+    data = read_whole(weights, "weights file", MAX_BYTES)
     endpoints = connect_to(endpoint)
     with open_session(endpoints) as session:
         car = _controller(session, endpoints, name, timeout)

@@ -48,11 +48,11 @@ def status(
     Without --name: all cars that are found. A process that is there and does not answer is shown
     as such; if none answers, that is an error.
     """
-    from rich.console import Console
 
     from bayesrace.transport import open_session
     from experiments.operation import ask_statuses, find
     from experiments.status_table import StatusTable
+    from experiments.terminal import Terminal
 
     endpoints = connect_to(endpoint)
     with open_session(endpoints) as session, _until_nobody_reads():
@@ -64,7 +64,7 @@ def status(
         elif as_json:
             _print_json(picture)
         else:
-            Console().print(StatusTable(picture))
+            Terminal().print(StatusTable(picture))
     if not watch and not picture.answering:
         raise InputError(
             f"none of the processes found answers within {timeout:g} s; they hang, are of another "
@@ -73,13 +73,13 @@ def status(
 
 
 def _watch(session: object, picture: "Picture", name: str) -> None:
-    from rich.console import Console
     from rich.live import Live
 
     from experiments.operation import follow
     from experiments.status_table import StatusTable
+    from experiments.terminal import Terminal
 
-    with Live(console=Console(), auto_refresh=False) as live:
+    with Live(console=Terminal(), auto_refresh=False) as live:
 
         def show(car: str | None) -> None:
             if car is None:
@@ -155,7 +155,7 @@ def _command(
     from bayesrace.messages import Reply
     from bayesrace.transport import open_session
     from experiments.operation import command, find, pick
-    from experiments.picture import printable
+    from experiments.printable import printable
 
     endpoints = connect_to(endpoint)
     with open_session(endpoints) as session:

@@ -50,10 +50,10 @@ def tracks(
 ) -> None:
     """List the built-in tracks, check a track file, or write a track to a file."""
     import numpy as np
-    from rich.console import Console
     from rich.table import Table
 
     from bayesrace.tracks import builtin_tracks, load_track, write_track
+    from experiments.terminal import Terminal
 
     if out is not None and name is None:
         raise InputError("--out needs the name of the track to write")
@@ -68,7 +68,7 @@ def tracks(
         )  # fmt: skip
         if out is not None:
             write_track(out, track)
-    Console().print(table)
+    Terminal().print(table)
 
 
 def raceline(
@@ -153,13 +153,13 @@ def train(
     Beyond --points, samples are chosen one by one where the GP knows least; what that costs is
     printed beside a choice by chance.
     """
-    from rich.console import Console
 
     from bayesrace.gp.weights import write_weights
     from bayesrace.manifest import read_manifest
     from bayesrace.vehicles import get_car
     from experiments.learning_table import print_choices, print_kernels
     from experiments.progress import stages_on
+    from experiments.terminal import Terminal
     from learning.dataset import left_out
     from learning.residual import discretisation_of
     from learning.sources import read_samples
@@ -172,7 +172,7 @@ def train(
         wanted = discretisation_of(manifest.discretisation, get_car(manifest.car))
         manifest.check_points(points)
     samples = read_samples([*(logs or []), *(data or [])], car, name, wanted)
-    console = Console()
+    console = Terminal()
     every = tuple(one.value for one in KernelChoice if one is not KernelChoice.auto)
     settings = TrainingSettings(
         kernels=every if kernel is KernelChoice.auto else (kernel.value,),

@@ -7,11 +7,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from bayesrace.errors import InputError
+from bayesrace.files import read_whole
+from bayesrace.gp.weights import MAX_BYTES
 from bayesrace.messages import STATUS, Event, Reply, StatusRequest
 from bayesrace.transport import ask, send_weights
 from experiments.learn.feed import Feed, What
 from experiments.learn.journal import Journal, UpdateRecord
-from experiments.learn.publishing import Answer, read_bytes
+from experiments.learn.publishing import Answer
 
 __all__ = ["Desk"]
 
@@ -159,7 +161,7 @@ class Desk:
 
     def _send(self, update: UpdateRecord) -> None:
         try:
-            data = read_bytes(self._journal.path(update.file))
+            data = read_whole(self._journal.path(update.file), "weights file", MAX_BYTES)
         except InputError as error:
             self._say(f"{update.version}: {error}")
         else:

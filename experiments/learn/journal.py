@@ -24,10 +24,10 @@ from itertools import count
 from pathlib import Path
 from typing import IO, Final, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from bayesrace.errors import InputError
-from bayesrace.files import clear_partials, write_whole
+from bayesrace.errors import InputError, faults_in
+from bayesrace.files import clear_partials, read_whole, write_whole
 from experiments.learn.settings import LearnSettings
 
 __all__ = ["MOST_WEIGHTS", "Journal", "LapRecord", "Record", "UpdateRecord"]
@@ -145,8 +145,8 @@ class Journal:
         """Those of the job that has left this folder; InputError if none has."""
         path = folder / _Files.settings
         try:
-            return LearnSettings.model_validate_json(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError):  # ValidationError is a ValueError
+            return LearnSettings.model_validate_json(read_whole(path, "the settings"))
+        except (InputError, ValidationError):
             raise InputError(f"{path} is of no learning job; choose another folder") from None
 
     def close(self) -> None:
@@ -257,9 +257,11 @@ class Journal:
         if not path.exists():
             return Record()
         try:
-            return Record.model_validate_json(path.read_text(encoding="utf-8"))
-        except ValueError as error:  # ValidationError is one
-            raise InputError(f"{path} cannot be read ({error}); choose another folder") from None
+            return Record.model_validate_json(read_whole(path, "the journal", 1 << 28))
+        except ValidationError as error:
+            raise InputError(
+                f"{path} cannot be read ({faults_in(error)}); choose another folder"
+            ) from None
 
     def _write(self, record: Record) -> None:
         self.record = record

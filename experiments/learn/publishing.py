@@ -1,13 +1,10 @@
-"""What publishing weights comes to: the file that is sent, and what the controller makes of it."""
+"""What the controller makes of published weights."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
-from bayesrace.errors import InputError
-from bayesrace.gp.weights import MAX_BYTES
 from bayesrace.messages import Reply, Scalar
 
-__all__ = ["Answer", "NotTakenOverError", "read_bytes"]
+__all__ = ["Answer", "NotTakenOverError"]
 
 
 class NotTakenOverError(RuntimeError):
@@ -58,21 +55,6 @@ class Answer:
         which = "" if self.acceptance is None else f" (acceptance {self.acceptance})"
         kept = f", but not kept: {self.not_kept}" if self.not_kept else ""
         return f"taken over at cycle {self.cycle}{which}{kept}"
-
-
-def read_bytes(path: Path) -> bytes:
-    """A weights file as it is: whether it is any good is the controller's to judge.
-
-    InputError if it cannot be read, or is longer than any weights.
-    """
-    try:
-        with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise InputError(f"cannot read weights file {path}: {error.strerror}") from error
-    if len(data) > MAX_BYTES:
-        raise InputError(f"{path} is longer than any weights file; give one from 'bayesrace train'")
-    return data
 
 
 def _count(value: Scalar | None) -> int | None:

@@ -6,6 +6,7 @@ from rich.table import Table
 from rich.text import Text
 
 from experiments.learn.journal import LapRecord, Record, UpdateRecord
+from experiments.terminal import Terminal
 
 __all__ = ["print_laps"]
 
@@ -15,7 +16,7 @@ _MOST: int = 40
 
 def print_laps(record: Record, console: Console | None = None) -> None:
     """A row for each lap, with the update that followed it."""
-    console = console or Console()
+    console = console or Terminal()
     updates = {update.after_lap: update for update in record.updates}
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False)
     for title in ("lap", "time\ns", "new", "of", "in\ns"):

@@ -116,6 +116,7 @@ class _Base:
         self._fmu = fmu
         self._inputs = self._blocks(inputs)
         self._outputs = self._blocks(outputs)
+        self._initialised = False
 
     def _blocks(self, variables: Sequence[Variable]) -> list[tuple[str, _Block]]:
         by_type: dict[str, list[tuple[int, int]]] = {}
@@ -128,6 +129,7 @@ class _Base:
 
     def _bind(self) -> None:
         """Binds the transfers to the instance that has just been made."""
+        self._initialised = False
         for direction, blocks in (("Set", self._inputs), ("Get", self._outputs)):
             for name, block in blocks:
                 block.run = self._transfer(direction, name, block.references, block.values)
@@ -213,6 +215,7 @@ class _Fmi2(_Base):
             self.set(variable, value)
         _call(self._fmu.enterInitializationMode)
         _call(self._fmu.exitInitializationMode)
+        self._initialised = True
 
     def advance(self, time_s: float, step_s: float) -> None:
         fmu = self._fmu
@@ -241,7 +244,8 @@ class _Fmi2(_Base):
 
     def free(self) -> None:
         try:
-            _call(self._fmu.fmi2Terminate, self._fmu.component)
+            if self._initialised:  # before, FMI allows no end but to free it
+                _call(self._fmu.fmi2Terminate, self._fmu.component)
         finally:
             self._fmu.fmi2FreeInstance(self._fmu.component)
 
@@ -287,6 +291,7 @@ class _Fmi3(_Base):
             self.set(variable, value)
         _call(fmu.enterInitializationMode)
         _call(fmu.exitInitializationMode)
+        self._initialised = True
 
     def advance(self, time_s: float, step_s: float) -> None:
         fmu, end_s = self._fmu, time_s + step_s
@@ -309,7 +314,8 @@ class _Fmi3(_Base):
 
     def free(self) -> None:
         try:
-            _call(self._fmu.fmi3Terminate, self._fmu.component)
+            if self._initialised:  # before, FMI allows no end but to free it
+                _call(self._fmu.fmi3Terminate, self._fmu.component)
         finally:
             self._fmu.fmi3FreeInstance(self._fmu.component)
 

@@ -23,6 +23,7 @@ from pydantic import (
 )
 
 from bayesrace.errors import InputError
+from bayesrace.files import read_text
 
 __all__ = [
     "Derive",
@@ -213,9 +214,4 @@ def _faults(error: ValidationError) -> str:
 
 def read_map(path: Path) -> FmuMap:
     """The map in a file; InputError if it cannot be read or is not one."""
-    try:
-        return parse_map(path.read_text(encoding="utf-8"), str(path))
-    except OSError as error:
-        raise InputError(f"cannot read the map {path}: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise InputError(f"the map {path} is not UTF-8 text") from None
+    return parse_map(read_text(path, "the map"), str(path))

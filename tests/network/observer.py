@@ -20,8 +20,8 @@ from typing import Any, Protocol
 import zenoh
 
 from bayesrace.errors import InputError
-from bayesrace.log import Recorder
 from bayesrace.messages import STATE, State, car_key, decode
+from bayesrace.recorder import Recorder
 from bayesrace.tracks import Track, load_track
 from bayesrace.transport import Director, Endpoints, open_session
 from experiments.drive import RunPlan, run_request

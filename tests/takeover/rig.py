@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from bayesrace.gp.weights import GpWeights, encode_weights, write_weights
-from bayesrace.log import LogReader, Recorder
+from bayesrace.log import LogReader
 from bayesrace.messages import EVENT, STATE, TELEMETRY, Event, State, car_key, decode
 from bayesrace.raceline.line import write_raceline
+from bayesrace.recorder import Recorder
 from bayesrace.tracks import Track, write_track
 from bayesrace.transport import (
     Director,

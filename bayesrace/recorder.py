@@ -1,0 +1,221 @@
+"""Records every message of a car in a log that is readable whatever happens to this process.
+
+What is written is handed to the system at least every 0.2 s: a killed process loses at most that.
+"""
+
+import logging
+import threading
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final, Self
+
+import zenoh
+
+from bayesrace.errors import InputError
+from bayesrace.log import LogWriter, topic_of
+from bayesrace.messages import EVENT, Event, car_key, encode
+from bayesrace.messages.codec import peek_seq
+
+__all__ = ["FLUSH_PERIOD_S", "Recorder", "RecorderCounters"]
+
+_log = logging.getLogger("bayesrace.recorder")
+
+FLUSH_PERIOD_S: Final = 0.2
+_BATCH_S: Final = 0.002
+_CHANNEL_CAPACITY: Final = 1 << 16
+_MOST_KEYS: Final = 256
+"""A log's own keys are eight; the format has room for 65,535."""
+
+
+def _in_table(key: str) -> bool:
+    """Whether the table has this very key, of whatever car."""
+    topic, source = topic_of(key), key.rsplit("/", 1)[-1]
+    return topic is not None and ("{source}" not in topic.key or source in topic.sources)
+
+
+@dataclass(slots=True)
+class RecorderCounters:
+    """What a recorder saw."""
+
+    written: int = 0
+    missing: int = 0
+    """Messages that must have been sent, by their numbers, and did not arrive."""
+    disordered: int = 0
+    """Messages with a number not above the one before, restarts from 0 aside."""
+    restarts: int = 0
+    """Times that a sender began again at 0."""
+    unnumbered: int = 0
+    """Messages without a readable number; written all the same."""
+    unrecorded: int = 0
+    """Messages on more keys than a log has room for, let go."""
+
+
+class Recorder:
+    """Writes every message of a car (``bayesrace/{car}/**``) from a thread of its own.
+
+    Log times are those of writing, some milliseconds after arrival; the messages carry the times
+    at which they were made.
+    Its channel holds more than any stall needs and then blocks the senders: in lockstep it never
+    loses a message. ``with`` it; on the way out it waits for stragglers and finishes the file.
+    """
+
+    def __init__(
+        self,
+        session: Any,
+        car: str,
+        path: Path,
+        metadata: Mapping[str, Mapping[str, str]] | None = None,
+    ) -> None:
+        self.counters = RecorderCounters()
+        self.failed = ""
+        """Why the log cannot be written; empty while it can. Messages are then let go."""
+        self.gaps: list[str] = []
+        """The first few gaps in the numbering, in words."""
+        self._last: dict[str, int] = {}
+        self._keys: set[str] = set()
+        self._path, self._session = path, session
+        self._event_key = car_key(EVENT.key, car, "recorder")
+        self._writer = LogWriter(path, metadata)
+        self._lock = threading.Lock()
+        self._subscriber = session.declare_subscriber(
+            car_key("bayesrace/{car}/**", car), zenoh.handlers.FifoChannel(_CHANNEL_CAPACITY)
+        )
+        self._quiet_since_ns = time.monotonic_ns()
+        self._stop = threading.Event()
+        self._threads = [
+            threading.Thread(target=run, name=f"recorder-{name}", daemon=True)
+            for name, run in (("write", self._write_all), ("flush", self._flush_often))
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def settle(self, quiet_s: float = 0.1, at_most_s: float = 2.0) -> None:
+        """Wait until nothing has arrived for a while; then all of it can be read from the file.
+
+        Raises InputError if the log cannot be written any more, such as on a full disk.
+        """
+        give_up_ns = time.monotonic_ns() + int(at_most_s * 1e9)
+        while (now_ns := time.monotonic_ns()) < give_up_ns:
+            if now_ns - self._quiet_since_ns >= quiet_s * 1e9:
+                break
+            time.sleep(quiet_s / 5)
+        self._flush()
+        if self.failed:
+            raise InputError(self.failed)
+
+    def close(self) -> None:
+        """Wait for stragglers, stop, finish the file; a second call does nothing."""
+        if self._stop.is_set():
+            return
+        try:
+            self.settle()
+        finally:
+            self._stop.set()
+            self._subscriber.undeclare()
+            for thread in self._threads:
+                thread.join()
+            if self.counters.unrecorded:
+                _log.warning(
+                    "%s: %d messages on more than %d keys of other programs were not recorded",
+                    self._path, self.counters.unrecorded, _MOST_KEYS,
+                )  # fmt: skip
+            with suppress(OSError, ValueError):
+                counted = {name: str(count) for name, count in asdict(self.counters).items()}
+                self._writer.add_metadata("recorder", counted)
+                self._writer.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _write_all(self) -> None:
+        handler = self._subscriber.handler
+        while True:
+            try:
+                sample = handler.recv()
+                while sample is not None:
+                    self._write(sample)
+                    sample = handler.try_recv()
+            except zenoh.ZError:  # undeclared and drained
+                return
+            # Waking for a batch instead of each message leaves the CPU to who is recorded.
+            time.sleep(_BATCH_S)
+
+    def _write(self, sample: Any) -> None:
+        now_ns = time.monotonic_ns()
+        key, data = str(sample.key_expr), sample.payload.to_bytes()
+        if not data:  # an inbox of the same session waking itself
+            return
+        self._quiet_since_ns = now_ns
+        if not self._known(key):
+            self.counters.unrecorded += 1
+            return
+        seq = peek_seq(data)
+        self._account(key, seq)
+        if self.failed:
+            return
+        try:
+            with self._lock:
+                self._writer.write(key, data, now_ns, 0 if seq is None else seq & 0xFFFFFFFF)
+        except Exception as error:
+            self._fail(error)
+
+    def _known(self, key: str) -> bool:
+        """Whether messages on this key are written: the table's, and a bounded number of others."""
+        if key not in self._keys and (len(self._keys) < _MOST_KEYS or _in_table(key)):
+            self._keys.add(key)
+        return key in self._keys
+
+    def _fail(self, error: Exception) -> None:
+        """Notes the failure in :attr:`failed`, and publishes one event about it."""
+        if self.failed:
+            return
+        why = f"{type(error).__name__}: {error}"
+        if isinstance(error, OSError):
+            gone = isinstance(error, FileNotFoundError)
+            why = "it has been deleted" if gone else f"{error.strerror}; make room and drive again"
+        self.failed = f"cannot write the log {self._path}: {why}"
+        now_ns = time.monotonic_ns()
+        event = Event(0, now_ns, 0, "recorder", "recorder_failed", self.failed[:2000], {})
+        with suppress(zenoh.ZError):
+            # Not to itself, who takes nothing from its channel at this moment.
+            self._session.put(
+                self._event_key, encode(event), allowed_destination=zenoh.Locality.REMOTE
+            )
+
+    def _flush(self) -> None:
+        try:
+            with self._lock:
+                self._writer.flush()
+            # A file that has been deleted takes everything, and nobody will ever read it.
+            self._path.stat()
+        except (OSError, ValueError) as error:
+            self._fail(error)
+
+    def _flush_often(self) -> None:
+        while not self._stop.wait(FLUSH_PERIOD_S):
+            self._flush()
+
+    def _account(self, key: str, seq: int | None) -> None:
+        counters = self.counters
+        counters.written += 1
+        if seq is None:
+            counters.unnumbered += 1
+            return
+        last = self._last.get(key)
+        self._last[key] = seq
+        if last is None or seq == last + 1:
+            return
+        if seq == 0:
+            counters.restarts += 1
+        elif seq <= last:
+            counters.disordered += 1
+        else:
+            counters.missing += seq - last - 1
+            if len(self.gaps) < 20:
+                self.gaps.append(f"{key}: {last + 1} to {seq - 1} missing")
