@@ -46,11 +46,13 @@ bench: $(VENV)/.ready
 # RUNNER: 'make check' measures coverage.
 RUNNER = $(BIN)/python -m
 TIER = not check
+# Pairs of processes in real time that run at once.
+PAIRS = 3
 PYTEST = $(RUNNER) pytest --dist worksteal
 define RUN_TESTS
 	@$(PYTEST) --numprocesses auto --maxprocesses 8 $(ARGS) -m "($(TIER)) and not wall_clock"; \
 	computing=$$?; \
-	$(PYTEST) --numprocesses 3 $(ARGS) -m "($(TIER)) and wall_clock"; meeting=$$?; $(TOOK); \
+	$(PYTEST) --numprocesses $(PAIRS) $(ARGS) -m "($(TIER)) and wall_clock"; meeting=$$?; $(TOOK); \
 	for code in $$computing $$meeting; do [ $$code -eq 0 ] || [ $$code -eq 5 ] || exit $$code; done; \
 	[ $$computing -ne 5 ] || [ $$meeting -ne 5 ] || { echo "ARGS selects no test" >&2; exit 5; }
 endef
@@ -73,6 +75,7 @@ tools:
 	@.ci/tools
 
 rest: TIER = check
+rest: PAIRS = 4
 rest: $(VENV)/.ready-dev
 	$(RUN_TESTS)
 

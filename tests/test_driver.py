@@ -274,3 +274,20 @@ def test_another_plant_begins_anew_and_its_forerunner_is_not_heard(rig: Rig) -> 
     assert not rig.driver.observe(left_over)
     assert rig.driver.states.foreign == 1
     assert rig.cycle().level is Level.SOLUTION
+
+
+def test_second_starts_and_jumps_of_the_cost_are_counted(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    driving(rig, 5)
+    assert (rig.driver.second_starts, rig.driver.cost_jumps) == (0, 0)
+    step = rig.controller.step
+
+    def odd(*arguments: Any) -> Any:
+        output = step(*arguments)
+        output.second_start, output.cost_shifted, output.cost = 1, 1.0, 100.0
+        return output
+
+    monkeypatch.setattr(rig.controller, "step", odd)
+    rig.cycle()
+    assert (rig.driver.second_starts, rig.driver.cost_jumps) == (1, 1)
