@@ -14,16 +14,49 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_whole
+from bayesrace.native_interface import ABI
 
-__all__ = ["ABI", "LIBRARY", "MANIFEST", "Manifest", "check_library", "read_manifest"]
-
-ABI: Final = 5
-"""Version of the C interface in controller/native/bayesrace_mpc.h."""
+__all__ = [
+    "LIBRARY",
+    "MANIFEST",
+    "Manifest",
+    "ParameterInfo",
+    "ProblemInfo",
+    "check_library",
+    "read_manifest",
+]
 
 _ROOT: Final = 0
 
 LIBRARY: Final = "libmpc.so"
 MANIFEST: Final = "manifest.json"
+
+
+class ParameterInfo(BaseModel):
+    """One run-time parameter of a problem."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str
+    unit: str
+    text: str
+    low: float
+    high: float
+    positive: bool = Field(description="has to be above zero")
+
+
+class ProblemInfo(BaseModel):
+    """The control problem, as far as its users need it; codegen/problems/ describes it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str
+    states: list[str]
+    inputs: list[str]
+    stage_parameters: list[str]
+    parameters: list[ParameterInfo] = Field(description="in the order of br_mpc_parameters")
+    features: list[str] = Field(description="of the residual")
+    outputs: int = Field(description="of the residual")
 
 
 class Manifest(BaseModel):
@@ -32,6 +65,7 @@ class Manifest(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     abi: int = Field(description="version of the C interface")
+    problem: ProblemInfo
     model: str = Field(description="vehicle model the OCP predicts with")
     car: str
     car_digest: str = Field(description="identity of the car's parameters")

@@ -107,7 +107,7 @@ static void fill_cost(br_mpc *mpc, int k, struct d_ocp_qp *qp) {
     double q[NXA * NXA] = {0}, qv[NXA] = {0}, s[BR_NU * NXA] = {0};
     if (k < BR_N) {
         const double *u = mpc->plan.u[k];
-        const double change = u[0] - (k ? mpc->plan.u[k - 1][0] : mpc->d_previous);
+        const double change = u[0] - (k ? mpc->plan.u[k - 1][0] : mpc->u_before[0]);
         double r[BR_NU * BR_NU] = {2 * p->r_duty, 0, 0, 2 * p->r_delta_rate};
         double rv[BR_NU] = {2 * p->r_duty * change, 2 * p->r_delta_rate * u[1]};
         d_ocp_qp_set_R(k, r, qp);
@@ -283,13 +283,13 @@ int main(int argc, char **argv) {
         at += 10 + 7 * n;
     }
     if (br_mpc_set_parameters(mpc, &p) || br_mpc_set_weights(mpc, outputs)) return 1;
-    mpc->d_lowest = p.d_min; /* as for a car that is rolling */
     set_up_hpipm();
     FILE *out = fopen(argv[2], "wb");
     if (!out) return 1;
     for (++at; at + 8 + 6 * BR_N <= end; at += 8 + 6 * BR_N) {
         memcpy(mpc->x0, at, sizeof mpc->x0);
-        mpc->d_previous = at[7];
+        mpc->u_before[0] = at[7];
+        br_evaluate_bounds(mpc);
         memcpy(mpc->reference, at + 8, sizeof mpc->reference);
         memset(&mpc->info, 0, sizeof mpc->info);
         const int warm = mpc->warm;

@@ -12,24 +12,35 @@ import tempfile
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from bayesrace.cache import cache_folder, digest, locked, software
 from bayesrace.cpu import cpu_digest, cpu_identity
 from bayesrace.errors import InputError
 from bayesrace.manifest import (
-    ABI,
     LIBRARY,
     MANIFEST,
     Manifest,
+    ParameterInfo,
+    ProblemInfo,
     check_library,
     read_manifest,
 )
+from bayesrace.native_interface import ABI, c_interface
 from bayesrace.vehicles import get_car
 from codegen.compiler import FLAGS, Compiler, find_compiler
 from codegen.settings import BuildSettings
 
-__all__ = ["NATIVE", "build", "build_hash", "generate"]
+if TYPE_CHECKING:
+    from codegen.problems.problem import Problem
+
+__all__ = [
+    "NATIVE",
+    "build",
+    "build_hash",
+    "generate",
+    "problem_of",
+]
 
 _ROOT: Final = Path(__file__).resolve().parents[1]
 
@@ -41,13 +52,20 @@ _SHAPED_BY: Final = (
     "codegen",
     "bayesrace/vehicles",
     "bayesrace/integrators.py",
+    "bayesrace/native_interface.py",
 )
 
 
-def build_hash(settings: BuildSettings, compiler: Compiler) -> str:
-    """Identity of the artefact: settings, car, every source file, CasADi, compiler, CPU."""
+def build_hash(
+    settings: BuildSettings, compiler: Compiler, problem: "Problem | None" = None
+) -> str:
+    """Identity of the artefact: settings, car, every source file, CasADi, compiler, CPU.
+
+    Of a problem that no source file here describes, its header and functions, too.
+    """
     return digest(
         [
+            *_identity_of(problem),
             settings.model_dump_json(),
             get_car(settings.car).model_dump_json(),
             *compiler.command,
@@ -59,21 +77,37 @@ def build_hash(settings: BuildSettings, compiler: Compiler) -> str:
     )
 
 
-def generate(settings: BuildSettings, folder: Path) -> None:
-    """Writes br_model.c, br_model.h and br_config.h into ``folder``."""
+def _identity_of(problem: "Problem | None") -> list[str]:
+    if problem is None:
+        return []
+    from codegen.problems.generate import c_header, functions
+
+    return [c_header(problem), *(one.serialize() for one in functions(problem))]
+
+
+def problem_of(settings: BuildSettings) -> "Problem":
+    """The control problem that these settings name."""
+    from bayesrace.vehicles.models import MODELS
+    from codegen.problems.tracking import tracking
+
+    return tracking(MODELS[settings.model](get_car(settings.car)), settings.discretisation)
+
+
+def generate(problem: "Problem", settings: BuildSettings, folder: Path) -> None:
+    """Writes br_model.c, br_model.h, br_config.h, br_interface.h and br_problem.h into a folder."""
     import casadi as ca
 
-    from bayesrace.vehicles.models import MODELS
-    from codegen.stage import advance_function, linearise_function
+    from codegen.problems.generate import c_header, functions
 
-    model = MODELS[settings.model](get_car(settings.car))
     # CasADi derives the include guard from the name and writes into the working folder
     generator = ca.CodeGenerator(
         "br_model.c", {"with_header": True, "casadi_int": "int", "with_export": False}
     )
-    generator.add(linearise_function(model, settings.discretisation))
-    generator.add(advance_function(model, settings.discretisation))
+    for function in functions(problem):
+        generator.add(function)
     generator.generate(str(folder) + os.sep)
+    (folder / "br_problem.h").write_text(c_header(problem))
+    (folder / "br_interface.h").write_text(c_interface())
     (folder / "br_config.h").write_text(
         "/* generated: dimensions of this controller */\n"
         "#ifndef BR_CONFIG_H\n#define BR_CONFIG_H\n"
@@ -93,9 +127,10 @@ def casadi_includes() -> tuple[Path, Path]:
     return package / "include", package / "libdaqpstat.a"
 
 
-def _compile(settings: BuildSettings, compiler: Compiler, folder: Path) -> None:
+def _compile(problem: "Problem", settings: BuildSettings, compiler: Compiler, folder: Path) -> None:
+    """Everything of an artefact but its manifest, into an empty folder."""
     include, daqp = casadi_includes()
-    generate(settings, folder)
+    generate(problem, settings, folder)
     for path in NATIVE.glob("*.[ch]"):
         shutil.copy(path, folder)
     shutil.copytree(include / "daqp", folder / "daqp")
@@ -108,15 +143,18 @@ def _compile(settings: BuildSettings, compiler: Compiler, folder: Path) -> None:
 
 
 def build(
-    settings: BuildSettings, progress: Callable[[str], None] = lambda _: None
+    settings: BuildSettings,
+    progress: Callable[[str], None] = lambda _: None,
+    problem: "Problem | None" = None,
 ) -> tuple[Path, Manifest]:
     """Artefact folder and manifest of the controller; from the cache if it is there.
 
+    ``problem``: one of your own, with the step of ``settings.discretisation``; tracking without.
     Raises CompileError with the compiler's own words, InputError if there is no compiler.
     """
     compiler = find_compiler()
-    identity = build_hash(settings, compiler)
-    target = cache_folder() / f"{settings.model}-{identity}"
+    identity = build_hash(settings, compiler, problem)
+    target = cache_folder() / f"{problem.name if problem else settings.model}-{identity}"
 
     def built() -> tuple[Path, Manifest] | None:
         """What the cache has; None if it is absent, damaged, or somebody else's."""
@@ -138,8 +176,9 @@ def build(
         with tempfile.TemporaryDirectory(dir=target.parent, prefix=_partial(target)) as temporary:
             folder = Path(temporary) / "artefact"
             folder.mkdir()
-            _compile(settings, compiler, folder)
-            manifest = _manifest(settings, compiler, identity, folder)
+            problem = problem or problem_of(settings)
+            _compile(problem, settings, compiler, folder)
+            manifest = _manifest(problem, settings, compiler, identity, folder)
             (folder / MANIFEST).write_text(manifest.model_dump_json(indent=1) + "\n")
             for one in (folder, folder / LIBRARY):
                 one.chmod(0o755)  # whatever the umask: what others may write is not loaded
@@ -168,10 +207,32 @@ def _clear(target: Path) -> None:
         ) from None
 
 
-def _manifest(settings: BuildSettings, compiler: Compiler, identity: str, folder: Path) -> Manifest:
+def _manifest(
+    problem: "Problem", settings: BuildSettings, compiler: Compiler, identity: str, folder: Path
+) -> Manifest:
+    """What the compiled controller in the folder is."""
     car = get_car(settings.car)
     return Manifest(
         abi=ABI,
+        problem=ProblemInfo(
+            name=problem.name,
+            states=[one.name for one in problem.states],
+            inputs=[one.name for one in problem.inputs],
+            stage_parameters=[one.name for one in problem.stage_parameters],
+            parameters=[
+                ParameterInfo(
+                    name=one.name,
+                    unit=one.unit,
+                    text=one.text,
+                    low=one.low,
+                    high=one.high,
+                    positive=one.positive,
+                )
+                for one in problem.parameters
+            ],
+            features=list(problem.features),
+            outputs=problem.outputs,
+        ),
         model=settings.model,
         car=settings.car,
         car_digest=car.digest(),

@@ -1,47 +1,30 @@
-"""The optimal control problem of the paper, equation (8), as one CasADi NLP.
+"""Any control problem as one CasADi NLP, solved by IPOPT.
 
-The definition that the native step is measured against: same objective, same constraints, any
-prediction model. Solved by IPOPT it is the oracle of the tests, and, expanded to scalars and
-started cold as the published code does, the peer of ``bayesrace bench``.
-
-    min  sum_{k=1}^N q |p_k - p_ref,k|^2
-       + sum_{k=0}^{N-1} r_d (d_k - d_{k-1})^2 + r_delta delta_rate_k^2 + s |eps_k|^2
-    s.t. x_{k+1} = f(x_k, u_k),  x_0 given,  d_{-1} given
-         n_k . p_k <= upper_k - margin + eps_k,1,   -n_k . p_k <= -lower_k - margin + eps_k,2
-         eps >= 0,  bounds on d_k, delta_rate_k (k < N) and on delta_k (k >= 1)
-
-The half-planes' normals have unit length. delta_0 is measured, so it is not constrained.
+Made from the same description as the native step (:mod:`codegen.problems`), by another formulation:
+multiple shooting with slack variables, all of them in one vector. It is the oracle of the tests,
+and, expanded to scalars and started cold as the published code does, the peer of ``bayesrace
+bench``.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from bayesrace.vehicles import CarParameters
+from codegen.problems.problem import Problem
 
-__all__ = ["OcpParameters", "OcpSolution", "RacingOcp"]
+__all__ = ["OcpNlp", "OcpSolution"]
 
 Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class OcpParameters:
-    """Run-time weights of the objective; symbols as in the module text."""
-
-    q_position: float
-    r_duty: float
-    r_delta_rate: float
-    s_slack: float
-    margin_m: float
-
-
 @dataclass(frozen=True, eq=False)
 class OcpSolution:
-    """A local solution: x (N + 1, 7), u (N, 2), objective, and how the solver ended."""
+    """A local solution: x (N + 1, nx), u (N, nu), objective, and how the solver ended."""
 
     x: Floats
     u: Floats
@@ -51,97 +34,122 @@ class OcpSolution:
     seconds: float
 
 
-class RacingOcp:
-    """Equation (8) for one prediction model, solved by IPOPT.
+class OcpNlp:
+    """A problem with one prediction model over ``horizon`` stages.
 
     ``f``: CasADi function (x, u) -> x_next. ``expand``: scalar expressions instead of matrices
     (as the published code; takes seconds and hundreds of MB with 400 training points).
-    ``options``: IPOPT's own.
+    ``options``: IPOPT's own. Parameters are given by name; settings of the native solver among
+    them are not looked at.
     """
 
     def __init__(
         self,
+        problem: Problem,
         f: ca.Function,
-        car: CarParameters,
         horizon: int,
         expand: bool = False,
         options: dict[str, Any] | None = None,
     ) -> None:
-        self.horizon, self._car = horizon, car
+        self.horizon, self._problem = horizon, problem
+        self._nx, self._nu = len(problem.states), len(problem.inputs)
+        self._soft = [row for row in problem.rows if row.soft]
+        self._hard = [row for row in problem.rows if not row.soft]
+        self._stage = self._stage_function()
         self._nlp, self._split = self._formulate(f)
         settings: dict[str, Any] = {"print_time": False, "expand": expand, "error_on_fail": False}
         settings |= {"ipopt": {"print_level": 0, "sb": "yes"} | (options or {})}
         self._objective = ca.Function(
             "objective", [self._nlp["x"], self._nlp["p"]], [self._nlp["f"]]
         )
-        self._solver = ca.nlpsol("racing_ocp", "ipopt", self._nlp, settings)
-        self._bounds = self._variable_bounds()
+        self._solver = ca.nlpsol("ocp", "ipopt", self._nlp, settings)
+        s = problem.symbols
+        self._input_bounds = ca.Function(
+            "bounds", [s.x, s.theta], [problem.u_lower, problem.u_upper]
+        )
+
+    def _stage_function(self) -> ca.Function:
+        """(x, u, u_before, last, p, theta) -> cost, penalties, and the rows less their bounds:
+        soft ones above and below, hard ones above and below; all of them <= 0 but for slack."""
+        s = self._problem.symbols
+
+        def outside(rows: list[Any]) -> ca.SX:
+            pairs = ((r.value - r.upper, r.lower - r.value) for r in rows)
+            return ca.vertcat(ca.SX(0, 1), *(e for pair in pairs for e in pair))
+
+        penalties = ca.vertcat(
+            ca.SX(0, 1), *(w for r in self._soft for w in [r.penalty] * 2 if w is not None)
+        )
+        return ca.Function(
+            "stage",
+            [s.x, s.u, s.u_before, s.last, s.p, s.theta],
+            [self._problem.cost, penalties, outside(self._soft), outside(self._hard)],
+        )
 
     def _formulate(self, f: ca.Function) -> tuple[dict[str, Any], ca.Function]:
-        n = self.horizon
-        u, x, eps = ca.MX.sym("u", 2, n), ca.MX.sym("x", 7, n), ca.MX.sym("eps", 2, n)
-        x0, d_before = ca.MX.sym("x0", 7), ca.MX.sym("d_before")
-        ref, weight = ca.MX.sym("ref", 6, n), ca.MX.sym("weight", 5)
-        q, r_d, r_delta, s, margin = ca.vertsplit(weight)
+        n, nx, nu, soft = self.horizon, self._nx, self._nu, 2 * len(self._soft)
+        u, x, eps = ca.MX.sym("u", nu, n), ca.MX.sym("x", nx, n), ca.MX.sym("eps", soft, n)
+        x0, u_before = ca.MX.sym("x0", nx), ca.MX.sym("u_before", nu)
+        p = ca.MX.sym("p", len(self._problem.stage_parameters), n)
+        theta = ca.MX.sym("theta", len(self._problem.parameters))
         cost, constraints = ca.MX(0), []
-        previous = x0
+        state, acting = x0, u_before
         for k in range(n):
-            constraints.append(x[:, k] - f(previous, u[:, k]))
-            previous = x[:, k]
-            along = ca.dot(ref[2:4, k], x[:2, k])
-            constraints.append(along - ref[5, k] + margin - eps[0, k])
-            constraints.append(ref[4, k] + margin - along - eps[1, k])
-            change = u[0, k] - (u[0, k - 1] if k else d_before)
-            cost += q * ca.sumsqr(x[:2, k] - ref[:2, k]) + r_d * change**2
-            cost += r_delta * u[1, k] ** 2 + s * ca.sumsqr(eps[:, k])
+            constraints.append(x[:, k] - f(state, u[:, k]))
+            state = x[:, k]
+            last = float(k == n - 1)
+            stage, weights, over, hard = self._stage(state, u[:, k], acting, last, p[:, k], theta)
+            acting = u[:, k]
+            cost += stage + ca.dot(weights, eps[:, k] ** 2)
+            constraints += [over - eps[:, k], hard]
         variables = ca.veccat(u, x, eps)
         nlp = {
             "x": variables,
-            "p": ca.veccat(x0, d_before, ref, weight),
+            "p": ca.veccat(x0, u_before, p, theta),
             "f": cost,
             "g": ca.vertcat(*constraints),
         }
         return nlp, ca.Function("split", [variables], [u, x, eps])
 
-    def _variable_bounds(self) -> dict[str, Any]:
-        n, car = self.horizon, self._car
-        free = np.full((7, n), np.inf)
-        free[6] = car.delta_max_rad
-        low_u = np.tile([[car.d_min], [-car.delta_rate_max_radps]], (1, n))
-        high_u = np.tile([[car.d_max], [car.delta_rate_max_radps]], (1, n))
-        low_g = np.tile(np.r_[np.zeros(7), -np.inf, -np.inf], n)
+    def _variable_bounds(self, x0: Floats, theta: list[float]) -> dict[str, Any]:
+        n, rows = self.horizon, 2 * (len(self._soft) + len(self._hard))
+        low_u, high_u = (ca.repmat(one, 1, n) for one in self._input_bounds(x0, theta))
+        free = np.full((self._nx, n), np.inf)
+        soft = 2 * len(self._soft)
         return {
-            "lbx": ca.veccat(low_u, -free, np.zeros((2, n))),
-            "ubx": ca.veccat(high_u, free, np.full((2, n), np.inf)),
-            "lbg": low_g,
-            "ubg": np.zeros(9 * n),
+            "lbx": ca.veccat(low_u, -free, np.zeros((soft, n))),
+            "ubx": ca.veccat(high_u, free, np.full((soft, n), np.inf)),
+            "lbg": np.tile(np.r_[np.zeros(self._nx), np.full(rows, -np.inf)], n),
+            "ubg": np.zeros((self._nx + rows) * n),
         }
 
     def solve(
         self,
         x0: Floats,
-        d_previous: float,
+        u_before: ArrayLike,
         reference: Floats,
-        parameters: OcpParameters,
+        parameters: Mapping[str, float],
         guess: tuple[Floats, Floats] | None = None,
     ) -> OcpSolution:
-        """Local solution from ``guess`` (x (N + 1, 7), u (N, 2)); zeros, as published, without.
+        """Local solution from ``guess`` (x (N + 1, nx), u (N, nu)); zeros, as published, without.
 
-        ``reference`` (N, 6): x, y, unit normal (2), lower, upper.
+        ``u_before`` (nu,), or a number for all components; ``reference`` (N, np): the parameters
+        of the stages 1..N.
         """
         n = self.horizon
+        values = self._values(x0, u_before, reference, parameters)
         start: Any = 0
         if guess is not None:
-            start = self._variables(guess[0], guess[1], reference, parameters)
-        values = self._values(x0, d_previous, reference, parameters)
+            start = self._variables(guess[0], guess[1], u_before, reference, parameters)
         started = perf_counter()
-        out = self._solver(x0=start, p=values, **self._bounds)
+        bounds = self._variable_bounds(x0, self._theta(parameters))
+        out = self._solver(x0=start, p=values, **bounds)
         seconds = perf_counter() - started
         u, x, _ = (np.asarray(part, dtype=float) for part in self._split(out["x"]))
         stats = self._solver.stats()
         return OcpSolution(
             x=np.vstack([x0, x.T]),
-            u=u.T.reshape(n, 2),
+            u=u.T.reshape(n, self._nu),
             cost=float(out["f"]),
             success=bool(stats["success"]),
             status=str(stats["return_status"]),
@@ -149,28 +157,43 @@ class RacingOcp:
         )
 
     def cost(
-        self, x: Floats, u: Floats, d_previous: float, reference: Floats, parameters: OcpParameters
+        self,
+        x: Floats,
+        u: Floats,
+        u_before: ArrayLike,
+        reference: Floats,
+        parameters: Mapping[str, float],
     ) -> float:
-        """Objective of a plan x (N + 1, 7), u (N, 2), with the slack that it needs."""
-        variables = self._variables(x, u, reference, parameters)
-        values = self._values(x[0], d_previous, reference, parameters)
+        """Objective of a plan x (N + 1, nx), u (N, nu), with the slack that it needs."""
+        variables = self._variables(x, u, u_before, reference, parameters)
+        values = self._values(x[0], u_before, reference, parameters)
         return float(self._objective(variables, values))
 
-    @staticmethod
+    def _theta(self, parameters: Mapping[str, float]) -> list[float]:
+        return [float(parameters[one.name]) for one in self._problem.parameters]
+
     def _values(
-        x0: Floats, d_previous: float, reference: Floats, parameters: OcpParameters
+        self, x0: Floats, u_before: ArrayLike, reference: Floats, parameters: Mapping[str, float]
     ) -> ca.DM:
-        p = parameters
-        weight = [p.q_position, p.r_duty, p.r_delta_rate, p.s_slack, p.margin_m]
-        return ca.veccat(x0, d_previous, reference.T, weight)
+        acting = np.broadcast_to(u_before, self._nu)
+        return _dm(x0, acting, np.asarray(reference).T, self._theta(parameters))
 
     def _variables(
-        self, x: Floats, u: Floats, reference: Floats, parameters: OcpParameters
+        self,
+        x: Floats,
+        u: Floats,
+        u_before: ArrayLike,
+        reference: Floats,
+        parameters: Mapping[str, float],
     ) -> ca.DM:
-        return ca.veccat(u.T, x[1:].T, self._slack(x, reference, parameters))
+        theta, acting = self._theta(parameters), np.broadcast_to(u_before, self._nu)
+        slack = []
+        for k in range(self.horizon):
+            _, _, over, _ = self._stage(x[k + 1], u[k], acting, 0.0, reference[k], theta)
+            slack.append(ca.fmax(0, over))
+            acting = u[k]
+        return _dm(u.T, x[1:].T, ca.horzcat(*slack))
 
-    def _slack(self, x: Floats, reference: Floats, parameters: OcpParameters) -> Floats:
-        along = np.sum(reference[:, 2:4] * x[1:, :2], axis=1)
-        over = along - reference[:, 5] + parameters.margin_m
-        under = reference[:, 4] + parameters.margin_m - along
-        return np.asarray(np.maximum(0.0, np.vstack([over, under])))
+
+def _dm(*parts: Any) -> ca.DM:
+    return ca.DM(ca.veccat(*parts))

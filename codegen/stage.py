@@ -6,20 +6,38 @@ import casadi as ca
 from bayesrace.integrators import Discretisation
 from bayesrace.vehicles.models import Model
 
-__all__ = ["advance_function", "linearise_function"]
+__all__ = ["advance_function", "linearise_function", "linearised"]
 
 _NX, _NV, _NE = 7, 9, 3
 _NW = _NV + _NE
 
 
-def _derivatives(f: ca.Function, name: str) -> ca.Function:
-    """``(w, lambda) -> (x_next, J, H)`` of f(x, u, e), w = [x; u; e], all dense."""
-    w, lam = ca.SX.sym("w", _NW), ca.SX.sym("lambda", _NX)
-    x_next = f(w[:_NX], w[_NX:_NV], w[_NV:])
+def linearised(f: ca.Function) -> ca.Function:
+    """``(x, u, e, lambda) -> (F, J', H)`` of any f(x, u, e), as :func:`linearise_function`."""
+    nx, nu, ne = (f.size1_in(i) for i in range(3))
+    nv = nx + nu
+    w, lam = ca.SX.sym("w", nv + ne), ca.SX.sym("lambda", nx)
+    x_next = f(w[:nx], w[nx:nv], w[nv:])
     jacobian = ca.jacobian(x_next, w)
     hessian, _ = ca.hessian(ca.dot(lam, x_next), w)
     outputs = [x_next, ca.densify(jacobian), ca.densify(hessian)]
-    return ca.Function(name, [w, lam], outputs, {"cse": True})
+    return _with_arguments(
+        ca.Function("br_derivatives", [w, lam], outputs, {"cse": True}), nx, nu, ne
+    )
+
+
+def _with_arguments(derivatives: ca.Function, nx: int, nu: int, ne: int) -> ca.Function:
+    """The same with x, u and e apart, and the Jacobian transposed."""
+    x, u, e = ca.MX.sym("x", nx), ca.MX.sym("u", nu), ca.MX.sym("e", ne)
+    lam = ca.MX.sym("lambda", nx)
+    x_next, jacobian, hessian = derivatives(ca.vertcat(x, u, e), lam)
+    return ca.Function(
+        "br_linearise",
+        [x, u, e, lam],
+        [x_next, jacobian.T, hessian],
+        ["x", "u", "e", "lambda"],
+        ["x_next", "jacobian_transposed", "hessian"],
+    )
 
 
 def _substep_functions(f: ca.Function) -> tuple[ca.Function, ca.Function]:
@@ -85,19 +103,8 @@ def linearise_function(model: Model, discretisation: Discretisation) -> ca.Funct
     natively (controller/native/br_stage.c).
     """
     if discretisation.substeps > 1 and discretisation.pose == "integrated":
-        derivatives = _composed(model, discretisation)
-    else:
-        derivatives = _derivatives(discretisation.corrected(model), "br_derivatives")
-    x, u, e = ca.MX.sym("x", _NX), ca.MX.sym("u", 2), ca.MX.sym("e", _NE)
-    lam = ca.MX.sym("lambda", _NX)
-    x_next, jacobian, hessian = derivatives(ca.vertcat(x, u, e), lam)
-    return ca.Function(
-        "br_linearise",
-        [x, u, e, lam],
-        [x_next, jacobian.T, hessian],
-        ["x", "u", "e", "lambda"],
-        ["x_next", "jacobian_transposed", "hessian"],
-    )
+        return _with_arguments(_composed(model, discretisation), _NX, _NV - _NX, _NE)
+    return linearised(discretisation.corrected(model))
 
 
 def advance_function(model: Model, discretisation: Discretisation) -> ca.Function:

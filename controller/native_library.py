@@ -1,22 +1,24 @@
 """The native library as ctypes sees it: structures, status codes, argument types.
 
-Mirrors controller/native/bayesrace_mpc.h; :data:`bayesrace.manifest.ABI` says which version.
+Made from the same tables as the C: :mod:`bayesrace.native_interface`, and the artefact's manifest.
 """
 
 import ctypes as ct
+from collections.abc import Iterable
 from enum import IntEnum
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from bayesrace.cpu import cpu_digest
 from bayesrace.errors import InputError
-from bayesrace.manifest import ABI, Manifest, check_library
+from bayesrace.manifest import Manifest, ProblemInfo, check_library
+from bayesrace.native_interface import ABI, INFO, SOLVER, STATUSES
 
-__all__ = ["Gp", "Parameters", "StepInfo", "StepStatus", "load_library"]
+__all__ = ["Gp", "StepInfo", "StepStatus", "load_library", "parameters_type"]
 
 
 class StepStatus(IntEnum):
-    """br_mpc_status: what became of the optimisation problem."""
+    """What became of the optimisation problem; see :data:`bayesrace.native_interface.STATUSES`."""
 
     CONVERGED = 0
     ACCEPTABLE = 1
@@ -35,46 +37,20 @@ class StepStatus(IntEnum):
     @property
     def text(self) -> str:
         """As br_mpc_status_text has it."""
-        return _STATUS_TEXT[self]
+        return STATUSES[self][1]
 
 
-_STATUS_TEXT: Final = {
-    StepStatus.CONVERGED: "converged",
-    StepStatus.ACCEPTABLE: "acceptable",
-    StepStatus.DEFECT: "dynamics defect too large",
-    StepStatus.INFEASIBLE: "QP infeasible",
-    StepStatus.QP_LIMIT: "QP iteration limit",
-    StepStatus.NOT_FINITE: "not finite",
-    StepStatus.BAD_STATE: "bad state",
-    StepStatus.TIME_LIMIT: "out of time before the plan was usable",
-}
-"""For those who hold a status but no library; a test compares."""
+_TYPES: Final[dict[str, Any]] = {"double": ct.c_double, "int": ct.c_int}
 
 
-class Parameters(ct.Structure):
-    """br_mpc_parameters."""
+def _fields(table: Iterable[tuple[str, str, str]]) -> list[tuple[str, Any]]:
+    return [(name, _TYPES[kind]) for name, kind, _ in table]
 
-    _fields_ = [
-        *(
-            (name, ct.c_double)
-            for name in (
-                "q_position",
-                "r_duty",
-                "r_delta_rate",
-                "s_slack",
-                "margin_m",
-                "d_min",
-                "d_max",
-                "delta_max_rad",
-                "delta_rate_max_radps",
-                "tolerance",
-                "defect_max",
-                "settle",
-            )
-        ),
-        ("iterations", ct.c_int),
-        ("iterations_cold", ct.c_int),
-    ]
+
+def parameters_type(problem: ProblemInfo) -> type[ct.Structure]:
+    """br_mpc_parameters: the problem's run-time parameters, then the settings of the solver."""
+    own = [(one.name, ct.c_double) for one in problem.parameters]
+    return type("Parameters", (ct.Structure,), {"_fields_": [*own, *_fields(SOLVER)]})
 
 
 class Gp(ct.Structure):
@@ -92,35 +68,18 @@ class Gp(ct.Structure):
 
 
 class StepInfo(ct.Structure):
-    """br_mpc_info: residuals at the returned plan, cost, and the car's place on the line."""
+    """br_mpc_info: residuals at the returned plan, cost, and the car's place on the line.
 
-    _fields_ = [
-        ("iterations", ct.c_int),
-        ("qp_iterations", ct.c_int),
-        ("regularised", ct.c_int),
-        ("shortened", ct.c_int),
-        ("second_start", ct.c_int),
-        ("shifts", ct.c_int),
-        ("prepared", ct.c_int),
-        ("prepared_iterations", ct.c_int),
-        ("time_limited", ct.c_int),
-        ("stationarity", ct.c_double),
-        ("defect", ct.c_double),
-        ("bound", ct.c_double),
-        ("shifted_cost", ct.c_double),
-        ("cost", ct.c_double),
-        ("slack_max_m", ct.c_double),
-        ("s_ref_m", ct.c_double),
-        ("lateral_m", ct.c_double),
-    ]
+    What each field means: :data:`bayesrace.native_interface.INFO`.
+    """
+
+    _fields_ = _fields(INFO)
     iterations: int
     qp_iterations: int
     regularised: int
     shortened: int
     second_start: int
-    """1: the plan from before was doubtful, and a new one no better; 2: the new one is better."""
     shifts: int
-    """Stages by which the plan before was shifted; -1: there was none."""
     prepared: int
     prepared_iterations: int
     time_limited: int
@@ -128,7 +87,6 @@ class StepInfo(ct.Structure):
     defect: float
     bound: float
     shifted_cost: float
-    """Of the plan before, shifted, under the same reference; 0 cold."""
     cost: float
     slack_max_m: float
     s_ref_m: float
@@ -174,8 +132,8 @@ def _declare(library: ct.CDLL) -> None:
         "set_clock": [pointer] * 3,
         "set_speed_limit": [pointer, ct.c_double, ct.c_double],
         "reset": [pointer],
-        "step": [pointer, pointer, real, real, real, *[pointer] * 3],
-        "solve": [pointer, pointer, real, real, real, *[pointer] * 4],
+        "step": [*[pointer] * 3, real, real, *[pointer] * 3],
+        "solve": [*[pointer] * 3, real, real, *[pointer] * 4],
         "prepare": [pointer, real, real],
         "rehearse": [pointer],
         "predict": [pointer, pointer, pointer, real, pointer],

@@ -2,6 +2,8 @@
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from bayesrace.vehicles import CarParameters
+
 __all__ = ["MpcSettings"]
 
 
@@ -40,3 +42,10 @@ class MpcSettings(BaseModel):
         le=1000,
         description="the same after a reset; with a time budget the larger limits every step",
     )
+
+    def parameters(self, car: CarParameters) -> dict[str, float]:
+        """Run-time parameters of the tracking problem and settings of its solver, by name."""
+        values = self.model_dump(exclude={"constraints"})
+        values["s_slack"] = self.s_slack if self.constraints else 0.0
+        limits = ("d_min", "d_max", "delta_max_rad", "delta_rate_max_radps")
+        return values | {name: getattr(car, name) for name in limits}

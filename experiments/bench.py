@@ -29,7 +29,8 @@ from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from codegen.build import build
 from codegen.compiler import find_compiler
-from codegen.ocp import OcpParameters, RacingOcp
+from codegen.ocp import OcpNlp
+from codegen.problems.tracking import tracking
 from codegen.settings import BuildSettings
 from controller.native_step import NativeStep, StepStatus
 from controller.path_table import make_path_table
@@ -192,9 +193,10 @@ def run_bench(settings: BenchSettings, stages: Stages) -> BenchResult:
             )
     with stages.stage("IPOPT, expanded (builds for some 15 s)") as stage:
         peers = _peers(recording, settings.peers)
+        problem = tracking(e_kinematic(car), PREDICTION)
         published = corrected_function(e_kinematic(car), _PUBLISHED, weights, check_identity=False)
         times, solved = _published(
-            RacingOcp(published, car, horizon, expand=True), peers, stage.update
+            OcpNlp(problem, published, horizon, expand=True), car, peers, stage.update
         )
     with stages.stage("check against IPOPT"):
         # A barrier left at its usual size would push weakly active bounds inwards.
@@ -206,9 +208,9 @@ def run_bench(settings: BenchSettings, stages: Stages) -> BenchResult:
             "mu_init": 1e-9,
         }
         f = corrected_function(e_kinematic(car), PREDICTION, weights)
-        oracle = RacingOcp(f, car, horizon, options=strict)
-        agreement = _agreement(oracle, peers)
-        gaps = [_gap(oracle, step, p) for p in recording.problems if p.has_converged]
+        oracle = OcpNlp(problem, f, horizon, options=strict)
+        agreement = _agreement(oracle, car, peers)
+        gaps = [_gap(oracle, car, step, p) for p in recording.problems if p.has_converged]
     return _result(settings, weights, recording, times, solved, agreement, gaps)
 
 
@@ -257,28 +259,31 @@ def _peers(recording: _Recording, count: int) -> list[_Problem]:
     return [recording.problems[row] for row in dict.fromkeys(rows.tolist())]
 
 
-def _parameters() -> OcpParameters:
-    mpc = MpcSettings()
-    return OcpParameters(mpc.q_position, mpc.r_duty, mpc.r_delta_rate, mpc.s_slack, mpc.margin_m)
+def _parameters(car: CarParameters) -> dict[str, float]:
+    return MpcSettings().parameters(car)
 
 
 def _published(
-    ocp: RacingOcp, problems: list[_Problem], progress: Callable[[float], None]
+    ocp: OcpNlp, car: CarParameters, problems: list[_Problem], progress: Callable[[float], None]
 ) -> tuple[list[float], int]:
     times: list[float] = []
     solved = 0
     for problem in problems:
         progress(len(times) / len(problems))
-        out = ocp.solve(problem.x, problem.d_previous, problem.reference, _parameters())
+        out = ocp.solve(
+            problem.x, problem.d_previous, problem.reference, MpcSettings().parameters(car)
+        )
         times.append(out.seconds * 1e6)
         solved += out.success
     return times, solved
 
 
-def _agreement(oracle: RacingOcp, problems: list[_Problem]) -> float:
+def _agreement(oracle: OcpNlp, car: CarParameters, problems: list[_Problem]) -> float:
     differences = []
     for p in (p for p in problems if p.has_converged):
-        out = oracle.solve(p.x, p.d_previous, p.reference, _parameters(), p.converged)
+        out = oracle.solve(
+            p.x, p.d_previous, p.reference, MpcSettings().parameters(car), p.converged
+        )
         if out.success:
             differences.append(float(np.abs(out.u[0] - p.converged[1][0]).max()))
     if not differences:
@@ -286,13 +291,17 @@ def _agreement(oracle: RacingOcp, problems: list[_Problem]) -> float:
     return max(differences)
 
 
-def _gap(oracle: RacingOcp, step: NativeStep, problem: _Problem) -> float:
+def _gap(oracle: OcpNlp, car: CarParameters, step: NativeStep, problem: _Problem) -> float:
     """What the planned inputs really cost, relative to the optimum."""
     x = [problem.x]
     for u in problem.plan[1]:
         x.append(step.evaluate(np.concatenate([x[-1], u]), np.zeros(7))[0])
     cost = oracle.cost(
-        np.array(x), problem.plan[1], problem.d_previous, problem.reference, _parameters()
+        np.array(x),
+        problem.plan[1],
+        problem.d_previous,
+        problem.reference,
+        MpcSettings().parameters(car),
     )
     return cost / problem.converged_cost - 1.0
 

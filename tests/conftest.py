@@ -16,13 +16,14 @@ from numpy.typing import ArrayLike, NDArray
 from bayesrace.gp.expression import kernel_matrix
 from bayesrace.gp.weights import KERNELS, GpOutput, GpWeights
 from bayesrace.integrators import PREDICTION, Discretisation
+from bayesrace.native_interface import SOLVER
 from bayesrace.raceline.line import RaceLine
 from bayesrace.tracks import Track
 from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import Model, dynamic, e_kinematic
 from codegen.build import build
+from codegen.problems.tracking import tracking
 from codegen.settings import BuildSettings
-from controller.native_library import Parameters
 from controller.native_step import NativeStep
 from controller.path_table import PathTable, make_path_table
 from controller.settings import MpcSettings
@@ -214,10 +215,10 @@ def weights(car: CarParameters) -> GpWeights:
 
 def native_numbers(settings: MpcSettings, car: CarParameters, weights: GpWeights) -> Floats:
     """Parameters and weights in the order of the C structures, as the C programs read them."""
-    names = [field[0] for field in Parameters._fields_]
-    parts: list[ArrayLike] = [
-        [float(getattr(car if hasattr(car, name) else settings, name)) for name in names]
-    ]
+    values = settings.parameters(car)
+    problem = tracking(e_kinematic(car), PREDICTION)
+    names = [*(one.name for one in problem.parameters), *(name for name, _, _ in SOLVER)]
+    parts: list[ArrayLike] = [[values[name] for name in names]]
     for output in weights.outputs:
         scale = output.y_scale * output.signal_variance
         parts.append([KERNELS.index(output.kernel), output.count, output.y_mean, scale])

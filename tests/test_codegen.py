@@ -17,11 +17,13 @@ from bayesrace.cache import cache_folder
 from bayesrace.errors import InputError
 from bayesrace.integrators import PERFECT, PREDICTION, Discretisation
 from bayesrace.interpreter import RUN_MODULE
-from bayesrace.manifest import ABI, LIBRARY, MANIFEST, read_manifest
+from bayesrace.manifest import LIBRARY, MANIFEST, read_manifest
+from bayesrace.native_interface import ABI
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import MODELS
 from codegen.build import build, build_hash, generate
 from codegen.compiler import CompileError, Compiler, find_compiler
+from codegen.problems.problem import Problem
 from codegen.settings import BuildSettings
 from codegen.stage import linearise_function
 from controller.native_step import NativeStep
@@ -170,8 +172,8 @@ def test_a_compile_error_comes_with_the_compilers_words(tmp_path: Path) -> None:
 def test_a_failed_build_leaves_nothing_in_the_cache(
     cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def broken(settings: BuildSettings, folder: Path) -> None:
-        generate(settings, folder)
+    def broken(problem: Problem, settings: BuildSettings, folder: Path) -> None:
+        generate(problem, settings, folder)
         (folder / "br_model.h").write_text("#error broken on purpose\n")
 
     monkeypatch.setattr(build_module, "generate", broken)

@@ -17,7 +17,6 @@ from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
 from bayesrace.manifest import read_manifest
 from bayesrace.vehicles import get_car
-from bayesrace.vehicles.parameters import BRAKE_FADE_MPS
 from codegen.build import NATIVE as HEADERS
 from codegen.compiler import find_compiler
 from codegen.fmu import resources
@@ -64,7 +63,6 @@ class _State(ct.Structure):
     [
         ("BR_PATH_COLUMNS", {path_table.PATH_COLUMNS, resources.PATH_COLUMNS}),
         ("BR_PATH_CAPACITY", {path_table.CAPACITY, resources.PATH_CAPACITY}),
-        ("BR_BRAKE_FADE_MPS", {BRAKE_FADE_MPS}),
     ],
 )
 def test_sizes_and_limits_of_the_native_step_are_those_that_python_states(

@@ -16,7 +16,8 @@ from bayesrace.integrators import PERFECT, PREDICTION
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.fmu import model_from_fmu
 from bayesrace.vehicles.models import INPUTS, STATES, Model, dynamic
-from codegen.ocp import OcpParameters, RacingOcp
+from codegen.ocp import OcpNlp
+from codegen.problems.tracking import tracking
 from controller.native_step import NativeStep, StepStatus
 from tests.car_fmu import packed_car
 from tests.conftest import SETTINGS, Circuit, Problem
@@ -25,9 +26,6 @@ Floats = NDArray[np.float64]
 
 EXACT: Final = SETTINGS.model_copy(
     update={"iterations": 60, "iterations_cold": 60, "tolerance": 1e-11}
-)
-WEIGHTS: Final = OcpParameters(
-    EXACT.q_position, EXACT.r_duty, EXACT.r_delta_rate, EXACT.s_slack, EXACT.margin_m
 )
 IPOPT: Final = {
     "tol": 1e-10,
@@ -111,14 +109,14 @@ def best_case(dynamic_artefact: Path, car: CarParameters, circuit: Circuit) -> N
 
 
 @pytest.fixture(scope="module")
-def ocp(truth: Model, car: CarParameters) -> RacingOcp:
+def ocp(truth: Model, car: CarParameters) -> OcpNlp:
     """Exact first derivatives, and IPOPT's Newton steps with differences of them as Hessian."""
-    return RacingOcp(PERFECT.discretise(truth), car, 20, options=IPOPT)
+    return OcpNlp(tracking(dynamic(car), PERFECT), PERFECT.discretise(truth), 20, options=IPOPT)
 
 
 @pytest.mark.check
 def test_best_case_with_the_fmu_has_the_solution_of_the_built_in_equations(
-    ocp: RacingOcp, best_case: NativeStep, recorded: list[Problem]
+    ocp: OcpNlp, best_case: NativeStep, car: CarParameters, recorded: list[Problem]
 ) -> None:
     """Found from a guess that is somewhat off."""
     random = np.random.default_rng(0)
@@ -130,7 +128,9 @@ def test_best_case_with_the_fmu_has_the_solution_of_the_built_in_equations(
             continue
         plan_x, plan_u = best_case.read_plan()
         guess = plan_x + 1e-3 * random.normal(size=plan_x.shape), 0.97 * plan_u
-        found = ocp.solve(problem.x0, problem.d_previous, problem.reference, WEIGHTS, guess)
+        found = ocp.solve(
+            problem.x0, problem.d_previous, problem.reference, EXACT.parameters(car), guess
+        )
         assert found.success, found.status
         np.testing.assert_allclose(found.u, plan_u, rtol=0, atol=1e-5)
         np.testing.assert_allclose(found.x, plan_x, rtol=0, atol=1e-6)
@@ -141,7 +141,7 @@ def test_best_case_with_the_fmu_has_the_solution_of_the_built_in_equations(
 
 @pytest.mark.check
 def test_it_drives(
-    ocp: RacingOcp, best_case: NativeStep, truth: Model, car: CarParameters, circuit: Circuit
+    ocp: OcpNlp, best_case: NativeStep, truth: Model, car: CarParameters, circuit: Circuit
 ) -> None:
     """Some .4 s with the FMU as plant and in the OCP: where the built-in ones go."""
     with_fmu, built_in = PERFECT.discretise(truth), PERFECT.discretise(dynamic(car))
@@ -149,7 +149,9 @@ def test_it_drives(
     x, d = start, 0.0
     for _ in range(steps):
         assert best_case.step(x, d).usable
-        solution = ocp.solve(x, d, best_case.read_reference(), WEIGHTS, best_case.read_plan())
+        solution = ocp.solve(
+            x, d, best_case.read_reference(), EXACT.parameters(car), best_case.read_plan()
+        )
         assert solution.success, solution.status
         d, x = float(solution.u[0, 0]), np.asarray(with_fmu(x, solution.u[0])).ravel()
     best_case.reset()

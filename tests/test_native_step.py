@@ -14,7 +14,9 @@ from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import PERFECT, PREDICTION
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic, e_kinematic
-from codegen.ocp import OcpParameters, RacingOcp
+from codegen.build import problem_of
+from codegen.ocp import OcpNlp
+from codegen.settings import BuildSettings
 from controller.native_step import NativeStep, StepStatus
 from controller.path_table import make_path_table
 from controller.settings import MpcSettings
@@ -46,10 +48,7 @@ FROM_OUR_PLAN = {
     "slack_bound_frac": 1e-12,
 }
 AT_BOUND = 1e-8
-
-
-def ocp_parameters(s: MpcSettings) -> OcpParameters:
-    return OcpParameters(s.q_position, s.r_duty, s.r_delta_rate, s.s_slack, s.margin_m)
+E_KINEMATIC = BuildSettings()
 
 
 def solved(step: NativeStep, problem: Problem) -> tuple[StepStatus, Floats, Floats]:
@@ -87,13 +86,13 @@ def active(problem: Problem, x: Floats, u: Floats, car: CarParameters) -> dict[s
 def test_the_converged_step_is_the_solution_of_ipopt(
     exact: NativeStep, corrected: ca.Function, recorded: list[Problem], car: CarParameters
 ) -> None:
-    ocp = RacingOcp(corrected, car, 20, options=TIGHT_IPOPT | FROM_OUR_PLAN)
+    ocp = OcpNlp(problem_of(E_KINEMATIC), corrected, 20, options=TIGHT_IPOPT | FROM_OUR_PLAN)
     kinds: dict[str, int] = {}
     for problem in recorded[::12]:
         status, x, u = solved(exact, problem)
         assert status is StepStatus.CONVERGED
         oracle = ocp.solve(
-            problem.x0, problem.d_previous, problem.reference, ocp_parameters(EXACT), (x, u)
+            problem.x0, problem.d_previous, problem.reference, EXACT.parameters(car), (x, u)
         )
         assert oracle.success, oracle.status
         np.testing.assert_allclose(u, oracle.u, rtol=0, atol=1e-6)
@@ -118,13 +117,18 @@ def test_nearly_every_problem_converges_from_cold(
 def test_the_cost_is_no_worse_than_that_of_ipopt_from_its_own_start(
     exact: NativeStep, corrected: ca.Function, recorded: list[Problem], car: CarParameters
 ) -> None:
-    ocp = RacingOcp(corrected, car, 20, options=TIGHT_IPOPT | {"max_iter": 300})
+    ocp = OcpNlp(
+        problem_of(E_KINEMATIC),
+        corrected,
+        20,
+        options=TIGHT_IPOPT | {"max_iter": 300},
+    )
     same = 0
     for problem in recorded[5::15]:
         status, _, u = solved(exact, problem)
         if status is not StepStatus.CONVERGED:
             continue  # their share is bounded below
-        oracle = ocp.solve(problem.x0, problem.d_previous, problem.reference, ocp_parameters(EXACT))
+        oracle = ocp.solve(problem.x0, problem.d_previous, problem.reference, EXACT.parameters(car))
         if not oracle.success or np.abs(oracle.u - u).max() > 0.05:
             continue  # another basin
         same += 1
@@ -141,12 +145,12 @@ def test_the_converged_best_case_step_is_the_solution_of_ipopt(
     problems, _ = drive(step, circuit, 120)
     step.set_parameters(car, EXACT)
     f = PERFECT.discretise(dynamic(car))
-    ocp = RacingOcp(f, car, 20, options=TIGHT_IPOPT | FROM_OUR_PLAN)
+    ocp = OcpNlp(problem_of(BuildSettings.best_case()), f, 20, options=TIGHT_IPOPT | FROM_OUR_PLAN)
     for problem in problems[::30]:
         status, x, u = solved(step, problem)
         assert status is StepStatus.CONVERGED
         oracle = ocp.solve(
-            problem.x0, problem.d_previous, problem.reference, ocp_parameters(EXACT), (x, u)
+            problem.x0, problem.d_previous, problem.reference, EXACT.parameters(car), (x, u)
         )
         assert oracle.success, oracle.status
         np.testing.assert_allclose(u, oracle.u, rtol=0, atol=1e-6)

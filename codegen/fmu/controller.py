@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
 from bayesrace.manifest import Manifest, read_manifest
+from bayesrace.native_interface import STATUSES
 from bayesrace.vehicles.parameters import CarParameters
 from codegen.compiler import FLAGS
 from codegen.fmu.definition import FmuDefinition
@@ -66,15 +67,7 @@ _COUNTS: Final = (
     ("iterations_cold", "the same for the first step and after a reset"),
 )
 
-_STATUSES: Final = (
-    "converged",
-    "acceptable",
-    "defect",
-    "infeasible",
-    "QP limit",
-    "not finite",
-    "bad state",
-)
+_STATUSES: Final = tuple(text for _, text, _ in STATUSES[:-1])
 """br_mpc_status in order, but for the last: a step without a budget is never out of time."""
 
 _WITHOUT_STEP: Final = {

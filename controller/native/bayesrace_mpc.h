@@ -8,34 +8,31 @@
  *
  * A control period, with or without the preparation:
  *
- *   br_mpc_step(mpc, x, d, elapsed, budget, u, &status, &info);   the state has arrived
+ *   br_mpc_step(mpc, x, u_before, elapsed, budget, u, &status, &info);   the state is here
  *   (send u)
  *   br_mpc_prepare(mpc, period, budget);                          while waiting for the next one
  *
  * Two enums, after OSQP: br_mpc_error says what is wrong with a call, br_mpc_status what became
  * of the optimisation problem. The status is derived from residuals measured at the returned plan.
  *
- * Units are SI. x = [x, y, psi, vx, vy, omega, delta], u = [d, delta_rate].
+ * The problem (states, inputs, cost, constraints, parameters) is described in codegen/problems/ and
+ * generated; br_problem.h has its sizes and structures. Units are SI.
  */
 #ifndef BAYESRACE_MPC_H
 #define BAYESRACE_MPC_H
 
 #include <stddef.h>
 
-#include "br_config.h" /* generated: BR_N, BR_TS, BR_GP_CAPACITY, BR_MODEL_NAME */
+#include "br_config.h"    /* generated: BR_N, BR_TS, BR_GP_CAPACITY, BR_MODEL_NAME */
+#include "br_interface.h" /* generated: br_mpc_error, br_mpc_status, br_mpc_info, BR_ABI */
+#include "br_problem.h"   /* generated: sizes, br_mpc_parameters, br_mpc_reference */
 
 #ifdef __cplusplus
 extern "C" {
 #endif
 
-#define BR_ABI 5
 #define BR_SECOND_START_ITERATIONS 12 /* at most; most often it needs eight */
-#define BR_NX 7
-#define BR_NU 2
 #define BR_NV (BR_NX + BR_NU)      /* stage variables v = [x; u] */
-#define BR_NZ 6                    /* GP features z = v[3..8] = [vx vy omega delta d delta_rate] */
-#define BR_NE 3                    /* GP outputs: vx, vy, omega */
-#define BR_BRAKE_FADE_MPS 0.1      /* below this speed d_min fades to 0: brakes drive no car back */
 #define BR_PATH_COLUMNS 7          /* see br_mpc_set_path */
 #define BR_PATH_CAPACITY 8192      /* points of the path table */
 #define BR_PREDICT_MAX_S 1.0       /* longest br_mpc_predict */
@@ -49,57 +46,11 @@ extern "C" {
 typedef struct br_mpc br_mpc;
 
 typedef enum {
-    BR_OK = 0,
-    BR_ERROR_NULL = 1,        /* a required pointer is NULL */
-    BR_ERROR_MEMORY = 2,      /* block too small or not aligned to 64 bytes */
-    BR_ERROR_PARAMETERS = 3,  /* a parameter is not finite or out of its range */
-    BR_ERROR_PATH = 4,        /* path table: size, spacing or values */
-    BR_ERROR_WEIGHTS = 5,     /* GP weights: size, kernel or values */
-    BR_ERROR_NOT_READY = 6,   /* parameters or path have not been set */
-    BR_ERROR_TIME = 7,        /* a time is negative, not finite or too long */
-    BR_ERROR_STATE = 8,       /* br_mpc_predict: not finite or absurd, on the way in or out */
-    BR_ERROR_BUSY = 9,        /* another thread is staging weights at this moment */
-    BR_ERROR_NOT_STAGED = 10  /* there are no weights to adopt */
-} br_mpc_error;
-
-typedef enum {
-    BR_CONVERGED = 0,     /* all residuals below tolerance */
-    BR_ACCEPTABLE = 1,    /* dynamics and bounds hold to defect_max; not stationary to tolerance */
-    BR_DEFECT = 2,        /* predicted trajectory violates the dynamics by more than defect_max */
-    BR_INFEASIBLE = 3,    /* the QP has no solution */
-    BR_QP_LIMIT = 4,      /* the QP solver hit its iteration limit or cycled */
-    BR_NOT_FINITE = 5,    /* a number in the problem or its solution is not finite */
-    BR_BAD_STATE = 6,     /* the measured state is not finite or absurd; nothing was solved */
-    BR_TIME_LIMIT = 7     /* the budget was used up before the plan was usable */
-} br_mpc_status;
-
-typedef enum {
     BR_KERNEL_RBF = 0,
     BR_KERNEL_MATERN05 = 1,
     BR_KERNEL_MATERN15 = 2,
     BR_KERNEL_MATERN25 = 3
 } br_mpc_kernel;
-
-/* Run-time parameters of the OCP, paper equation (8). Objective without factor 1/2. */
-typedef struct {
-    double q_position;       /* Q = q I, weight of the squared position error [1/m^2] */
-    double r_duty;           /* weight of (d_k - d_{k-1})^2 */
-    double r_delta_rate;     /* weight of delta_rate_k^2 [s^2/rad^2] */
-    double s_slack;          /* weight of eps^2 [1/m^2]; 0 switches the track constraints off */
-    double margin_m;         /* distance kept from the track edges */
-    double d_min, d_max;
-    double delta_max_rad;
-    double delta_rate_max_radps;
-    double tolerance;        /* of the scaled KKT residual for BR_CONVERGED */
-    double defect_max;       /* largest dynamics defect of an acceptable plan */
-    double settle;           /* a step ends at this stationarity and tenth of the defect, or, warm,
-                                when they fall by less than half and the defect is below 0.01;
-                                0: neither */
-    int iterations;          /* SQP iterations a step without budget may use, once the defect is
-                                below 0.01 */
-    int iterations_cold;     /* the same for the first step after a reset; with a budget the larger
-                                of the two is the limit of every step, second starts aside */
-} br_mpc_parameters;
 
 /* Time in seconds since any fixed moment, never going backwards. */
 typedef double (*br_mpc_clock)(void *context);
@@ -114,32 +65,6 @@ typedef struct {
     const double *inputs;          /* n x BR_NZ, row major */
     const double *alpha;           /* n */
 } br_mpc_gp;
-
-/* One stage of the reference: position, and the track as lower <= normal . p <= upper. */
-typedef struct {
-    double x, y, normal_x, normal_y, lower, upper;
-} br_mpc_reference;
-
-typedef struct {
-    int iterations;          /* SQP iterations used, those of a second start included */
-    int qp_iterations;       /* active-set iterations, summed */
-    int regularised;         /* iterations whose Hessian had to be made positive definite */
-    int shortened;           /* steps that the line search halved */
-    int second_start;        /* 1: the plan from before was doubtful, and a new one no better;
-                                2: the new one is better */
-    int shifts;              /* stages by which the plan was shifted; -1: there was no plan */
-    int prepared;            /* 1: br_mpc_prepare had the linearisation and factorisation ready */
-    int prepared_iterations; /* SQP iterations of br_mpc_prepare since the step before */
-    int time_limited;        /* 1: the budget ended the iterations */
-    double stationarity;     /* scaled infinity norms at the returned plan */
-    double defect;
-    double bound;
-    double shifted_cost;     /* of the plan before, shifted, under the same reference; 0 cold */
-    double cost;             /* objective at the returned plan, slack included */
-    double slack_max_m;
-    double s_ref_m;          /* projection of the car on the racing line */
-    double lateral_m;        /* distance of the car from the racing line, positive left */
-} br_mpc_info;
 
 /* --- set-up; none is for the control loop but where it says so ------------------------------ */
 
@@ -190,7 +115,7 @@ BR_API void br_mpc_reset(br_mpc *mpc);
  * Where the car stands and points away from the line, the reference (br_mpc_get_reference) leads it
  * round at a walking pace instead, with the track's edges 2 m farther out: see br_turn.c.
  *
- * x: measured state. d_previous: duty cycle that acts now. u: first input of the plan; written
+ * x: measured state. u_before: the input that acts now. u: first input of the plan; written
  * only for BR_CONVERGED and BR_ACCEPTABLE. info may be NULL.
  *
  * elapsed_s: time from the state of the call before to this one, whether that was solved or not.
@@ -205,12 +130,12 @@ BR_API void br_mpc_reset(br_mpc *mpc);
  * Without a clock or with budget_s <= 0 the iteration limits alone count. Either way an iteration
  * that fails does not take back a usable plan found before it. After BR_TIME_LIMIT the next step
  * goes on from where this one stopped. */
-BR_API br_mpc_error br_mpc_step(br_mpc *mpc, const double x[BR_NX], double d_previous,
+BR_API br_mpc_error br_mpc_step(br_mpc *mpc, const double x[BR_NX], const double u_before[BR_NU],
                                 double elapsed_s, double budget_s, double u[BR_NU],
                                 br_mpc_status *status, br_mpc_info *info);
 
 /* The same with a reference of the caller's own planner, stages 1..BR_N. */
-BR_API br_mpc_error br_mpc_solve(br_mpc *mpc, const double x[BR_NX], double d_previous,
+BR_API br_mpc_error br_mpc_solve(br_mpc *mpc, const double x[BR_NX], const double u_before[BR_NU],
                                  double elapsed_s, double budget_s,
                                  const br_mpc_reference reference[BR_N], double u[BR_NU],
                                  br_mpc_status *status, br_mpc_info *info);

@@ -19,13 +19,10 @@ br_mpc_error br_mpc_init(void *memory, size_t size, br_mpc **out) {
 }
 
 static int valid(const br_mpc_parameters *p) {
-    const double numbers[] = {p->q_position, p->r_duty, p->r_delta_rate, p->s_slack, p->margin_m,
-                              p->d_min, p->d_max, p->delta_max_rad, p->delta_rate_max_radps,
-                              p->tolerance, p->defect_max, p->settle};
-    return br_all_finite(numbers, sizeof numbers / sizeof numbers[0]) && p->q_position > 0 &&
-           p->r_duty > 0 && p->r_delta_rate > 0 && p->s_slack >= 0 && p->margin_m >= 0 &&
-           p->d_min < p->d_max && p->delta_max_rad > 0 && p->delta_rate_max_radps > 0 &&
-           p->tolerance > 0 && p->defect_max > 0 && p->settle >= 0 && p->iterations >= 1 && p->iterations_cold >= 1;
+    const double numbers[] = {p->tolerance, p->defect_max, p->settle};
+    return br_all_finite(numbers, sizeof numbers / sizeof numbers[0]) && p->tolerance > 0 &&
+           p->defect_max > 0 && p->settle >= 0 && p->iterations >= 1 && p->iterations_cold >= 1 &&
+           br_valid_parameters(p);
 }
 
 br_mpc_error br_mpc_set_parameters(br_mpc *mpc, const br_mpc_parameters *parameters) {
@@ -34,6 +31,7 @@ br_mpc_error br_mpc_set_parameters(br_mpc *mpc, const br_mpc_parameters *paramet
     mpc->parameters = *parameters;
     mpc->has_parameters = 1;
     mpc->qp.factorised = 0;
+    br_evaluate_penalties(mpc);
     return BR_OK;
 }
 
@@ -47,7 +45,12 @@ br_mpc_error br_mpc_set_speed_limit(br_mpc *mpc, double limit_mps, double rate_m
 
 br_mpc_error br_mpc_set_path(br_mpc *mpc, const double *table, int n, double spacing_m) {
     if (!mpc || !table) return BR_ERROR_NULL;
+#if BR_HAS_PATH
     return br_path_load(&mpc->path, table, n, spacing_m);
+#else
+    (void)n, (void)spacing_m;
+    return BR_ERROR_PATH;
+#endif
 }
 
 br_mpc_error br_mpc_set_clock(br_mpc *mpc, br_mpc_clock clock, void *context) {
@@ -92,34 +95,13 @@ br_mpc_error br_mpc_evaluate(const br_mpc *mpc, const double v[BR_NV], const dou
 }
 
 const char *br_mpc_error_text(br_mpc_error error) {
-    switch (error) {
-    case BR_OK: return "no error";
-    case BR_ERROR_NULL: return "a required pointer is NULL";
-    case BR_ERROR_MEMORY: return "memory block too small or not aligned to 64 bytes";
-    case BR_ERROR_PARAMETERS: return "a parameter is not finite or out of its range";
-    case BR_ERROR_PATH: return "path table is unusable";
-    case BR_ERROR_WEIGHTS: return "GP weights are unusable";
-    case BR_ERROR_NOT_READY: return "parameters or path have not been set";
-    case BR_ERROR_TIME: return "a time is negative, not finite or too long";
-    case BR_ERROR_STATE: return "a state or input is not finite or absurd";
-    case BR_ERROR_BUSY: return "another thread is staging weights";
-    case BR_ERROR_NOT_STAGED: return "no weights are staged";
-    }
-    return "unknown error";
+    static const char *const texts[] = BR_ERROR_TEXTS;
+    return (unsigned)error < sizeof texts / sizeof texts[0] ? texts[error] : "unknown error";
 }
 
 const char *br_mpc_status_text(br_mpc_status status) {
-    switch (status) {
-    case BR_CONVERGED: return "converged";
-    case BR_ACCEPTABLE: return "acceptable";
-    case BR_DEFECT: return "dynamics defect too large";
-    case BR_INFEASIBLE: return "QP infeasible";
-    case BR_QP_LIMIT: return "QP iteration limit";
-    case BR_NOT_FINITE: return "not finite";
-    case BR_BAD_STATE: return "bad state";
-    case BR_TIME_LIMIT: return "out of time before the plan was usable";
-    }
-    return "unknown status";
+    static const char *const texts[] = BR_STATUS_TEXTS;
+    return (unsigned)status < sizeof texts / sizeof texts[0] ? texts[status] : "unknown status";
 }
 
 const char *br_mpc_model_name(void) { return BR_MODEL_NAME; }

@@ -1,4 +1,4 @@
-/* Posterior mean of the three Gaussian processes with gradient and Hessian.
+/* Posterior mean of the Gaussian processes with gradient and Hessian.
  *
  * Native counterpart of bayesrace/gp/expression.py (tested against it and its derivatives): one
  * pass over the training points of an output, in vectors. With t = (z - z_i) / l and r = |t|,
@@ -63,7 +63,7 @@ fill_block(const int kind, const br_gp_output *gp, const br_vec query[BR_NZ], in
 #pragma GCC unroll 2
     for (int i = 0; i < count; i += BR_LANES) {
         br_vec r2 = {0};
-#pragma GCC unroll 6
+#pragma GCC unroll 16
         for (int a = 0; a < BR_NZ; ++a) {
             const br_vec t = query[a] - br_load(&gp->inputs[a][first + i]);
             br_store(&out->t[a][i], t);
@@ -78,62 +78,50 @@ fill_block(const int kind, const br_gp_output *gp, const br_vec query[BR_NZ], in
     return sum;
 }
 
+#define UNROLL _Pragma("GCC unroll 16")
+#define INLINE static inline __attribute__((always_inline))
+#define SECOND_MOMENTS (BR_NZ * (BR_NZ + 1) / 2)
+
 /* sums[0] += sum w1, sums[1 + a] += sum w1 t_a */
-static inline void add_first_moments(const block *in, int count, br_vec sums[1 + BR_NZ]) {
-    br_vec total = sums[0], s0 = sums[1], s1 = sums[2], s2 = sums[3], s3 = sums[4], s4 = sums[5],
-           s5 = sums[6];
+INLINE void add_first_moments(const block *in, int count, br_vec sums[1 + BR_NZ]) {
+    br_vec total = sums[0], s[BR_NZ];
+    UNROLL for (int a = 0; a < BR_NZ; ++a) s[a] = sums[1 + a];
     for (int i = 0; i < count; i += BR_LANES) {
         const br_vec w = br_load(&in->w1[i]);
         total += w;
-        s0 += w * br_load(&in->t[0][i]);
-        s1 += w * br_load(&in->t[1][i]);
-        s2 += w * br_load(&in->t[2][i]);
-        s3 += w * br_load(&in->t[3][i]);
-        s4 += w * br_load(&in->t[4][i]);
-        s5 += w * br_load(&in->t[5][i]);
+        UNROLL for (int a = 0; a < BR_NZ; ++a) s[a] += w * br_load(&in->t[a][i]);
     }
-    sums[0] = total, sums[1] = s0, sums[2] = s1, sums[3] = s2, sums[4] = s3, sums[5] = s4, sums[6] = s5;
+    sums[0] = total;
+    UNROLL for (int a = 0; a < BR_NZ; ++a) sums[1 + a] = s[a];
 }
 
-/* Second moments sum w2 t_a t_b for b <= a, packed by rows: a = 0..3 and a = 4, 5. */
-static inline void add_second_moments(const block *in, int count, br_vec sums[21]) {
-    br_vec s00 = sums[0], s10 = sums[1], s11 = sums[2], s20 = sums[3], s21 = sums[4], s22 = sums[5],
-           s30 = sums[6], s31 = sums[7], s32 = sums[8], s33 = sums[9];
+/* Second moments sum w2 t_a t_b for b <= a, packed by rows; of the rows first <= a < end, whose sums
+ * have room in the registers. */
+INLINE void add_rows(const block *in, int count, const int first, const int end,
+                     br_vec sums[SECOND_MOMENTS]) {
+    br_vec s[SECOND_MOMENTS];
+    UNROLL for (int e = first * (first + 1) / 2; e < end * (end + 1) / 2; ++e) s[e] = sums[e];
     for (int i = 0; i < count; i += BR_LANES) {
         const br_vec w = br_load(&in->w2[i]);
-        const br_vec t0 = br_load(&in->t[0][i]), t1 = br_load(&in->t[1][i]);
-        const br_vec t2 = br_load(&in->t[2][i]), t3 = br_load(&in->t[3][i]);
-        const br_vec w0 = w * t0, w1 = w * t1, w2 = w * t2, w3 = w * t3;
-        s00 += w0 * t0;
-        s10 += w1 * t0, s11 += w1 * t1;
-        s20 += w2 * t0, s21 += w2 * t1, s22 += w2 * t2;
-        s30 += w3 * t0, s31 += w3 * t1, s32 += w3 * t2, s33 += w3 * t3;
+        br_vec t[BR_NZ], wt[BR_NZ];
+        UNROLL for (int a = 0; a < end; ++a) t[a] = br_load(&in->t[a][i]);
+        UNROLL for (int a = first; a < end; ++a) wt[a] = w * t[a];
+        UNROLL for (int a = first; a < end; ++a)
+            UNROLL for (int b = 0; b <= a; ++b) s[a * (a + 1) / 2 + b] += wt[a] * t[b];
     }
-    sums[0] = s00, sums[1] = s10, sums[2] = s11, sums[3] = s20, sums[4] = s21, sums[5] = s22;
-    sums[6] = s30, sums[7] = s31, sums[8] = s32, sums[9] = s33;
-    br_vec s40 = sums[10], s41 = sums[11], s42 = sums[12], s43 = sums[13], s44 = sums[14];
-    br_vec s50 = sums[15], s51 = sums[16], s52 = sums[17], s53 = sums[18], s54 = sums[19], s55 = sums[20];
-    for (int i = 0; i < count; i += BR_LANES) {
-        const br_vec t4 = br_load(&in->t[4][i]), t5 = br_load(&in->t[5][i]);
-        const br_vec w = br_load(&in->w2[i]), w4 = w * t4, w5 = w * t5;
-        br_vec t = br_load(&in->t[0][i]);
-        s40 += w4 * t, s50 += w5 * t;
-        t = br_load(&in->t[1][i]);
-        s41 += w4 * t, s51 += w5 * t;
-        t = br_load(&in->t[2][i]);
-        s42 += w4 * t, s52 += w5 * t;
-        t = br_load(&in->t[3][i]);
-        s43 += w4 * t, s53 += w5 * t;
-        s44 += w4 * t4, s54 += w5 * t4, s55 += w5 * t5;
-    }
-    sums[10] = s40, sums[11] = s41, sums[12] = s42, sums[13] = s43, sums[14] = s44;
-    sums[15] = s50, sums[16] = s51, sums[17] = s52, sums[18] = s53, sums[19] = s54, sums[20] = s55;
+    UNROLL for (int e = first * (first + 1) / 2; e < end * (end + 1) / 2; ++e) sums[e] = s[e];
+}
+
+static inline void add_second_moments(const block *in, int count, br_vec sums[SECOND_MOMENTS]) {
+#define GROUP(first, end) add_rows(in, count, first, end, sums);
+    BR_MOMENT_GROUPS
+#undef GROUP
 }
 
 static inline __attribute__((always_inline)) void
 evaluate(const int kind, const br_gp_output *gp, const double z[BR_NZ], double *mean,
          double gradient[BR_NZ], double hessian[BR_NZ][BR_NZ]) {
-    br_vec query[BR_NZ], sum = {0}, first[1 + BR_NZ] = {{0}}, second[21] = {{0}};
+    br_vec query[BR_NZ], sum = {0}, first[1 + BR_NZ] = {{0}}, second[SECOND_MOMENTS] = {{0}};
     block points;
     for (int a = 0; a < BR_NZ; ++a) query[a] = br_splat(z[a] * gp->inverse_scale[a]);
     for (int i = 0; i < gp->n_padded; i += BLOCK) {

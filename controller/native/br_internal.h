@@ -5,17 +5,20 @@
 #include <daqp/types.h>
 #include <stdatomic.h>
 
+#define BR_TABLES /* the sparsity of the problem, too */
 #include "bayesrace_mpc.h"
 #include "br_vector.h"
 
 #define BR_M (BR_NU * BR_N)                      /* condensed variables */
 #define BR_MP (((BR_M + 7) / 8) * 8)             /* padded to whole vectors */
-#define BR_ROWS (BR_M + 2 * BR_N)                /* input bounds, steering angle, half-planes */
+#define BR_ROWS (BR_M + BR_NR * BR_N)            /* input bounds, then the problem's, row by row */
+#define BR_ROW(r, k) (BR_M + BR_N * (r) + (k))   /* row r of stage k + 1 */
+#define BR_ROW_LATE BR_ROW(BR_NR_EARLY, 0)       /* from here on gradients are known at a step only */
 #define BR_COLS ((((BR_ROWS + 1) + 7) / 8) * 8)  /* right-hand sides of one substitution */
 #define BR_HORIZON_S (BR_N * BR_TS)
 #define BR_LINE_SEARCH_TRIALS 5
 #define BR_FUTILE 8 /* second starts in vain from which they are made only each so many steps */
-#define BR_DEFECT_FINE 0.01 /* m, m, rad, m/s, m/s, 10 rad/s, rad: not worth another iteration */
+#define BR_DEFECT_FINE 0.01 /* of BR_STATE_SCALE: not worth another iteration */
 #define BR_GP_PADDED (((BR_GP_CAPACITY + 7) / 8) * 8)
 
 /* One output of the residual as the kernel wants it: scaled features, structure of arrays. */
@@ -31,6 +34,20 @@ typedef struct {
     int any; /* 0 while every output is constant zero: WorstCase and BestCase skip the kernels */
     br_gp_output output[BR_NE];
 } br_gp;
+
+/* Cost and constraints of one stage, at the state of its end: br_terms writes this. */
+typedef struct {
+    double cost;
+    double in_x[BR_NX], in_u[BR_NU], in_u_before[BR_NU]; /* the cost's gradient */
+    double value[BR_NR], lower[BR_NR], upper[BR_NR];     /* of the rows */
+    double gradient[BR_ROW_NNZ];                         /* of the rows in x, by BR_ROW_INDEX */
+} br_stage_terms;
+
+/* Second derivatives of the same: br_curvature writes them. */
+typedef struct {
+    double cost_xx[BR_CXX_NNZ + 1], rows_xx[BR_RXX_NNZ + 1]; /* by BR_CXX_ROW and so on */
+    double uu[2 * BR_NU][2 * BR_NU];                         /* of [u; u_before] */
+} br_stage_curvature;
 
 /* Linearisation of the corrected model at one stage. */
 typedef struct {
@@ -53,6 +70,9 @@ typedef struct {
     int factorised;     /* g, h, and y, scale, m of the rows up to ROW_TRACK fit the linearisation */
     int regularised;    /* the exact Hessian was not positive definite */
     double curvature;   /* share of the second-order part that is in h */
+    br_stage_terms terms[BR_N];
+    br_stage_curvature second[BR_N];
+    double penalty[BR_NR]; /* of the soft rows */
     BR_ALIGNED double g[BR_N + 1][BR_NX][BR_MP]; /* sensitivity of stage k to all inputs */
     BR_ALIGNED double costate[2][BR_NX][BR_MP];
     BR_ALIGNED double h[BR_M][BR_MP];            /* condensed Hessian, then its Cholesky factor */
@@ -117,8 +137,8 @@ struct br_mpc {
     int gp_in_use;       /* written by who has taken the spare buffer, in the control thread */
     atomic_int spare;
     /* the problem */
-    double d_previous;
-    double d_lowest;     /* d_min, less where the car is slow: see BR_BRAKE_FADE_MPS */
+    double u_before[BR_NU];
+    double u_lower[BR_NU], u_upper[BR_NU];
     double x0[BR_NX];
     br_mpc_reference reference[BR_N];
     double turn;         /* the side that the car turns round to, 1 left, -1 right; 0: it does not */
@@ -173,6 +193,24 @@ void br_stage_linearise(const br_gp *gp, const double x[BR_NX], const double u[B
 void br_stage_advance(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
                       double duration, double x_next[BR_NX]);
 
+/* br_problem.c: cost and constraints as the problem's generated functions have them */
+void br_evaluate_terms(br_mpc *mpc);
+/* out += (cost_xx + share * rows_xx) dx */
+static inline void br_add_curvature(const br_stage_curvature *second, double share,
+                                    const double dx[BR_NX], double out[BR_NX]) {
+    for (int n = 0; n < BR_CXX_NNZ; ++n) out[BR_CXX_ROW[n]] += second->cost_xx[n] * dx[BR_CXX_COLUMN[n]];
+    for (int n = 0; n < BR_RXX_NNZ; ++n)
+        out[BR_RXX_ROW[n]] += share * second->rows_xx[n] * dx[BR_RXX_COLUMN[n]];
+}
+void br_evaluate_curvature(br_mpc *mpc);
+void br_evaluate_bounds(br_mpc *mpc);
+void br_evaluate_penalties(br_mpc *mpc);
+void br_first_guess(const br_mpc *mpc, const double u_before[BR_NU], double share, double u[BR_NU]);
+int br_valid_parameters(const br_mpc_parameters *parameters);
+static inline const double *br_theta(const br_mpc_parameters *parameters) {
+    return (const double *)parameters; /* the problem's come first, all of them doubles */
+}
+
 /* br_qp.c: condensing and the QP of one SQP iteration */
 void br_qp_init(br_qp *qp);
 void br_qp_factorise(br_mpc *mpc);
@@ -190,7 +228,7 @@ void br_timer_note(const br_timer *timer, double begin, double *longest);
 /* br_sqp.c: the plan's start, shift and iteration */
 void br_sqp_linearise(br_mpc *mpc);
 void br_sqp_cold_start(br_mpc *mpc);
-void br_sqp_roll_out(br_mpc *mpc, double throttle);
+void br_sqp_roll_out(br_mpc *mpc, const double u[BR_NU]);
 void br_sqp_shift(br_mpc *mpc);
 br_mpc_status br_sqp_iterate(br_mpc *mpc, int warm, int first_of_warm);
 

@@ -9,6 +9,8 @@
 
 #include "br_internal.h"
 
+#if BR_HAS_PATH
+
 enum { X = 0, Y = 1, SPEED = 2, NORMAL_X = 3, NORMAL_Y = 4, LOWER = 5, UPPER = 6 };
 
 #define WINDOW_BACK_M 0.3
@@ -61,7 +63,7 @@ static void path_at(const br_path *path, double s, double row[BR_PATH_COLUMNS]) 
 }
 
 static double squared_distance(const double *row, const double x[BR_NX]) {
-    const double dx = row[X] - x[0], dy = row[Y] - x[1];
+    const double dx = row[X] - x[BR_INDEX_X], dy = row[Y] - x[BR_INDEX_Y];
     return dx * dx + dy * dy;
 }
 
@@ -78,7 +80,7 @@ static int nearest_anywhere(const br_path *path, const double x[BR_NX]) {
     for (int i = 0; i < path->n; ++i) {
         const double *row = path->table[i];
         double distance = sqrt(squared_distance(row, x));
-        if (!same_direction(path, i, x[2])) distance += row[UPPER] - row[LOWER];
+        if (!same_direction(path, i, x[BR_INDEX_PSI])) distance += row[UPPER] - row[LOWER];
         if (distance < best_distance) {
             best = i;
             best_distance = distance;
@@ -109,7 +111,7 @@ static void project(const br_path *path, int i, const double x[BR_NX], double *s
         const int j = wrap_index(i + k, path->n);
         const double *a = path->table[j], *b = path->table[wrap_index(j + 1, path->n)];
         const double tx = b[X] - a[X], ty = b[Y] - a[Y];
-        const double px = x[0] - a[X], py = x[1] - a[Y];
+        const double px = x[BR_INDEX_X] - a[X], py = x[BR_INDEX_Y] - a[Y];
         double w = (px * tx + py * ty) / (tx * tx + ty * ty);
         w = w < 0 ? 0 : (w > 1 ? 1 : w);
         const double ex = px - w * tx, ey = py - w * ty, d2 = ex * ex + ey * ey;
@@ -132,7 +134,7 @@ void br_path_ahead(const br_path *path, double distance, double point[2]) {
 void br_path_plan(br_path *path, const double x[BR_NX], br_mpc_reference reference[BR_N],
                   double *lateral) {
     double s, row[BR_PATH_COLUMNS];
-    if (path->age * hypot(x[3], x[4]) > 0.8 * WINDOW_AHEAD_M) path->known = 0; /* may have left the window */
+    if (path->age * hypot(x[BR_INDEX_VX], x[BR_INDEX_VY]) > 0.8 * WINDOW_AHEAD_M) path->known = 0; /* may have left the window */
     path->age = 0;
     project(path, path->known ? nearest_in_window(path, x) : nearest_anywhere(path, x), x, &s, lateral);
     path_at(path, s, row);
@@ -153,3 +155,5 @@ void br_path_plan(br_path *path, const double x[BR_NX], br_mpc_reference referen
         };
     }
 }
+
+#endif

@@ -4,9 +4,8 @@
 #include "br_internal.h"
 
 int br_plausible_state(const double x[BR_NX]) {
-    static const double limit[BR_NX] = {1e4, 1e4, 1e7, 100, 100, 1e3, 1.5};
     for (int i = 0; i < BR_NX; ++i)
-        if (!(fabs(x[i]) <= limit[i])) return 0;
+        if (!(fabs(x[i]) <= BR_STATE_LIMIT[i])) return 0;
     return 1;
 }
 

@@ -3,10 +3,10 @@
  *
  *   min 1/2 dU' H dU + g' dU   s.t.  lower <= A dU <= upper
  *
- * rows: BR_M input bounds, BR_N steering angles (stages 1..N), BR_N track half-planes. The two
- * half-planes of a stage are parallel: one two-sided row. They are soft with the penalty s eps^2,
- * eps >= 0 per side; only one side can be violated, and with a purely quadratic penalty eps >= 0
- * never binds, so DAQP's dual regularisation (1 / 2s on a soft row's diagonal) is exact.
+ * rows: BR_M input bounds, then BR_N for each row of the problem (stages 1..N), two-sided, those with
+ * constant gradients first. Soft ones have the penalty w eps^2, eps >= 0 per side; only one side can
+ * be violated, and with a purely quadratic penalty eps >= 0 never binds, so DAQP's dual
+ * regularisation (1 / 2w on a soft row's diagonal) is exact.
  *
  * DAQP gets M = A L^{-T} (H = L L') in caller-owned memory; only its core daqp_ldp is called,
  * which neither allocates nor reads a clock. docs/decisions/ says why DAQP and not HPIPM.
@@ -16,8 +16,6 @@
 
 #include "br_internal.h"
 
-#define ROW_DELTA BR_M
-#define ROW_TRACK (BR_M + BR_N)
 #define POSITIVE_DEFINITE 1e-10 /* smallest pivot, relative to the largest diagonal entry */
 
 void br_qp_init(br_qp *qp) {
@@ -52,35 +50,47 @@ void br_qp_init(br_qp *qp) {
 }
 
 void br_qp_forget_working_set(br_qp *qp) {
-    for (int i = 0; i < BR_ROWS; ++i) qp->sense[i] = i >= ROW_TRACK ? SOFT : 0;
+    for (int i = 0; i < BR_M; ++i) qp->sense[i] = 0;
+    for (int r = 0; r < BR_NR; ++r)
+        for (int k = 0; k < BR_N; ++k) qp->sense[BR_ROW(r, k)] = BR_ROW_SOFT[r] ? SOFT : 0;
 }
 
 /* What belongs to rows moves with the horizon: stage k takes what stage k + 1 had. */
 void br_qp_shift_rows(void *rows, size_t size) {
     char *at = rows;
     memmove(at, at + BR_NU * size, (BR_M - BR_NU) * size);
-    at += ROW_DELTA * size;
-    memmove(at, at + size, (BR_N - 1) * size);
-    at += (ROW_TRACK - ROW_DELTA) * size;
-    memmove(at, at + size, (BR_N - 1) * size);
+    at += BR_M * size;
+    for (int r = 0; r < BR_NR; ++r, at += BR_N * size) memmove(at, at + size, (BR_N - 1) * size);
 }
 
 /* Whole vectors that cover columns 0..n-1 of a BR_MP-wide row; the rest of a row is zero. */
 static inline int padded(int n) { return (n + 7) & ~7; }
 
-/* G_{k+1} = [A_k G_k, B_k]; pose columns of A are unit vectors (translation invariance), so that
- * rows x and y add themselves and no other row sees them. */
+/* out[c] (+)= sum_n weight_n rows[n][c] for whole vectors of columns. */
+static inline __attribute__((always_inline)) void
+combine(double *restrict out, const int columns, const int add, const int count,
+        const double *restrict weight, const double *const *restrict rows) {
+    for (int c = 0; c < columns; c += BR_LANES) {
+        br_vec sum = add ? br_load(&out[c]) : br_splat(0.0);
+        for (int n = 0; n < count; ++n) sum += weight[n] * br_load(&rows[n][c]);
+        br_store(&out[c], sum);
+    }
+}
+
+/* G_{k+1} = [A_k G_k, B_k] */
 static void propagate_sensitivity(double (*restrict next)[BR_MP], double (*restrict g)[BR_MP],
                                   const br_stage *stage, int k) {
     const int columns = padded(BR_NU * k);
     for (int i = 0; i < BR_NX; ++i) {
-        for (int c = 0; c < columns; ++c) next[i][c] = i < 2 ? g[i][c] : 0.0;
-        for (int j = 2; j < BR_NX; ++j) {
-            const double a = stage->jacobian[i][j];
-            for (int c = 0; c < columns; ++c) next[i][c] += a * g[j][c];
+        double weight[BR_NX];
+        const double *rows[BR_NX];
+        int count = 0;
+        for (int n = BR_A_START[i]; n < BR_A_START[i + 1]; ++n, ++count) {
+            weight[count] = stage->jacobian[i][BR_A_INDEX[n]];
+            rows[count] = g[BR_A_INDEX[n]];
         }
-        next[i][BR_NU * k] = stage->jacobian[i][BR_NX];
-        next[i][BR_NU * k + 1] = stage->jacobian[i][BR_NX + 1];
+        combine(next[i], columns, 0, count, weight, rows);
+        for (int c = 0; c < BR_NU; ++c) next[i][BR_NU * k + c] = stage->jacobian[i][BR_NX + c];
     }
 }
 
@@ -99,85 +109,108 @@ static void propagate_state(br_mpc *mpc) {
 }
 
 /* One step of the backward recursion for the Hessian's rows of stage k, columns of inputs <= k:
- * H_k = B' P + S G_k,  P <- A' P + W G_k, with curvature weight tau. */
+ * H_k = B' P + S G_k,  P <- A' P + (W + second derivatives of cost and rows) G_k, the second-order
+ * part of dynamics and rows with the weight tau. */
 static void hessian_rows(br_mpc *mpc, int k, double tau, double (*restrict p)[BR_MP],
                          double (*restrict p_next)[BR_MP]) {
     br_qp *qp = &mpc->qp;
     const br_stage *stage = &mpc->stage[k];
     const int columns = padded(BR_NU * (k + 1)), before = padded(BR_NU * k);
     double(*restrict g)[BR_MP] = qp->g[k];
+    double weight[2 * BR_NX];
+    const double *rows[2 * BR_NX];
     for (int r = 0; r < BR_NU; ++r) {
         double *restrict row = qp->h[BR_NU * k + r];
-        for (int c = 0; c < columns; ++c) row[c] = 0;
-        for (int j = 0; j < BR_NX; ++j) {
-            const double b = stage->jacobian[j][BR_NX + r];
-            for (int c = 0; c < columns; ++c) row[c] += b * p[j][c];
+        int count = 0;
+        for (int n = BR_BT_START[r]; n < BR_BT_START[r + 1]; ++n, ++count) {
+            weight[count] = stage->jacobian[BR_BT_INDEX[n]][BR_NX + r];
+            rows[count] = p[BR_BT_INDEX[n]];
         }
-        for (int j = 2; j < BR_NX; ++j) {
-            const double s = tau * stage->hessian[BR_NX + r][j];
-            for (int c = 0; c < before; ++c) row[c] += s * g[j][c];
+        combine(row, columns, 0, count, weight, rows);
+        count = 0;
+        for (int n = BR_WUX_START[r]; n < BR_WUX_START[r + 1]; ++n, ++count) {
+            weight[count] = tau * stage->hessian[BR_NX + r][BR_WUX_INDEX[n]];
+            rows[count] = g[BR_WUX_INDEX[n]];
         }
+        combine(row, before, 1, count, weight, rows);
         for (int c = 0; c < BR_NU; ++c)
             row[BR_NU * k + c] += tau * stage->hessian[BR_NX + r][BR_NX + c];
     }
     if (k == 0) return;
-    const double q = 2 * mpc->parameters.q_position;
     for (int i = 0; i < BR_NX; ++i) {
-        for (int c = 0; c < before; ++c) p_next[i][c] = i < 2 ? p[i][c] + q * g[i][c] : 0.0;
-        if (i < 2) continue; /* the pose columns of A are unit vectors, their curvature zero */
-        for (int j = 0; j < BR_NX; ++j) {
-            const double a = stage->jacobian[j][i];
-            for (int c = 0; c < before; ++c) p_next[i][c] += a * p[j][c];
+        int count = 0;
+        for (int n = BR_AT_START[i]; n < BR_AT_START[i + 1]; ++n, ++count) {
+            weight[count] = stage->jacobian[BR_AT_INDEX[n]][i];
+            rows[count] = p[BR_AT_INDEX[n]];
         }
-        for (int j = 2; j < BR_NX; ++j) {
-            const double w = tau * stage->hessian[i][j];
-            for (int c = 0; c < before; ++c) p_next[i][c] += w * g[j][c];
+        for (int n = BR_WXX_START[i]; n < BR_WXX_START[i + 1]; ++n, ++count) {
+            weight[count] = tau * stage->hessian[i][BR_WXX_INDEX[n]];
+            rows[count] = g[BR_WXX_INDEX[n]];
         }
+        combine(p_next[i], before, 0, count, weight, rows);
+    }
+    br_stage_curvature *second = &qp->second[k - 1];
+    for (int n = 0; n < BR_CXX_NNZ; ++n) {
+        rows[0] = g[BR_CXX_COLUMN[n]];
+        combine(p_next[BR_CXX_ROW[n]], before, 1, 1, &second->cost_xx[n], rows);
+    }
+    for (int n = 0; n < BR_RXX_NNZ; ++n) {
+        weight[0] = tau * second->rows_xx[n];
+        rows[0] = g[BR_RXX_COLUMN[n]];
+        combine(p_next[BR_RXX_ROW[n]], before, 1, 1, weight, rows);
     }
 }
 
 static void condense_hessian(br_mpc *mpc, double tau) {
     br_qp *qp = &mpc->qp;
-    const br_mpc_parameters *par = &mpc->parameters;
-    for (int i = 0; i < BR_NX; ++i)
+    const br_stage_curvature *final = &qp->second[BR_N - 1];
+    memset(qp->costate[0], 0, sizeof qp->costate[0]);
+    for (int n = 0; n < BR_CXX_NNZ; ++n)
         for (int c = 0; c < BR_MP; ++c)
-            qp->costate[0][i][c] = i < 2 ? 2 * par->q_position * qp->g[BR_N][i][c] : 0.0;
+            qp->costate[0][BR_CXX_ROW[n]][c] += final->cost_xx[n] * qp->g[BR_N][BR_CXX_COLUMN[n]][c];
+    for (int n = 0; n < BR_RXX_NNZ; ++n)
+        for (int c = 0; c < BR_MP; ++c)
+            qp->costate[0][BR_RXX_ROW[n]][c] +=
+                tau * final->rows_xx[n] * qp->g[BR_N][BR_RXX_COLUMN[n]][c];
     for (int k = BR_N - 1, side = 0; k >= 0; --k, side = !side)
         hessian_rows(mpc, k, tau, qp->costate[side], qp->costate[!side]);
     for (int k = 0; k < BR_N; ++k) {
         const int i = BR_NU * k;
-        qp->h[i][i] += 2 * par->r_duty * (k + 1 < BR_N ? 2 : 1);
-        if (k) qp->h[i][i - BR_NU] -= 2 * par->r_duty;
-        qp->h[i + 1][i + 1] += 2 * par->r_delta_rate;
+        for (int a = 0; a < BR_NU; ++a)
+            for (int b = 0; b < BR_NU; ++b) {
+                const double later = k + 1 < BR_N ? qp->second[k + 1].uu[BR_NU + a][BR_NU + b] : 0.0;
+                qp->h[i + a][i + b] += qp->second[k].uu[a][b] + later;
+                if (k) qp->h[i + a][i - BR_NU + b] += qp->second[k].uu[a][BR_NU + b];
+            }
     }
 }
 
 /* Gradient of the QP at dU = 0 by the adjoint recursion along xbar. */
 static void condense_gradient(br_mpc *mpc, double tau) {
     br_qp *qp = &mpc->qp;
-    const br_mpc_parameters *par = &mpc->parameters;
     double p[BR_NX] = {0};
     for (int k = BR_N; k >= 0; --k) {
         double next[BR_NX] = {0};
         if (k < BR_N) {
             const br_stage *stage = &mpc->stage[k];
-            const double *u = mpc->plan.u[k], *dx = qp->xbar[k];
-            const double before = k ? mpc->plan.u[k - 1][0] : mpc->d_previous;
-            const double after = k + 1 < BR_N ? mpc->plan.u[k + 1][0] - u[0] : 0.0;
-            double r[BR_NU] = {2 * par->r_duty * (u[0] - before - after), 2 * par->r_delta_rate * u[1]};
+            const double *dx = qp->xbar[k];
             for (int c = 0; c < BR_NU; ++c) {
-                for (int j = 0; j < BR_NX; ++j)
-                    r[c] += stage->jacobian[j][BR_NX + c] * p[j] + tau * stage->hessian[BR_NX + c][j] * dx[j];
-                qp->gradient[BR_NU * k + c] = r[c];
+                double sum = qp->terms[k].in_u[c] + (k + 1 < BR_N ? qp->terms[k + 1].in_u_before[c] : 0.0);
+                for (int j = 0; j < BR_NX; ++j) sum += stage->jacobian[j][BR_NX + c] * p[j];
+                for (int n = BR_WUX_START[c]; n < BR_WUX_START[c + 1]; ++n)
+                    sum += tau * stage->hessian[BR_NX + c][BR_WUX_INDEX[n]] * dx[BR_WUX_INDEX[n]];
+                qp->gradient[BR_NU * k + c] = sum;
             }
-            for (int i = 0; i < BR_NX; ++i)
-                for (int j = 0; j < BR_NX; ++j)
-                    next[i] += stage->jacobian[j][i] * p[j] + tau * stage->hessian[i][j] * dx[j];
+            for (int i = 0; i < BR_NX; ++i) {
+                for (int n = BR_AT_START[i]; n < BR_AT_START[i + 1]; ++n)
+                    next[i] += stage->jacobian[BR_AT_INDEX[n]][i] * p[BR_AT_INDEX[n]];
+                for (int n = BR_WXX_START[i]; n < BR_WXX_START[i + 1]; ++n)
+                    next[i] += tau * stage->hessian[i][BR_WXX_INDEX[n]] * dx[BR_WXX_INDEX[n]];
+            }
         }
         if (k) {
-            const br_mpc_reference *ref = &mpc->reference[k - 1];
-            next[0] += 2 * par->q_position * (mpc->plan.x[k][0] + qp->xbar[k][0] - ref->x);
-            next[1] += 2 * par->q_position * (mpc->plan.x[k][1] + qp->xbar[k][1] - ref->y);
+            for (int i = 0; i < BR_NX; ++i) next[i] += qp->terms[k - 1].in_x[i];
+            br_add_curvature(&qp->second[k - 1], tau, qp->xbar[k], next);
         }
         memcpy(p, next, sizeof p);
     }
@@ -204,7 +237,7 @@ static int cholesky(br_qp *qp) {
     return 1;
 }
 
-/* Y = L^{-1} [A' | g]; the columns before ROW_TRACK belong to the inputs and steering angles. */
+/* Y = L^{-1} [A' | g]; the columns before BR_ROW_LATE do not need the measured state. */
 static inline __attribute__((always_inline)) void substitute(br_qp *qp, const int first,
                                                              const int last) {
     for (int r = 0; r < BR_M; ++r) {
@@ -218,12 +251,44 @@ static inline __attribute__((always_inline)) void substitute(br_qp *qp, const in
     }
 }
 
-/* Rows of DAQP's matrix. Hard ones are scaled to unit length; soft ones stay in metres because DAQP
- * has one weight for all soft rows. */
+/* Rows of DAQP's matrix. Hard ones are scaled to unit length, soft ones by the root of their penalty,
+ * because DAQP has one weight for all soft rows: see set_scales. */
 static inline __attribute__((always_inline)) void fill_rows(br_qp *qp, const int first,
                                                             const int last) {
     for (int i = first; i < last; ++i)
         for (int r = 0; r < BR_M; ++r) qp->m[i * BR_M + r] = qp->scale[i] * qp->y[r][i];
+}
+
+/* The rows' sensitivities to input r, columns of y: row r of the problem is h_x G. */
+static void fill_sensitivities(br_qp *qp, const int first, const int last, int input, double *y) {
+    for (int r = first; r < last; ++r)
+        for (int k = input / BR_NU; k < BR_N; ++k) {
+            double sum = 0;
+            for (int n = BR_ROW_START[r]; n < BR_ROW_START[r + 1]; ++n) {
+                const int i = BR_ROW_INDEX[n];
+                const double h = r < BR_NR_EARLY ? BR_ROW_CONSTANT[BR_NX * r + i] : qp->terms[k].gradient[n];
+                sum += h * qp->g[k + 1][i][input];
+            }
+            y[BR_ROW(r, k)] = sum;
+        }
+}
+
+/* Of soft rows with several penalties, each is scaled so that the first one's penalty serves all. */
+static double slack_weight(const br_qp *qp) {
+    for (int r = 0; r < BR_NR; ++r)
+        if (BR_ROW_SOFT[r] && qp->penalty[r] > 0) return qp->penalty[r];
+    return 0;
+}
+
+static void set_scales(br_qp *qp, int first, int last, const double *norm2) {
+    const double weight = slack_weight(qp);
+    for (int i = first; i < last; ++i) {
+        const int r = i < BR_M ? -1 : (i - BR_M) / BR_N;
+        if (r >= 0 && BR_ROW_SOFT[r])
+            qp->scale[i] = qp->penalty[r] > 0 ? sqrt(qp->penalty[r] / weight) : 1.0;
+        else
+            qp->scale[i] = norm2[i] > 0 ? 1.0 / sqrt(norm2[i]) : 1.0;
+    }
 }
 
 /* What of the least-distance problem depends on the linearisation alone. */
@@ -233,22 +298,23 @@ static void transform(br_qp *qp) {
         double *y = qp->y[r];
         memset(y, 0, sizeof qp->y[r]);
         y[r] = 1.0;
-        for (int k = r / BR_NU; k < BR_N; ++k) y[ROW_DELTA + k] = qp->g[k + 1][6][r];
+        fill_sensitivities(qp, 0, BR_NR_EARLY, r, y);
     }
-    substitute(qp, 0, ROW_TRACK);
+    substitute(qp, 0, BR_ROW_LATE);
     for (int r = 0; r < BR_M; ++r)
-        for (int i = 0; i < ROW_TRACK; ++i) norm2[i] += qp->y[r][i] * qp->y[r][i];
-    for (int i = 0; i < BR_ROWS; ++i) qp->scale[i] = i < ROW_TRACK ? 1.0 / sqrt(norm2[i]) : 1.0;
-    fill_rows(qp, 0, ROW_TRACK);
+        for (int i = 0; i < BR_ROW_LATE; ++i) norm2[i] += qp->y[r][i] * qp->y[r][i];
+    set_scales(qp, 0, BR_ROW_LATE, norm2);
+    fill_rows(qp, 0, BR_ROW_LATE);
 }
 
 /* All that needs neither the measured state nor the reference. With the exact Hessian if that is
- * positive definite in the inputs; else with less and less of its second-order part, down to
- * Gauss-Newton, which always is. */
+ * positive definite in the inputs; else with less and less of the dynamics' and the rows' part, down
+ * to that of the cost alone, which always is. */
 void br_qp_factorise(br_mpc *mpc) {
     static const double curvature[] = {1.0, 0.5, 0.25, 0.0};
     br_qp *qp = &mpc->qp;
     qp->factorised = 0;
+    br_evaluate_curvature(mpc);
     for (int k = 0; k < BR_N; ++k) propagate_sensitivity(qp->g[k + 1], qp->g[k], &mpc->stage[k], k);
     for (int attempt = 0; attempt < 4; ++attempt) {
         condense_hessian(mpc, curvature[attempt]);
@@ -263,8 +329,9 @@ void br_qp_factorise(br_mpc *mpc) {
 
 br_mpc_status br_qp_condense(br_mpc *mpc) {
     br_qp *qp = &mpc->qp;
-    if (!qp->factorised) br_qp_factorise(mpc);
-    if (!qp->factorised) return BR_NOT_FINITE; /* Gauss-Newton is positive definite by construction */
+    br_evaluate_terms(mpc);
+    if (!qp->factorised || BR_CURVATURE_LATE) br_qp_factorise(mpc);
+    if (!qp->factorised) return BR_NOT_FINITE; /* a convex cost alone is positive definite */
     propagate_state(mpc);
     condense_gradient(mpc, qp->curvature);
     mpc->info.regularised += qp->regularised;
@@ -273,55 +340,55 @@ br_mpc_status br_qp_condense(br_mpc *mpc) {
 
 static void bounds(br_mpc *mpc) {
     br_qp *qp = &mpc->qp;
-    const br_mpc_parameters *par = &mpc->parameters;
     for (int k = 0; k < BR_N; ++k) {
-        const double *x = mpc->plan.x[k + 1], *dx = qp->xbar[k + 1];
-        const br_mpc_reference *ref = &mpc->reference[k];
-        const int d = BR_NU * k, rate = d + 1, delta = ROW_DELTA + k, track = ROW_TRACK + k;
-        qp->lower[d] = mpc->d_lowest - mpc->plan.u[k][0];
-        qp->upper[d] = par->d_max - mpc->plan.u[k][0];
-        qp->lower[rate] = -par->delta_rate_max_radps - mpc->plan.u[k][1];
-        qp->upper[rate] = par->delta_rate_max_radps - mpc->plan.u[k][1];
-        qp->lower[delta] = -par->delta_max_rad - x[6] - dx[6];
-        qp->upper[delta] = par->delta_max_rad - x[6] - dx[6];
-        const double along = ref->normal_x * (x[0] + dx[0]) + ref->normal_y * (x[1] + dx[1]);
-        qp->lower[track] = ref->lower + par->margin_m - along;
-        qp->upper[track] = ref->upper - par->margin_m - along;
+        for (int c = 0; c < BR_NU; ++c) {
+            qp->lower[BR_NU * k + c] = mpc->u_lower[c] - mpc->plan.u[k][c];
+            qp->upper[BR_NU * k + c] = mpc->u_upper[c] - mpc->plan.u[k][c];
+        }
+        const br_stage_terms *terms = &qp->terms[k];
+        for (int r = 0; r < BR_NR; ++r) {
+            double value = terms->value[r];
+            for (int n = BR_ROW_START[r]; n < BR_ROW_START[r + 1]; ++n)
+                value += terms->gradient[n] * qp->xbar[k + 1][BR_ROW_INDEX[n]];
+            const int off = BR_ROW_SOFT[r] && !(qp->penalty[r] > 0);
+            qp->lower[BR_ROW(r, k)] = off ? -DAQP_INF : terms->lower[r] - value;
+            qp->upper[BR_ROW(r, k)] = off ? DAQP_INF : terms->upper[r] - value;
+        }
     }
 }
 
-/* The rest of the least-distance problem: half-planes and right-hand sides. */
-static void fill_least_distance(br_mpc *mpc, int rows) {
+/* The rest of the least-distance problem: late rows and right-hand sides. */
+static void fill_least_distance(br_mpc *mpc) {
     br_qp *qp = &mpc->qp;
-    BR_ALIGNED double shift[BR_COLS] = {0};
+    BR_ALIGNED double shift[BR_COLS] = {0}, norm2[BR_COLS] = {0};
     for (int r = 0; r < BR_M; ++r) {
         double *y = qp->y[r];
-        for (int i = ROW_TRACK; i < BR_COLS; ++i) y[i] = 0;
-        for (int k = r / BR_NU; k < BR_N; ++k) {
-            const br_mpc_reference *ref = &mpc->reference[k];
-            y[ROW_TRACK + k] = ref->normal_x * qp->g[k + 1][0][r] + ref->normal_y * qp->g[k + 1][1][r];
-        }
+        for (int i = BR_ROW_LATE; i < BR_COLS; ++i) y[i] = 0;
+        fill_sensitivities(qp, BR_NR_EARLY, BR_NR, r, y);
         y[BR_ROWS] = qp->gradient[r];
     }
-    substitute(qp, ROW_TRACK, BR_COLS);
+    substitute(qp, BR_ROW_LATE, BR_COLS);
     for (int r = 0; r < BR_M; ++r) {
         const double *restrict y = qp->y[r], v = y[BR_ROWS];
         for (int i = 0; i < BR_COLS; ++i) shift[i] += y[i] * v;
+        for (int i = BR_ROW_LATE; i < BR_ROWS; ++i) norm2[i] += y[i] * y[i];
     }
-    for (int i = 0; i < rows; ++i) {
+    set_scales(qp, BR_ROW_LATE, BR_ROWS, norm2);
+    for (int i = 0; i < BR_ROWS; ++i) {
         qp->dupper[i] = qp->scale[i] * (qp->upper[i] + shift[i]);
         qp->dlower[i] = qp->scale[i] * (qp->lower[i] + shift[i]);
     }
-    if (rows > ROW_TRACK) fill_rows(qp, ROW_TRACK, BR_ROWS);
+    fill_rows(qp, BR_ROW_LATE, BR_ROWS);
 }
 
-static int run_daqp(br_qp *qp, int rows, double slack_weight) {
+static int run_daqp(br_qp *qp) {
+    const double weight = slack_weight(qp);
     DAQPWorkspace *work = &qp->daqp;
-    work->m = rows;
+    work->m = BR_ROWS;
     work->ms = 0;
     work->lam = qp->lam[0];
     work->lam_star = qp->lam[1];
-    qp->settings.rho_soft = slack_weight > 0 ? 1.0 / (2 * slack_weight) : 0.0;
+    qp->settings.rho_soft = weight > 0 ? 1.0 / (2 * weight) : 0.0;
     reset_daqp_workspace(work);
     activate_constraints(work);
     return daqp_ldp(work);
@@ -343,17 +410,15 @@ static void recover(br_qp *qp) {
 
 br_mpc_status br_qp_solve(br_mpc *mpc, int warm) {
     br_qp *qp = &mpc->qp;
-    const double slack_weight = mpc->parameters.s_slack;
-    const int rows = slack_weight > 0 ? BR_ROWS : ROW_TRACK;
     bounds(mpc);
-    fill_least_distance(mpc, rows);
-    if (!br_all_finite(qp->dupper, rows) || !br_all_finite(qp->dlower, rows)) return BR_NOT_FINITE;
+    fill_least_distance(mpc);
+    if (!br_all_finite(qp->dupper, BR_ROWS) || !br_all_finite(qp->dlower, BR_ROWS)) return BR_NOT_FINITE;
     if (!warm) br_qp_forget_working_set(qp);
-    int flag = run_daqp(qp, rows, slack_weight);
+    int flag = run_daqp(qp);
     mpc->info.qp_iterations += qp->daqp.iterations;
     if (flag < 0 && warm) { /* once more without the old working set before giving up */
         br_qp_forget_working_set(qp);
-        flag = run_daqp(qp, rows, slack_weight);
+        flag = run_daqp(qp);
         mpc->info.qp_iterations += qp->daqp.iterations;
     }
     if (flag == EXIT_INFEASIBLE) return BR_INFEASIBLE;

@@ -19,23 +19,23 @@ static void linearise(br_mpc *mpc, int first) {
 
 void br_sqp_linearise(br_mpc *mpc) { linearise(mpc, 0); }
 
-/* Without a plan from before: hold the steering, half throttle, see where that leads; or turn.
- * Where that has led to no plan time and again, Newton's steps may go round in circles: then, but
- * for a turn, other throttles are tried. */
+/* Without a plan from before: the problem's guess, see where that leads; or turn. Where that has led
+ * to no plan time and again, Newton's steps may go round in circles: then, but for a turn, other
+ * guesses are tried. */
 void br_sqp_cold_start(br_mpc *mpc) {
-    static const double throttles[] = {0.5, 0.5, 1.0, 0.25};
-    const double share = throttles[mpc->attempts % 4], d_max = mpc->parameters.d_max;
-    br_sqp_roll_out(mpc, fmin(fmax(mpc->d_previous, share * d_max), d_max));
+    static const double shares[] = {0.5, 0.5, 1.0, 0.25};
+    double u[BR_NU];
+    br_first_guess(mpc, mpc->u_before, shares[mpc->attempts % 4], u);
+    br_sqp_roll_out(mpc, u);
 }
 
-/* The plan that holds the steering and this throttle, or turns. */
-void br_sqp_roll_out(br_mpc *mpc, double throttle) {
+/* The plan that holds this input, or turns. */
+void br_sqp_roll_out(br_mpc *mpc, const double u[BR_NU]) {
     memcpy(mpc->plan.x[0], mpc->x0, sizeof mpc->x0);
     memset(mpc->plan.costate, 0, sizeof mpc->plan.costate);
     memset(mpc->plan.multiplier, 0, sizeof mpc->plan.multiplier);
     for (int k = 0; k < BR_N; ++k) {
-        mpc->plan.u[k][0] = mpc->turn ? mpc->turn_u[k][0] : throttle;
-        mpc->plan.u[k][1] = mpc->turn ? mpc->turn_u[k][1] : 0;
+        memcpy(mpc->plan.u[k], mpc->turn ? mpc->turn_u[k] : u, sizeof mpc->plan.u[k]);
         br_stage_linearise(&mpc->gp[mpc->gp_in_use], mpc->plan.x[k], mpc->plan.u[k],
                            mpc->plan.costate[k + 1], &mpc->stage[k]);
         memcpy(mpc->plan.x[k + 1], mpc->stage[k].f, sizeof mpc->plan.x[k + 1]);
@@ -54,14 +54,14 @@ void br_sqp_shift(br_mpc *mpc) {
     memmove(mpc->stage, mpc->stage + 1, last * sizeof mpc->stage[0]);
     br_qp_shift_rows(mpc->plan.multiplier, sizeof mpc->plan.multiplier[0]);
     br_qp_shift_rows(mpc->qp.sense, sizeof mpc->qp.sense[0]);
-    /* hold the duty cycle at the new end; the steering rate goes to zero so that the angle stays */
-    mpc->plan.u[last][1] = 0;
+    for (int c = 0; c < BR_NU; ++c)
+        if (!BR_INPUT_HELD[c]) mpc->plan.u[last][c] = 0;
     linearise(mpc, mpc->linearised ? last : 0);
     memcpy(mpc->plan.x[BR_N], mpc->stage[last].f, sizeof mpc->plan.x[BR_N]);
 }
 
 /* Changes of the states under the QP's inputs, and the costates from the QP's optimality:
- * lambda_k = grad_x cost + W (dx, du) + A' lambda_{k+1} + (constraint normals)' multipliers. */
+ * lambda_k = grad_x cost + W (dx, du) + A' lambda_{k+1} + (gradients of the rows)' multipliers. */
 static void direction(br_mpc *mpc) {
     br_qp *qp = &mpc->qp;
     memcpy(qp->delta_x[0], qp->xbar[0], sizeof qp->xbar[0]);
@@ -76,22 +76,26 @@ static void direction(br_mpc *mpc) {
         }
     }
     for (int k = BR_N; k >= 1; --k) {
-        const br_mpc_reference *ref = &mpc->reference[k - 1];
-        const double *x = mpc->plan.x[k], *dx = qp->delta_x[k];
-        const double q = 2 * mpc->parameters.q_position, track = qp->multiplier[BR_M + BR_N + k - 1];
+        const br_stage_terms *terms = &qp->terms[k - 1];
+        const double *dx = qp->delta_x[k];
         double *lambda = qp->costate_next[k];
-        memset(lambda, 0, sizeof qp->costate_next[k]);
-        lambda[0] = q * (x[0] + dx[0] - ref->x) + track * ref->normal_x;
-        lambda[1] = q * (x[1] + dx[1] - ref->y) + track * ref->normal_y;
-        lambda[6] = qp->multiplier[BR_M + k - 1];
+        memcpy(lambda, terms->in_x, sizeof qp->costate_next[k]);
+        br_add_curvature(&qp->second[k - 1], 1.0, dx, lambda);
+        for (int r = 0; r < BR_NR; ++r)
+            for (int n = BR_ROW_START[r]; n < BR_ROW_START[r + 1]; ++n)
+                lambda[BR_ROW_INDEX[n]] += qp->multiplier[BR_ROW(r, k - 1)] * terms->gradient[n];
         if (k == BR_N) continue;
         const br_stage *stage = &mpc->stage[k];
         const double *after = qp->costate_next[k + 1], *du = &qp->delta_u[BR_NU * k];
         for (int i = 0; i < BR_NX; ++i) {
-            for (int j = 0; j < BR_NX; ++j)
-                lambda[i] += stage->jacobian[j][i] * after[j] + stage->hessian[i][j] * dx[j];
-            for (int c = 0; c < BR_NU; ++c) lambda[i] += stage->hessian[i][BR_NX + c] * du[c];
+            for (int n = BR_AT_START[i]; n < BR_AT_START[i + 1]; ++n)
+                lambda[i] += stage->jacobian[BR_AT_INDEX[n]][i] * after[BR_AT_INDEX[n]];
+            for (int n = BR_WXX_START[i]; n < BR_WXX_START[i + 1]; ++n)
+                lambda[i] += stage->hessian[i][BR_WXX_INDEX[n]] * dx[BR_WXX_INDEX[n]];
         }
+        for (int c = 0; c < BR_NU; ++c)
+            for (int n = BR_WUX_START[c]; n < BR_WUX_START[c + 1]; ++n)
+                lambda[BR_WUX_INDEX[n]] += stage->hessian[BR_WUX_INDEX[n]][BR_NX + c] * du[c];
     }
 }
 

@@ -79,15 +79,17 @@ static int worth_a_try(br_mpc *mpc) {
     return futile < BR_FUTILE || futile % BR_FUTILE == 0;
 }
 
-/* Iterates from another start, with another throttle each time in a row; leaves the better plan of
+/* Iterates from another start, with another guess each time in a row; leaves the better plan of
  * that and the one at hand. To coast from the measured state most often leads to the good minimum in
  * a few iterations (docs/decisions/2026-11-22-second-start.md). */
 br_mpc_status br_start_again(br_mpc *mpc, br_mpc_status status, unsigned turn) {
-    static const double throttles[] = {0, 0.5, 1, 0.25};
+    static const double shares[] = {0, 0.5, 1, 0.25}, nothing[BR_NU] = {0};
     const int time_limited = mpc->info.time_limited;
+    double u[BR_NU];
     int better;
     br_first_keep(mpc, status);
-    br_sqp_roll_out(mpc, throttles[turn % 4] * mpc->parameters.d_max);
+    br_first_guess(mpc, nothing, shares[turn % 4], u);
+    br_sqp_roll_out(mpc, u);
     status = br_first_compare(mpc, iterate(mpc, 0, BR_SECOND_START_ITERATIONS), &better);
     mpc->info.second_start = better ? 2 : 1;
     if (better) mpc->futile = mpc->starts = 0;
@@ -125,16 +127,22 @@ static void solve(br_mpc *mpc, double u[BR_NU], br_mpc_status *status, br_mpc_in
     if (info) *info = mpc->info;
 }
 
+static int plausible_input(const double u[BR_NU]) {
+    for (int c = 0; c < BR_NU; ++c)
+        if (!(fabs(u[c]) <= 1e3)) return 0;
+    return 1;
+}
+
 typedef struct {
-    const double *x;
-    double d_previous, elapsed_s, budget_s;
+    const double *x, *u_before;
+    double elapsed_s, budget_s;
     const double *u;
     br_mpc_status *status;
     br_mpc_info *info;
 } request;
 
 static br_mpc_error begin(br_mpc *mpc, const request *r, int *plausible) {
-    if (!mpc || !r->x || !r->u || !r->status) return BR_ERROR_NULL;
+    if (!mpc || !r->x || !r->u_before || !r->u || !r->status) return BR_ERROR_NULL;
     br_timer_start(&mpc->timer, r->budget_s);
     *r->status = BR_BAD_STATE; /* until there is something better to say */
     memset(&mpc->info, 0, sizeof mpc->info);
@@ -143,39 +151,40 @@ static br_mpc_error begin(br_mpc *mpc, const request *r, int *plausible) {
     if (!(r->elapsed_s >= 0 && isfinite(r->elapsed_s))) return BR_ERROR_TIME;
     mpc->lag += r->elapsed_s;
     mpc->path.age += r->elapsed_s;
-    *plausible = br_plausible_state(r->x) && fabs(r->d_previous) <= 1e3;
+    *plausible = br_plausible_state(r->x) && plausible_input(r->u_before);
     if (!*plausible) return BR_OK;
     memcpy(mpc->x0, r->x, sizeof mpc->x0);
-    mpc->d_previous = r->d_previous;
-    mpc->d_lowest = mpc->parameters.d_min;
-    if (mpc->d_lowest < 0) mpc->d_lowest *= fmin(fmax(r->x[3] / BR_BRAKE_FADE_MPS, 0), 1);
+    memcpy(mpc->u_before, r->u_before, sizeof mpc->u_before);
+    br_evaluate_bounds(mpc);
     mpc->info.prepared_iterations = mpc->prepared_iterations;
     mpc->prepared_iterations = 0;
     return BR_OK;
 }
 
-br_mpc_error br_mpc_step(br_mpc *mpc, const double x[BR_NX], double d_previous, double elapsed_s,
-                         double budget_s, double u[BR_NU], br_mpc_status *status,
+br_mpc_error br_mpc_step(br_mpc *mpc, const double x[BR_NX], const double u_before[BR_NU],
+                         double elapsed_s, double budget_s, double u[BR_NU], br_mpc_status *status,
                          br_mpc_info *info) {
     int plausible;
-    const request r = {x, d_previous, elapsed_s, budget_s, u, status, info};
+    const request r = {x, u_before, elapsed_s, budget_s, u, status, info};
     const br_mpc_error error = begin(mpc, &r, &plausible);
     if (error) return error;
-    if (!mpc->path.ready) return BR_ERROR_NOT_READY;
+    if (!mpc->path.ready) return BR_ERROR_NOT_READY; /* as always without a path */
     if (!plausible) return BR_OK;
+#if BR_HAS_PATH
     br_path_plan(&mpc->path, x, mpc->reference, &mpc->info.lateral_m);
     br_turn(mpc);
     mpc->info.s_ref_m = mpc->path.s;
+#endif
     solve(mpc, u, status, info);
     return BR_OK;
 }
 
-br_mpc_error br_mpc_solve(br_mpc *mpc, const double x[BR_NX], double d_previous, double elapsed_s,
-                          double budget_s, const br_mpc_reference reference[BR_N], double u[BR_NU],
+br_mpc_error br_mpc_solve(br_mpc *mpc, const double x[BR_NX], const double u_before[BR_NU],
+                          double elapsed_s, double budget_s, const br_mpc_reference reference[BR_N], double u[BR_NU],
                           br_mpc_status *status, br_mpc_info *info) {
     if (!reference) return BR_ERROR_NULL;
     int plausible;
-    const request r = {x, d_previous, elapsed_s, budget_s, u, status, info};
+    const request r = {x, u_before, elapsed_s, budget_s, u, status, info};
     const br_mpc_error error = begin(mpc, &r, &plausible);
     if (error || !plausible) return error;
     memcpy(mpc->reference, reference, sizeof mpc->reference);

@@ -10,6 +10,8 @@
 
 #include "br_internal.h"
 
+#if BR_HAS_PATH
+
 #define SLOW_MPS 0.2     /* a turn begins below this speed if the line is */
 #define AWAY_RAD 0.6     /* farther than this to one side, */
 #define FACED_RAD 0.3    /* and ends within this */
@@ -24,15 +26,15 @@
 
 /* Angle to the point, seen from the car; positive left. */
 static double bearing(const double x[BR_NX], const double to[2]) {
-    return remainder(atan2(to[1] - x[1], to[0] - x[0]) - x[2], 2 * M_PI);
+    return remainder(atan2(to[1] - x[BR_INDEX_Y], to[0] - x[BR_INDEX_X]) - x[BR_INDEX_PSI], 2 * M_PI);
 }
 
 /* The side to turn to: the nearer one, or, with the line behind, the one with more room. */
 static double side(const double x[BR_NX], double away, const br_mpc_reference *here) {
     if (fabs(away) < BEHIND_RAD) return copysign(1, away);
-    const double along = here->normal_x * x[0] + here->normal_y * x[1];
+    const double along = here->normal_x * x[BR_INDEX_X] + here->normal_y * x[BR_INDEX_Y];
     const double room_left = here->upper - along, room_right = along - here->lower;
-    const double facing = here->normal_x * -sin(x[2]) + here->normal_y * cos(x[2]);
+    const double facing = here->normal_x * -sin(x[BR_INDEX_PSI]) + here->normal_y * cos(x[BR_INDEX_PSI]);
     return copysign(1, (room_left - room_right) * facing);
 }
 
@@ -48,13 +50,13 @@ static double bearing_on_line(const br_path *path, const double to[2]) {
     double here[BR_NX] = {0}, next[2];
     br_path_ahead(path, 0, here);
     br_path_ahead(path, TANGENT_M, next);
-    here[2] = atan2(next[1] - here[1], next[0] - here[0]);
+    here[BR_INDEX_PSI] = atan2(next[1] - here[1], next[0] - here[0]);
     return bearing(here, to);
 }
 
 /* Begins, goes on with and ends a turn, of a slow or turning car. */
 static void decide(br_mpc *mpc, const double target[2]) {
-    const double *x = mpc->x0, away = bearing(x, target), speed = fabs(x[3]);
+    const double *x = mpc->x0, away = bearing(x, target), speed = fabs(x[BR_INDEX_VX]);
     if (mpc->path.speed_limit < STOP_MPS || speed > TOO_FAST_MPS) {
         mpc->turn = 0;
     } else if (mpc->turn) {
@@ -68,7 +70,7 @@ static void decide(br_mpc *mpc, const double target[2]) {
 
 void br_turn(br_mpc *mpc) {
     double target[2], x[BR_NX], next[BR_NX];
-    if (!mpc->turn && fabs(mpc->x0[3]) >= SLOW_MPS) return;
+    if (!mpc->turn && fabs(mpc->x0[BR_INDEX_VX]) >= SLOW_MPS) return;
     br_path_ahead(&mpc->path, AHEAD_M, target);
     decide(mpc, target);
     if (!mpc->turn) return;
@@ -78,16 +80,18 @@ void br_turn(br_mpc *mpc) {
     for (int k = 0; k < BR_N; ++k) {
         const double angle = remaining(mpc->turn, bearing(x, target));
         const double steering = mpc->turn * fmax(fmin(angle, p->delta_max_rad), -p->delta_max_rad);
-        const double rate = (steering - x[6]) / BR_TS;
+        const double rate = (steering - x[BR_INDEX_DELTA]) / BR_TS;
         double *u = mpc->turn_u[k];
-        u[0] = fmin(fmax(THROTTLE * (pace - x[3]), 0), p->d_max);
-        u[1] = fmin(fmax(rate, -p->delta_rate_max_radps), p->delta_rate_max_radps);
+        u[BR_INDEX_DUTY] = fmin(fmax(THROTTLE * (pace - x[BR_INDEX_VX]), 0), p->d_max);
+        u[BR_INDEX_DELTA_RATE] = fmin(fmax(rate, -p->delta_rate_max_radps), p->delta_rate_max_radps);
         br_stage_advance(&mpc->gp[mpc->gp_in_use], x, u, BR_TS, next);
         memcpy(x, next, sizeof x);
         br_mpc_reference *reference = &mpc->reference[k];
-        reference->x = x[0];
-        reference->y = x[1];
+        reference->x = x[BR_INDEX_X];
+        reference->y = x[BR_INDEX_Y];
         reference->lower -= WIDER_M;
         reference->upper += WIDER_M;
     }
 }
+
+#endif

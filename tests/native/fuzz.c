@@ -85,7 +85,7 @@ static const br_mpc_parameters usual = {
 };
 
 static br_mpc_parameters parameters;
-static double x[BR_NX], d_previous;
+static double x[BR_NX], before[BR_NU];
 
 static void set_parameters(controller *c, int count) {
     br_mpc_parameters p = usual;
@@ -145,7 +145,7 @@ static void set_weights(controller *c, int count) {
 static void measure(void) {
     static const double spread[BR_NX] = {0.1, 0.1, 0.3, 1, 0.3, 3, 0.4};
     for (int i = 0; i < BR_NX; ++i) x[i] = number(x[i], spread[i]);
-    d_previous = number(0.3, 0.5);
+    before[0] = number(0.3, 0.5);
 }
 
 static void check_answer(const double u[BR_NU], br_mpc_status status, const br_mpc_info *info) {
@@ -179,9 +179,9 @@ static void step(controller *c, int count, int own_reference, double budget) {
             br_mpc_reference reference[BR_N];
             CHECK(br_mpc_get_reference(c[i].mpc, reference) == BR_OK);
             (&reference[0].x)[cell] += value;
-            error = br_mpc_solve(c[i].mpc, x, d_previous, elapsed, budget, reference, u[i], &status[i], &info[i]);
+            error = br_mpc_solve(c[i].mpc, x, before, elapsed, budget, reference, u[i], &status[i], &info[i]);
         } else {
-            error = br_mpc_step(c[i].mpc, x, d_previous, elapsed, budget, u[i], &status[i], &info[i]);
+            error = br_mpc_step(c[i].mpc, x, before, elapsed, budget, u[i], &status[i], &info[i]);
         }
         CHECK(error == BR_OK || error == BR_ERROR_NOT_READY || error == BR_ERROR_TIME);
         if (!error) check_answer(u[i], status[i], &info[i]);

@@ -178,7 +178,8 @@ static int solve(fmu_instance *instance, double u[BR_NU], br_mpc_info *info) {
     c->stepped_s = time_s;
     c->has_stepped = 1;
     br_mpc_status status;
-    if (br_mpc_step(native(instance), x, d, elapsed_s, 0, u, &status, info)) return STATUS_REFUSED;
+    const double before[BR_NU] = {[BR_INDEX_DUTY] = d};
+    if (br_mpc_step(native(instance), x, before, elapsed_s, 0, u, &status, info)) return STATUS_REFUSED;
     return (int)status;
 }
 

@@ -1,0 +1,189 @@
+"""Step time and first-input error of two checkouts, interleaved over the same recorded problems.
+
+    python -m benchmarks.step_versions OTHER_CHECKOUT [--passes 10] [--json FILE]
+
+Records drives of the present step on three tracks (those of ``bayesrace bench``), gives all
+problems, with their references, to a process of each checkout, and lets both solve them in turn,
+pass by pass. A problem's time is the median over its passes, so that a stall of the machine does
+not count. Ratios are those of this checkout over the other one.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bayesrace.gp.weights import encode_weights
+from bayesrace.integrators import PREDICTION
+from bayesrace.raceline.cached import racing_line
+from bayesrace.tracks import load_track
+from bayesrace.vehicles import get_car
+from bayesrace.vehicles.models import dynamic
+from codegen.build import build
+from codegen.settings import BuildSettings
+from controller.native_step import NativeStep
+from controller.path_table import make_path_table
+from controller.settings import MpcSettings
+from experiments.bench import BenchSettings
+from experiments.preparation import trained_weights, training_samples
+from learning.training import TrainingSettings
+from plant.simulator import Simulator
+
+ROOT = Path(__file__).resolve().parents[1]
+
+# Runs in either checkout, so it may use only what both have.
+WORKER = """
+import json, sys, time
+import numpy as np
+sys.path.insert(0, sys.argv[1])
+from bayesrace.gp.weights import decode_weights
+from bayesrace.vehicles import get_car
+from codegen.build import build
+from codegen.settings import BuildSettings
+from controller.native_step import NativeStep
+from controller.settings import MpcSettings
+data = np.load(sys.argv[2])
+car = get_car(str(data["car"]))
+exact = MpcSettings(iterations=100, iterations_cold=100, tolerance=1e-10, settle=0)
+def make(settings):
+    step = NativeStep(build(BuildSettings(car=car.name))[0], car, settings)
+    step.set_weights(decode_weights(data["weights"].tobytes()))
+    return step
+def solve(step):
+    times, inputs, good = [], [], []
+    for x, d, reference, first in zip(data["x"], data["d"], data["reference"], data["first"]):
+        if first:
+            step.reset()
+        begin = time.perf_counter_ns()
+        status = step.solve(x, d, reference)
+        times.append((time.perf_counter_ns() - begin) * 1e-3)
+        inputs.append(step.u.tolist())
+        good.append(bool(status.usable))
+    return times, inputs, good
+fast = make(MpcSettings())
+solve(fast)
+print(json.dumps(solve(make(exact))[1:]), flush=True)
+for line in sys.stdin:
+    print(json.dumps(solve(fast)), flush=True)
+"""
+
+
+def record(problems: int, seed: int) -> dict[str, Any]:
+    """Closed loops on the tracks of the bench: what both checkouts are to solve, by name."""
+    settings = BenchSettings(seed=seed)
+    car = get_car(settings.car)
+    samples = training_samples(load_track(settings.train_track), car, 40.0, seed)
+    options = TrainingSettings(capacity=settings.points, seed=seed)
+    weights = trained_weights(samples, PREDICTION, options)
+    step = NativeStep(build(BuildSettings(car=car.name))[0], car, MpcSettings())
+    step.set_weights(weights)
+    rows: dict[str, list[Any]] = {name: [] for name in ("x", "d", "reference", "first")}
+    for name in settings.tracks:
+        track = load_track(name)
+        step.set_path(make_path_table(track, racing_line(track, car)))
+        step.reset()
+        simulator = Simulator(dynamic(car))
+        simulator.reset([*track.start_pose(), 1.0, 0.0, 0.0, 0.0])
+        for k in range(problems // len(settings.tracks)):
+            x, d = simulator.x.copy(), simulator.u_applied[0]
+            status = step.step(x, d)
+            for key, value in zip(rows, (x, d, step.read_reference(), k == 0), strict=True):
+                rows[key].append(value)
+            simulator.step(step.u.tolist() if status.usable else None)
+    encoded = np.frombuffer(encode_weights(weights), dtype=np.uint8)
+    return {"car": car.name, "weights": encoded, **rows}
+
+
+class _Worker:
+    """A process of one checkout."""
+
+    def __init__(self, checkout: Path, problems: Path) -> None:
+        line = [sys.executable, "-P", "-c", WORKER, str(checkout), str(problems)]
+        self._process = subprocess.Popen(
+            line, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=checkout
+        )
+        self.inputs, self.converged = self._read()
+
+    def solve(self) -> tuple[list[float], list[list[float]], list[bool]]:
+        """One pass: times [us], first inputs, whether they are usable."""
+        assert self._process.stdin is not None
+        self._process.stdin.write("go\n")
+        self._process.stdin.flush()
+        times, inputs, good = self._read()
+        return times, inputs, good
+
+    def close(self) -> None:
+        """Ends the process."""
+        self._process.communicate()
+
+    def _read(self) -> Any:
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            raise SystemExit("a worker has ended: see above")
+        return json.loads(line)
+
+
+def measure(other: Path, problems: Path, passes: int) -> dict[str, Any]:
+    """Percentiles of step time and error of both, and their ratios."""
+    workers = {"this": _Worker(ROOT, problems), "other": _Worker(other, problems)}
+    times: dict[str, list[list[float]]] = {name: [] for name in workers}
+    last: dict[str, Any] = {}
+    for number in range(passes):
+        order = list(workers) if number % 2 else list(workers)[::-1]
+        for name in order:
+            took, inputs, good = workers[name].solve()
+            times[name].append(took)
+            last[name] = np.array(inputs), np.array(good)
+    result: dict[str, Any] = {"problems": len(took), "passes": passes}
+    exact = {name: np.array(worker.inputs) for name, worker in workers.items()}
+    both = np.all([worker.converged for worker in workers.values()], axis=0)
+    result["exact_difference"] = np.abs(exact["this"] - exact["other"])[both].max(axis=0).tolist()
+    same = both & (np.abs(exact["this"] - exact["other"]).max(axis=1) < 1e-3)
+    result["same_minimum"] = int(same.sum())
+    result["exact_difference_same_minimum"] = float(
+        np.abs(exact["this"] - exact["other"])[same].max()
+    )
+    for name in workers:
+        us = np.median(times[name], axis=0)
+        inputs, good = last[name]
+        error = np.abs(inputs - exact[name])[same & good]
+        result[name] = {
+            "step_us": {f"p{q}": float(np.percentile(us, q)) for q in (50, 90, 99)},
+            "u0_error": {f"p{q}": np.percentile(error, q, axis=0).tolist() for q in (95, 99)},
+            "usable": int(good.sum()),
+        }
+        workers[name].close()
+    result["ratio"] = {
+        q: result["this"]["step_us"][q] / result["other"]["step_us"][q]
+        for q in ("p50", "p90", "p99")
+    }
+    return result
+
+
+def main() -> None:
+    """See the text of this module."""
+    parser = argparse.ArgumentParser(description="Step time of two checkouts, interleaved.")
+    parser.add_argument("other", type=Path, help="checkout to compare with")
+    parser.add_argument("--problems", type=int, default=900)
+    parser.add_argument("--passes", type=int, default=10)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", type=Path, help="write the numbers to this file")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        problems = Path(folder) / "problems.npz"
+        np.savez(problems, **record(given.problems, given.seed))
+        result = measure(given.other.resolve(), problems, given.passes)
+    text = json.dumps(result, indent=1)
+    print(text)
+    if given.json:
+        given.json.write_text(text + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,180 @@
+"""What an optimal control problem is: one object that the C code, its Python binding and the
+IPOPT oracle are all made from.
+
+    min  sum_{k=1}^N  l(x_k, u_{k-1}, u_{k-2}, p_k)  +  sum_k sum_r  w_r eps_{k,r}^2
+    s.t. x_{k+1} = f(x_k, u_k) + residual,   x_0 and u_{-1} given
+         u_lower <= u_k <= u_upper
+         lower_r <= h_r(x_k, p_k) <= upper_r             hard rows, k = 1..N
+         lower_r - eps <= h_r(x_k, p_k) <= upper_r + eps  soft rows with penalty w_r
+
+``p_k`` are the parameters of stage k, written by a planner at each step; ``theta`` are run-time
+parameters, which change seldom. All expressions are CasADi SX.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import casadi as ca
+
+__all__ = ["NO_BOUND", "Input", "Parameter", "Problem", "Row", "State", "Symbols"]
+
+NO_BOUND: Final = 1e20
+"""A bound of a row that is none."""
+
+
+@dataclass(frozen=True)
+class State:
+    """One component of the state."""
+
+    name: str
+    unit: str
+    scale: float = 1.0
+    """Size of a defect that counts as 1 in its norm."""
+    limit: float = 1e6
+    """A larger absolute value is no state of this system."""
+
+
+@dataclass(frozen=True)
+class Input:
+    """One component of the input."""
+
+    name: str
+    unit: str
+    held: bool = True
+    """Beyond the end of a plan that is shifted: held, or zero."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter, of a stage or of the whole problem."""
+
+    name: str
+    unit: str
+    text: str = ""
+    low: float = -NO_BOUND
+    high: float = NO_BOUND
+    positive: bool = False
+    """Has to be above zero."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A constraint on the states from stage 1 on; hard without a penalty."""
+
+    name: str
+    value: ca.SX
+    lower: ca.SX | float
+    upper: ca.SX | float
+    penalty: ca.SX | None = None
+    """Weight of the squared violation, of theta alone; 0 switches the row off."""
+
+    @property
+    def soft(self) -> bool:
+        """Whether it may be violated."""
+        return self.penalty is not None
+
+
+@dataclass(frozen=True, eq=False)
+class Symbols:
+    """What the expressions of a problem are written in."""
+
+    x: ca.SX
+    u: ca.SX
+    u_before: ca.SX
+    """Input of the stage before."""
+    p: ca.SX
+    """Parameters of the stage."""
+    theta: ca.SX
+    """Run-time parameters."""
+    last: ca.SX
+    """1 at the last stage, else 0: a factor of the terminal cost."""
+    share: ca.SX
+    """Of a guess of the inputs: 0 to 1; several guesses are tried."""
+    h: ca.SX
+    """Duration [s] over which an input acts."""
+
+    @classmethod
+    def of(cls, states: int, inputs: int, stage_parameters: int, parameters: int) -> "Symbols":
+        """Symbols of these sizes."""
+        sym = ca.SX.sym
+        return cls(
+            sym("x", states), sym("u", inputs), sym("u_before", inputs),
+            sym("p", stage_parameters), sym("theta", parameters),
+            sym("last"), sym("share"), sym("h"),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """One optimal control problem with its prediction model."""
+
+    name: str
+    states: tuple[State, ...]
+    inputs: tuple[Input, ...]
+    stage_parameters: tuple[Parameter, ...]
+    parameters: tuple[Parameter, ...]
+    features: tuple[str, ...]
+    """Names of the states and inputs that the residual depends on."""
+    outputs: int
+    """Number of the residual's outputs."""
+    symbols: Symbols
+    f: ca.Function
+    """The discretised model, (x, u, e) -> x_next; e is the residual's mean."""
+    linearise: ca.Function
+    """(x, u, e, lambda) -> f, its transposed Jacobian, Hessian of lambda' f; see stage.py."""
+    advance: ca.Function
+    """(x, u, e, h) -> x_next: the model over h [s]."""
+    cost: ca.SX
+    """l, convex and strictly so in u; of x, u, u_before, p, theta and last."""
+    rows: tuple[Row, ...]
+    u_lower: ca.SX
+    """Of theta and the measured state, which stands in x."""
+    u_upper: ca.SX
+    guess: ca.SX
+    """Input to begin with where there is no plan; of x, u_before, share, theta."""
+    acting: ca.SX
+    """What of u acts over h from x on, given the actuators' limits."""
+    reached: ca.SX
+    """The state that is then reached, given those limits; of x and theta."""
+    valid: ca.SX
+    """Above zero in all components for parameters that fit each other; of theta."""
+    path: Mapping[str, str] = field(default_factory=dict)
+    """Roles (x, y, psi, vx, vy, delta; duty, delta_rate) to names, for a planner that follows a
+    path; empty: there is none, and the stage parameters are always the caller's."""
+
+    def __post_init__(self) -> None:
+        """Checks what the generated code relies on."""
+        s = self.symbols
+        everything = (s.x, s.u, s.u_before, s.p, s.theta, s.last, s.share, s.h)
+        allowed: tuple[tuple[str, Any, tuple[Any, ...]], ...] = (
+            ("the cost", self.cost, (s.x, s.u, s.u_before, s.p, s.theta, s.last)),
+            *((f"row '{r.name}'", r.value, (s.x, s.p, s.theta)) for r in self.rows),
+            *((f"a bound of row '{r.name}'", r.lower, (s.p, s.theta)) for r in self.rows),
+            *((f"a bound of row '{r.name}'", r.upper, (s.p, s.theta)) for r in self.rows),
+            *((f"row '{r.name}'", r.penalty, (s.theta,)) for r in self.rows if r.soft),
+            ("a bound of the inputs", self.u_lower, (s.x, s.theta)),
+            ("a bound of the inputs", self.u_upper, (s.x, s.theta)),
+        )
+        for what, expression, known in allowed:
+            others = [one for one in everything if not any(one is k for k in known)]
+            if ca.depends_on(ca.SX(expression), ca.veccat(*others)):
+                raise ValueError(f"problem '{self.name}': {what} depends on what it must not")
+        hessian, _ = ca.hessian(self.cost, ca.veccat(s.x, s.u, s.u_before))
+        n = s.x.numel()
+        if hessian[:n, n:].nnz():
+            raise ValueError(f"problem '{self.name}': the cost couples states with inputs")
+
+    @property
+    def feature_indices(self) -> tuple[int, ...]:
+        """Of the features within v = [x; u]."""
+        names = [*(one.name for one in self.states), *(one.name for one in self.inputs)]
+        return tuple(names.index(name) for name in self.features)
+
+    def role(self, name: str) -> int:
+        """Index of the state or input that has this role for the planner."""
+        states = [one.name for one in self.states]
+        wanted = self.path[name]
+        if wanted in states:
+            return states.index(wanted)
+        return [one.name for one in self.inputs].index(wanted)

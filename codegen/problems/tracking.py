@@ -1,0 +1,96 @@
+"""Tracking of a racing line, equation (8) of the paper.
+
+    l = q |p_k - p_ref,k|^2 + r_d (d_{k-1} - d_{k-2})^2 + r_delta delta_rate_{k-1}^2
+    hard: |delta_k| <= delta_max;  soft: lower + margin <= n_k . p_k <= upper - margin
+    d_min <= d <= d_max,  |delta_rate| <= delta_rate_max
+
+The normals n_k have unit length. delta_0 is measured, so it is not constrained. Below
+``BRAKE_FADE_MPS`` d_min fades to 0: brakes do not drive a car backwards.
+"""
+
+import casadi as ca
+
+from bayesrace.integrators import Discretisation
+from bayesrace.vehicles.models import Model
+from bayesrace.vehicles.parameters import BRAKE_FADE_MPS
+from codegen.problems.problem import Input, Parameter, Problem, Row, State, Symbols
+from codegen.stage import advance_function, linearise_function
+
+__all__ = ["tracking"]
+
+_STATES = (
+    State("x", "m", limit=1e4),
+    State("y", "m", limit=1e4),
+    State("psi", "rad", limit=1e7),
+    State("vx", "m/s", limit=100),
+    State("vy", "m/s", limit=100),
+    State("omega", "rad/s", scale=10, limit=1e3),
+    State("delta", "rad", limit=1.5),
+)
+_INPUTS = (Input("d", "1"), Input("delta_rate", "rad/s", held=False))
+_REFERENCE = (
+    Parameter("x", "m"),
+    Parameter("y", "m"),
+    Parameter("normal_x", "1", "left normal of the centreline, unit length"),
+    Parameter("normal_y", "1"),
+    Parameter("lower", "m", "the track is lower <= normal . p <= upper"),
+    Parameter("upper", "m"),
+)
+_PARAMETERS = (
+    Parameter("q_position", "1/m2", "weight of the squared position error", positive=True),
+    Parameter("r_duty", "1", "weight of the squared change of the duty cycle", positive=True),
+    Parameter("r_delta_rate", "s2/rad2", "weight of the squared steering rate", positive=True),
+    Parameter("s_slack", "1/m2", "weight of the squared track violation; 0: no track", low=0),
+    Parameter("margin_m", "m", "distance kept from the track edges", low=0),
+    Parameter("d_min", "1", "lowest duty cycle (full brake)"),
+    Parameter("d_max", "1", "highest duty cycle"),
+    Parameter("delta_max_rad", "rad", "limit of the steering angle", positive=True),
+    Parameter("delta_rate_max_radps", "rad/s", "limit of the steering rate", positive=True),
+)
+
+
+def tracking(model: Model, discretisation: Discretisation) -> Problem:
+    """The problem with one prediction model (seven states, duty cycle and steering rate)."""
+    s = Symbols.of(len(_STATES), len(_INPUTS), len(_REFERENCE), len(_PARAMETERS))
+    x_ref, y_ref, normal_x, normal_y, lower, upper = ca.vertsplit(s.p)
+    q, r_d, r_delta, slack, margin, d_min, d_max, delta_max, rate_max = ca.vertsplit(s.theta)
+    x, y, _, vx, _, _, delta = ca.vertsplit(s.x)
+    d, rate = ca.vertsplit(s.u)
+    error = (x - x_ref) ** 2 + (y - y_ref) ** 2
+    cost = q * error + r_d * (d - s.u_before[0]) ** 2 + r_delta * rate**2
+    along = normal_x * x + normal_y * y
+    fade = ca.fmin(ca.fmax(vx / BRAKE_FADE_MPS, 0), 1)
+    brake = ca.if_else(d_min < 0, d_min * fade, d_min)
+    # The nearest rate within its limit that leaves the angle within its own after h.
+    within = ca.fmin(ca.fmax(rate, (-delta_max - delta) / s.h), (delta_max - delta) / s.h)
+    reached = ca.vertcat(s.x[:6], ca.fmin(ca.fmax(delta, -delta_max), delta_max))
+    return Problem(
+        name="tracking",
+        states=_STATES,
+        inputs=_INPUTS,
+        stage_parameters=_REFERENCE,
+        parameters=_PARAMETERS,
+        features=("vx", "vy", "omega", "delta", "d", "delta_rate"),
+        outputs=3,
+        symbols=s,
+        f=discretisation.corrected(model),
+        linearise=linearise_function(model, discretisation),
+        advance=advance_function(model, discretisation),
+        cost=cost,
+        rows=(
+            Row("steering angle", delta, -delta_max, delta_max),
+            Row("track", along, lower + margin, upper - margin, penalty=slack),
+        ),
+        u_lower=ca.vertcat(brake, -rate_max),
+        u_upper=ca.vertcat(d_max, rate_max),
+        guess=ca.vertcat(ca.fmin(ca.fmax(s.u_before[0], s.share * d_max), d_max), 0),
+        acting=ca.vertcat(
+            ca.fmin(ca.fmax(d, d_min), d_max), ca.fmin(ca.fmax(within, -rate_max), rate_max)
+        ),
+        reached=reached,
+        valid=d_max - d_min,
+        path={
+            "x": "x", "y": "y", "psi": "psi", "vx": "vx", "vy": "vy", "delta": "delta",
+            "duty": "d", "delta_rate": "delta_rate",
+        },
+    )  # fmt: skip

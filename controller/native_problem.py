@@ -1,0 +1,258 @@
+"""Python's view of any compiled problem: loads the artefact, one object per controller.
+
+ctypes with buffers made once: a step costs about 2 us beyond the C call. The sizes and names are
+those of the artefact's manifest.
+"""
+
+import ctypes as ct
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from bayesrace.errors import InputError
+from bayesrace.manifest import read_manifest
+from controller.native_library import Gp, StepInfo, StepStatus, load_library, parameters_type
+
+__all__ = ["NativeProblem", "Reference"]
+
+_ALIGNMENT: Final = 64
+_DOUBLES = npt.NDArray[np.float64]
+
+Reference = _DOUBLES
+"""Parameters of the stages 1..N, shape (N, np), in the order of the manifest."""
+
+
+def _address(array: _DOUBLES) -> int:
+    return array.ctypes.data
+
+
+class NativeProblem:
+    """A compiled control problem. Not thread-safe, but for :meth:`stage_weights`.
+
+    With nx states and nu inputs, ``u`` (nu,), ``info`` and the plan arrays are overwritten by each
+    step. Times are in seconds; budgets are measured by the system's monotonic clock.
+    """
+
+    def __init__(self, artefact: Path) -> None:
+        """Without parameters, and with a residual of zero. InputError for no usable artefact."""
+        self.manifest = read_manifest(artefact)
+        self._library = load_library(artefact, self.manifest)
+        self._mpc = self._new_object()
+        problem, n = self.manifest.problem, self.manifest.horizon
+        self._nx, self._nu = len(problem.states), len(problem.inputs)
+        self._step_s = self.manifest.step_s
+        self._parameters = parameters_type(problem)()
+        self.u = np.zeros(self._nu)
+        self.info = StepInfo()
+        self._x = np.zeros(self._nx)
+        self._u_before = np.zeros(self._nu)
+        self._u_held = np.zeros(self._nu)
+        self._predicted = np.zeros(self._nx)
+        self._status = ct.c_int()
+        self._u_address = _address(self.u)
+        self._x_address = _address(self._x)
+        self._u_before_address = _address(self._u_before)
+        self._status_address = ct.addressof(self._status)
+        self._info_address = ct.addressof(self.info)
+        self.plan_x = np.zeros((n + 1, self._nx))
+        self.plan_u = np.zeros((n, self._nu))
+        self._u_held_address = _address(self._u_held)
+        self._predicted_address = _address(self._predicted)
+        self._step = self._library.br_mpc_step
+        self._prepare = self._library.br_mpc_prepare
+        self._predict = self._library.br_mpc_predict
+        self._rehearse = self._library.br_mpc_rehearse
+        # Holds on to the interpreter's lock, which is not to be had back within a microsecond.
+        self._adopt = ct.PyDLL(self._library._name).br_mpc_adopt_weights
+        self._adopt.argtypes = [ct.c_void_p]
+        self._set_clock()
+        self.set_zero_weights()
+
+    def _new_object(self) -> ct.c_void_p:
+        size = self._library.br_mpc_memory_size()
+        self._memory = ct.create_string_buffer(size + _ALIGNMENT)
+        start = -ct.addressof(self._memory) % _ALIGNMENT
+        mpc = ct.c_void_p()
+        address = ct.c_void_p(ct.addressof(self._memory) + start)
+        self._check(self._library.br_mpc_init(address, size, ct.byref(mpc)), "init")
+        return mpc
+
+    def _set_clock(self) -> None:
+        clock = ct.cast(self._library.br_mpc_monotonic, ct.c_void_p)
+        self._check(self._library.br_mpc_set_clock(self._mpc, clock, None), "clock")
+
+    def _check(self, error: int, what: str) -> None:
+        if error:
+            text = self._library.br_mpc_error_text(error).decode()
+            raise InputError(f"native controller, {what}: {text}")
+
+    def set_values(self, values: Mapping[str, float]) -> None:
+        """Sets run-time parameters and solver settings by name; effective from the next step.
+
+        All of them the first time. InputError for a name that there is not, or a value that the
+        problem does not allow.
+        """
+        known = {field[0] for field in self._parameters._fields_}
+        if unknown := sorted(set(values) - known):
+            raise InputError(
+                f"problem '{self.manifest.problem.name}' has no parameter {', '.join(unknown)}; "
+                f"it has {', '.join(sorted(known))}"
+            )
+        for name, value in values.items():
+            setattr(self._parameters, name, value)
+        error = self._library.br_mpc_set_parameters(self._mpc, ct.byref(self._parameters))
+        self._check(error, "parameters")
+
+    def stage_weights(self, outputs: "ct.Array[Gp]") -> None:
+        """Copies the outputs beside those in use, for :meth:`adopt_weights`.
+
+        The one method that another thread may call; the interpreter goes on meanwhile. InputError
+        if they are unusable; they are not compared with the manifest.
+        """
+        self._check(self._library.br_mpc_stage_weights(self._mpc, outputs), "weights")
+
+    def adopt_weights(self) -> None:
+        """Puts what is staged into use, between two steps; InputError if there is nothing."""
+        self._check(self._adopt(self._mpc), "weights")
+
+    def set_zero_weights(self) -> None:
+        """No correction of the model."""
+        self._check(
+            self._library.br_mpc_set_weights(self._mpc, (Gp * self.manifest.problem.outputs)()),
+            "weights",
+        )
+
+    def reset(self) -> None:
+        """Forgets plan, working set and place on the line."""
+        self._library.br_mpc_reset(self._mpc)
+
+    def step(
+        self,
+        x: _DOUBLES,
+        u_before: npt.ArrayLike,
+        *,
+        elapsed_s: float | None = None,
+        budget_s: float = 0.0,
+    ) -> StepStatus:
+        """One control step from the measured state x (nx,); results in ``u`` and ``info``.
+
+        ``u_before`` (nu,): the input that acts now; a number stands for all components.
+        ``elapsed_s``: since the state of the call before, of whatever status; None: one stage Ts.
+        ``budget_s``: iterate until settled or within this time from now; 0: the iteration limits
+        of the settings alone. InputError if ``elapsed_s`` is negative or not finite.
+        """
+        self._x[:] = x
+        self._u_before[:] = u_before
+        self._check(
+            self._step(
+                self._mpc,
+                self._x_address,
+                self._u_before_address,
+                self._step_s if elapsed_s is None else elapsed_s,
+                budget_s,
+                self._u_address,
+                self._status_address,
+                self._info_address,
+            ),
+            "step",
+        )
+        return StepStatus(self._status.value)
+
+    def solve(
+        self,
+        x: _DOUBLES,
+        u_before: npt.ArrayLike,
+        reference: Reference,
+        *,
+        elapsed_s: float | None = None,
+        budget_s: float = 0.0,
+    ) -> StepStatus:
+        """As :meth:`step`, with the stage parameters (N, np) of another planner."""
+        rows = np.ascontiguousarray(reference, dtype=np.float64)
+        wanted = (self.manifest.horizon, len(self.manifest.problem.stage_parameters))
+        if rows.shape != wanted:
+            raise InputError(f"reference has shape {rows.shape}, not {wanted}")
+        self._x[:] = x
+        self._u_before[:] = u_before
+        error = self._library.br_mpc_solve(
+            self._mpc,
+            self._x_address,
+            self._u_before_address,
+            self._step_s if elapsed_s is None else elapsed_s,
+            budget_s,
+            _address(rows),
+            self._u_address,
+            self._status_address,
+            self._info_address,
+        )
+        self._check(error, "solve")
+        return StepStatus(self._status.value)
+
+    def prepare(self, elapsed_s: float | None = None, budget_s: float = 0.0) -> None:
+        """Makes ready what of the next step needs no state; call it after :meth:`step`.
+
+        ``elapsed_s``: expected of the next step; None: one stage Ts. With ``budget_s`` the last
+        problem is iterated on first. Results in ``u``, ``info`` and the plan stay. Leaving it out,
+        or another ``elapsed_s`` in the step, changes nothing but the time that the step takes.
+        """
+        elapsed = self._step_s if elapsed_s is None else elapsed_s
+        self._check(self._prepare(self._mpc, elapsed, budget_s), "prepare")
+
+    def rehearse(self) -> None:
+        """Does the preparation over, to the same bits, so that the step finds its caches warm."""
+        self._check(self._rehearse(self._mpc), "rehearse")
+
+    def predict(
+        self, x: _DOUBLES, u: _DOUBLES, duration_s: float, out: _DOUBLES | None = None
+    ) -> _DOUBLES:
+        """State (nx,) after x (nx,) with u (nu,) held, by the model and the weights in use.
+
+        Written into ``out`` (may be x) if given. ``duration_s``: 0 to 1. InputError if it is not,
+        or if a number is not finite or absurd.
+        """
+        self._x[:] = x
+        self._u_held[:] = u
+        self._check(
+            self._predict(
+                self._mpc,
+                self._x_address,
+                self._u_held_address,
+                duration_s,
+                self._predicted_address,
+            ),
+            "predict",
+        )
+        if out is None:
+            return self._predicted.copy()
+        out[:] = self._predicted
+        return out
+
+    def read_plan(self) -> tuple[_DOUBLES, _DOUBLES]:
+        """The last plan, x (N + 1, nx) and u (N, nu), in buffers that the next call overwrites."""
+        self._library.br_mpc_get_plan(self._mpc, _address(self.plan_x), _address(self.plan_u))
+        return self.plan_x, self.plan_u
+
+    def read_reference(self) -> Reference:
+        """The stage parameters of the last step, (N, np)."""
+        rows = np.zeros((self.manifest.horizon, len(self.manifest.problem.stage_parameters)))
+        self._library.br_mpc_get_reference(self._mpc, _address(rows))
+        return rows
+
+    def evaluate(self, v: _DOUBLES, costate: _DOUBLES) -> tuple[_DOUBLES, _DOUBLES, _DOUBLES]:
+        """Corrected model at v = [x; u] (nv,): x_next (nx,), J (nx, nv), H of lambda' x_next."""
+        nx, nv = self._nx, self._nx + self._nu
+        v = np.ascontiguousarray(v, dtype=np.float64)
+        costate = np.ascontiguousarray(costate, dtype=np.float64)
+        if v.shape != (nv,) or costate.shape != (nx,):
+            raise InputError(
+                f"evaluate takes v ({nv},), costate ({nx},), not {v.shape}, {costate.shape}"
+            )
+        x_next, jacobian, hessian = np.zeros(nx), np.zeros((nx, nv)), np.zeros((nv, nv))
+        arrays = (v, costate, x_next, jacobian, hessian)
+        self._check(
+            self._library.br_mpc_evaluate(self._mpc, *(_address(a) for a in arrays)), "evaluate"
+        )
+        return x_next, jacobian, hessian
