@@ -184,6 +184,7 @@ def c_header(problem: Problem) -> str:
         f"#define BR_CURVATURE_LATE {int(late)} /* second derivatives depend on the stage's p */",
         f"#define BR_HAS_PATH {int(bool(problem.path))}",
         *(f"#define BR_INDEX_{role.upper()} {problem.role(role)}" for role in problem.path),
+        *(f"#define BR_{n.upper()} {float(v)!r}" for n, v in problem.constants.items()),
         *_struct("br_mpc_reference", problem.stage_parameters),
         *_struct("br_mpc_parameters", problem.parameters, "    BR_SOLVER_SETTINGS"),
         "#ifdef BR_TABLES /* for the runtime */",

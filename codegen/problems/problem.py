@@ -143,6 +143,9 @@ class Problem:
     """Roles (x, y, psi, vx, vy, delta; duty, delta_rate) to names, for a planner that follows a
     path; empty: there is none, and the stage parameters are always the caller's."""
 
+    constants: Mapping[str, float] = field(default_factory=dict)
+    """Numbers that C is compiled with, as ``BR_NAME``: those of the planner for a path."""
+
     def __post_init__(self) -> None:
         """Checks what the generated code relies on."""
         s = self.symbols

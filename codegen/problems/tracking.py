@@ -48,6 +48,14 @@ _PARAMETERS = (
     Parameter("delta_rate_max_radps", "rad/s", "limit of the steering rate", positive=True),
 )
 
+_PLANNER = {
+    "path_spacing_min_m": 1e-4, "path_spacing_max_m": 0.1, "path_window_back_m": 0.3,
+    "path_window_ahead_m": 0.5, "path_far_m": 1e4, "path_speed_max_mps": 100.0,
+    "turn_slow_mps": 0.2, "turn_away_rad": 0.6, "turn_faced_rad": 0.3, "turn_ahead_m": 0.5,
+    "turn_tangent_m": 0.05, "turn_behind_rad": 2.0, "turn_wider_m": 2.0, "turn_pace_mps": 0.5,
+    "turn_stop_mps": 0.05, "turn_too_fast_mps": 1.0, "turn_throttle_spm": 2.0,
+}  # fmt: skip
+
 
 def tracking(model: Model, discretisation: Discretisation) -> Problem:
     """The problem with one prediction model (seven states, duty cycle and steering rate)."""
@@ -93,4 +101,5 @@ def tracking(model: Model, discretisation: Discretisation) -> Problem:
             "x": "x", "y": "y", "psi": "psi", "vx": "vx", "vy": "vy", "delta": "delta",
             "duty": "d", "delta_rate": "delta_rate",
         },
+        constants=_PLANNER,
     )  # fmt: skip

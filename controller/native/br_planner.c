@@ -3,7 +3,8 @@
  *
  * The path is a table over the closed line's arc length; between rows everything is linear, which
  * at the default 5 mm costs less than .02 mm. The search starts where the car was a step ago and
- * looks no farther than a window, so that it never jumps to a neighbouring piece of the track.
+ * looks no farther than a window, so that it never jumps to a neighbouring piece of the track. All
+ * lengths and speeds (BR_PATH_...) are the car's, from its file.
  */
 #include <math.h>
 
@@ -13,23 +14,17 @@
 
 enum { X = 0, Y = 1, SPEED = 2, NORMAL_X = 3, NORMAL_Y = 4, LOWER = 5, UPPER = 6 };
 
-#define WINDOW_BACK_M 0.3
-#define WINDOW_AHEAD_M 0.5
-#define SPACING_MAX_M 0.1 /* the window must hold several rows */
-#define SPACING_MIN_M 1e-4 /* and few enough to count */
-#define FAR_M 1e4 /* as for measured states: sums of squares stay finite */
-#define SPEED_MAX_MPS 100
 
 br_mpc_error br_path_load(br_path *path, const double *table, int n, double spacing) {
-    if (n < 8 || n > BR_PATH_CAPACITY || !(spacing >= SPACING_MIN_M && spacing <= SPACING_MAX_M))
-        return BR_ERROR_PATH;
+    if (n < 8 || n > BR_PATH_CAPACITY) return BR_ERROR_PATH;
+    if (!(spacing >= BR_PATH_SPACING_MIN_M && spacing <= BR_PATH_SPACING_MAX_M)) return BR_ERROR_PATH;
     if (!br_all_finite(table, n * BR_PATH_COLUMNS)) return BR_ERROR_PATH;
     for (int i = 0; i < n; ++i) {
         const double *row = &table[i * BR_PATH_COLUMNS];
         const double norm = hypot(row[NORMAL_X], row[NORMAL_Y]);
         const double *next = &table[(i + 1) % n * BR_PATH_COLUMNS];
-        if (fabs(row[X]) > FAR_M || fabs(row[Y]) > FAR_M) return BR_ERROR_PATH;
-        if (row[SPEED] <= 0 || row[SPEED] > SPEED_MAX_MPS) return BR_ERROR_PATH;
+        if (fabs(row[X]) > BR_PATH_FAR_M || fabs(row[Y]) > BR_PATH_FAR_M) return BR_ERROR_PATH;
+        if (row[SPEED] <= 0 || row[SPEED] > BR_PATH_SPEED_MAX_MPS) return BR_ERROR_PATH;
         if (row[UPPER] <= row[LOWER] || fabs(norm - 1) > 1e-6) return BR_ERROR_PATH;
         if (next[X] == row[X] && next[Y] == row[Y]) return BR_ERROR_PATH; /* no direction there */
     }
@@ -90,8 +85,8 @@ static int nearest_anywhere(const br_path *path, const double x[BR_NX]) {
 }
 
 static int nearest_in_window(const br_path *path, const double x[BR_NX]) {
-    const int start = (int)((path->s - WINDOW_BACK_M) / path->spacing);
-    int count = (int)((WINDOW_BACK_M + WINDOW_AHEAD_M) / path->spacing) + 1, best = start;
+    const int start = (int)((path->s - BR_PATH_WINDOW_BACK_M) / path->spacing);
+    int count = (int)((BR_PATH_WINDOW_BACK_M + BR_PATH_WINDOW_AHEAD_M) / path->spacing) + 1, best = start;
     if (count > path->n) count = path->n;
     double best_d2 = INFINITY;
     for (int i = start; i < start + count; ++i) {
@@ -134,7 +129,8 @@ void br_path_ahead(const br_path *path, double distance, double point[2]) {
 void br_path_plan(br_path *path, const double x[BR_NX], br_mpc_reference reference[BR_N],
                   double *lateral) {
     double s, row[BR_PATH_COLUMNS];
-    if (path->age * hypot(x[BR_INDEX_VX], x[BR_INDEX_VY]) > 0.8 * WINDOW_AHEAD_M) path->known = 0; /* may have left the window */
+    const double moved = path->age * hypot(x[BR_INDEX_VX], x[BR_INDEX_VY]);
+    if (moved > 0.8 * BR_PATH_WINDOW_AHEAD_M) path->known = 0; /* may have left the window */
     path->age = 0;
     project(path, path->known ? nearest_in_window(path, x) : nearest_anywhere(path, x), x, &s, lateral);
     path_at(path, s, row);

@@ -4,25 +4,14 @@
  * from the reference, and the optimal plan is to stand still for ever. So the reference is laid
  * along the turn itself: where the corrected model goes when it steers to one side at a walking
  * pace until it faces the line again. The track's edges do not count on the way; the car may
- * have been across one already, and its turning circle can be wider than the track.
+ * have been across one already, and its turning circle can be wider than the track. All numbers
+ * (BR_TURN_...) are the car's, from its file.
  */
 #include <math.h>
 
 #include "br_internal.h"
 
 #if BR_HAS_PATH
-
-#define SLOW_MPS 0.2     /* a turn begins below this speed if the line is */
-#define AWAY_RAD 0.6     /* farther than this to one side, */
-#define FACED_RAD 0.3    /* and ends within this */
-#define AHEAD_M 0.5      /* of the car: the point of the line that it turns to */
-#define TANGENT_M 0.05   /* length of line that its direction beside the car is taken from */
-#define BEHIND_RAD 2.0   /* with that point farther behind than this, either side serves */
-#define WIDER_M 2.0      /* the track to either side, on the way */
-#define PACE_MPS 0.5     /* or the speed limit, if that is lower */
-#define STOP_MPS 0.05    /* a limit below this is a stop */
-#define TOO_FAST_MPS 1.0 /* no turn of ours any more */
-#define THROTTLE 2.0     /* duty cycle per m/s below the pace */
 
 /* Angle to the point, seen from the car; positive left. */
 static double bearing(const double x[BR_NX], const double to[2]) {
@@ -31,7 +20,7 @@ static double bearing(const double x[BR_NX], const double to[2]) {
 
 /* The side to turn to: the nearer one, or, with the line behind, the one with more room. */
 static double side(const double x[BR_NX], double away, const br_mpc_reference *here) {
-    if (fabs(away) < BEHIND_RAD) return copysign(1, away);
+    if (fabs(away) < BR_TURN_BEHIND_RAD) return copysign(1, away);
     const double along = here->normal_x * x[BR_INDEX_X] + here->normal_y * x[BR_INDEX_Y];
     const double room_left = here->upper - along, room_right = along - here->lower;
     const double facing = here->normal_x * -sin(x[BR_INDEX_PSI]) + here->normal_y * cos(x[BR_INDEX_PSI]);
@@ -49,7 +38,7 @@ static double remaining(double turn, double away) {
 static double bearing_on_line(const br_path *path, const double to[2]) {
     double here[BR_NX] = {0}, next[2];
     br_path_ahead(path, 0, here);
-    br_path_ahead(path, TANGENT_M, next);
+    br_path_ahead(path, BR_TURN_TANGENT_M, next);
     here[BR_INDEX_PSI] = atan2(next[1] - here[1], next[0] - here[0]);
     return bearing(here, to);
 }
@@ -57,12 +46,12 @@ static double bearing_on_line(const br_path *path, const double to[2]) {
 /* Begins, goes on with and ends a turn, of a slow or turning car. */
 static void decide(br_mpc *mpc, const double target[2]) {
     const double *x = mpc->x0, away = bearing(x, target), speed = fabs(x[BR_INDEX_VX]);
-    if (mpc->path.speed_limit < STOP_MPS || speed > TOO_FAST_MPS) {
+    if (mpc->path.speed_limit < BR_TURN_STOP_MPS || speed > BR_TURN_TOO_FAST_MPS) {
         mpc->turn = 0;
     } else if (mpc->turn) {
-        if (remaining(mpc->turn, away) < FACED_RAD) mpc->turn = 0;
-    } else if (fabs(away) > AWAY_RAD &&
-               fabs(remainder(away - bearing_on_line(&mpc->path, target), 2 * M_PI)) > AWAY_RAD) {
+        if (remaining(mpc->turn, away) < BR_TURN_FACED_RAD) mpc->turn = 0;
+    } else if (fabs(away) > BR_TURN_AWAY_RAD &&
+               fabs(remainder(away - bearing_on_line(&mpc->path, target), 2 * M_PI)) > BR_TURN_AWAY_RAD) {
         mpc->turn = side(x, away, &mpc->reference[0]);
         mpc->warm = 0;
     }
@@ -70,27 +59,27 @@ static void decide(br_mpc *mpc, const double target[2]) {
 
 void br_turn(br_mpc *mpc) {
     double target[2], x[BR_NX], next[BR_NX];
-    if (!mpc->turn && fabs(mpc->x0[BR_INDEX_VX]) >= SLOW_MPS) return;
-    br_path_ahead(&mpc->path, AHEAD_M, target);
+    if (!mpc->turn && fabs(mpc->x0[BR_INDEX_VX]) >= BR_TURN_SLOW_MPS) return;
+    br_path_ahead(&mpc->path, BR_TURN_AHEAD_M, target);
     decide(mpc, target);
     if (!mpc->turn) return;
     const br_mpc_parameters *p = &mpc->parameters;
-    const double pace = fmin(PACE_MPS, mpc->path.speed_limit);
+    const double pace = fmin(BR_TURN_PACE_MPS, mpc->path.speed_limit);
     memcpy(x, mpc->x0, sizeof x);
     for (int k = 0; k < BR_N; ++k) {
         const double angle = remaining(mpc->turn, bearing(x, target));
         const double steering = mpc->turn * fmax(fmin(angle, p->delta_max_rad), -p->delta_max_rad);
         const double rate = (steering - x[BR_INDEX_DELTA]) / BR_TS;
         double *u = mpc->turn_u[k];
-        u[BR_INDEX_DUTY] = fmin(fmax(THROTTLE * (pace - x[BR_INDEX_VX]), 0), p->d_max);
+        u[BR_INDEX_DUTY] = fmin(fmax(BR_TURN_THROTTLE_SPM * (pace - x[BR_INDEX_VX]), 0), p->d_max);
         u[BR_INDEX_DELTA_RATE] = fmin(fmax(rate, -p->delta_rate_max_radps), p->delta_rate_max_radps);
         br_stage_advance(&mpc->gp[mpc->gp_in_use], x, u, BR_TS, next);
         memcpy(x, next, sizeof x);
         br_mpc_reference *reference = &mpc->reference[k];
         reference->x = x[BR_INDEX_X];
         reference->y = x[BR_INDEX_Y];
-        reference->lower -= WIDER_M;
-        reference->upper += WIDER_M;
+        reference->lower -= BR_TURN_WIDER_M;
+        reference->upper += BR_TURN_WIDER_M;
     }
 }
 
