@@ -92,7 +92,7 @@ class Manifest(BaseModel):
 def read_manifest(artefact: Path) -> Manifest:
     """Manifest of the artefact folder; InputError if it is not one or belongs to another ABI."""
     path = artefact / MANIFEST
-    if not path.is_file():
+    if not os.access(path, os.F_OK):  # where that may not be looked at, it is none either
         raise InputError(
             f"{artefact} is not a built controller (no {MANIFEST}): run 'bayesrace build'"
         )

@@ -72,7 +72,7 @@ class PredictiveController:
         """One native step, timed around the C call."""
         native, output = self._step, self._output
         begin_ns = time.perf_counter_ns()
-        status = native.step(x, float(u_previous[0]), elapsed_s=elapsed_s, budget_s=budget_s)
+        status = native.step(x, u_previous, elapsed_s=elapsed_s, budget_s=budget_s)
         output.solve_us = (time.perf_counter_ns() - begin_ns) * 1e-3
         native.read_plan()
         info = native.info

@@ -112,6 +112,11 @@ class NativeProblem:
         The one method that another thread may call; the interpreter goes on meanwhile. InputError
         if they are unusable; they are not compared with the manifest.
         """
+        if len(outputs) != self.manifest.problem.outputs:
+            raise InputError(
+                f"{len(outputs)} outputs of a residual are not the {self.manifest.problem.outputs} "
+                f"of problem '{self.manifest.problem.name}'"
+            )
         self._check(self._library.br_mpc_stage_weights(self._mpc, outputs), "weights")
 
     def adopt_weights(self) -> None:

@@ -21,6 +21,11 @@ class NativeStep(NativeProblem):
     def __init__(self, artefact: Path, car: CarParameters, settings: MpcSettings) -> None:
         """InputError if it was built for another car."""
         super().__init__(artefact)
+        if self.manifest.problem.name != "tracking":
+            raise InputError(
+                f"{artefact} solves the problem '{self.manifest.problem.name}', which drives no "
+                "car: run 'bayesrace build'"
+            )
         built_for = (self.manifest.car, self.manifest.car_digest)
         if built_for != (car.name, car.digest()):
             raise InputError(
@@ -56,7 +61,7 @@ class NativeStep(NativeProblem):
                 f"controller predicts with {self.manifest.discretisation}: train with the same car "
                 "and discretisation"
             )
-        outputs = (Gp * 3)()
+        outputs = (Gp * self.manifest.problem.outputs)()
         for target, output in zip(outputs, weights.outputs, strict=True):
             if len(output.alpha) > self.manifest.gp_capacity:
                 raise InputError(

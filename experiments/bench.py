@@ -270,9 +270,7 @@ def _published(
     solved = 0
     for problem in problems:
         progress(len(times) / len(problems))
-        out = ocp.solve(
-            problem.x, problem.d_previous, problem.reference, MpcSettings().parameters(car)
-        )
+        out = ocp.solve(problem.x, problem.d_previous, problem.reference, _parameters(car))
         times.append(out.seconds * 1e6)
         solved += out.success
     return times, solved
@@ -281,9 +279,7 @@ def _published(
 def _agreement(oracle: OcpNlp, car: CarParameters, problems: list[_Problem]) -> float:
     differences = []
     for p in (p for p in problems if p.has_converged):
-        out = oracle.solve(
-            p.x, p.d_previous, p.reference, MpcSettings().parameters(car), p.converged
-        )
+        out = oracle.solve(p.x, p.d_previous, p.reference, _parameters(car), p.converged)
         if out.success:
             differences.append(float(np.abs(out.u[0] - p.converged[1][0]).max()))
     if not differences:
@@ -301,7 +297,7 @@ def _gap(oracle: OcpNlp, car: CarParameters, step: NativeStep, problem: _Problem
         problem.plan[1],
         problem.d_previous,
         problem.reference,
-        MpcSettings().parameters(car),
+        _parameters(car),
     )
     return cost / problem.converged_cost - 1.0
 

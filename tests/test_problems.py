@@ -19,7 +19,7 @@ from codegen.ocp import OcpNlp
 from codegen.problems.problem import NO_BOUND, Input, Parameter, Problem, Row, State, Symbols
 from codegen.settings import BuildSettings
 from codegen.stage import linearised
-from controller.native_library import Gp
+from controller.native_library import Gp, StepStatus
 from controller.native_problem import NativeProblem
 
 Floats = NDArray[np.float64]
@@ -122,6 +122,10 @@ def problem() -> Problem:
 @pytest.fixture(scope="module")
 def native(problem: Problem) -> NativeProblem:
     """The compiled problem with its residual."""
+    return compiled(problem)
+
+
+def compiled(problem: Problem) -> NativeProblem:
     settings = BuildSettings(
         discretisation=Discretisation(step_s=STEP_S), horizon=HORIZON, gp_capacity=CAPACITY
     )
@@ -166,12 +170,13 @@ def test_it_solves_to_the_solution_of_ipopt_along_a_flight(
 ) -> None:
     ocp = OcpNlp(problem, corrected(problem), HORIZON, options=IPOPT)
     native.reset()
-    x, u = np.array([-1.3, 0.0, 0.8, 0.0, 0.3]), np.zeros(3)
-    closest, active = np.inf, {"hard": 0, "lane": 0, "input": 0, "obstacle": 0}
+    x, u = np.array([-1.3, -0.9, 0.5, -0.6, 0.3]), np.zeros(3)
+    converged, closest, active = 0, np.inf, {"hard": 0, "lane": 0, "input": 0, "obstacle": 0}
     for k in range(24):
         reference = stages(k)
         status = native.solve(x, u, reference)
         assert status.usable
+        converged += status is StepStatus.CONVERGED
         plan_x, plan_u = (part.copy() for part in native.read_plan())
         oracle = ocp.solve(x, u, reference, VALUES, (plan_x, plan_u))
         assert oracle.success, oracle.status
@@ -181,15 +186,18 @@ def test_it_solves_to_the_solution_of_ipopt_along_a_flight(
         distance = np.hypot(plan_x[1:, 0] - 0.2, plan_x[1:, 1] - 0.1)
         active["obstacle"] += bool(distance.min() < 0.4 - 1e-6)
         active["hard"] += bool(plan_x[1:, 4].max() > 0.5 - 1e-8)
-        active["lane"] += bool(np.abs(plan_x[1:, 1]).max() > 0.55 + 1e-6)
-        active["input"] += bool(np.abs(plan_u[:, :2]).max() > 3.0 - 1e-8)
+        active["lane"] += bool(np.abs(plan_x[1:, 1]).max() > VALUES["lane"] + 1e-6)
+        active["input"] += bool(np.abs(plan_u[:, :2]).max() > VALUES["a_max"] - 1e-8)
         u = native.u.copy()
         native.prepare()
         x = native.predict(x, u, STEP_S)
         closest = min(closest, float(np.hypot(x[0] - 0.2, x[1] - 0.1)))
+    assert converged == 24
     assert 0.3 < closest < 0.5  # it has flown round the obstacle, close by
     assert active["obstacle"] > 3
     assert active["hard"] > 3
+    assert active["lane"] > 3
+    assert active["input"] > 0
 
 
 def test_the_preparation_changes_no_bit(native: NativeProblem) -> None:
@@ -218,6 +226,12 @@ def test_a_soft_row_without_penalty_is_off(native: NativeProblem) -> None:
         plan = native.read_plan()[0]
         kept[weight] = float(np.hypot(plan[:, 0] - 0.2, plan[:, 1] - 0.1).min())
     native.set_values({"w_obstacle": VALUES["w_obstacle"]})
+    assert native.solve(x, np.zeros(3), stages(4)).usable  # from the plan through the obstacle
+    native.set_values({"w_obstacle": 0.0})
+    assert native.solve(x, np.zeros(3), stages(4)).usable  # and back, without a reset
+    plan = native.read_plan()[0]
+    assert np.hypot(plan[:, 0] - 0.2, plan[:, 1] - 0.1).min() < 0.3
+    native.set_values({"w_obstacle": VALUES["w_obstacle"]})
     assert kept[0.0] < 0.3 < kept[VALUES["w_obstacle"]]
 
 
@@ -244,3 +258,45 @@ def test_a_description_that_c_could_not_follow_is_refused(problem: Problem) -> N
         replace(problem, cost=problem.cost + s.x[0] * s.u[0])
     with pytest.raises(ValueError, match="row 'wrong' depends on what it must not"):
         replace(problem, rows=(Row("wrong", s.u[0], -1, 1),))
+    with pytest.raises(ValueError, match="row 'round' is not linear: give it a penalty"):
+        replace(problem, rows=(Row("round", s.x[0] ** 2, -1, 1),))
+    with pytest.raises(ValueError, match="rows with constant gradients come first"):
+        replace(problem, rows=problem.rows[::-1])
+    with pytest.raises(ValueError, match="'a b' names no parameter, or more than one"):
+        replace(problem, parameters=(Parameter("a b", "1"),))
+    with pytest.raises(ValueError, match="a stage needs at least one parameter"):
+        replace(problem, stage_parameters=())
+    with pytest.raises(ValueError, match="has no state or input"):
+        replace(problem, features=("speed",))
+
+
+def test_second_derivatives_that_depend_on_the_stage_are_those_of_the_step(
+    problem: Problem,
+) -> None:
+    """A cost whose curvature only the step knows: the preparation must not use an older one."""
+    from dataclasses import replace
+
+    s = problem.symbols
+    change = s.u[2] - s.u_before[2]
+    error = (s.x[0] - s.p[0]) ** 2
+    late = replace(
+        problem, name="late", cost=problem.cost + 0.1 * change**4 + 0.5 * ca.sqrt(1 + error)
+    )
+    step = compiled(late)
+    ocp = OcpNlp(late, corrected(late), HORIZON, options=IPOPT)
+    plans = []
+    for prepares in (False, True):
+        step.reset()
+        x, u = np.array([-1.3, 0.0, 0.8, 0.0, 0.3]), np.zeros(3)
+        for k in range(6):
+            assert step.solve(x, u, stages(k)).usable
+            plan = step.read_plan()[0].copy()
+            oracle = ocp.solve(x, u, stages(k), VALUES, (plan, step.plan_u))
+            np.testing.assert_allclose(plan, oracle.x, rtol=0, atol=1e-6)
+            u = step.u.copy()
+            if prepares:
+                step.prepare()
+                step.rehearse()
+            x = step.predict(x, u, STEP_S)
+        plans.append(plan.tobytes())
+    assert plans[0] == plans[1]

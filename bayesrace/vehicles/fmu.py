@@ -1,7 +1,7 @@
 """A Model Exchange FMU as a vehicle model: a black box that CasADi can differentiate.
 
 CasADi asks the FMU for directional derivatives, and takes differences of these for second ones; the
-result can be discretised, simulated, and predicted with in :class:`codegen.ocp.RacingOcp`. It
+result can be discretised, simulated, and predicted with in :class:`codegen.ocp.OcpNlp`. It
 cannot be turned into C: the native step takes models that are expressions.
 """
 

@@ -18,7 +18,7 @@ GRAVITY_MPS2: Final = 9.81
 
 BRAKE_FADE_MPS: Final = 0.1
 """Below this speed braking fades linearly to none, so that a car stops and stays: brakes do not
-drive a car back. The native controller's BR_BRAKE_FADE_MPS is the same number."""
+drive a car back."""
 
 
 class _Frozen(BaseModel):

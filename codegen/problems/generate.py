@@ -136,7 +136,7 @@ def _struct(name: str, parameters: Sequence[Parameter], after: str = "") -> list
         f"    double {one.name}; /* {one.text}{' ' if one.text else ''}[{one.unit}] */"
         for one in parameters
     ]
-    return ["typedef struct {", *(lines or ["    double none;"]), after, f"}} {name};"]
+    return ["typedef struct {", *lines, *([after] if after else []), f"}} {name};"]
 
 
 def _groups(features: int, most: int = 11) -> str:
@@ -161,10 +161,9 @@ def c_header(problem: Problem) -> str:
     row_jacobian = _row_jacobian(problem)
     cost_xx, rows_xx = _hessians_in_x(problem, ca.SX.sym("multiplier", len(rows)))
     in_u = ca.hessian(problem.cost, ca.veccat(s.u, s.u_before))[0]
-    late = ca.depends_on(ca.veccat(_nonzeros(cost_xx), _nonzeros(rows_xx), _nonzeros(in_u)), s.p)
+    second = ca.veccat(_nonzeros(cost_xx), _nonzeros(rows_xx), _nonzeros(in_u))
+    late = ca.depends_on(second, ca.veccat(s.p, s.u_before))
     early = [row_jacobian[i, :].is_constant() for i in range(len(rows))]
-    if early != sorted(early, reverse=True):
-        raise ValueError(f"problem '{problem.name}': rows with constant gradients come first")
     constant = [
         [float(row_jacobian[i, j]) if early[i] else 0.0 for j in range(nx)]
         for i in range(len(rows))
@@ -180,8 +179,9 @@ def c_header(problem: Problem) -> str:
         f"#define BR_NZ {len(problem.features)} /* features: {', '.join(problem.features)} */",
         f"#define BR_NE {problem.outputs} /* outputs of the residual */",
         f"#define BR_NR {len(rows)} /* rows a stage: {', '.join(r.name for r in rows)} */",
+        f"#define BR_NR_SOFT {sum(row.soft for row in rows)} /* of them, soft */",
         f"#define BR_NR_EARLY {sum(early)} /* of them, with constant gradients */",
-        f"#define BR_CURVATURE_LATE {int(late)} /* second derivatives depend on the stage's p */",
+        f"#define BR_CURVATURE_LATE {int(late)} /* second derivatives depend on p or u_before */",
         f"#define BR_HAS_PATH {int(bool(problem.path))}",
         *(f"#define BR_INDEX_{role.upper()} {problem.role(role)}" for role in problem.path),
         *(f"#define BR_{n.upper()} {float(v)!r}" for n, v in problem.constants.items()),
@@ -191,6 +191,7 @@ def c_header(problem: Problem) -> str:
         _array("BR_FEATURE", problem.feature_indices),
         _array("BR_STATE_SCALE", [float(one.scale) for one in states], "double"),
         _array("BR_STATE_LIMIT", [float(one.limit) for one in states], "double"),
+        _array("BR_INPUT_LIMIT", [float(one.limit) for one in inputs], "double"),
         _array("BR_INPUT_HELD", [one.held for one in inputs]),
         _array("BR_PARAMETER_LOW", [float(one.low) for one in problem.parameters], "double"),
         _array("BR_PARAMETER_HIGH", [float(one.high) for one in problem.parameters], "double"),

@@ -43,6 +43,8 @@ class Input:
     unit: str
     held: bool = True
     """Beyond the end of a plan that is shifted: held, or zero."""
+    limit: float = 1e6
+    """A larger absolute value is no input of this system."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +149,9 @@ class Problem:
     """Numbers that C is compiled with, as ``BR_NAME``: those of the planner for a path."""
 
     def __post_init__(self) -> None:
-        """Checks what the generated code relies on."""
+        """Checks what the generated code relies on; ValueError names what is wrong."""
+        self._check_names()
+        self._check_rows()
         s = self.symbols
         everything = (s.x, s.u, s.u_before, s.p, s.theta, s.last, s.share, s.h)
         allowed: tuple[tuple[str, Any, tuple[Any, ...]], ...] = (
@@ -167,6 +171,32 @@ class Problem:
         n = s.x.numel()
         if hessian[:n, n:].nnz():
             raise ValueError(f"problem '{self.name}': the cost couples states with inputs")
+
+    def _check_names(self) -> None:
+        if not self.stage_parameters:
+            raise ValueError(f"problem '{self.name}': a stage needs at least one parameter")
+        known = [*(one.name for one in self.states), *(one.name for one in self.inputs)]
+        groups = {
+            "state or input": known,
+            "stage parameter": [one.name for one in self.stage_parameters],
+            "parameter": [one.name for one in self.parameters],
+        }
+        for what, names in groups.items():
+            for name in (self.name, *names):
+                if not name.isidentifier() or names.count(name) > 1:
+                    raise ValueError(f"'{name}' names no {what}, or more than one")
+        if unknown := set(self.features) - set(known):
+            raise ValueError(f"problem '{self.name}' has no state or input {sorted(unknown)}")
+
+    def _check_rows(self) -> None:
+        x = self.symbols.x
+        constant = [ca.jacobian(row.value, x).is_constant() for row in self.rows]
+        if constant != sorted(constant, reverse=True):
+            raise ValueError(f"problem '{self.name}': rows with constant gradients come first")
+        for row, linear in zip(self.rows, constant, strict=True):
+            if not (row.soft or linear):
+                # The line search weighs defects and soft rows alone.
+                raise ValueError(f"row '{row.name}' is not linear: give it a penalty")
 
     @property
     def feature_indices(self) -> tuple[int, ...]:

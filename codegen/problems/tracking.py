@@ -27,7 +27,7 @@ _STATES = (
     State("omega", "rad/s", scale=10, limit=1e3),
     State("delta", "rad", limit=1.5),
 )
-_INPUTS = (Input("d", "1"), Input("delta_rate", "rad/s", held=False))
+_INPUTS = (Input("d", "1", limit=1e3), Input("delta_rate", "rad/s", held=False, limit=1e3))
 _REFERENCE = (
     Parameter("x", "m"),
     Parameter("y", "m"),

@@ -5,6 +5,7 @@ last entry of the index is the one in use.
 """
 
 import hashlib
+import os
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -101,7 +102,7 @@ class Store:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise InputError(f"store {folder}: {error.strerror}; choose another folder") from None
-        there = (folder / _INDEX).exists()
+        there = os.access(folder / _INDEX, os.F_OK)
         text = read_text(folder / _INDEX, "the store's index") if there else ""
         try:
             self._index = _Index.model_validate_json(text) if text else _Index()

@@ -112,8 +112,9 @@ BR_API double br_mpc_monotonic(void *context);
 BR_API void br_mpc_reset(br_mpc *mpc);
 
 /* One control step: projects the car on the racing line, makes the reference, solves, checks.
+ * A problem without a path has none of that (BR_ERROR_NOT_READY): br_mpc_solve serves it.
  * Where the car stands and points away from the line, the reference (br_mpc_get_reference) leads it
- * round at a walking pace instead, with the track's edges 2 m farther out: see br_turn.c.
+ * round at a walking pace instead, with the track's edges farther out: see br_turn.c.
  *
  * x: measured state. u_before: the input that acts now. u: first input of the plan; written
  * only for BR_CONVERGED and BR_ACCEPTABLE. info may be NULL.
@@ -167,8 +168,8 @@ BR_API br_mpc_error br_mpc_get_reference(const br_mpc *mpc, br_mpc_reference ref
 
 /* --- for tests and tools ----------------------------------------------------------------------- */
 
-/* Corrected model at v = [x; u]: x_next (7), J = d x_next / d v (7 x 9 row major) and
- * H = sum_i lambda_i d^2 x_next_i / d v^2 (9 x 9). */
+/* Corrected model at v = [x; u]: x_next, J = d x_next / d v (row major) and
+ * H = sum_i lambda_i d^2 x_next_i / d v^2. */
 BR_API br_mpc_error br_mpc_evaluate(const br_mpc *mpc, const double v[BR_NV],
                                     const double lambda[BR_NX], double x_next[BR_NX],
                                     double jacobian[BR_NX * BR_NV], double hessian[BR_NV * BR_NV]);

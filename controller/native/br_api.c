@@ -2,7 +2,6 @@
 #include <math.h>
 
 #include "br_internal.h"
-#include "br_model.h"
 
 size_t br_mpc_memory_size(void) { return sizeof(br_mpc); }
 

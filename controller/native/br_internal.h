@@ -13,6 +13,7 @@
 #define BR_MP (((BR_M + 7) / 8) * 8)             /* padded to whole vectors */
 #define BR_ROWS (BR_M + BR_NR * BR_N)            /* input bounds, then the problem's, row by row */
 #define BR_ROW(r, k) (BR_M + BR_N * (r) + (k))   /* row r of stage k + 1 */
+#define BR_ACTIVE (BR_M + BR_NR_SOFT * BR_N + 2) /* most rows that DAQP holds active at a time */
 #define BR_ROW_LATE BR_ROW(BR_NR_EARLY, 0)       /* from here on gradients are known at a step only */
 #define BR_COLS ((((BR_ROWS + 1) + 7) / 8) * 8)  /* right-hand sides of one substitution */
 #define BR_HORIZON_S (BR_N * BR_TS)
@@ -67,7 +68,7 @@ typedef struct {
 } br_path;
 
 typedef struct {
-    int factorised;     /* g, h, and y, scale, m of the rows up to ROW_TRACK fit the linearisation */
+    int factorised;     /* g, h, and y, scale, m of the rows before BR_ROW_LATE fit the linearisation */
     int regularised;    /* the exact Hessian was not positive definite */
     double curvature;   /* share of the second-order part that is in h */
     br_stage_terms terms[BR_N];
@@ -91,9 +92,9 @@ typedef struct {
     BR_ALIGNED double m[BR_ROWS * BR_M];
     double dupper[BR_ROWS], dlower[BR_ROWS], unit[BR_ROWS];
     int sense[BR_ROWS];
-    double lam[2][BR_M + BR_N + 2], l[(BR_M + BR_N + 2) * (BR_M + BR_N + 3) / 2],
-        d[BR_M + BR_N + 2], xldl[BR_M + BR_N + 2], zldl[BR_M + BR_N + 2], u[BR_M];
-    int working_set[BR_M + BR_N + 2];
+    double lam[2][BR_ACTIVE], l[BR_ACTIVE * (BR_ACTIVE + 1) / 2], d[BR_ACTIVE], xldl[BR_ACTIVE],
+        zldl[BR_ACTIVE], u[BR_M];
+    int working_set[BR_ACTIVE];
 } br_qp;
 
 /* Trajectory with its multipliers. costate[k] belongs to the dynamics into stage k,

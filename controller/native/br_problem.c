@@ -1,4 +1,5 @@
 /* The problem's generated functions, with the arguments that the controller's memory has. */
+#include <daqp/constants.h>
 #include <math.h>
 
 #include "br_internal.h"
@@ -22,7 +23,7 @@ void br_evaluate_terms(br_mpc *mpc) {
         const casadi_real *arg[br_terms_SZ_ARG] = {
             mpc->plan.x[k + 1], mpc->plan.u[k], input_before(mpc, k), &last,
             (const double *)&mpc->reference[k], theta};
-        casadi_real *res[br_terms_SZ_RES] = {&mpc->qp.terms[k].cost};
+        casadi_real *res[br_terms_SZ_RES] = {(double *)&mpc->qp.terms[k]};
         br_terms(arg, res, iw, w, 0);
     }
 }
@@ -58,6 +59,13 @@ void br_evaluate_penalties(br_mpc *mpc) {
     casadi_int iw[br_penalties_SZ_IW + 1];
     casadi_real w[br_penalties_SZ_W + 1];
     br_penalties(arg, res, iw, w, 0);
+    for (int r = 0; r < BR_NR; ++r) {
+        if (!BR_ROW_SOFT[r] || mpc->qp.penalty[r] > 0) continue;
+        for (int k = 0; k < BR_N; ++k) { /* off: no warm start from it */
+            mpc->qp.sense[BR_ROW(r, k)] = SOFT;
+            mpc->plan.multiplier[BR_ROW(r, k)] = 0;
+        }
+    }
 }
 
 /* The problem's first guess of the input at the measured state; share: see Symbols. */

@@ -11,7 +11,7 @@ int br_all_finite(const double *values, int n) {
 
 /* How far a row is outside its bounds; negative within. */
 static double violation(const br_stage_terms *terms, int r) {
-    return fmax(terms->lower[r] - terms->value[r], terms->value[r] - terms->upper[r]);
+    return br_worse(terms->lower[r] - terms->value[r], terms->value[r] - terms->upper[r]);
 }
 
 /* Objective of a stage with the slack of its soft rows; the largest one is noted. */
@@ -19,7 +19,7 @@ static double stage_cost(br_mpc *mpc, const br_stage_terms *terms) {
     double cost = terms->cost;
     for (int r = 0; r < BR_NR; ++r) {
         if (!(BR_ROW_SOFT[r] && mpc->qp.penalty[r] > 0)) continue;
-        const double slack = fmax(0, violation(terms, r));
+        const double slack = br_worse(0, violation(terms, r));
         mpc->info.slack_max_m = br_worse(mpc->info.slack_max_m, slack);
         cost += mpc->qp.penalty[r] * slack * slack;
     }
@@ -99,7 +99,7 @@ br_mpc_status br_judge(const br_mpc *mpc) {
     const br_mpc_info *info = &mpc->info;
     const double tolerance = mpc->parameters.tolerance;
     if (!br_all_finite(&mpc->plan.x[0][0], (BR_N + 1) * BR_NX) ||
-        !br_all_finite(&mpc->plan.u[0][0], BR_M) || !isfinite(info->stationarity + mpc->merit))
+        !br_all_finite(&mpc->plan.u[0][0], BR_M) || !isfinite(info->stationarity + mpc->merit + info->bound))
         return BR_NOT_FINITE;
     /* linear in the QP, as inputs and early rows are, they are violated by no more than round-off */
     if (info->defect > mpc->parameters.defect_max || info->bound > 1e-6) return BR_DEFECT;

@@ -129,7 +129,7 @@ static void solve(br_mpc *mpc, double u[BR_NU], br_mpc_status *status, br_mpc_in
 
 static int plausible_input(const double u[BR_NU]) {
     for (int c = 0; c < BR_NU; ++c)
-        if (!(fabs(u[c]) <= 1e3)) return 0;
+        if (!(fabs(u[c]) <= BR_INPUT_LIMIT[c])) return 0;
     return 1;
 }
 
