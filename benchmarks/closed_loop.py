@@ -73,7 +73,7 @@ def drive(
     ``vehicle``: what plays the car; the built-in equations without.
     """
     step, simulator = NativeStep(artefact, car, MpcSettings()), vehicle or Simulator(dynamic(car))
-    step.set_path(make_path_table(track, line))
+    step.set_path(make_path_table(track, line, car.tuning.path.spacing_m))
     if weights is not None:
         step.set_weights(weights)
     step.reset()

@@ -16,7 +16,7 @@ import numpy as np
 from bayesrace.integrators import PREDICTION
 from bayesrace.raceline.cached import racing_line
 from bayesrace.tracks import load_track
-from bayesrace.vehicles import get_car
+from bayesrace.vehicles import DEFAULT_CAR, get_car
 from benchmarks.closed_loop import Drive, drive
 from codegen.build import build
 from codegen.settings import BuildSettings
@@ -33,7 +33,7 @@ PAIRS: Final = (
 )  # fmt: skip
 """Race track, training track."""
 COLLECT_S: Final = 12.0
-CAR: Final = get_car("orca")
+CAR: Final = get_car(DEFAULT_CAR)
 
 
 def drives(race: str, training: str, seed: int) -> dict[str, Drive]:

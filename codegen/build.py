@@ -173,7 +173,7 @@ def _manifest(settings: BuildSettings, compiler: Compiler, identity: str, folder
     return Manifest(
         abi=ABI,
         model=settings.model,
-        car=settings.car,
+        car=car.name,
         car_digest=car.digest(),
         discretisation=settings.discretisation.identity(settings.model, car),
         horizon=settings.horizon,

@@ -25,7 +25,7 @@ from bayesrace.tracks import (
     load_track,
     write_track,
 )
-from bayesrace.vehicles import CarParameters, get_car
+from bayesrace.vehicles import CarParameters, CarSetting, default_car
 from codegen.build import build
 from codegen.settings import BuildSettings
 from controller.pure_pursuit import PurePursuitSettings
@@ -57,7 +57,7 @@ class PreparationSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    car: str = "orca"
+    car: CarSetting = Field(default_factory=default_car)
     track: str = DEFAULT_RACE_TRACK
     train_track: str = DEFAULT_TRAINING_TRACK
     collect_s: float = Field(12.0, ge=1, le=600, description="length of the training drive")
@@ -107,7 +107,7 @@ def prepare(
 
     Raises InputError for a track or car that cannot be used, RaceLineError and CompileError.
     """
-    car = get_car(settings.car)
+    car = settings.car
     track = load_track(settings.track, car.width_m)
     line_file = raceline_file(track, car, RaceLineSettings())
     track_file = line_file.with_name(_TRACK)
@@ -127,7 +127,7 @@ def prepare(
             weights = _weights_file(samples, PREDICTION, options, None, stage.update)
     if artefact is None:
         with stages.stage("build the controller"):
-            artefact, _ = build(BuildSettings(car=car.name))
+            artefact, _ = build(BuildSettings(car=car))
     return Prepared(track_file, raceline, weights, artefact)
 
 

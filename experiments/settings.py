@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.raceline import RaceLineSettings
 from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK
+from bayesrace.vehicles import CarSetting, default_car
 from controller.pure_pursuit import PurePursuitSettings
 from controller.settings import MpcSettings
 from plant.simulator import PLANT
@@ -20,7 +21,7 @@ class RaceSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    car: str = Field("orca", description="built-in car")
+    car: CarSetting = Field(default_factory=default_car)
     track: str = Field(DEFAULT_RACE_TRACK, description="race track: name, random:SEED or CSV file")
     train_track: str = Field(DEFAULT_TRAINING_TRACK, description="the same for the training track")
     laps: int = Field(

@@ -27,7 +27,7 @@ from tests.conftest import Circuit
 from tests.programs import environment, finish, peanut, run, start, until
 
 SUBCOMMANDS = (
-    "race", "drive", "report", "bench", "tracks", "raceline", "collect", "train", "build",
+    "race", "drive", "report", "bench", "tracks", "cars", "raceline", "collect", "train", "build",
     "plant", "controller", "status", "stop", "go", "router", "latency",
     "fmu export", "fmu inspect", "fmu weights",
     "validate", "publish", "rollback", "learn",
@@ -113,6 +113,20 @@ def test_an_unknown_track_or_car_is_refused_with_those_there_are(cli: Cli, tmp_p
     for command in ("race", "plant", "build"):
         refused(cli(command, "--car", "lorry"), "lorry", "orca")
     refused(cli("raceline", "paddock", "--car", "lorry"), "lorry", "orca")
+    refused(cli("plant", "--car", "lorry.toml"), "lorry.toml", "bayesrace cars")
+
+
+def test_cars_are_listed_checked_and_written(cli: Cli, tmp_path: Path) -> None:
+    listed = cli("cars")
+    assert listed.code == 0
+    assert "orca" in listed.out
+    assert cli("cars", "orca", "--out", "mine.toml").code == 0
+    checked = cli("cars", "mine.toml")
+    assert (checked.code, checked.out) == (0, listed.out)
+    refused(cli("cars", "--out", "x.toml"), "--out", "name")
+    text = (tmp_path / "mine.toml").read_text()
+    (tmp_path / "mine.toml").write_text(text.replace("mass_kg = 0.041", "mass_kg = -1"))
+    refused(cli("cars", "mine.toml"), "mine.toml", "geometry.mass_kg = -1 kg", "greater than 0")
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,6 @@ from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
 from bayesrace.manifest import read_manifest
 from bayesrace.vehicles import get_car
-from bayesrace.vehicles.parameters import BRAKE_FADE_MPS
 from codegen.build import NATIVE as HEADERS
 from codegen.compiler import find_compiler
 from codegen.fmu import resources
@@ -64,7 +63,7 @@ class _State(ct.Structure):
     [
         ("BR_PATH_COLUMNS", {path_table.PATH_COLUMNS, resources.PATH_COLUMNS}),
         ("BR_PATH_CAPACITY", {path_table.CAPACITY, resources.PATH_CAPACITY}),
-        ("BR_BRAKE_FADE_MPS", {BRAKE_FADE_MPS}),
+        ("BR_BRAKE_FADE_MPS", {CAR.brake_fade_mps}),
     ],
 )
 def test_sizes_and_limits_of_the_native_step_are_those_that_python_states(
@@ -122,7 +121,7 @@ def test_the_fallback_in_c_does_what_the_one_in_python_does(
     state = _State()
     numbers = _Settings(
         CAR.d_min, CAR.d_max, CAR.delta_rate_max_radps, chosen.shifted_s, chosen.tolerance,
-        chosen.brake_fade_mps, chosen.recover_cycles,
+        CAR.brake_fade_mps, chosen.recover_cycles,
     )  # fmt: skip
     time_s = 0.0
     for kind, first, (d, rate, spoil), vx, later_s in cycles:
