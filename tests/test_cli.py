@@ -7,7 +7,7 @@ import signal
 import socket
 import subprocess
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +17,11 @@ from bayesrace.gp.weights import write_weights, zero_weights
 from bayesrace.integrators import Discretisation
 from bayesrace.log import LogReader
 from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY
-from bayesrace.raceline.line import write_raceline
+from bayesrace.raceline import RaceLineSettings, write_raceline
+from bayesrace.raceline.identity import line_identity
 from bayesrace.tracks import write_track
 from bayesrace.transport import Director, free_endpoint
-from bayesrace.vehicles import get_car
+from bayesrace.vehicles import get_car, write_car
 from experiments.processes import child
 from tests.command_line import Cli, refused
 from tests.conftest import Circuit
@@ -170,6 +171,21 @@ def test_missing_and_wrong_input_files_are_refused(
             "controller", "--artefact", kinematic_artefact, *course, "--settings", argument
         )
         refused(outcome, argument)
+
+
+def test_a_line_for_another_car_is_refused_wherever_it_would_be_driven(
+    cli: Cli, circuit: Circuit, kinematic_artefact: Path, tmp_path: Path
+) -> None:
+    car = get_car("orca").model_copy(update={"friction": 0.5})
+    made = line_identity(circuit.track, car, RaceLineSettings())
+    write_track(tmp_path / "track.csv", circuit.track)
+    write_raceline(tmp_path / "line.csv", replace(circuit.line, made_for=made))
+    course = ("--track", "track.csv", "--raceline", "line.csv")
+    export = ("fmu", "export", "--controller", "--artefact", kinematic_artefact, "--out", "x.fmu")
+    for command in (("controller", "--artefact", kinematic_artefact), ("collect",), export):
+        refused(cli(*command, *course), "line.csv", "friction of 0.5", "has 0.75")
+    write_car(tmp_path / "wet.toml", car)
+    assert cli("collect", *course, "--duration", "1", "--car", "wet.toml").code == 0
 
 
 def test_more_points_than_the_controller_holds_are_refused(

@@ -105,7 +105,8 @@ def raceline(
     out: OutFile = Path("raceline.csv"),
     car: Car = DEFAULT_CAR,
     friction: Annotated[
-        float | None, typer.Option(help="Usable acceleration over g [the car's].")
+        float | None,
+        typer.Option(help="Usable acceleration over g of who drives the line [the car's]."),
     ] = None,
     margin: Annotated[
         float | None, typer.Option(help="Centre of gravity to track edge [m].")
