@@ -115,5 +115,5 @@ def _laps(
 def pursue(car: CarParameters, track: Track, line: RaceLine, step_s: float) -> Dataset:
     """The training drive of ``bayesrace race``, with its defaults."""
     settings = RaceSettings()
-    x, u = drive_samples(track, line, car, settings.collect_s, settings.pursuit)
+    x, u = drive_samples(track, line, car, car.tuning.pursuit.drive_s, settings.pursuit)
     return filter_dataset(Dataset(car, step_s, x[:-1], u, x[1:]))

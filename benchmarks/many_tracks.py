@@ -32,7 +32,6 @@ PAIRS: Final = (
     ("random:30", "random:11"), ("harbour", "paddock"),
 )  # fmt: skip
 """Race track, training track."""
-COLLECT_S: Final = 12.0
 CAR: Final = get_car(DEFAULT_CAR)
 
 
@@ -40,7 +39,7 @@ def drives(race: str, training: str, seed: int) -> dict[str, Drive]:
     """With weights of the training track, with those updated by these laps, without any error."""
     track = load_track(race)
     line = racing_line(track, CAR)
-    samples = training_samples(load_track(training), CAR, COLLECT_S, seed)
+    samples = training_samples(load_track(training), CAR, CAR.tuning.pursuit.drive_s, seed)
     settings = TrainingSettings(seed=seed)
     weights = trained_weights(samples, PREDICTION, settings)
     nominal, perfect = build(BuildSettings())[0], build(BuildSettings.best_case())[0]

@@ -43,7 +43,6 @@ __all__ = ["BenchResult", "BenchSettings", "run_bench"]
 
 Floats = NDArray[np.float64]
 
-_COLLECT_S: Final = 12.0
 _START_SPEED_MPS: Final = 0.1
 _CONVERGED: Final = MpcSettings(iterations=100, iterations_cold=100, tolerance=1e-9, settle=0)
 _PUBLISHED: Final = Discretisation(scheme="euler", step_s=PREDICTION.step_s)
@@ -174,7 +173,7 @@ def run_bench(settings: BenchSettings, stages: Stages) -> BenchResult:
         courses = [load_track(name, car.width_m) for name in settings.tracks]
         lines = [racing_line(course, car) for course in courses]
         training = load_track(settings.train_track, car.width_m)
-        samples = training_samples(training, car, _COLLECT_S, settings.seed)
+        samples = training_samples(training, car, car.tuning.pursuit.drive_s, settings.seed)
     with stages.stage("train the residual") as stage:
         options = TrainingSettings(capacity=settings.points, seed=settings.seed)
         weights = trained_weights(samples, PREDICTION, options, progress=stage.update)

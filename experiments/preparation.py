@@ -60,7 +60,9 @@ class PreparationSettings(BaseModel):
     car: CarSetting = Field(default_factory=default_car)
     track: str = DEFAULT_RACE_TRACK
     train_track: str = DEFAULT_TRAINING_TRACK
-    collect_s: float = Field(12.0, ge=1, le=600, description="length of the training drive")
+    collect_s: float | None = Field(
+        None, ge=1, le=3600, description="length of the training drive [s]; None: the car's tuning"
+    )
     points: int = Field(400, ge=20, le=1024, description="training points per output")
     seed: int = Field(0, ge=0)
 
@@ -121,7 +123,8 @@ def prepare(
     if weights is None:
         with stages.stage("training drive (pure pursuit)"):
             training = load_track(settings.train_track, car.width_m)
-            samples = training_samples(training, car, settings.collect_s, settings.seed)
+            duration_s = settings.collect_s or car.tuning.pursuit.drive_s
+            samples = training_samples(training, car, duration_s, settings.seed)
         with stages.stage("train the residual") as stage:
             options = TrainingSettings(capacity=settings.points, seed=settings.seed)
             weights = _weights_file(samples, PREDICTION, options, None, stage.update)

@@ -101,9 +101,10 @@ class _Race:
         """Drives the training track by pure pursuit and reads the samples from the log."""
         settings = self.settings
         log = self.out / FILES.collect_log
+        duration_s = settings.collect_s or self.car.tuning.pursuit.drive_s
         with self.vehicle() as vehicle:
             collect(
-                course.track, course.line, self.car, log, settings.collect_s, settings.pursuit,
+                course.track, course.line, self.car, log, duration_s, settings.pursuit,
                 settings.start_speed_mps, vehicle,
             )  # fmt: skip
         return dataset_from_log(log, self.car, settings.discretisation.step_s)

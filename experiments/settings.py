@@ -35,7 +35,9 @@ class RaceSettings(BaseModel):
     time_limit: float = Field(
         3.0, gt=1, description="a run ends at this multiple of the racing line's time"
     )
-    collect_s: float = Field(12.0, ge=1, le=600, description="length of the training drive")
+    collect_s: float | None = Field(
+        None, ge=1, le=3600, description="length of the training drive [s]; None: the car's tuning"
+    )
     points: int = Field(400, ge=20, le=1024, description="training points per output")
     discretisation: Discretisation = PREDICTION
     raceline: RaceLineSettings = RaceLineSettings()

@@ -168,6 +168,7 @@ class PursuitTuning(_Section):
     speed_min_mps: float = _number(0.4, SPEED, "target speed is never below [m/s]")
     window_m: float = _number(0.4, LENGTH, "way ahead in which the nearest point is sought [m]")
     lost_m: float = _number(0.5, LENGTH, "farther from it, the whole line is searched [m]")
+    drive_s: float = _number(12.0, TIME, "length of a training drive [s]")
 
 
 class GateTuning(_Section):

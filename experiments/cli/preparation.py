@@ -130,8 +130,9 @@ def collect(
     raceline: RaceLineFile,
     out: OutFile = Path("collect.mcap"),
     duration: Annotated[
-        float, typer.Option(min=1, max=3600, help="Length of the drive [s].")
-    ] = 12.0,
+        float | None,
+        typer.Option(min=1, max=3600, help="Length of the drive [s] [by the car's tuning]."),
+    ] = None,
     seed: Seed = 0,
     fmu: FmuFile = None,
     fmu_map: FmuMap = None,
@@ -150,7 +151,8 @@ def collect(
     course = load_track(track, parameters.width_m)
     line = read_raceline_for(raceline, course, parameters)
     with open_vehicle(parameters, fmu, fmu_map) as vehicle:
-        samples = drive(course, line, parameters, out, duration, settings, vehicle=vehicle)
+        duration_s = duration or parameters.tuning.pursuit.drive_s
+        samples = drive(course, line, parameters, out, duration_s, settings, vehicle=vehicle)
     typer.echo(f"{samples} samples: {out}")
 
 
