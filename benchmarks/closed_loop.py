@@ -73,7 +73,7 @@ def drive(
     ``vehicle``: what plays the car; the built-in equations without.
     """
     step, simulator = NativeStep(artefact, car, MpcSettings()), vehicle or Simulator(dynamic(car))
-    step.set_path(make_path_table(track, line))
+    step.set_path(make_path_table(track, line, car.tuning.path.spacing_m))
     if weights is not None:
         step.set_weights(weights)
     step.reset()
@@ -115,5 +115,5 @@ def _laps(
 def pursue(car: CarParameters, track: Track, line: RaceLine, step_s: float) -> Dataset:
     """The training drive of ``bayesrace race``, with its defaults."""
     settings = RaceSettings()
-    x, u = drive_samples(track, line, car, settings.collect_s, settings.pursuit)
+    x, u = drive_samples(track, line, car, car.tuning.pursuit.drive_s, settings.pursuit)
     return filter_dataset(Dataset(car, step_s, x[:-1], u, x[1:]))

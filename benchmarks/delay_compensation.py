@@ -23,7 +23,7 @@ from bayesrace.raceline import read_raceline
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK, Track, load_track
 from bayesrace.transport import Director, Endpoints, Publisher, free_endpoint, open_session
-from bayesrace.vehicles import get_car
+from bayesrace.vehicles import DEFAULT_CAR, get_car
 from experiments.analysis import time_laps
 from experiments.drive import RunPlan, execute, wait_for_both
 from experiments.preparation import PreparationSettings, Prepared, prepare
@@ -31,7 +31,7 @@ from experiments.processes import child
 from experiments.progress import stages_on
 
 DELAYS_MS = (0, 10, 20, 40)
-CAR = "orca"
+CAR = DEFAULT_CAR
 
 
 @dataclass(frozen=True)

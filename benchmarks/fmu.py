@@ -29,7 +29,7 @@ from rich.table import Table
 from bayesrace.gp.weights import read_weights
 from bayesrace.raceline import read_raceline
 from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK, load_track
-from bayesrace.vehicles import get_car
+from bayesrace.vehicles import DEFAULT_CAR, get_car
 from bayesrace.vehicles.models import STATES, dynamic
 from benchmarks.closed_loop import START_MPS, Drive, drive
 from codegen.fmu import pack
@@ -124,7 +124,7 @@ def times_us(step: Callable[[list[float]], object]) -> tuple[float, float]:
 
 def print_times(fmus: dict[str, Path], console: Console) -> None:
     """One row for each way to have a period computed."""
-    car = get_car("orca")
+    car = get_car(DEFAULT_CAR)
     table = Table("one period of 20 ms", "median µs", "p99 µs")
     simulator = Simulator(dynamic(car))
     simulator.reset(START)
@@ -153,7 +153,7 @@ def master(car: Path, controller: Path, x0: list[float], periods: int) -> np.nda
 
 def print_laps(fmus: dict[str, Path], prepared: Prepared, folder: Path, console: Console) -> None:
     """Two laps of each car, and how far apart their states are at most."""
-    car = get_car("orca")
+    car = get_car(DEFAULT_CAR)
     track, line = load_track(prepared.track, car.width_m), read_raceline(prepared.raceline)
     weights = read_weights(prepared.weights)
     table = Table(f"{track.name}, BayesRace", "laps s", "off track", "largest difference")
@@ -170,13 +170,14 @@ def print_laps(fmus: dict[str, Path], prepared: Prepared, folder: Path, console:
         with open_fmu(car, fmu) as vehicle:
             own = drive(prepared.artefact, car, track, line, weights, vehicle=vehicle)
         row(name, own, own.x)
-    path = make_path_table(track, line)
+    path = make_path_table(track, line, car.tuning.path.spacing_m)
     x0 = [*track.start_pose(), START_MPS, 0.0, 0.0, 0.0]
     for cpu in ("native", "portable"):
         for version, fmu in zip(VERSIONS, fmus.values(), strict=True):
             definition = controller_fmu(
                 prepared.artefact, car, path.rows, path.spacing_m, MpcSettings().model_dump(),
-                FallbackSettings().model_dump(), weights, version, cpu,
+                FallbackSettings().model_dump() | {"brake_fade_mps": car.brake_fade_mps},
+                weights, version, cpu,
             )  # fmt: skip
             controller = pack(definition, folder / f"controller-{cpu}-{version}.fmu")
             x = master(fmu, controller, x0, len(reference.x) - 1)
@@ -197,7 +198,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         fmus = {
-            f"FMI {n}.0": pack(car_fmu(get_car("orca"), n), folder / f"car{n}.fmu")
+            f"FMI {n}.0": pack(car_fmu(get_car(DEFAULT_CAR), n), folder / f"car{n}.fmu")
             for n in VERSIONS
         }
         print_times(fmus, console)

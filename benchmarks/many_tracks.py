@@ -16,7 +16,7 @@ import numpy as np
 from bayesrace.integrators import PREDICTION
 from bayesrace.raceline.cached import racing_line
 from bayesrace.tracks import load_track
-from bayesrace.vehicles import get_car
+from bayesrace.vehicles import DEFAULT_CAR, get_car
 from benchmarks.closed_loop import Drive, drive
 from codegen.build import build
 from codegen.settings import BuildSettings
@@ -32,15 +32,14 @@ PAIRS: Final = (
     ("random:30", "random:11"), ("harbour", "paddock"),
 )  # fmt: skip
 """Race track, training track."""
-COLLECT_S: Final = 12.0
-CAR: Final = get_car("orca")
+CAR: Final = get_car(DEFAULT_CAR)
 
 
 def drives(race: str, training: str, seed: int) -> dict[str, Drive]:
     """With weights of the training track, with those updated by these laps, without any error."""
     track = load_track(race)
     line = racing_line(track, CAR)
-    samples = training_samples(load_track(training), CAR, COLLECT_S, seed)
+    samples = training_samples(load_track(training), CAR, CAR.tuning.pursuit.drive_s, seed)
     settings = TrainingSettings(seed=seed)
     weights = trained_weights(samples, PREDICTION, settings)
     nominal, perfect = build(BuildSettings())[0], build(BuildSettings.best_case())[0]

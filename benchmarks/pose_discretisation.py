@@ -17,7 +17,7 @@ from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.raceline import RaceLine, compute_raceline
 from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK, Track, load_track
-from bayesrace.vehicles import get_car
+from bayesrace.vehicles import DEFAULT_CAR, get_car
 from bayesrace.vehicles.models import e_kinematic
 from benchmarks.closed_loop import Drive, drive, pursue
 from codegen.build import build
@@ -26,7 +26,7 @@ from experiments.settings import RaceSettings
 from learning.dataset import Dataset, concatenate
 from learning.training import TrainingSettings, train
 
-CAR = get_car("orca")
+CAR = get_car(DEFAULT_CAR)
 TRAINING = TrainingSettings(capacity=RaceSettings().points)
 
 

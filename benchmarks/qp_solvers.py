@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesrace.gp.weights import GpWeights
-from bayesrace.vehicles import get_car
+from bayesrace.vehicles import DEFAULT_CAR, get_car
 from codegen.build import build, casadi_includes
 from codegen.compiler import FLAGS, find_compiler
 from codegen.settings import BuildSettings
@@ -34,7 +34,7 @@ STEPS = 300
 
 def write_problems(path: Path, artefact: Path, weights: GpWeights) -> None:
     """Records the drive and writes it as qp_solvers.c reads it."""
-    car, circuit, s = get_car("orca"), make_circuit(), SETTINGS
+    car, circuit, s = get_car(DEFAULT_CAR), make_circuit(), SETTINGS
     step = NativeStep(artefact, car, s)
     step.set_weights(weights)
     step.set_path(circuit.table)
@@ -60,7 +60,7 @@ def compile_harness(artefact: Path, folder: Path) -> Path:
 def measure() -> NDArray[np.float64]:
     """Results (problems, routes, 4): time [us], distance, iterations, status."""
     artefact, _ = build(BuildSettings())
-    weights = fit_weights(get_car("orca"), ("rbf", "matern25", "matern15"))
+    weights = fit_weights(get_car(DEFAULT_CAR), ("rbf", "matern25", "matern15"))
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         write_problems(folder / "problems.bin", artefact, weights)

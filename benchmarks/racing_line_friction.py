@@ -10,7 +10,7 @@ import argparse
 
 from bayesrace.raceline import RaceLineSettings, compute_raceline
 from bayesrace.tracks import DEFAULT_RACE_TRACK, load_track
-from bayesrace.vehicles import get_car
+from bayesrace.vehicles import DEFAULT_CAR, get_car
 from benchmarks.closed_loop import drive
 from codegen.build import build
 from codegen.settings import BuildSettings
@@ -22,7 +22,7 @@ def main() -> None:
     """Prints a line per friction number."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--track", default=DEFAULT_RACE_TRACK)
-    track, car = load_track(parser.parse_args().track), get_car("orca")
+    track, car = load_track(parser.parse_args().track), get_car(DEFAULT_CAR)
     artefact, _ = build(BuildSettings.best_case(car.name))
     print(f"{track.name}: friction, the line's own flying lap, driven laps")
     for friction in FRICTIONS:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesrace.vehicles import CarParameters, get_car
+from bayesrace.vehicles import DEFAULT_CAR, CarParameters, get_car
 from bayesrace.vehicles.models import dynamic, longitudinal_force
 from bayesrace.vehicles.parameters import GRAVITY_MPS2
 from plant.simulator import Simulator
@@ -65,7 +65,7 @@ def moving_mean(values: NDArray[np.float64], n: int) -> NDArray[np.float64]:
 def main() -> None:
     """Prints a row per steering angle and the largest of all."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--car", default="orca")
+    parser.add_argument("--car", default=DEFAULT_CAR)
     car = get_car(parser.parse_args().car)
     print("steering rad  lateral/g  speed m/s  radius m  drag m/s^2")
     results = [ramp(car, share * car.delta_max_rad) for share in np.linspace(0.1, 1.0, 10)]

@@ -21,7 +21,7 @@ from bayesrace.gp.weights import read_weights
 from bayesrace.messages import State
 from bayesrace.raceline import RaceLine, read_raceline
 from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK, load_track
-from bayesrace.vehicles import get_car
+from bayesrace.vehicles import DEFAULT_CAR, get_car
 from bayesrace.vehicles.models import dynamic
 from controller.compensation import CompensationSettings
 from controller.driver import Driver
@@ -44,18 +44,17 @@ SECOND: Final = 50
 UNDER_WAY_M: Final = 0.5
 """Progress along the line within a second."""
 STALE_S: Final = 0.1
-STOP_MPS2: Final = 1.5
 
 
 class Rig:
     """A driver and its car."""
 
     def __init__(self, step: NativeStep, length_m: float) -> None:
-        car = get_car("orca")
+        car = get_car(DEFAULT_CAR)
         self._step, self._length_m = step, length_m
         self._driver = Driver(
             PredictiveController(step), car, FallbackSettings(),
-            CompensationSettings(mode="fixed", delay_s=0.0), STALE_S, STOP_MPS2,
+            CompensationSettings(mode="fixed", delay_s=0.0), STALE_S,
         )  # fmt: skip
         self.car = Simulator(dynamic(car))
         self._run = 0
@@ -116,10 +115,10 @@ def main() -> None:
         made = prepare(
             PreparationSettings(track=given.track, train_track=given.train_track), stages
         )
-    car, track, line = get_car("orca"), load_track(given.track), read_raceline(made.raceline)
+    car, track, line = get_car(DEFAULT_CAR), load_track(given.track), read_raceline(made.raceline)
     step = NativeStep(made.artefact, car, MpcSettings())
     step.set_weights(read_weights(made.weights))
-    step.set_path(make_path_table(track, line))
+    step.set_path(make_path_table(track, line, car.tuning.path.spacing_m))
     rig, random = Rig(step, line.length_m), np.random.default_rng(given.seed)
     stood = 0
     for x in poses(line, given.count, random):

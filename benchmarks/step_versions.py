@@ -85,7 +85,7 @@ def record(problems: int, seed: int) -> dict[str, Any]:
     rows: dict[str, list[Any]] = {name: [] for name in ("x", "d", "reference", "first")}
     for name in settings.tracks:
         track = load_track(name)
-        step.set_path(make_path_table(track, racing_line(track, car)))
+        step.set_path(make_path_table(track, racing_line(track, car), car.tuning.path.spacing_m))
         step.reset()
         simulator = Simulator(dynamic(car))
         simulator.reset([*track.start_pose(), 1.0, 0.0, 0.0, 0.0])

@@ -17,6 +17,7 @@ import numpy as np
 
 from bayesrace.gp.weights import encode_weights, read_weights
 from bayesrace.transport import free_endpoint
+from bayesrace.vehicles import DEFAULT_CAR
 from tests.network.cars import gentle_course, start_controller, start_plant
 from tests.network.observer import Observer, observing
 from tests.programs import until
@@ -41,7 +42,9 @@ def main() -> None:
         with (
             start_plant(folder, plant_at),
             start_controller(folder, course, plant_at, controller_at, *rate) as controller,
-            observing([plant_at, controller_at], "orca", course.track, folder / "log") as observer,
+            observing(
+                [plant_at, controller_at], DEFAULT_CAR, course.track, folder / "log"
+            ) as observer,
         ):
             observer.start(1)
             until(lambda: observer.status("controller")["counters"]["gatekeeper"], "gatekeeper")

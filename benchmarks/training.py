@@ -24,7 +24,7 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteK
 from bayesrace.gp.weights import OUTPUTS
 from bayesrace.integrators import PREDICTION
 from bayesrace.tracks import DEFAULT_TRAINING_TRACK, load_track
-from bayesrace.vehicles import get_car
+from bayesrace.vehicles import DEFAULT_CAR, get_car
 from experiments.preparation import training_samples
 from learning.hyperparameters import BOUNDS, starts
 from learning.regression import scaling_of
@@ -62,7 +62,7 @@ def main() -> None:
     arguments = parser.parse_args()
     points, kind = arguments.points, arguments.kernel
 
-    car = get_car("orca")
+    car = get_car(DEFAULT_CAR)
     track = load_track(DEFAULT_TRAINING_TRACK, car.width_m)
     duration_s = (points + 5) * PREDICTION.step_s
     samples = training_samples(track, car, duration_s, arguments.seed).select(slice(points))

@@ -234,7 +234,7 @@ def _manifest(
             outputs=problem.outputs,
         ),
         model=settings.model,
-        car=settings.car,
+        car=car.name,
         car_digest=car.digest(),
         discretisation=settings.discretisation.identity(settings.model, car),
         horizon=settings.horizon,

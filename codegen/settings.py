@@ -5,6 +5,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.integrators import PERFECT, PREDICTION, Discretisation
+from bayesrace.vehicles import DEFAULT_CAR, CarParameters, CarSetting, default_car, get_car
 
 __all__ = ["BuildSettings"]
 
@@ -14,7 +15,7 @@ class BuildSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    car: str = Field("orca", description="built-in car")
+    car: CarSetting = Field(default_factory=default_car)
     model: Literal["e_kinematic", "dynamic"] = Field(
         "e_kinematic", description="model the OCP predicts with; dynamic is BestCase"
     )
@@ -23,6 +24,6 @@ class BuildSettings(BaseModel):
     gp_capacity: int = Field(1024, ge=8, le=16384, description="training points per output")
 
     @classmethod
-    def best_case(cls, car: str = "orca") -> "BuildSettings":
+    def best_case(cls, car: str | CarParameters = DEFAULT_CAR) -> "BuildSettings":
         """The controller with the perfect model, for comparison and validation only."""
-        return cls(car=car, model="dynamic", discretisation=PERFECT, gp_capacity=8)
+        return cls(car=get_car(car), model="dynamic", discretisation=PERFECT, gp_capacity=8)

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ValidationError
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_whole
 from bayesrace.gp.weights import decode_weights, encode_weights, read_weights
-from bayesrace.raceline.line import read_raceline
+from bayesrace.raceline import read_raceline_for
 from bayesrace.tracks import load_track
 from bayesrace.vehicles import CarParameters
 from controller.gate.store import Accepted, Store
@@ -49,13 +49,15 @@ def predictive_controller(
     the start, whatever ``weights`` are. Raises InputError naming the file that cannot be used.
     """
     step = NativeStep(artefact, car, read_settings(settings, MpcSettings))
-    step.set_path(make_path_table(load_track(track, car.width_m), read_raceline(raceline)))
+    course = load_track(track, car.width_m)
+    line = read_raceline_for(raceline, course, car)
+    step.set_path(make_path_table(course, line, car.tuning.path.spacing_m))
     first = Accepted(0, "", b"", proven=True)
     if weights is not None:
         loaded = read_weights(weights)
         step.set_weights(loaded)
         first = Accepted(0, loaded.version, encode_weights(loaded), proven=True)
-    port = WeightsPort(artefact.resolve(), step, [first])
+    port = WeightsPort(artefact.resolve(), step, car, [first])
     if store is not None:
         _restore(port, Store(store, step.manifest.discretisation))
         port.store = store

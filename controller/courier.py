@@ -194,8 +194,8 @@ class Courier:
         """Starts one and tells it where things stand; OSError if the system does not."""
         link, port = Link(self._memory), self._port
         link.begin(
-            self._settings, port.artefact, port.step.manifest, port.history, port.next_number,
-            port.withdrawn, port.store, self._watched_from,
+            self._settings, port.artefact, port.step.manifest, port.car, port.history,
+            port.next_number, port.withdrawn, port.store, self._watched_from,
         )  # fmt: skip
         return link
 

@@ -33,9 +33,6 @@ UNPREDICTABLE = 252
 HALTED = 253
 """Status of a cycle without a step: the car is not to be driven."""
 
-_STANDING_MPS = 0.1
-"""Speed below which a stop ends in holding the brake."""
-
 _JUMP, _JUMP_BY = 2.0, 0.01
 """A plan that costs more than so many times the one before, shifted, and so much more (m^2)."""
 
@@ -82,16 +79,15 @@ class Driver:
         fallback: FallbackSettings,
         compensation: CompensationSettings,
         stale_s: float,
-        stop_mps2: float,
         hold: bool = False,
     ) -> None:
         """``stale_s``: age from which a state is no longer predicted forward but fallen back
-        from. ``stop_mps2``: deceleration of a stop on command. ``hold``: wait for :meth:`go`."""
+        from. ``hold``: wait for :meth:`go`."""
         self._controller = controller
         self._fallback = Fallback(car, fallback)
         self._compensation = DelayCompensator(compensation, controller.predict)
         self._stale_s = stale_s
-        self._stop_mps2 = stop_mps2
+        self._tuning = car.tuning.driving
         self._stopping_from: tuple[float, float] | None = None
         self.decision = Decision()
         """Of the newest cycle."""
@@ -217,14 +213,14 @@ class Driver:
 
         Driven to standstill, the car stays on the line and points along it, fit to go on.
         """
-        rolling = abs(state.x[3]) > _STANDING_MPS
+        rolling = abs(state.x[3]) > self._tuning.standing_mps
         if self._stopping_from is None and not rolling:
             return False
         if self._stopping_from is None:  # just told, or a rolling car taken over on hold
             self._stopping_from = basis_s, max(float(state.x[3]), 0.0)
         since_s, speed_mps = self._stopping_from
-        limit_mps = max(speed_mps - self._stop_mps2 * (basis_s - since_s), 0.0)
-        self._controller.limit_speed(limit_mps, self._stop_mps2)
+        limit_mps = max(speed_mps - self._tuning.stop_mps2 * (basis_s - since_s), 0.0)
+        self._controller.limit_speed(limit_mps, self._tuning.stop_mps2)
         if limit_mps > 0 or rolling:
             return True
         self._stopping_from = None

@@ -13,7 +13,7 @@ from enum import IntEnum
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from bayesrace.vehicles.parameters import BRAKE_FADE_MPS, CarParameters
+from bayesrace.vehicles.parameters import CarParameters
 from controller.interface import NO_PLAN, Array, StepOutput
 
 __all__ = ["Fallback", "FallbackSettings", "Level"]
@@ -46,11 +46,6 @@ class FallbackSettings(BaseModel):
     tolerance: float = Field(
         default=1e-3, ge=0, le=0.1, description="excess over a limit that is clipped, not refused"
     )
-    brake_fade_mps: float = Field(
-        default=BRAKE_FADE_MPS,
-        gt=0,
-        description="speed below which braking fades to none at standstill",
-    )
 
 
 class Fallback:
@@ -60,6 +55,7 @@ class Fallback:
         self._settings = settings or FallbackSettings()
         self._low = np.array([car.d_min, -car.delta_rate_max_radps])
         self._high = np.array([car.d_max, car.delta_rate_max_radps])
+        self._brake_fade_mps = car.brake_fade_mps
         self.counts = [0, 0, 0, 0]
         """Cycles so far by level."""
         self.reset()
@@ -113,7 +109,7 @@ class Fallback:
         # The plan is kept only from solutions that were fit to be driven.
         self._plan = self._fit(output)
         self._plan_s, self._row_s = time_s, output.plan_step_s
-        if self._to_recover > 1 and vx_mps > self._settings.brake_fade_mps:
+        if self._to_recover > 1 and vx_mps > self._brake_fade_mps:
             self._to_recover -= 1
             return self._braking(vx_mps, time_s + late_s)
         self._to_recover = 0
@@ -143,7 +139,7 @@ class Fallback:
 
     def _braking(self, vx_mps: float, time_s: float) -> tuple[float, float, Level]:
         d = self._brake(vx_mps)
-        if not vx_mps > self._settings.brake_fade_mps:
+        if not vx_mps > self._brake_fade_mps:
             return d, 0.0, Level.STOP
         row = self._row(time_s)
         if row < len(self._plan):
@@ -154,7 +150,7 @@ class Fallback:
     def _brake(self, vx_mps: float) -> float:
         if not math.isfinite(vx_mps):
             return 0.0
-        return float(self._low[0]) * min(max(vx_mps / self._settings.brake_fade_mps, 0.0), 1.0)
+        return float(self._low[0]) * min(max(vx_mps / self._brake_fade_mps, 0.0), 1.0)
 
     def _limited(self, d: float, rate: float) -> tuple[float, float]:
         low, high = self._low, self._high

@@ -23,7 +23,7 @@ from typing import Any, Final
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import decode_weights
 from bayesrace.messages import Scalar
-from bayesrace.vehicles.parameters import get_car
+from bayesrace.vehicles import described_car
 from controller.gate.channel import Channel, Message
 from controller.gate.judge import Gate, Incumbent, Verdict, Watch
 from controller.gate.memory import ALL_SEEN, Memory, Noted
@@ -89,8 +89,9 @@ class Gatekeeper:
     def _start(self, fields: dict[str, Any], data: bytes) -> None:
         settings = GateSettings.model_validate(fields["settings"])
         self._rest_s = min(_REST_S, settings.hang_s / _SIGNS)
-        self._gate = Gate(settings, Path(fields["artefact"]), get_car(fields["car"]))
-        self._sampler = Sampler(self._gate.step_s, settings.moving_mps)
+        car = described_car(fields["car"])
+        self._gate = Gate(settings, Path(fields["artefact"]), car)
+        self._sampler = Sampler(self._gate.step_s, car.tuning.gate.moving_mps)
         self._recent: deque[Sample] = deque(maxlen=settings.recent_samples)
         self._withdrawn: list[str] = list(fields["withdrawn"])
         self._next_number = int(fields["next_number"])

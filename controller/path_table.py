@@ -24,10 +24,6 @@ ASTRAY_MAX: Final = 0.05
 """Share of a line that may be farther out than half the track's width: with more it belongs to
 another track."""
 
-SPACING_M: Final = 0.005
-"""Wanted distance of rows: between them the planner interpolates linearly, which at a curvature
-of 5 rad/m is wrong by .016 mm."""
-
 
 @dataclass(frozen=True, eq=False)
 class PathTable:
@@ -40,11 +36,12 @@ class PathTable:
     spacing_m: float
 
 
-def make_path_table(track: Track, line: RaceLine, spacing_m: float = SPACING_M) -> PathTable:
+def make_path_table(track: Track, line: RaceLine, spacing_m: float) -> PathTable:
     """Samples the line and, at each sample's projection on the centreline, the two half-planes.
 
     The half-planes are parallel to the centreline (paper, equation 8d), their normal has length 1,
-    their distance is the track's width there. InputError if the line belongs to another track.
+    their distance is the track's width there. ``spacing_m``: wanted distance of rows; between them
+    the planner interpolates linearly. InputError if the line belongs to another track.
     """
     count = min(CAPACITY, max(8, math.ceil(line.length_m / spacing_m)))
     s: npt.NDArray[np.float64] = np.arange(count, dtype=np.float64) * (line.length_m / count)

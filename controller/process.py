@@ -35,7 +35,6 @@ from bayesrace.transport import (
     Publisher,
     open_session,
 )
-from bayesrace.vehicles.parameters import get_car
 from controller.courier import Courier
 from controller.driver import Decision, Driver
 from controller.interface import Controller
@@ -81,14 +80,13 @@ class ControllerProcess:
 
     def __init__(self, session: Any, settings: ControllerSettings, controller: Controller) -> None:
         self._settings = settings
-        self.name = settings.name or settings.car
+        self.name = settings.name or settings.car.name
         self._driver = Driver(
             controller,
-            get_car(settings.car),
+            settings.car,
             settings.fallback,
             settings.compensation,
             settings.stale_s,
-            settings.stop_mps2,
             settings.hold,
         )
         self._controller = controller

@@ -4,6 +4,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.realtime import RealtimeSettings
 from bayesrace.transport import CONTROLLER_ENDPOINT, PLANT_ENDPOINT, Endpoints
+from bayesrace.vehicles import CarSetting, default_car
 from controller.compensation import CompensationSettings
 from controller.fallback import FallbackSettings
 from controller.gate.settings import GateSettings
@@ -16,7 +17,7 @@ class ControllerSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    car: str = Field(default="orca", description="car whose limits hold")
+    car: CarSetting = Field(default_factory=default_car)
     name: str = Field(default="", description="name in message keys; the car's own if empty")
     endpoints: Endpoints = Endpoints(listen=(CONTROLLER_ENDPOINT,), connect=(PLANT_ENDPOINT,))
     rate_hz: float = Field(50.0, ge=1, le=500, description="of the loop by the wall clock")
@@ -27,9 +28,6 @@ class ControllerSettings(BaseModel):
     fallback: FallbackSettings = FallbackSettings()
     stale_s: float = Field(
         default=0.06, gt=0, le=60, description="age from which a state is not predicted forward"
-    )
-    stop_mps2: float = Field(
-        1.5, gt=0, le=100, description="deceleration along the line of a stop on command"
     )
     hold: bool = Field(False, description="wait for 'go' before driving")
     gate: GateSettings = GateSettings()

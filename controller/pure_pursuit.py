@@ -21,19 +21,13 @@ __all__ = ["PurePursuit", "PurePursuitSettings"]
 
 
 class PurePursuitSettings(BaseModel):
-    """How it drives; lengths are those of a 1:43 car, scaled by wheelbase / 0.062 m."""
+    """How it drives; what depends on the car's size is in the car's tuning."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    lookahead_m: float = Field(
-        default=0.16, gt=0, description="distance of the target at standstill"
-    )
-    lookahead_s: float = Field(default=0.05, ge=0, description="added distance per speed")
     speed_scale: float = Field(
         default=0.95, gt=0, le=1.5, description="fraction of the line's speed"
     )
-    speed_gain: float = Field(default=0.9, gt=0, description="duty cycle per speed error [s/m]")
-    speed_min_mps: float = Field(default=0.4, ge=0, description="target speed is never below")
     excite_d: float = Field(
         default=0.1, ge=0, le=1, description="std. deviation of the d disturbance"
     )
@@ -74,7 +68,7 @@ class PurePursuit:
         # Twice around, so that every window of indices is one slice.
         self._twice_x, self._twice_y = np.tile(self._points, (2, 1)).T.copy()
         self._lengths = np.concatenate([[0.0], np.cumsum(steps)])
-        self._scale = car.wheelbase_m / 0.062
+        self._tuning = car.tuning.pursuit
         self._spacing = float(self._lengths[-1]) / len(steps)
         self._nearest = 0
         self._random = np.random.default_rng(self._settings.seed)
@@ -137,7 +131,11 @@ class PurePursuit:
         self._follow(px, py)
         self._excite()
         target_speed, delta_target = self._targets(px, py, psi, vx)
-        d = settings.speed_gain * (target_speed - vx) + self._hold(vx) + float(self._noise[0])
+        d = (
+            self._tuning.speed_gain_spm * (target_speed - vx)
+            + self._hold(vx)
+            + float(self._noise[0])
+        )
         rate = (delta_target + float(self._noise[1]) - delta) / settings.step_s
         lowest = max(-car.delta_rate_max_radps, (-car.delta_max_rad - delta) / settings.step_s)
         highest = min(car.delta_rate_max_radps, (car.delta_max_rad - delta) / settings.step_s)
@@ -148,15 +146,15 @@ class PurePursuit:
 
     def _targets(self, px: float, py: float, psi: float, vx: float) -> tuple[float, float]:
         """Speed [m/s] and steering angle [rad] to aim for."""
-        car, settings = self._car, self._settings
-        reach = (settings.lookahead_m + settings.lookahead_s * max(vx, 0.0)) * self._scale
+        car, settings, tuning = self._car, self._settings, self._tuning
+        reach = tuning.lookahead_m + tuning.lookahead_s * max(vx, 0.0)
         ahead = (self._nearest + max(1, round(reach / self._spacing))) % len(self._points)
         rear_x = px - car.lr_m * math.cos(psi)
         rear_y = py - car.lr_m * math.sin(psi)
         dx, dy = float(self._points[ahead, 0]) - rear_x, float(self._points[ahead, 1]) - rear_y
         alpha = math.atan2(dy, dx) - psi
         delta = math.atan2(2 * car.wheelbase_m * math.sin(alpha), math.hypot(dx, dy))
-        speed = max(settings.speed_scale * float(self._speeds[ahead]), settings.speed_min_mps)
+        speed = max(settings.speed_scale * float(self._speeds[ahead]), tuning.speed_min_mps)
         return min(speed, self._limit_mps), min(max(delta, -car.delta_max_rad), car.delta_max_rad)
 
     def _hold(self, vx: float) -> float:
@@ -176,13 +174,13 @@ class PurePursuit:
     def _follow(self, px: float, py: float) -> None:
         """Nearest point near the last one; the whole line if the car has left it by far."""
         count = len(self._points)
-        reach = min(max(3, int(0.4 * self._scale / self._spacing)), count // 3)
+        reach = min(max(3, int(self._tuning.window_m / self._spacing)), count // 3)
         first = (self._nearest - reach // 2) % count
         window = slice(first, first + reach // 2 + reach)
         dx, dy = self._twice_x[window] - px, self._twice_y[window] - py
         squared = dx * dx + dy * dy
         best = int(squared.argmin())
-        if squared[best] > (0.5 * self._scale) ** 2:
+        if squared[best] > self._tuning.lost_m**2:
             self._nearest = int(np.argmin(self._squared_distances(px, py)))
         else:
             self._nearest = (first + best) % count

@@ -13,6 +13,7 @@ from typing import Final
 
 from bayesrace.errors import InputError
 from bayesrace.messages import State
+from bayesrace.vehicles import CarParameters
 from controller.gate.memory import ALL_SEEN, Memory
 from controller.gate.store import Accepted
 from controller.native_step import NativeStep
@@ -31,6 +32,7 @@ class WeightsPort:
 
     artefact: Path
     step: NativeStep
+    car: CarParameters
     history: list[Accepted]
     """Oldest first, the ones in use last; never empty."""
     next_number: int = 1

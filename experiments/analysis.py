@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,6 @@ from bayesrace.raceline import RaceLine
 from bayesrace.tracks import PathProjection, StartLine, Track
 from bayesrace.tracks.projection import CentrelineSearch
 from bayesrace.tracks.spline import PlaneSpline
-from bayesrace.vehicles import get_car
 from experiments.recording import PlannedRun, Recording, RunRecord, read_recording
 from experiments.results import (
     GpMetrics,
@@ -208,7 +207,7 @@ class RaceAnalysis:
         run = self.recording.run_of("bestcase")
         if run is None:
             return None
-        car = get_car(str(self.recording.settings.get("car", "orca")))
+        car = self.recording.car
         step_s = self.recording.discretisation.step_s
         try:
             return dataset_from_messages(run.states, run.telemetry, car, step_s)
@@ -235,7 +234,7 @@ class RaceAnalysis:
         gaps = sum(run.record.gaps for run in self.runs)
         recording = self.recording
         return RaceResult(
-            settings=_summary(recording.settings),
+            settings=_summary(recording),
             laps=[run.result() for run in self.runs],
             gp=self._metrics("bayesrace"),
             gp_updated=self._metrics("bayesrace-updated"),
@@ -254,13 +253,15 @@ class RaceAnalysis:
         }
 
 
-def _summary(settings: dict[str, Any]) -> SettingsSummary:
+def _summary(recording: Recording) -> SettingsSummary:
+    settings = recording.settings
+
     def name(key: str) -> str:
         return Path(str(settings.get(key, ""))).stem
 
     mpc = settings.get("mpc")
     return SettingsSummary(
-        car=str(settings.get("car", "orca")),
+        car=recording.car.name,
         track=name("track"),
         train_track=name("train_track"),
         mode=str(settings.get("mode", "")),

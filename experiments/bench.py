@@ -25,7 +25,7 @@ from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.raceline.cached import racing_line
 from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK, Track, load_track
-from bayesrace.vehicles import CarParameters, get_car
+from bayesrace.vehicles import CarParameters, CarSetting, default_car
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from codegen.build import build
 from codegen.compiler import find_compiler
@@ -44,7 +44,6 @@ __all__ = ["BenchResult", "BenchSettings", "run_bench"]
 
 Floats = NDArray[np.float64]
 
-_COLLECT_S: Final = 12.0
 _START_SPEED_MPS: Final = 0.1
 _CONVERGED: Final = MpcSettings(iterations=100, iterations_cold=100, tolerance=1e-9, settle=0)
 _PUBLISHED: Final = Discretisation(scheme="euler", step_s=PREDICTION.step_s)
@@ -64,7 +63,7 @@ class BenchSettings(BaseModel):
         (DEFAULT_RACE_TRACK, "random:11", "random:15"), min_length=1, description="driven on"
     )
     train_track: str = DEFAULT_TRAINING_TRACK
-    car: str = "orca"
+    car: CarSetting = Field(default_factory=default_car)
     problems: int = Field(900, ge=10, description="control steps in closed loop, all tracks")
     peers: int = Field(25, ge=1, description="of these, solved by IPOPT")
     points: int = Field(400, ge=20, le=1024, description="training points per output")
@@ -170,23 +169,24 @@ class _Recording:
 def run_bench(settings: BenchSettings, stages: Stages) -> BenchResult:
     """Measures; takes about a minute, most of it IPOPT's."""
     find_compiler()  # what is missing is told now, not after the training
-    car = get_car(settings.car)
+    car = settings.car
     with stages.stage("racing lines and training drive"):
-        courses = [load_track(name) for name in settings.tracks]
+        courses = [load_track(name, car.width_m) for name in settings.tracks]
         lines = [racing_line(course, car) for course in courses]
-        samples = training_samples(load_track(settings.train_track), car, _COLLECT_S, settings.seed)
+        training = load_track(settings.train_track, car.width_m)
+        samples = training_samples(training, car, car.tuning.pursuit.drive_s, settings.seed)
     with stages.stage("train the residual") as stage:
         options = TrainingSettings(capacity=settings.points, seed=settings.seed)
         weights = trained_weights(samples, PREDICTION, options, progress=stage.update)
     with stages.stage("build"):
-        artefact, manifest = build(BuildSettings(car=car.name))
+        artefact, manifest = build(BuildSettings(car=car))
         horizon = manifest.horizon
         step, converged = (_controller(artefact, car, s, weights) for s in _pair())
     with stages.stage("closed loop"):
         recording = _Recording()
         for course, line in zip(courses, lines, strict=True):
             for one in (step, converged):
-                one.set_path(make_path_table(course, line))
+                one.set_path(make_path_table(course, line, car.tuning.path.spacing_m))
             _record(step, converged, course, car, 50)  # caches, branch predictors, clock frequency
             recording += _record(
                 step, converged, course, car, -(-settings.problems // len(courses))

@@ -10,7 +10,7 @@ from bayesrace.log import LogWriter
 from bayesrace.messages import ACTUATION, STATE, Actuation, State, car_key, encode
 from bayesrace.raceline import RaceLine
 from bayesrace.tracks import StartLine, Track
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import CarParameters, car_text
 from bayesrace.vehicles.models import dynamic
 from controller.pure_pursuit import PurePursuit, PurePursuitSettings
 from plant.simulator import Simulator
@@ -74,7 +74,7 @@ def collect(
     states, inputs = drive_samples(track, line, car, duration_s, settings, start_speed_mps, vehicle)
     start_line, lap = StartLine(track), 0
     state_key, actuation_key = (car_key(topic.key, car.name) for topic in (STATE, ACTUATION))
-    log = LogWriter(path, {"collect": {"track": track.name, "car": car.name}})
+    log = LogWriter(path, {"collect": {"track": track.name, "car": car_text(car)}})
     applied = (0.0, 0.0)
     try:
         for seq, x in enumerate(states):

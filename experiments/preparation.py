@@ -25,7 +25,7 @@ from bayesrace.tracks import (
     load_track,
     write_track,
 )
-from bayesrace.vehicles import CarParameters, get_car
+from bayesrace.vehicles import CarParameters, CarSetting, default_car
 from codegen.build import build
 from codegen.settings import BuildSettings
 from controller.pure_pursuit import PurePursuitSettings
@@ -57,10 +57,12 @@ class PreparationSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    car: str = "orca"
+    car: CarSetting = Field(default_factory=default_car)
     track: str = DEFAULT_RACE_TRACK
     train_track: str = DEFAULT_TRAINING_TRACK
-    collect_s: float = Field(12.0, ge=1, le=600, description="length of the training drive")
+    collect_s: float | None = Field(
+        None, ge=1, le=3600, description="length of the training drive [s]; None: the car's tuning"
+    )
     points: int = Field(400, ge=20, le=1024, description="training points per output")
     seed: int = Field(0, ge=0)
 
@@ -107,7 +109,7 @@ def prepare(
 
     Raises InputError for a track or car that cannot be used, RaceLineError and CompileError.
     """
-    car = get_car(settings.car)
+    car = settings.car
     track = load_track(settings.track, car.width_m)
     line_file = raceline_file(track, car, RaceLineSettings())
     track_file = line_file.with_name(_TRACK)
@@ -121,13 +123,14 @@ def prepare(
     if weights is None:
         with stages.stage("training drive (pure pursuit)"):
             training = load_track(settings.train_track, car.width_m)
-            samples = training_samples(training, car, settings.collect_s, settings.seed)
+            duration_s = settings.collect_s or car.tuning.pursuit.drive_s
+            samples = training_samples(training, car, duration_s, settings.seed)
         with stages.stage("train the residual") as stage:
             options = TrainingSettings(capacity=settings.points, seed=settings.seed)
             weights = _weights_file(samples, PREDICTION, options, None, stage.update)
     if artefact is None:
         with stages.stage("build the controller"):
-            artefact, _ = build(BuildSettings(car=car.name))
+            artefact, _ = build(BuildSettings(car=car))
     return Prepared(track_file, raceline, weights, artefact)
 
 

@@ -22,7 +22,7 @@ from bayesrace.raceline.cached import racing_line
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import Track, load_track, write_track
 from bayesrace.transport import Director, Endpoints, Publisher, free_endpoint, open_session
-from bayesrace.vehicles import CarParameters, get_car
+from bayesrace.vehicles import CarParameters, write_car
 from codegen.build import build
 from codegen.compiler import find_compiler
 from codegen.settings import BuildSettings
@@ -53,6 +53,7 @@ class _Files:
     """Names in the run directory."""
 
     settings: str = "settings.json"
+    car: str = "car.toml"
     log: str = "run.mcap"
     collect_log: str = "collect.mcap"
     result: str = "result.json"
@@ -79,7 +80,11 @@ class _Course:
 class _Race:
     def __init__(self, settings: RaceSettings, out: Path, stages: Stages) -> None:
         self.settings, self.out, self.stages = settings, out, stages
-        self.car: CarParameters = get_car(settings.car)
+        grip = settings.raceline.friction
+        self.car = (
+            settings.car if grip is None else settings.car.model_copy(update={"friction": grip})
+        )
+        """With the friction that the line is asked for: whoever drives it must know the same."""
         self._run = 0
 
     # Preparation -------------------------------------------------------------------------------
@@ -96,9 +101,10 @@ class _Race:
         """Drives the training track by pure pursuit and reads the samples from the log."""
         settings = self.settings
         log = self.out / FILES.collect_log
+        duration_s = settings.collect_s or self.car.tuning.pursuit.drive_s
         with self.vehicle() as vehicle:
             collect(
-                course.track, course.line, self.car, log, settings.collect_s, settings.pursuit,
+                course.track, course.line, self.car, log, duration_s, settings.pursuit,
                 settings.start_speed_mps, vehicle,
             )  # fmt: skip
         return dataset_from_log(log, self.car, settings.discretisation.step_s)
@@ -120,6 +126,11 @@ class _Race:
                 shutil.copyfile(source, target)
         with self.vehicle():  # an FMU that cannot be the car is told now, not in half a minute
             pass
+
+    @property
+    def car_file(self) -> str:
+        """The car, as the processes read it."""
+        return str(self.out / FILES.car)
 
     @property
     def fmu_files(self) -> tuple[Path | None, Path | None]:
@@ -144,9 +155,9 @@ class _Race:
     def artefact(self, model: str) -> Path:
         """Builds the controller, or takes it from the cache; its manifest goes into the run."""
         if model == "dynamic":
-            settings = BuildSettings.best_case(self.car.name)
+            settings = BuildSettings.best_case(self.car)
         else:
-            settings = BuildSettings(car=self.car.name, discretisation=self.settings.discretisation)
+            settings = BuildSettings(car=self.car, discretisation=self.settings.discretisation)
         folder, manifest = build(settings)
         write_whole(self.out / f"manifest-{model}.json", manifest.model_dump_json(indent=1) + "\n")
         return folder
@@ -201,7 +212,7 @@ class _Paddock:
         return ["--parent-pid", str(os.getpid()), *(["--low-latency"] if self._low_latency else [])]
 
     def _plant(self) -> Any:
-        arguments = ["plant", "--car", self._race.car.name, "--endpoint", self._plant_endpoint]
+        arguments = ["plant", "--car", self._race.car_file, "--endpoint", self._plant_endpoint]
         for option, file in zip(("--fmu", "--map"), self._race.fmu_files, strict=True):
             arguments += [option, str(file)] if file is not None else []
         return child([*arguments, *self._flags()], self._race.out / "plant.log")
@@ -217,7 +228,7 @@ class _Paddock:
         settings_file = race.out / FILES.mpc
         write_whole(settings_file, race.settings.mpc.model_dump_json(indent=1) + "\n")
         arguments = [
-            "controller", "--car", race.car.name, "--artefact", str(artefact),
+            "controller", "--car", race.car_file, "--artefact", str(artefact),
             "--track", str(course.track_file), "--raceline", str(course.line_file),
             "--settings", str(settings_file), "--endpoint", self._plant_endpoint,
             "--listen", self._controller_endpoint, *self._flags(),
@@ -257,6 +268,7 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
     )
     out.mkdir(parents=True, exist_ok=True)
     this.keep_fmu()
+    write_car(this.car_file, this.car)
     write_whole(out / FILES.settings, settings.model_dump_json(indent=1) + "\n")
     with stages.stage("racing line, training track"):
         training = this.course(train_track, "train")

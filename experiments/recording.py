@@ -27,6 +27,7 @@ from bayesrace.messages import (
 )
 from bayesrace.raceline import RaceLine, read_raceline
 from bayesrace.tracks import Track, read_track
+from bayesrace.vehicles import DEFAULT_CAR, CarParameters, described_car
 
 __all__ = ["RUN_EVENT", "PlannedRun", "Recording", "RunRecord", "read_recording"]
 
@@ -151,6 +152,14 @@ class Recording:
     """Messages of the log that could not be decoded."""
     started_ns: int | None
     """Calendar time of the first message [ns since 1970]."""
+
+    @property
+    def car(self) -> CarParameters:
+        """The car that was driven, as the settings describe it."""
+        try:
+            return described_car(self.settings.get("car", DEFAULT_CAR))
+        except InputError as error:
+            raise InputError(f"settings.json, car: {error}") from None
 
     @property
     def discretisation(self) -> Discretisation:

@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.raceline import RaceLineSettings
 from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK
+from bayesrace.vehicles import CarSetting, default_car
 from controller.pure_pursuit import PurePursuitSettings
 from controller.settings import MpcSettings
 from plant.simulator import PLANT
@@ -20,7 +21,7 @@ class RaceSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    car: str = Field("orca", description="built-in car")
+    car: CarSetting = Field(default_factory=default_car)
     track: str = Field(DEFAULT_RACE_TRACK, description="race track: name, random:SEED or CSV file")
     train_track: str = Field(DEFAULT_TRAINING_TRACK, description="the same for the training track")
     laps: int = Field(
@@ -34,7 +35,9 @@ class RaceSettings(BaseModel):
     time_limit: float = Field(
         3.0, gt=1, description="a run ends at this multiple of the racing line's time"
     )
-    collect_s: float = Field(12.0, ge=1, le=600, description="length of the training drive")
+    collect_s: float | None = Field(
+        None, ge=1, le=3600, description="length of the training drive [s]; None: the car's tuning"
+    )
     points: int = Field(400, ge=20, le=1024, description="training points per output")
     discretisation: Discretisation = PREDICTION
     raceline: RaceLineSettings = RaceLineSettings()

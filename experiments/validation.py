@@ -10,7 +10,7 @@ from threadpoolctl import threadpool_limits
 
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
-from bayesrace.vehicles import get_car
+from bayesrace.vehicles import CarParameters, get_car
 from experiments.notation import UNCERTAIN
 from experiments.results import GpMetrics
 from learning.dataset import Dataset, left_out
@@ -115,14 +115,16 @@ def validate_weights(
     name: str = "",
     runs: tuple[int, ...] | None = None,
     threshold: float = UNCERTAIN,
+    car: CarParameters | None = None,
 ) -> Validated:
     """Judges weights on logs (MCAP) or arrays (``.npz``), filtered as for training.
 
-    The discretisation is the one that the weights were learned with. InputError for drives of
-    another car or step, or without samples.
+    The discretisation is the one that the weights were learned with. ``car``: theirs, needed where
+    it is not built in. InputError for drives of another car or step, or without samples.
     """
-    discretisation = discretisation_of(weights.discretisation, get_car(weights.car))
-    samples = read_samples(drives, weights.car, name, discretisation, runs=runs)
+    car = car or get_car(weights.car)
+    discretisation = discretisation_of(weights.discretisation, car)
+    samples = read_samples(drives, car, name, discretisation, runs=runs)
     data = samples.dataset
     if len(data) == 0:
         counts = left_out(data.dropped)

@@ -3,7 +3,7 @@
 =========== ================================== ====================================================
 array       shape                              what
 =========== ================================== ====================================================
-``car``     text                               the car's name
+``car``     text                               a built-in car's name, or all its values (JSON)
 ``step_s``  number                             sampling time [s]
 either
 ``x``       (n, 7)                             states [x, y, psi, vx, vy, omega, delta] at the start
@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesrace.errors import InputError
-from bayesrace.vehicles.parameters import CarParameters, get_car
+from bayesrace.vehicles import CarParameters, car_text, described_car
 from learning.dataset import Dataset, dataset_from_arrays
 from learning.published import is_published, published_drive
 
@@ -76,14 +76,14 @@ def dataset_from_npz(
     return dataset if step_s is None else replace(dataset, step_s=step_s)
 
 
-def car_of_npz(path: str | os.PathLike[str]) -> str:
-    """Name of the car that a file tells; empty if it tells none. InputError if it is no such file.
+def car_of_npz(path: str | os.PathLike[str]) -> CarParameters | None:
+    """The car that a file describes; None if it describes none. InputError if it is no such file.
 
     Whether the samples are fit to be read is not looked at.
     """
     arrays = _read(Path(path), ("car",))
     try:
-        return _car_name(arrays["car"]) if "car" in arrays else ""
+        return described_car(_text(arrays["car"])) if "car" in arrays else None
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
@@ -109,7 +109,7 @@ def _dataset(arrays: Mapping[str, NDArray[Any]]) -> Dataset:
     names = set(arrays) - set(_ABOUT)
     if not set(_ABOUT) <= set(arrays) or names not in (set(_SAMPLES), set(_DRIVE)):
         raise InputError(f"arrays {', '.join(sorted(arrays)) or 'none'}; {_SCHEMA}")
-    car = get_car(_car_name(arrays["car"]))
+    car = described_car(_text(arrays["car"]))
     for name in sorted(names | {"step_s"}):
         if arrays[name].dtype.kind not in "fiu":
             raise InputError(f"'{name}' holds no numbers")
@@ -121,7 +121,7 @@ def _dataset(arrays: Mapping[str, NDArray[Any]]) -> Dataset:
     return Dataset(car, step_s, arrays["x"], arrays["u"], arrays["x_next"])
 
 
-def _car_name(array: NDArray[Any]) -> str:
+def _text(array: NDArray[Any]) -> str:
     if array.shape != () or array.dtype.kind != "U":
         raise InputError("'car' must be one text")
     return str(array)
@@ -131,7 +131,7 @@ def write_npz(path: str | os.PathLike[str], dataset: Dataset) -> None:
     """The samples as :func:`dataset_from_npz` reads them."""
     np.savez_compressed(
         path,
-        car=np.array(dataset.car.name),
+        car=np.array(car_text(dataset.car)),
         step_s=np.array(dataset.step_s),
         x=dataset.x,
         u=dataset.u,

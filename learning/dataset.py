@@ -131,7 +131,6 @@ class FilterSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    min_vx_mps: float = Field(default=0.05, ge=0, description="slower is standstill")
     tolerance: float = Field(
         default=1e-6,
         ge=0,
@@ -146,7 +145,7 @@ def filter_dataset(dataset: Dataset, settings: FilterSettings | None = None) -> 
     """
     settings = settings or FilterSettings()
     car, slack = dataset.car, settings.tolerance
-    moving = dataset.x[:, 3] >= settings.min_vx_mps
+    moving = dataset.x[:, 3] >= car.tuning.gate.moving_mps
     kept = dataset.select(moving, "standstill")
     d, rate = kept.u.T
     angle = np.maximum(np.abs(kept.x[:, 6]), np.abs(kept.x_next[:, 6]))

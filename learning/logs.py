@@ -15,7 +15,7 @@ from bayesrace.errors import InputError
 from bayesrace.integrators import Discretisation
 from bayesrace.log import LogReader
 from bayesrace.messages import STATE, TELEMETRY, State, Telemetry, car_key
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles import CarParameters, described_car
 from learning.dataset import Dataset, FilterSettings, filter_dataset
 
 __all__ = ["LogFacts", "dataset_from_log", "dataset_from_messages", "log_facts"]
@@ -27,8 +27,8 @@ class LogFacts:
 
     names: tuple[str, ...]
     """Cars in the network whose states it holds, by the keys."""
-    car: str
-    """The car that drove, by who recorded it; empty if that is not told."""
+    car: CarParameters | None
+    """The car that drove, by who recorded it; None if that is not told."""
     discretisation: Discretisation | None
     """With which its controller predicted; None if that is not told."""
 
@@ -44,7 +44,10 @@ def log_facts(path: str | os.PathLike[str]) -> LogFacts:
             told = json.loads(metadata["race"].get("settings", "{}"))
         given = told.get("discretisation")
         discretisation = None if given is None else Discretisation.model_validate(given)
-        return LogFacts(tuple(names), str(told.get("car", "")), discretisation)
+        car = described_car(told["car"]) if told.get("car") else None
+        return LogFacts(tuple(names), car, discretisation)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
     except (ValueError, AttributeError, ValidationError) as error:
         raise InputError(f"{path}: its settings cannot be read ({error})") from error
 

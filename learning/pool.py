@@ -12,7 +12,7 @@ import numpy as np
 from bayesrace.gp.expression import evaluate_mean
 from bayesrace.gp.weights import OUTPUTS, GpWeights
 from bayesrace.integrators import Discretisation
-from bayesrace.vehicles.parameters import get_car
+from bayesrace.vehicles import CarParameters
 from learning.dataset import Dataset
 from learning.residual import NOMINAL, discretisation_of
 from learning.subset import evenly, most_informative
@@ -54,13 +54,12 @@ def bounded(dataset: Dataset, wanted: int, weights: GpWeights | None = None) -> 
     return looked_at.select(chosen)
 
 
-def recalled(weights: GpWeights) -> Dataset:
-    """What weights know at their own training inputs, as samples of their car.
+def recalled(weights: GpWeights, car: CarParameters) -> Dataset:
+    """What weights know at their own training inputs, as samples of ``car``, which is theirs.
 
     Each is a step of the nominal model from the origin, plus the mean: learned from again they
     give nearly the same means. InputError if the model is not known here.
     """
-    car = get_car(weights.car)
     discretisation: Discretisation = discretisation_of(weights.discretisation, car)
     every = np.vstack([output.inputs for output in weights.outputs])
     _, first = np.unique(every, axis=0, return_index=True)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from bayesrace.errors import InputError
 from bayesrace.integrators import PREDICTION, Discretisation
-from bayesrace.vehicles.parameters import CARS, CarParameters, get_car
+from bayesrace.vehicles import CarParameters, builtin_cars
 from learning.arrays import car_of_npz, dataset_from_npz
 from learning.dataset import Dataset, FilterSettings, concatenate, filter_dataset
 from learning.logs import LogFacts, dataset_from_log, log_facts
@@ -29,24 +29,24 @@ class _Source:
     """None for arrays."""
 
 
-def _car(sources: Sequence[_Source], wanted: str, name: str) -> CarParameters:
+def _car(sources: Sequence[_Source], wanted: CarParameters | None, name: str) -> CarParameters:
     """The one car of all sources; InputError if they tell of several, or of none."""
-    told: dict[str, Path] = {}
+    told: dict[str, tuple[CarParameters, Path]] = {}
     for source in sources:
         if source.facts is None:
             car = car_of_npz(source.path)
         else:
             driver = _driver(source.path, source.facts, name)
-            car = source.facts.car or (driver if driver in CARS else "")
-        if car:
-            told.setdefault(car, source.path)
-    if wanted:
-        told.setdefault(wanted, Path("--car"))
+            car = source.facts.car or builtin_cars().get(driver)
+        if car is not None:
+            told.setdefault(car.identity, (car, source.path))
+    if wanted is not None:
+        told.setdefault(wanted.identity, (wanted, Path("--car")))
     if len(told) > 1:
-        cars = ", ".join(f"'{car}' ({path})" for car, path in told.items())
+        cars = ", ".join(f"'{name}' ({path})" for name, (_, path) in told.items())
         raise InputError(f"different cars cannot be mixed: {cars}; give logs of one car")
     if told:
-        return get_car(next(iter(told)))
+        return next(iter(told.values()))[0]
     raise InputError("no file names its car; name it with --car")
 
 
@@ -79,7 +79,7 @@ def _discretisation(sources: Sequence[_Source], given: Discretisation | None) ->
 
 def read_samples(
     paths: Sequence[Path],
-    car: str = "",
+    car: CarParameters | None = None,
     name: str = "",
     discretisation: Discretisation | None = None,
     settings: FilterSettings | None = None,

@@ -19,7 +19,7 @@ from bayesrace.errors import InputError
 from bayesrace.files import replacing
 from bayesrace.gp.weights import OUTPUTS, GpWeights, read_weights, write_weights
 from bayesrace.integrators import Discretisation
-from bayesrace.vehicles.parameters import get_car
+from bayesrace.vehicles import CarSetting
 from learning.arrays import dataset_from_npz, write_npz
 from learning.dataset import Dataset, concatenate
 from learning.pool import bounded, recalled
@@ -36,7 +36,7 @@ class Task(_Frozen):
     """Learn from old and new samples; keep a bounded part of them."""
 
     number: int = Field(description="comes back in the outcome")
-    car: str
+    car: CarSetting
     discretisation: Discretisation
     old: Path | None = Field(None, description="samples kept so far (.npz)")
     new: tuple[Path, ...] = Field((), description="samples driven since (.npz)")
@@ -64,8 +64,8 @@ class Outcome(_Frozen):
 
 
 def _samples(task: Task) -> Dataset:
-    car, step_s = get_car(task.car), task.discretisation.step_s
-    found = [recalled(read_weights(task.recall))] if task.recall is not None else []
+    car, step_s = task.car, task.discretisation.step_s
+    found = [recalled(read_weights(task.recall), car)] if task.recall is not None else []
     old = [task.old] if task.old is not None else []
     found += [dataset_from_npz(path, car, step_s) for path in (*old, *task.new)]
     return concatenate(found)

@@ -47,7 +47,7 @@ from bayesrace.transport import (
     decode_request,
     open_session,
 )
-from bayesrace.vehicles.parameters import get_car
+from bayesrace.vehicles import CarSetting, default_car
 from plant.fmu.faults import FmuFault
 from plant.run import End, Run, RunCounters
 from plant.vehicle import Vehicle, open_vehicle
@@ -69,7 +69,7 @@ class PlantSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    car: str = Field(default="orca", description="car whose parameters drive the model")
+    car: CarSetting = Field(default_factory=default_car)
     name: str = Field(default="", description="name in message keys; the car's own if empty")
     endpoints: Endpoints = Endpoints(listen=(PLANT_ENDPOINT,))
     rate_hz: float = Field(
@@ -102,7 +102,7 @@ class PlantProcess:
 
     def __init__(self, session: Any, settings: PlantSettings, vehicle: Vehicle) -> None:
         self._session, self._settings = session, settings
-        self.name = settings.name or settings.car
+        self.name = settings.name or settings.car.name
         self._simulator = vehicle
         # Two processes started in one nanosecond on two machines must differ too.
         self._epoch = secrets.randbits(62)
@@ -328,7 +328,7 @@ def main(settings: PlantSettings) -> int:
     Call it from the main thread of a process: it takes over the signals.
     """
     die_with_parent(settings.parent_pid)
-    vehicles = open_vehicle(get_car(settings.car), settings.fmu, settings.fmu_map, settings.rate_hz)
+    vehicles = open_vehicle(settings.car, settings.fmu, settings.fmu_map, settings.rate_hz)
     with vehicles as vehicle, open_session(settings.endpoints, "plant") as session:
         process = PlantProcess(session, settings, vehicle)
         for refusal in prepare_thread(settings.realtime):

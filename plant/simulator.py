@@ -16,7 +16,7 @@ import numpy.typing as npt
 from bayesrace.errors import InputError
 from bayesrace.integrators import Discretisation
 from bayesrace.vehicles.models import Model
-from bayesrace.vehicles.parameters import BRAKE_FADE_MPS, CarParameters
+from bayesrace.vehicles.parameters import CarParameters
 
 __all__ = [
     "PLANT",
@@ -77,6 +77,7 @@ class PlantGuard:
         self._d_min, self._d_max = car.d_min, car.d_max
         self._rate_max = car.delta_rate_max_radps
         self._delta_max = car.delta_max_rad
+        self._brake_fade_mps = car.brake_fade_mps
         self.counters = GuardCounters()
 
     def apply(
@@ -96,7 +97,7 @@ class PlantGuard:
     def brake(self, vx_mps: float) -> tuple[float, float]:
         """Full brake while rolling forward, fading to none at standstill; steering held."""
         self.counters.braked += 1
-        return self._d_min * min(max(vx_mps / BRAKE_FADE_MPS, 0.0), 1.0), 0.0
+        return self._d_min * min(max(vx_mps / self._brake_fade_mps, 0.0), 1.0), 0.0
 
     def _steerable(self, rate: float, delta_rad: float, duration_s: float) -> float:
         """The nearest rate within its limit that leaves the angle within its own at the end."""

@@ -233,7 +233,7 @@ def make_circuit() -> Circuit:
     points = np.column_stack([1.15 * radius * np.cos(angle), radius * np.sin(angle)])
     track = Track.from_points("peanut", points, 0.16, 0.18)
     line = offset_line(track, offset_m=0.17, lateral_mps2=6.0, v_max=2.6)
-    return Circuit(track, line, make_path_table(track, line))
+    return Circuit(track, line, make_path_table(track, line, get_car("orca").tuning.path.spacing_m))
 
 
 @pytest.fixture(scope="session")

@@ -71,7 +71,7 @@ class Lockstep:
     def __post_init__(self) -> None:
         compensation = CompensationSettings(mode="fixed", delay_s=self.delay_s)
         controller = PredictiveController(self.native)
-        self.driver = Driver(controller, self.car, FALLBACK, compensation, 0.06, 1.5)
+        self.driver = Driver(controller, self.car, FALLBACK, compensation, 0.06)
         self.plant = Simulator(dynamic(self.car))
 
     def answer(self, seq: int, x: Floats) -> Floats:
@@ -148,7 +148,7 @@ def exported_controllers(
             "rows": circuit.table.rows,
             "spacing_m": circuit.table.spacing_m,
             "settings": RACING.model_dump(),
-            "fallback": FALLBACK.model_dump(),
+            "fallback": FALLBACK.model_dump() | {"brake_fade_mps": car.brake_fade_mps},
             "weights": weights,
         }
         return controller_fmu(**(values | changes))

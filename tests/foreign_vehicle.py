@@ -12,8 +12,8 @@ import numpy as np
 from pythonfmu import DefaultExperiment, Fmi2Causality, Fmi2Slave, Fmi2Variability, Real
 
 from bayesrace.integrators import Discretisation
+from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import dynamic
-from bayesrace.vehicles.parameters import get_car
 
 SUBSTEP_S = 1e-3
 

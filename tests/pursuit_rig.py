@@ -42,7 +42,7 @@ sys.exit(main(PlantSettings.model_validate_json(sys.argv[1])))
 CONTROLLER = """
 import sys
 import numpy as np
-from bayesrace.vehicles.parameters import get_car
+from bayesrace.vehicles import get_car
 from controller.process import ControllerSettings, main
 from controller.pure_pursuit import PurePursuit, PurePursuitSettings
 assert not {"casadi", "sklearn", "matplotlib", "scipy"} & set(sys.modules), "slow imports"

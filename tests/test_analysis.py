@@ -10,6 +10,7 @@ import pytest
 from rich.console import Console
 
 from bayesrace.errors import InputError
+from bayesrace.vehicles import default_car
 from experiments.analysis import analyse, read_race, read_result, time_laps, write_result
 from experiments.results import LapResult, RaceResult
 from experiments.table import COLUMNS, print_table
@@ -164,6 +165,21 @@ def test_a_log_that_was_cut_off_is_analysed_as_far_as_it_goes(tmp_path: Path, sh
     assert not result.complete
     assert 1 <= len(result.laps) <= 2
     assert result.laps[0].finished == (share >= 0.5)
+
+
+def test_a_run_of_a_file_car_needs_its_settings_only(tmp_path: Path) -> None:
+    """They describe the whole car, so that a report can be made again."""
+    path = write_race(tmp_path, [])
+    settings = json.loads((path / "settings.json").read_text())
+    mine = default_car().model_copy(update={"name": "mine", "mass_kg": 0.05})
+    settings["car"] = json.loads(mine.model_dump_json())
+    (path / "settings.json").write_text(json.dumps(settings))
+    analysis = read_race(path)
+    assert analysis.recording.car == mine
+    assert analysis.result.settings.car == "mine"
+    (path / "settings.json").write_text(json.dumps(settings | {"car": "lorry"}))
+    with pytest.raises(InputError, match=r"settings\.json, car: unknown car 'lorry'"):
+        _ = read_race(path).result
 
 
 def test_settings_are_summarised(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import signal
 import socket
 import subprocess
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +17,18 @@ from bayesrace.gp.weights import write_weights, zero_weights
 from bayesrace.integrators import Discretisation
 from bayesrace.log import LogReader
 from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY
-from bayesrace.raceline.line import write_raceline
+from bayesrace.raceline import RaceLineSettings, write_raceline
+from bayesrace.raceline.identity import line_identity
 from bayesrace.tracks import write_track
 from bayesrace.transport import Director, free_endpoint
-from bayesrace.vehicles import get_car
+from bayesrace.vehicles import get_car, write_car
 from experiments.processes import child
 from tests.command_line import Cli, refused
 from tests.conftest import Circuit
 from tests.programs import environment, finish, peanut, run, start, until
 
 SUBCOMMANDS = (
-    "race", "drive", "report", "bench", "tracks", "raceline", "collect", "train", "build",
+    "race", "drive", "report", "bench", "tracks", "cars", "raceline", "collect", "train", "build",
     "plant", "controller", "status", "stop", "go", "router", "latency",
     "fmu export", "fmu inspect", "fmu weights",
     "validate", "publish", "rollback", "learn",
@@ -113,6 +114,20 @@ def test_an_unknown_track_or_car_is_refused_with_those_there_are(cli: Cli, tmp_p
     for command in ("race", "plant", "build"):
         refused(cli(command, "--car", "lorry"), "lorry", "orca")
     refused(cli("raceline", "paddock", "--car", "lorry"), "lorry", "orca")
+    refused(cli("plant", "--car", "lorry.toml"), "lorry.toml", "bayesrace cars")
+
+
+def test_cars_are_listed_checked_and_written(cli: Cli, tmp_path: Path) -> None:
+    listed = cli("cars")
+    assert listed.code == 0
+    assert "orca" in listed.out
+    assert cli("cars", "orca", "--out", "mine.toml").code == 0
+    checked = cli("cars", "mine.toml")
+    assert (checked.code, checked.out) == (0, listed.out)
+    refused(cli("cars", "--out", "x.toml"), "--out", "name")
+    text = (tmp_path / "mine.toml").read_text()
+    (tmp_path / "mine.toml").write_text(text.replace("mass_kg = 0.041", "mass_kg = -1"))
+    refused(cli("cars", "mine.toml"), "mine.toml", "geometry.mass_kg = -1 kg", "greater than 0")
 
 
 @pytest.mark.parametrize(
@@ -156,6 +171,21 @@ def test_missing_and_wrong_input_files_are_refused(
             "controller", "--artefact", kinematic_artefact, *course, "--settings", argument
         )
         refused(outcome, argument)
+
+
+def test_a_line_for_another_car_is_refused_wherever_it_would_be_driven(
+    cli: Cli, circuit: Circuit, kinematic_artefact: Path, tmp_path: Path
+) -> None:
+    car = get_car("orca").model_copy(update={"friction": 0.5})
+    made = line_identity(circuit.track, car, RaceLineSettings())
+    write_track(tmp_path / "track.csv", circuit.track)
+    write_raceline(tmp_path / "line.csv", replace(circuit.line, made_for=made))
+    course = ("--track", "track.csv", "--raceline", "line.csv")
+    export = ("fmu", "export", "--controller", "--artefact", kinematic_artefact, "--out", "x.fmu")
+    for command in (("controller", "--artefact", kinematic_artefact), ("collect",), export):
+        refused(cli(*command, *course), "line.csv", "friction of 0.5", "has 0.75")
+    write_car(tmp_path / "wet.toml", car)
+    assert cli("collect", *course, "--duration", "1", "--car", "wet.toml").code == 0
 
 
 def test_more_points_than_the_controller_holds_are_refused(

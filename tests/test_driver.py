@@ -37,7 +37,6 @@ class Rig:
             FallbackSettings(recover_cycles=3),
             CompensationSettings(mode="fixed", delay_s=delay_s),
             STALE_S,
-            1.5,
             hold,
         )
         self.plant = discrete(dynamic(car))

@@ -15,7 +15,11 @@ EXAMPLES = re.findall(
 )
 
 
-@pytest.mark.parametrize(("title", "code"), EXAMPLES, ids=[title for title, _ in EXAMPLES])
+# test_cars.py runs 'Add a car', which is a file and a program.
+PROGRAMS = [(title, code) for title, code in EXAMPLES if title != "Add a car"]
+
+
+@pytest.mark.parametrize(("title", "code"), PROGRAMS, ids=[title for title, _ in PROGRAMS])
 def test_the_example_runs(title: str, code: str) -> None:
     assert len(code.splitlines()) < 60, title
     done = subprocess.run(

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bayesrace.vehicles.parameters import get_car
+from bayesrace.vehicles import get_car
 from controller.fallback import Fallback, FallbackSettings, Level
 from controller.interface import StepOutput
 

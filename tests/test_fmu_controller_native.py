@@ -120,7 +120,7 @@ def test_the_fallback_in_c_does_what_the_one_in_python_does(
     state = _State()
     numbers = _Settings(
         CAR.d_min, CAR.d_max, CAR.delta_rate_max_radps, chosen.shifted_s, chosen.tolerance,
-        chosen.brake_fade_mps, chosen.recover_cycles,
+        CAR.brake_fade_mps, chosen.recover_cycles,
     )  # fmt: skip
     time_s = 0.0
     for kind, first, (d, rate, spoil), vx, later_s in cycles:

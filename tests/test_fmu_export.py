@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 from bayesrace.errors import InputError
 from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import STATES, dynamic
-from bayesrace.vehicles.parameters import BRAKE_FADE_MPS
 from codegen.fmu import FmuDefinition, Variable, pack
 from plant.fmu.export import car_fmu, car_values
 from plant.simulator import PlantGuard
@@ -141,7 +140,7 @@ def test_a_standing_car_stays_when_its_command_is_lost() -> None:
     assert rows[0, 7] == -0.1
     assert (rows[1:, 3] <= rows[:-1, 3]).all()
     assert 0 <= rows[-1, 3] < 1e-3
-    assert rows[-1, 7] == pytest.approx(-0.1 * rows[-2, 3] / BRAKE_FADE_MPS)
+    assert rows[-1, 7] == pytest.approx(-0.1 * rows[-2, 3] / get_car("orca").brake_fade_mps)
 
 
 @pytest.fixture(scope="module")

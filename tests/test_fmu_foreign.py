@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import dynamic
-from bayesrace.vehicles.parameters import get_car
 from plant.fmu.inspection import inspect
 from plant.fmu.proposal import starting_map
 from plant.fmu.simulator import open_fmu

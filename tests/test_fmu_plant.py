@@ -21,7 +21,7 @@ from bayesrace.errors import InputError
 from bayesrace.log import LogReader
 from bayesrace.messages import STATE, TELEMETRY, State
 from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
-from bayesrace.vehicles.parameters import get_car
+from bayesrace.vehicles import get_car
 from experiments.recording import PlannedRun, RunRecord, _sort_in
 from learning.logs import dataset_from_messages
 from tests import programs

@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from bayesrace.errors import InputError
-from bayesrace.vehicles.parameters import get_car
+from bayesrace.vehicles import get_car
 from plant.fmu.faults import FmuFault
 from plant.fmu.host import FmuHost
 from plant.fmu.package import read_description

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from bayesrace.errors import InputError
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import CarParameters, default_car
 from controller.native_step import NativeStep
 from controller.path_table import PathTable, make_path_table
 from controller.settings import MpcSettings
@@ -213,4 +213,4 @@ def test_an_unusable_table_is_an_input_error_and_the_old_one_stays(
 def test_a_racing_line_of_another_track_is_refused(circuit: Circuit) -> None:
     elsewhere = replace(circuit.line, x_m=circuit.line.x_m + 3.0, track_name="elsewhere")
     with pytest.raises(InputError, match=r"'elsewhere' is far outside the track .*raceline"):
-        make_path_table(circuit.track, elsewhere)
+        make_path_table(circuit.track, elsewhere, default_car().tuning.path.spacing_m)

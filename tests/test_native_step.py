@@ -12,7 +12,7 @@ from scipy.optimize import lsq_linear
 from bayesrace.gp.corrected import corrected_function
 from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import PERFECT, PREDICTION
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import CarParameters, default_car
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from codegen.build import problem_of
 from codegen.ocp import OcpNlp
@@ -324,7 +324,7 @@ def test_a_mirrored_track_gives_mirrored_laps(
     circuit: Circuit,
 ) -> None:
     track, line = circuit.track.mirrored(), mirrored_line(circuit.line)
-    mirror = Circuit(track, line, make_path_table(track, line))
+    mirror = Circuit(track, line, make_path_table(track, line, default_car().tuning.path.spacing_m))
     other = NativeStep(kinematic_artefact, car, SETTINGS)
     other.set_weights(mirrored_weights(weights))
     other.set_path(mirror.table)

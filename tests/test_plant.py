@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from bayesrace.errors import InputError
 from bayesrace.integrators import Discretisation
+from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import dynamic
-from bayesrace.vehicles.parameters import get_car
 from plant.laps import LineCounter
 from plant.simulator import Simulator
 

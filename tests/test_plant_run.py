@@ -12,7 +12,7 @@ import pytest
 
 from bayesrace.messages import Actuation, Decoder, RunRequest, State, encode
 from bayesrace.transport import Inbox, Item, Kind, Numbering, Publisher
-from bayesrace.vehicles.parameters import get_car
+from bayesrace.vehicles import get_car
 from plant.run import Run, RunCounters
 from plant.simulator import GuardCounters
 from plant.vehicle import Vehicle, open_vehicle

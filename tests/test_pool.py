@@ -76,7 +76,7 @@ def test_of_too_many_at_once_evenly_spread_ones_are_looked_at(driven: Dataset) -
 
 
 def test_recalled_samples_teach_what_the_weights_know(driven: Dataset, learned: GpWeights) -> None:
-    samples = recalled(learned)
+    samples = recalled(learned, CAR)
     known = residual(samples, PREDICTION)
     np.testing.assert_allclose(known, evaluate_mean(learned, samples.features), atol=1e-12)
     again = train(samples, PREDICTION, SMALL)
@@ -90,7 +90,7 @@ def test_recalled_samples_teach_what_the_weights_know(driven: Dataset, learned: 
 
 def test_weights_that_know_nothing_recall_nothing() -> None:
     name = PREDICTION.identity("e_kinematic", CAR)
-    assert len(recalled(zero_weights(CAR.name, name))) == 0
+    assert len(recalled(zero_weights(CAR.name, name), CAR)) == 0
 
 
 def _task(folder: Path, **changes: object) -> Task:

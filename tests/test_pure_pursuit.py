@@ -9,8 +9,8 @@ import pytest
 from bayesrace.errors import InputError
 from bayesrace.messages import State
 from bayesrace.tracks import DEFAULT_TRAINING_TRACK, load_track
+from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import dynamic
-from bayesrace.vehicles.parameters import get_car
 from controller.pure_pursuit import PurePursuit, PurePursuitSettings
 from plant.laps import LineCounter
 from plant.simulator import Simulator

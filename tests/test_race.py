@@ -15,6 +15,7 @@ import pytest
 
 from bayesrace.log import LogReader
 from bayesrace.messages import STATE
+from bayesrace.vehicles import default_car, read_car, write_car
 from codegen.build import build
 from codegen.settings import BuildSettings
 from experiments.results import RaceResult, read_result
@@ -113,6 +114,22 @@ def test_the_published_race_is_won_as_the_paper_says_and_faster(tmp_path: Path) 
     race = Race.running(tmp_path / "published", *options)()
     assert_order(race)
     assert race.lap("bayesrace-updated")["lap_time_s"] <= 7.7
+
+
+@pytest.mark.check
+def test_a_car_from_a_file_is_driven_and_reported_without_its_file(
+    short: ShortRace, cli: Cli, tmp_path: Path
+) -> None:
+    mine = default_car().model_copy(update={"name": "mine", "mass_kg": 0.043})
+    write_car(tmp_path / "mine.toml", mine)
+    race = short("file-car", "--car", tmp_path / "mine.toml", "--laps", "1")()
+    (tmp_path / "mine.toml").unlink()
+    assert read_car(race.out / "car.toml") == mine
+    assert race.lap("bayesrace-updated")["finished"]
+    told = (race.out / "result.json").read_text()
+    assert cli("report", race.out).code == 0
+    assert (race.out / "result.json").read_text() == told
+    assert read_result(race.out / "result.json").settings.car == "mine"
 
 
 @pytest.mark.check

@@ -17,13 +17,16 @@ from bayesrace.raceline import (
     RaceLineSettings,
     compute_raceline,
     read_raceline,
+    read_raceline_for,
     write_raceline,
 )
 from bayesrace.raceline.guess import speed_profile
+from bayesrace.raceline.identity import line_identity
 from bayesrace.raceline.ocp import car_limits
 from bayesrace.tracks import StartLine, Track, load_track
 from bayesrace.tracks.spline import FloatArray
-from bayesrace.vehicles.parameters import GRAVITY_MPS2, get_car
+from bayesrace.vehicles import described_car, get_car
+from bayesrace.vehicles.parameters import GRAVITY_MPS2
 from tests.reference import reference_file
 
 CAR = get_car("orca")
@@ -45,7 +48,9 @@ def track_called(name: str) -> Track:
 
 @cache
 def line_on(name: str, **options: Any) -> RaceLine:
-    return compute_raceline(track_called(name), CAR, RaceLineSettings(**options))
+    step_m = options.pop("step_m", CAR.tuning.raceline.step_m)
+    car = described_car(CAR.model_dump() | {"tuning": {"raceline": {"step_m": step_m}}})
+    return compute_raceline(track_called(name), car, RaceLineSettings(**options))
 
 
 def closed_difference(values: FloatArray, gain: float = 0.0) -> FloatArray:
@@ -220,6 +225,54 @@ def test_lines_of_others_without_the_repeated_point_are_read(tmp_path: Path) -> 
     assert line.track_name == "ring"
     assert line.length_m == pytest.approx(2 * np.pi, rel=1e-3)
     assert line.lap_time_s == pytest.approx(np.pi, rel=1e-3)
+
+
+def test_a_line_says_what_it_was_made_for(tmp_path: Path) -> None:
+    line, path = line_on("paddock"), tmp_path / "line.csv"
+    write_raceline(path, line)
+    head = path.read_text().splitlines()[1:6]
+    assert head[:3] == [f"# car: {CAR.identity}", "# width_m: 0.05", "# friction: 0.75"]
+    assert read_raceline(path).made_for == line.made_for
+    slower = line_identity(track_called("paddock"), CAR, RaceLineSettings(margin_m=0.03))
+    assert line.made_for is not None
+    assert slower.settings != line.made_for.settings
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"mass_kg": 0.05}, ("orca-", "for the car", "bayesrace raceline")),
+        ({"width_m": 0.06}, ("0.05 m wide", "0.06 m", "bayesrace raceline")),
+        ({"friction": 0.7}, ("friction of 0.75", "has 0.7:", "bayesrace raceline")),
+        ({}, ("track 'paddock-", "this is 'ring-", "bayesrace raceline")),
+    ],
+)
+def test_a_line_for_another_car_grip_or_track_is_refused(
+    tmp_path: Path, change: dict[str, float], words: tuple[str, ...]
+) -> None:
+    """Both are named, and what to do."""
+    track, path = track_called("paddock"), tmp_path / "line.csv"
+    made = line_identity(track, CAR, RaceLineSettings())
+    write_raceline(path, replace(ring(), made_for=made))
+    other = CAR.model_copy(update=change)
+    driven = track if change else replace(circle(1.0, 0.2), name="ring")
+    with pytest.raises(InputError) as caught:
+        read_raceline_for(path, driven, other)
+    assert all(word in str(caught.value) for word in (str(path), *words))
+    named = CAR.model_copy(update={"name": "mine"})
+    assert read_raceline_for(path, replace(track, name="mine"), named).made_for == made
+
+
+def test_a_line_from_elsewhere_is_accepted_and_said_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "ring.csv"
+    write_raceline(path, ring())
+    path.write_text("# car: a note of somebody\n" + path.read_text())
+    assert read_raceline_for(path, track_called("paddock"), CAR).made_for is None
+    (record,) = caplog.records
+    assert record.levelname == "WARNING"
+    assert str(path) in record.getMessage()
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from bayesrace.errors import InputError
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.log import LogReader, LogWriter
 from bayesrace.messages import encode
+from bayesrace.vehicles import car_text
 from bayesrace.vehicles.models import dynamic
 from learning.arrays import dataset_from_npz, write_npz
 from learning.dataset import Dataset
@@ -160,11 +161,11 @@ def test_damaged_files_are_read_or_refused(
 
 def test_a_log_tells_its_car_and_discretisation(tmp_path: Path, driven: Dataset) -> None:
     facts = log_facts(write_log(tmp_path / "bare.mcap", driven))
-    assert (facts.names, facts.car, facts.discretisation) == (("orca",), "", None)
+    assert (facts.names, facts.car, facts.discretisation) == (("orca",), None, None)
     given = {"car": "orca", "discretisation": PREDICTION.model_dump()}
     race = {"race": {"settings": json.dumps(given)}}
     facts = log_facts(write_log(tmp_path / "race.mcap", driven, "red", race))
-    assert (facts.names, facts.car, facts.discretisation) == (("red",), "orca", PREDICTION)
+    assert (facts.names, facts.car, facts.discretisation) == (("red",), CAR, PREDICTION)
 
 
 @pytest.mark.parametrize("content", ["{", "[1]", '{"discretisation": {"scheme": "magic"}}'])
@@ -228,18 +229,20 @@ def test_a_car_under_another_name_is_known_by_its_log(
     silent = write_log(tmp_path / "b.mcap", other, "red")
     with pytest.raises(InputError, match="--car"):
         read_samples([silent])
-    assert same(read_samples([silent], car="orca").dataset, other)
+    assert same(read_samples([silent], car=CAR).dataset, other)
     with pytest.raises(InputError, match="no states of car 'blue'"):
         read_samples([told], name="blue")
 
 
 def test_mixed_cars_are_refused(tmp_path: Path, driven: Dataset, other: Dataset) -> None:
     a = write_log(tmp_path / "a.mcap", driven)
-    b = write_log(tmp_path / "b.mcap", other, "red", {"drive": {"car": "lorry"}})
-    with pytest.raises(InputError, match=r"'orca' .*'lorry'"):
+    lorry = CAR.model_copy(update={"name": "lorry"})
+    about = {"drive": {"car": car_text(lorry)}}
+    b = write_log(tmp_path / "b.mcap", other, "red", about)
+    with pytest.raises(InputError, match=r"'orca-.*'lorry-"):
         read_samples([a, b])
     with pytest.raises(InputError, match="lorry"):
-        read_samples([a], car="lorry")
+        read_samples([a], car=lorry)
 
 
 def test_mixed_discretisations_and_steps_are_refused(

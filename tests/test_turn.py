@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from bayesrace.tracks import Track
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import CarParameters, default_car
 from controller.native_step import NativeStep
 from controller.path_table import make_path_table
 from tests.conftest import SETTINGS, Circuit, offset_line
@@ -72,7 +72,7 @@ def test_a_start_in_a_tight_bend_is_no_turn(native: NativeStep) -> None:
         "ring", 0.4 * np.column_stack([np.cos(angle), np.sin(angle)]), 0.16, 0.16
     )
     line = offset_line(track, offset_m=0.0, lateral_mps2=3.0, v_max=2.0)
-    ring = Circuit(track, line, make_path_table(track, line))
+    ring = Circuit(track, line, make_path_table(track, line, default_car().tuning.path.spacing_m))
     native.set_path(ring.table)
     rig = Rig(native, ring)
     native.reset()

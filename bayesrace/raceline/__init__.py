@@ -3,17 +3,21 @@
 CasADi is imported on the first call of :func:`compute_raceline`, not with this package.
 """
 
-from bayesrace.raceline.line import RaceLine, read_raceline, write_raceline
+from bayesrace.raceline.identity import check_line, read_raceline_for
+from bayesrace.raceline.line import LineIdentity, RaceLine, read_raceline, write_raceline
 from bayesrace.raceline.settings import RaceLineError, RaceLineSettings
 from bayesrace.tracks import Track
 from bayesrace.vehicles.parameters import CarParameters
 
 __all__ = [
+    "LineIdentity",
     "RaceLine",
     "RaceLineError",
     "RaceLineSettings",
+    "check_line",
     "compute_raceline",
     "read_raceline",
+    "read_raceline_for",
     "write_raceline",
 ]
 

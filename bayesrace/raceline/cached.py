@@ -30,12 +30,11 @@ def racing_line(
 
 def raceline_file(track: Track, car: CarParameters, settings: RaceLineSettings) -> Path:
     """Where the line is kept, in a folder named after car, the track's shape, settings and code."""
-    columns = (track.x_m, track.y_m, track.width_right_m, track.width_left_m)
     identity = digest(
         [
             car.model_dump_json(),
             settings.model_dump_json(),
-            *(column.tobytes() for column in columns),
+            track.identity.rpartition("-")[2],
             cpu_identity(),  # on which the last bits depend
             *software(_SOURCES, ("casadi", "numpy")),
         ]

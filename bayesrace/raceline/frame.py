@@ -13,13 +13,13 @@ from bayesrace.errors import InputError
 from bayesrace.tracks import Track
 from bayesrace.tracks.shapes import resample_closed, smooth_closed
 from bayesrace.tracks.spline import FloatArray, fit_arc_length
+from bayesrace.vehicles.tuning import RacelineTuning
 
 __all__ = ["Frame", "build_frame"]
 
 _FOLD: Final = 0.85
 """Largest n * kappa: beyond 1 neighbouring normals cross and stations lose their order."""
 
-_ROOM_M: Final = 0.005
 _OVERSAMPLING: Final = 8
 
 
@@ -39,17 +39,17 @@ class Frame:
     length_m: float
 
 
-def build_frame(track: Track, step_m: float, smoothing_m: float, margin_m: float) -> Frame:
-    """Stations about ``step_m`` apart; offsets keep ``margin_m`` from the track's edges.
+def build_frame(track: Track, tuning: RacelineTuning, margin_m: float) -> Frame:
+    """Stations about ``tuning.step_m`` apart; offsets keep ``margin_m`` from the track's edges.
 
     Raises InputError if the margin leaves no room somewhere.
     """
     room = track.width_left_m + track.width_right_m - 2 * margin_m
-    _check_room(track, track.s_m, room, margin_m)
-    count = max(24, round(track.length_m / step_m))
+    _check_room(track, track.s_m, room, margin_m, tuning.room_m)
+    count = max(24, round(track.length_m / tuning.step_m))
     dense = count * _OVERSAMPLING
     points = track.position(np.arange(dense) * (track.length_m / dense))
-    smooth = smooth_closed(points, smoothing_m * dense / track.length_m)
+    smooth = smooth_closed(points, tuning.smoothing_m * dense / track.length_m)
     curve = fit_arc_length(resample_closed(smooth, track.length_m / dense))
     station = np.arange(count, dtype=np.float64) * (curve.period / count)
     xy, first, second = curve.derivatives(station)
@@ -65,12 +65,14 @@ def build_frame(track: Track, step_m: float, smoothing_m: float, margin_m: float
         fold = _FOLD / np.abs(kappa)
     n_max = np.where(kappa > 0, np.minimum(n_max, fold), n_max)
     n_min = np.where(kappa < 0, np.maximum(n_min, -fold), n_min)
-    _check_room(track, station, n_max - n_min, margin_m)
+    _check_room(track, station, n_max - n_min, margin_m, tuning.room_m)
     return Frame(xy, normal, heading, turn, kappa, n_min, n_max, curve.period)
 
 
-def _check_room(track: Track, s: FloatArray, room: FloatArray, margin_m: float) -> None:
-    tight = room < _ROOM_M
+def _check_room(
+    track: Track, s: FloatArray, room: FloatArray, margin_m: float, least_m: float
+) -> None:
+    tight = room < least_m
     if tight.any():
         at = float(s[int(np.argmax(tight))])
         raise InputError(

@@ -1,23 +1,43 @@
 """A racing line as data, and its file form. No optimiser is needed to read or use one.
 
-Columns ``s_m; x_m; y_m; psi_rad; kappa_radpm; vx_mps; ax_mps2``; lines with # are comments.
+Columns ``s_m; x_m; y_m; psi_rad; kappa_radpm; vx_mps; ax_mps2``; lines with # are comments. Those
+of the form ``# key: value`` say what the line was made for (:class:`LineIdentity`).
 """
 
-from dataclasses import dataclass
+import math
+import re
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from bayesrace.errors import InputError
-from bayesrace.files import write_whole
+from bayesrace.files import read_text, write_whole
 from bayesrace.tracks.files import read_table
 from bayesrace.tracks.spline import FloatArray
 
-__all__ = ["RACELINE_COLUMNS", "RaceLine", "read_raceline", "write_raceline"]
+__all__ = ["RACELINE_COLUMNS", "LineIdentity", "RaceLine", "read_raceline", "write_raceline"]
 
 RACELINE_COLUMNS: Final = ("s_m", "x_m", "y_m", "psi_rad", "kappa_radpm", "vx_mps", "ax_mps2")
 _MIN_POINTS: Final = 8
+_KEY: Final = re.compile(r"#\s*(\w+):\s*(\S+)\s*")
+
+
+@dataclass(frozen=True)
+class LineIdentity:
+    """What a racing line was made for."""
+
+    car: str
+    """Name and digest: :attr:`bayesrace.vehicles.CarParameters.identity`."""
+    width_m: float
+    """Of the car, which the distance from the edges follows."""
+    friction: float
+    """Usable acceleration over g [-]."""
+    track: str
+    """Name and digest: :attr:`bayesrace.tracks.Track.identity`."""
+    settings: str
+    """Digest of the optimisation's settings."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +58,8 @@ class RaceLine:
     vx_mps: FloatArray
     ax_mps2: FloatArray
     length_m: float
+    made_for: LineIdentity | None = None
+    """None: not known; the line comes from elsewhere."""
 
     @property
     def lap_time_s(self) -> float:
@@ -62,6 +84,8 @@ def write_raceline(path: Path | str, line: RaceLine) -> None:
     closing[0, 3] += 2 * np.pi * np.round((line.psi_rad[-1] - line.psi_rad[0]) / (2 * np.pi))
     rows = np.concatenate([table, closing]).tolist()
     lines = [f"# {'; '.join(RACELINE_COLUMNS)}"]
+    if line.made_for is not None:
+        lines += [f"# {f.name}: {getattr(line.made_for, f.name)}" for f in fields(LineIdentity)]
     lines += ["; ".join(repr(value) for value in row) for row in rows]
     write_whole(Path(path), "\n".join(lines) + "\n")
 
@@ -106,4 +130,17 @@ def read_raceline(path: Path | str, track_name: str | None = None) -> RaceLine:
         )
     name = path.stem if track_name is None else track_name
     s, x, y, psi, kappa, v, a = np.ascontiguousarray(table.T)
-    return RaceLine(name, s, x, y, psi, kappa, v, a, length)
+    return RaceLine(name, s, x, y, psi, kappa, v, a, length, _made_for(path))
+
+
+def _made_for(path: Path) -> LineIdentity | None:
+    """None unless the comments say all of it."""
+    text = read_text(path, "the racing line")
+    found = (_KEY.fullmatch(row) for row in text.splitlines() if row.startswith("#"))
+    told = {match[1]: match[2] for match in found if match}
+    try:
+        width_m, friction = float(told["width_m"]), float(told["friction"])
+        made = LineIdentity(told["car"], width_m, friction, told["track"], told["settings"])
+    except (KeyError, ValueError):
+        return None
+    return made if math.isfinite(width_m) and math.isfinite(friction) else None

@@ -17,7 +17,7 @@ measured without tyre curves: mass, geometry, motor and one friction number. Wha
 costs in a bend is left to the controller.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import casadi as ca
@@ -26,6 +26,7 @@ import numpy as np
 from bayesrace.interrupts import deferred_interrupt
 from bayesrace.raceline.frame import Frame, build_frame
 from bayesrace.raceline.guess import speed_profile
+from bayesrace.raceline.identity import line_identity
 from bayesrace.raceline.line import RaceLine
 from bayesrace.raceline.sample import Clothoids, sample_line
 from bayesrace.raceline.settings import RaceLineError, RaceLineSettings
@@ -36,12 +37,7 @@ from bayesrace.vehicles.parameters import GRAVITY_MPS2, CarParameters
 
 __all__ = ["CarLimits", "car_limits", "solve"]
 
-_V_MIN_MPS: Final = 0.2
-_V_ANY_MPS: Final = 30.0
-_A_ANY_MPS2: Final = 50.0
 _XI_MAX_RAD: Final = 1.2
-_KAPPA_WEIGHT: Final = 1e-6
-_TOLERANCE_M: Final = 5e-4
 _ROUNDS: Final = 3
 
 
@@ -93,20 +89,18 @@ def solve(track: Track, car: CarParameters, settings: RaceLineSettings) -> RaceL
     than allowed, it is optimised again with that much more.
     """
     margin = car.width_m / 2 if settings.margin_m is None else settings.margin_m
-    limits = car_limits(car, settings)
+    limits, tuning = car_limits(car, settings), car.tuning.raceline
     extra = 0.0
     for _ in range(_ROUNDS):
-        frame = build_frame(track, settings.step_m, settings.smoothing_m, margin + extra)
-        line = sample_line(
-            track, _optimise(track.name, frame, limits, settings), settings.spacing_m
-        )
+        frame = build_frame(track, tuning, margin + extra)
+        line = sample_line(track, _optimise(track.name, frame, limits, settings), tuning.spacing_m)
         excess = float(np.max(track.project_path(line.xy_m).off_track_m)) + margin
-        if excess <= _TOLERANCE_M:
-            return line
+        if excess <= tuning.tolerance_m:
+            return replace(line, made_for=line_identity(track, car, settings))
         extra += excess
     raise RaceLineError(
         f"the racing line for track '{track.name}' passes the margin by {1e3 * excess:.1f} mm "
-        "between stations; choose a smaller step_m"
+        "between stations; choose a smaller step_m in the car's [tuning.raceline]"
     )
 
 
@@ -127,7 +121,7 @@ def _following(x: Any) -> Any:
     return ca.vertcat(x[1:], x[0])
 
 
-def _problem(frame: Frame, limits: CarLimits, settings: RaceLineSettings) -> _Problem:
+def _problem(frame: Frame, limits: CarLimits) -> _Problem:
     """Objective and constraints over x = [n, xi, E, kappa, a], each (N, 1)."""
     count = len(frame.kappa_radpm)
     step = frame.length_m / count
@@ -146,8 +140,9 @@ def _problem(frame: Frame, limits: CarLimits, settings: RaceLineSettings) -> _Pr
     v = ca.sqrt(energy)
     time = 2 * length / (_following(v) + v)
     within = _car_within(limits, time, energy, kappa, a)
-    rough = settings.rate_weight * (_following(a) - a) ** 2
-    rough += _KAPPA_WEIGHT * (_following(kappa) - kappa) ** 2
+    tuning = limits.car.tuning.raceline
+    rough = tuning.rate_weight * (_following(a) - a) ** 2
+    rough += tuning.curvature_weight * (_following(kappa) - kappa) ** 2
     return _Problem(
         x=ca.vertcat(n, xi, energy, kappa, a),
         f=ca.sum1(time) + ca.sum1(rough) / step,
@@ -178,10 +173,11 @@ def _car_within(limits: CarLimits, time: Any, energy: Any, kappa: Any, a: Any) -
 def _bounds(frame: Frame, limits: CarLimits, v_max: float) -> tuple[FloatArray, FloatArray]:
     """Lower and upper bounds of x."""
     one = np.ones(len(frame.kappa_radpm))
-    kappa = limits.kappa_max_radpm
-    low = [frame.n_min_m, -_XI_MAX_RAD * one, _V_MIN_MPS**2 * one, -kappa * one, -_A_ANY_MPS2 * one]
+    kappa, tuning = limits.kappa_max_radpm, limits.car.tuning.raceline
+    v_min, a_any = tuning.speed_min_mps, tuning.acceleration_bound_mps2
+    low = [frame.n_min_m, -_XI_MAX_RAD * one, v_min**2 * one, -kappa * one, -a_any * one]
     high = [frame.n_max_m, _XI_MAX_RAD * one, (1.05 * v_max) ** 2 * one, kappa * one]
-    return np.concatenate(low), np.concatenate([*high, _A_ANY_MPS2 * one])
+    return np.concatenate(low), np.concatenate([*high, a_any * one])
 
 
 def _guess(frame: Frame, limits: CarLimits, v_max: float) -> FloatArray:
@@ -197,7 +193,7 @@ def _guess(frame: Frame, limits: CarLimits, v_max: float) -> FloatArray:
         limits.grip_mps2,
         lambda v: limits.straight_values(v, car.d_max),
         lambda v: limits.straight_values(v, car.d_min),
-        2 * _V_MIN_MPS,
+        2 * car.tuning.raceline.speed_min_mps,
         v_max,
     )
     n = np.clip(0.0, frame.n_min_m, frame.n_max_m)
@@ -206,7 +202,7 @@ def _guess(frame: Frame, limits: CarLimits, v_max: float) -> FloatArray:
 
 
 def _optimise(name: str, frame: Frame, limits: CarLimits, settings: RaceLineSettings) -> Clothoids:
-    problem = _problem(frame, limits, settings)
+    problem = _problem(frame, limits)
     options: dict[str, Any] = {
         "print_time": False,
         "error_on_fail": False,
@@ -229,8 +225,8 @@ def _optimise(name: str, frame: Frame, limits: CarLimits, settings: RaceLineSett
     if not stats["success"]:
         raise RaceLineError(
             f"no racing line for track '{name}': IPOPT ended with {stats['return_status']} after "
-            f"{stats['iter_count']} iterations; try a smaller margin_m, another step_m or more "
-            "max_iterations"
+            f"{stats['iter_count']} iterations; try a smaller margin_m, another step_m in "
+            "the car's [tuning.raceline], or more max_iterations"
         )
     n, xi, energy, kappa, a = np.asarray(result["x"]).reshape(5, -1)
     lengths = ca.Function("length", [problem.x], [problem.length])(result["x"])
@@ -247,7 +243,8 @@ def _optimise(name: str, frame: Frame, limits: CarLimits, settings: RaceLineSett
 
 def _top_speed(limits: CarLimits) -> float:
     """Speed at which full drive only balances the resistances [m/s]."""
-    v = np.linspace(0.0, _V_ANY_MPS, 3001)
+    highest_mps = limits.car.tuning.raceline.speed_bound_mps
+    v = np.linspace(0.0, highest_mps, 3001)
     spent = limits.straight_values(v, limits.car.d_max) <= 0
     spent[0] = False  # a standing car has no resistance but may have no drive either
-    return float(v[int(np.argmax(spent))]) if spent.any() else _V_ANY_MPS
+    return float(v[int(np.argmax(spent))]) if spent.any() else highest_mps

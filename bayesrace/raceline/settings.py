@@ -10,7 +10,7 @@ class RaceLineError(RuntimeError):
 
 
 class RaceLineSettings(BaseModel):
-    """Settings of :func:`bayesrace.raceline.compute_raceline`."""
+    """Settings of :func:`bayesrace.raceline.compute_raceline`; the car's tuning has its steps."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -19,15 +19,5 @@ class RaceLineSettings(BaseModel):
     )
     margin_m: float | None = Field(
         default=None, ge=0, description="centre of gravity to track edge; None: half a car's width"
-    )
-    step_m: float = Field(default=0.03, gt=0, description="length of an optimisation interval")
-    spacing_m: float = Field(default=0.01, gt=0, description="distance of the line's points")
-    smoothing_m: float = Field(
-        default=0.03, ge=0, description="Gaussian smoothing of the frame (not of the track)"
-    )
-    rate_weight: float = Field(
-        default=1e-6,
-        ge=0,
-        description="cost of the squared slope of acceleration over the way, against chatter",
     )
     max_iterations: int = Field(default=500, ge=1, description="iteration limit of the optimiser")

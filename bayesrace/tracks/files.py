@@ -29,7 +29,7 @@ COLUMNS = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")
 def read_track(path: Path | str, car_width_m: float | None = None) -> Track:
     """The track in a CSV file, named after the file.
 
-    ``car_width_m``: the track must be at least as wide; default: the ORCA car's width. Raises
+    ``car_width_m``: the track must be at least as wide; default: the default car's. Raises
     InputError naming file, row (line number in the file) and remedy.
     """
     path = Path(path)
@@ -53,9 +53,9 @@ def default_car_width_m(car_width_m: float | None) -> float:
     """The given width, or that of the default car."""
     if car_width_m is not None:
         return car_width_m
-    from bayesrace.vehicles.parameters import get_car
+    from bayesrace.vehicles import DEFAULT_CAR, get_car
 
-    return get_car("orca").width_m
+    return get_car(DEFAULT_CAR).width_m
 
 
 def read_table(path: Path, columns: tuple[str, ...]) -> tuple[FloatArray, list[int]]:

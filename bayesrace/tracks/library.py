@@ -17,8 +17,8 @@ _SEED_DIGITS = 18
 def load_track(name_or_path: str | Path, car_width_m: float | None = None) -> Track:
     """The built-in track of that name, ``random:SEED``, or the track in that CSV file.
 
-    ``car_width_m``: least width of a track from a file; default: the ORCA car's. Raises InputError
-    saying what there is instead.
+    ``car_width_m``: least width of a track from a file; default: the default car's. Raises
+    InputError saying what there is instead.
     """
     text = str(name_or_path)
     if text in builtin_tracks():

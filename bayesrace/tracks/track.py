@@ -12,6 +12,7 @@ from typing import overload
 import numpy as np
 import numpy.typing as npt
 
+from bayesrace.cache import digest
 from bayesrace.errors import InputError
 from bayesrace.tracks.checks import find_fault
 from bayesrace.tracks.projection import CentrelineSearch
@@ -100,6 +101,13 @@ class Track:
         for array in arrays:
             array.setflags(write=False)
         return cls(name, *arrays, spline.period)
+
+    @cached_property
+    def identity(self) -> str:
+        """Name without spaces and a digest of the shape, which does not change with the name."""
+        columns = (self.x_m, self.y_m, self.width_right_m, self.width_left_m)
+        shape = digest(column.astype("<f8", order="C").tobytes() for column in columns)
+        return f"{'_'.join(self.name.split())}-{shape}"
 
     @cached_property
     def centreline(self) -> PlaneSpline:

@@ -1,5 +1,31 @@
-"""Cars as data (:mod:`.parameters`) and their models as expressions (:mod:`.models`, CasADi)."""
+"""Cars as data (:mod:`.parameters`), their size-dependent numbers (:mod:`.tuning`) and TOML files
+(:mod:`.files`), and their models as expressions (:mod:`.models`, CasADi)."""
 
-from bayesrace.vehicles.parameters import CARS, CarParameters, Pacejka, get_car
+from bayesrace.vehicles.files import (
+    DEFAULT_CAR,
+    CarSetting,
+    builtin_cars,
+    car_text,
+    default_car,
+    described_car,
+    get_car,
+    read_car,
+    write_car,
+)
+from bayesrace.vehicles.parameters import CarParameters, Pacejka
+from bayesrace.vehicles.tuning import Tuning
 
-__all__ = ["CARS", "CarParameters", "Pacejka", "get_car"]
+__all__ = [
+    "DEFAULT_CAR",
+    "CarParameters",
+    "CarSetting",
+    "Pacejka",
+    "Tuning",
+    "builtin_cars",
+    "car_text",
+    "default_car",
+    "described_car",
+    "get_car",
+    "read_car",
+    "write_car",
+]

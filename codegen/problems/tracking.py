@@ -5,28 +5,19 @@
     d_min <= d <= d_max,  |delta_rate| <= delta_rate_max
 
 The normals n_k have unit length. delta_0 is measured, so it is not constrained. Below
-``BRAKE_FADE_MPS`` d_min fades to 0: brakes do not drive a car backwards.
+the car's ``brake_fade_mps`` d_min fades to 0: brakes do not drive a car backwards.
 """
 
 import casadi as ca
 
 from bayesrace.integrators import Discretisation
-from bayesrace.vehicles.models import Model
-from bayesrace.vehicles.parameters import BRAKE_FADE_MPS
+from bayesrace.vehicles.models import STATES, Model
+from bayesrace.vehicles.tuning import Tuning
 from codegen.problems.problem import Input, Parameter, Problem, Row, State, Symbols
 from codegen.stage import advance_function, linearise_function
 
 __all__ = ["tracking"]
 
-_STATES = (
-    State("x", "m", limit=1e4),
-    State("y", "m", limit=1e4),
-    State("psi", "rad", limit=1e7),
-    State("vx", "m/s", limit=100),
-    State("vy", "m/s", limit=100),
-    State("omega", "rad/s", scale=10, limit=1e3),
-    State("delta", "rad", limit=1.5),
-)
 _INPUTS = (Input("d", "1", limit=1e3), Input("delta_rate", "rad/s", held=False, limit=1e3))
 _REFERENCE = (
     Parameter("x", "m"),
@@ -48,18 +39,31 @@ _PARAMETERS = (
     Parameter("delta_rate_max_radps", "rad/s", "limit of the steering rate", positive=True),
 )
 
-_PLANNER = {
-    "path_spacing_min_m": 1e-4, "path_spacing_max_m": 0.1, "path_window_back_m": 0.3,
-    "path_window_ahead_m": 0.5, "path_far_m": 1e4, "path_speed_max_mps": 100.0,
-    "turn_slow_mps": 0.2, "turn_away_rad": 0.6, "turn_faced_rad": 0.3, "turn_ahead_m": 0.5,
-    "turn_tangent_m": 0.05, "turn_behind_rad": 2.0, "turn_wider_m": 2.0, "turn_pace_mps": 0.5,
-    "turn_stop_mps": 0.05, "turn_too_fast_mps": 1.0, "turn_throttle_spm": 2.0,
-}  # fmt: skip
+
+def _states(tuning: Tuning) -> tuple[State, ...]:
+    """With the sizes by which defects are measured, and the largest plausible values."""
+    size, most = tuning.scale, tuning.plausible
+    return (
+        State("x", "m", size.position_m, most.position_m),
+        State("y", "m", size.position_m, most.position_m),
+        State("psi", "rad", size.heading_rad, most.heading_rad),
+        State("vx", "m/s", size.speed_mps, most.speed_mps),
+        State("vy", "m/s", size.speed_mps, most.speed_mps),
+        State("omega", "rad/s", size.yaw_rate_radps, most.yaw_rate_radps),
+        State("delta", "rad", size.steering_rad, most.steering_rad),
+    )
+
+
+def _planner(tuning: Tuning) -> dict[str, float]:
+    """What the planner in C is compiled with: see the sections path and turn of the tuning."""
+    sections = {"path": tuning.path, "turn": tuning.turn}
+    return {f"{n}_{key}": value for n, one in sections.items() for key, value in one}
 
 
 def tracking(model: Model, discretisation: Discretisation) -> Problem:
     """The problem with one prediction model (seven states, duty cycle and steering rate)."""
-    s = Symbols.of(len(_STATES), len(_INPUTS), len(_REFERENCE), len(_PARAMETERS))
+    car = model.car
+    s = Symbols.of(len(STATES), len(_INPUTS), len(_REFERENCE), len(_PARAMETERS))
     x_ref, y_ref, normal_x, normal_y, lower, upper = ca.vertsplit(s.p)
     q, r_d, r_delta, slack, margin, d_min, d_max, delta_max, rate_max = ca.vertsplit(s.theta)
     x, y, _, vx, _, _, delta = ca.vertsplit(s.x)
@@ -67,14 +71,14 @@ def tracking(model: Model, discretisation: Discretisation) -> Problem:
     error = (x - x_ref) ** 2 + (y - y_ref) ** 2
     cost = q * error + r_d * (d - s.u_before[0]) ** 2 + r_delta * rate**2
     along = normal_x * x + normal_y * y
-    fade = ca.fmin(ca.fmax(vx / BRAKE_FADE_MPS, 0), 1)
+    fade = ca.fmin(ca.fmax(vx / car.brake_fade_mps, 0), 1)
     brake = ca.if_else(d_min < 0, d_min * fade, d_min)
     # The nearest rate within its limit that leaves the angle within its own after h.
     within = ca.fmin(ca.fmax(rate, (-delta_max - delta) / s.h), (delta_max - delta) / s.h)
     reached = ca.vertcat(s.x[:6], ca.fmin(ca.fmax(delta, -delta_max), delta_max))
     return Problem(
         name="tracking",
-        states=_STATES,
+        states=_states(car.tuning),
         inputs=_INPUTS,
         stage_parameters=_REFERENCE,
         parameters=_PARAMETERS,
@@ -101,5 +105,5 @@ def tracking(model: Model, discretisation: Discretisation) -> Problem:
             "x": "x", "y": "y", "psi": "psi", "vx": "vx", "vy": "vy", "delta": "delta",
             "duty": "d", "delta_rate": "delta_rate",
         },
-        constants=_PLANNER,
+        constants=_planner(car.tuning),
     )  # fmt: skip

@@ -60,12 +60,15 @@ class Comparison:
 
 
 def compare(
-    settings: GateSettings, step_s: float, new: _Floats, old: _Floats, nominal: _Floats
+    settings: GateSettings, slack: _Floats, new: _Floats, old: _Floats, nominal: _Floats
 ) -> Comparison:
-    """Errors (n, 3) of the three; samples that the nominal model cannot follow do not count."""
+    """Errors (n, 3) of the three; samples that the nominal model cannot follow do not count.
+
+    ``slack``: errors (3,) that do not count.
+    """
     usable = np.isfinite(nominal).all(axis=1)
     new, old, nominal = (_rmse(errors[usable]) for errors in (new, old, nominal))
-    slack = settings.worse_share * nominal + np.array(settings.resolution_radps2) * step_s
+    slack = settings.worse_share * nominal + slack
     # Written so that infinity on both sides is worse, too.
     fine = new <= settings.worse_factor * np.minimum(old, 1e12) + slack
     worse = tuple(name for name, good in zip(OUTPUTS, fine, strict=True) if not good)
@@ -125,6 +128,7 @@ class Gate:
         self.settings, self._artefact, self._car = settings, artefact, car
         self.nominal = OneStepModel(artefact, car, None)
         self.step_s = self.nominal.step_s
+        self.slack = np.array(car.tuning.gate.resolution) * self.step_s
         self._plausible = plausible_samples(car, self.step_s, settings.plausible_states)
         self._plausible_nominal = self.nominal.velocities(self._plausible)
 
@@ -168,7 +172,7 @@ class Gate:
         """With those in use, unless the new weights are worse than others that count."""
         new, nominal = model.errors(samples), self.nominal.errors(samples)
         results = [
-            compare(self.settings, self.step_s, new, one.model(self).errors(samples), nominal)
+            compare(self.settings, self.slack, new, one.model(self).errors(samples), nominal)
             for one in against
         ]
         return next((result for result in results if result.worse), results[0])
@@ -206,7 +210,7 @@ class Gate:
             known = np.isfinite(nominal).all(axis=1)
             corrected = model.velocities(states)[known]
             excess = np.abs(corrected - nominal[known]) / self.step_s
-            limit = np.array(self.settings.absurd_radps2)
+            limit = np.array(self._car.tuning.gate.absurd)
             if not (excess <= limit).all():  # NaN: the corrected model leaves all bounds
                 worst = excess.max(axis=0)
                 raise InputError(
@@ -256,7 +260,7 @@ class Watch:
         if len(self._errors) < gate.settings.watch_least:
             return None
         new, old, nominal = np.array(self._errors).transpose(1, 0, 2)
-        comparison = compare(gate.settings, gate.step_s, new, old, nominal)
+        comparison = compare(gate.settings, gate.slack, new, old, nominal)
         return comparison if comparison.worse else None
 
     def _note(self, sample: Sample) -> None:

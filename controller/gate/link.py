@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from bayesrace.manifest import Manifest
+from bayesrace.vehicles import CarParameters, car_text
 from controller.gate.channel import Channel, Message
 from controller.gate.launch import ended, spawn
 from controller.gate.memory import Memory
@@ -51,6 +52,7 @@ class Link:
         settings: GateSettings,
         artefact: Path,
         manifest: Manifest,
+        car: CarParameters,
         history: Sequence[Accepted],
         next_number: int,
         withdrawn: Sequence[str],
@@ -64,7 +66,7 @@ class Link:
                 b"".join(one.data for one in history),
                 settings=settings.model_dump(),
                 artefact=str(artefact),
-                car=manifest.car,
+                car=car_text(car),
                 discretisation=manifest.discretisation,
                 history=[
                     (one.number, one.version, one.proven, one.accepted_utc_ns, len(one.data))

@@ -4,9 +4,6 @@ from pydantic import BaseModel, ConfigDict, Field
 
 __all__ = ["GateSettings"]
 
-PerOutput = tuple[float, float, float]
-"""For vx, vy, omega."""
-
 
 class GateSettings(BaseModel):
     """When weights are refused, and when they are given up again.
@@ -16,7 +13,8 @@ class GateSettings(BaseModel):
 
         error_new > worse_factor * error_old + worse_share * error_nominal + resolution * Ts
 
-    with RMSEs over the same samples and ``nominal`` the model without correction.
+    with RMSEs over the same samples and ``nominal`` the model without correction. ``resolution``
+    and the bound on corrections depend on the car: :class:`bayesrace.vehicles.tuning.GateTuning`.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -30,15 +28,6 @@ class GateSettings(BaseModel):
         description="the same as a share of the uncorrected model's error: good weights that are "
         "learned again differ by several times their error, which is next to nothing",
     )
-    resolution_radps2: PerOutput = Field(
-        (0.1, 0.2, 2.0),
-        description="accelerations [m/s^2, m/s^2, rad/s^2] that do not count: a car that goes "
-        "straight on has no error to compare with",
-    )
-    absurd_radps2: PerOutput = Field(
-        (100.0, 100.0, 1000.0),
-        description="accelerations that no correction amounts to: 13, 37, 377 are learned",
-    )
     plausible_states: int = Field(
         500, ge=0, le=10_000, description="states all over what the car can do, for that bound"
     )
@@ -50,9 +39,6 @@ class GateSettings(BaseModel):
     )
     least_samples: int = Field(
         50, ge=1, le=5000, description="with fewer, weights are accepted on probation alone"
-    )
-    moving_mps: float = Field(
-        0.05, ge=0, description="slower, a car that stands says nothing but that it stands"
     )
     hang_s: float = Field(
         15.0,

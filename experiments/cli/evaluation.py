@@ -9,6 +9,7 @@ import typer
 
 from bayesrace.files import write_whole
 from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK
+from bayesrace.vehicles import DEFAULT_CAR
 from experiments.cli.options import (
     Car,
     CarName,
@@ -31,7 +32,7 @@ class Mode(StrEnum):
 
 
 def race(
-    car: Car = "orca",
+    car: Car = DEFAULT_CAR,
     track: TrackName = DEFAULT_RACE_TRACK,
     train_track: Annotated[
         str, typer.Option(help="Track of the training drive: the same forms.")
@@ -55,6 +56,7 @@ def race(
     result.json and report.html.
     """
 
+    from bayesrace.vehicles import get_car
     from experiments.analysis import read_race, write_result
     from experiments.progress import stages_on
     from experiments.race import FILES
@@ -65,8 +67,8 @@ def race(
     from experiments.terminal import Terminal
 
     settings = RaceSettings(
-        car=car, track=track, train_track=train_track, laps=laps, mode=mode.value, seed=seed,
-        fmu=fmu, fmu_map=fmu_map,
+        car=get_car(car), track=track, train_track=train_track, laps=laps, mode=mode.value,
+        seed=seed, fmu=fmu, fmu_map=fmu_map,
     )  # fmt: skip
     mpc = settings.mpc.model_copy(update={"constraints": constraints})
     settings = settings.model_copy(update={"mpc": mpc})
@@ -111,7 +113,7 @@ def drive(
     log: Annotated[Path, typer.Option(callback=writable, help="Log to write (MCAP).")] = Path(
         "run.mcap"
     ),
-    car: Car = "orca",
+    car: Car = DEFAULT_CAR,
     name: CarName = "",
 ) -> None:
     """Start a run on a plant and a controller that are waiting elsewhere, and record it."""
@@ -119,13 +121,16 @@ def drive(
     from bayesrace.recorder import Recorder
     from bayesrace.tracks import load_track
     from bayesrace.transport import Director, Publisher, open_session
+    from bayesrace.vehicles import car_text, get_car
     from experiments.drive import RunPlan, execute
 
-    course = load_track(track)
-    name = name or car
+    parameters = get_car(car)
+    course = load_track(track, parameters.width_m)
+    name = name or parameters.name
+    about = {"drive": {"car": car_text(parameters), "track": course.name}}
     with (
         open_session(connect_to(endpoint)) as session,
-        Recorder(session, name, log, {"drive": {"car": car, "track": course.name}}) as recorder,
+        Recorder(session, name, log, about) as recorder,
     ):
         director = Director(session, name)
         director.wait_for(("plant", "controller"), 10.0)
@@ -153,9 +158,11 @@ def bench(
     peers: Annotated[int, typer.Option(min=1, help="How many of them IPOPT solves too.")] = 25,
     points: Annotated[int, typer.Option(min=20, max=1024, help="Training points per GP.")] = 400,
     seed: Seed = 0,
+    car: Car = DEFAULT_CAR,
 ) -> None:
     """Time the compiled step beside the paper's formulation in CasADi + IPOPT, same problems."""
 
+    from bayesrace.vehicles import get_car
     from experiments.bench import BenchSettings, run_bench
     from experiments.progress import stages_on
     from experiments.terminal import Terminal
@@ -163,7 +170,9 @@ def bench(
     console = Terminal()
     with stages_on(console) as stages:
         chosen = {} if not track else {"tracks": tuple(track)}
-        settings = BenchSettings(problems=problems, peers=peers, points=points, seed=seed, **chosen)
+        settings = BenchSettings(
+            car=get_car(car), problems=problems, peers=peers, points=points, seed=seed, **chosen
+        )
         result = run_bench(settings, stages)
     result.print(console)
     if json_file:

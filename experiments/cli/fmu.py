@@ -9,9 +9,11 @@ import typer
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from bayesrace.tracks import DEFAULT_RACE_TRACK
+from bayesrace.vehicles import DEFAULT_CAR
 from experiments.cli.options import Car, OutFile, writable
 
 if TYPE_CHECKING:
+    from bayesrace.vehicles import CarParameters
     from codegen.fmu import FmuDefinition
 
 __all__ = ["register"]
@@ -41,7 +43,7 @@ fmu = typer.Typer(
 @fmu.command()
 def export(
     out: OutFile,
-    car: Car = "orca",
+    car: Car = DEFAULT_CAR,
     version: Annotated[Version, typer.Option(help="Of the FMI standard: 2 or 3.")] = Version.three,
     kind: Annotated[
         Kind, typer.Option(help="Co-Simulation, or Model Exchange (the car, FMI 3.0).")
@@ -93,7 +95,14 @@ def export(
         raise InputError("a controller is sampled, not continuous: export it with --kind cs")
     else:
         definition = _controller(
-            car, number, track or DEFAULT_RACE_TRACK, raceline, weights, settings, artefact, cpu
+            parameters,
+            number,
+            track or DEFAULT_RACE_TRACK,
+            raceline,
+            weights,
+            settings,
+            artefact,
+            cpu,
         )
     pack(definition, out, platform)
     typer.echo(f"{definition.name}, FMI {number}.0 {kind.value}: {out}")
@@ -106,7 +115,7 @@ def _only_for_controllers(**options: object) -> None:
 
 
 def _controller(
-    car: str,
+    car: "CarParameters",
     version: Literal[2, 3],
     track: str,
     raceline: Path | None,
@@ -116,10 +125,9 @@ def _controller(
     cpu: str,
 ) -> "FmuDefinition":
     from bayesrace.gp.weights import read_weights
-    from bayesrace.raceline import read_raceline
+    from bayesrace.raceline import read_raceline_for
     from bayesrace.raceline.cached import racing_line
     from bayesrace.tracks import load_track
-    from bayesrace.vehicles import get_car
     from codegen.build import build
     from codegen.fmu.controller import controller_fmu
     from codegen.settings import BuildSettings
@@ -128,17 +136,18 @@ def _controller(
     from controller.path_table import make_path_table
     from controller.settings import MpcSettings
 
-    parameters = get_car(car)
-    course = load_track(track, parameters.width_m)
-    line = racing_line(course, parameters) if raceline is None else read_raceline(raceline)
-    table = make_path_table(course, line)
+    course = load_track(track, car.width_m)
+    line = (
+        racing_line(course, car) if raceline is None else read_raceline_for(raceline, course, car)
+    )
+    table = make_path_table(course, line, car.tuning.path.spacing_m)
     return controller_fmu(
         artefact or build(BuildSettings(car=car))[0],
-        parameters,
+        car,
         table.rows,
         table.spacing_m,
         read_settings(settings, MpcSettings).model_dump(),
-        FallbackSettings().model_dump(),
+        FallbackSettings().model_dump() | {"brake_fade_mps": car.brake_fade_mps},
         None if weights is None else read_weights(weights),
         version,
         cpu,

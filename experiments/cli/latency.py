@@ -8,6 +8,7 @@ import typer
 
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
+from bayesrace.vehicles import DEFAULT_CAR
 from experiments.cli.options import Car, CarName, connect_to, writable
 
 __all__ = ["register"]
@@ -43,7 +44,7 @@ def latency(
         list[str] | None,
         typer.Option(help="Attach: plant and controller, one each; the defaults of both without."),
     ] = None,
-    car: Car = "orca",
+    car: Car = DEFAULT_CAR,
     name: CarName = "",
 ) -> None:
     """Measure where a control cycle's time goes, from sampling the state to acting.
@@ -59,6 +60,7 @@ def latency(
 
     from bayesrace.realtime import RealtimeSettings
     from bayesrace.tracks import DEFAULT_RACE_TRACK
+    from bayesrace.vehicles import get_car
     from experiments.latency.report import print_report
     from experiments.latency.settings import LatencySettings
     from experiments.progress import stages_on
@@ -66,7 +68,7 @@ def latency(
 
     ends = connect_to(endpoint).connect if attach else ()
     settings = LatencySettings(
-        car=car, name=name, rate_hz=rate, duration_s=duration, load=load,
+        car=get_car(car), name=name, rate_hz=rate, duration_s=duration, load=load,
         settle_s=1.0 if attach else 3.0,
         track=track if track is not None else "" if attach else DEFAULT_RACE_TRACK,
         realtime=RealtimeSettings(fifo=fifo, lock_memory=lock_memory),

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bayesrace.files import write_whole
+from bayesrace.vehicles import DEFAULT_CAR
 from experiments.cli.options import Car, CarName, Endpoint, Seed, connect_to, writable
 from experiments.notation import UNCERTAIN
 
@@ -51,6 +52,9 @@ def validate(
     run: Annotated[
         list[int] | None, typer.Option(help="Only this run of the log; repeatable.")
     ] = None,
+    car: Annotated[
+        str, typer.Option(help="Car of the weights, where it is not built in: TOML file.")
+    ] = "",
     name: CarName = "",
 ) -> None:
     """Judge weights on a drive: error, coverage, and drift over one step and over the horizon.
@@ -61,13 +65,15 @@ def validate(
 
     from bayesrace.gp.weights import read_weights
     from bayesrace.tracks import load_track
+    from bayesrace.vehicles import get_car
     from experiments.learning_table import print_validation
     from experiments.terminal import Terminal
     from experiments.validation import validate_weights
 
+    parameters = get_car(car) if car else None
     course = None if track is None else load_track(track)
     runs = tuple(run) if run else None
-    judged = validate_weights(read_weights(weights), on, name, runs, threshold)
+    judged = validate_weights(read_weights(weights), on, name, runs, threshold, parameters)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
     text = judged.result.model_dump_json(indent=1) + "\n"
@@ -178,7 +184,7 @@ def learn(
     ] = None,
     endpoint: Endpoint = None,
     seed: Seed = 0,
-    car: Car = "orca",
+    car: Car = DEFAULT_CAR,
     name: CarName = "",
 ) -> None:
     """Learn from the laps of a car that drives, and hand the weights to its controller.
@@ -195,10 +201,11 @@ def learn(
 
     stamp = datetime.now(UTC).astimezone().strftime("%Y%m%d-%H%M%S")
     folder = out or Path("runs") / f"learn-{stamp}"
+    parameters = get_car(car)
     settings = LearnSettings(
-        car=car,
-        name=name or car,
-        discretisation=discretisation_from(get_car(car), weights, artefact, points, folder),
+        car=parameters,
+        name=name or parameters.name,
+        discretisation=discretisation_from(parameters, weights, artefact, points, folder),
         points=points,
         keep=keep,
         laps=laps or (None if watch else 1),

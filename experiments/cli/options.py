@@ -26,7 +26,7 @@ __all__ = [
     "writable",
 ]
 
-Car = Annotated[str, typer.Option(help="Built-in car.")]
+Car = Annotated[str, typer.Option(help="Car: built-in name or TOML file.")]
 CarName = Annotated[
     str, typer.Option("--name", help="Name of the car in the network; the car's own without.")
 ]

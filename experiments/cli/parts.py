@@ -7,6 +7,7 @@ import typer
 
 from bayesrace.clock import die_with_parent
 from bayesrace.errors import InputError
+from bayesrace.vehicles import DEFAULT_CAR
 from experiments.cli.options import (
     Car,
     CarName,
@@ -33,7 +34,7 @@ LockMemory = Annotated[bool, typer.Option(help="Keep the process's memory from b
 
 
 def plant(
-    car: Car = "orca",
+    car: Car = DEFAULT_CAR,
     name: CarName = "",
     endpoint: Annotated[str, typer.Option(help="Zenoh endpoint to listen on.")] = _PLANT,
     connect: Annotated[
@@ -58,10 +59,11 @@ def plant(
     die_with_parent(parent_pid)
     from bayesrace.realtime import RealtimeSettings
     from bayesrace.transport import Endpoints
+    from bayesrace.vehicles import get_car
     from plant.process import PlantSettings, main
 
     settings = PlantSettings(
-        car=car,
+        car=get_car(car),
         name=name,
         endpoints=Endpoints(
             listen=(endpoint,), connect=tuple(connect or ()), low_latency=low_latency
@@ -90,7 +92,7 @@ def controller(
         Path | None,
         typer.Option(help="Folder that keeps accepted weights for the next start."),
     ] = None,
-    car: Car = "orca",
+    car: Car = DEFAULT_CAR,
     name: CarName = "",
     endpoint: Annotated[
         list[str] | None, typer.Option(help=f"Zenoh endpoint of the plant [{_PLANT}].")
@@ -128,8 +130,9 @@ def controller(
     from controller.gate.settings import GateSettings
     from controller.process import ControllerSettings, main
 
+    parameters = get_car(car)
     process = ControllerSettings(
-        car=car,
+        car=parameters,
         name=name,
         endpoints=Endpoints(
             listen=(listen,), connect=tuple(endpoint or (_PLANT,)), low_latency=low_latency
@@ -142,9 +145,7 @@ def controller(
         realtime=RealtimeSettings(cpu=cpu, fifo=fifo, lock_memory=lock_memory),
         parent_pid=parent_pid,
     )
-    driver = predictive_controller(
-        artefact, get_car(car), track, raceline, settings, weights, store
-    )
+    driver = predictive_controller(artefact, parameters, track, raceline, settings, weights, store)
     raise typer.Exit(main(process, driver))
 
 

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from bayesrace.errors import InputError
+from bayesrace.vehicles import DEFAULT_CAR
 from experiments.cli.options import (
     Car,
     CarName,
@@ -71,12 +72,41 @@ def tracks(
     Terminal().print(table)
 
 
+def cars(
+    car: Annotated[
+        str | None, typer.Argument(help="Built-in name or TOML file; all built in without.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", callback=writable, help="Write it as TOML, tuning included."),
+    ] = None,
+) -> None:
+    """List the built-in cars, check a car's file, or write a car to a file with all its values."""
+    from rich.table import Table
+
+    from bayesrace.vehicles import builtin_cars, get_car, write_car
+    from experiments.terminal import Terminal
+
+    if out is not None and car is None:
+        raise InputError("--out needs the name of the car to write")
+    table = Table("car", "wheelbase m", "width m", "mass kg", "friction", "identity")
+    for one in [get_car(car)] if car is not None else builtin_cars().values():
+        table.add_row(
+            one.name, f"{one.wheelbase_m:.4g}", f"{one.width_m:.4g}", f"{one.mass_kg:.4g}",
+            f"{one.friction:.4g}", one.identity,
+        )  # fmt: skip
+        if out is not None:
+            write_car(out, one)
+    Terminal().print(table)
+
+
 def raceline(
     track: Annotated[str, typer.Argument(help="Built-in name, random:SEED or CSV file.")],
     out: OutFile = Path("raceline.csv"),
-    car: Car = "orca",
+    car: Car = DEFAULT_CAR,
     friction: Annotated[
-        float | None, typer.Option(help="Usable acceleration over g [the car's].")
+        float | None,
+        typer.Option(help="Usable acceleration over g of who drives the line [the car's]."),
     ] = None,
     margin: Annotated[
         float | None, typer.Option(help="Centre of gravity to track edge [m].")
@@ -100,15 +130,16 @@ def collect(
     raceline: RaceLineFile,
     out: OutFile = Path("collect.mcap"),
     duration: Annotated[
-        float, typer.Option(min=1, max=3600, help="Length of the drive [s].")
-    ] = 12.0,
+        float | None,
+        typer.Option(min=1, max=3600, help="Length of the drive [s] [by the car's tuning]."),
+    ] = None,
     seed: Seed = 0,
     fmu: FmuFile = None,
     fmu_map: FmuMap = None,
-    car: Car = "orca",
+    car: Car = DEFAULT_CAR,
 ) -> None:
     """Drive a track by pure pursuit and log it: training data."""
-    from bayesrace.raceline import read_raceline
+    from bayesrace.raceline import read_raceline_for
     from bayesrace.tracks import load_track
     from bayesrace.vehicles import get_car
     from controller.pure_pursuit import PurePursuitSettings
@@ -116,11 +147,12 @@ def collect(
     from plant.vehicle import open_vehicle
 
     settings = PurePursuitSettings(seed=seed)
-    line = read_raceline(raceline)
-    with open_vehicle(get_car(car), fmu, fmu_map) as vehicle:
-        samples = drive(
-            load_track(track), line, get_car(car), out, duration, settings, vehicle=vehicle
-        )
+    parameters = get_car(car)
+    course = load_track(track, parameters.width_m)
+    line = read_raceline_for(raceline, course, parameters)
+    with open_vehicle(parameters, fmu, fmu_map) as vehicle:
+        duration_s = duration or parameters.tuning.pursuit.drive_s
+        samples = drive(course, line, parameters, out, duration_s, settings, vehicle=vehicle)
     typer.echo(f"{samples} samples: {out}")
 
 
@@ -145,7 +177,7 @@ def train(
         Path | None, typer.Option(help="Built controller to learn for; the default one without.")
     ] = None,
     seed: Seed = 0,
-    car: Annotated[str, typer.Option(help="Built-in car, where the files do not name it.")] = "",
+    car: Annotated[str, typer.Option(help="Car, where the files do not name it.")] = "",
     name: CarName = "",
 ) -> None:
     """Train the three GPs on the residual that run logs or plain arrays show.
@@ -165,13 +197,13 @@ def train(
     from learning.sources import read_samples
     from learning.training import TrainingSettings, fit
 
-    wanted = None
+    wanted, parameters = None, get_car(car) if car else None
     if artefact is not None:
         manifest = read_manifest(artefact)
-        car = car or manifest.car
-        wanted = discretisation_of(manifest.discretisation, get_car(manifest.car))
+        parameters = parameters or get_car(manifest.car)
+        wanted = discretisation_of(manifest.discretisation, parameters)
         manifest.check_points(points)
-    samples = read_samples([*(logs or []), *(data or [])], car, name, wanted)
+    samples = read_samples([*(logs or []), *(data or [])], parameters, name, wanted)
     console = Terminal()
     every = tuple(one.value for one in KernelChoice if one is not KernelChoice.auto)
     settings = TrainingSettings(
@@ -211,15 +243,16 @@ def build(
     horizon: Annotated[int, typer.Option(min=2, max=100, help="Stages N.")] = 20,
     gp_capacity: Annotated[int, typer.Option(min=8, max=16384, help="Points per output.")] = 1024,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Copy the artefact here.")] = None,
-    car: Car = "orca",
+    car: Car = DEFAULT_CAR,
 ) -> None:
     """Generate and compile a controller, or find it in the cache; prints its folder."""
     from bayesrace.integrators import PERFECT, PREDICTION
+    from bayesrace.vehicles import get_car
     from codegen.build import build as make
     from codegen.settings import BuildSettings
 
     settings = BuildSettings(
-        car=car,
+        car=get_car(car),
         model=model.value,
         discretisation=PERFECT if model is PredictionModel.dynamic else PREDICTION,
         horizon=horizon,
@@ -241,5 +274,5 @@ def _replace(source: str, target: str) -> None:
 
 def register(app: typer.Typer) -> None:
     """Adds this module's subcommands."""
-    for command in (tracks, raceline, collect, train, build):
+    for command in (tracks, cars, raceline, collect, train, build):
         app.command()(command)

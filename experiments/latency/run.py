@@ -9,7 +9,7 @@ from typing import Final
 from bayesrace.errors import InputError
 from bayesrace.tracks import load_track
 from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
-from bayesrace.vehicles import get_car
+from bayesrace.vehicles import write_car
 from experiments.drive import RunPlan, run_request, wait_for_both
 from experiments.latency.settings import LatencySettings
 from experiments.latency.stand import (
@@ -41,8 +41,7 @@ def measure_latency(settings: LatencySettings, out: Path, stages: Stages) -> Mea
     could be measured; no process outlives the call.
     """
     check_new(out)
-    car = get_car(settings.car)
-    track = load_track(settings.track, car.width_m)
+    track = load_track(settings.track, settings.car.width_m)
     files = prepare(
         PreparationSettings(car=settings.car, track=settings.track),
         stages,
@@ -72,7 +71,9 @@ def _started(settings: LatencySettings, files: Prepared, out: Path) -> Iterator[
     """Plant and controller as processes of their own, ready for a run."""
     plant_endpoint, controller_endpoint = free_endpoint(), free_endpoint()
     realtime = settings.realtime
-    both = ["--car", settings.car, "--name", settings.car_name]
+    car_file = out / "car.toml"
+    write_car(car_file, settings.car)
+    both = ["--car", str(car_file), "--name", settings.car_name]
     both += ["--rate", repr(settings.rate_hz), "--parent-pid", str(os.getpid())]
     both += ["--lock-memory"] if realtime.lock_memory else []
     both += ["--fifo", str(realtime.fifo)] if realtime.fifo else []

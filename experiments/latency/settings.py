@@ -6,6 +6,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.realtime import RealtimeSettings
 from bayesrace.tracks import DEFAULT_RACE_TRACK
+from bayesrace.vehicles import CarSetting, default_car
 
 __all__ = ["LatencySettings"]
 
@@ -15,7 +16,7 @@ class LatencySettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    car: str = "orca"
+    car: CarSetting = Field(default_factory=default_car)
     name: str = Field("", description="name in message keys; the car's own if empty")
     rate_hz: float = Field(50.0, ge=1, le=500, description="of plant and controller")
     duration_s: float = Field(20.0, gt=0, le=1e6, description="observed, after the settling")
@@ -33,4 +34,4 @@ class LatencySettings(BaseModel):
     @property
     def car_name(self) -> str:
         """In message keys."""
-        return self.name or self.car
+        return self.name or self.car.name

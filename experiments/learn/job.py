@@ -9,7 +9,7 @@ from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.manifest import read_manifest
 from bayesrace.tracks import load_track
 from bayesrace.transport import Endpoints, open_session
-from bayesrace.vehicles.parameters import CarParameters, get_car
+from bayesrace.vehicles import CarParameters
 from experiments.learn.figure import References, draw, references
 from experiments.learn.journal import Journal, Record
 from experiments.learn.loop import Learner
@@ -58,8 +58,8 @@ def learn(
     InputError for what cannot be used; a plant or a controller that is not there is none: it is
     waited for.
     """
-    car = get_car(settings.car)
-    track = None if settings.track is None else load_track(settings.track, car.width_m)
+    width_m = settings.car.width_m
+    track = None if settings.track is None else load_track(settings.track, width_m)
     beside = references(settings.compare)
     unread = []
     if Journal.resumable(folder):
@@ -91,6 +91,6 @@ def _samples(settings: LearnSettings, data: Sequence[Path]) -> Dataset | None:
 
 def _weights(settings: LearnSettings, path: Path) -> GpWeights:
     weights = read_weights(path)
-    if weights.car != settings.car:
-        raise InputError(f"{path} is for the car '{weights.car}', not '{settings.car}'")
+    if weights.car != settings.car.name:
+        raise InputError(f"{path} is for the car '{weights.car}', not '{settings.car.name}'")
     return weights

@@ -14,7 +14,6 @@ from bayesrace.gp.weights import GpWeights, write_weights
 from bayesrace.interrupts import catching_signals, deferred_interrupt
 from bayesrace.messages import Actuation, Decoder, Event, State, Telemetry
 from bayesrace.tracks import Track
-from bayesrace.vehicles.parameters import get_car
 from experiments.learn.collector import Collector, Driven, Lap
 from experiments.learn.desk import Desk
 from experiments.learn.feed import Feed, Item, What
@@ -47,7 +46,7 @@ class Learner:
     ) -> None:
         """``say``: a line for people. ``draw``: the picture anew, after each training."""
         self._settings, self._journal, self._say, self._draw = settings, journal, say, draw
-        self._car = get_car(settings.car)
+        self._car = settings.car
         self._collector = Collector(self._car, settings.discretisation.step_s, track)
         self._feed = Feed(session, settings.name)
         self._desk = Desk(session, settings.name, journal, self._feed, say)

@@ -5,6 +5,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.integrators import PREDICTION, Discretisation
+from bayesrace.vehicles import CarSetting, default_car
 
 __all__ = ["LearnSettings"]
 
@@ -14,8 +15,11 @@ class LearnSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    car: str = Field("orca", description="built-in car")
-    name: str = Field("orca", description="name of the car in the network")
+    car: CarSetting = Field(default_factory=default_car)
+    name: str = Field(
+        default_factory=lambda known: known["car"].name if "car" in known else "",
+        description="name of the car in the network [its own]",
+    )
     discretisation: Discretisation = PREDICTION
     points: int = Field(400, ge=20, le=20_000, description="training points per output")
     keep: int = Field(1200, ge=100, le=20_000, description="samples kept from lap to lap")

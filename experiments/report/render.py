@@ -12,7 +12,6 @@ from typing import Any, Final, NamedTuple
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from bayesrace.files import write_whole
-from bayesrace.vehicles import get_car
 from experiments.analysis import RaceAnalysis, read_race
 from experiments.notation import UNCERTAIN
 from experiments.published import LIMIT, SOURCE, compare_gp, compare_laps
@@ -172,7 +171,7 @@ def _figures(analysis: RaceAnalysis, picture: Path) -> dict[str, str]:
         figures["laps"] = inline_svg(laps)
         write_png(laps, picture)
         if driven:
-            car = get_car(str(analysis.recording.settings.get("car", "orca")))
+            car = analysis.recording.car
             figures["speed"] = inline_svg(speed_figure(driven, track, line))
             figures["inputs"] = inline_svg(inputs_figure(driven, track, car))
             figures["deviation"] = inline_svg(deviation_figure(driven, track))

@@ -15,7 +15,7 @@ from annotated_types import Ge, Gt, Le, Lt
 from bayesrace.errors import InputError
 from bayesrace.integrators import SCHEMES
 from bayesrace.vehicles.models import DYNAMIC_PARAMETERS, STATES, car_value
-from bayesrace.vehicles.parameters import BRAKE_FADE_MPS, CarParameters, Pacejka
+from bayesrace.vehicles.parameters import CarParameters, Pacejka
 from codegen.fmu import FmuDefinition, Variable
 from plant.simulator import PLANT, SUBSTEP_HZ
 
@@ -240,7 +240,7 @@ def car_fmu(
     """
     if kind not in ("cs", "me"):
         raise InputError(f"FMU kind '{kind}' is unknown; choose cs or me")
-    constants = {"BRAKE_FADE_MPS": BRAKE_FADE_MPS, "SUBSTEP_HZ": float(SUBSTEP_HZ)}
+    constants = {"BRAKE_FADE_MPS": car.brake_fade_mps, "SUBSTEP_HZ": float(SUBSTEP_HZ)}
     return FmuDefinition(
         name=f"BayesRace {car.name}",
         identifier=re.sub(r"[^A-Za-z0-9_]", "_", f"bayesrace_{car.name}"),

@@ -31,10 +31,7 @@ def replayed(course: Course, states: Sequence[State], weights: Mapping[int, GpWe
     files = course.track_file, course.line_file
     controller = predictive_controller(course.artefact, CAR, *files, weights=course.weights_file)
     settings = ControllerSettings()
-    driver = Driver(
-        controller, CAR, settings.fallback, settings.compensation, settings.stale_s,
-        settings.stop_mps2,
-    )  # fmt: skip
+    driver = Driver(controller, CAR, settings.fallback, settings.compensation, settings.stale_s)
     inputs = []
     for index, state in enumerate(states):
         if index in weights:
@@ -51,7 +48,7 @@ def replayed(course: Course, states: Sequence[State], weights: Mapping[int, GpWe
 def converged(course: Course, weights: GpWeights, x: ArrayLike, d_previous: float) -> Floats:
     """The optimal input (2,) at state x (7,), from a guess that knows no plan."""
     step = NativeStep(course.artefact, CAR, MpcSettings())
-    step.set_path(make_path_table(course.track, course.line))
+    step.set_path(make_path_table(course.track, course.line, CAR.tuning.path.spacing_m))
     step.set_weights(weights)
     status = step.step(np.array(x), d_previous)
     assert status.usable, status

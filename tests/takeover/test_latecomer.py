@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bayesrace.vehicles import get_car
 from controller.gate.store import WITHDRAWN, Accepted, digest_of
 from controller.latecomer import Latecomer, Tell, encode_answer, newest_first
 from controller.ledger import Job, Ledger
@@ -129,7 +130,7 @@ def test_the_answer_names_the_newest_that_were_given_up() -> None:
 @pytest.mark.parametrize("accepted_utc_ns", [0, 300, None])
 def test_who_takes_them_over_makes_them_no_newer(accepted_utc_ns: int | None) -> None:
     """Not either where nobody knows when they were accepted; own ones are accepted now."""
-    ledger = Ledger(WeightsPort(Path(), cast(NativeStep, None), [FRESH]))
+    ledger = Ledger(WeightsPort(Path(), cast(NativeStep, None), get_car("orca"), [FRESH]))
     job = Job("weights", b"new", None, accepted_utc_ns=accepted_utc_ns)
     before_ns = time.time_ns()
     ledger.accept(Offer("new", 1, "weights", watched=True), job, 0.0)

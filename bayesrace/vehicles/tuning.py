@@ -1,0 +1,246 @@
+"""Numbers that depend on the size of a car, with defaults from its own scales.
+
+Each number belongs to a reference car of wheelbase L0 = 0.062 m and friction 0.75. For a car of
+wheelbase L and usable acceleration a = friction g it is scaled by dimensional analysis,
+
+    value = reference (L / L0)^p (a / a0)^q
+
+with (p, q) = (1, 0) for lengths, (1/2, 1/2) for speeds, (1/2, -1/2) for times, (0, 1) for
+accelerations, (-1/2, 1/2) for yaw rates. A new car needs none of them in its file.
+"""
+
+from typing import Any, Final, Self
+
+from pydantic import BaseModel, ConfigDict, Field
+
+__all__ = [
+    "REFERENCE_ACCELERATION_MPS2",
+    "REFERENCE_WHEELBASE_M",
+    "DrivingTuning",
+    "GateTuning",
+    "PathTuning",
+    "PlausibleTuning",
+    "PursuitTuning",
+    "RacelineTuning",
+    "Scales",
+    "ScaleTuning",
+    "Tuning",
+    "TurnTuning",
+    "scaled",
+]
+
+GRAVITY_MPS2: Final = 9.81
+
+REFERENCE_WHEELBASE_M: Final = 0.029 + 0.033
+REFERENCE_ACCELERATION_MPS2: Final = 0.75 * GRAVITY_MPS2
+
+LENGTH: Final = (1.0, 0.0)
+SPEED: Final = (0.5, 0.5)
+TIME: Final = (0.5, -0.5)
+ACCELERATION: Final = (0.0, 1.0)
+YAW_RATE: Final = (-0.5, 0.5)
+YAW_ACCELERATION: Final = (-1.0, 1.0)
+PER_SPEED: Final = (-0.5, -0.5)
+NONE: Final = (0.0, 0.0)
+
+Scales = tuple[float, float]
+"""Wheelbase and usable acceleration of a car, as multiples of the reference car's."""
+
+
+def scaled(reference: float, dimension: tuple[float, float], scales: Scales) -> float:
+    """The reference car's number for a car of these scales; exactly the same for (1, 1)."""
+    return float(reference * scales[0] ** dimension[0] * scales[1] ** dimension[1])
+
+
+def _number(reference: float, dimension: tuple[float, float], text: str) -> Any:
+    length, acceleration = dimension
+    extra: dict[str, Any] = {
+        "reference": reference, "length": length, "acceleration": acceleration
+    }  # fmt: skip
+    return Field(gt=0, description=text, json_schema_extra=extra)
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @classmethod
+    def defaults(cls, scales: Scales) -> dict[str, Any]:
+        """Every number of the section for a car of these scales, by name."""
+        values: dict[str, Any] = {}
+        for name, field in cls.model_fields.items():
+            extra = field.json_schema_extra
+            if isinstance(extra, dict):
+                numbers = [extra[key] for key in ("reference", "length", "acceleration")]
+                reference, length, acceleration = (float(str(number)) for number in numbers)
+                values[name] = scaled(reference, (length, acceleration), scales)
+        return values
+
+
+class RacelineTuning(_Section):
+    """How the racing line is optimised and sampled."""
+
+    step_m: float = _number(0.03, LENGTH, "length of an optimisation interval [m]")
+    spacing_m: float = _number(0.01, LENGTH, "distance of the line's points [m]")
+    smoothing_m: float = _number(
+        0.03, LENGTH, "Gaussian smoothing of the frame, not of the track [m]"
+    )
+    rate_weight: float = _number(
+        1e-6,
+        (1.5, -2.5),
+        "cost of the squared slope of acceleration over the way, against chatter [s^5/m]",
+    )
+    curvature_weight: float = _number(
+        1e-6, (3.5, -0.5), "cost of the squared slope of curvature over the way [s m^3]"
+    )
+    tolerance_m: float = _number(
+        5e-4, LENGTH, "by which the line may pass the margin between stations [m]"
+    )
+    room_m: float = _number(0.005, LENGTH, "least width that the margins must leave [m]")
+    speed_min_mps: float = _number(0.2, SPEED, "least speed of a flying lap [m/s]")
+    speed_bound_mps: float = _number(30.0, SPEED, "bound above any top speed [m/s]")
+    acceleration_bound_mps2: float = _number(
+        50.0, ACCELERATION, "bound above any acceleration [m/s^2]"
+    )
+
+
+class PathTuning(_Section):
+    """The table of racing line and track that the planner reads, and its search."""
+
+    spacing_m: float = _number(
+        0.005, LENGTH, "wanted distance of rows; the planner interpolates linearly [m]"
+    )
+    spacing_min_m: float = _number(1e-4, LENGTH, "least distance of rows [m]")
+    spacing_max_m: float = _number(
+        0.1, LENGTH, "largest distance of rows: the search window must hold several [m]"
+    )
+    window_back_m: float = _number(0.3, LENGTH, "search window behind the last projection [m]")
+    window_ahead_m: float = _number(0.5, LENGTH, "search window ahead of it [m]")
+    far_m: float = _number(1e4, LENGTH, "largest coordinate of a row [m]")
+    speed_max_mps: float = _number(100.0, SPEED, "largest speed of a row [m/s]")
+
+
+class TurnTuning(_Section):
+    """Turning round, for a slow car that points away from its line."""
+
+    slow_mps: float = _number(0.2, SPEED, "a turn begins below this speed [m/s]")
+    away_rad: float = _number(0.6, NONE, "and if the line is farther than this to one side [rad]")
+    faced_rad: float = _number(0.3, NONE, "a turn ends within this angle [rad]")
+    ahead_m: float = _number(0.5, LENGTH, "point of the line that the car turns to, ahead [m]")
+    tangent_m: float = _number(
+        0.05, LENGTH, "length of line that its direction beside the car is taken from [m]"
+    )
+    behind_rad: float = _number(
+        2.0, NONE, "with the point farther behind, either side serves [rad]"
+    )
+    wider_m: float = _number(2.0, LENGTH, "added to the track on either side, on the way [m]")
+    pace_mps: float = _number(0.5, SPEED, "speed of a turn [m/s]")
+    stop_mps: float = _number(0.05, SPEED, "a speed limit below this is a stop [m/s]")
+    too_fast_mps: float = _number(1.0, SPEED, "a faster car is not turning round [m/s]")
+    throttle_spm: float = _number(2.0, PER_SPEED, "duty cycle per speed below the pace [s/m]")
+
+
+class PlausibleTuning(_Section):
+    """Largest magnitudes of a state that a controller accepts."""
+
+    position_m: float = _number(1e4, LENGTH, "coordinates [m]")
+    heading_rad: float = _number(1e7, NONE, "heading, not wrapped [rad]")
+    speed_mps: float = _number(100.0, SPEED, "velocities [m/s]")
+    yaw_rate_radps: float = _number(1e3, YAW_RATE, "yaw rate [rad/s]")
+    steering_rad: float = _number(1.5, NONE, "steering angle [rad]")
+
+
+class ScaleTuning(_Section):
+    """Sizes of the states, by which the OCP's dynamics defects are measured."""
+
+    position_m: float = _number(1.0, LENGTH, "coordinates [m]")
+    heading_rad: float = _number(1.0, NONE, "heading [rad]")
+    speed_mps: float = _number(1.0, SPEED, "velocities [m/s]")
+    yaw_rate_radps: float = _number(10.0, YAW_RATE, "yaw rate [rad/s]")
+    steering_rad: float = _number(1.0, NONE, "steering angle [rad]")
+
+
+class PursuitTuning(_Section):
+    """Pure pursuit, which drives for training data."""
+
+    lookahead_m: float = _number(0.16, LENGTH, "distance of the target at standstill [m]")
+    lookahead_s: float = _number(0.05, TIME, "distance added per speed [s]")
+    speed_gain_spm: float = _number(0.9, PER_SPEED, "duty cycle per speed error [s/m]")
+    speed_min_mps: float = _number(0.4, SPEED, "target speed is never below [m/s]")
+    window_m: float = _number(0.4, LENGTH, "way ahead in which the nearest point is sought [m]")
+    lost_m: float = _number(0.5, LENGTH, "farther from it, the whole line is searched [m]")
+    drive_s: float = _number(12.0, TIME, "length of a training drive [s]")
+
+
+class GateTuning(_Section):
+    """What new weights are judged by, and which samples are learned from."""
+
+    resolution_vx_mps2: float = _number(
+        0.1, ACCELERATION, "error in the longitudinal acceleration that does not count [m/s^2]"
+    )
+    resolution_vy_mps2: float = _number(
+        0.2, ACCELERATION, "error in the lateral acceleration that does not count [m/s^2]"
+    )
+    resolution_omega_radps2: float = _number(
+        2.0, YAW_ACCELERATION, "error in the yaw acceleration that does not count [rad/s^2]"
+    )
+    absurd_vx_mps2: float = _number(
+        100.0, ACCELERATION, "longitudinal acceleration that no correction amounts to [m/s^2]"
+    )
+    absurd_vy_mps2: float = _number(
+        100.0, ACCELERATION, "lateral acceleration that no correction amounts to [m/s^2]"
+    )
+    absurd_omega_radps2: float = _number(
+        1000.0, YAW_ACCELERATION, "yaw acceleration that no correction amounts to [rad/s^2]"
+    )
+    moving_mps: float = _number(
+        0.05, SPEED, "slower, a car stands, and its samples are left out [m/s]"
+    )
+
+    @property
+    def resolution(self) -> tuple[float, float, float]:
+        """For vx, vy, omega."""
+        return self.resolution_vx_mps2, self.resolution_vy_mps2, self.resolution_omega_radps2
+
+    @property
+    def absurd(self) -> tuple[float, float, float]:
+        """For vx, vy, omega."""
+        return self.absurd_vx_mps2, self.absurd_vy_mps2, self.absurd_omega_radps2
+
+
+class DrivingTuning(_Section):
+    """Stopping on command."""
+
+    stop_mps2: float = _number(
+        1.5, ACCELERATION, "deceleration along the line of a stop on command [m/s^2]"
+    )
+    standing_mps: float = _number(
+        0.1, SPEED, "speed below which a stop ends in holding the brake [m/s]"
+    )
+
+
+class Tuning(_Section):
+    """All of them, complete; :meth:`completed` makes one from what a car's file states."""
+
+    raceline: RacelineTuning
+    path: PathTuning
+    turn: TurnTuning
+    plausible: PlausibleTuning
+    scale: ScaleTuning
+    pursuit: PursuitTuning
+    gate: GateTuning
+    driving: DrivingTuning
+
+    @classmethod
+    def completed(cls, given: dict[str, Any], scales: Scales) -> dict[str, Any]:
+        """``given`` with what it lacks, as data for this model; faults in it are left there."""
+        values = dict(given)
+        for name, field in cls.model_fields.items():
+            section, stated = field.annotation, values.get(name, {})
+            if isinstance(stated, dict) and section is not None:
+                values[name] = section.defaults(scales) | stated
+        return values
+
+    @classmethod
+    def of(cls, scales: Scales) -> Self:
+        """What a car of these scales has by default."""
+        return cls.model_validate(cls.completed({}, scales))

@@ -1,0 +1,188 @@
+"""Cars as files: what is read, what is refused and how, and what follows from a car's size."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bayesrace.errors import InputError
+from bayesrace.raceline import RaceLine
+from bayesrace.vehicles import (
+    CarParameters,
+    Tuning,
+    car_text,
+    default_car,
+    described_car,
+    get_car,
+    read_car,
+    write_car,
+)
+from bayesrace.vehicles.files import MODELS, SECTIONS
+from experiments.settings import RaceSettings
+from tests.command_line import Cli
+
+ORCA = Path(__file__).parents[1] / "bayesrace" / "cars" / "orca.toml"
+EXTENDING = Path(__file__).parents[1] / "docs" / "extending.md"
+
+
+def example() -> tuple[str, str]:
+    """The car's file and the program of docs/extending.md, 'Add a car'."""
+    part = EXTENDING.read_text().split("\n## ")[1]
+    toml, program = re.findall(r"```\w+\n(.*?)```", part, re.DOTALL)
+    assert len((toml + program).splitlines()) < 60
+    return toml, program
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "car.toml"
+    path.write_text(text)
+    return path
+
+
+def refusal(path: Path) -> str:
+    with pytest.raises(InputError) as caught:
+        read_car(path)
+    text = str(caught.value)
+    assert text.startswith(str(path))
+    assert "\n" not in text
+    return text
+
+
+def test_the_built_in_car_is_the_one_it_was() -> None:
+    """Weights, manifests and logs name it by this digest."""
+    assert default_car().identity == "orca-d463397c7fde"
+    assert get_car("orca") is default_car()
+    assert get_car(ORCA) == get_car(str(ORCA)) == default_car()
+
+
+def test_a_car_survives_its_file_and_its_description(tmp_path: Path) -> None:
+    stated = {"mass_kg": 1 / 3, "tuning": {"pursuit": {"lookahead_m": 0.1 + 0.2}}}
+    car = described_car(default_car().model_dump() | stated | {"name": "mine"})
+    write_car(tmp_path / "mine.toml", car)
+    again = read_car(tmp_path / "mine.toml")
+    assert again == car == described_car(car_text(car))
+    assert again.tuning.pursuit.lookahead_m == 0.1 + 0.2
+    assert car_text(default_car()) == "orca"
+    with pytest.raises(InputError, match="unknown car"):  # logs of others name no files to read
+        described_car(str(tmp_path / "mine.toml"))
+
+
+def test_every_value_of_a_car_has_its_place_in_the_file_and_a_unit() -> None:
+    models = (names for one in MODELS.values() for names in one.values())
+    placed = [name for names in (*SECTIONS.values(), *models) for name in names]
+    assert sorted(placed) == sorted(set(CarParameters.model_fields) - {"name", "tuning"})
+    forms = [CarParameters, *(field.annotation for field in Tuning.model_fields.values())]
+    for form in forms:
+        for name, field in form.model_fields.items():  # type: ignore[union-attr]
+            apart = name in ("name", "tuning", "front", "rear")
+            assert apart or re.search(r" \[[^]]+\]$", field.description or ""), name
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [
+        ("mass_kg = 0.041", "mass_kg = -1", ("geometry.mass_kg = -1 kg", "greater than 0")),
+        ("mass_kg = 0.041", 'mass_kg = "x"', ("geometry.mass_kg = x kg", "number", "[geometry]")),
+        ("mass_kg = 0.041", "mass_kg = nan", ("geometry.mass_kg = nan kg", "finite")),
+        ("lf_m = 0.029\n", "", ("geometry.lf_m is missing", "front axle", "lf_m = NUMBER in m")),
+        ("lf_m = 0.029", "lenght = 1", ("geometry.lenght = 1 is unknown", "lf_m, lr_m")),
+        ('"pacejka"', '"magic"', ("tyres.model = 'magic' is unknown", "pacejka")),
+        ('model = "dc_motor"\n', "", ("drive.model is missing", "dc_motor")),
+        ("c = 1.2,", "c = 0,", ("tyres.front.c = 0", "[tyres.front]", "shape factor")),
+        ("friction = 0.75", "friction = 75", ("limits.friction = 75", "less than or equal to 5")),
+        ('name = "orca"', 'name = "a/b"', ("name = a/b", "letters")),
+        ('name = "orca"', "name = ", ("no TOML", "line 3")),
+        ("[limits]", "[limit]", ("limit = ", "is unknown", "limits")),
+        ("[limits]", "[tuning.turn]\nslow_mps = 0\n[limits]", ("tuning.turn.slow_mps = 0 m/s",)),
+        ("[limits]", "[tuning.turn]\nslow = 1\n[limits]", ("tuning.turn.slow = 1", "slow_mps")),
+    ],
+)
+def test_a_fault_is_told_with_field_value_unit_and_remedy(
+    tmp_path: Path, before: str, after: str, words: tuple[str, ...]
+) -> None:
+    text = ORCA.read_text()
+    assert before in text
+    text = text.replace("brake_fade_mps = 0.1\n", "").replace(before, after)
+    told = refusal(written(tmp_path, text))
+    assert "brake_fade" not in told or after == "[limit]"  # it only follows from others
+    assert [word for word in words if word not in told] == []
+
+
+def test_a_missing_file_is_told_with_the_remedy(tmp_path: Path) -> None:
+    assert "bayesrace cars orca --out" in refusal_of_missing(tmp_path / "none.toml")
+
+
+def refusal_of_missing(path: Path) -> str:
+    with pytest.raises(InputError) as caught:
+        get_car(str(path))
+    return str(caught.value)
+
+
+def test_tuning_follows_from_the_cars_own_scales(tmp_path: Path) -> None:
+    """Four times the wheelbase: lengths x 4, speeds and times x 2, yaw rates / 2."""
+    small = default_car()
+    stated = {"lf_m": 4 * small.lf_m, "lr_m": 4 * small.lr_m}
+    apart = {"tuning", "brake_fade_mps"}
+    large = described_car(small.model_dump(exclude=apart) | stated).tuning
+    assert large.path.spacing_m == pytest.approx(4 * small.tuning.path.spacing_m)
+    assert large.turn.pace_mps == pytest.approx(2 * small.tuning.turn.pace_mps)
+    assert large.turn.throttle_spm == pytest.approx(small.tuning.turn.throttle_spm / 2)
+    assert large.pursuit.lookahead_s == pytest.approx(2 * small.tuning.pursuit.lookahead_s)
+    assert large.scale.yaw_rate_radps == pytest.approx(small.tuning.scale.yaw_rate_radps / 2)
+    assert large.driving.stop_mps2 == small.tuning.driving.stop_mps2
+    assert large.turn.away_rad == small.tuning.turn.away_rad
+    text = ORCA.read_text() + "[tuning.turn]\npace_mps = 0.7\n"
+    stated_one = read_car(written(tmp_path, text)).tuning
+    pace = stated_one.turn.model_copy(update={"pace_mps": small.tuning.turn.pace_mps})
+    assert stated_one.turn.pace_mps == 0.7
+    assert stated_one.model_copy(update={"turn": pace}) == small.tuning
+
+
+def test_the_constants_in_c_are_those_of_the_reference_car() -> None:
+    """Until the native code takes them from the tuning, they must not drift apart."""
+    native = Path(__file__).parents[1] / "controller" / "native"
+    turn, path = default_car().tuning.turn, default_car().tuning.path
+    expected = {
+        "SLOW_MPS": turn.slow_mps, "AWAY_RAD": turn.away_rad, "FACED_RAD": turn.faced_rad,
+        "AHEAD_M": turn.ahead_m, "TANGENT_M": turn.tangent_m, "BEHIND_RAD": turn.behind_rad,
+        "WIDER_M": turn.wider_m, "PACE_MPS": turn.pace_mps, "STOP_MPS": turn.stop_mps,
+        "TOO_FAST_MPS": turn.too_fast_mps, "THROTTLE": turn.throttle_spm,
+        "WINDOW_BACK_M": path.window_back_m, "WINDOW_AHEAD_M": path.window_ahead_m,
+        "SPACING_MAX_M": path.spacing_max_m, "SPACING_MIN_M": path.spacing_min_m,
+        "FAR_M": path.far_m, "SPEED_MAX_MPS": path.speed_max_mps,
+    }  # fmt: skip
+    found: dict[str, float] = {}
+    for source in native.glob("*.c"):
+        text = source.read_text()
+        found |= {n: float(v) for n, v in re.findall(r"#define (\w+) ([\d.e-]+)", text)}
+    assert {name: found.get(name, value) for name, value in expected.items()} == expected
+
+
+def test_settings_hold_the_whole_car(tmp_path: Path) -> None:
+    toml, _ = example()
+    settings = RaceSettings.model_validate({"car": written(tmp_path, toml)})
+    (tmp_path / "car.toml").unlink()
+    again = RaceSettings.model_validate_json(settings.model_dump_json())
+    assert again.car == settings.car
+    assert again.car.name == "f1tenth"
+    assert RaceSettings().car == default_car()
+
+
+def test_the_example_of_the_documentation_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cli: Cli
+) -> None:
+    toml, program = example()
+    (tmp_path / "f1tenth.toml").write_text(toml)
+    checked = cli("cars", "f1tenth.toml")
+    assert checked.code == 0
+    assert "f1tenth" in checked.out
+    monkeypatch.chdir(tmp_path)
+    values: dict[str, object] = {}
+    exec(compile(program, str(EXTENDING), "exec"), values)  # noqa: S102
+    made, states = values["line"], values["states"]
+    assert isinstance(made, RaceLine)
+    assert isinstance(states, np.ndarray)
+    assert 8.0 < made.lap_time_s < 12.0
+    assert float(str(values["deepest_m"])) < 0.31
+    assert np.ptp(states[:, 0]) > 15.0  # around the track, not beside it
