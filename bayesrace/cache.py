@@ -9,6 +9,8 @@ import hashlib
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Final, TypeVar
@@ -16,11 +18,40 @@ from typing import Final, TypeVar
 from bayesrace.errors import InputError
 from bayesrace.files import replacing
 
-__all__ = ["cache_folder", "digest", "kept", "locked", "software"]
+__all__ = ["Uses", "cache_folder", "digest", "kept", "locked", "note_use", "software", "uses"]
 
 Result = TypeVar("Result")
 
 _ROOT: Final = Path(__file__).resolve().parents[1]
+
+
+@dataclass
+class Uses:
+    """Results that were needed."""
+
+    found: list[Path] = field(default_factory=list)
+    made: list[Path] = field(default_factory=list)
+
+
+_uses: ContextVar[Uses | None] = ContextVar("uses", default=None)
+
+
+@contextmanager
+def uses() -> Iterator[Uses]:
+    """Lists the results that this thread needs within the block: found in the cache, or made."""
+    noted = Uses()
+    token = _uses.set(noted)
+    try:
+        yield noted
+    finally:
+        _uses.reset(token)
+
+
+def note_use(path: Path, made: bool) -> None:
+    """Adds a result to the :func:`uses` of the block around, if there is one."""
+    noted = _uses.get()
+    if noted is not None:
+        (noted.made if made else noted.found).append(path)
 
 
 def cache_folder() -> Path:
@@ -84,11 +115,18 @@ def kept(path: Path, make: Callable[[Path], None], read: Callable[[Path], Result
     ``read`` raises InputError for a file that is absent or damaged. Of several processes that need
     the file at once, one makes it and the others wait. Raises what ``make`` raises.
     """
+
+    def read_found() -> Result:
+        result = read(path)
+        note_use(path, made=False)
+        return result
+
     with suppress(InputError):
-        return read(path)
+        return read_found()
     with locked(path):
-        with suppress(InputError):
-            return read(path)
+        with suppress(InputError):  # made by another process, meanwhile
+            return read_found()
         with replacing(path) as partial:
             make(partial)
+    note_use(path, made=True)
     return read(path)

@@ -44,7 +44,7 @@ def measure_latency(settings: LatencySettings, out: Path, stages: Stages) -> Mea
     car = get_car(settings.car)
     track = load_track(settings.track, car.width_m)
     files = prepare(
-        PreparationSettings(car=settings.car, track=settings.track),
+        PreparationSettings(car=settings.car, tracks=(settings.track,)),
         stages,
         settings.raceline,
         settings.weights,
@@ -78,8 +78,7 @@ def _started(settings: LatencySettings, files: Prepared, out: Path) -> Iterator[
     both += ["--fifo", str(realtime.fifo)] if realtime.fifo else []
     plant = ["plant", "--endpoint", plant_endpoint, *both]
     controller = [
-        "controller", "--artefact", str(files.artefact), "--track", str(files.track),
-        "--raceline", str(files.raceline), "--weights", str(files.weights),
+        "controller", *files.arguments,
         "--endpoint", plant_endpoint, "--listen", controller_endpoint, *both,
     ]  # fmt: skip
     with (
