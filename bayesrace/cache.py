@@ -10,7 +10,6 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
-from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Final, TypeVar
@@ -18,28 +17,20 @@ from typing import Final, TypeVar
 from bayesrace.errors import InputError
 from bayesrace.files import replacing
 
-__all__ = ["Uses", "cache_folder", "digest", "kept", "locked", "note_use", "software", "uses"]
+__all__ = ["cache_folder", "digest", "kept", "locked", "note_use", "software", "uses"]
 
 Result = TypeVar("Result")
 
 _ROOT: Final = Path(__file__).resolve().parents[1]
 
 
-@dataclass
-class Uses:
-    """Results that were needed."""
-
-    found: list[Path] = field(default_factory=list)
-    made: list[Path] = field(default_factory=list)
-
-
-_uses: ContextVar[Uses | None] = ContextVar("uses", default=None)
+_uses: ContextVar[list[bool] | None] = ContextVar("uses", default=None)
 
 
 @contextmanager
-def uses() -> Iterator[Uses]:
-    """Lists the results that this thread needs within the block: found in the cache, or made."""
-    noted = Uses()
+def uses() -> Iterator[list[bool]]:
+    """For each result that this thread needs within the block: whether it is made anew."""
+    noted: list[bool] = []
     token = _uses.set(noted)
     try:
         yield noted
@@ -47,11 +38,11 @@ def uses() -> Iterator[Uses]:
         _uses.reset(token)
 
 
-def note_use(path: Path, made: bool) -> None:
+def note_use(made: bool) -> None:
     """Adds a result to the :func:`uses` of the block around, if there is one."""
     noted = _uses.get()
     if noted is not None:
-        (noted.made if made else noted.found).append(path)
+        noted.append(made)
 
 
 def cache_folder() -> Path:
@@ -118,7 +109,7 @@ def kept(path: Path, make: Callable[[Path], None], read: Callable[[Path], Result
 
     def read_found() -> Result:
         result = read(path)
-        note_use(path, made=False)
+        note_use(made=False)
         return result
 
     with suppress(InputError):
@@ -128,5 +119,5 @@ def kept(path: Path, make: Callable[[Path], None], read: Callable[[Path], Result
             return read_found()
         with replacing(path) as partial:
             make(partial)
-    note_use(path, made=True)
+    note_use(made=True)
     return read(path)

@@ -24,9 +24,10 @@ from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK, Track
 from bayesrace.transport import Director, Endpoints, Publisher, free_endpoint, open_session
 from experiments.drive import RunPlan, execute, wait_for_both
 from experiments.laps import time_laps
-from experiments.preparation import PreparationSettings, Prepared, prepare
+from experiments.preparation import Prepared, prepare
 from experiments.processes import child
 from experiments.progress import stages_on
+from experiments.settings import PreparationSettings
 
 DELAYS_MS = (0, 10, 20, 40)
 CAR = "orca"
@@ -106,9 +107,9 @@ def main() -> None:
     parser.add_argument("--train-track", default=DEFAULT_TRAINING_TRACK)
     parser.add_argument("--laps", type=int, default=3)
     options = parser.parse_args()
-    settings = PreparationSettings(tracks=(options.track,), train_track=options.train_track)
+    settings = PreparationSettings(train_track=options.train_track)
     with stages_on(Console(stderr=True)) as stages:
-        files = prepare(settings, stages)
+        files = prepare(settings, (options.track,), stages)
     print("| delay each way ms | compensated | lap s | flying s | off track | deepest mm "
           "| fallbacks | measured ms |")  # fmt: skip
     print("|---|---|---|---|---|---|---|---|")

@@ -36,8 +36,9 @@ from controller.fallback import FallbackSettings
 from controller.path_table import make_path_table
 from controller.settings import MpcSettings
 from experiments.closed_loop import Driven, drive_compiled
-from experiments.preparation import PreparationSettings, Prepared, prepare
+from experiments.preparation import Prepared, prepare
 from experiments.progress import stages_on
+from experiments.settings import PreparationSettings
 from plant.fmu.export import car_fmu
 from plant.fmu.simulator import open_fmu
 from plant.simulator import PLANT, Simulator
@@ -202,9 +203,9 @@ def main() -> None:
         print_times(fmus, console)
         if not options.laps:
             return
-        settings = PreparationSettings(tracks=(options.track,), train_track=options.train_track)
+        settings = PreparationSettings(train_track=options.train_track)
         with stages_on(console) as stages:
-            prepared = prepare(settings, stages)
+            prepared = prepare(settings, (options.track,), stages)
         print_laps(fmus, prepared, folder, console)
 
 

@@ -30,9 +30,10 @@ from bayesrace.vehicles import get_car
 from controller.assembly import compiled_controller
 from experiments.closed_loop import ClosedLoop
 from experiments.drive import RunPlan, execute, wait_for_both
-from experiments.preparation import PreparationSettings, Prepared, prepare
+from experiments.preparation import Prepared, prepare
 from experiments.processes import child
 from experiments.progress import stages_on
+from experiments.settings import PreparationSettings
 
 CAR = "orca"
 LIMIT_S = 1000.0
@@ -83,7 +84,7 @@ def main() -> None:
     options = parser.parse_args()
     console = Console()
     with stages_on(Console(stderr=True)) as stages:
-        prepared = prepare(PreparationSettings(tracks=(options.track,)), stages)
+        prepared = prepare(PreparationSettings(), (options.track,), stages)
     car, course = get_car(CAR), prepared.course
     weights = read_weights(prepared.weights)
     controller = compiled_controller(prepared.artefacts[0], car, course.track, course.line, weights)

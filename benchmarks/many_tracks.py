@@ -19,10 +19,10 @@ from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.vehicles import get_car
 from experiments.closed_loop import Driven, drive_compiled
-from experiments.preparation import PreparationSettings, prepare, trained_weights
+from experiments.preparation import prepare, trained_weights, training_settings
 from experiments.progress import Stages, stages_on
+from experiments.settings import PreparationSettings
 from learning.dataset import concatenate
-from learning.training import TrainingSettings
 
 __all__ = ["drives"]
 
@@ -37,10 +37,8 @@ CAR: Final = get_car("orca")
 
 def drives(race: str, training: str, seed: int, stages: Stages) -> dict[str, Driven]:
     """With weights of the training track, with those updated by these laps, without any error."""
-    settings = PreparationSettings(
-        tracks=(race,), train_track=training, models=("e_kinematic", "dynamic"), seed=seed
-    )
-    prepared = prepare(settings, stages)
+    settings = PreparationSettings(train_track=training, seed=seed)
+    prepared = prepare(settings, (race,), stages, ("e_kinematic", "dynamic"))
     assert prepared.training is not None
     course, weights = prepared.course, read_weights(prepared.weights)
     nominal, perfect = prepared.artefacts
@@ -50,7 +48,7 @@ def drives(race: str, training: str, seed: int, stages: Stages) -> dict[str, Dri
 
     first = drive(nominal, weights)
     both = concatenate([prepared.training.samples, first.samples()])
-    updated = trained_weights(both, PREDICTION, TrainingSettings(seed=seed), weights)
+    updated = trained_weights(both, PREDICTION, training_settings(settings), weights)
     return {
         "first": first,
         "updated": drive(nominal, read_weights(updated)),

@@ -23,13 +23,14 @@ from bayesrace.vehicles.models import e_kinematic
 from codegen.build import build
 from codegen.settings import BuildSettings
 from experiments.closed_loop import Driven, drive_compiled
-from experiments.preparation import PreparationSettings, prepare
+from experiments.preparation import prepare, training_settings
 from experiments.progress import stages_on
+from experiments.settings import PreparationSettings
 from learning.dataset import Dataset, concatenate
 from learning.training import train
 
 CAR = get_car("orca")
-TRAINING = PreparationSettings().training
+TRAINING = training_settings(PreparationSettings())
 
 
 def heading_error_rad(samples: Dataset, prediction: Discretisation, weights: GpWeights) -> str:
@@ -63,11 +64,9 @@ def main() -> None:
     parser.add_argument("--track", default=DEFAULT_RACE_TRACK)
     parser.add_argument("--train-track", default=DEFAULT_TRAINING_TRACK)
     arguments = parser.parse_args()
-    settings = PreparationSettings(
-        tracks=(arguments.track,), train_track=arguments.train_track, models=("dynamic",)
-    )
+    settings = PreparationSettings(train_track=arguments.train_track)
     with stages_on(Console()) as stages:
-        prepared = prepare(settings, stages)
+        prepared = prepare(settings, (arguments.track,), stages, ("dynamic",))
     assert prepared.training is not None
     track, line = course = prepared.course.track, prepared.course.line
     best = drive_compiled(prepared.artefacts[0], *course, car=CAR)

@@ -28,8 +28,9 @@ from controller.compensation import CompensationSettings
 from controller.driver import Driver
 from controller.fallback import FallbackSettings
 from controller.mpc import PredictiveController
-from experiments.preparation import PreparationSettings, prepare
+from experiments.preparation import prepare
 from experiments.progress import stages_on
+from experiments.settings import PreparationSettings
 from plant.simulator import Simulator
 
 ASIDE_M: Final = 0.6
@@ -111,9 +112,8 @@ def main() -> None:
     given = parser.parse_args()
     console = Console()
     with stages_on(console) as stages:
-        made = prepare(
-            PreparationSettings(tracks=(given.track,), train_track=given.train_track), stages
-        )
+        settings = PreparationSettings(train_track=given.train_track)
+        made = prepare(settings, (given.track,), stages)
     car, track, line = get_car("orca"), made.course.track, made.course.line
     weights = read_weights(made.weights)
     controller = compiled_controller(made.artefacts[0], car, track, line, weights)

@@ -23,7 +23,8 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteK
 
 from bayesrace.gp.weights import OUTPUTS
 from bayesrace.integrators import PREDICTION
-from experiments.preparation import PreparationSettings, training_samples
+from experiments.preparation import training_samples
+from experiments.settings import PreparationSettings
 from learning.hyperparameters import BOUNDS, starts
 from learning.regression import scaling_of
 from learning.residual import residual

@@ -68,12 +68,12 @@ def predictive_controller(
     ``store``: folder of the weights that it accepts; the newest of an earlier life are in use from
     the start, whatever ``weights`` are. Raises InputError naming the file that cannot be used.
     """
-    step = NativeStep(artefact, car, read_settings(settings, MpcSettings))
-    step.set_path(make_path_table(load_track(track, car.width_m), read_raceline(raceline)))
+    loaded = None if weights is None else read_weights(weights)
+    course = load_track(track, car.width_m), read_raceline(raceline)
+    mpc = read_settings(settings, MpcSettings)
+    step = compiled_controller(artefact, car, *course, loaded, mpc).native
     first = Accepted(0, "", b"", proven=True)
-    if weights is not None:
-        loaded = read_weights(weights)
-        step.set_weights(loaded)
+    if loaded is not None:
         first = Accepted(0, loaded.version, encode_weights(loaded), proven=True)
     port = WeightsPort(artefact.resolve(), step, [first])
     if store is not None:

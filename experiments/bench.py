@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 from rich.console import Console
 from rich.table import Table
 
@@ -23,7 +23,7 @@ from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.manifest import read_manifest
 from bayesrace.messages import State
-from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK
+from bayesrace.tracks import DEFAULT_RACE_TRACK
 from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import e_kinematic
 from codegen.ocp import OcpParameters, RacingOcp
@@ -33,8 +33,9 @@ from controller.mpc import PredictiveController
 from controller.native_step import NativeStep, StepStatus
 from controller.settings import MpcSettings
 from experiments.closed_loop import ClosedLoop
-from experiments.preparation import PreparationSettings, prepare
+from experiments.preparation import prepare
 from experiments.progress import Stages
+from experiments.settings import PreparationSettings
 from plant.simulator import PLANT
 
 __all__ = ["BenchResult", "BenchSettings", "run_bench"]
@@ -50,20 +51,14 @@ class BenchError(RuntimeError):
     """There is nothing to compare with."""
 
 
-class BenchSettings(BaseModel):
+class BenchSettings(PreparationSettings):
     """What is measured."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     tracks: tuple[str, ...] = Field(
         (DEFAULT_RACE_TRACK, "random:11", "random:15"), min_length=1, description="driven on"
     )
-    train_track: str = DEFAULT_TRAINING_TRACK
-    car: str = "orca"
     problems: int = Field(900, ge=10, description="control steps in closed loop, all tracks")
     peers: int = Field(25, ge=1, description="of these, solved by IPOPT")
-    points: int = Field(400, ge=20, le=1024, description="training points per output")
-    seed: int = Field(0, ge=0)
 
 
 class Times(BaseModel):
@@ -165,14 +160,7 @@ class _Recording:
 def run_bench(settings: BenchSettings, stages: Stages) -> BenchResult:
     """Measures; takes about a minute, most of it IPOPT's."""
     car = get_car(settings.car)
-    wanted = PreparationSettings(
-        car=settings.car,
-        tracks=settings.tracks,
-        train_track=settings.train_track,
-        points=settings.points,
-        seed=settings.seed,
-    )
-    prepared = prepare(wanted, stages)
+    prepared = prepare(settings, settings.tracks, stages)
     weights, artefact = read_weights(prepared.weights), prepared.artefacts[0]
     horizon = read_manifest(artefact).horizon
     with stages.stage("closed loop"):

@@ -4,36 +4,29 @@ Each depends on settings, files and code alone, is kept in the cache under a dig
 and is made only if it is not there. ``race``, ``bench`` and ``latency`` prepare by :func:`prepare`.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal
-
-from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.cache import cache_folder, digest, kept, note_use, software
 from bayesrace.cpu import cpu_identity
 from bayesrace.errors import InputError
 from bayesrace.files import read_whole, replacing
 from bayesrace.gp.weights import GpWeights, encode_weights, read_weights, write_weights
-from bayesrace.integrators import PREDICTION, Discretisation
+from bayesrace.integrators import Discretisation
 from bayesrace.log import LogReader
 from bayesrace.messages import STATE, TELEMETRY
 from bayesrace.raceline import RaceLine, RaceLineSettings, read_raceline
 from bayesrace.raceline.cached import raceline_file, racing_line
-from bayesrace.tracks import (
-    DEFAULT_RACE_TRACK,
-    DEFAULT_TRAINING_TRACK,
-    Track,
-    load_track,
-    write_track,
-)
+from bayesrace.tracks import Track, load_track, write_track
 from bayesrace.vehicles import CarParameters, get_car
 from codegen.build import build
 from codegen.compiler import find_compiler
 from codegen.settings import BuildSettings
-from controller.pure_pursuit import PurePursuitSettings
 from experiments.collect import collect
 from experiments.progress import Stages
+from experiments.settings import PreparationSettings
 from learning.dataset import Dataset
 from learning.logs import dataset_from_messages
 from learning.training import Progress, TrainingSettings, train
@@ -42,13 +35,13 @@ from plant.vehicle import open_vehicle
 
 __all__ = [
     "Course",
-    "PreparationSettings",
     "Prepared",
     "Training",
     "prepare",
     "trained_weights",
     "training_drive",
     "training_samples",
+    "training_settings",
 ]
 
 _WEIGHTS_SOURCES: Final = (
@@ -75,32 +68,7 @@ _TRACK: Final = "race.csv"
 
 _LARGEST_FMU: Final = 1 << 30
 
-
-class PreparationSettings(BaseModel):
-    """What is to be driven, and from what the residual is learned."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    car: str = "orca"
-    tracks: tuple[str, ...] = Field((DEFAULT_RACE_TRACK,), min_length=1, description="driven on")
-    train_track: str = DEFAULT_TRAINING_TRACK
-    models: tuple[Literal["e_kinematic", "dynamic"], ...] = Field(
-        ("e_kinematic",), min_length=1, description="prediction models of the controllers"
-    )
-    collect_s: float = Field(12.0, ge=1, le=600, description="length of the training drive")
-    start_speed_mps: float = Field(0.1, ge=0, le=5, description="speed at its start line")
-    points: int = Field(400, ge=20, le=1024, description="training points per output")
-    seed: int = Field(0, ge=0, description="of the training drive and of the GP's starts")
-    discretisation: Discretisation = PREDICTION
-    raceline: RaceLineSettings = RaceLineSettings()
-    pursuit: PurePursuitSettings = PurePursuitSettings()
-    fmu: Path | None = Field(None, description="FMU that plays the car in the training drive")
-    fmu_map: Path | None = Field(None, description="how the FMU's variables are ours (TOML)")
-
-    @property
-    def training(self) -> TrainingSettings:
-        """How weights are learned."""
-        return TrainingSettings(capacity=self.points, seed=self.seed)
+PredictionModel = Literal["e_kinematic", "dynamic"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,12 +95,12 @@ class Prepared:
     """What plant and controller are started with."""
 
     courses: tuple[Course, ...]
-    """In the order of the settings' tracks."""
+    """In the order of the tracks."""
     training: Training | None
     """None where weights were given."""
     weights: Path
     artefacts: tuple[Path, ...]
-    """In the order of the settings' models."""
+    """In the order of the models."""
 
     @property
     def course(self) -> Course:
@@ -150,12 +118,15 @@ class Prepared:
 
 def prepare(
     settings: PreparationSettings,
+    tracks: Sequence[str],
     stages: Stages,
+    models: Sequence[PredictionModel] = ("e_kinematic",),
     raceline: Path | None = None,
     weights: Path | None = None,
     artefact: Path | None = None,
 ) -> Prepared:
-    """Everything, made or taken from the cache, but for the files that are given.
+    """Everything that is needed to drive on ``tracks`` by controllers that predict with ``models``,
+    made or taken from the cache, but for the files that are given.
 
     Raises InputError for a track or car that cannot be used, RaceLineError, CompileError, and
     FmuFault if the FMU fails in the training drive.
@@ -163,26 +134,26 @@ def prepare(
     if artefact is None:
         find_compiler()  # what is missing is reported now, not after the training
     car = get_car(settings.car)
-    tracks = [load_track(name, car.width_m) for name in settings.tracks]
+    driven_on = [load_track(name, car.width_m) for name in tracks]
     training = None
     if weights is None:
         train_track = load_track(settings.train_track, car.width_m)
         with stages.stage(f"racing line, {train_track.name}"):
             training_course = _course(train_track, car, settings.raceline)
     courses = []
-    for track in tracks:
+    for track in driven_on:
         with stages.stage(f"racing line, {track.name}"):
             courses.append(_course(track, car, settings.raceline, raceline))
     if weights is None:
         with stages.stage("training drive (pure pursuit)"):
             training = training_drive(training_course, car, settings)
         with stages.stage("train the residual") as stage:
-            learned = training.samples, settings.discretisation, settings.training
+            learned = training.samples, settings.discretisation, training_settings(settings)
             weights = trained_weights(*learned, progress=stage.update)
     artefacts = [] if artefact is None else [artefact]
     if artefact is None:
         with stages.stage("build the controllers"):
-            artefacts = [_artefact(settings, model) for model in settings.models]
+            artefacts = [_artefact(settings, model) for model in models]
     return Prepared(tuple(courses), training, weights, tuple(artefacts))
 
 
@@ -243,6 +214,11 @@ def training_drive(course: Course, car: CarParameters, settings: PreparationSett
     return Training(course, path, kept(path, make, read))
 
 
+def training_settings(settings: PreparationSettings) -> TrainingSettings:
+    """How weights are learned."""
+    return TrainingSettings(capacity=settings.points, seed=settings.seed)
+
+
 def training_samples(settings: PreparationSettings) -> Dataset:
     """Those of the training drive alone."""
     car = get_car(settings.car)
@@ -278,12 +254,12 @@ def trained_weights(
     return path
 
 
-def _artefact(settings: PreparationSettings, model: str) -> Path:
+def _artefact(settings: PreparationSettings, model: PredictionModel) -> Path:
     """Folder of the controller that predicts with this model."""
     wanted = BuildSettings(car=settings.car, discretisation=settings.discretisation)
     if model == "dynamic":
         wanted = BuildSettings.best_case(settings.car)
     said: list[str] = []
     folder, _ = build(wanted, said.append)
-    note_use(folder, made=said != [f"{wanted.model}: cached"])
+    note_use(made=said != [f"{wanted.model}: cached"])
     return folder

@@ -10,7 +10,7 @@ from typing import Final, Protocol
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from bayesrace.cache import Uses, uses
+from bayesrace.cache import uses
 from bayesrace.interrupts import raise_if_interrupted
 
 __all__ = ["Stage", "Stages", "stages_on"]
@@ -90,5 +90,5 @@ class _PlainStages:
             self._console.print(f"{name}: {_CACHED}", highlight=False)
 
 
-def _all_found(needed: Uses) -> bool:
-    return bool(needed.found) and not needed.made
+def _all_found(needed: list[bool]) -> bool:
+    return bool(needed) and not any(needed)

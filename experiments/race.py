@@ -26,17 +26,17 @@ from codegen.compiler import find_compiler
 from experiments.drive import RunPlan, execute, wait_for_both
 from experiments.preparation import (
     Course,
-    PreparationSettings,
+    PredictionModel,
     Prepared,
     prepare,
     trained_weights,
+    training_settings,
 )
 from experiments.processes import Child, child, endings
 from experiments.progress import Stage, Stages
 from experiments.settings import RaceSettings
 from learning.dataset import Dataset, concatenate
 from learning.logs import dataset_from_log
-from learning.training import TrainingSettings
 from plant.fmu.faults import FmuFault
 from plant.simulator import PLANT
 from plant.vehicle import open_vehicle
@@ -44,6 +44,9 @@ from plant.vehicle import open_vehicle
 __all__ = ["FILES", "RaceError", "race"]
 
 _START_S: Final = 20.0
+
+_MODELS: Final[tuple[PredictionModel, ...]] = ("e_kinematic", "dynamic")
+"""Of BayesRace and of BestCase."""
 
 
 class RaceError(RuntimeError):
@@ -78,29 +81,15 @@ class _Race:
 
     def prepare(self) -> Prepared:
         """Everything made, or taken from the cache; copies in the run directory."""
-        settings = self.settings
-        wanted = PreparationSettings(
-            car=settings.car,
-            tracks=(settings.track,),
-            train_track=settings.train_track,
-            models=("e_kinematic", "dynamic"),
-            collect_s=settings.collect_s,
-            start_speed_mps=settings.start_speed_mps,
-            points=settings.points,
-            seed=settings.seed,
-            discretisation=settings.discretisation,
-            raceline=settings.raceline,
-            pursuit=settings.pursuit,
-            fmu=self.fmu_files[0],
-            fmu_map=self.fmu_files[1],
-        )
+        fmu, fmu_map = self.fmu_files
+        settings = self.settings.model_copy(update={"fmu": fmu, "fmu_map": fmu_map})
         with _faults_named():
-            prepared = prepare(wanted, self.stages)
+            prepared = prepare(settings, (settings.track,), self.stages, _MODELS)
         if prepared.training is not None:
             self._keep_course(prepared.training.course, "train")
             shutil.copyfile(prepared.training.log, self.out / FILES.collect_log)
         course = self._keep_course(prepared.course, "race")
-        for model, folder in zip(wanted.models, prepared.artefacts, strict=True):
+        for model, folder in zip(_MODELS, prepared.artefacts, strict=True):
             shutil.copyfile(folder / MANIFEST, self.out / f"manifest-{model}.json")
         shutil.copyfile(prepared.weights, self.out / FILES.weights)
         return replace(prepared, courses=(course,), weights=self.out / FILES.weights)
@@ -137,7 +126,7 @@ class _Race:
         weights = trained_weights(
             concatenate(samples),
             settings.discretisation,
-            TrainingSettings(capacity=settings.points, seed=settings.seed),
+            training_settings(settings),
             read_weights(prepared.weights),
             stage.update,
         )

@@ -12,33 +12,40 @@ from controller.pure_pursuit import PurePursuitSettings
 from controller.settings import MpcSettings
 from plant.simulator import PLANT
 
-__all__ = ["RaceSettings"]
+__all__ = ["PreparationSettings", "RaceSettings"]
 
 
-class RaceSettings(BaseModel):
-    """Settings of ``bayesrace race``; defaults are the shown run."""
+class PreparationSettings(BaseModel):
+    """From what, and with what, everything is made that a drive needs."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     car: str = Field("orca", description="built-in car")
-    track: str = Field(DEFAULT_RACE_TRACK, description="race track: name, random:SEED or CSV file")
-    train_track: str = Field(DEFAULT_TRAINING_TRACK, description="the same for the training track")
-    laps: int = Field(
-        2, ge=1, le=100, description="laps a controller drives: one from standstill, then flying"
+    train_track: str = Field(
+        DEFAULT_TRAINING_TRACK, description="training track: name, random:SEED or CSV file"
     )
-    mode: Literal["lockstep", "realtime"] = Field("lockstep", description="time mode of the runs")
     fmu: Path | None = Field(None, description="FMU that plays the car; the built-in car without")
     fmu_map: Path | None = Field(None, description="how the FMU's variables are ours (TOML)")
     seed: int = Field(0, ge=0, description="of the training drive and of the GP's starts")
     start_speed_mps: float = Field(0.1, ge=0, le=5, description="speed at the start line")
-    time_limit: float = Field(
-        3.0, gt=1, description="a run ends at this multiple of the racing line's time"
-    )
     collect_s: float = Field(12.0, ge=1, le=600, description="length of the training drive")
     points: int = Field(400, ge=20, le=1024, description="training points per output")
     discretisation: Discretisation = PREDICTION
     raceline: RaceLineSettings = RaceLineSettings()
     pursuit: PurePursuitSettings = PurePursuitSettings()
+
+
+class RaceSettings(PreparationSettings):
+    """Settings of ``bayesrace race``; defaults are the shown run."""
+
+    track: str = Field(DEFAULT_RACE_TRACK, description="race track: name, random:SEED or CSV file")
+    laps: int = Field(
+        2, ge=1, le=100, description="laps a controller drives: one from standstill, then flying"
+    )
+    mode: Literal["lockstep", "realtime"] = Field("lockstep", description="time mode of the runs")
+    time_limit: float = Field(
+        3.0, gt=1, description="a run ends at this multiple of the racing line's time"
+    )
     mpc: MpcSettings = MpcSettings()
 
     @model_validator(mode="after")

@@ -20,8 +20,9 @@ from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
 from experiments.drive import RunPlan, run_request
 from experiments.latency.histograms import new_histogram
 from experiments.latency.legs import LEGS
-from experiments.preparation import PreparationSettings, Prepared, prepare
+from experiments.preparation import Prepared, prepare
 from experiments.progress import stages_on
+from experiments.settings import PreparationSettings
 from tests.command_line import Cli, refused
 from tests.programs import COMMAND, ROOT, environment, finish, leftovers, peanut, run, start, until
 from tests.shared import session_folder
@@ -36,7 +37,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
 
     track = peanut(tmp_path_factory.mktemp("track") / "peanut.csv")
     with stages_on(Console(quiet=True)) as stages:
-        return prepare(PreparationSettings(tracks=(str(track),)), stages)
+        return prepare(PreparationSettings(), (str(track),), stages)
 
 
 @dataclass

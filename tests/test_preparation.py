@@ -12,12 +12,13 @@ from bayesrace.gp.weights import GpWeights
 from bayesrace.raceline import cached
 from bayesrace.tracks import Track
 from experiments import preparation
-from experiments.preparation import PreparationSettings, Prepared, prepare
+from experiments.preparation import Prepared, prepare
 from experiments.progress import stages_on
+from experiments.settings import PreparationSettings
 from tests.car_fmu import packed_car
 from tests.conftest import offset_line
 
-SETTINGS = PreparationSettings(tracks=("random:1",), train_track="random:2", collect_s=2.0)
+SETTINGS = PreparationSettings(train_track="random:2", collect_s=2.0)
 
 Preparing = Callable[..., tuple[Prepared, list[str]]]
 
@@ -43,7 +44,7 @@ def preparing(
     def run(**changes: object) -> tuple[Prepared, list[str]]:
         console = Console(file=io.StringIO(), width=200)
         with stages_on(console) as stages:
-            prepared = prepare(SETTINGS.model_copy(update=changes), stages)
+            prepared = prepare(SETTINGS.model_copy(update=changes), ("random:1",), stages)
         assert isinstance(console.file, io.StringIO)
         lines = console.file.getvalue().splitlines()
         cached_stages = [line.split(":")[0] for line in lines if line.endswith(": from the cache")]

@@ -21,9 +21,10 @@ from experiments.latency.stand import (
     measurement,
     open_folder,
 )
-from experiments.preparation import PreparationSettings, Prepared, prepare
+from experiments.preparation import Prepared, prepare
 from experiments.processes import child
 from experiments.progress import Stages
+from experiments.settings import PreparationSettings
 
 __all__ = ["measure_latency"]
 
@@ -44,11 +45,12 @@ def measure_latency(settings: LatencySettings, out: Path, stages: Stages) -> Mea
     car = get_car(settings.car)
     track = load_track(settings.track, car.width_m)
     files = prepare(
-        PreparationSettings(car=settings.car, tracks=(settings.track,)),
+        PreparationSettings(car=settings.car),
+        (settings.track,),
         stages,
-        settings.raceline,
-        settings.weights,
-        settings.artefact,
+        raceline=settings.raceline,
+        weights=settings.weights,
+        artefact=settings.artefact,
     )
     open_folder(out, settings)
     with ExitStack() as stack:
