@@ -25,9 +25,9 @@ from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import dynamic
 from controller.assembly import compiled_controller
 from controller.compensation import CompensationSettings
-from controller.driver import Driver
-from controller.fallback import FallbackSettings
+from controller.cycle import Cycle
 from controller.mpc import PredictiveController
+from controller.process_settings import ControllerSettings
 from experiments.preparation import prepare
 from experiments.progress import stages_on
 from experiments.settings import PreparationSettings
@@ -43,7 +43,6 @@ SECOND: Final = 50
 UNDER_WAY_M: Final = 0.5
 """Progress along the line within a second."""
 STALE_S: Final = 0.1
-STOP_MPS2: Final = 1.5
 
 
 class Rig:
@@ -52,10 +51,9 @@ class Rig:
     def __init__(self, controller: PredictiveController, length_m: float) -> None:
         car = get_car("orca")
         self._step, self._length_m = controller.native, length_m
-        self._driver = Driver(
-            controller, car, FallbackSettings(),
-            CompensationSettings(mode="fixed", delay_s=0.0), STALE_S, STOP_MPS2,
-        )  # fmt: skip
+        compensation = CompensationSettings(mode="fixed", delay_s=0.0)
+        settings = ControllerSettings(compensation=compensation, stale_s=STALE_S)
+        self._driver = Cycle(controller, car, settings).driver
         self.car = Simulator(dynamic(car))
         self._run = 0
 

@@ -39,7 +39,7 @@ from controller.cycle import Cycle
 from controller.driver import Decision
 from controller.interface import Controller
 from controller.process_settings import ControllerSettings
-from experiments.drive import RunPlan, run_request
+from experiments.drive import RunPlan, announcement, run_request
 from experiments.laps import LapTimes, time_laps
 from learning.dataset import Dataset, dataset_from_arrays, filter_dataset
 from plant.lockstep import CarRun, End, drive_lockstep
@@ -180,8 +180,7 @@ class ClosedLoop:
         end = drive_lockstep(run, self._seq, self._exchange)
         self._cycle.driver.lost(silent=False)
         if self._log is not None:
-            counters = self._vehicle.guard.counters.as_dict()
-            self._log.ends(run, end, counters)
+            self._log.ends(run, end)
         states = self._states
         self._seq = states[-1].seq + 1
         if len(states) > 1 and states[-1].time_s == states[-2].time_s:
@@ -229,32 +228,26 @@ class _Messages:
 
     def __init__(self, log: LogWriter, car: str) -> None:
         self._log, self._car = log, car
-        self._events = 0
+        self._runs = 0
 
     def write(self, topic: Topic[Any], message: Message, source: str = "") -> None:
         key = car_key(topic.key, self._car, source)
         self._log.write(key, encode(message), message.source_time_ns, message.seq)
 
     def begins(self, plan: RunPlan, weights_version: str) -> None:
-        text = f"run {plan.run}: {plan.controller}"
-        data: dict[str, Scalar] = {
-            "run": plan.run,
-            "controller": plan.controller,
-            "weights_version": weights_version,
-        }
-        self._event(plan.run, "race", "run", text, data)
-        self._event(plan.run, "plant", "run_started", f"run {plan.run} in one process", {})
+        self.write(EVENT, announcement(plan, self._runs, weights_version), "race")
+        self._event(2 * self._runs, plan.run, "run_started", "in one process", {})
 
-    def ends(self, run: CarRun, end: End, counters: dict[str, int]) -> None:
-        number = run.request.run
-        text = f"run {number} ended after {run.time_s:.2f} s: {end.text}"
+    def ends(self, run: CarRun, end: End) -> None:
+        text = f"run {run.request.run} ended after {run.time_s:.2f} s: {end.text}"
         data: dict[str, Scalar] = {"reason": end.reason, "time_s": run.time_s, "laps": run.laps}
-        self._event(number, "plant", "run_ended", text, data | counters)
+        data |= run.vehicle.guard.counters.as_dict()
+        self._event(2 * self._runs + 1, run.request.run, "run_ended", text, data)
+        self._runs += 1
 
-    def _event(self, run: int, source: str, kind: str, text: str, data: dict[str, Scalar]) -> None:
-        event = Event(self._events, time.monotonic_ns(), run, source, kind, text[:2000], data)
-        self.write(EVENT, event, source)
-        self._events += 1
+    def _event(self, seq: int, run: int, kind: str, text: str, data: dict[str, Scalar]) -> None:
+        event = Event(seq, time.monotonic_ns(), run, "plant", kind, text[:2000], data)
+        self.write(EVENT, event, "plant")
 
 
 def drive_compiled(
