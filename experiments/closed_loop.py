@@ -177,8 +177,10 @@ class ClosedLoop:
         second_starts = self._cycle.driver.second_starts
         if self._log is not None:
             self._log.begins(plan, self._controller.weights_version)
-        end = drive_lockstep(run, self._seq, self._exchange)
-        self._cycle.driver.lost(silent=False)
+        try:
+            end = drive_lockstep(run, self._seq, self._exchange)
+        finally:
+            self._cycle.driver.lost(silent=False)
         if self._log is not None:
             self._log.ends(run, end)
         states = self._states
