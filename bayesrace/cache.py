@@ -9,6 +9,7 @@ import hashlib
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from importlib.metadata import version
 from pathlib import Path
 from typing import Final, TypeVar
@@ -16,11 +17,32 @@ from typing import Final, TypeVar
 from bayesrace.errors import InputError
 from bayesrace.files import replacing
 
-__all__ = ["cache_folder", "digest", "kept", "locked", "software"]
+__all__ = ["cache_folder", "digest", "kept", "locked", "note_use", "software", "uses"]
 
 Result = TypeVar("Result")
 
 _ROOT: Final = Path(__file__).resolve().parents[1]
+
+
+_uses: ContextVar[list[bool] | None] = ContextVar("uses", default=None)
+
+
+@contextmanager
+def uses() -> Iterator[list[bool]]:
+    """For each result that this thread needs within the block: whether it is made anew."""
+    noted: list[bool] = []
+    token = _uses.set(noted)
+    try:
+        yield noted
+    finally:
+        _uses.reset(token)
+
+
+def note_use(made: bool) -> None:
+    """Adds a result to the :func:`uses` of the block around, if there is one."""
+    noted = _uses.get()
+    if noted is not None:
+        noted.append(made)
 
 
 def cache_folder() -> Path:
@@ -84,11 +106,18 @@ def kept(path: Path, make: Callable[[Path], None], read: Callable[[Path], Result
     ``read`` raises InputError for a file that is absent or damaged. Of several processes that need
     the file at once, one makes it and the others wait. Raises what ``make`` raises.
     """
+
+    def read_found() -> Result:
+        result = read(path)
+        note_use(made=False)
+        return result
+
     with suppress(InputError):
-        return read(path)
+        return read_found()
     with locked(path):
-        with suppress(InputError):
-            return read(path)
+        with suppress(InputError):  # made by another process, meanwhile
+            return read_found()
         with replacing(path) as partial:
             make(partial)
+    note_use(made=True)
     return read(path)

@@ -19,16 +19,16 @@ from rich.console import Console
 
 from bayesrace.log import LogReader
 from bayesrace.messages import EVENT, STATE, TELEMETRY, Event
-from bayesrace.raceline import read_raceline
 from bayesrace.recorder import Recorder
-from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK, Track, load_track
+from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK, Track
 from bayesrace.transport import Director, Endpoints, Publisher, free_endpoint, open_session
-from bayesrace.vehicles import DEFAULT_CAR, get_car
-from experiments.analysis import time_laps
+from bayesrace.vehicles import DEFAULT_CAR
 from experiments.drive import RunPlan, execute, wait_for_both
-from experiments.preparation import PreparationSettings, Prepared, prepare
+from experiments.laps import time_laps
+from experiments.preparation import Prepared, prepare
 from experiments.processes import child
 from experiments.progress import stages_on
+from experiments.settings import PreparationSettings
 
 DELAYS_MS = (0, 10, 20, 40)
 CAR = DEFAULT_CAR
@@ -55,17 +55,17 @@ class Outcome:
         return [first, flying, off, deepest, str(self.fallbacks), f"{self.delay_ms:.1f}"]
 
 
-def drive(files: Prepared, track: Track, delay_ms: float, mode: str, laps: int) -> Outcome:
+def drive(files: Prepared, delay_ms: float, mode: str, laps: int) -> Outcome:
     """Starts both processes, drives, analyses the log."""
     plant_at, controller_at = free_endpoint(), free_endpoint()
     parent = ["--parent-pid", str(os.getpid())]
     plant = ["plant", "--endpoint", plant_at, "--delay", f"{delay_ms:g}", *parent]
     controller = [
-        "controller", "--artefact", str(files.artefact), "--track", str(files.track),
-        "--raceline", str(files.raceline), "--weights", str(files.weights),
+        "controller", *files.arguments,
         "--endpoint", plant_at, "--listen", controller_at, "--delay", mode, *parent,
     ]  # fmt: skip
-    limit_s = 3.0 * read_raceline(files.raceline).lap_time_s * laps
+    track = files.course.track
+    limit_s = 3.0 * files.course.line.lap_time_s * laps
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         children = [
@@ -108,16 +108,15 @@ def main() -> None:
     parser.add_argument("--train-track", default=DEFAULT_TRAINING_TRACK)
     parser.add_argument("--laps", type=int, default=3)
     options = parser.parse_args()
-    track = load_track(options.track, get_car(CAR).width_m)
-    settings = PreparationSettings(track=options.track, train_track=options.train_track)
+    settings = PreparationSettings(train_track=options.train_track)
     with stages_on(Console(stderr=True)) as stages:
-        files = prepare(settings, stages)
+        files = prepare(settings, (options.track,), stages)
     print("| delay each way ms | compensated | lap s | flying s | off track | deepest mm "
           "| fallbacks | measured ms |")  # fmt: skip
     print("|---|---|---|---|---|---|---|---|")
     for delay_ms in DELAYS_MS:
         for mode in ("off", "measured"):
-            outcome = drive(files, track, delay_ms, mode, options.laps)
+            outcome = drive(files, delay_ms, mode, options.laps)
             word = "yes" if mode == "measured" else "no"
             print("|", " | ".join([str(delay_ms), word, *outcome.cells()]), "|", flush=True)
 

@@ -27,18 +27,18 @@ from rich.console import Console
 from rich.table import Table
 
 from bayesrace.gp.weights import read_weights
-from bayesrace.raceline import read_raceline
-from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK, load_track
+from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK
 from bayesrace.vehicles import DEFAULT_CAR, get_car
 from bayesrace.vehicles.models import STATES, dynamic
-from benchmarks.closed_loop import START_MPS, Drive, drive
 from codegen.fmu import pack
 from codegen.fmu.controller import controller_fmu
 from controller.fallback import FallbackSettings
 from controller.path_table import make_path_table
 from controller.settings import MpcSettings
-from experiments.preparation import PreparationSettings, Prepared, prepare
+from experiments.closed_loop import Driven, drive_compiled
+from experiments.preparation import Prepared, prepare
 from experiments.progress import stages_on
+from experiments.settings import PreparationSettings
 from plant.fmu.export import car_fmu
 from plant.fmu.simulator import open_fmu
 from plant.simulator import PLANT, Simulator
@@ -154,28 +154,28 @@ def master(car: Path, controller: Path, x0: list[float], periods: int) -> np.nda
 def print_laps(fmus: dict[str, Path], prepared: Prepared, folder: Path, console: Console) -> None:
     """Two laps of each car, and how far apart their states are at most."""
     car = get_car(DEFAULT_CAR)
-    track, line = load_track(prepared.track, car.width_m), read_raceline(prepared.raceline)
-    weights = read_weights(prepared.weights)
+    artefact, course = prepared.artefacts[0], prepared.course
+    track, line, weights = course.track, course.line, read_weights(prepared.weights)
     table = Table(f"{track.name}, BayesRace", "laps s", "off track", "largest difference")
 
-    def row(name: str, own: Drive, x: np.ndarray) -> None:
+    def row(name: str, own: Driven, x: np.ndarray) -> None:
         count = min(len(x), len(reference.x))
         apart = float(np.abs(x[:count] - reference.x[:count]).max())
         laps = " ".join(f"{lap:.3f}" for lap in own.laps_s)
-        table.add_row(name, laps, str(own.off_track), f"{apart:.3g}")
+        table.add_row(name, laps, str(int((own.off_track_m > 0).sum())), f"{apart:.3g}")
 
-    reference = drive(prepared.artefact, car, track, line, weights)
+    reference = drive_compiled(artefact, track, line, weights, car=car)
     row("built-in car", reference, reference.x)
     for name, fmu in fmus.items():
         with open_fmu(car, fmu) as vehicle:
-            own = drive(prepared.artefact, car, track, line, weights, vehicle=vehicle)
+            own = drive_compiled(artefact, track, line, weights, car=car, vehicle=vehicle)
         row(name, own, own.x)
     path = make_path_table(track, line, car.tuning.path.spacing_m)
-    x0 = [*track.start_pose(), START_MPS, 0.0, 0.0, 0.0]
+    x0 = reference.x[0].tolist()
     for cpu in ("native", "portable"):
         for version, fmu in zip(VERSIONS, fmus.values(), strict=True):
             definition = controller_fmu(
-                prepared.artefact, car, path.rows, path.spacing_m, MpcSettings().model_dump(),
+                artefact, car, path.rows, path.spacing_m, MpcSettings().model_dump(),
                 FallbackSettings().model_dump() | {"brake_fade_mps": car.brake_fade_mps},
                 weights, version, cpu,
             )  # fmt: skip
@@ -204,9 +204,9 @@ def main() -> None:
         print_times(fmus, console)
         if not options.laps:
             return
-        settings = PreparationSettings(track=options.track, train_track=options.train_track)
+        settings = PreparationSettings(train_track=options.train_track)
         with stages_on(console) as stages:
-            prepared = prepare(settings, stages)
+            prepared = prepare(settings, (options.track,), stages)
         print_laps(fmus, prepared, folder, console)
 
 

@@ -9,20 +9,20 @@ perfect weights, too; second starts are for that (docs/decisions/2026-11-22-seco
 """
 
 import argparse
+from pathlib import Path
 from typing import Final
 
 import numpy as np
+from rich.console import Console
 
+from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.integrators import PREDICTION
-from bayesrace.raceline.cached import racing_line
-from bayesrace.tracks import load_track
 from bayesrace.vehicles import DEFAULT_CAR, get_car
-from benchmarks.closed_loop import Drive, drive
-from codegen.build import build
-from codegen.settings import BuildSettings
-from experiments.preparation import trained_weights, training_samples
+from experiments.closed_loop import Driven, drive_compiled
+from experiments.preparation import prepare, trained_weights, training_settings
+from experiments.progress import Stages, stages_on
+from experiments.settings import PreparationSettings
 from learning.dataset import concatenate
-from learning.training import TrainingSettings
 
 __all__ = ["drives"]
 
@@ -35,21 +35,24 @@ PAIRS: Final = (
 CAR: Final = get_car(DEFAULT_CAR)
 
 
-def drives(race: str, training: str, seed: int) -> dict[str, Drive]:
+def drives(race: str, training: str, seed: int, stages: Stages) -> dict[str, Driven]:
     """With weights of the training track, with those updated by these laps, without any error."""
-    track = load_track(race)
-    line = racing_line(track, CAR)
-    samples = training_samples(load_track(training), CAR, CAR.tuning.pursuit.drive_s, seed)
-    settings = TrainingSettings(seed=seed)
-    weights = trained_weights(samples, PREDICTION, settings)
-    nominal, perfect = build(BuildSettings())[0], build(BuildSettings.best_case())[0]
-    first = drive(nominal, CAR, track, line, weights)
-    both = concatenate([samples, first.samples(CAR, PREDICTION.step_s)])
-    updated = trained_weights(both, PREDICTION, settings, weights)
+    settings = PreparationSettings(train_track=training, seed=seed)
+    prepared = prepare(settings, (race,), stages, ("e_kinematic", "dynamic"))
+    assert prepared.training is not None
+    course, weights = prepared.course, read_weights(prepared.weights)
+    nominal, perfect = prepared.artefacts
+
+    def drive(artefact: Path, weights: GpWeights | None = None) -> Driven:
+        return drive_compiled(artefact, course.track, course.line, weights, car=CAR)
+
+    first = drive(nominal, weights)
+    both = concatenate([prepared.training.samples, first.samples()])
+    updated = trained_weights(both, PREDICTION, training_settings(settings), weights)
     return {
         "first": first,
-        "updated": drive(nominal, CAR, track, line, updated),
-        "perfect": drive(perfect, CAR, track, line),
+        "updated": drive(nominal, read_weights(updated)),
+        "perfect": drive(perfect),
     }
 
 
@@ -61,7 +64,9 @@ def main() -> None:
     arguments = parser.parse_args()
     for race, training in arguments.pair or PAIRS:
         print(f"{race}, trained on {training}, seed {arguments.seed}")
-        for name, one in drives(race, training, arguments.seed).items():
+        with stages_on(Console(quiet=True)) as stages:
+            driven = drives(race, training, arguments.seed, stages)
+        for name, one in driven.items():
             p50, p99 = np.percentile(one.step_us, [50, 99])
             times = f"step p50 {p50:.0f} us, p99 {p99:.0f} us, second starts {one.second_starts}"
             print(f"  {name:8} {one}; {times}", flush=True)

@@ -11,23 +11,26 @@ docs/decisions/2026-11-21-pose-from-corrected-velocities.md holds the conclusion
 import argparse
 
 import numpy as np
+from rich.console import Console
 
 from bayesrace.gp.corrected import corrected_function
 from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import PREDICTION, Discretisation
-from bayesrace.raceline import RaceLine, compute_raceline
-from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK, Track, load_track
+from bayesrace.raceline import RaceLine
+from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK, Track
 from bayesrace.vehicles import DEFAULT_CAR, get_car
 from bayesrace.vehicles.models import e_kinematic
-from benchmarks.closed_loop import Drive, drive, pursue
 from codegen.build import build
 from codegen.settings import BuildSettings
-from experiments.settings import RaceSettings
+from experiments.closed_loop import Driven, drive_compiled
+from experiments.preparation import prepare, training_settings
+from experiments.progress import stages_on
+from experiments.settings import PreparationSettings
 from learning.dataset import Dataset, concatenate
-from learning.training import TrainingSettings, train
+from learning.training import train
 
 CAR = get_car(DEFAULT_CAR)
-TRAINING = TrainingSettings(capacity=RaceSettings().points)
+TRAINING = training_settings(PreparationSettings())
 
 
 def heading_error_rad(samples: Dataset, prediction: Discretisation, weights: GpWeights) -> str:
@@ -39,19 +42,19 @@ def heading_error_rad(samples: Dataset, prediction: Discretisation, weights: GpW
 
 
 def chain(
-    prediction: Discretisation, training: Dataset, course: tuple[Track, RaceLine], best: Drive
+    prediction: Discretisation, training: Dataset, course: tuple[Track, RaceLine], best: Driven
 ) -> None:
     """Prints what one discretisation leads to."""
     artefact, _ = build(BuildSettings(car=CAR.name, discretisation=prediction))
     weights = train(training, prediction, TRAINING)
-    first = drive(artefact, CAR, *course, weights)
-    both = concatenate([training, first.samples(CAR, prediction.step_s)])
+    first = drive_compiled(artefact, *course, weights, car=CAR)
+    both = concatenate([training, first.samples()])
     updated = train(both, prediction, TRAINING, initial=weights)
-    second = drive(artefact, CAR, *course, updated)
+    second = drive_compiled(artefact, *course, updated, car=CAR)
     print(f"{prediction.scheme}, {prediction.pose}")
     print(f"  bayesrace          {first}")
     print(f"  bayesrace-updated  {second}")
-    heading = heading_error_rad(best.samples(CAR, prediction.step_s), prediction, updated)
+    heading = heading_error_rad(best.samples(), prediction, updated)
     print(f"  heading error of one step, rms / max: {heading} rad", flush=True)
 
 
@@ -61,17 +64,18 @@ def main() -> None:
     parser.add_argument("--track", default=DEFAULT_RACE_TRACK)
     parser.add_argument("--train-track", default=DEFAULT_TRAINING_TRACK)
     arguments = parser.parse_args()
-    training, track = load_track(arguments.train_track), load_track(arguments.track)
-    course = track, compute_raceline(track, CAR)
-    samples = pursue(CAR, training, compute_raceline(training, CAR), PREDICTION.step_s)
-    perfect, _ = build(BuildSettings.best_case(CAR.name))
-    best = drive(perfect, CAR, *course)
-    print(f"{track.name}: racing line's own time {course[1].lap_time_s:.3f} s (flying)")
+    settings = PreparationSettings(train_track=arguments.train_track)
+    with stages_on(Console()) as stages:
+        prepared = prepare(settings, (arguments.track,), stages, ("dynamic",))
+    assert prepared.training is not None
+    track, line = course = prepared.course.track, prepared.course.line
+    best = drive_compiled(prepared.artefacts[0], *course, car=CAR)
+    print(f"{track.name}: racing line's own time {line.lap_time_s:.3f} s (flying)")
     print(f"bestcase             {best}", flush=True)
     for scheme in ("euler", "rk4"):
         for pose in ("integrated", "interpolated"):
             prediction = PREDICTION.model_copy(update={"scheme": scheme, "pose": pose})
-            chain(prediction, samples, course, best)
+            chain(prediction, prepared.training.samples, course, best)
 
 
 if __name__ == "__main__":

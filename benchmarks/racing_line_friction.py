@@ -11,9 +11,9 @@ import argparse
 from bayesrace.raceline import RaceLineSettings, compute_raceline
 from bayesrace.tracks import DEFAULT_RACE_TRACK, load_track
 from bayesrace.vehicles import DEFAULT_CAR, get_car
-from benchmarks.closed_loop import drive
 from codegen.build import build
 from codegen.settings import BuildSettings
+from experiments.closed_loop import drive_compiled
 
 FRICTIONS = (0.65, 0.70, 0.75, 0.80, 0.85)
 
@@ -27,7 +27,7 @@ def main() -> None:
     print(f"{track.name}: friction, the line's own flying lap, driven laps")
     for friction in FRICTIONS:
         line = compute_raceline(track, car, RaceLineSettings(friction=friction))
-        driven = drive(artefact, car, track, line)
+        driven = drive_compiled(artefact, track, line, car=car)
         print(f"{friction:.2f}  {line.lap_time_s:.3f} s  {driven}", flush=True)
 
 

@@ -19,19 +19,18 @@ from rich.console import Console
 
 from bayesrace.gp.weights import read_weights
 from bayesrace.messages import State
-from bayesrace.raceline import RaceLine, read_raceline
-from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK, load_track
+from bayesrace.raceline import RaceLine
+from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK
 from bayesrace.vehicles import DEFAULT_CAR, get_car
 from bayesrace.vehicles.models import dynamic
+from controller.assembly import compiled_controller
 from controller.compensation import CompensationSettings
-from controller.driver import Driver
-from controller.fallback import FallbackSettings
+from controller.cycle import Cycle
 from controller.mpc import PredictiveController
-from controller.native_step import NativeStep
-from controller.path_table import make_path_table
-from controller.settings import MpcSettings
-from experiments.preparation import PreparationSettings, prepare
+from controller.process_settings import ControllerSettings
+from experiments.preparation import prepare
 from experiments.progress import stages_on
+from experiments.settings import PreparationSettings
 from plant.simulator import Simulator
 
 ASIDE_M: Final = 0.6
@@ -49,13 +48,12 @@ STALE_S: Final = 0.1
 class Rig:
     """A driver and its car."""
 
-    def __init__(self, step: NativeStep, length_m: float) -> None:
+    def __init__(self, controller: PredictiveController, length_m: float) -> None:
         car = get_car(DEFAULT_CAR)
-        self._step, self._length_m = step, length_m
-        self._driver = Driver(
-            PredictiveController(step), car, FallbackSettings(),
-            CompensationSettings(mode="fixed", delay_s=0.0), STALE_S,
-        )  # fmt: skip
+        self._step, self._length_m = controller.native, length_m
+        compensation = CompensationSettings(mode="fixed", delay_s=0.0)
+        settings = ControllerSettings(compensation=compensation, stale_s=STALE_S)
+        self._driver = Cycle(controller, car, settings).driver
         self.car = Simulator(dynamic(car))
         self._run = 0
 
@@ -112,14 +110,12 @@ def main() -> None:
     given = parser.parse_args()
     console = Console()
     with stages_on(console) as stages:
-        made = prepare(
-            PreparationSettings(track=given.track, train_track=given.train_track), stages
-        )
-    car, track, line = get_car(DEFAULT_CAR), load_track(given.track), read_raceline(made.raceline)
-    step = NativeStep(made.artefact, car, MpcSettings())
-    step.set_weights(read_weights(made.weights))
-    step.set_path(make_path_table(track, line, car.tuning.path.spacing_m))
-    rig, random = Rig(step, line.length_m), np.random.default_rng(given.seed)
+        settings = PreparationSettings(train_track=given.train_track)
+        made = prepare(settings, (given.track,), stages)
+    car, track, line = get_car(DEFAULT_CAR), made.course.track, made.course.line
+    weights = read_weights(made.weights)
+    controller = compiled_controller(made.artefacts[0], car, track, line, weights)
+    rig, random = Rig(controller, line.length_m), np.random.default_rng(given.seed)
     stood = 0
     for x in poses(line, given.count, random):
         rig.place(x)

@@ -17,21 +17,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.console import Console
 
-from bayesrace.gp.weights import encode_weights
-from bayesrace.integrators import PREDICTION
-from bayesrace.raceline.cached import racing_line
-from bayesrace.tracks import load_track
-from bayesrace.vehicles import get_car
+from bayesrace.gp.weights import encode_weights, read_weights
 from bayesrace.vehicles.models import dynamic
-from codegen.build import build
-from codegen.settings import BuildSettings
-from controller.native_step import NativeStep
-from controller.path_table import make_path_table
-from controller.settings import MpcSettings
+from controller.assembly import compiled_controller
 from experiments.bench import BenchSettings
-from experiments.preparation import trained_weights, training_samples
-from learning.training import TrainingSettings
+from experiments.preparation import prepare
+from experiments.progress import stages_on
 from plant.simulator import Simulator
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -76,19 +69,17 @@ for line in sys.stdin:
 def record(problems: int, seed: int) -> dict[str, Any]:
     """Closed loops on the tracks of the bench: what both checkouts are to solve, by name."""
     settings = BenchSettings(seed=seed)
-    car = get_car(settings.car)
-    samples = training_samples(load_track(settings.train_track), car, 40.0, seed)
-    options = TrainingSettings(capacity=settings.points, seed=seed)
-    weights = trained_weights(samples, PREDICTION, options)
-    step = NativeStep(build(BuildSettings(car=car.name))[0], car, MpcSettings())
-    step.set_weights(weights)
+    car = settings.driven_car
+    with stages_on(Console(stderr=True)) as stages:
+        prepared = prepare(settings, settings.tracks, stages)
+    weights = read_weights(prepared.weights)
     rows: dict[str, list[Any]] = {name: [] for name in ("x", "d", "reference", "first")}
-    for name in settings.tracks:
-        track = load_track(name)
-        step.set_path(make_path_table(track, racing_line(track, car), car.tuning.path.spacing_m))
-        step.reset()
-        simulator = Simulator(dynamic(car))
-        simulator.reset([*track.start_pose(), 1.0, 0.0, 0.0, 0.0])
+    for course in prepared.courses:
+        controller = compiled_controller(
+            prepared.artefacts[0], car, course.track, course.line, weights
+        )
+        step, simulator = controller.native, Simulator(dynamic(car))
+        simulator.reset([*course.track.start_pose(), 1.0, 0.0, 0.0, 0.0])
         for k in range(problems // len(settings.tracks)):
             x, d = simulator.x.copy(), simulator.u_applied[0]
             status = step.step(x, d)

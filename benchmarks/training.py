@@ -23,9 +23,8 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteK
 
 from bayesrace.gp.weights import OUTPUTS
 from bayesrace.integrators import PREDICTION
-from bayesrace.tracks import DEFAULT_TRAINING_TRACK, load_track
-from bayesrace.vehicles import DEFAULT_CAR, get_car
 from experiments.preparation import training_samples
+from experiments.settings import PreparationSettings
 from learning.hyperparameters import BOUNDS, starts
 from learning.regression import scaling_of
 from learning.residual import residual
@@ -62,12 +61,11 @@ def main() -> None:
     arguments = parser.parse_args()
     points, kind = arguments.points, arguments.kernel
 
-    car = get_car(DEFAULT_CAR)
-    track = load_track(DEFAULT_TRAINING_TRACK, car.width_m)
     duration_s = (points + 5) * PREDICTION.step_s
-    samples = training_samples(track, car, duration_s, arguments.seed).select(slice(points))
+    settings = PreparationSettings(collect_s=duration_s, seed=arguments.seed)
+    samples = training_samples(settings).select(slice(points))
     assert len(samples) == points, f"{len(samples)} samples are left of {points}"
-    settings = TrainingSettings(
+    options = TrainingSettings(
         kernels=(kind,),
         restarts=arguments.restarts,
         seed=arguments.seed,
@@ -81,7 +79,7 @@ def main() -> None:
         f"{os.cpu_count()} cores"
     )
     began = time.perf_counter()
-    weights = fit(samples, PREDICTION, settings).weights
+    weights = fit(samples, PREDICTION, options).weights
     ours_s = time.perf_counter() - began
     ours = [weights.metrics[f"training {output}"]["log_likelihood"] for output in OUTPUTS]
     print(f"ours, all of training: {ours_s:.2f} s")

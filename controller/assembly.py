@@ -7,9 +7,9 @@ from pydantic import BaseModel, ValidationError
 
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_whole
-from bayesrace.gp.weights import decode_weights, encode_weights, read_weights
-from bayesrace.raceline import read_raceline_for
-from bayesrace.tracks import load_track
+from bayesrace.gp.weights import GpWeights, decode_weights, encode_weights, read_weights
+from bayesrace.raceline import RaceLine, read_raceline_for
+from bayesrace.tracks import Track, load_track
 from bayesrace.vehicles import CarParameters
 from controller.gate.store import Accepted, Store
 from controller.mpc import PredictiveController
@@ -18,7 +18,7 @@ from controller.path_table import make_path_table
 from controller.settings import MpcSettings
 from controller.takeover import WeightsPort
 
-__all__ = ["predictive_controller", "read_settings"]
+__all__ = ["compiled_controller", "predictive_controller", "read_settings"]
 
 Settings = TypeVar("Settings", bound=BaseModel)
 
@@ -32,6 +32,26 @@ def read_settings(path: Path | None, form: type[Settings]) -> Settings:
     except ValidationError as error:
         where = form.__module__.replace(".", "/")
         raise InputError(f"{path}: {faults_in(error)}; {where}.py has the form") from None
+
+
+def compiled_controller(
+    artefact: Path,
+    car: CarParameters,
+    track: Track,
+    line: RaceLine,
+    weights: GpWeights | None = None,
+    settings: MpcSettings | None = None,
+) -> PredictiveController:
+    """The compiled controller of ``artefact`` on a track, ready to drive; without ``weights`` it
+    predicts by the uncorrected model.
+
+    Raises InputError if artefact, car, line or weights do not fit together.
+    """
+    step = NativeStep(artefact, car, settings or MpcSettings())
+    step.set_path(make_path_table(track, line, car.tuning.path.spacing_m))
+    if weights is not None:
+        step.set_weights(weights)
+    return PredictiveController(step, "" if weights is None else weights.version)
 
 
 def predictive_controller(
@@ -48,14 +68,13 @@ def predictive_controller(
     ``store``: folder of the weights that it accepts; the newest of an earlier life are in use from
     the start, whatever ``weights`` are. Raises InputError naming the file that cannot be used.
     """
-    step = NativeStep(artefact, car, read_settings(settings, MpcSettings))
+    loaded = None if weights is None else read_weights(weights)
     course = load_track(track, car.width_m)
     line = read_raceline_for(raceline, course, car)
-    step.set_path(make_path_table(course, line, car.tuning.path.spacing_m))
+    mpc = read_settings(settings, MpcSettings)
+    step = compiled_controller(artefact, car, course, line, loaded, mpc).native
     first = Accepted(0, "", b"", proven=True)
-    if weights is not None:
-        loaded = read_weights(weights)
-        step.set_weights(loaded)
+    if loaded is not None:
         first = Accepted(0, loaded.version, encode_weights(loaded), proven=True)
     port = WeightsPort(artefact.resolve(), step, car, [first])
     if store is not None:

@@ -19,7 +19,7 @@ class PredictiveController:
     ) -> None:
         """``step``: with parameters and path set. ``weights_version``: of what it holds already.
         ``port``: how a process takes over new ones; without, :meth:`set_weights` does."""
-        self._step = step
+        self.native = step
         self.port = port
         self._version = weights_version
         self._output = StepOutput(
@@ -36,41 +36,41 @@ class PredictiveController:
 
     def reset(self, state: State) -> None:
         """Next step starts cold."""
-        self._step.reset()
+        self.native.reset()
 
     def set_weights(self, data: bytes) -> str:
         """From the next step on; the plan and everything else goes on as it is."""
         weights = decode_weights(data)
-        self._step.set_weights(weights)
+        self.native.set_weights(weights)
         self._version = weights.version
         return weights.version
 
     def adopt_weights(self, version: str) -> None:
         """What is staged is used from the next step on; the plan goes on."""
-        self._step.adopt_weights()
+        self.native.adopt_weights()
         self._version = version
 
     def prepare(self, elapsed_s: float, budget_s: float = 0.0) -> None:
         """Iterates on until converged if there is a budget, then shifts and condenses."""
-        self._step.prepare(elapsed_s, budget_s)
+        self.native.prepare(elapsed_s, budget_s)
 
     def rehearse(self) -> None:
         """The preparation once more."""
-        self._step.rehearse()
+        self.native.rehearse()
 
     def predict(self, x: Array, u: Array, duration_s: float) -> Array:
         """By the model the OCP predicts with, corrected by the weights in use."""
-        return self._step.predict(x, u, duration_s)
+        return self.native.predict(x, u, duration_s)
 
     def limit_speed(self, limit_mps: float, rate_mps2: float) -> None:
         """The reference point moves along the line no faster."""
-        self._step.set_speed_limit(limit_mps, rate_mps2)
+        self.native.set_speed_limit(limit_mps, rate_mps2)
 
     def step(
         self, x: Array, u_previous: Array, elapsed_s: float, budget_s: float = 0.0
     ) -> StepOutput:
         """One native step, timed around the C call."""
-        native, output = self._step, self._output
+        native, output = self.native, self._output
         begin_ns = time.perf_counter_ns()
         status = native.step(x, u_previous, elapsed_s=elapsed_s, budget_s=budget_s)
         output.solve_us = (time.perf_counter_ns() - begin_ns) * 1e-3

@@ -36,13 +36,13 @@ from bayesrace.transport import (
     open_session,
 )
 from controller.courier import Courier
-from controller.driver import Decision, Driver
+from controller.cycle import Cycle
+from controller.driver import Decision
 from controller.interface import Controller
 from controller.process_settings import ControllerSettings
 from controller.schedule import Schedule
 from controller.service import Service
 from controller.takeover import Takeover
-from controller.telemetry import Timing, telemetry_of
 
 __all__ = ["ControllerProcess", "ControllerSettings", "main"]
 
@@ -81,20 +81,12 @@ class ControllerProcess:
     def __init__(self, session: Any, settings: ControllerSettings, controller: Controller) -> None:
         self._settings = settings
         self.name = settings.name or settings.car.name
-        self._driver = Driver(
-            controller,
-            settings.car,
-            settings.fallback,
-            settings.compensation,
-            settings.stale_s,
-            settings.hold,
-        )
-        self._controller = controller
+        self._cycle = Cycle(controller, settings.car, settings)
+        self._driver, self._timing = self._cycle.driver, self._cycle.timing
         self._decoder: Decoder[State] = Decoder(State)
         self._actuations = Publisher(session, ACTUATION, self.name)
         self._telemetry = Publisher(session, TELEMETRY, self.name)
         self._schedule = Schedule(settings.rate_hz)
-        self._timing = Timing()
         self._arrived_ns = 0
         self._payload = b""
         self._serve_ns = 0
@@ -201,12 +193,7 @@ class ControllerProcess:
             if state is not None:
                 if state.final or not state.lockstep:
                     break
-                timing.released_ns = time.monotonic_ns()
-                self._decide(state, state.time_s, 0.0)
-                self._send(state, self._driver.settle())
-                if self._takeover is not None:
-                    self._takeover.in_lockstep(self._next_cycle)
-                self._prepare(self._driver.states.interval_s, 0.0)
+                self._cycle.answer(state, self._send_in_lockstep)
             elif self._silent() or not self._service.plant_there:
                 break
             self._service.beat()
@@ -214,6 +201,12 @@ class ControllerProcess:
             state = None if item is None else self._take(item)
         inbox.spin_s = 0.0
         return self._leave(state)
+
+    def _send_in_lockstep(self, state: State, decision: Decision) -> None:
+        """The cycle's messages; new weights are taken over before the next cycle is prepared."""
+        self._send(state, decision)
+        if self._takeover is not None:
+            self._takeover.in_lockstep(self._next_cycle)
 
     # Free-running ------------------------------------------------------------------------------
 
@@ -247,7 +240,7 @@ class ControllerProcess:
         # What has held up a state on its way is part of its age: hence the schedule's plant time,
         # not the time since this state's own arrival.
         basis_s = max(schedule.plant_time_s(timing.released_ns), state.time_s)
-        self._decide(state, basis_s, max(budget_s - spent_s, _LEAST_BUDGET * budget_s))
+        self._cycle.decide(state, basis_s, max(budget_s - spent_s, _LEAST_BUDGET * budget_s))
         late_s = (time.monotonic_ns() - schedule.release_ns) * 1e-9 - budget_s
         timing.overruns += late_s > 0
         self._send(state, driver.settle(max(late_s, 0.0)))
@@ -267,7 +260,7 @@ class ControllerProcess:
         self._service.beat()
         left_s = (end_ns - time.monotonic_ns()) * 1e-9
         if left_s > 0:
-            self._prepare(self._schedule.period_ns * 1e-9, left_s)
+            self._cycle.prepare(self._schedule.period_ns * 1e-9, left_s)
 
     def _next_state(self) -> State | None:
         """Sleeps until shortly before the release, then looks for the state that is due."""
@@ -317,39 +310,17 @@ class ControllerProcess:
 
     # Both --------------------------------------------------------------------------------------
 
-    def _decide(self, state: State, basis_s: float, budget_s: float) -> None:
-        begin_ns = time.perf_counter_ns()
-        self._driver.decide(state, basis_s, budget_s)
-        self._timing.solve_us = (time.perf_counter_ns() - begin_ns) * 1e-3
-
-    def _prepare(self, period_s: float, budget_s: float) -> None:
-        begin_ns = time.perf_counter_ns()
-        self._driver.prepare(period_s, budget_s)
-        self._timing.prepare_us = (time.perf_counter_ns() - begin_ns) * 1e-3
-
     def _send(self, state: State, decision: Decision) -> None:
         """The actuation, then how it came about."""
         timing = self._timing
         begin_ns = time.perf_counter_ns()
         self._actuations.put(self._actuation(state, decision), lockstep=state.lockstep)
         timing.encode_us = (time.perf_counter_ns() - begin_ns) * 1e-3
-        timing.ticks += 1
-        timing.received_ns = self._arrived_ns
-        message = telemetry_of(self._telemetry.next_seq, state, decision, timing)
+        message = self._cycle.telemetry(self._telemetry.next_seq, state, decision, self._arrived_ns)
         self._telemetry.put(message, lockstep=state.lockstep)
 
     def _actuation(self, state: State, decision: Decision) -> Actuation:
-        return Actuation(
-            self._actuations.next_seq,
-            time.monotonic_ns(),
-            state.epoch,
-            state.run,
-            state.seq,
-            decision.basis_s,
-            (decision.d, decision.delta_rate),
-            self._controller.weights_version,
-            decision.status,
-        )
+        return self._cycle.actuation(self._actuations.next_seq, state, decision)
 
     @property
     def _next_cycle(self) -> int:

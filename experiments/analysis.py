@@ -6,7 +6,6 @@ that lie beside it; nothing is taken over from the processes that were running.
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Final
@@ -18,9 +17,10 @@ from threadpoolctl import threadpool_limits
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import read_weights
 from bayesrace.raceline import RaceLine
-from bayesrace.tracks import PathProjection, StartLine, Track
+from bayesrace.tracks import PathProjection, Track
 from bayesrace.tracks.projection import CentrelineSearch
 from bayesrace.tracks.spline import PlaneSpline
+from experiments.laps import time_laps
 from experiments.recording import PlannedRun, Recording, RunRecord, read_recording
 from experiments.results import (
     GpMetrics,
@@ -39,7 +39,6 @@ __all__ = [
     "DrivenRun",
     "GpMetrics",
     "LapResult",
-    "LapTimes",
     "Percentiles",
     "PlannedRun",
     "RaceAnalysis",
@@ -49,58 +48,15 @@ __all__ = [
     "line_offset",
     "read_race",
     "read_result",
-    "time_laps",
     "write_result",
 ]
 
 Floats = NDArray[np.float64]
 
-SHORT_CUT: Final = 0.15
-"""A leap along the centreline from one sample to the next of more than this share of the track
-leaves out a piece of it: what comes after is no lap. (At 4 m/s a sample is .08 m.)"""
-
 WEIGHTS_FILES: Final = {
     "bayesrace": "weights-bayesrace.bin",
     "bayesrace-updated": "weights-updated.bin",
 }
-
-
-@dataclass(frozen=True)
-class LapTimes:
-    """The laps of one run, in order."""
-
-    times_s: tuple[float, ...]
-    after: tuple[int, ...]
-    """Index of the first sample after each lap's end."""
-    cut_at: int | None
-    """Index of the sample before which the car left out a piece of the track; no later lap
-    counts. None if it never did."""
-
-
-def time_laps(track: Track, time_s: Floats, xy: Floats, s_m: Floats) -> LapTimes:
-    """Laps of a trajectory: times (n,), positions (n, 2), arc lengths on the centreline (n,).
-
-    A lap ends where the car has crossed the start line once more forwards than backwards since the
-    last one; the crossing is interpolated within the sampling period. The first lap begins at
-    plant time 0.
-    """
-    line, crossings = StartLine(track), 0
-    ends: list[float] = [0.0]
-    after: list[int] = []
-    half = track.length_m / 2
-    leap = np.abs((np.diff(s_m) + half) % track.length_m - half)
-    cuts = np.flatnonzero(leap > SHORT_CUT * track.length_m)
-    cut_at = int(cuts[0]) + 1 if len(cuts) else None
-    points = [(float(x), float(y)) for x, y in xy[:cut_at]]
-    for k in range(1, len(points)):
-        crossing = line.crossing(points[k - 1], points[k])
-        crossings += crossing.direction
-        if crossings <= len(after):
-            continue
-        before_s = float(time_s[k - 1])
-        ends.append(before_s + crossing.fraction * (float(time_s[k]) - before_s))
-        after.append(k)
-    return LapTimes(tuple(np.diff(ends).tolist()), tuple(after), cut_at)
 
 
 def line_offset(line: RaceLine, xy: Floats, reach_m: float) -> Floats:

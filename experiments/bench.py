@@ -8,43 +8,41 @@ with its default options, from zeros. (With our discretisation, whose pose depen
 that takes four times as long: no fair peer.)
 """
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 from rich.console import Console
 from rich.table import Table
 
 from bayesrace.gp.corrected import corrected_function
-from bayesrace.gp.weights import GpWeights
+from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.integrators import PREDICTION, Discretisation
-from bayesrace.raceline.cached import racing_line
-from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK, Track, load_track
-from bayesrace.vehicles import CarParameters, CarSetting, default_car
-from bayesrace.vehicles.models import dynamic, e_kinematic
-from codegen.build import build
-from codegen.compiler import find_compiler
+from bayesrace.manifest import read_manifest
+from bayesrace.messages import State
+from bayesrace.tracks import DEFAULT_RACE_TRACK
+from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles.models import e_kinematic
 from codegen.ocp import OcpNlp
 from codegen.problems.tracking import tracking
-from codegen.settings import BuildSettings
+from controller.assembly import compiled_controller
+from controller.interface import StepOutput
+from controller.mpc import PredictiveController
 from controller.native_step import NativeStep, StepStatus
-from controller.path_table import make_path_table
 from controller.settings import MpcSettings
-from experiments.preparation import trained_weights, training_samples
+from experiments.closed_loop import ClosedLoop
+from experiments.preparation import prepare
 from experiments.progress import Stages
-from learning.training import TrainingSettings
-from plant.simulator import Simulator
+from experiments.settings import PreparationSettings
+from plant.simulator import PLANT
 
 __all__ = ["BenchResult", "BenchSettings", "run_bench"]
 
 Floats = NDArray[np.float64]
 
-_START_SPEED_MPS: Final = 0.1
 _CONVERGED: Final = MpcSettings(iterations=100, iterations_cold=100, tolerance=1e-9, settle=0)
 _PUBLISHED: Final = Discretisation(scheme="euler", step_s=PREDICTION.step_s)
 """The published controller predicts with forward Euler; the mean changes the velocities alone."""
@@ -54,20 +52,14 @@ class BenchError(RuntimeError):
     """There is nothing to compare with."""
 
 
-class BenchSettings(BaseModel):
+class BenchSettings(PreparationSettings):
     """What is measured."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     tracks: tuple[str, ...] = Field(
         (DEFAULT_RACE_TRACK, "random:11", "random:15"), min_length=1, description="driven on"
     )
-    train_track: str = DEFAULT_TRAINING_TRACK
-    car: CarSetting = Field(default_factory=default_car)
     problems: int = Field(900, ge=10, description="control steps in closed loop, all tracks")
     peers: int = Field(25, ge=1, description="of these, solved by IPOPT")
-    points: int = Field(400, ge=20, le=1024, description="training points per output")
-    seed: int = Field(0, ge=0)
 
 
 class Times(BaseModel):
@@ -168,29 +160,23 @@ class _Recording:
 
 def run_bench(settings: BenchSettings, stages: Stages) -> BenchResult:
     """Measures; takes about a minute, most of it IPOPT's."""
-    find_compiler()  # what is missing is told now, not after the training
-    car = settings.car
-    with stages.stage("racing lines and training drive"):
-        courses = [load_track(name, car.width_m) for name in settings.tracks]
-        lines = [racing_line(course, car) for course in courses]
-        training = load_track(settings.train_track, car.width_m)
-        samples = training_samples(training, car, car.tuning.pursuit.drive_s, settings.seed)
-    with stages.stage("train the residual") as stage:
-        options = TrainingSettings(capacity=settings.points, seed=settings.seed)
-        weights = trained_weights(samples, PREDICTION, options, progress=stage.update)
-    with stages.stage("build"):
-        artefact, manifest = build(BuildSettings(car=car))
-        horizon = manifest.horizon
-        step, converged = (_controller(artefact, car, s, weights) for s in _pair())
+    car = settings.driven_car
+    prepared = prepare(settings, settings.tracks, stages)
+    weights, artefact = read_weights(prepared.weights), prepared.artefacts[0]
+    horizon = read_manifest(artefact).horizon
     with stages.stage("closed loop"):
         recording = _Recording()
-        for course, line in zip(courses, lines, strict=True):
-            for one in (step, converged):
-                one.set_path(make_path_table(course, line, car.tuning.path.spacing_m))
-            _record(step, converged, course, car, 50)  # caches, branch predictors, clock frequency
-            recording += _record(
-                step, converged, course, car, -(-settings.problems // len(courses))
+        for course in prepared.courses:
+            step, converged = (
+                compiled_controller(artefact, car, course.track, course.line, weights, mpc)
+                for mpc in (MpcSettings(), _CONVERGED)
             )
+            recorder = _Recorder(step.native, converged.native)
+            loop = ClosedLoop(car, course.track, course.line, recorder)
+            for count in (50, -(-settings.problems // len(prepared.courses))):
+                recorder.recording = _Recording()  # without those that warm up
+                loop.drive(0, count * PLANT.step_s)
+            recording += recorder.recording
     with stages.stage("IPOPT, expanded (builds for some 15 s)") as stage:
         peers = _peers(recording, settings.peers)
         problem = tracking(e_kinematic(car), PREDICTION)
@@ -210,48 +196,48 @@ def run_bench(settings: BenchSettings, stages: Stages) -> BenchResult:
         f = corrected_function(e_kinematic(car), PREDICTION, weights)
         oracle = OcpNlp(problem, f, horizon, options=strict)
         agreement = _agreement(oracle, car, peers)
-        gaps = [_gap(oracle, car, step, p) for p in recording.problems if p.has_converged]
+        gaps = [_gap(oracle, car, step.native, p) for p in recording.problems if p.has_converged]
     return _result(settings, weights, recording, times, solved, agreement, gaps)
 
 
-def _pair() -> tuple[MpcSettings, MpcSettings]:
-    return MpcSettings(), _CONVERGED
+class _Recorder(PredictiveController):
+    """Drives by the real-time step, whole and unprepared; the converged one looks on."""
 
+    def __init__(self, step: NativeStep, converged: NativeStep) -> None:
+        super().__init__(step)
+        self._converged = converged
+        self.recording = _Recording()
 
-def _controller(
-    artefact: Path, car: CarParameters, mpc: MpcSettings, weights: GpWeights
-) -> NativeStep:
-    step = NativeStep(artefact, car, mpc)
-    step.set_weights(weights)
-    return step
+    def reset(self, state: State) -> None:
+        """Both start cold."""
+        super().reset(state)
+        self._converged.reset()
 
+    def prepare(self, elapsed_s: float, budget_s: float = 0.0) -> None:
+        """Nothing: what is timed is the whole step."""
 
-def _record(
-    step: NativeStep, converged: NativeStep, track: Track, car: CarParameters, count: int
-) -> _Recording:
-    """Closed loop from the start line; the real-time step drives, the other one looks on."""
-    simulator, recording = Simulator(dynamic(car)), _Recording()
-    x, y, psi = track.start_pose()
-    simulator.reset([x, y, psi, _START_SPEED_MPS, 0.0, 0.0, 0.0])
-    for one in (step, converged):
-        one.reset()
-    for _ in range(count):
-        state, d_previous = simulator.x.copy(), simulator.u_applied[0]
-        begin_ns = time.perf_counter_ns()
-        status = step.step(state, d_previous)
-        recording.step_us.append((time.perf_counter_ns() - begin_ns) * 1e-3)
-        recording.second_starts += step.info.second_start > 0
-        plan = tuple(part.copy() for part in step.read_plan())
-        other = converged.step(state, d_previous)
-        best = tuple(part.copy() for part in converged.read_plan())
+    def step(
+        self, x: Floats, u_previous: Floats, elapsed_s: float, budget_s: float = 0.0
+    ) -> StepOutput:
+        """Records the problem and both answers."""
+        step, converged, recording = self.native, self._converged, self.recording
+        output = super().step(x, u_previous, elapsed_s, budget_s)
+        recording.step_us.append(output.solve_us)
+        recording.second_starts += output.second_start > 0
+        other = converged.step(x, u_previous, elapsed_s=elapsed_s)
+        converged.read_plan()
         recording.problems.append(
             _Problem(
-                state, d_previous, step.read_reference(), (plan[0], plan[1]), (best[0], best[1]),
-                converged.info.cost, status.usable and other is StepStatus.CONVERGED,
+                x.copy(),
+                float(u_previous[0]),
+                step.read_reference(),
+                (step.plan_x.copy(), step.plan_u.copy()),
+                (converged.plan_x.copy(), converged.plan_u.copy()),
+                converged.info.cost,
+                output.status == 0 and other is StepStatus.CONVERGED,
             )
-        )  # fmt: skip
-        simulator.step(step.u.tolist() if status.usable else None)
-    return recording
+        )
+        return output
 
 
 def _peers(recording: _Recording, count: int) -> list[_Problem]:

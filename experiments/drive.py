@@ -12,7 +12,7 @@ from bayesrace.tracks import StartLine, Track
 from bayesrace.transport import Director, Publisher, RefusedError
 from experiments.processes import Child, endings
 
-__all__ = ["RunPlan", "execute", "run_request", "wait_for_both"]
+__all__ = ["RunPlan", "announcement", "execute", "run_request", "wait_for_both"]
 
 _ABSENCE_S = 10.0
 """By the wall clock a process may be away for so long: a link comes back, a controller is started
@@ -72,17 +72,15 @@ def wait_for_both(director: Director, children: Sequence[Child], timeout_s: floa
                 raise
 
 
-def _announce(publisher: Publisher[Event], plan: RunPlan, weights_version: str) -> None:
-    """Puts into the log, before the run, who is going to drive it."""
+def announcement(plan: RunPlan, seq: int, weights_version: str) -> Event:
+    """What stands in the log before a run: who is going to drive it."""
     text = f"run {plan.run}: {plan.controller}"
     data: dict[str, Scalar] = {
         "run": plan.run,
         "controller": plan.controller,
         "weights_version": weights_version,
     }
-    now_ns = time.monotonic_ns()
-    event = Event(publisher.next_seq, now_ns, plan.run, "race", "run", text, data)
-    publisher.put(event, lockstep=True)
+    return Event(seq, time.monotonic_ns(), plan.run, "race", "run", text, data)
 
 
 def execute(
@@ -99,7 +97,8 @@ def execute(
     controllers of one name are there, before or after; KeyboardInterrupt on a signal.
     """
     director.check_alone()
-    _announce(publisher, plan, director.status("controller").weights_version)
+    version = director.status("controller").weights_version
+    publisher.put(announcement(plan, publisher.next_seq, version), lockstep=True)
     before = director.status("plant").counters
     try:
         director.start(run_request(track, plan))

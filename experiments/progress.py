@@ -1,15 +1,21 @@
-"""What a person sees while the parts work: a line per stage with its time."""
+"""What a person sees while the parts work: a line per stage with its time.
+
+A stage that needs results of the cache and computes none of them is marked as such.
+"""
 
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
-from typing import Protocol
+from typing import Final, Protocol
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
+from bayesrace.cache import uses
 from bayesrace.interrupts import raise_if_interrupted
 
 __all__ = ["Stage", "Stages", "stages_on"]
+
+_CACHED: Final = "from the cache"
 
 
 class Stage(Protocol):
@@ -42,9 +48,10 @@ class _RichStages:
     @contextmanager
     def stage(self, name: str) -> Iterator[Stage]:
         shown = _Shown(self._progress, name)
-        yield shown
+        with uses() as needed:
+            yield shown
         raise_if_interrupted()
-        shown.update(1.0)
+        shown.update(1.0, _CACHED if _all_found(needed) else "")
 
 
 class _Silent:
@@ -76,5 +83,12 @@ class _PlainStages:
     @contextmanager
     def stage(self, name: str) -> Iterator[Stage]:
         self._console.print(f"{name} …", highlight=False)
-        yield _Silent()
+        with uses() as needed:
+            yield _Silent()
         raise_if_interrupted()
+        if _all_found(needed):
+            self._console.print(f"{name}: {_CACHED}", highlight=False)
+
+
+def _all_found(needed: list[bool]) -> bool:
+    return bool(needed) and not any(needed)

@@ -9,39 +9,44 @@ import shutil
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
-from bayesrace.gp.weights import GpWeights, write_weights
+from bayesrace.gp.weights import read_weights
+from bayesrace.manifest import MANIFEST
 from bayesrace.messages import EVENT, Event
-from bayesrace.raceline import RaceLine, write_raceline
-from bayesrace.raceline.cached import racing_line
 from bayesrace.recorder import Recorder
-from bayesrace.tracks import Track, load_track, write_track
+from bayesrace.tracks import load_track
 from bayesrace.transport import Director, Endpoints, Publisher, free_endpoint, open_session
 from bayesrace.vehicles import CarParameters, write_car
-from codegen.build import build
 from codegen.compiler import find_compiler
-from codegen.settings import BuildSettings
-from experiments.collect import collect
 from experiments.drive import RunPlan, execute, wait_for_both
-from experiments.preparation import trained_weights
+from experiments.preparation import (
+    Course,
+    PredictionModel,
+    Prepared,
+    prepare,
+    trained_weights,
+    training_settings,
+)
 from experiments.processes import Child, child, endings
 from experiments.progress import Stage, Stages
 from experiments.settings import RaceSettings
 from learning.dataset import Dataset, concatenate
 from learning.logs import dataset_from_log
-from learning.training import TrainingSettings
 from plant.fmu.faults import FmuFault
 from plant.simulator import PLANT
-from plant.vehicle import Vehicle, open_vehicle
+from plant.vehicle import open_vehicle
 
 __all__ = ["FILES", "RaceError", "race"]
 
 _START_S: Final = 20.0
+
+_MODELS: Final[tuple[PredictionModel, ...]] = ("e_kinematic", "dynamic")
+"""Of BayesRace and of BestCase."""
 
 
 class RaceError(RuntimeError):
@@ -67,56 +72,34 @@ class _Files:
 FILES: Final = _Files()
 
 
-@dataclass(frozen=True, eq=False)
-class _Course:
-    """A track with its racing line, and the files that the processes read them from."""
-
-    track: Track
-    line: RaceLine
-    track_file: Path
-    line_file: Path
-
-
 class _Race:
     def __init__(self, settings: RaceSettings, out: Path, stages: Stages) -> None:
         self.settings, self.out, self.stages = settings, out, stages
-        grip = settings.raceline.friction
-        self.car = (
-            settings.car if grip is None else settings.car.model_copy(update={"friction": grip})
-        )
-        """With the friction that the line is asked for: whoever drives it must know the same."""
+        self.car = settings.driven_car
         self._run = 0
 
     # Preparation -------------------------------------------------------------------------------
 
-    def course(self, track: Track, label: str) -> _Course:
-        """Computes the line if it is not cached; writes track and line into the run directory."""
-        line = racing_line(track, self.car, self.settings.raceline)
+    def prepare(self) -> Prepared:
+        """Everything made, or taken from the cache; copies in the run directory."""
+        fmu, fmu_map = self.fmu_files
+        settings = self.settings.model_copy(update={"fmu": fmu, "fmu_map": fmu_map})
+        with _faults_named():
+            prepared = prepare(settings, (settings.track,), self.stages, _MODELS)
+        if prepared.training is not None:
+            self._keep_course(prepared.training.course, "train")
+            shutil.copyfile(prepared.training.log, self.out / FILES.collect_log)
+        course = self._keep_course(prepared.course, "race")
+        for model, folder in zip(_MODELS, prepared.artefacts, strict=True):
+            shutil.copyfile(folder / MANIFEST, self.out / f"manifest-{model}.json")
+        shutil.copyfile(prepared.weights, self.out / FILES.weights)
+        return replace(prepared, courses=(course,), weights=self.out / FILES.weights)
+
+    def _keep_course(self, course: Course, label: str) -> Course:
         files = self.out / f"{label}.csv", self.out / f"{label}_raceline.csv"
-        write_track(files[0], track)
-        write_raceline(files[1], line)
-        return _Course(track, line, *files)
-
-    def training_drive(self, course: _Course) -> Dataset:
-        """Drives the training track by pure pursuit and reads the samples from the log."""
-        settings = self.settings
-        log = self.out / FILES.collect_log
-        duration_s = settings.collect_s or self.car.tuning.pursuit.drive_s
-        with self.vehicle() as vehicle:
-            collect(
-                course.track, course.line, self.car, log, duration_s, settings.pursuit,
-                settings.start_speed_mps, vehicle,
-            )  # fmt: skip
-        return dataset_from_log(log, self.car, settings.discretisation.step_s)
-
-    @contextmanager
-    def vehicle(self) -> Iterator[Vehicle]:
-        """What plays the car where no plant process is needed."""
-        try:
-            with open_vehicle(self.car, *self.fmu_files, 1 / PLANT.step_s) as vehicle:
-                yield vehicle
-        except FmuFault as fault:
-            raise RaceError(str(fault)) from fault
+        shutil.copyfile(course.track_file, files[0])
+        shutil.copyfile(course.line_file, files[1])
+        return Course(course.track, course.line, *files)
 
     def keep_fmu(self) -> None:
         """Copies FMU and map, if there are any, into the run directory, and tries them."""
@@ -124,7 +107,8 @@ class _Race:
         for source, target in zip((settings.fmu, settings.fmu_map), self.fmu_files, strict=True):
             if source is not None and target is not None:
                 shutil.copyfile(source, target)
-        with self.vehicle():  # an FMU that cannot be the car is told now, not in half a minute
+        # An FMU that cannot be the car is reported now, not in half a minute.
+        with _faults_named(), open_vehicle(self.car, *self.fmu_files, 1 / PLANT.step_s):
             pass
 
     @property
@@ -141,30 +125,22 @@ class _Race:
             None if settings.fmu_map is None else self.out / FILES.fmu_map,
         )
 
-    def train(
-        self, samples: Dataset, name: str, stage: Stage, initial: GpWeights | None = None
-    ) -> GpWeights:
-        """Weights learned from the samples, or taken from the cache; in the run directory, too."""
-        settings = TrainingSettings(capacity=self.settings.points, seed=self.settings.seed)
+    def update(self, prepared: Prepared, lap: Dataset, stage: Stage) -> Path:
+        """Weights learned from training drive and lap, beginning with those of the lap."""
+        settings = self.settings
+        samples = [lap] if prepared.training is None else [prepared.training.samples, lap]
         weights = trained_weights(
-            samples, self.settings.discretisation, settings, initial, stage.update
+            concatenate(samples),
+            settings.discretisation,
+            training_settings(settings),
+            read_weights(prepared.weights),
+            stage.update,
         )
-        write_weights(self.out / name, weights)
-        return weights
-
-    def artefact(self, model: str) -> Path:
-        """Builds the controller, or takes it from the cache; its manifest goes into the run."""
-        if model == "dynamic":
-            settings = BuildSettings.best_case(self.car)
-        else:
-            settings = BuildSettings(car=self.car, discretisation=self.settings.discretisation)
-        folder, manifest = build(settings)
-        write_whole(self.out / f"manifest-{model}.json", manifest.model_dump_json(indent=1) + "\n")
-        return folder
+        return Path(shutil.copyfile(weights, self.out / FILES.weights_updated))
 
     # Driving -----------------------------------------------------------------------------------
 
-    def plan(self, controller: str, course: _Course) -> RunPlan:
+    def plan(self, controller: str, course: Course) -> RunPlan:
         """The next run."""
         self._run += 1
         settings = self.settings
@@ -173,6 +149,15 @@ class _Race:
         return RunPlan(
             self._run, controller, settings.laps, limit_s, lockstep, settings.start_speed_mps
         )
+
+
+@contextmanager
+def _faults_named() -> Iterator[None]:
+    """Turns a fault of the FMU into the reason why there is no race."""
+    try:
+        yield
+    except FmuFault as fault:
+        raise RaceError(str(fault)) from fault
 
 
 @contextmanager
@@ -188,7 +173,7 @@ def _explained(children: list[Child]) -> Iterator[None]:
 class _Paddock:
     """The processes of a race and the session that directs and records them."""
 
-    def __init__(self, race: _Race, course: _Course, stack: ExitStack) -> None:
+    def __init__(self, race: _Race, course: Course, stack: ExitStack) -> None:
         self._race, self._course, self._stack = race, course, stack
         self._plant_endpoint = free_endpoint()
         self._controller_endpoint = free_endpoint()
@@ -261,39 +246,29 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
     """
     if (out / FILES.log).exists():
         raise InputError(f"{out} holds a run already; choose another folder or remove it")
-    find_compiler()  # what is missing is told now, not after the training
+    find_compiler()  # what is missing is reported now, before there is a run directory
     this = _Race(settings, out, stages)
-    train_track, track = (
-        load_track(name, this.car.width_m) for name in (settings.train_track, settings.track)
-    )
+    for name in (settings.train_track, settings.track):
+        load_track(name, this.car.width_m)
     out.mkdir(parents=True, exist_ok=True)
     this.keep_fmu()
     write_car(this.car_file, this.car)
     write_whole(out / FILES.settings, settings.model_dump_json(indent=1) + "\n")
-    with stages.stage("racing line, training track"):
-        training = this.course(train_track, "train")
-    with stages.stage("racing line, race track"):
-        course = this.course(track, "race")
-    with stages.stage("training drive (pure pursuit)"):
-        samples = this.training_drive(training)
-    with stages.stage("train the residual") as stage:
-        weights = this.train(samples, FILES.weights, stage)
-    with stages.stage("build the controllers"):
-        artefact, perfect = this.artefact("e_kinematic"), this.artefact("dynamic")
+    prepared = this.prepare()
+    artefact, perfect = prepared.artefacts
     with ExitStack() as stack:
-        paddock = _Paddock(this, course, stack)
+        paddock = _Paddock(this, prepared.course, stack)
         with paddock.controller(artefact, "bayesrace"):
             with stages.stage("drive WorstCase"):
                 paddock.drive("worstcase")
             with stages.stage("drive BayesRace"):
-                paddock.director.send_weights((out / FILES.weights).read_bytes())
+                paddock.director.send_weights(prepared.weights.read_bytes())
                 driven = paddock.drive("bayesrace")
             with stages.stage("update the residual") as stage:
                 lap = paddock.flushed(driven, this.car, settings.discretisation.step_s)
-                both = concatenate([samples, lap])
-                this.train(both, FILES.weights_updated, stage, weights)
+                updated = this.update(prepared, lap, stage)
             with stages.stage("drive BayesRace-updated"):
-                paddock.director.send_weights((out / FILES.weights_updated).read_bytes())
+                paddock.director.send_weights(updated.read_bytes())
                 paddock.drive("bayesrace-updated")
         with paddock.controller(perfect, "bestcase"), stages.stage("drive BestCase"):
             paddock.drive("bestcase")

@@ -8,33 +8,27 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.raceline import RaceLineSettings
 from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK
-from bayesrace.vehicles import CarSetting, default_car
+from bayesrace.vehicles import CarParameters, CarSetting, default_car
 from controller.pure_pursuit import PurePursuitSettings
 from controller.settings import MpcSettings
 from plant.simulator import PLANT
 
-__all__ = ["RaceSettings"]
+__all__ = ["PreparationSettings", "RaceSettings"]
 
 
-class RaceSettings(BaseModel):
-    """Settings of ``bayesrace race``; defaults are the shown run."""
+class PreparationSettings(BaseModel):
+    """From what, and with what, everything is made that a drive needs."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     car: CarSetting = Field(default_factory=default_car)
-    track: str = Field(DEFAULT_RACE_TRACK, description="race track: name, random:SEED or CSV file")
-    train_track: str = Field(DEFAULT_TRAINING_TRACK, description="the same for the training track")
-    laps: int = Field(
-        2, ge=1, le=100, description="laps a controller drives: one from standstill, then flying"
+    train_track: str = Field(
+        DEFAULT_TRAINING_TRACK, description="training track: name, random:SEED or CSV file"
     )
-    mode: Literal["lockstep", "realtime"] = Field("lockstep", description="time mode of the runs")
     fmu: Path | None = Field(None, description="FMU that plays the car; the built-in car without")
     fmu_map: Path | None = Field(None, description="how the FMU's variables are ours (TOML)")
     seed: int = Field(0, ge=0, description="of the training drive and of the GP's starts")
     start_speed_mps: float = Field(0.1, ge=0, le=5, description="speed at the start line")
-    time_limit: float = Field(
-        3.0, gt=1, description="a run ends at this multiple of the racing line's time"
-    )
     collect_s: float | None = Field(
         None, ge=1, le=3600, description="length of the training drive [s]; None: the car's tuning"
     )
@@ -42,6 +36,30 @@ class RaceSettings(BaseModel):
     discretisation: Discretisation = PREDICTION
     raceline: RaceLineSettings = RaceLineSettings()
     pursuit: PurePursuitSettings = PurePursuitSettings()
+
+    @property
+    def driven_car(self) -> CarParameters:
+        """With the friction that the line is asked for: whoever drives it must know the same."""
+        grip = self.raceline.friction
+        return self.car if grip is None else self.car.model_copy(update={"friction": grip})
+
+    @property
+    def drive_s(self) -> float:
+        """Length of the training drive."""
+        return self.collect_s or self.car.tuning.pursuit.drive_s
+
+
+class RaceSettings(PreparationSettings):
+    """Settings of ``bayesrace race``; defaults are the shown run."""
+
+    track: str = Field(DEFAULT_RACE_TRACK, description="race track: name, random:SEED or CSV file")
+    laps: int = Field(
+        2, ge=1, le=100, description="laps a controller drives: one from standstill, then flying"
+    )
+    mode: Literal["lockstep", "realtime"] = Field("lockstep", description="time mode of the runs")
+    time_limit: float = Field(
+        3.0, gt=1, description="a run ends at this multiple of the racing line's time"
+    )
     mpc: MpcSettings = MpcSettings()
 
     @model_validator(mode="after")

@@ -49,7 +49,8 @@ from bayesrace.transport import (
 )
 from bayesrace.vehicles import CarSetting, default_car
 from plant.fmu.faults import FmuFault
-from plant.run import End, Run, RunCounters
+from plant.lockstep import End
+from plant.run import Run, RunCounters
 from plant.vehicle import Vehicle, open_vehicle
 
 __all__ = ["PlantProcess", "PlantSettings", "main"]

@@ -11,12 +11,10 @@ from bayesrace.clock import sleep_until_ns
 from bayesrace.messages import Actuation, Decoder, RunRequest, State
 from bayesrace.transport import LOCKSTEP_SPIN_S, Inbox, Item, Kind, Numbering, Publisher
 from plant.fmu.faults import FmuFault
-from plant.laps import LineCounter
+from plant.lockstep import CarRun, End, drive_lockstep, fault_end
 from plant.vehicle import Vehicle
 
-__all__ = ["End", "Run", "RunCounters"]
-
-_WORLD_M: Final = 1e4
+__all__ = ["Run", "RunCounters"]
 
 _REMEMBERED: Final = 1024
 """States whose answers are taken; what answers an older one is stale."""
@@ -39,18 +37,6 @@ class RunCounters:
     def as_dict(self) -> dict[str, int]:
         """Name to count."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
-
-
-@dataclass(frozen=True, slots=True)
-class End:
-    """Why a run ended: a word of ``END_REASONS``, and a sentence."""
-
-    reason: str
-    text: str
-
-
-def _fault(fault: FmuFault) -> End:
-    return End("plant_fault", str(fault))
 
 
 class _Waiting(NamedTuple):
@@ -85,6 +71,7 @@ class Run:
     ) -> None:
         """``delay_s``: added to states and actuations alike when running by the wall clock."""
         self.request = request
+        self._car = CarRun(request, simulator, epoch)
         self._epoch = epoch
         self._delay_ns = round(delay_s * 1e9)
         self._simulator = simulator
@@ -95,95 +82,40 @@ class Run:
         self._react = react
         self._beat = beat
         self._numbering = numbering
-        self._line = LineCounter(
-            request.line_x_m,
-            request.line_y_m,
-            request.line_heading_rad,
-            request.line_left_m,
-            request.line_right_m,
-        )
         # Running by the wall clock:
         self._outbox: deque[tuple[int, State]] = deque()
         self._sampled_ns: dict[int, int] = {}
         self._waiting: list[_Waiting] = []
         self._held: Actuation | None = None
-        simulator.reset(request.x0)
-        self._line.restart(request.x0[0], request.x0[1])
 
     @property
     def laps(self) -> int:
         """Start-line crossings so far."""
-        return self._line.crossings
+        return self._car.laps
 
     @property
     def time_s(self) -> float:
         """Plant time since the start."""
-        return self._simulator.time_s
+        return self._car.time_s
 
     def execute(self) -> End:
         """Drive until something ends the run."""
         if self.request.lockstep:
             self._inbox.spin_s = LOCKSTEP_SPIN_S
             try:
-                return self._lockstep()
+                first = self._publisher.next_seq
+                return drive_lockstep(self._car, first, self._exchange, self._beat)
             finally:
                 self._inbox.spin_s = 0.0
         with self._inbox.stamped():
             return self._wall_clock()
 
-    # Both modes --------------------------------------------------------------------------------
-
-    def _sample(self, seq: int, answers: tuple[float, ...] = (), final: bool = False) -> State:
-        """The state as the sensors tell it now."""
-        simulator, request = self._simulator, self.request
-        return State(
-            seq,
-            time.monotonic_ns(),
-            self._epoch,
-            request.run,
-            simulator.time_s,
-            tuple(simulator.x.tolist()),
-            simulator.u_applied,
-            self._line.crossings,
-            request.lockstep,
-            answers,
-            final,
-        )
-
-    def _finished(self) -> End | None:
-        """Judges the state that has just been reached."""
-        x, y = float(self._simulator.x[0]), float(self._simulator.x[1])
-        if not (abs(x) <= _WORLD_M and abs(y) <= _WORLD_M):
-            return End("left_world", f"the car is {_WORLD_M:g} m away or nowhere")
-        laps = self._line.move(x, y)
-        if 0 < self.request.laps <= laps:
-            return End("laps", f"{laps} lap(s) done")
-        if self._simulator.time_s >= self.request.max_time_s:
-            return End("max_time", f"time limit of {self.request.max_time_s:g} s reached")
-        return None
-
     # Lockstep ----------------------------------------------------------------------------------
 
-    def _lockstep(self) -> End:
-        end: End | None = None
-        while True:
-            seq = self._publisher.next_seq
-            self._publisher.put(self._sample(seq, final=end is not None), lockstep=True)
-            if end is not None:
-                return end
-            answer = self._answer_to(seq)
-            if isinstance(answer, End):
-                return answer
-            if (end := self._beat()) is not None:
-                continue
-            try:
-                self._simulator.step(answer)
-            except FmuFault as fault:
-                end = _fault(fault)  # the state before is the last there is: once more, as final
-                continue
-            end = self._finished()
-            if end is not None and end.reason == "left_world":
-                return end  # no message could carry this state
+    def _exchange(self, state: State) -> tuple[float, ...] | End:
+        """Sends the state and waits for its answer; nothing answers the last one."""
+        self._publisher.put(state, lockstep=True)
+        return () if state.final else self._answer_to(state.seq)
 
     def _answer_to(self, seq: int) -> tuple[float, ...] | End:
         """Waits for the actuation that answers this state, or for what ends the run."""
@@ -217,7 +149,7 @@ class Run:
     def _wall_clock(self) -> End:
         period_ns = round(self._simulator.step_s * 1e9)
         seq = self._publisher.next_seq
-        first = self._sample(seq)
+        first = self._car.sample(seq)
         start_ns = first.source_time_ns
         self._enqueue(first)
         while True:
@@ -229,11 +161,11 @@ class Run:
             if end is not None:
                 return end
             answers, end = self._drive_period(begin_ns, begin_ns + period_ns, seq)
-            end = end or self._finished()
+            end = end or self._car.finished()
             if end is not None and end.reason == "left_world":
                 return end  # no message could carry this state
             seq += 1
-            self._enqueue(self._sample(seq, answers, final=end is not None))
+            self._enqueue(self._car.sample(seq, answers, final=end is not None))
             if end is not None:
                 if self._outbox:
                     self._sleep_and_send(self._outbox[-1][0])
@@ -308,7 +240,7 @@ class Run:
         try:
             simulator.step_switched(commands)
         except FmuFault as fault:
-            end = _fault(fault)
+            end = fault_end(fault)
         if self._held is None or self._held.state_seq < seq:
             self._counters.late += 1
         return tuple(answers[: 3 * _MOST_ANSWERS]), end

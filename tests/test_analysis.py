@@ -11,7 +11,8 @@ from rich.console import Console
 
 from bayesrace.errors import InputError
 from bayesrace.vehicles import default_car
-from experiments.analysis import analyse, read_race, read_result, time_laps, write_result
+from experiments.analysis import analyse, read_race, read_result, write_result
+from experiments.laps import time_laps
 from experiments.results import LapResult, RaceResult
 from experiments.table import COLUMNS, print_table
 from tests.synthetic_race import LAP_S, LINE_M, STEP_S, Drive, Floats, circle, track, write_race

@@ -15,13 +15,14 @@ from typing import Any
 import pytest
 from hdrh.log import HistogramLogReader
 
-from bayesrace.tracks import Track, load_track
+from bayesrace.tracks import Track
 from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
 from experiments.drive import RunPlan, run_request
 from experiments.latency.histograms import new_histogram
 from experiments.latency.legs import LEGS
-from experiments.preparation import PreparationSettings, Prepared, prepare
+from experiments.preparation import Prepared, prepare
 from experiments.progress import stages_on
+from experiments.settings import PreparationSettings
 from tests.command_line import Cli, refused
 from tests.programs import COMMAND, ROOT, environment, finish, leftovers, peanut, run, start, until
 from tests.shared import session_folder
@@ -36,14 +37,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
 
     track = peanut(tmp_path_factory.mktemp("track") / "peanut.csv")
     with stages_on(Console(quiet=True)) as stages:
-        return prepare(PreparationSettings(track=str(track)), stages)
-
-
-def given(files: Prepared) -> list[str]:
-    return [
-        "--weights", str(files.weights), "--artefact", str(files.artefact),
-        "--raceline", str(files.raceline), "--track", str(files.track),
-    ]  # fmt: skip
+        return prepare(PreparationSettings(), (str(track),), stages)
 
 
 @dataclass
@@ -65,7 +59,7 @@ def loaded(files: Prepared, tmp_path_factory: pytest.TempPathFactory) -> Run:
 
     def make(folder: Path) -> None:
         process = start(
-            "latency", *given(files), "--duration", "3", "--load", "1", "--out", folder / "run",
+            "latency", *files.arguments, "--duration", "3", "--load", "1", "--out", folder / "run",
             "--json", folder / "copy.json",
         )  # fmt: skip
         done = finish(process)
@@ -158,7 +152,7 @@ def _observing(out: Path) -> bool:
 def test_killed_controller_ends_it_with_a_reason_and_a_report(
     files: Prepared, tmp_path: Path
 ) -> None:
-    process = start("latency", *given(files), "--duration", "60", "--out", tmp_path / "run")
+    process = start("latency", *files.arguments, "--duration", "60", "--out", tmp_path / "run")
     until(lambda: _observing(tmp_path / "run"), "time observed")
     controller = _child_pid(process.pid, "controller")
     assert controller is not None
@@ -175,7 +169,7 @@ def test_killed_controller_ends_it_with_a_reason_and_a_report(
 @pytest.mark.check
 def test_interrupt_leaves_a_report_and_no_process(files: Prepared, tmp_path: Path) -> None:
     out = tmp_path / "run"
-    process = start("latency", *given(files), "--duration", "60", "--load", "1", "--out", out)
+    process = start("latency", *files.arguments, "--duration", "60", "--load", "1", "--out", out)
     until(lambda: _observing(out), "time observed")
     time.sleep(1.0)
     process.send_signal(signal.SIGINT)
@@ -189,7 +183,7 @@ def test_interrupt_leaves_a_report_and_no_process(files: Prepared, tmp_path: Pat
 def test_killed_measurement_takes_its_children_along(files: Prepared, tmp_path: Path) -> None:
     """The busy processes above all: nobody would look for them."""
     out = tmp_path / "run"
-    process = start("latency", *given(files), "--duration", "60", "--load", "2", "--out", out)
+    process = start("latency", *files.arguments, "--duration", "60", "--load", "2", "--out", out)
     until(lambda: _observing(out), "time observed")
     assert len(_with_parent(process.pid)) == 5
     process.kill()
@@ -242,8 +236,7 @@ def _driving(
         )
         stack.enter_context(
             _process([
-                *COMMAND, "controller", "--artefact", str(files.artefact),
-                "--track", str(files.track), "--raceline", str(files.raceline),
+                *COMMAND, "controller", *files.arguments,
                 "--weights", str(files.weights), "--endpoint", plant, "--listen", controller,
                 "--name", "other",
             ])
@@ -265,7 +258,7 @@ def _attached(endpoints: list[str], out: Path) -> dict[str, Any]:
 
 @pytest.mark.check
 def test_a_running_system_is_measured_and_left_running(files: Prepared, tmp_path: Path) -> None:
-    with _driving(files, load_track(files.track), []) as (endpoints, director):
+    with _driving(files, files.course.track, []) as (endpoints, director):
         result = _attached(endpoints, tmp_path / "run")
         assert director.status("plant").phase == "running"
         assert director.status("controller").phase == "driving"
@@ -302,7 +295,7 @@ def test_clock_of_another_host_is_found_and_corrected(files: Prepared, tmp_path:
     if why_not := _time_namespaces():
         pytest.skip(f"time namespaces are not allowed here: {why_not}")
     prefix = ["unshare", "--time", "--monotonic=1000", "--fork", "--kill-child"]
-    with _driving(files, load_track(files.track), prefix) as (endpoints, _):
+    with _driving(files, files.course.track, prefix) as (endpoints, _):
         result = _attached(endpoints, tmp_path / "run")
     clocks = result["clocks"]
     assert clocks["shared"] is False

@@ -8,14 +8,15 @@ import pytest
 
 from bayesrace.errors import InputError
 from bayesrace.messages import State
-from bayesrace.tracks import DEFAULT_TRAINING_TRACK, load_track
-from bayesrace.vehicles import get_car
+from bayesrace.tracks import DEFAULT_TRAINING_TRACK, Track, load_track
+from bayesrace.vehicles import default_car
 from bayesrace.vehicles.models import dynamic
 from controller.pure_pursuit import PurePursuit, PurePursuitSettings
-from plant.laps import LineCounter
+from experiments.closed_loop import ClosedLoop, Driven
 from plant.simulator import Simulator
+from tests.conftest import offset_line
 
-CAR = get_car("orca")
+CAR = default_car()
 SIMULATOR = Simulator(dynamic(CAR))
 
 
@@ -28,32 +29,27 @@ def first_state(x0: tuple[float, ...]) -> State:
     return State(0, 0, 0, 0, 0.0, x0, (0.0, 0.0), 0, True, (), False)
 
 
+TRACK = Track.from_points("oval", np.column_stack(oval()[:2]), 0.5, 0.5)
+
+
 def drive(
-    driver: PurePursuit, x0: tuple[float, ...], laps: int, time_s: float
-) -> tuple[int, Any, Any]:
-    """Laps done, states (n, 7) and applied inputs (n, 2)."""
-    line = LineCounter(x0[0], x0[1], x0[2], 0.5, 0.5)
-    line.restart(x0[0], x0[1])
-    SIMULATOR.reset(x0)
-    driver.reset(first_state(x0))
-    u = np.zeros(2)
-    states, inputs = [], []
-    while line.crossings < laps and SIMULATOR.time_s < time_s:
-        SIMULATOR.step(driver.step(SIMULATOR.x, u).u.tolist())
-        u[:] = SIMULATOR.u_applied
-        states.append(SIMULATOR.x.copy())
-        inputs.append(u.copy())
-        line.move(float(SIMULATOR.x[0]), float(SIMULATOR.x[1]))
-    return line.crossings, np.array(states), np.array(inputs)
+    driver: PurePursuit,
+    laps: int,
+    time_s: float,
+    track: Track = TRACK,
+    x0: tuple[float, ...] | None = None,
+) -> Driven:
+    line = offset_line(track, 0.0, 5.0, 1.5)
+    return ClosedLoop(CAR, track, line, driver, SIMULATOR).drive(laps, time_s, x0=x0)
 
 
 START = (2.0, 0.0, math.pi / 2, 0.1, 0.0, 0.0, 0.0)
 
 
 def test_it_laps_an_oval_without_leaving_it() -> None:
-    laps, states, _ = drive(PurePursuit(CAR, *oval()), START, 2, 60.0)
-    assert laps == 2
-    radius = np.hypot(states[:, 0] / 2, states[:, 1])
+    driven = drive(PurePursuit(CAR, *oval()), 2, 60.0)
+    assert driven.lap[-1] == 2
+    radius = np.hypot(driven.x[:, 0] / 2, driven.x[:, 1])
     assert np.abs(radius - 1).max() < 0.2
 
 
@@ -65,8 +61,9 @@ def test_it_laps_a_built_in_track_within_the_cars_limits(seed: int) -> None:
     xy = track.position(s_m)
     driver = PurePursuit(CAR, xy[:, 0], xy[:, 1], np.full(400, 1.6), PurePursuitSettings(seed=seed))
     clipped = SIMULATOR.guard.counters.clipped
-    laps, states, inputs = drive(driver, (*track.start_pose(), 0.1, 0.0, 0.0, 0.0), 2, 60.0)
-    assert laps == 2
+    driven = drive(driver, 2, 60.0, track)
+    states, inputs = driven.x, driven.u
+    assert driven.lap[-1] == 2
     assert SIMULATOR.guard.counters.clipped == clipped, "it saturates as the car does"
     assert (inputs[:, 0] >= CAR.d_min).all()
     assert (inputs[:, 0] <= CAR.d_max).all()
@@ -80,7 +77,7 @@ def test_it_laps_a_built_in_track_within_the_cars_limits(seed: int) -> None:
 
 def test_the_seed_and_nothing_else_decides_the_disturbance() -> None:
     runs = [
-        drive(PurePursuit(CAR, *oval(), PurePursuitSettings(seed=seed)), START, 1, 3.0)[1]
+        drive(PurePursuit(CAR, *oval(), PurePursuitSettings(seed=seed)), 1, 3.0).x
         for seed in (5, 5, 6)
     ]
     np.testing.assert_array_equal(runs[0], runs[1])
@@ -90,9 +87,9 @@ def test_the_seed_and_nothing_else_decides_the_disturbance() -> None:
 def test_a_mirrored_line_is_driven_with_mirrored_steering() -> None:
     quiet = PurePursuitSettings(excite_d=0.0, excite_delta_rad=0.0)
     x, y, v = oval()
-    _, left, _ = drive(PurePursuit(CAR, x, y, v, quiet), START, 1, 3.0)
+    left = drive(PurePursuit(CAR, x, y, v, quiet), 1, 3.0, x0=START).x
     mirrored = (*START[:2], -START[2], *START[3:])
-    _, right, _ = drive(PurePursuit(CAR, x, -y, v, quiet), mirrored, 1, 3.0)
+    right = drive(PurePursuit(CAR, x, -y, v, quiet), 1, 3.0, x0=mirrored).x
     signs = np.array([1, -1, -1, 1, -1, -1, -1])
     np.testing.assert_allclose(right, left * signs, rtol=0, atol=1e-6)
 

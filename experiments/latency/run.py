@@ -21,9 +21,10 @@ from experiments.latency.stand import (
     measurement,
     open_folder,
 )
-from experiments.preparation import PreparationSettings, Prepared, prepare
+from experiments.preparation import Prepared, prepare
 from experiments.processes import child
 from experiments.progress import Stages
+from experiments.settings import PreparationSettings
 
 __all__ = ["measure_latency"]
 
@@ -43,11 +44,12 @@ def measure_latency(settings: LatencySettings, out: Path, stages: Stages) -> Mea
     check_new(out)
     track = load_track(settings.track, settings.car.width_m)
     files = prepare(
-        PreparationSettings(car=settings.car, track=settings.track),
+        PreparationSettings(car=settings.car),
+        (settings.track,),
         stages,
-        settings.raceline,
-        settings.weights,
-        settings.artefact,
+        raceline=settings.raceline,
+        weights=settings.weights,
+        artefact=settings.artefact,
     )
     open_folder(out, settings)
     with ExitStack() as stack:
@@ -79,8 +81,7 @@ def _started(settings: LatencySettings, files: Prepared, out: Path) -> Iterator[
     both += ["--fifo", str(realtime.fifo)] if realtime.fifo else []
     plant = ["plant", "--endpoint", plant_endpoint, *both]
     controller = [
-        "controller", "--artefact", str(files.artefact), "--track", str(files.track),
-        "--raceline", str(files.raceline), "--weights", str(files.weights),
+        "controller", *files.arguments,
         "--endpoint", plant_endpoint, "--listen", controller_endpoint, *both,
     ]  # fmt: skip
     with (

@@ -9,7 +9,8 @@ from bayesrace.gp.weights import GpWeights, encode_weights
 from bayesrace.messages import State
 from bayesrace.vehicles import get_car
 from controller.assembly import predictive_controller
-from controller.driver import Driver
+from controller.cycle import Cycle
+from controller.driver import Decision
 from controller.native_step import NativeStep
 from controller.path_table import make_path_table
 from controller.process_settings import ControllerSettings
@@ -30,18 +31,21 @@ def replayed(course: Course, states: Sequence[State], weights: Mapping[int, GpWe
     """
     files = course.track_file, course.line_file
     controller = predictive_controller(course.artefact, CAR, *files, weights=course.weights_file)
-    settings = ControllerSettings()
-    driver = Driver(controller, CAR, settings.fallback, settings.compensation, settings.stale_s)
-    inputs = []
-    for index, state in enumerate(states):
-        if index in weights:
-            controller.set_weights(encode_weights(weights[index]))
-        if index:
-            driver.prepare(driver.states.interval_s)
-        assert driver.observe(state)
-        driver.decide(state, state.time_s)
-        decision = driver.settle()
+    cycle = Cycle(controller, CAR, ControllerSettings())
+    inputs: list[tuple[float, float]] = []
+
+    def take_over() -> None:
+        if len(inputs) in weights:
+            controller.set_weights(encode_weights(weights[len(inputs)]))
+
+    def send(_: State, decision: Decision) -> None:
         inputs.append((decision.d, decision.delta_rate))
+        take_over()
+
+    take_over()
+    for state in states:
+        assert cycle.driver.observe(state)
+        cycle.answer(state, send)
     return np.array(inputs)
 
 

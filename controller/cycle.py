@@ -1,0 +1,76 @@
+"""The control cycle with its execution times, for whoever carries the messages.
+
+:mod:`controller.process` receives states and sends actuations over the network;
+``experiments.closed_loop`` does so by function calls. Both answer a lockstep state by
+:meth:`Cycle.answer`, so their runs are equal to the bit.
+"""
+
+import time
+from collections.abc import Callable
+
+from bayesrace.messages import Actuation, State, Telemetry
+from bayesrace.vehicles.parameters import CarParameters
+from controller.driver import Decision, Driver
+from controller.interface import Controller
+from controller.process_settings import ControllerSettings
+from controller.telemetry import Timing, telemetry_of
+
+__all__ = ["Cycle"]
+
+
+class Cycle:
+    """Drives one car with one controller; for one thread."""
+
+    def __init__(
+        self, controller: Controller, car: CarParameters, settings: ControllerSettings
+    ) -> None:
+        """``car``: whose limits hold."""
+        self.driver = Driver(
+            controller,
+            car,
+            settings.fallback,
+            settings.compensation,
+            settings.stale_s,
+            settings.hold,
+        )
+        self.timing = Timing()
+        self._controller = controller
+
+    def answer(self, state: State, send: Callable[[State, Decision], None]) -> None:
+        """Answers a state of a lockstep run, then prepares for the next one."""
+        self.timing.released_ns = time.monotonic_ns()
+        self.decide(state, state.time_s, 0.0)
+        send(state, self.driver.settle())
+        self.prepare(self.driver.states.interval_s, 0.0)
+
+    def decide(self, state: State, basis_s: float, budget_s: float) -> None:
+        """:meth:`Driver.decide`, timed."""
+        begin_ns = time.perf_counter_ns()
+        self.driver.decide(state, basis_s, budget_s)
+        self.timing.solve_us = (time.perf_counter_ns() - begin_ns) * 1e-3
+
+    def prepare(self, period_s: float, budget_s: float) -> None:
+        """:meth:`Driver.prepare`, timed."""
+        begin_ns = time.perf_counter_ns()
+        self.driver.prepare(period_s, budget_s)
+        self.timing.prepare_us = (time.perf_counter_ns() - begin_ns) * 1e-3
+
+    def actuation(self, seq: int, state: State, decision: Decision) -> Actuation:
+        """The message that answers ``state``."""
+        return Actuation(
+            seq,
+            time.monotonic_ns(),
+            state.epoch,
+            state.run,
+            state.seq,
+            decision.basis_s,
+            (decision.d, decision.delta_rate),
+            self._controller.weights_version,
+            decision.status,
+        )
+
+    def telemetry(self, seq: int, state: State, decision: Decision, received_ns: int) -> Telemetry:
+        """How the cycle went; counts it."""
+        self.timing.ticks += 1
+        self.timing.received_ns = received_ns
+        return telemetry_of(seq, state, decision, self.timing)

@@ -1,0 +1,55 @@
+"""Lap times of a trajectory."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesrace.tracks import StartLine, Track
+
+__all__ = ["LapTimes", "time_laps"]
+
+Floats = NDArray[np.float64]
+
+SHORT_CUT: Final = 0.15
+"""A leap along the centreline from one sample to the next of more than this share of the track
+leaves out a piece of it: what comes after is no lap. (At 4 m/s a sample is .08 m.)"""
+
+
+@dataclass(frozen=True)
+class LapTimes:
+    """The laps of one run, in order."""
+
+    times_s: tuple[float, ...]
+    after: tuple[int, ...]
+    """Index of the first sample after each lap's end."""
+    cut_at: int | None
+    """Index of the sample before which the car left out a piece of the track; no later lap
+    counts. None if it never did."""
+
+
+def time_laps(track: Track, time_s: Floats, xy: Floats, s_m: Floats) -> LapTimes:
+    """Laps of a trajectory: times (n,), positions (n, 2), arc lengths on the centreline (n,).
+
+    A lap ends where the car has crossed the start line once more forwards than backwards since the
+    last one; the crossing is interpolated within the sampling period. The first lap begins at
+    plant time 0.
+    """
+    line, crossings = StartLine(track), 0
+    ends: list[float] = [0.0]
+    after: list[int] = []
+    half = track.length_m / 2
+    leap = np.abs((np.diff(s_m) + half) % track.length_m - half)
+    cuts = np.flatnonzero(leap > SHORT_CUT * track.length_m)
+    cut_at = int(cuts[0]) + 1 if len(cuts) else None
+    points = [(float(x), float(y)) for x, y in xy[:cut_at]]
+    for k in range(1, len(points)):
+        crossing = line.crossing(points[k - 1], points[k])
+        crossings += crossing.direction
+        if crossings <= len(after):
+            continue
+        before_s = float(time_s[k - 1])
+        ends.append(before_s + crossing.fraction * (float(time_s[k]) - before_s))
+        after.append(k)
+    return LapTimes(tuple(np.diff(ends).tolist()), tuple(after), cut_at)

@@ -1,0 +1,126 @@
+"""A run of the car without transport or clock: start, laps, end, and the loop of a lockstep run.
+
+The plant process exchanges states for inputs over the network; ``experiments.closed_loop`` does so
+by a function call. Both drive the car through :func:`drive_lockstep`, so their runs are equal to
+the bit.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from bayesrace.messages import RunRequest, State
+from plant.fmu.faults import FmuFault
+from plant.laps import LineCounter
+from plant.vehicle import Vehicle
+
+__all__ = ["CarRun", "End", "drive_lockstep", "fault_end"]
+
+_WORLD_M: Final = 1e4
+
+
+@dataclass(frozen=True, slots=True)
+class End:
+    """Why a run ended: a word of ``END_REASONS``, and a sentence."""
+
+    reason: str
+    text: str
+
+
+def fault_end(fault: FmuFault) -> End:
+    """The end of a run whose car has failed."""
+    return End("plant_fault", str(fault))
+
+
+class CarRun:
+    """The car of one run: reset to its start, sampled as states, its laps counted, its end found.
+
+    Raises InputError if the car cannot be in the start state, FmuFault if it fails at that.
+    """
+
+    def __init__(self, request: RunRequest, vehicle: Vehicle, epoch: int) -> None:
+        """``epoch``: of the plant, as its states carry it."""
+        self.request, self.vehicle = request, vehicle
+        self._epoch = epoch
+        self._line = LineCounter(
+            request.line_x_m,
+            request.line_y_m,
+            request.line_heading_rad,
+            request.line_left_m,
+            request.line_right_m,
+        )
+        vehicle.reset(request.x0)
+        self._line.restart(request.x0[0], request.x0[1])
+
+    @property
+    def laps(self) -> int:
+        """Start-line crossings so far."""
+        return self._line.crossings
+
+    @property
+    def time_s(self) -> float:
+        """Plant time since the start."""
+        return self.vehicle.time_s
+
+    def sample(self, seq: int, answers: tuple[float, ...] = (), final: bool = False) -> State:
+        """The state as the sensors tell it now."""
+        vehicle, request = self.vehicle, self.request
+        return State(
+            seq,
+            time.monotonic_ns(),
+            self._epoch,
+            request.run,
+            vehicle.time_s,
+            tuple(vehicle.x.tolist()),
+            vehicle.u_applied,
+            self._line.crossings,
+            request.lockstep,
+            answers,
+            final,
+        )
+
+    def finished(self) -> End | None:
+        """Counts laps in the state that has just been reached; what ends the run, if anything."""
+        x, y = float(self.vehicle.x[0]), float(self.vehicle.x[1])
+        if not (abs(x) <= _WORLD_M and abs(y) <= _WORLD_M):
+            return End("left_world", f"the car is {_WORLD_M:g} m away or nowhere")
+        laps = self._line.move(x, y)
+        if 0 < self.request.laps <= laps:
+            return End("laps", f"{laps} lap(s) done")
+        if self.vehicle.time_s >= self.request.max_time_s:
+            return End("max_time", f"time limit of {self.request.max_time_s:g} s reached")
+        return None
+
+
+def drive_lockstep(
+    car: CarRun,
+    first_seq: int,
+    exchange: Callable[[State], tuple[float, ...] | End],
+    beat: Callable[[], End | None] = lambda: None,
+) -> End:
+    """Drives in lockstep until something ends the run.
+
+    ``exchange`` hands over a state, numbered from ``first_seq`` on, and returns the input (2,) that
+    answers it, or what ends the run; nothing answers a final state. ``beat`` is called once a
+    period; what it returns, if anything, ends the run, too.
+    """
+    seq = first_seq
+    end: End | None = None
+    while True:
+        answer = exchange(car.sample(seq, final=end is not None))
+        if end is not None:
+            return end
+        if isinstance(answer, End):
+            return answer
+        seq += 1
+        if (end := beat()) is not None:
+            continue
+        try:
+            car.vehicle.step(answer)
+        except FmuFault as fault:
+            end = fault_end(fault)  # the state before is the last there is: once more, as final
+            continue
+        end = car.finished()
+        if end is not None and end.reason == "left_world":
+            return end  # no message could carry this state

@@ -1,0 +1,137 @@
+"""The closed loop in one process: the same run, to the bit, as two processes over Zenoh."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bayesrace.gp.weights import read_weights
+from bayesrace.log import LogReader, LogWriter
+from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY, Event
+from bayesrace.raceline import read_raceline
+from bayesrace.recorder import Recorder
+from bayesrace.tracks import load_track
+from bayesrace.transport import Director, Endpoints, Publisher, free_endpoint, open_session
+from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles.models import dynamic
+from controller.assembly import compiled_controller
+from controller.pure_pursuit import PurePursuit, PurePursuitSettings
+from experiments.closed_loop import ClosedLoop
+from experiments.collect import collect
+from experiments.drive import RunPlan, execute
+from learning.logs import dataset_from_log
+from plant.fmu.faults import FmuFault
+from plant.simulator import Simulator
+from tests.conftest import Circuit
+from tests.network.cars import gentle_course, start_controller, start_plant
+from tests.programs import PATIENCE_S
+
+PLANS = (
+    RunPlan(1, "one lap", 1, 100.0, True),
+    RunPlan(2, "the time is up", 0, 1.0, True, start_speed_mps=0.5),
+)
+CLOCKS = {
+    "source_time_ns", "epoch", "released_ns", "received_ns", "wake_us", "decode_us", "prepare_us",
+    "solve_us", "encode_us",
+}  # fmt: skip
+"""Fields that differ from run to run."""
+
+
+def told(log: Path) -> list[dict[str, Any]]:
+    """States, actuations and telemetry, all fields but the clocks', and how the runs ended."""
+    reader = LogReader(log)
+    messages = [entry.message for entry in reader.messages((STATE, ACTUATION, TELEMETRY))]
+    messages.sort(key=lambda one: (type(one).__name__, one.seq))
+    rows = [
+        {name: getattr(one, name) for name in one.__slots__ if name not in CLOCKS}
+        | {"seq": one.seq}
+        for one in messages
+    ]
+    ends = [
+        {name: event.data[name] for name in ("reason", "time_s", "laps", "braked", "clipped")}
+        for event in reader.select(EVENT)
+        if event.kind == "run_ended"
+    ]
+    assert reader.refused == 0
+    assert len(ends) == len(PLANS)
+    return rows + ends
+
+
+def test_a_run_is_that_of_two_processes_over_zenoh_to_the_bit(
+    tmp_path: Path, car: CarParameters
+) -> None:
+    course = gentle_course(tmp_path, speed_mps=2.5)
+    track, line = load_track(course.track_file, car.width_m), read_raceline(course.line_file)
+    at_plant, at_controller = free_endpoint(), free_endpoint()
+    with (
+        start_plant(tmp_path, at_plant, "--low-latency") as plant,
+        start_controller(tmp_path, course, at_plant, at_controller, "--low-latency") as controller,
+        open_session(Endpoints(connect=(at_plant, at_controller))) as session,
+        Recorder(session, "orca", tmp_path / "zenoh.mcap") as recorder,
+    ):
+        director = Director(session, "orca")
+        director.wait_for(("plant", "controller"), PATIENCE_S)
+        events: Publisher[Event] = Publisher(session, EVENT, "orca", "race")
+        for plan in PLANS:
+            execute(director, events, track, plan, recorder)
+        controller.end()
+        plant.end()
+
+    weights = read_weights(course.weights_file)
+    compiled = compiled_controller(course.artefact, car, track, line, weights)
+    log = LogWriter(tmp_path / "own.mcap")
+    loop = ClosedLoop(car, track, line, compiled, log=log)
+    driven = [
+        loop.drive(plan.laps, plan.max_time_s, plan.start_speed_mps, name=plan.controller)
+        for plan in PLANS
+    ]
+    log.close()
+    assert told(tmp_path / "own.mcap") == told(tmp_path / "zenoh.mcap")
+    first, second = driven
+    assert (first.end.reason, second.end.reason) == ("laps", "max_time")
+    assert len(first.laps_s) == first.lap[-1] == 1
+    assert first.time_s[-2] <= first.laps_s[0] <= first.time_s[-1]
+    assert first.x[:, 3].max() > 1.8
+    assert second.x.shape == (51, 7)
+    assert second.u.shape == (*second.levels.shape, 2) == (50, 2)
+    assert not second.statuses.any()
+    states = LogReader(tmp_path / "own.mcap").select(STATE)
+    for run, one in enumerate(driven, 1):
+        assert np.array_equal(one.x, [state.x for state in states if state.run == run])
+
+
+class Failing(Simulator):
+    """A car that fails after a second."""
+
+    def step(self, u: Sequence[float] | None) -> None:
+        """As the built-in car, 50 times."""
+        if self.steps == 50:
+            raise FmuFault("it has crashed")
+        super().step(u)
+
+
+def test_a_fault_of_the_car_ends_the_run(
+    circuit: Circuit, car: CarParameters, tmp_path: Path
+) -> None:
+    line, vehicle = circuit.line, Failing(dynamic(car))
+    pursuit = PurePursuit(car, line.x_m, line.y_m, line.vx_mps)
+    driven = ClosedLoop(car, circuit.track, line, pursuit, vehicle).drive()
+    assert driven.end.reason == "plant_fault"
+    assert len(driven.x) == len(driven.u) + 1 == 51
+    assert len(driven.samples()) > 40
+    arguments = circuit.track, line, car, tmp_path / "log.mcap", 2.0, PurePursuitSettings()
+    with pytest.raises(FmuFault, match="it has crashed"):
+        collect(*arguments, vehicle=vehicle)
+
+
+def test_samples_are_those_of_its_log(circuit: Circuit, car: CarParameters, tmp_path: Path) -> None:
+    line = circuit.line
+    pursuit = PurePursuit(car, line.x_m, line.y_m, line.vx_mps)
+    log = LogWriter(tmp_path / "log.mcap")
+    driven = ClosedLoop(car, circuit.track, line, pursuit, log=log).drive(1)
+    log.close()
+    logged = dataset_from_log(tmp_path / "log.mcap", car, driven.step_s)
+    assert len(logged) > 100
+    assert driven.samples().digest() == logged.digest()

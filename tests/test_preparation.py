@@ -1,0 +1,114 @@
+"""What is prepared once is not prepared again, and is said to come from the cache."""
+
+import io
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from bayesrace.gp.weights import GpWeights
+from bayesrace.raceline import cached
+from bayesrace.tracks import Track
+from experiments import preparation
+from experiments.preparation import Prepared, prepare
+from experiments.progress import stages_on
+from experiments.settings import PreparationSettings
+from tests.car_fmu import packed_car
+from tests.conftest import offset_line
+
+SETTINGS = PreparationSettings(train_track="random:2", collect_s=2.0)
+
+Preparing = Callable[..., tuple[Prepared, list[str]]]
+
+
+@pytest.fixture
+def preparing(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    weights: GpWeights,
+    kinematic_artefact: Path,
+) -> Preparing:
+    """Prepares in an empty cache, with these changes; what the console shows. A line and weights
+    that take no time take the place of those computed; the controller is built already."""
+    monkeypatch.setenv("BAYESRACE_CACHE", str(tmp_path / "cache"))
+    shutil.copytree(kinematic_artefact, tmp_path / "cache" / kinematic_artefact.name)
+
+    def compute(track: Track, *_: object) -> object:
+        return offset_line(track, 0.01, 5.0, 2.5)
+
+    monkeypatch.setattr(cached, "compute_raceline", compute)
+    monkeypatch.setattr(preparation, "train", lambda *_: weights)
+
+    def run(**changes: object) -> tuple[Prepared, list[str]]:
+        console = Console(file=io.StringIO(), width=200)
+        with stages_on(console) as stages:
+            prepared = prepare(SETTINGS.model_copy(update=changes), ("random:1",), stages)
+        assert isinstance(console.file, io.StringIO)
+        lines = console.file.getvalue().splitlines()
+        cached_stages = [line.split(":")[0] for line in lines if line.endswith(": from the cache")]
+        return prepared, cached_stages
+
+    return run
+
+
+STAGES = [
+    "racing line, random",
+    "racing line, random",
+    "training drive (pure pursuit)",
+    "train the residual",
+    "build the controllers",
+]
+
+
+def test_a_second_preparation_computes_nothing_and_says_so(
+    preparing: Preparing, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, stages = preparing()
+    assert stages == ["build the controllers"]
+
+    def never(*_: object) -> None:
+        raise AssertionError("computed again")
+
+    for module, name in ((cached, "compute_raceline"), (preparation, "collect")):
+        monkeypatch.setattr(module, name, never)
+    monkeypatch.setattr(preparation, "train", never)
+    again, stages = preparing()
+    assert stages == STAGES
+    assert again.arguments == first.arguments
+    assert again.artefacts == first.artefacts
+    assert first.training is not None
+    assert again.training is not None
+    assert again.training.log == first.training.log
+    assert again.training.samples.digest() == first.training.samples.digest()
+    assert len(again.training.samples) > 80
+
+
+def test_the_training_drive_is_kept_for_all_that_shapes_it(preparing: Preparing) -> None:
+    logs = set()
+    for changes in (
+        {},
+        {"seed": 1},
+        {"collect_s": 2.5},
+        {"start_speed_mps": 0.2},
+        {"train_track": "random:3"},
+        {"pursuit": SETTINGS.pursuit.model_copy(update={"lookahead_s": 0.06})},
+        {"fmu": packed_car()},
+    ):
+        prepared, _ = preparing(**changes)
+        assert prepared.training is not None
+        logs.add(prepared.training.log)
+    assert len(logs) == 7
+
+
+def test_a_damaged_training_drive_is_driven_again(preparing: Preparing) -> None:
+    prepared, _ = preparing()
+    assert prepared.training is not None
+    log = prepared.training.log
+    whole = log.read_bytes()
+    log.write_bytes(whole[: len(whole) // 2])
+    again, stages = preparing()
+    assert "training drive (pure pursuit)" not in stages
+    assert again.training is not None
+    assert again.training.samples.digest() == prepared.training.samples.digest()
