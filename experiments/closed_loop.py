@@ -142,7 +142,7 @@ class ClosedLoop:
         concern lockstep."""
         self._car, self._track, self._line = car, track, line
         self._vehicle = vehicle or Simulator(dynamic(car))
-        self._cycle = Cycle(controller, car, settings or ControllerSettings(car=car.name))
+        self._cycle = Cycle(controller, car, settings or ControllerSettings(car=car))
         self._controller = controller
         self._log = None if log is None else _Messages(log, car.name)
         self._run = self._seq = 0

@@ -19,6 +19,9 @@ from bayesrace.vehicles import (
     write_car,
 )
 from bayesrace.vehicles.files import MODELS, SECTIONS
+from codegen.build import problem_of
+from codegen.problems.generate import c_header
+from codegen.settings import BuildSettings
 from experiments.settings import RaceSettings
 from tests.command_line import Cli
 
@@ -139,24 +142,18 @@ def test_tuning_follows_from_the_cars_own_scales(tmp_path: Path) -> None:
     assert stated_one.model_copy(update={"turn": pace}) == small.tuning
 
 
-def test_the_constants_in_c_are_those_of_the_reference_car() -> None:
-    """Until the native code takes them from the tuning, they must not drift apart."""
-    native = Path(__file__).parents[1] / "controller" / "native"
-    turn, path = default_car().tuning.turn, default_car().tuning.path
-    expected = {
-        "SLOW_MPS": turn.slow_mps, "AWAY_RAD": turn.away_rad, "FACED_RAD": turn.faced_rad,
-        "AHEAD_M": turn.ahead_m, "TANGENT_M": turn.tangent_m, "BEHIND_RAD": turn.behind_rad,
-        "WIDER_M": turn.wider_m, "PACE_MPS": turn.pace_mps, "STOP_MPS": turn.stop_mps,
-        "TOO_FAST_MPS": turn.too_fast_mps, "THROTTLE": turn.throttle_spm,
-        "WINDOW_BACK_M": path.window_back_m, "WINDOW_AHEAD_M": path.window_ahead_m,
-        "SPACING_MAX_M": path.spacing_max_m, "SPACING_MIN_M": path.spacing_min_m,
-        "FAR_M": path.far_m, "SPEED_MAX_MPS": path.speed_max_mps,
-    }  # fmt: skip
-    found: dict[str, float] = {}
-    for source in native.glob("*.c"):
-        text = source.read_text()
-        found |= {n: float(v) for n, v in re.findall(r"#define (\w+) ([\d.e-]+)", text)}
-    assert {name: found.get(name, value) for name, value in expected.items()} == expected
+def test_the_planner_in_c_is_compiled_with_the_numbers_of_the_car(tmp_path: Path) -> None:
+    toml, _ = example()
+    car = read_car(written(tmp_path, toml))
+    header = c_header(problem_of(BuildSettings(car=car)))
+    turn, path, scale = car.tuning.turn, car.tuning.path, car.tuning.scale
+    assert turn.pace_mps > 0.8  # 0.5 for the 1:43 car
+    for line in (
+        f"#define BR_TURN_PACE_MPS {turn.pace_mps!r}",
+        f"#define BR_PATH_WINDOW_AHEAD_M {path.window_ahead_m!r}",
+        f"{scale.speed_mps!r}, {scale.speed_mps!r}, {scale.yaw_rate_radps!r}",
+    ):
+        assert line in header
 
 
 def test_settings_hold_the_whole_car(tmp_path: Path) -> None:

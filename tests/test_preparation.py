@@ -93,7 +93,7 @@ def test_the_training_drive_is_kept_for_all_that_shapes_it(preparing: Preparing)
         {"collect_s": 2.5},
         {"start_speed_mps": 0.2},
         {"train_track": "random:3"},
-        {"pursuit": SETTINGS.pursuit.model_copy(update={"lookahead_s": 0.06})},
+        {"car": SETTINGS.car.model_copy(update={"mass_kg": 0.05})},
         {"fmu": packed_car()},
     ):
         prepared, _ = preparing(**changes)
