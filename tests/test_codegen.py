@@ -18,7 +18,7 @@ from bayesrace.errors import InputError
 from bayesrace.integrators import PERFECT, PREDICTION, Discretisation
 from bayesrace.interpreter import RUN_MODULE
 from bayesrace.manifest import LIBRARY, MANIFEST, read_manifest
-from bayesrace.native_interface import ABI
+from bayesrace.native_interface import ABI, INFO, STATUSES
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import MODELS
 from codegen.build import build, build_hash, generate
@@ -26,6 +26,7 @@ from codegen.compiler import CompileError, Compiler, find_compiler
 from codegen.problems.problem import Problem
 from codegen.settings import BuildSettings
 from codegen.stage import linearise_function
+from controller.native_library import StepInfo, StepStatus
 from controller.native_step import NativeStep
 from controller.settings import MpcSettings
 
@@ -280,6 +281,15 @@ def test_a_manifest_of_another_interface_is_refused(artefact: Path, car: CarPara
     (artefact / MANIFEST).write_text(other.model_dump_json())
     with pytest.raises(InputError, match=r"built for interface .*build"):
         load(artefact, car)
+
+
+def test_the_binding_has_the_names_of_the_interface() -> None:
+    """ctypes and annotations for readers and type checkers beside the tables that C is made from."""
+    assert [(one.name, one.value) for one in StepStatus] == [
+        (name, number) for number, (name, _, _) in enumerate(STATUSES)
+    ]
+    assert list(StepInfo.__annotations__) == [name for name, _, _ in INFO]
+    assert StepStatus.TIME_LIMIT.text == "out of time before the plan was usable"
 
 
 @pytest.mark.parametrize("text", ["", "{", "{}", '{"abi": "one"}'])
