@@ -26,8 +26,6 @@ from bayesrace.messages import (
     RunRequest,
     Scalar,
     Status,
-    StatusRequest,
-    car_key,
     peek_seq,
 )
 from bayesrace.realtime import RealtimeSettings, prepare_thread
@@ -43,7 +41,7 @@ from bayesrace.transport import (
     Numbering,
     Publisher,
     Request,
-    ask_all,
+    count_processes,
     decode_request,
     open_session,
 )
@@ -175,7 +173,8 @@ class PlantProcess:
                 f"no controller for car '{self.name}': start one that connects to this plant "
                 "(bayesrace controller)"
             )
-        if (count := self._controllers()) > 1:
+        if (count := count_processes(self._session, self.name, "controller", _STATUS_S)) > 1:
+            # Their actuations could not be told apart.
             return f"{count} controllers drive car '{self.name}'; end all but one"
         try:
             self._run = Run(
@@ -196,12 +195,6 @@ class PlantProcess:
         self._run_number = message.run
         self._runs += 1
         return ""
-
-    def _controllers(self) -> int:
-        """How many answer under this car's name; their actuations could not be told apart."""
-        key = car_key(STATUS.key, self.name, "controller")
-        request = StatusRequest(0, time.monotonic_ns())
-        return len(ask_all(self._session, (key,), request, _STATUS_S)[key])
 
     def _overheard(self, item: Item) -> None:
         """An actuation when nothing is driven: received, and no more."""
@@ -227,8 +220,11 @@ class PlantProcess:
         self._run = None
         if run is None:
             return
-        if end.reason in ("laps", "max_time") and (count := self._controllers()) > 1:
-            end = End("several_controllers", f"{end.text}, but {count} controllers drove the car")
+        if end.reason in ("laps", "max_time"):
+            count = count_processes(self._session, self.name, "controller", _STATUS_S)
+            if count > 1:
+                words = f"{end.text}, but {count} controllers drove the car"
+                end = End("several_controllers", words)
         self._text = f"run {message.run} ended after {run.time_s:.2f} s: {end.text}"
         # A fault is the FMU's, and its last words are in the text.
         level = logging.ERROR if end.reason == "plant_fault" else logging.INFO

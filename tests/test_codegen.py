@@ -284,7 +284,7 @@ def test_a_manifest_of_another_interface_is_refused(artefact: Path, car: CarPara
 
 
 def test_the_binding_has_the_names_of_the_interface() -> None:
-    """ctypes and annotations for readers and type checkers beside the tables that C is made from."""
+    """They are written out for readers and type checkers; C is made from the tables."""
     assert [(one.name, one.value) for one in StepStatus] == [
         (name, number) for number, (name, _, _) in enumerate(STATUSES)
     ]

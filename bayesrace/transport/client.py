@@ -35,6 +35,7 @@ __all__ = [
     "RefusedError",
     "ask",
     "ask_all",
+    "count_processes",
     "decisive",
     "fetch_all",
     "send_rollback",
@@ -154,6 +155,15 @@ def ask_all(
     return answers
 
 
+def count_processes(
+    session: Any, car: str, source: str, timeout_s: float = STATUS.timeout_s
+) -> int:
+    """How many processes answer as the ``source`` of a car, as far as this session sees them."""
+    key = car_key(STATUS.key, car, source)
+    request = StatusRequest(0, time.monotonic_ns())
+    return len(_valid(Status, ask_all(session, (key,), request, timeout_s)[key]))
+
+
 def fetch_all(session: Any, service: Service[Any, Any], car: str) -> list[bytes]:
     """The answers of all other processes, as bytes: for answers that are no messages."""
     key = car_key(service.key, car)
@@ -238,11 +248,8 @@ class Director:
 
         Their messages cannot be told apart: each would drive, or be driven, now and then.
         """
-        request = StatusRequest(0, time.monotonic_ns())
-        sources = {car_key(STATUS.key, self._car, one): one for one in ("plant", "controller")}
-        answers = ask_all(self._session, sources, request, STATUS.timeout_s)
-        for key, source in sources.items():
-            if (count := len(answers[key])) > 1:
+        for source in ("plant", "controller"):
+            if (count := count_processes(self._session, self._car, source)) > 1:
                 raise InputError(
                     f"{count} processes are the {source} of car '{self._car}'; end all but one, or "
                     "give each car a name of its own (--name)"
