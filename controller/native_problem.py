@@ -44,6 +44,7 @@ class NativeProblem:
         problem, n = self.manifest.problem, self.manifest.horizon
         self._nx, self._nu = len(problem.states), len(problem.inputs)
         self._step_s = self.manifest.step_s
+        self._reference_shape = (n, len(problem.stage_parameters))
         self._parameters = parameters_type(problem)()
         self.u = np.zeros(self._nu)
         self.info = StepInfo()
@@ -177,9 +178,8 @@ class NativeProblem:
     ) -> StepStatus:
         """As :meth:`step`, with the stage parameters (N, np) of another planner."""
         rows = np.ascontiguousarray(reference, dtype=np.float64)
-        wanted = (self.manifest.horizon, len(self.manifest.problem.stage_parameters))
-        if rows.shape != wanted:
-            raise InputError(f"reference has shape {rows.shape}, not {wanted}")
+        if rows.shape != self._reference_shape:
+            raise InputError(f"reference has shape {rows.shape}, not {self._reference_shape}")
         self._x[:] = x
         self._u_before[:] = u_before
         error = self._library.br_mpc_solve(
@@ -242,7 +242,7 @@ class NativeProblem:
 
     def read_reference(self) -> Reference:
         """The stage parameters of the last step, (N, np)."""
-        rows = np.zeros((self.manifest.horizon, len(self.manifest.problem.stage_parameters)))
+        rows = np.zeros(self._reference_shape)
         self._library.br_mpc_get_reference(self._mpc, _address(rows))
         return rows
 

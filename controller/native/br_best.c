@@ -11,7 +11,7 @@ static void note(const br_mpc *mpc, br_best *best, br_mpc_status status) {
 
 static void put_back(br_mpc *mpc, const br_best *best) {
     mpc->plan = best->plan;
-    mpc->linearised = mpc->qp.factorised = 0;
+    mpc->linearised = mpc->qp.factorised = mpc->qp.evaluated = 0;
     mpc->info.stationarity = best->info.stationarity;
     mpc->info.defect = best->info.defect;
     mpc->info.bound = best->info.bound;

@@ -71,6 +71,7 @@ typedef struct {
     int factorised;     /* g, h, and y, scale, m of the rows before BR_ROW_LATE fit the linearisation */
     int regularised;    /* the exact Hessian was not positive definite */
     double curvature;   /* share of the second-order part that is in h */
+    int evaluated;      /* terms belong to the plan, the reference and the parameters */
     br_stage_terms terms[BR_N];
     br_stage_curvature second[BR_N];
     double penalty[BR_NR]; /* of the soft rows */

@@ -28,7 +28,7 @@ void br_undo_preparation(br_mpc *mpc) {
     if (mpc->ahead) {
         mpc->plan = mpc->kept;
         memcpy(mpc->qp.sense, mpc->kept_sense, sizeof mpc->kept_sense);
-        mpc->linearised = mpc->qp.factorised = 0;
+        mpc->linearised = mpc->qp.factorised = mpc->qp.evaluated = 0;
     }
     mpc->ahead = 0;
 }

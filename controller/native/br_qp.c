@@ -259,17 +259,21 @@ static inline __attribute__((always_inline)) void fill_rows(br_qp *qp, const int
         for (int r = 0; r < BR_M; ++r) qp->m[i * BR_M + r] = qp->scale[i] * qp->y[r][i];
 }
 
-/* The rows' sensitivities to input r, columns of y: row r of the problem is h_x G. */
-static void fill_sensitivities(br_qp *qp, const int first, const int last, int input, double *y) {
+/* Columns of y for these rows of the problem: their sensitivities h_x G to all inputs. */
+static void fill_sensitivities(br_qp *qp, const int first, const int last) {
     for (int r = first; r < last; ++r)
-        for (int k = input / BR_NU; k < BR_N; ++k) {
-            double sum = 0;
-            for (int n = BR_ROW_START[r]; n < BR_ROW_START[r + 1]; ++n) {
+        for (int k = 0; k < BR_N; ++k) {
+            BR_ALIGNED double row[BR_MP];
+            double weight[BR_NX];
+            const double *sensitivity[BR_NX];
+            int count = 0;
+            for (int n = BR_ROW_START[r]; n < BR_ROW_START[r + 1]; ++n, ++count) {
                 const int i = BR_ROW_INDEX[n];
-                const double h = r < BR_NR_EARLY ? BR_ROW_CONSTANT[BR_NX * r + i] : qp->terms[k].gradient[n];
-                sum += h * qp->g[k + 1][i][input];
+                weight[count] = r < BR_NR_EARLY ? BR_ROW_CONSTANT[BR_NX * r + i] : qp->terms[k].gradient[n];
+                sensitivity[count] = qp->g[k + 1][i];
             }
-            y[BR_ROW(r, k)] = sum;
+            combine(row, padded(BR_NU * (k + 1)), 0, count, weight, sensitivity);
+            for (int c = 0; c < BR_NU * (k + 1); ++c) qp->y[c][BR_ROW(r, k)] = row[c];
         }
 }
 
@@ -298,8 +302,8 @@ static void transform(br_qp *qp) {
         double *y = qp->y[r];
         memset(y, 0, sizeof qp->y[r]);
         y[r] = 1.0;
-        fill_sensitivities(qp, 0, BR_NR_EARLY, r, y);
     }
+    fill_sensitivities(qp, 0, BR_NR_EARLY);
     substitute(qp, 0, BR_ROW_LATE);
     for (int r = 0; r < BR_M; ++r)
         for (int i = 0; i < BR_ROW_LATE; ++i) norm2[i] += qp->y[r][i] * qp->y[r][i];
@@ -364,9 +368,9 @@ static void fill_least_distance(br_mpc *mpc) {
     for (int r = 0; r < BR_M; ++r) {
         double *y = qp->y[r];
         for (int i = BR_ROW_LATE; i < BR_COLS; ++i) y[i] = 0;
-        fill_sensitivities(qp, BR_NR_EARLY, BR_NR, r, y);
         y[BR_ROWS] = qp->gradient[r];
     }
+    fill_sensitivities(qp, BR_NR_EARLY, BR_NR);
     substitute(qp, BR_ROW_LATE, BR_COLS);
     for (int r = 0; r < BR_M; ++r) {
         const double *restrict y = qp->y[r], v = y[BR_ROWS];

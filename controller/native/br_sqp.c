@@ -10,7 +10,7 @@
 #include "br_internal.h"
 
 static void linearise(br_mpc *mpc, int first) {
-    mpc->qp.factorised = 0;
+    mpc->qp.factorised = mpc->qp.evaluated = 0;
     mpc->linearised = 1;
     for (int k = first; k < BR_N; ++k)
         br_stage_linearise(&mpc->gp[mpc->gp_in_use], mpc->plan.x[k], mpc->plan.u[k],
@@ -42,7 +42,7 @@ void br_sqp_roll_out(br_mpc *mpc, const double u[BR_NU]) {
     }
     br_qp_forget_working_set(&mpc->qp);
     mpc->linearised = 1;
-    mpc->qp.factorised = 0;
+    mpc->qp.factorised = mpc->qp.evaluated = 0;
 }
 
 /* By one stage. */

@@ -156,6 +156,7 @@ static br_mpc_error begin(br_mpc *mpc, const request *r, int *plausible) {
     memcpy(mpc->x0, r->x, sizeof mpc->x0);
     memcpy(mpc->u_before, r->u_before, sizeof mpc->u_before);
     br_evaluate_bounds(mpc);
+    mpc->qp.evaluated = 0;
     mpc->info.prepared_iterations = mpc->prepared_iterations;
     mpc->prepared_iterations = 0;
     return BR_OK;
