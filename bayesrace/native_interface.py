@@ -91,7 +91,7 @@ ERRORS: Final = (
 """What is wrong with a call, from 0 on: name, text."""
 
 _FUNCTIONS: Final = 6
-"""Raised by whoever changes a function of bayesrace_mpc.h."""
+"""Version of the functions in bayesrace_mpc.h: increase it with each change of a signature."""
 
 ABI: Final = zlib.crc32(repr((SOLVER, INFO, STATUSES, ERRORS, _FUNCTIONS)).encode()) & 0x7FFFFFFF
 """Number of the interface: library and binding must have the same."""

@@ -192,7 +192,7 @@ class Recorder:
         try:
             with self._lock:
                 self._writer.flush()
-            # A file that has been deleted takes everything, and nobody will ever read it.
+            # Writing to a deleted file succeeds, but its content is lost.
             self._path.stat()
         except (OSError, ValueError) as error:
             self._fail(error)

@@ -14,7 +14,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from bayesrace.cache import cache_folder, digest, locked, software
+from bayesrace.cache import cache_folder, digest, locked, note_use, software
 from bayesrace.cpu import cpu_digest, cpu_identity
 from bayesrace.errors import InputError
 from bayesrace.manifest import (
@@ -164,6 +164,7 @@ def build(
         except InputError:
             return None
         progress(f"{settings.model}: cached")
+        note_use(made=False)
         return target, manifest
 
     if found := built():
@@ -183,6 +184,7 @@ def build(
             for one in (folder, folder / LIBRARY):
                 one.chmod(0o755)  # whatever the umask: what others may write is not loaded
             folder.rename(target)
+    note_use(made=True)
     return target, manifest
 
 

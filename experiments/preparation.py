@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal
 
-from bayesrace.cache import cache_folder, digest, kept, note_use, software
+from bayesrace.cache import cache_folder, digest, kept, software
 from bayesrace.cpu import cpu_identity
 from bayesrace.errors import InputError
 from bayesrace.files import read_whole, replacing
@@ -259,7 +259,4 @@ def _artefact(settings: PreparationSettings, model: PredictionModel) -> Path:
     wanted = BuildSettings(car=settings.driven_car, discretisation=settings.discretisation)
     if model == "dynamic":
         wanted = BuildSettings.best_case(settings.driven_car)
-    said: list[str] = []
-    folder, _ = build(wanted, said.append)
-    note_use(made=said != [f"{wanted.model}: cached"])
-    return folder
+    return build(wanted)[0]

@@ -46,7 +46,7 @@ END_REASONS: Final = (
 """Why a run ended, in the ``kind="run_ended"`` event's data under ``reason``; plant_fault: what
 plays the car has failed, and its last good state is sent once more as the final one; abandoned: who
 started it has been gone for long; several_controllers: at its regular end more than one was there,
-so that nobody knows which one has driven."""
+so that the actuations of the run cannot be attributed."""
 
 PHASES: Final = ("idle", "running", "waiting", "ready", "driving", "fallback", "stopped")
 """Of a process, see :class:`Status`."""

@@ -137,10 +137,10 @@ def _made_for(path: Path) -> LineIdentity | None:
     """None unless the comments say all of it."""
     text = read_text(path, "the racing line")
     found = (_KEY.fullmatch(row) for row in text.splitlines() if row.startswith("#"))
-    told = {match[1]: match[2] for match in found if match}
+    values = {match[1]: match[2] for match in found if match}
     try:
-        width_m, friction = float(told["width_m"]), float(told["friction"])
-        made = LineIdentity(told["car"], width_m, friction, told["track"], told["settings"])
+        width_m, friction = float(values["width_m"]), float(values["friction"])
+        made = LineIdentity(values["car"], width_m, friction, values["track"], values["settings"])
     except (KeyError, ValueError):
         return None
     return made if math.isfinite(width_m) and math.isfinite(friction) else None

@@ -71,8 +71,8 @@ def ask(
 
     Repeats the request if the link broke while it was pending, as when a machine stalls for longer
     than the lease, and the service is repeatable. If several processes answer to one name,
-    :func:`decisive` chooses among the valid answers. Raises InputError if nobody answers in time,
-    or nobody validly.
+    :func:`decisive` chooses among the valid answers. Raises InputError if there is no valid
+    answer in time.
     """
     if service.answer is None:
         raise TypeError(f"the answer of '{service.name}' is not a message; use fetch_all")

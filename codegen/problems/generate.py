@@ -1,7 +1,7 @@
 """From a problem to C: its functions (br_model.c) and its sizes, structures and sparsity
 (br_problem.h). The runtime in controller/native knows a problem by these alone."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import casadi as ca
@@ -21,10 +21,7 @@ def _parts(problem: Problem) -> list[ca.Function]:
     s, rows = problem.symbols, problem.rows
     stage = [s.x, s.u, s.u_before, s.last, s.p, s.theta]
     names = ["x", "u", "u_before", "last", "p", "theta"]
-    values, lower, upper = (
-        ca.vertcat(*(getattr(row, name) for row in rows)) if rows else ca.SX(0, 1)
-        for name in ("value", "lower", "upper")
-    )
+    values, lower, upper = (_of_rows(problem, name) for name in ("value", "lower", "upper"))
     gradient = ca.gradient(problem.cost, ca.veccat(s.x, s.u, s.u_before))
     terms = [problem.cost, ca.densify(gradient), *map(ca.densify, (values, lower, upper))]
     terms.append(_nonzeros(_row_jacobian(problem).T))
@@ -35,7 +32,7 @@ def _parts(problem: Problem) -> list[ca.Function]:
     options = {"cse": True}
     penalties = ca.vertcat(*(0 if r.penalty is None else r.penalty for r in rows))
     return [
-        ca.Function("br_terms", stage, [_one(terms)], names, ["terms"], options),
+        ca.Function("br_terms", stage, [ca.vertcat(*terms)], names, ["terms"], options),
         ca.Function(
             "br_curvature",
             [*stage, multiplier],
@@ -54,8 +51,9 @@ def _parts(problem: Problem) -> list[ca.Function]:
     ]  # fmt: skip
 
 
-def _one(parts: Iterable[ca.SX]) -> ca.SX:
-    return ca.vertcat(*parts)
+def _of_rows(problem: Problem, name: str) -> ca.SX:
+    """One field of all rows, such as their values."""
+    return ca.vertcat(ca.SX(0, 1), *(getattr(row, name) for row in problem.rows))
 
 
 def _nonzeros(matrix: ca.SX) -> ca.SX:
@@ -65,8 +63,7 @@ def _nonzeros(matrix: ca.SX) -> ca.SX:
 
 
 def _row_jacobian(problem: Problem) -> ca.SX:
-    values = ca.vertcat(*(row.value for row in problem.rows)) if problem.rows else ca.SX(0, 1)
-    return ca.jacobian(values, problem.symbols.x)
+    return ca.jacobian(_of_rows(problem, "value"), problem.symbols.x)
 
 
 def _hessians_in_x(problem: Problem, multiplier: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -174,7 +171,6 @@ def c_header(problem: Problem) -> str:
         "#define BR_PROBLEM_H",
         f"#define BR_NX {nx} /* {', '.join(one.name for one in states)} */",
         f"#define BR_NU {len(inputs)} /* {', '.join(one.name for one in inputs)} */",
-        f"#define BR_NP {len(problem.stage_parameters)} /* parameters of a stage */",
         f"#define BR_NPARAMETERS {len(problem.parameters)} /* run-time parameters */",
         f"#define BR_NZ {len(problem.features)} /* features: {', '.join(problem.features)} */",
         f"#define BR_NE {problem.outputs} /* outputs of the residual */",
