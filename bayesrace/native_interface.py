@@ -5,32 +5,54 @@ problem (sizes, parameters) is in each artefact's manifest instead.
 """
 
 import zlib
+from collections.abc import Iterable
 from typing import Final
 
-__all__ = ["ABI", "ERRORS", "INFO", "SOLVER", "STATUSES", "c_interface"]
+__all__ = [
+    "ABI",
+    "COUNTERS",
+    "DECISION",
+    "DELAYS",
+    "DRIVING",
+    "ERRORS",
+    "INFO",
+    "LEVELS",
+    "MEASURED",
+    "NO_STEP",
+    "PHASES",
+    "SOLUTION",
+    "SOLVER",
+    "STATUSES",
+    "c_fields",
+    "c_interface",
+]
 
 SOLVER: Final = (
-    ("tolerance", "double", "of the scaled KKT residual for BR_CONVERGED"),
-    ("defect_max", "double", "largest dynamics defect of an acceptable plan"),
+    ("tolerance", "double", "KKT residual (scaled) of a converged step", "> 0"),
+    ("defect_max", "double", "largest dynamics defect of a usable plan", "> 0"),
     (
         "settle",
         "double",
-        "a step ends at this stationarity and tenth of the defect, or earlier: see br_step.c",
+        "a step ends at this stationarity and tenth of it as defect, or earlier: see br_step.c",
+        ">= 0",
     ),
     (
         "iterations",
         "int",
         "SQP iterations a step without budget may use, once the defect is below 0.01",
+        ">= 1",
     ),
     (
         "iterations_cold",
         "int",
         "the same for the first step after a reset; with a budget the larger limits every step",
+        ">= 1",
     ),
 )
-"""Settings of the solver: name, type, meaning. They follow the problem's parameters."""
+"""Settings of the solver: name, type, meaning, range. They follow the problem's parameters."""
 
 INFO: Final = (
+    ("status", "int", "br_mpc_status"),
     ("iterations", "int", "SQP iterations used, those of a second start included"),
     ("qp_iterations", "int", "active-set iterations, summed"),
     ("regularised", "int", "iterations whose Hessian had to be made positive definite"),
@@ -90,32 +112,172 @@ ERRORS: Final = (
 )
 """What is wrong with a call, from 0 on: name, text."""
 
-_FUNCTIONS: Final = 6
-"""Version of the functions in bayesrace_mpc.h: increase it with each change of a signature."""
+NO_STEP: Final = (
+    ("UNPREDICTABLE", 252, "the state cannot be predicted to the moment of acting"),
+    ("HALTED", 253, "the car is not to be driven"),
+    ("NO_STATE", 254, "the newest state is too old"),
+    ("STEP_FAILED", 255, "the step is broken: an exception, or a call that it refuses"),
+)
+"""Statuses of a cycle without a result of a step: name, number, meaning."""
 
-ABI: Final = zlib.crc32(repr((SOLVER, INFO, STATUSES, ERRORS, _FUNCTIONS)).encode()) & 0x7FFFFFFF
+LEVELS: Final = (
+    ("SOLUTION", "the solution"),
+    ("SHIFTED_PLAN", "the plan before, shifted"),
+    ("BRAKE", "braking along the plan's steering, held when the plan is over"),
+    ("STOP", "standing still"),
+)
+"""Levels of the fallback, from 0 on: name, where the input comes from."""
+
+PHASES: Final = (
+    ("WAITING", "for a state"),
+    ("READY", "states arrive; go has not been said"),
+    ("DRIVING", "the input is the solution"),
+    ("FALLBACK", "the input is the fallback's"),
+    ("STOPPED", "stop has been said: the car brakes to standstill, and stays"),
+)
+"""Life cycle of a controller, from 0 on: name, meaning."""
+
+DELAYS: Final = 64
+"""Most measured delays that come with one state."""
+
+MEASURED: Final = (
+    ("epoch", "int64", "random number of the plant's process"),
+    ("run", "int64", "number of the run"),
+    ("seq", "int64", "number of the state among those of its plant"),
+    ("time_s", "double", "plant time since the start of the run"),
+    ("x", "states", "as measured"),
+    ("u_applied", "inputs", "acted during the period before"),
+    ("lockstep", "int", "1: the plant waits for the answer"),
+    ("delays", "int", "how many delays follow"),
+    ("delays_s", "delays", "from the basis of an input to its acting, measured since the last one"),
+)
+"""A state as a controller receives it: name, type, meaning."""
+
+DRIVING: Final = (
+    ("u_low", "inputs", "what no input is below"),
+    ("u_high", "inputs", "what no input is above"),
+    ("brake_fade_mps", "double", "speed below which braking fades to none at standstill"),
+    ("standing_mps", "double", "a car that is not faster stands"),
+    ("stop_mps2", "double", "deceleration of a stop on command"),
+    ("shifted_s", "double", "how long after its first input a plan may be driven"),
+    ("limit_tolerance", "double", "excess over a limit that is clipped, not refused"),
+    ("recover_cycles", "int", "usable solutions in a row that end braking"),
+    ("compensation", "int", "the delay: 0 none, 1 measured, 2 fixed"),
+    ("delay_s", "double", "the fixed one"),
+    ("longest_s", "double", "no prediction goes farther"),
+    ("stale_s", "double", "age from which a state is fallen back from"),
+)
+"""Settings of the control cycle: name, type, meaning."""
+
+SOLUTION: Final = (
+    ("u", "inputs", "first input of the plan"),
+    ("rows", "int", "of the plan; 0: none"),
+    ("plan_u", "plan", "planned inputs"),
+    ("plan_step_s", "double", "time from one row of the plan to the next"),
+    ("second_start", "int", "as in br_mpc_info"),
+    ("cost", "double", "of the plan; -1: not known"),
+    ("shifted_cost", "double", "of the plan before, shifted; -1: there was none"),
+)
+"""What a controller's step hands out: name, type, meaning."""
+
+DECISION: Final = (
+    ("u", "inputs", "to be sent: finite, and within the limits"),
+    ("status", "int", "of the step, 0: usable; or why there was none"),
+    ("level", "int", "of the fallback"),
+    ("stepped", "int", "1: a step has been made"),
+    ("epoch", "int64", "of the state that this answers"),
+    ("run", "int64", "of that state"),
+    ("seq", "int64", "of that state"),
+    ("basis_s", "double", "plant time up to which the state is known"),
+    ("delay_s", "double", "prediction from there to the moment of acting"),
+    ("step_us", "double", "execution time of the step; 0 without a clock"),
+    ("late_s", "double", "how much later than its budget it was made; not above 0: in time"),
+)
+"""What one cycle decides: name, type, meaning."""
+
+COUNTERS: Final = (
+    ("levels", "levels", "cycles by level of the fallback; those on command are not among them"),
+    ("failed", "int64", "steps that were broken"),
+    ("second_starts", "int64", "steps that looked for another plan"),
+    ("cost_jumps", "int64", "steps whose plan costs much more than to go on with the one before"),
+    ("stale", "int64", "states of the run under way that were not newer than one before"),
+    ("foreign", "int64", "states of another plant or run, or far ahead, that were not driven on"),
+    ("phase", "int", "life cycle of the controller, at this moment"),
+    ("delay_s", "double", "delay that is compensated, at this moment"),
+    ("interval_s", "double", "plant time between two states in a row; 0: not known"),
+)
+"""What a control cycle has counted: name, type, meaning."""
+
+_FUNCTIONS: Final = 7
+"""Version of the functions in the public headers: increase it with each change of a signature."""
+
+_TABLES: Final = (
+    SOLVER, INFO, STATUSES, ERRORS, NO_STEP, LEVELS, PHASES, DELAYS, MEASURED, DRIVING, SOLUTION,
+    DECISION, COUNTERS, _FUNCTIONS,
+)  # fmt: skip
+
+ABI: Final = zlib.crc32(repr(_TABLES).encode()) & 0x7FFFFFFF
 """Number of the interface: library and binding must have the same."""
+
+_ARRAYS: Final = {
+    "states": ("double", "BR_NX"),
+    "inputs": ("double", "BR_NU"),
+    "plan": ("double", "BR_N * BR_NU"),
+    "delays": ("double", str(DELAYS)),
+    "levels": ("int64_t", str(len(LEVELS))),
+}
+
+
+def _enum(prefix: str, table: Iterable[tuple[str, int, str]], name: str) -> list[str]:
+    return [
+        "typedef enum {",
+        *(f"    BR_{prefix}{one} = {number}, /* {text} */" for one, number, text in table),
+        f"}} {name};",
+    ]
+
+
+def c_fields(table: Iterable[tuple[str, ...]]) -> list[str]:
+    """The members of a structure in C, a line each."""
+    lines = []
+    for field, kind, text, *_ in table:
+        element, size = _ARRAYS.get(kind, (kind.replace("int64", "int64_t"), ""))
+        lines.append(f"    {element} {field}{f'[{size}]' if size else ''}; /* {text} */")
+    return lines
+
+
+def _struct(table: Iterable[tuple[str, ...]], name: str) -> list[str]:
+    return ["typedef struct {", *c_fields(table), f"}} {name};"]
+
+
+def _each(table: Iterable[tuple[str, ...]]) -> str:
+    """The members of a structure as arguments of one of two macros."""
+    return " ".join(f"{'WHOLE' if kind == 'int' else 'REAL'}({name})" for name, kind, *_ in table)
 
 
 def c_interface() -> str:
-    """The content of br_interface.h."""
+    """The content of br_interface.h; it follows br_config.h and br_problem.h."""
+    statuses = [(name, n, why) for n, (name, _, why) in enumerate(STATUSES)]
     return "\n".join([
         "/* generated from bayesrace/native_interface.py */",
         "#ifndef BR_INTERFACE_H",
         "#define BR_INTERFACE_H",
+        "#include <stdint.h>",
         f"#define BR_ABI {ABI}",
-        "typedef enum {",
-        *(f"    BR_{name} = {n}, /* {text} */" for n, (name, text) in enumerate(ERRORS)),
-        "} br_mpc_error;",
-        "typedef enum {",
-        *(f"    BR_{name} = {n}, /* {why} */" for n, (name, _, why) in enumerate(STATUSES)),
-        "} br_mpc_status;",
-        "typedef struct {",
-        *(f"    {kind} {name}; /* {text} */" for name, kind, text in INFO),
-        "} br_mpc_info;",
-        "#define BR_SOLVER_SETTINGS \\",
-        *(f"    {kind} {name}; /* {text} */ \\" for name, kind, text in SOLVER),
-        "",
+        f"#define BR_DELAYS {DELAYS}",
+        *_enum("", [(name, n, text) for n, (name, text) in enumerate(ERRORS)], "br_mpc_error"),
+        *_enum("", statuses, "br_mpc_status"),
+        *_enum("", NO_STEP, "br_no_step"),
+        *_enum("", [(name, n, text) for n, (name, text) in enumerate(LEVELS)], "br_level"),
+        *_enum("PHASE_", [(name, n, text) for n, (name, text) in enumerate(PHASES)], "br_phase"),
+        *_struct(INFO, "br_mpc_info"),
+        *_struct(MEASURED, "br_measured"),
+        *_struct(DRIVING, "br_driving"),
+        *_struct(SOLUTION, "br_solution"),
+        *_struct(DECISION, "br_decision"),
+        *_struct(COUNTERS, "br_counters"),
+        f"#define BR_SOLVER_FIELDS(REAL, WHOLE) {_each(SOLVER)}",
+        f"#define BR_DRIVING_FIELDS(REAL, WHOLE) {_each(DRIVING)}",
+        f"#define BR_SOLVER_VALID(p) ({' && '.join(f'(p)->{n} {r}' for n, _, _, r in SOLVER)})",
         "#define BR_ERROR_TEXTS { \\",
         *(f'    "{text}", \\' for _, text in ERRORS),
         "}",

@@ -32,7 +32,7 @@ from bayesrace.vehicles import DEFAULT_CAR, get_car
 from bayesrace.vehicles.models import STATES, dynamic
 from codegen.fmu import pack
 from codegen.fmu.controller import controller_fmu
-from controller.fallback import FallbackSettings
+from controller.cycle_settings import FallbackSettings
 from controller.path_table import make_path_table
 from controller.settings import MpcSettings
 from experiments.closed_loop import Driven, drive_compiled

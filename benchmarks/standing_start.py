@@ -24,8 +24,8 @@ from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK
 from bayesrace.vehicles import DEFAULT_CAR, get_car
 from bayesrace.vehicles.models import dynamic
 from controller.assembly import compiled_controller
-from controller.compensation import CompensationSettings
 from controller.cycle import Cycle
+from controller.cycle_settings import CompensationSettings
 from controller.mpc import PredictiveController
 from controller.process_settings import ControllerSettings
 from experiments.preparation import prepare
@@ -70,13 +70,9 @@ class Rig:
                 self.car.steps, 0, 1, self._run, self.car.time_s, tuple(self.car.x),
                 self.car.u_applied, 0, False, (), False,
             )  # fmt: skip
-            newest = driver.states.newest
-            if blind and newest is not None:
-                driver.decide(newest, state.time_s)
-            else:
+            if not blind:
                 driver.observe(state)
-                driver.decide(state, state.time_s)
-            decision = driver.settle()
+            decision = driver.decide(state.time_s)
             self.car.step((decision.d, decision.delta_rate))
 
     def under_way(self) -> bool:

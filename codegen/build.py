@@ -2,7 +2,8 @@
 
 The artefact folder holds the library, its manifest and everything it was made from (our C, CasADi's
 C, DAQP's headers and static library for this platform, MIT licence), so that it can be rebuilt or
-embedded without Python: ``cc -O3 *.c libdaqpstat.a -I. -lm``.
+embedded without Python: ``cc -O3 *.c libdaqpstat.a -I. -lm``. Its folder ``host`` has C that loads
+racing line, weights and settings from files.
 """
 
 import hashlib
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from codegen.problems.problem import Problem
 
 __all__ = [
+    "HOST",
     "NATIVE",
     "build",
     "build_hash",
@@ -47,8 +49,12 @@ _ROOT: Final = Path(__file__).resolve().parents[1]
 NATIVE: Final = _ROOT / "controller" / "native"
 """The hand-written part of the step: read as files, not imported."""
 
+HOST: Final = "host"
+"""Folder of the C that is for hosts, and no part of the library."""
+
 _SHAPED_BY: Final = (
     "controller/native",
+    "controller/native/host",
     "codegen",
     "bayesrace/vehicles",
     "bayesrace/integrators.py",
@@ -115,8 +121,14 @@ def generate(problem: "Problem", settings: BuildSettings, folder: Path) -> None:
         f"#define BR_TS {settings.discretisation.step_s!r}\n"
         f"#define BR_GP_CAPACITY {settings.gp_capacity}\n"
         f'#define BR_MODEL_NAME "{settings.model}"\n'
+        f'#define BR_MODEL_IDENTITY "{_model_identity(settings)}"\n'
         "#endif\n"
     )
+
+
+def _model_identity(settings: BuildSettings) -> str:
+    """Of the discretised model, as weights name it."""
+    return settings.discretisation.identity(settings.model, get_car(settings.car))
 
 
 def casadi_includes() -> tuple[Path, Path]:
@@ -133,6 +145,7 @@ def _compile(problem: "Problem", settings: BuildSettings, compiler: Compiler, fo
     generate(problem, settings, folder)
     for path in NATIVE.glob("*.[ch]"):
         shutil.copy(path, folder)
+    shutil.copytree(NATIVE / HOST, folder / HOST)
     shutil.copytree(include / "daqp", folder / "daqp")
     # its licence wants to go where its code goes
     shutil.copy(include / "licenses" / "daqp-external" / "LICENSE", folder / "daqp")
@@ -238,7 +251,7 @@ def _manifest(
         model=settings.model,
         car=car.name,
         car_digest=car.digest(),
-        discretisation=settings.discretisation.identity(settings.model, car),
+        discretisation=_model_identity(settings),
         horizon=settings.horizon,
         step_s=settings.discretisation.step_s,
         gp_capacity=settings.gp_capacity,

@@ -67,7 +67,7 @@ class Compiler:
             # A version script instead of --exclude-libs, which zig's linker does not know; -z defs,
             # or a library that lacks a symbol would fail only when it is loaded.
             exports = out.with_suffix(".map")
-            exports.write_text("{ global: br_mpc_*; local: *; };\n")
+            exports.write_text("{ global: br_mpc_*; br_cycle_*; local: *; };\n")
             line += [f"-Wl,--version-script={exports}", "-Wl,-z,defs"]
         done = subprocess.run(line, capture_output=True, text=True, check=False)
         if done.returncode:

@@ -39,15 +39,15 @@ class Cycle:
     def answer(self, state: State, send: Callable[[State, Decision], None]) -> None:
         """Answers a state of a lockstep run, then prepares for the next one."""
         self.timing.released_ns = time.monotonic_ns()
-        self.decide(state, state.time_s, 0.0)
-        send(state, self.driver.settle())
-        self.prepare(self.driver.states.interval_s, 0.0)
+        send(state, self.decide(state.time_s))
+        self.prepare(self.driver.interval_s, 0.0)
 
-    def decide(self, state: State, basis_s: float, budget_s: float) -> None:
+    def decide(self, basis_s: float, budget_s: float = 0.0, spent_s: float = 0.0) -> Decision:
         """:meth:`Driver.decide`, timed."""
         begin_ns = time.perf_counter_ns()
-        self.driver.decide(state, basis_s, budget_s)
+        decision = self.driver.decide(basis_s, budget_s, spent_s)
         self.timing.solve_us = (time.perf_counter_ns() - begin_ns) * 1e-3
+        return decision
 
     def prepare(self, period_s: float, budget_s: float) -> None:
         """:meth:`Driver.prepare`, timed."""

@@ -1,56 +1,59 @@
-"""From states to inputs: stop and go, delay compensation, the step, the fallback. No input/output.
+"""From states to inputs: the control cycle in C (controller/native/br_cycle.c) and its results.
 
-The process around it knows messages and clocks; this knows what is to be driven. Times are the
-plant's unless they say otherwise, so lockstep and free-running mode are the same here.
+The process around it knows messages and clocks; the cycle knows what is to be driven: which states
+count, stop and go, delay compensation, the step, the fallback. Times are the plant's unless they
+say otherwise, so lockstep and free-running mode are the same here.
 """
 
-import math
-from contextlib import suppress
+import ctypes as ct
 from dataclasses import dataclass
-from enum import StrEnum
+from enum import IntEnum, StrEnum
 
-import numpy as np
-
-from bayesrace.errors import InputError
 from bayesrace.messages import State
+from bayesrace.native_interface import NO_STEP
+from bayesrace.transport import Numbering
 from bayesrace.vehicles.parameters import CarParameters
-from controller.compensation import CompensationSettings, DelayCompensator
-from controller.fallback import Fallback, FallbackSettings, Level
+from controller.cycle_settings import CompensationSettings, FallbackSettings, driving_values
 from controller.interface import Controller, StepOutput
-from controller.states import StateStream
+from controller.native_library import aligned_memory
 
-__all__ = ["HALTED", "NO_STATE", "STEP_RAISED", "UNPREDICTABLE", "Decision", "Driver", "Phase"]
+__all__ = [
+    "HALTED",
+    "NO_STATE",
+    "STEP_FAILED",
+    "UNPREDICTABLE",
+    "Decision",
+    "Driver",
+    "Level",
+    "Phase",
+]
 
-STEP_RAISED = 255
-"""Status of a cycle whose step raised an exception."""
+UNPREDICTABLE, HALTED, NO_STATE, STEP_FAILED = (number for _, number, _ in NO_STEP)
+"""Statuses of a cycle without a result of a step: see there."""
 
-NO_STATE = 254
-"""Status of a cycle without a step: the newest state is too old."""
 
-UNPREDICTABLE = 252
-"""Status of a cycle without a step: the state cannot be predicted to the moment of acting."""
+class Level(IntEnum):
+    """Where the input came from; see controller/native/br_fallback.c."""
 
-HALTED = 253
-"""Status of a cycle without a step: the car is not to be driven."""
-
-_JUMP, _JUMP_BY = 2.0, 0.01
-"""A plan that costs more than so many times the one before, shifted, and so much more (m^2)."""
-
-_LONGEST_S = 1.0
-"""Longest piece of dead reckoning."""
+    SOLUTION = 0
+    SHIFTED_PLAN = 1
+    BRAKE = 2
+    STOP = 3
 
 
 class Phase(StrEnum):
-    """Life cycle of a controller."""
+    """Life cycle of a controller: :data:`bayesrace.native_interface.PHASES`, in that order."""
 
     WAITING = "waiting"
-    """For a state."""
     READY = "ready"
-    """States arrive; go has not been said."""
     DRIVING = "driving"
     FALLBACK = "fallback"
     STOPPED = "stopped"
-    """Stop has been said: the car brakes to standstill, and stays."""
+
+
+_PHASES, _LEVELS = tuple(Phase), tuple(Level)
+_NEW, _FOREIGN = 0, 2
+"""BR_STATE_NEW and BR_STATE_FOREIGN; between them, one that is too old."""
 
 
 @dataclass(slots=True)
@@ -65,6 +68,10 @@ class Decision:
     """Plant time up to which the state is known."""
     delay_s: float = 0.0
     """Prediction from there to the moment of acting."""
+    step_us: float = 0.0
+    """Execution time of the step."""
+    late_s: float = 0.0
+    """How much later than its budget it was made; not above 0: in time."""
     output: StepOutput | None = None
     """Of the step, if one was made."""
 
@@ -83,201 +90,126 @@ class Driver:
     ) -> None:
         """``stale_s``: age from which a state is no longer predicted forward but fallen back
         from. ``hold``: wait for :meth:`go`."""
-        self._controller = controller
-        self._fallback = Fallback(car, fallback)
-        self._compensation = DelayCompensator(compensation, controller.predict)
-        self._stale_s = stale_s
-        self._tuning = car.tuning.driving
-        self._stopping_from: tuple[float, float] | None = None
+        self.controller = controller
+        artefact = controller.artefact
+        library = self._library = artefact.library
+        self._memory, memory = aligned_memory(library.br_cycle_memory_size())
+        self._cycle = ct.c_void_p()
+        size = library.br_cycle_memory_size()
+        artefact.check(controller.begin_cycle(memory, size, hold, self._cycle), "control cycle")
+        values = driving_values(car, fallback, compensation, stale_s)
+        settings = ct.byref(artefact.Driving(**values))
+        artefact.check(library.br_cycle_set_driving(self._cycle, settings), "cycle settings")
+        clock = ct.cast(library.br_mpc_monotonic, ct.c_void_p)
+        library.br_cycle_set_clock(self._cycle, clock, None)
+        self._counters = artefact.Counters.from_address(library.br_cycle_counters(self._cycle))
+        self._measured, self._decided = artefact.Measured(), artefact.Decision()
+        self._measured_at = ct.addressof(self._measured)
+        self._decided_at = ct.addressof(self._decided)
+        self._decide = library.br_cycle_decide
+        self._refused: State | None = None
         self.decision = Decision()
         """Of the newest cycle."""
-        self._stepped_s: float | None = None
-        self._vx_mps = 0.0
-        self._standing = False
-        self._reckoned = np.zeros(7)
-        self._reckoned_s: float | None = None
-        self._u_sent = np.zeros(2)
-        self.states = StateStream()
-        self.phase = Phase.WAITING
-        self._halted: Phase | None = Phase.READY if hold else None
-        self.raised = 0
-        """Steps that raised an exception."""
-        self.last_error = ""
-        self.second_starts = 0
-        """Steps that looked for another plan beside the one that went on from before."""
-        self.cost_jumps = 0
-        """Steps whose plan costs much more than to go on with the one before."""
+        self.newest: State | None = None
+        """The newest state that counts."""
+        self.numbering = Numbering()
+        """States received and lost, foreign ones left out."""
+
+    @property
+    def phase(self) -> Phase:
+        """Where in its life the controller is."""
+        phase: int = self._counters.phase
+        return _PHASES[phase]
 
     @property
     def delay_s(self) -> float:
         """Delay that is compensated."""
-        return self._compensation.delay_s
+        delay_s: float = self._counters.delay_s
+        return delay_s
 
     @property
-    def counts(self) -> list[int]:
+    def interval_s(self) -> float:
+        """Plant time between two states in a row; 0: not known."""
+        interval_s: float = self._counters.interval_s
+        return interval_s
+
+    @property
+    def levels(self) -> list[int]:
         """Cycles so far by level of the fallback; those on command are not among them."""
-        return self._fallback.counts
+        return list(self._counters.levels)
+
+    def count(self, name: str) -> int:
+        """One of the counters of :data:`bayesrace.native_interface.COUNTERS`."""
+        return int(getattr(self._counters, name))
 
     @property
     def fallen_back(self) -> bool | None:
         """Whether the newest input was the fallback's for want of a solution; None: the car is
         not driven, or its state is not known."""
-        decision = self.decision
-        if self._standing or decision.status in (HALTED, NO_STATE):
+        if self.decision.status in (HALTED, NO_STATE):
             return None
-        return decision.level is not Level.SOLUTION
+        return self.decision.level is not Level.SOLUTION
 
     def stop(self) -> None:
         """From the next cycle on slow down along the line to standstill, and stay."""
-        self._halted = Phase.STOPPED
+        self._library.br_cycle_stop(self._cycle)
 
     def go(self) -> None:
         """From the next cycle on drive."""
-        self._halted = self._stopping_from = None
-        self._controller.limit_speed(math.inf, 0.0)
+        self._library.br_cycle_go(self._cycle)
 
     def lost(self, silent: bool) -> State | None:
         """The run is over, its plant has gone, or, ``silent``, nothing has come for long.
 
-        Any other may follow, such as the state that is returned: see :meth:`StateStream.forget`.
+        Any other may follow, such as the state that is returned: the last one refused, of a
+        lockstep run whose plant may still want an answer.
         """
-        self.phase = Phase.WAITING
-        self.states.end()
-        return self.states.forget() if silent else None
+        if not silent:
+            self._library.br_cycle_end(self._cycle)
+            return None
+        return self._refused if self._library.br_cycle_forget(self._cycle) else None
 
     def observe(self, state: State) -> bool:
-        """Takes a state that has arrived; False if it is an old one."""
-        before = self.states.newest
-        if not self.states.accept(state):
+        """Takes a state that has arrived; False if it is not to be driven on."""
+        measured = self._measured
+        measured.epoch, measured.run, measured.seq = state.epoch, state.run, state.seq
+        measured.time_s, measured.lockstep = state.time_s, state.lockstep
+        measured.x[:] = state.x
+        measured.u_applied[:] = state.u_applied
+        delays_s = state.answers[2::3]
+        measured.delays = len(delays_s)
+        measured.delays_s[: len(delays_s)] = delays_s
+        reception = self._library.br_cycle_observe(self._cycle, self._measured_at)
+        if reception != _FOREIGN:
+            if self.newest is not None and state.epoch != self.newest.epoch:
+                self.numbering.restart()
+            self.numbering.note(state.seq)
+        if reception != _NEW:
+            self._refused = state
             return False
-        if before is None or (state.epoch, state.run) != (before.epoch, before.run):
-            self._fallback.reset()
-            self._compensation.reset()
-            self._controller.reset(state)
-            self._stepped_s = self._stopping_from = self._reckoned_s = None
-        if not state.lockstep:
-            self._compensation.observe(state)
+        self.newest = state
         return True
 
-    def decide(self, state: State, basis_s: float, budget_s: float = 0.0) -> Decision:
-        """The input on the basis of plant time ``basis_s``, with ``state`` the newest one.
+    def decide(self, basis_s: float, budget_s: float = 0.0, spent_s: float = 0.0) -> Decision:
+        """The input on the basis of plant time ``basis_s``, by the newest state.
 
-        ``budget_s``: how long the step may take; 0 is no limit but its own.
+        ``budget_s``: how long after its release the cycle should be done; 0: no limit but the
+        step's own. ``spent_s``: how long ago the release is. InputError before the first state.
         """
-        compensation, decision = self._compensation, self.decision
-        decision.basis_s = basis_s
-        decision.output = None
-        decision.delay_s = 0.0 if state.lockstep else compensation.delay_s
-        self._standing = self._halted is not None and not self._slowing(state, basis_s)
-        if self._standing:
-            return self._halt(state, decision)
-        # Where states come seldom, the next one is no sooner to be had.
-        if basis_s - state.time_s > max(self._stale_s, 2 * self.states.interval_s):
-            decision.status = NO_STATE
-            self._reckon(state, basis_s)
-        else:
-            self._reckoned_s = None
-            self._vx_mps = float(state.x[3])
-            self._step(state, budget_s)
-        return decision
-
-    def settle(self, late_s: float = 0.0) -> Decision:
-        """Ends the cycle: what is sent after all, ``late_s`` after it should have been."""
-        decision = self.decision
-        time_s = decision.basis_s + decision.delay_s
-        if not self._standing:
-            chosen = self._fallback.decide(decision.output, self._vx_mps, time_s, late_s)
-            decision.d, decision.delta_rate, decision.level = chosen
-            driving = Phase.DRIVING if decision.level is Level.SOLUTION else Phase.FALLBACK
-            self.phase = self._halted or driving
-        self._compensation.sent(decision.basis_s, decision.d, decision.delta_rate)
+        decided, decision = self._decided, self.decision
+        error = self._decide(self._cycle, basis_s, budget_s, spent_s, self._decided_at)
+        self.controller.artefact.check(error, "control cycle")
+        decision.d, decision.delta_rate = decided.u
+        decision.level, decision.status = _LEVELS[decided.level], decided.status
+        decision.basis_s, decision.delay_s = decided.basis_s, decided.delay_s
+        decision.step_us, decision.late_s = decided.step_us, decided.late_s
+        decision.output = self.controller.result() if decided.stepped else None
         return decision
 
     def prepare(self, period_s: float, budget_s: float = 0.0) -> None:
         """Preparation phase for a state that is expected a period after the last one."""
-        if self._stepped_s is not None and not self._standing:
-            self._controller.prepare(period_s, budget_s)
+        self._library.br_cycle_prepare(self._cycle, period_s, budget_s)
 
     def rehearse(self) -> None:
         """Walks the way of a cycle without effect, so that its code and data are in the caches."""
-        state = self.states.newest
-        if self._stepped_s is None or self._standing or state is None:
-            return
-        with suppress(InputError):  # a state that cannot be predicted from
-            self._compensation.at_acting(state, self.decision.basis_s)
-        self._controller.rehearse()
-        self._fallback.rehearse(self.decision.output)
-
-    def _slowing(self, state: State, basis_s: float) -> bool:
-        """Whether a stop on command is still under way; sets the speed that it has got to.
-
-        Driven to standstill, the car stays on the line and points along it, fit to go on.
-        """
-        rolling = abs(state.x[3]) > self._tuning.standing_mps
-        if self._stopping_from is None and not rolling:
-            return False
-        if self._stopping_from is None:  # just told, or a rolling car taken over on hold
-            self._stopping_from = basis_s, max(float(state.x[3]), 0.0)
-        since_s, speed_mps = self._stopping_from
-        limit_mps = max(speed_mps - self._tuning.stop_mps2 * (basis_s - since_s), 0.0)
-        self._controller.limit_speed(limit_mps, self._tuning.stop_mps2)
-        if limit_mps > 0 or rolling:
-            return True
-        self._stopping_from = None
-        return False
-
-    def _halt(self, state: State, decision: Decision) -> Decision:
-        """Not to be driven: braked. The next step will be the first of a new drive."""
-        self.phase = self._halted or Phase.READY
-        if self._stepped_s is not None:
-            self._controller.reset(state)
-            self._stepped_s = None
-        time_s = decision.basis_s + decision.delay_s
-        decision.d, decision.delta_rate = self._fallback.halt(float(state.x[3]), time_s)
-        decision.level, decision.status = Level.STOP, HALTED
-        return decision
-
-    def _reckon(self, state: State, basis_s: float) -> None:
-        """How fast the car may still be: by the model, braking since it was last seen.
-
-        A duty cycle that brakes a rolling car drives a standing one backwards.
-        """
-        decision = self.decision
-        self._u_sent[:] = decision.d, decision.delta_rate
-        try:
-            if self._reckoned_s is None:
-                self._reckoned_s = state.time_s + self._stale_s
-                self._reckoned[:], _ = self._compensation.at_acting(state, self._reckoned_s)
-            duration_s = min(max(basis_s - self._reckoned_s, 0.0), _LONGEST_S)
-            self._reckoned[:] = self._controller.predict(self._reckoned, self._u_sent, duration_s)
-        except InputError:
-            return  # what the model cannot follow: the speed stays the last one known
-        self._reckoned_s = basis_s
-        self._vx_mps = float(self._reckoned[3])
-
-    def _step(self, state: State, budget_s: float) -> None:
-        controller, decision = self._controller, self.decision
-        if state.lockstep:
-            x, u_previous = self._compensation.as_measured(state)
-        else:
-            try:
-                x, u_previous = self._compensation.at_acting(state, decision.basis_s)
-            except InputError:  # no model predicts from such a state
-                decision.status = UNPREDICTABLE
-                return
-        time_s = decision.basis_s + decision.delay_s
-        # Where the delay measured has fallen, the moment of acting may even go back.
-        elapsed_s = 0.0 if self._stepped_s is None else max(time_s - self._stepped_s, 0.0)
-        self._stepped_s = time_s
-        try:
-            output = controller.step(x, u_previous, elapsed_s, budget_s)
-        except Exception as error:
-            # Whatever it is, the car must not be left without an answer.
-            self.raised += 1
-            self.last_error = f"{type(error).__name__}: {error}"
-            decision.status = STEP_RAISED
-        else:
-            decision.output, decision.status = output, output.status
-            self.second_starts += output.second_start > 0
-            if output.cost_shifted >= 0:
-                self.cost_jumps += output.cost > _JUMP * output.cost_shifted + _JUMP_BY
+        self._library.br_cycle_rehearse(self._cycle)

@@ -1,17 +1,17 @@
-"""What the controller process drives: any object with these methods."""
+"""What the control cycle drives: the compiled controller, or a control law written in Python."""
 
+import ctypes as ct
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from bayesrace.messages import State
-
 if TYPE_CHECKING:
+    from controller.native_library import Artefact
     from controller.takeover import WeightsPort
 
-__all__ = ["NO_PLAN", "Array", "Controller", "StepOutput"]
+__all__ = ["NO_PLAN", "Array", "ControlLaw", "Controller", "StepOutput"]
 
 Array = npt.NDArray[np.float64]
 
@@ -29,14 +29,13 @@ class StepOutput:
     u: Array
     """Shape (2,): d [-], delta_rate [rad/s]. Looked at only if ``status`` is 0."""
     status: int = 0
-    """0: usable. Else the controller's own code (1 to 255): the fallback takes over."""
+    """0: usable. Else the controller's own code (1 to 251): the fallback takes over."""
     iterations: int = 0
-    solve_us: float = 0.0
-    """Execution time of the step (its feedback phase) [us]; 0: measured from outside."""
     plan_x: Array = field(default_factory=lambda: _NO_STATES)
     """Shape (N + 1, 7) or (0, 7): predicted states."""
     plan_u: Array = field(default_factory=lambda: NO_PLAN)
-    """Shape (N, 2) or (0, 2): planned inputs, the first of which is ``u``."""
+    """Shape (N, 2) or (0, 2): planned inputs, the first of which is ``u``; the fallback drives on
+    along the first ones, as many as the artefact's horizon has."""
     plan_step_s: float = 0.02
     """Time from one row of the plan to the next."""
     residual_dynamics: float = -1.0
@@ -51,47 +50,25 @@ class StepOutput:
 
 
 class Controller(Protocol):
-    """One car's controller. All calls come from one thread; none may block or do input/output."""
+    """One car's controller, as the process and the driver know it; for one thread."""
+
+    @property
+    def artefact(self) -> "Artefact":
+        """Whose control cycle it is driven by."""
+
+    def begin_cycle(self, memory: ct.c_void_p, size: int, hold: bool, cycle: ct.c_void_p) -> int:
+        """Makes the br_cycle that drives it in that memory; returns a br_mpc_error."""
+
+    def result(self) -> StepOutput:
+        """Of the last step of that cycle; valid until the next."""
+
+    @property
+    def last_error(self) -> str:
+        """Of the last step that was broken; empty if none was."""
 
     @property
     def weights_version(self) -> str:
         """Version of the residual's weights in use; empty if it takes none."""
-
-    def reset(self, state: State) -> None:
-        """Forget everything about the past: ``state`` is the first of a run."""
-
-    def step(
-        self, x: Array, u_previous: Array, elapsed_s: float, budget_s: float = 0.0
-    ) -> StepOutput:
-        """The input for state ``x`` (7,), where ``u_previous`` (2,) acted until now.
-
-        Both arrays are the caller's and change with the next state. ``elapsed_s``: time between
-        the state of the step before and this one (0 for the first). ``budget_s``: how long it may
-        take, best effort; 0 is as long as its settings say. Never raises for a finite state: what
-        goes wrong is told by the status.
-        """
-
-    def prepare(self, elapsed_s: float, budget_s: float = 0.0) -> None:
-        """What can be done for the next step before its state is there (preparation phase).
-
-        The next state is expected ``elapsed_s`` after the last one. What the last step handed out
-        is used up by now.
-        """
-
-    def rehearse(self) -> None:
-        """Use what :meth:`step` will use, without any effect: the caches are then warm for it."""
-
-    def predict(self, x: Array, u: Array, duration_s: float) -> Array:
-        """State (7,) after ``duration_s`` (at most 1 s) with input ``u`` (2,) held.
-
-        The array returned is overwritten by the next call.
-        """
-
-    def limit_speed(self, limit_mps: float, rate_mps2: float) -> None:
-        """From the next step on aim at no more than this speed, falling by the rate from there on.
-
-        ``math.inf`` and 0: no limit.
-        """
 
     @property
     def port(self) -> "WeightsPort | None":
@@ -104,4 +81,33 @@ class Controller(Protocol):
         """Take over weights (``bayesrace.gp.weights`` file content) from the next step on.
 
         Returns their version; InputError says why they are refused, and the old ones stay.
+        """
+
+
+class ControlLaw(Protocol):
+    """A controller written in Python, for :class:`controller.python_controller.PythonController`.
+
+    None of its methods may block or do input/output. What a method raises ends in the fallback.
+    """
+
+    def reset(self) -> None:
+        """Forget everything about the past: the next state is the first of a run or a drive."""
+
+    def step(
+        self, x: Array, u_previous: Array, elapsed_s: float, budget_s: float = 0.0
+    ) -> StepOutput:
+        """The input for state ``x`` (7,), where ``u_previous`` (2,) acted until now.
+
+        Both arrays change with the next state. ``elapsed_s``: time between the state of the step
+        before and this one (0 for the first). ``budget_s``: how long it may take, best effort; 0
+        is as long as its settings say.
+        """
+
+    def predict(self, x: Array, u: Array, duration_s: float) -> Array:
+        """State (7,) after ``duration_s`` (at most 1 s) with input ``u`` (2,) held."""
+
+    def limit_speed(self, limit_mps: float, rate_mps2: float) -> None:
+        """From the next step on aim at no more than this speed, falling by the rate from there on.
+
+        ``math.inf`` and 0: no limit.
         """

@@ -1,10 +1,10 @@
 """The predictive controller as the process drives it: native step, weights, telemetry."""
 
-import time
+import ctypes as ct
 
 from bayesrace.gp.weights import decode_weights
-from bayesrace.messages import State
-from controller.interface import Array, StepOutput
+from controller.interface import StepOutput
+from controller.native_library import Artefact, StepInfo, StepStatus
 from controller.native_step import NativeStep
 from controller.takeover import WeightsPort
 
@@ -21,22 +21,27 @@ class PredictiveController:
         ``port``: how a process takes over new ones; without, :meth:`set_weights` does."""
         self.native = step
         self.port = port
+        self._info = step.info
         self._version = weights_version
         self._output = StepOutput(
-            u=step.u,
+            u=step.plan_u[0],
             plan_x=step.plan_x,
             plan_u=step.plan_u,
             plan_step_s=step.manifest.step_s,
         )
 
+    last_error = ""
+    """Its steps end with a status."""
+
+    @property
+    def artefact(self) -> Artefact:
+        """What it was built as."""
+        return self.native.artefact
+
     @property
     def weights_version(self) -> str:
         """Version of the weights in use; empty while there is no correction."""
         return self._version
-
-    def reset(self, state: State) -> None:
-        """Next step starts cold."""
-        self.native.reset()
 
     def set_weights(self, data: bytes) -> str:
         """From the next step on; the plan and everything else goes on as it is."""
@@ -50,34 +55,22 @@ class PredictiveController:
         self.native.adopt_weights()
         self._version = version
 
-    def prepare(self, elapsed_s: float, budget_s: float = 0.0) -> None:
-        """Iterates on until converged if there is a budget, then shifts and condenses."""
-        self.native.prepare(elapsed_s, budget_s)
+    def begin_cycle(self, memory: ct.c_void_p, size: int, hold: bool, cycle: ct.c_void_p) -> int:
+        """With the compiled step, called from C."""
+        native = self.native
+        drive = native.artefact.library.br_cycle_drive_mpc
+        error = int(drive(memory, size, native.handle, hold, ct.byref(cycle)))
+        if not error:
+            address = native.artefact.library.br_cycle_info(cycle)
+            self._info = StepInfo.from_address(address)
+        return error
 
-    def rehearse(self) -> None:
-        """The preparation once more."""
-        self.native.rehearse()
-
-    def predict(self, x: Array, u: Array, duration_s: float) -> Array:
-        """By the model the OCP predicts with, corrected by the weights in use."""
-        return self.native.predict(x, u, duration_s)
-
-    def limit_speed(self, limit_mps: float, rate_mps2: float) -> None:
-        """The reference point moves along the line no faster."""
-        self.native.set_speed_limit(limit_mps, rate_mps2)
-
-    def step(
-        self, x: Array, u_previous: Array, elapsed_s: float, budget_s: float = 0.0
-    ) -> StepOutput:
-        """One native step, timed around the C call."""
-        native, output = self.native, self._output
-        begin_ns = time.perf_counter_ns()
-        status = native.step(x, u_previous, elapsed_s=elapsed_s, budget_s=budget_s)
-        output.solve_us = (time.perf_counter_ns() - begin_ns) * 1e-3
-        native.read_plan()
-        info = native.info
+    def result(self) -> StepOutput:
+        """Of the last step; the plan, too, if it is not usable."""
+        info, output = self._info, self._output
+        self.native.read_plan()
         # Acceptable and converged may both be driven; the residuals below tell them apart.
-        output.status = 0 if status.usable else int(status)
+        output.status = 0 if StepStatus(info.status).usable else info.status
         output.iterations = info.iterations
         output.residual_dynamics = info.defect
         output.residual_bounds = max(info.bound, 0.0)

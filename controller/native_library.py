@@ -4,17 +4,31 @@ Made from the same tables as the C: :mod:`bayesrace.native_interface`, and the a
 """
 
 import ctypes as ct
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from enum import IntEnum
 from pathlib import Path
 from typing import Any, Final
 
 from bayesrace.cpu import cpu_digest
 from bayesrace.errors import InputError
-from bayesrace.manifest import Manifest, ProblemInfo, check_library
-from bayesrace.native_interface import ABI, INFO, SOLVER, STATUSES
+from bayesrace.manifest import Manifest, ProblemInfo, check_library, read_manifest
+from bayesrace.native_interface import (
+    ABI,
+    COUNTERS,
+    DECISION,
+    DELAYS,
+    DRIVING,
+    INFO,
+    LEVELS,
+    MEASURED,
+    SOLUTION,
+    SOLVER,
+    STATUSES,
+)
 
-__all__ = ["Gp", "StepInfo", "StepStatus", "load_library", "parameters_type"]
+__all__ = ["Artefact", "Gp", "StepInfo", "StepStatus", "aligned_memory", "parameters_type"]
+
+_ALIGNMENT: Final = 64
 
 
 class StepStatus(IntEnum):
@@ -40,17 +54,32 @@ class StepStatus(IntEnum):
         return STATUSES[self][1]
 
 
-_TYPES: Final[dict[str, Any]] = {"double": ct.c_double, "int": ct.c_int}
+_TYPES: Final[dict[str, Any]] = {
+    "double": ct.c_double,
+    "int": ct.c_int,
+    "int64": ct.c_int64,
+    "delays": ct.c_double * DELAYS,
+    "levels": ct.c_int64 * len(LEVELS),
+}
 
 
-def _fields(table: Iterable[tuple[str, str, str]]) -> list[tuple[str, Any]]:
-    return [(name, _TYPES[kind]) for name, kind, _ in table]
+def _fields(
+    table: Iterable[tuple[str, ...]], sized: Mapping[str, Any] = _TYPES
+) -> list[tuple[str, Any]]:
+    return [(name, sized[kind]) for name, kind, *_ in table]
 
 
 def parameters_type(problem: ProblemInfo) -> type[ct.Structure]:
     """br_mpc_parameters: the problem's run-time parameters, then the settings of the solver."""
     own = [(one.name, ct.c_double) for one in problem.parameters]
     return type("Parameters", (ct.Structure,), {"_fields_": [*own, *_fields(SOLVER)]})
+
+
+def aligned_memory(size: int) -> tuple[Any, ct.c_void_p]:
+    """A block for an object of the library, and the address of its aligned part."""
+    block = ct.create_string_buffer(size + _ALIGNMENT)
+    start = -ct.addressof(block) % _ALIGNMENT
+    return block, ct.c_void_p(ct.addressof(block) + start)
 
 
 class Gp(ct.Structure):
@@ -74,6 +103,7 @@ class StepInfo(ct.Structure):
     """
 
     _fields_ = _fields(INFO)
+    status: int
     iterations: int
     qp_iterations: int
     regularised: int
@@ -93,7 +123,51 @@ class StepInfo(ct.Structure):
     lateral_m: float
 
 
-def load_library(artefact: Path, manifest: Manifest) -> ct.CDLL:
+class Artefact:
+    """A compiled problem: its manifest, its library, and the structures of its size.
+
+    The structures are those of :mod:`bayesrace.native_interface`: ``Measured``, ``Driving``,
+    ``Solution``, ``Decision``, ``Counters``.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """InputError if it cannot be used here."""
+        self.manifest = read_manifest(folder)
+        self.library = _load(folder, self.manifest)
+        nx, nu = len(self.manifest.problem.states), len(self.manifest.problem.inputs)
+        sized = {
+            **_TYPES,
+            "states": ct.c_double * nx,
+            "inputs": ct.c_double * nu,
+            "plan": ct.c_double * (nu * self.manifest.horizon),
+        }
+        for name, table in _STRUCTURES.items():
+            made = type(name, (ct.Structure,), {"_fields_": _fields(table, sized)})
+            setattr(self, name, made)
+
+    Measured: Any
+    Driving: Any
+    Solution: Any
+    Decision: Any
+    Counters: Any
+
+    def check(self, error: int, what: str) -> None:
+        """InputError with the library's words, if there is an error."""
+        if error:
+            text = self.library.br_mpc_error_text(error).decode()
+            raise InputError(f"native controller, {what}: {text}")
+
+
+_STRUCTURES: Final = {
+    "Measured": MEASURED,
+    "Driving": DRIVING,
+    "Solution": SOLUTION,
+    "Decision": DECISION,
+    "Counters": COUNTERS,
+}
+
+
+def _load(artefact: Path, manifest: Manifest) -> ct.CDLL:
     """The artefact's library with its functions' types; InputError if it cannot be used here."""
     path = check_library(artefact, manifest)
     if manifest.cpu != cpu_digest():
@@ -118,28 +192,52 @@ def load_library(artefact: Path, manifest: Manifest) -> ct.CDLL:
 
 
 def _declare(library: ct.CDLL) -> None:
-    pointer, real = ct.c_void_p, ct.c_double
-    library.br_mpc_memory_size.restype = ct.c_size_t
-    library.br_mpc_error_text.restype = ct.c_char_p
-    library.br_mpc_status_text.restype = ct.c_char_p
-    library.br_mpc_reset.restype = None
-    arguments: dict[str, list[type]] = {
-        "init": [pointer, ct.c_size_t, pointer],
-        "set_parameters": [pointer] * 2,
-        "set_path": [pointer, pointer, ct.c_int, real],
-        "set_weights": [pointer] * 2,
-        "stage_weights": [pointer] * 2,
-        "set_clock": [pointer] * 3,
-        "set_speed_limit": [pointer, ct.c_double, ct.c_double],
-        "reset": [pointer],
-        "step": [*[pointer] * 3, real, real, *[pointer] * 3],
-        "solve": [*[pointer] * 3, real, real, *[pointer] * 4],
-        "prepare": [pointer, real, real],
-        "rehearse": [pointer],
-        "predict": [pointer, pointer, pointer, real, pointer],
-        "get_plan": [pointer] * 3,
-        "get_reference": [pointer] * 2,
-        "evaluate": [pointer] * 6,
+    pointer, real, whole = ct.c_void_p, ct.c_double, ct.c_int
+    arguments: dict[str, list[Any]] = {
+        "mpc_init": [pointer, ct.c_size_t, pointer],
+        "mpc_set_parameters": [pointer] * 2,
+        "mpc_set_path": [pointer, pointer, whole, real],
+        "mpc_set_weights": [pointer] * 2,
+        "mpc_stage_weights": [pointer] * 2,
+        "mpc_set_clock": [pointer] * 3,
+        "mpc_set_speed_limit": [pointer, real, real],
+        "mpc_reset": [pointer],
+        "mpc_step": [*[pointer] * 3, real, real, *[pointer] * 3],
+        "mpc_solve": [*[pointer] * 3, real, real, *[pointer] * 4],
+        "mpc_prepare": [pointer, real, real],
+        "mpc_rehearse": [pointer],
+        "mpc_predict": [pointer, pointer, pointer, real, pointer],
+        "mpc_get_plan": [pointer] * 3,
+        "mpc_get_reference": [pointer] * 2,
+        "mpc_evaluate": [pointer] * 6,
+        "mpc_memory_size": [],
+        "mpc_error_text": [whole],
+        "mpc_status_text": [whole],
     }
+    of_cycles: dict[str, list[Any]] = {
+        "cycle_memory_size": [],
+        "cycle_init": [pointer, ct.c_size_t, pointer, whole, pointer],
+        "cycle_drive_mpc": [pointer, ct.c_size_t, pointer, whole, pointer],
+        "cycle_info": [pointer],
+        "cycle_set_driving": [pointer] * 2,
+        "cycle_set_clock": [pointer] * 3,
+        "cycle_observe": [pointer] * 2,
+        "cycle_decide": [pointer, *[real] * 3, pointer],
+        "cycle_prepare": [pointer, real, real],
+        "cycle_counters": [pointer],
+        **{f"cycle_{name}": [pointer] for name in ("rehearse", "stop", "go", "end", "forget")},
+    }
+    if hasattr(library, "br_cycle_init"):  # of a problem that follows a path
+        arguments |= of_cycles
     for name, types in arguments.items():
-        getattr(library, f"br_mpc_{name}").argtypes = types
+        function = getattr(library, f"br_{name}")
+        function.argtypes = types
+        function.restype = _RETURNS.get(name.partition("_")[2], whole)
+
+
+_RETURNS: Final[dict[str, Any]] = {
+    "memory_size": ct.c_size_t,
+    **dict.fromkeys(("error_text", "status_text"), ct.c_char_p),
+    **dict.fromkeys(("info", "counters"), ct.c_void_p),
+    **dict.fromkeys(("reset", "stop", "go", "end"), None),
+}

@@ -7,18 +7,22 @@ those of the artefact's manifest.
 import ctypes as ct
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from bayesrace.errors import InputError
-from bayesrace.manifest import read_manifest
-from controller.native_library import Gp, StepInfo, StepStatus, load_library, parameters_type
+from controller.native_library import (
+    Artefact,
+    Gp,
+    StepInfo,
+    StepStatus,
+    aligned_memory,
+    parameters_type,
+)
 
 __all__ = ["NativeProblem", "Reference"]
 
-_ALIGNMENT: Final = 64
 _DOUBLES = npt.NDArray[np.float64]
 
 Reference = _DOUBLES
@@ -38,9 +42,13 @@ class NativeProblem:
 
     def __init__(self, artefact: Path) -> None:
         """Without parameters, and with a residual of zero. InputError for no usable artefact."""
-        self.manifest = read_manifest(artefact)
-        self._library = load_library(artefact, self.manifest)
-        self._mpc = self._new_object()
+        self.artefact = Artefact(artefact)
+        self.manifest, self._library = self.artefact.manifest, self.artefact.library
+        self._check = self.artefact.check
+        self._memory, memory = aligned_memory(self._library.br_mpc_memory_size())
+        self._mpc = ct.c_void_p()
+        size = self._library.br_mpc_memory_size()
+        self._check(self._library.br_mpc_init(memory, size, ct.byref(self._mpc)), "init")
         problem, n = self.manifest.problem, self.manifest.horizon
         self._nx, self._nu = len(problem.states), len(problem.inputs)
         self._step_s = self.manifest.step_s
@@ -72,23 +80,14 @@ class NativeProblem:
         self._set_clock()
         self.set_zero_weights()
 
-    def _new_object(self) -> ct.c_void_p:
-        size = self._library.br_mpc_memory_size()
-        self._memory = ct.create_string_buffer(size + _ALIGNMENT)
-        start = -ct.addressof(self._memory) % _ALIGNMENT
-        mpc = ct.c_void_p()
-        address = ct.c_void_p(ct.addressof(self._memory) + start)
-        self._check(self._library.br_mpc_init(address, size, ct.byref(mpc)), "init")
-        return mpc
+    @property
+    def handle(self) -> ct.c_void_p:
+        """The br_mpc, for other functions of the library."""
+        return self._mpc
 
     def _set_clock(self) -> None:
         clock = ct.cast(self._library.br_mpc_monotonic, ct.c_void_p)
         self._check(self._library.br_mpc_set_clock(self._mpc, clock, None), "clock")
-
-    def _check(self, error: int, what: str) -> None:
-        if error:
-            text = self._library.br_mpc_error_text(error).decode()
-            raise InputError(f"native controller, {what}: {text}")
 
     def set_values(self, values: Mapping[str, float]) -> None:
         """Sets run-time parameters and solver settings by name; effective from the next step.

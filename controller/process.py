@@ -71,9 +71,6 @@ asks without end must not hold up the loop."""
 
 _SWITCH_S: Final = 1e-4
 
-_LEAST_BUDGET: Final = 0.1
-"""What a step gets however late its cycle began (fraction of the budget)."""
-
 
 class ControllerProcess:
     """Drives one car over an open session."""
@@ -233,17 +230,16 @@ class ControllerProcess:
 
     def _tick(self, state: State) -> None:
         """One cycle: decide, send, report."""
-        schedule, timing, driver = self._schedule, self._timing, self._driver
+        schedule, timing = self._schedule, self._timing
         timing.released_ns = time.monotonic_ns()
         budget_s = self._settings.budget * schedule.period_ns * 1e-9
         spent_s = (timing.released_ns - schedule.release_ns) * 1e-9
         # What has held up a state on its way is part of its age: hence the schedule's plant time,
         # not the time since this state's own arrival.
         basis_s = max(schedule.plant_time_s(timing.released_ns), state.time_s)
-        self._cycle.decide(state, basis_s, max(budget_s - spent_s, _LEAST_BUDGET * budget_s))
-        late_s = (time.monotonic_ns() - schedule.release_ns) * 1e-9 - budget_s
-        timing.overruns += late_s > 0
-        self._send(state, driver.settle(max(late_s, 0.0)))
+        decision = self._cycle.decide(basis_s, budget_s, spent_s)
+        timing.overruns += decision.late_s > 0
+        self._send(state, decision)
         timing.missed = time.monotonic_ns() > schedule.deadline_ns
         timing.misses += timing.missed
 
@@ -274,7 +270,7 @@ class ControllerProcess:
         if rehearses:
             self._rehearse()
         fresh: State | None = None
-        newest = self._driver.states.newest
+        newest = self._driver.newest
         run = newest.run if newest is not None else None
         until_ns = release_ns + (round(_GRACE * period_ns) if self._state_due() else 0)
         for _ in range(NEWEST):  # what came while the loop was held up, but no flood
@@ -285,7 +281,7 @@ class ControllerProcess:
         if fresh is not None:
             if fresh.run != run:
                 schedule.start(self._arrived_ns)
-            schedule.observe(self._arrived_ns, fresh.time_s, self._driver.states.interval_s)
+            schedule.observe(self._arrived_ns, fresh.time_s, self._driver.interval_s)
         return fresh
 
     def _rehearse(self) -> None:
@@ -294,7 +290,7 @@ class ControllerProcess:
         After 20 ms of other work the code and data of a cycle are cold, and everything in it takes
         two to four times as long (docs/decisions/).
         """
-        state = self._driver.states.newest
+        state = self._driver.newest
         if state is not None:
             decode(State, self._payload)
             self._driver.rehearse()
@@ -303,7 +299,7 @@ class ControllerProcess:
     def _state_due(self) -> bool:
         """Whether a state is due at the next release: they may come less often than releases."""
         schedule = self._schedule
-        interval_ns = self._driver.states.interval_s * 1e9 or schedule.period_ns
+        interval_ns = self._driver.interval_s * 1e9 or schedule.period_ns
         since_ns = schedule.release_ns - self._arrived_ns
         away_ns = since_ns - round(since_ns / interval_ns) * interval_ns
         return abs(away_ns) < schedule.period_ns / 2 or interval_ns < schedule.period_ns
@@ -332,16 +328,16 @@ class ControllerProcess:
 
     def _counters(self) -> dict[str, Scalar]:
         """What the loop has counted, by name."""
-        timing, states = self._timing, self._driver.states
+        timing, driver = self._timing, self._driver
         return {
             "ticks": timing.ticks,
             "skipped": timing.skipped,
             "deadline_misses": timing.misses,
             "overruns": timing.overruns,
-            "states_received": states.received,
-            "states_lost": states.lost,
-            "states_stale": states.stale,
-            "states_foreign": states.foreign,
+            "states_received": driver.numbering.received,
+            "states_lost": driver.numbering.lost,
+            "states_stale": driver.count("stale"),
+            "states_foreign": driver.count("foreign"),
             "refused": self._decoder.refused,
             "overflowed": self.inbox.overflowed,
             "turned_away": self.inbox.turned_away,

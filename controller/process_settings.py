@@ -5,8 +5,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from bayesrace.realtime import RealtimeSettings
 from bayesrace.transport import CONTROLLER_ENDPOINT, PLANT_ENDPOINT, Endpoints
 from bayesrace.vehicles import CarSetting, default_car
-from controller.compensation import CompensationSettings
-from controller.fallback import FallbackSettings
+from controller.cycle_settings import CompensationSettings, FallbackSettings
 from controller.gate.settings import GateSettings
 
 __all__ = ["ControllerSettings"]

@@ -13,7 +13,6 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.errors import InputError
-from bayesrace.messages import State
 from bayesrace.vehicles.parameters import CarParameters
 from controller.interface import Array, StepOutput
 
@@ -40,7 +39,7 @@ class PurePursuitSettings(BaseModel):
 
 
 class PurePursuit:
-    """See the module; implements :class:`controller.interface.Controller`."""
+    """See the module; a :class:`controller.interface.ControlLaw`."""
 
     def __init__(
         self,
@@ -70,40 +69,18 @@ class PurePursuit:
         self._lengths = np.concatenate([[0.0], np.cumsum(steps)])
         self._tuning = car.tuning.pursuit
         self._spacing = float(self._lengths[-1]) / len(steps)
-        self._nearest = 0
+        self._nearest: int | None = None
         self._random = np.random.default_rng(self._settings.seed)
         self._noise = np.zeros(2)
         self._output = StepOutput(u=np.zeros(2))
         self._predicted = np.zeros(7)
         self._limit_mps = math.inf
 
-    @property
-    def weights_version(self) -> str:
-        """None: it has no residual."""
-        return ""
-
-    def reset(self, state: State) -> None:
+    def reset(self) -> None:
         """Search the whole line; begin the disturbance anew."""
-        self._nearest = int(np.argmin(self._squared_distances(state.x[0], state.x[1])))
+        self._nearest = None
         self._random = np.random.default_rng(self._settings.seed)
         self._noise[:] = 0.0
-
-    def set_weights(self, data: bytes) -> str:
-        """Always refused."""
-        raise InputError("pure pursuit takes no weights; send them to the predictive controller")
-
-    port = None
-    """It has nowhere to put weights."""
-
-    def adopt_weights(self, version: str) -> None:
-        """Never asked."""
-        raise InputError("pure pursuit takes no weights")
-
-    def prepare(self, elapsed_s: float, budget_s: float = 0.0) -> None:
-        """Nothing can be done ahead."""
-
-    def rehearse(self) -> None:
-        """It is small."""
 
     def predict(self, x: Array, u: Array, duration_s: float) -> Array:
         """Dead reckoning: the velocities stay, the steering goes on at its rate."""
@@ -128,9 +105,9 @@ class PurePursuit:
         """Steer towards the target point, hold the line's speed."""
         car, settings, output = self._car, self._settings, self._output
         px, py, psi, vx, delta = (float(x[i]) for i in (0, 1, 2, 3, 6))
-        self._follow(px, py)
+        nearest = self._nearest = self._follow(px, py)
         self._excite()
-        target_speed, delta_target = self._targets(px, py, psi, vx)
+        target_speed, delta_target = self._targets(nearest, px, py, psi, vx)
         d = (
             self._tuning.speed_gain_spm * (target_speed - vx)
             + self._hold(vx)
@@ -141,14 +118,16 @@ class PurePursuit:
         highest = min(car.delta_rate_max_radps, (car.delta_max_rad - delta) / settings.step_s)
         output.u[0] = min(max(d, car.d_min), car.d_max)
         output.u[1] = min(max(rate, lowest), highest)
-        output.s_ref_m = float(self._lengths[self._nearest])
+        output.s_ref_m = float(self._lengths[nearest])
         return output
 
-    def _targets(self, px: float, py: float, psi: float, vx: float) -> tuple[float, float]:
+    def _targets(
+        self, nearest: int, px: float, py: float, psi: float, vx: float
+    ) -> tuple[float, float]:
         """Speed [m/s] and steering angle [rad] to aim for."""
         car, settings, tuning = self._car, self._settings, self._tuning
         reach = tuning.lookahead_m + tuning.lookahead_s * max(vx, 0.0)
-        ahead = (self._nearest + max(1, round(reach / self._spacing))) % len(self._points)
+        ahead = (nearest + max(1, round(reach / self._spacing))) % len(self._points)
         rear_x = px - car.lr_m * math.cos(psi)
         rear_y = py - car.lr_m * math.sin(psi)
         dx, dy = float(self._points[ahead, 0]) - rear_x, float(self._points[ahead, 1]) - rear_y
@@ -171,19 +150,19 @@ class PurePursuit:
         self._noise *= keep
         self._noise += fresh
 
-    def _follow(self, px: float, py: float) -> None:
-        """Nearest point near the last one; the whole line if the car has left it by far."""
+    def _follow(self, px: float, py: float) -> int:
+        """Nearest point near the last one; of the whole line if the car has left that by far."""
         count = len(self._points)
-        reach = min(max(3, int(self._tuning.window_m / self._spacing)), count // 3)
-        first = (self._nearest - reach // 2) % count
-        window = slice(first, first + reach // 2 + reach)
-        dx, dy = self._twice_x[window] - px, self._twice_y[window] - py
-        squared = dx * dx + dy * dy
-        best = int(squared.argmin())
-        if squared[best] > self._tuning.lost_m**2:
-            self._nearest = int(np.argmin(self._squared_distances(px, py)))
-        else:
-            self._nearest = (first + best) % count
+        if self._nearest is not None:
+            reach = min(max(3, int(self._tuning.window_m / self._spacing)), count // 3)
+            first = (self._nearest - reach // 2) % count
+            window = slice(first, first + reach // 2 + reach)
+            dx, dy = self._twice_x[window] - px, self._twice_y[window] - py
+            squared = dx * dx + dy * dy
+            best = int(squared.argmin())
+            if squared[best] <= self._tuning.lost_m**2:
+                return (first + best) % count
+        return int(np.argmin(self._squared_distances(px, py)))
 
     def _squared_distances(self, px: float, py: float) -> Array:
         offsets = self._points - (px, py)

@@ -18,8 +18,7 @@ from bayesrace.messages import (
     Status,
 )
 from bayesrace.transport import Heartbeat, Inbox, Item, Kind, Publisher, Request, decode_request
-from controller.driver import Driver
-from controller.fallback import Level
+from controller.driver import Driver, Level
 from controller.interface import Controller
 
 __all__ = ["Service"]
@@ -84,7 +83,7 @@ class Service:
 
     def status(self, seq: int = 0) -> Status:
         """The process's state at this moment."""
-        driver, newest = self._driver, self._driver.states.newest
+        driver, newest = self._driver, self._driver.newest
         now_ns = time.monotonic_ns()
         age_s = -1.0 if self.arrived_ns is None else (now_ns - self.arrived_ns) * 1e-9
         lockstep = newest is not None and newest.lockstep
@@ -104,9 +103,9 @@ class Service:
         )
 
     def _words(self) -> str:
-        words, raised = [self._text], self._driver.raised
-        if raised:
-            words.append(f"{raised} step(s) raised, the last {self._driver.last_error}")
+        words, failed = [self._text], self._driver.count("failed")
+        if failed:
+            words.append(f"{failed} step(s) failed, the last {self._controller.last_error}")
         if more := self._own_words():
             words.append(more)
         return "; ".join(words)
@@ -151,7 +150,7 @@ class Service:
     def announce(self, kind: str, text: str, data: Mapping[str, Scalar]) -> None:
         """Publishes an event; from any thread."""
         now_ns = time.monotonic_ns()
-        newest = self._driver.states.newest
+        newest = self._driver.newest
         run = 0 if newest is None else newest.run
         with self._publishing:
             seq = self._events.next_seq
@@ -159,15 +158,15 @@ class Service:
             self._events.put(event, lockstep=newest is None or newest.lockstep)
 
     def _count(self) -> dict[str, Scalar]:
-        counts = self._driver.counts
+        driver, levels = self._driver, self._driver.levels
         return {
             **self._counters(),
-            "solution": counts[Level.SOLUTION],
-            "shifted_plan": counts[Level.SHIFTED_PLAN],
-            "brake": counts[Level.BRAKE],
-            "stop": counts[Level.STOP],
-            "raised": self._driver.raised,
-            "second_starts": self._driver.second_starts,
-            "cost_jumps": self._driver.cost_jumps,
+            "solution": levels[Level.SOLUTION],
+            "shifted_plan": levels[Level.SHIFTED_PLAN],
+            "brake": levels[Level.BRAKE],
+            "stop": levels[Level.STOP],
+            "raised": driver.count("failed"),
+            "second_starts": driver.count("second_starts"),
+            "cost_jumps": driver.count("cost_jumps"),
             **({} if self._takes_weights else {"weights_refused": self._weights_refused}),
         }

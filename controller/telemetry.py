@@ -56,7 +56,7 @@ def telemetry_of(seq: int, state: State, decision: Decision, timing: Timing) -> 
         timing.wake_us,
         timing.decode_us,
         timing.prepare_us,
-        output.solve_us or timing.solve_us,
+        decision.step_us or timing.solve_us,
         timing.encode_us,
         decision.delay_s,
         _finite(output.plan_x),

@@ -8,6 +8,7 @@ with its default options, from zeros. (With our discretisation, whose pose depen
 that takes four times as long: no fair peer.)
 """
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
@@ -22,7 +23,6 @@ from bayesrace.gp.corrected import corrected_function
 from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.manifest import read_manifest
-from bayesrace.messages import State
 from bayesrace.tracks import DEFAULT_RACE_TRACK
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import e_kinematic
@@ -30,8 +30,8 @@ from codegen.ocp import OcpNlp
 from codegen.problems.tracking import tracking
 from controller.assembly import compiled_controller
 from controller.interface import StepOutput
-from controller.mpc import PredictiveController
 from controller.native_step import NativeStep, StepStatus
+from controller.python_controller import PythonController
 from controller.settings import MpcSettings
 from experiments.closed_loop import ClosedLoop
 from experiments.preparation import prepare
@@ -172,7 +172,8 @@ def run_bench(settings: BenchSettings, stages: Stages) -> BenchResult:
                 for mpc in (MpcSettings(), _CONVERGED)
             )
             recorder = _Recorder(step.native, converged.native)
-            loop = ClosedLoop(car, course.track, course.line, recorder)
+            controller = PythonController(artefact, recorder)
+            loop = ClosedLoop(car, course.track, course.line, controller)
             for count in (50, -(-settings.problems // len(prepared.courses))):
                 recorder.recording = _Recording()  # without those that warm up
                 loop.drive(0, count * PLANT.step_s)
@@ -200,30 +201,35 @@ def run_bench(settings: BenchSettings, stages: Stages) -> BenchResult:
     return _result(settings, weights, recording, times, solved, agreement, gaps)
 
 
-class _Recorder(PredictiveController):
+class _Recorder:
     """Drives by the real-time step, whole and unprepared; the converged one looks on."""
 
     def __init__(self, step: NativeStep, converged: NativeStep) -> None:
-        super().__init__(step)
-        self._converged = converged
+        self._step, self._converged = step, converged
         self.recording = _Recording()
 
-    def reset(self, state: State) -> None:
+    def reset(self) -> None:
         """Both start cold."""
-        super().reset(state)
+        self._step.reset()
         self._converged.reset()
 
-    def prepare(self, elapsed_s: float, budget_s: float = 0.0) -> None:
-        """Nothing: what is timed is the whole step."""
+    def predict(self, x: Floats, u: Floats, duration_s: float) -> Floats:
+        """By the model of both."""
+        return self._step.predict(x, u, duration_s)
+
+    def limit_speed(self, limit_mps: float, rate_mps2: float) -> None:
+        """Nothing stops here."""
 
     def step(
         self, x: Floats, u_previous: Floats, elapsed_s: float, budget_s: float = 0.0
     ) -> StepOutput:
         """Records the problem and both answers."""
-        step, converged, recording = self.native, self._converged, self.recording
-        output = super().step(x, u_previous, elapsed_s, budget_s)
-        recording.step_us.append(output.solve_us)
-        recording.second_starts += output.second_start > 0
+        step, converged, recording = self._step, self._converged, self.recording
+        begin_ns = time.perf_counter_ns()
+        status = step.step(x, u_previous, elapsed_s=elapsed_s, budget_s=budget_s)
+        recording.step_us.append((time.perf_counter_ns() - begin_ns) * 1e-3)
+        step.read_plan()
+        recording.second_starts += step.info.second_start > 0
         other = converged.step(x, u_previous, elapsed_s=elapsed_s)
         converged.read_plan()
         recording.problems.append(
@@ -234,10 +240,10 @@ class _Recorder(PredictiveController):
                 (step.plan_x.copy(), step.plan_u.copy()),
                 (converged.plan_x.copy(), converged.plan_u.copy()),
                 converged.info.cost,
-                output.status == 0 and other is StepStatus.CONVERGED,
+                status.usable and other is StepStatus.CONVERGED,
             )
         )
-        return output
+        return StepOutput(step.u, 0 if status.usable else status, plan_u=step.plan_u)
 
 
 def _peers(recording: _Recording, count: int) -> list[_Problem]:

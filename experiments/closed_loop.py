@@ -76,7 +76,7 @@ class Driven:
     statuses: NDArray[np.int64]
     """Of the controller's steps, shape (m,); m is n - 1, or n if the car failed or left."""
     levels: NDArray[np.int64]
-    """Of the fallback, shape (m,); see :class:`controller.fallback.Level`."""
+    """Of the fallback, shape (m,); see :class:`controller.driver.Level`."""
     step_us: Floats
     """Execution times of the steps that were made, shape (at most m,)."""
     second_starts: int
@@ -174,7 +174,7 @@ class ClosedLoop:
         self._states: list[State] = []
         self._decided: list[tuple[int, int]] = []
         self._step_us: list[float] = []
-        second_starts = self._cycle.driver.second_starts
+        second_starts = self._cycle.driver.count("second_starts")
         if self._log is not None:
             self._log.begins(plan, self._controller.weights_version)
         try:
@@ -199,7 +199,7 @@ class ClosedLoop:
             decided[:, 0],
             decided[:, 1],
             np.array(self._step_us),
-            self._cycle.driver.second_starts - second_starts,
+            self._cycle.driver.count("second_starts") - second_starts,
             end,
         )
 
@@ -217,7 +217,7 @@ class ClosedLoop:
         self._answer = decision.d, decision.delta_rate
         self._decided.append((decision.status, int(decision.level)))
         if decision.output is not None:
-            self._step_us.append(decision.output.solve_us)
+            self._step_us.append(decision.step_us)
         if self._log is not None:
             cycle, received_ns = self._cycle, state.source_time_ns
             seq = cycle.timing.ticks

@@ -7,6 +7,7 @@ from bayesrace.raceline import RaceLine
 from bayesrace.tracks import Track
 from bayesrace.vehicles import CarParameters, car_text
 from controller.pure_pursuit import PurePursuit, PurePursuitSettings
+from controller.python_controller import PythonController
 from experiments.closed_loop import ClosedLoop
 from plant.fmu.faults import FmuFault
 from plant.vehicle import Vehicle
@@ -18,6 +19,7 @@ def collect(
     track: Track,
     line: RaceLine,
     car: CarParameters,
+    artefact: Path,
     path: Path,
     duration_s: float,
     settings: PurePursuitSettings,
@@ -26,13 +28,14 @@ def collect(
 ) -> int:
     """Drives for ``duration_s`` and logs the run at ``path``; returns the number of samples.
 
-    The same settings give the same drive to the bit. ``vehicle``: what plays the car; the built-in
-    equations without. Raises FmuFault if it fails.
+    The same settings give the same drive to the bit. ``artefact``: a controller built for the car,
+    whose control cycle drives. ``vehicle``: what plays the car; the built-in equations without.
+    Raises FmuFault if it fails.
     """
     pursuit = PurePursuit(car, line.x_m, line.y_m, line.vx_mps, settings)
     log = LogWriter(path, {"collect": {"track": track.name, "car": car_text(car)}})
     try:
-        loop = ClosedLoop(car, track, line, pursuit, vehicle, log)
+        loop = ClosedLoop(car, track, line, PythonController(artefact, pursuit), vehicle, log)
         driven = loop.drive(0, duration_s, start_speed_mps, name="pure-pursuit")
     finally:
         log.close()

@@ -57,6 +57,7 @@ _DRIVE_SOURCES: Final = (
     "bayesrace/messages",
     "bayesrace/tracks",
     "controller",
+    "controller/native",
     "plant",
     "plant/fmu",
     "experiments/closed_loop.py",
@@ -144,16 +145,16 @@ def prepare(
     for track in driven_on:
         with stages.stage(f"racing line, {track.name}"):
             courses.append(_course(track, car, settings.raceline, raceline))
-    if weights is None:
-        with stages.stage("training drive (pure pursuit)"):
-            training = training_drive(training_course, car, settings)
-        with stages.stage("train the residual") as stage:
-            learned = training.samples, settings.discretisation, training_settings(settings)
-            weights = trained_weights(*learned, progress=stage.update)
     artefacts = [] if artefact is None else [artefact]
     if artefact is None:
         with stages.stage("build the controllers"):
             artefacts = [_artefact(settings, model) for model in models]
+    if weights is None:
+        with stages.stage("training drive (pure pursuit)"):
+            training = training_drive(training_course, car, settings, artefacts[0])
+        with stages.stage("train the residual") as stage:
+            learned = training.samples, settings.discretisation, training_settings(settings)
+            weights = trained_weights(*learned, progress=stage.update)
     return Prepared(tuple(courses), training, weights, tuple(artefacts))
 
 
@@ -170,9 +171,12 @@ def _course(
     return Course(track, line, track_file, line_file or cached)
 
 
-def training_drive(course: Course, car: CarParameters, settings: PreparationSettings) -> Training:
+def training_drive(
+    course: Course, car: CarParameters, settings: PreparationSettings, artefact: Path
+) -> Training:
     """The pure-pursuit drive, from the cache if it is there; its log is like a race's.
 
+    ``artefact``: a controller built for the car, whose control cycle drives.
     Raises InputError for an FMU or map that cannot be used, FmuFault if the FMU fails.
     """
     pursuit = settings.pursuit.model_copy(update={"seed": settings.seed})
@@ -199,7 +203,7 @@ def training_drive(course: Course, car: CarParameters, settings: PreparationSett
     def make(partial: Path) -> None:
         with open_vehicle(car, settings.fmu, settings.fmu_map, 1 / PLANT.step_s) as vehicle:
             collect(
-                track, course.line, car, partial, settings.drive_s, pursuit,
+                track, course.line, car, artefact, partial, settings.drive_s, pursuit,
                 settings.start_speed_mps, vehicle,
             )  # fmt: skip
 
@@ -223,7 +227,8 @@ def training_samples(settings: PreparationSettings) -> Dataset:
     """Those of the training drive alone."""
     car = settings.driven_car
     course = _course(load_track(settings.train_track, car.width_m), car, settings.raceline)
-    return training_drive(course, car, settings).samples
+    artefact = _artefact(settings, "e_kinematic")
+    return training_drive(course, car, settings, artefact).samples
 
 
 def trained_weights(

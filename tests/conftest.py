@@ -217,7 +217,7 @@ def native_numbers(settings: MpcSettings, car: CarParameters, weights: GpWeights
     """Parameters and weights in the order of the C structures, as the C programs read them."""
     values = settings.parameters(car)
     problem = tracking(e_kinematic(car), PREDICTION)
-    names = [*(one.name for one in problem.parameters), *(name for name, _, _ in SOLVER)]
+    names = [*(one.name for one in problem.parameters), *(name for name, *_ in SOLVER)]
     parts: list[ArrayLike] = [[values[name] for name in names]]
     for output in weights.outputs:
         scale = output.y_scale * output.signal_variance

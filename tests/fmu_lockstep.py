@@ -20,9 +20,8 @@ from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import STATES, dynamic
 from codegen.fmu import FmuDefinition, pack
 from codegen.fmu.controller import controller_fmu
-from controller.compensation import CompensationSettings
+from controller.cycle_settings import CompensationSettings, FallbackSettings
 from controller.driver import Driver
-from controller.fallback import FallbackSettings
 from controller.mpc import PredictiveController
 from controller.native_step import NativeStep, StepStatus
 from plant.simulator import Simulator
@@ -81,8 +80,7 @@ class Lockstep:
             u_applied=self.plant.u_applied, lockstep=not self.delay_s, answers=(), final=False,
         )  # fmt: skip
         self.driver.observe(state)
-        self.driver.decide(state, state.time_s)
-        decision = self.driver.settle()
+        decision = self.driver.decide(state.time_s)
         self.driver.prepare(STEP_S)
         self.x.append(x)
         self.u.append(np.array([decision.d, decision.delta_rate]))

@@ -17,6 +17,8 @@ from typing import Any
 from bayesrace.messages import STATE, Event, RunRequest, State, car_key, decode
 from bayesrace.recorder import Recorder
 from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
+from codegen.build import build
+from codegen.settings import BuildSettings
 from tests.programs import ROOT, until
 
 __all__ = [
@@ -41,15 +43,18 @@ sys.exit(main(PlantSettings.model_validate_json(sys.argv[1])))
 
 CONTROLLER = """
 import sys
+from pathlib import Path
 import numpy as np
 from bayesrace.vehicles import get_car
 from controller.process import ControllerSettings, main
 from controller.pure_pursuit import PurePursuit, PurePursuitSettings
+from controller.python_controller import PythonController
 assert not {"casadi", "sklearn", "matplotlib", "scipy"} & set(sys.modules), "slow imports"
 s = np.linspace(0, 2 * np.pi, 200, endpoint=False)
-line = PurePursuit(get_car("orca"), 2 * np.cos(s), np.sin(s), np.full(200, 1.5),
-                   PurePursuitSettings(seed=int(sys.argv[2])))
-sys.exit(main(ControllerSettings.model_validate_json(sys.argv[1]), line))
+law = PurePursuit(get_car("orca"), 2 * np.cos(s), np.sin(s), np.full(200, 1.5),
+                  PurePursuitSettings(seed=int(sys.argv[2])))
+controller = PythonController(Path(sys.argv[3]), law)
+sys.exit(main(ControllerSettings.model_validate_json(sys.argv[1]), controller))
 """
 
 
@@ -152,7 +157,9 @@ def running_rig(
         return json.dumps({"endpoints": ends, "parent_pid": os.getpid(), **more})
 
     plant = start(PLANT, settings(at_plant, **(plant_settings or {})))
-    controller = start(controller_code, settings(at_controller, at_plant), str(seed))
+    artefact, _ = build(BuildSettings())
+    at = settings(at_controller, at_plant)
+    controller = start(controller_code, at, str(seed), str(artefact))
     try:
         with open_session(Endpoints(connect=(at_plant, at_controller))) as session:
             director = Director(session, "orca")

@@ -18,6 +18,7 @@ from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
 from controller.assembly import compiled_controller
 from controller.pure_pursuit import PurePursuit, PurePursuitSettings
+from controller.python_controller import PythonController
 from experiments.closed_loop import ClosedLoop
 from experiments.collect import collect
 from experiments.drive import RunPlan, execute
@@ -113,22 +114,27 @@ class Failing(Simulator):
 
 
 def test_a_fault_of_the_car_ends_the_run(
-    circuit: Circuit, car: CarParameters, tmp_path: Path
+    circuit: Circuit, car: CarParameters, kinematic_artefact: Path, tmp_path: Path
 ) -> None:
     line, vehicle = circuit.line, Failing(dynamic(car))
-    pursuit = PurePursuit(car, line.x_m, line.y_m, line.vx_mps)
+    law = PurePursuit(car, line.x_m, line.y_m, line.vx_mps)
+    pursuit = PythonController(kinematic_artefact, law)
     driven = ClosedLoop(car, circuit.track, line, pursuit, vehicle).drive()
     assert driven.end.reason == "plant_fault"
     assert len(driven.x) == len(driven.u) + 1 == 51
     assert len(driven.samples()) > 40
-    arguments = circuit.track, line, car, tmp_path / "log.mcap", 2.0, PurePursuitSettings()
+    log = tmp_path / "log.mcap"
+    arguments = circuit.track, line, car, kinematic_artefact, log, 2.0, PurePursuitSettings()
     with pytest.raises(FmuFault, match="it has crashed"):
         collect(*arguments, vehicle=vehicle)
 
 
-def test_samples_are_those_of_its_log(circuit: Circuit, car: CarParameters, tmp_path: Path) -> None:
+def test_samples_are_those_of_its_log(
+    circuit: Circuit, car: CarParameters, kinematic_artefact: Path, tmp_path: Path
+) -> None:
     line = circuit.line
-    pursuit = PurePursuit(car, line.x_m, line.y_m, line.vx_mps)
+    law = PurePursuit(car, line.x_m, line.y_m, line.vx_mps)
+    pursuit = PythonController(kinematic_artefact, law)
     log = LogWriter(tmp_path / "log.mcap")
     driven = ClosedLoop(car, circuit.track, line, pursuit, log=log).drive(1)
     log.close()

@@ -325,8 +325,9 @@ def test_the_library_exports_the_interface_only(kinematic_artefact: Path) -> Non
     line = ["nm", "-D", "--defined-only", str(kinematic_artefact / LIBRARY)]
     listing = subprocess.run(line, capture_output=True, text=True, check=True).stdout
     names = {row.split()[-1] for row in listing.splitlines()}
-    assert {n for n in names if not n.startswith("br_mpc_")} == set()
-    header = (kinematic_artefact / "bayesrace_mpc.h").read_text()
+    assert {n for n in names if not n.startswith(("br_mpc_", "br_cycle_"))} == set()
+    headers = ("bayesrace_mpc.h", "bayesrace_cycle.h")
+    header = "".join((kinematic_artefact / one).read_text() for one in headers)
     assert all(name in header for name in names)
     assert "br_mpc_step" in names
 

@@ -1,20 +1,21 @@
-"""With an exact model, the predicted state is the true one at the moment the input acts."""
+"""With an exact model, the predicted state is the true one at the moment the input acts; and which
+states are driven on. Both are C, driven here by the control cycle's binding."""
 
-from dataclasses import replace
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bayesrace.messages import State
 from bayesrace.transport import Numbering
-from controller.compensation import CompensationSettings, DelayCompensator
-from controller.states import StateStream
+from controller.cycle_settings import CompensationSettings
+from controller.driver import Driver
+from controller.interface import StepOutput
+from tests.cycle_rig import STEP_S, ScriptedLaw, scripted_driver, state
 
 Floats = NDArray[np.float64]
-
-STEP_S = 0.02
 
 
 def exact(x: Floats, u: Floats, duration_s: float) -> Floats:
@@ -25,14 +26,6 @@ def exact(x: Floats, u: Floats, duration_s: float) -> Floats:
     after[3] = 3 * u[0] + (x[3] - 3 * u[0]) * decay
     after[6] += duration_s * u[1]
     return after
-
-
-def state(seq: int, x: Floats, u: Floats, **changes: Any) -> State:
-    values: dict[str, Any] = {
-        "source_time_ns": 0, "epoch": 1, "run": 1, "time_s": seq * STEP_S, "lap": 0,
-        "lockstep": False, "answers": (), "final": False,
-    }  # fmt: skip
-    return State(seq=seq, x=tuple(x), u_applied=tuple(u), **(values | changes))
 
 
 class Delayed:
@@ -54,24 +47,30 @@ class Delayed:
         self.x, self.time_s = exact(self.x, self.u, until_s - self.time_s), until_s
 
 
-def drive(delay_s: float, settings: CompensationSettings, every: int = 1) -> list[float]:
+def drive(
+    artefact: Path, delay_s: float, settings: CompensationSettings, every: int = 1
+) -> list[float]:
     """Drives with random inputs; how far each prediction was off. ``every`` state arrives."""
     random = np.random.default_rng(2)
-    plant, compensator = Delayed(delay_s), DelayCompensator(settings, exact)
+    seen: list[Floats] = []
+
+    def answer(x: Floats) -> StepOutput:
+        seen.append(x)
+        return StepOutput(u=random.uniform([-0.1, -5.0], [1.0, 5.0]))
+
+    driver = scripted_driver(artefact, ScriptedLaw(answer, exact), compensation=settings)
+    plant = Delayed(delay_s)
     promised: list[tuple[float, Floats]] = []
-    newest = state(0, plant.x, plant.u)
     for k in range(60):
         plant.advance(k * STEP_S)
         answers = (float(k), delay_s, delay_s) if k else ()
         if k % every == 0:
-            newest = state(k, plant.x, plant.u, answers=answers)
-            compensator.observe(newest)
-        basis_s = k * STEP_S
-        x, _ = compensator.at_acting(newest, basis_s)
-        promised.append((basis_s + delay_s, x.copy()))
-        u = random.uniform([-0.1, -5.0], [1.0, 5.0])
-        compensator.sent(basis_s, *u)
-        plant.accept(basis_s, u)
+            assert driver.observe(
+                state(k, x=tuple(plant.x), u_applied=tuple(plant.u), answers=answers)
+            )
+        decision = driver.decide(k * STEP_S)
+        promised.append((k * STEP_S + delay_s, seen[-1]))
+        plant.accept(k * STEP_S, np.array([decision.d, decision.delta_rate]))
     truth = Delayed(delay_s)
     truth.coming = [(0.0, np.zeros(2))]
     random = np.random.default_rng(2)
@@ -85,54 +84,74 @@ def drive(delay_s: float, settings: CompensationSettings, every: int = 1) -> lis
 
 
 @pytest.mark.parametrize("delay_s", [0.001, 0.02, 0.03, 0.08, 0.16])
-def test_the_measured_delay_is_covered(delay_s: float) -> None:
-    errors = drive(delay_s, CompensationSettings())
+def test_the_measured_delay_is_covered(kinematic_artefact: Path, delay_s: float) -> None:
+    errors = drive(kinematic_artefact, delay_s, CompensationSettings())
     assert max(errors[2:]) < 1e-9  # the first state comes before anything is measured
 
 
-def test_a_fixed_delay_needs_no_measurement() -> None:
-    assert max(drive(0.05, CompensationSettings(mode="fixed", delay_s=0.05))) < 1e-9
+def test_a_fixed_delay_needs_no_measurement(kinematic_artefact: Path) -> None:
+    settings = CompensationSettings(mode="fixed", delay_s=0.05)
+    assert max(drive(kinematic_artefact, 0.05, settings)) < 1e-9
 
 
-def test_lost_states_are_bridged() -> None:
-    assert max(drive(0.03, CompensationSettings(), every=3)[2:]) < 1e-9
+def test_lost_states_are_bridged(kinematic_artefact: Path) -> None:
+    assert max(drive(kinematic_artefact, 0.03, CompensationSettings(), every=3)[2:]) < 1e-9
 
 
-def test_without_compensation_the_state_is_that_of_the_past() -> None:
-    assert max(drive(0.08, CompensationSettings(mode="off"))) > 0.01
+def test_without_compensation_the_state_is_that_of_the_past(kinematic_artefact: Path) -> None:
+    assert max(drive(kinematic_artefact, 0.08, CompensationSettings(mode="off"))) > 0.01
 
 
-def test_the_delay_is_the_median_and_overtaken_answers_do_not_count() -> None:
-    compensator = DelayCompensator(CompensationSettings(), exact)
+@pytest.fixture(name="driver")
+def drivers(kinematic_artefact: Path) -> Callable[..., Driver]:
+    """Makes one for a law that stands still."""
+
+    def make(answer: Any = None, **chosen: Any) -> Driver:
+        law = ScriptedLaw(answer or (lambda _: StepOutput(u=np.zeros(2))), exact)
+        return scripted_driver(kinematic_artefact, law, compensation=CompensationSettings(**chosen))
+
+    return make
+
+
+Make = Callable[..., Driver]
+
+
+def test_the_delay_is_the_median_and_overtaken_answers_do_not_count(driver: Make) -> None:
+    made = driver()
     for seq, acting_s in enumerate([0.02, 0.02, 0.5, 0.02, -1.0, 0.03, 0.03]):
-        compensator.observe(state(seq, np.zeros(7), np.zeros(2), answers=(0.0, 0.01, acting_s)))
-    assert compensator.delay_s == 0.02
+        made.observe(state(seq, answers=(0.0, 0.01, acting_s)))
+    assert made.delay_s == 0.02
 
 
-def test_no_prediction_goes_farther_than_its_limit() -> None:
-    compensator = DelayCompensator(CompensationSettings(mode="fixed", delay_s=1.0), exact)
+def test_no_prediction_goes_farther_than_its_limit(driver: Make) -> None:
+    seen: list[Floats] = []
+
+    def answer(x: Floats) -> StepOutput:
+        seen.append(x)
+        return StepOutput(u=np.zeros(2))
+
+    made = driver(answer, mode="fixed", delay_s=1.0)
     moving = np.zeros(7)
     moving[3] = 1.0
-    x, _ = compensator.at_acting(state(0, moving, np.zeros(2)), 5.0)
-    assert x == pytest.approx(exact(moving, np.zeros(2), 0.5))
+    made.observe(state(0, x=tuple(moving)))
+    made.decide(5.0)
+    assert seen[0] == pytest.approx(exact(moving, np.zeros(2), 0.5))
 
 
-def test_a_run_goes_on_with_rising_numbers_and_another_plant_begins_anew() -> None:
-    stream = StateStream()
-    zero = np.zeros(7), np.zeros(2)
+def test_a_run_goes_on_with_rising_numbers_and_another_plant_begins_anew(driver: Make) -> None:
+    made = driver()
     for seq in (100, 101, 104, 103, 104):
-        stream.accept(state(seq, *zero))
+        made.observe(state(seq))
     # 102 is lost; 103 was overtaken, the second 104 a copy
-    assert (stream.received, stream.stale) == (5, 2)
-    assert stream.newest is not None
-    assert stream.newest.seq == 104
-    stream.end()
-    assert stream.accept(state(0, *zero, epoch=2))
-    assert not stream.accept(state(105, *zero, epoch=1))
-    assert stream.accept(state(1, *zero, epoch=2))
-    assert stream.newest.epoch == 2
-    assert (stream.stale, stream.foreign) == (2, 1)
-    assert stream.interval_s == pytest.approx(STEP_S)
+    assert (made.numbering.received, made.count("stale")) == (5, 2)
+    assert made.newest == state(104)
+    made.lost(silent=False)
+    assert made.observe(state(0, epoch=2))
+    assert not made.observe(state(105, epoch=1))
+    assert made.observe(state(1, epoch=2))
+    assert made.newest == state(1, epoch=2)
+    assert (made.count("stale"), made.count("foreign")) == (2, 1)
+    assert made.interval_s == pytest.approx(STEP_S)
 
 
 @pytest.mark.parametrize(
@@ -140,53 +159,48 @@ def test_a_run_goes_on_with_rising_numbers_and_another_plant_begins_anew() -> No
     [{"seq": 1100}, {"seq": 2**63 - 1}, {"epoch": 2}, {"run": 2}, {"seq": 0}],
     ids=["ahead", "far ahead", "epoch", "run", "behind"],
 )
-def test_one_foreign_state_is_counted_and_nothing_else(odd: dict[str, Any]) -> None:
-    stream = StateStream()
-    zero = np.zeros(7), np.zeros(2)
-    assert stream.accept(state(100, *zero))
-    assert not stream.accept(replace(state(101, *zero), **odd))
-    assert stream.stale + stream.foreign == 1
-    assert stream.accept(state(101, *zero))
-    assert stream.accept(state(102, *zero))
-    assert (stream.lost, stream.stale + stream.foreign) == (0, 1)
+def test_one_foreign_state_is_counted_and_nothing_else(driver: Make, odd: dict[str, Any]) -> None:
+    made = driver()
+    assert made.observe(state(100))
+    assert not made.observe(state(**({"seq": 101} | odd)))
+    assert made.count("stale") + made.count("foreign") == 1
+    assert made.observe(state(101))
+    assert made.observe(state(102))
+    assert (made.numbering.lost, made.count("stale") + made.count("foreign")) == (0, 1)
 
 
-def test_a_gap_of_a_quarter_second_is_a_loss_at_any_rate() -> None:
-    zero = np.zeros(7), np.zeros(2)
-    fast = [replace(state(seq, *zero), time_s=seq * 0.002) for seq in (100, 101, 226, 527)]
-    stream = StateStream()
-    assert [stream.accept(one) for one in fast] == [True, True, True, False]
-    assert (stream.lost, stream.foreign) == (124, 1)
+def test_a_gap_of_a_quarter_second_is_a_loss_at_any_rate(driver: Make) -> None:
+    made = driver()
+    fast = [state(seq, time_s=seq * 0.002) for seq in (100, 101, 226, 527)]
+    assert [made.observe(one) for one in fast] == [True, True, True, False]
+    assert (made.numbering.lost, made.count("foreign")) == (124, 1)
 
 
 @pytest.mark.parametrize("left", [{"seq": 101}, {"epoch": 2, "seq": 0}, {"seq": 40}])
 def test_several_in_a_row_are_followed_at_once_and_anything_after_silence(
-    left: dict[str, Any],
+    driver: Make, left: dict[str, Any]
 ) -> None:
     """What is taken for the run's newest state may have been the foreign one."""
-    zero = np.zeros(7), np.zeros(2)
     for silence in (False, True):
-        stream = StateStream()
-        stream.accept(state(100, *zero))
-        assert stream.accept(state(110, *zero))  # lost nine, or was deceived
-        first = replace(state(0, *zero), lockstep=silence, **left)
+        made = driver()
+        made.observe(state(100))
+        assert made.observe(state(110))  # lost nine, or was deceived
+        row = [state(lockstep=silence, **(left | {"seq": left["seq"] + k})) for k in range(5)]
         if silence:
-            assert not stream.accept(first)
-            assert stream.forget() == first
-            assert stream.forget() is None
-            assert stream.accept(first)
+            assert not made.observe(row[0])
+            assert made.lost(silent=True) == row[0]
+            assert made.lost(silent=True) is None
+            assert made.observe(row[0])
         else:
-            row = [replace(first, seq=first.seq + k) for k in range(5)]
-            assert [stream.accept(one) for one in row] == [False, False, False, True, True]
+            assert [made.observe(one) for one in row] == [False, False, False, True, True]
 
 
-def test_two_plants_at_once_are_not_mixed() -> None:
-    stream = StateStream()
-    zero = np.zeros(7), np.zeros(2)
+def test_two_plants_at_once_are_not_mixed(driver: Make) -> None:
+    made = driver()
     for seq in range(50):
-        assert stream.accept(state(seq, *zero, epoch=1))
-        assert not stream.accept(state(seq, *zero, epoch=2))
-    assert stream.foreign == 50
+        assert made.observe(state(seq, epoch=1))
+        assert not made.observe(state(seq, epoch=2))
+    assert made.count("foreign") == 50
 
 
 def test_losses_are_told_also_when_the_first_message_of_a_restarted_sender_is_lost() -> None:

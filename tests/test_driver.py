@@ -1,6 +1,7 @@
 """The controller between a state and an input: stop and go, and each level of the fallback by a
 real cause, with the compiled step."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,14 +9,25 @@ import pytest
 from numpy.typing import NDArray
 
 from bayesrace.messages import State
+from bayesrace.native_interface import LEVELS, PHASES
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
-from controller.compensation import CompensationSettings
-from controller.driver import HALTED, NO_STATE, STEP_RAISED, UNPREDICTABLE, Decision, Driver, Phase
-from controller.fallback import FallbackSettings, Level
+from controller.cycle_settings import CompensationSettings, FallbackSettings
+from controller.driver import (
+    HALTED,
+    NO_STATE,
+    STEP_FAILED,
+    UNPREDICTABLE,
+    Decision,
+    Driver,
+    Level,
+    Phase,
+)
+from controller.interface import StepOutput
 from controller.mpc import PredictiveController
 from controller.native_step import NativeStep, StepStatus
 from tests.conftest import SETTINGS, Circuit, discrete
+from tests.cycle_rig import ScriptedLaw, scripted_driver, state
 
 Floats = NDArray[np.float64]
 
@@ -54,19 +66,15 @@ class Rig:
 
     def cycle(self, late_s: float = 0.0, budget_s: float = 0.0, **changes: Any) -> Decision:
         """A state arrives, is answered, and the plant drives on."""
-        state = self.state(**changes)
-        self.driver.observe(state)
-        self.driver.decide(state, state.time_s, budget_s)
-        decision = self.driver.settle(late_s)
+        told = self.state(**changes)
+        self.driver.observe(told)
+        decision = self.driver.decide(told.time_s, budget_s or 1e-9 * (late_s > 0), late_s)
         self.advance(decision)
         return decision
 
     def silent_cycle(self) -> Decision:
         """No state arrives."""
-        newest = self.driver.states.newest
-        assert newest is not None
-        self.driver.decide(newest, self.seq * STEP_S)
-        decision = self.driver.settle()
+        decision = self.driver.decide(self.seq * STEP_S)
         self.advance(decision)
         return decision
 
@@ -97,7 +105,7 @@ def driving(rig: Rig, cycles: int = 20) -> Rig:
 
 def test_it_drives(rig: Rig) -> None:
     driving(rig, 100)
-    assert rig.driver.counts == [100, 0, 0, 0]
+    assert rig.driver.levels == [100, 0, 0, 0]
 
 
 def test_silence_goes_down_all_levels_and_ends_at_standstill(rig: Rig) -> None:
@@ -106,7 +114,7 @@ def test_silence_goes_down_all_levels_and_ends_at_standstill(rig: Rig) -> None:
     bridged = [rig.silent_cycle().level for _ in range(3)]
     statuses = [rig.silent_cycle().status for _ in range(200)]
     assert set(statuses) == {NO_STATE}
-    counts = rig.driver.counts
+    counts = rig.driver.levels
     assert bridged == [Level.SOLUTION] * 3
     assert counts[Level.SHIFTED_PLAN] >= 2
     assert counts[Level.BRAKE] > 10
@@ -127,13 +135,11 @@ def test_states_that_come_back_drive_again_after_several_good_solutions(rig: Rig
 def test_an_infeasible_problem_is_answered_by_the_plan_before(rig: Rig) -> None:
     """Steered farther than a period at full rate can bring back within the limit."""
     driving(rig)
-    plan = rig.controller.step(np.array(rig.x), rig.u, STEP_S).plan_u.copy()
     x = rig.x.copy()
     x[6] = 0.6
     decision = rig.cycle(x=tuple(x))
     assert decision.status == StepStatus.INFEASIBLE
     assert decision.level is Level.SHIFTED_PLAN
-    assert len(plan)
 
 
 def test_a_state_that_is_no_number_is_not_driven_on(rig: Rig) -> None:
@@ -189,18 +195,19 @@ def test_a_late_solution_is_driven_from_where_it_has_got_to(rig: Rig) -> None:
     assert (decision.d, decision.delta_rate) == pytest.approx(tuple(decision.output.plan_u[2]))
 
 
-def test_a_step_that_raises_is_counted_and_stepped_down_from(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    driving(rig)
-
-    def broken(*_: Any) -> Any:
-        raise RuntimeError("no step today")
-
-    monkeypatch.setattr(rig.controller, "step", broken)
-    decision = rig.cycle()
-    assert (decision.status, decision.level) == (STEP_RAISED, Level.SHIFTED_PLAN)
-    assert (rig.driver.raised, "no step today" in rig.driver.last_error) == (1, True)
+def test_a_step_that_raises_is_counted_and_stepped_down_from(kinematic_artefact: Path) -> None:
+    plan = np.full((20, 2), 0.25)
+    law = ScriptedLaw(lambda _: StepOutput(u=plan[0], plan_u=plan))
+    driver = scripted_driver(kinematic_artefact, law)
+    for seq in range(3):
+        driver.observe(state(seq))
+        assert driver.decide(seq * STEP_S).level is Level.SOLUTION
+    law.answer = None
+    driver.observe(state(3))
+    decision = driver.decide(3 * STEP_S)
+    assert (decision.status, decision.level) == (STEP_FAILED, Level.SHIFTED_PLAN)
+    assert (driver.count("failed"), decision.output) == (1, None)
+    assert driver.controller.last_error == "RuntimeError: no step today"
 
 
 def test_stop_and_go(rig: Rig) -> None:
@@ -214,7 +221,7 @@ def test_stop_and_go(rig: Rig) -> None:
     for _ in range(20):
         assert rig.cycle().status == HALTED
     assert abs(rig.x[3]) < 0.05
-    assert rig.driver.counts == [20 + slowing, 0, 0, 0]  # a stop on command is no fallback
+    assert rig.driver.levels == [20 + slowing, 0, 0, 0]  # a stop on command is no fallback
     rig.driver.go()
     for _ in range(60):
         assert rig.cycle().level is Level.SOLUTION
@@ -271,22 +278,18 @@ def test_another_plant_begins_anew_and_its_forerunner_is_not_heard(rig: Rig) -> 
     rig.epoch, rig.seq = 2, 0
     assert rig.cycle().level is Level.SOLUTION
     assert not rig.driver.observe(left_over)
-    assert rig.driver.states.foreign == 1
+    assert rig.driver.count("foreign") == 1
     assert rig.cycle().level is Level.SOLUTION
 
 
-def test_second_starts_and_jumps_of_the_cost_are_counted(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    driving(rig, 5)
-    before = rig.driver.second_starts, rig.driver.cost_jumps
-    step = rig.controller.step
+def test_second_starts_and_jumps_of_the_cost_are_counted(kinematic_artefact: Path) -> None:
+    output = StepOutput(u=np.zeros(2), second_start=1, cost_shifted=1.0, cost=100.0)
+    driver = scripted_driver(kinematic_artefact, ScriptedLaw(lambda _: output))
+    driver.observe(state(0))
+    driver.decide(0.0)
+    assert (driver.count("second_starts"), driver.count("cost_jumps")) == (1, 1)
 
-    def odd(*arguments: Any) -> Any:
-        output = step(*arguments)
-        output.second_start, output.cost_shifted, output.cost = 1, 1.0, 100.0
-        return output
 
-    monkeypatch.setattr(rig.controller, "step", odd)
-    rig.cycle()
-    assert (rig.driver.second_starts, rig.driver.cost_jumps) == (before[0] + 1, before[1] + 1)
+def test_names_are_those_of_the_interface() -> None:
+    assert [one.name for one in Level] == [name for name, _ in LEVELS]
+    assert [one.name for one in Phase] == [name for name, _ in PHASES]

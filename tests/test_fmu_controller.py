@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import STATES
-from controller.driver import UNPREDICTABLE
-from controller.fallback import Level
+from controller.driver import UNPREDICTABLE, Level
 from controller.native_step import StepStatus
 from tests.conftest import Circuit
 from tests.fmu_lockstep import (  # noqa: F401 - fixtures are used by name

@@ -20,7 +20,8 @@ from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights, zero_weights
 from bayesrace.vehicles import CarParameters
 from codegen.fmu import pack, write_sources
-from codegen.fmu.resources import WEIGHTS_FILE, exchange_weights, path_resource
+from codegen.fmu.resources import exchange_weights
+from codegen.host_files import WEIGHTS_FILE, path_file
 from tests.conftest import Circuit, fit_weights
 from tests.fmu_lockstep import (  # noqa: F401 - fixtures are used by name
     Exported,
@@ -153,7 +154,7 @@ def test_missing_and_damaged_resources_are_refused_and_named(
         (lambda: weights.write_bytes(data[:-8]), "cut off"),
         (lambda: weights.write_bytes(data[:500] + b"\xff" + data[501:]), "damaged (checksum)"),
         (weights.unlink, "missing"),
-        (lambda: shutil.rmtree(damaged / "resources"), "resources/path.bin is missing"),
+        (lambda: shutil.rmtree(damaged / "resources"), "path.bin is missing"),
     ):
         change()
         with pytest.raises(Exception, match="instantiate"):
@@ -245,4 +246,4 @@ def test_what_does_not_fit_together_is_not_exported(
         exported.define(cpu="-O0 evil")
     with pytest.raises(InputError, match="export it there"):
         pack(exported.define(), exported.folder / "no.fmu", ["x86_64-linux", "x86_64-windows"])
-    assert len(path_resource(circuit.table.rows, circuit.table.spacing_m)) % 8 == 0
+    assert len(path_file(circuit.table.rows, circuit.table.spacing_m)) % 8 == 0

@@ -56,9 +56,9 @@ def preparing(
 STAGES = [
     "racing line, random",
     "racing line, random",
+    "build the controllers",
     "training drive (pure pursuit)",
     "train the residual",
-    "build the controllers",
 ]
 
 

@@ -1,17 +1,20 @@
 """The data-collecting driver: laps complete, limits hold, the car is excited, seeds repeat."""
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from bayesrace.errors import InputError
-from bayesrace.messages import State
 from bayesrace.tracks import DEFAULT_TRAINING_TRACK, Track, load_track
 from bayesrace.vehicles import default_car
 from bayesrace.vehicles.models import dynamic
+from codegen.build import build
+from codegen.settings import BuildSettings
 from controller.pure_pursuit import PurePursuit, PurePursuitSettings
+from controller.python_controller import PythonController
 from experiments.closed_loop import ClosedLoop, Driven
 from plant.simulator import Simulator
 from tests.conftest import offset_line
@@ -25,10 +28,6 @@ def oval(points: int = 200) -> tuple[Any, Any, Any]:
     return 2 * np.cos(angle), np.sin(angle), np.full(points, 1.5)
 
 
-def first_state(x0: tuple[float, ...]) -> State:
-    return State(0, 0, 0, 0, 0.0, x0, (0.0, 0.0), 0, True, (), False)
-
-
 TRACK = Track.from_points("oval", np.column_stack(oval()[:2]), 0.5, 0.5)
 
 
@@ -40,7 +39,8 @@ def drive(
     x0: tuple[float, ...] | None = None,
 ) -> Driven:
     line = offset_line(track, 0.0, 5.0, 1.5)
-    return ClosedLoop(CAR, track, line, driver, SIMULATOR).drive(laps, time_s, x0=x0)
+    controller = PythonController(build(BuildSettings())[0], driver)
+    return ClosedLoop(CAR, track, line, controller, SIMULATOR).drive(laps, time_s, x0=x0)
 
 
 START = (2.0, 0.0, math.pi / 2, 0.1, 0.0, 0.0, 0.0)
@@ -96,7 +96,8 @@ def test_a_mirrored_line_is_driven_with_mirrored_steering() -> None:
 
 def test_a_car_far_from_where_it_was_finds_the_line_again() -> None:
     driver = PurePursuit(CAR, *oval())
-    driver.reset(first_state(START))
+    driver.reset()
+    driver.step(np.array(START), np.zeros(2))
     elsewhere = np.array([-2.0, 0.1, -math.pi / 2, 1.0, 0.0, 0.0, 0.0])
     arc = driver.step(elsewhere, np.zeros(2)).s_ref_m
     perimeter = 9.688
@@ -117,6 +118,7 @@ def test_an_unusable_line_is_refused(line: Any, fault: str) -> None:
         PurePursuit(CAR, *line)
 
 
-def test_weights_are_refused() -> None:
+def test_weights_are_refused(kinematic_artefact: Path) -> None:
+    controller = PythonController(kinematic_artefact, PurePursuit(CAR, *oval()))
     with pytest.raises(InputError, match="takes no weights"):
-        PurePursuit(CAR, *oval()).set_weights(b"")
+        controller.set_weights(b"")

@@ -201,9 +201,9 @@ def test_a_second_race_prepares_nothing_and_says_so(driven: Race, short: ShortRa
     assert found == [
         "racing line, peanut",
         "racing line, peanut",
+        "build the controllers",
         "training drive (pure pursuit)",
         "train the residual",
-        "build the controllers",
         "update the residual",
     ]
     for name in CONTROLLERS:

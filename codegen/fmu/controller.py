@@ -1,11 +1,12 @@
 """The predictive controller as a Co-Simulation FMU: the native step inside other tools.
 
-The C side is ``native/controller.c``: it does with a state what ``controller/driver.py`` does in
-lockstep. The sources of the step, DAQP included, come from a built artefact.
+The C side is ``native/controller.c``, around the control cycle of ``controller/native``. The
+sources of the step, DAQP included, come from a built artefact.
 """
 
 from collections.abc import Mapping
 from html import escape
+from math import isfinite
 from pathlib import Path
 from typing import Final, Literal
 
@@ -14,23 +15,17 @@ from numpy.typing import ArrayLike
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
 from bayesrace.manifest import Manifest, read_manifest
-from bayesrace.native_interface import STATUSES
+from bayesrace.native_interface import NO_STEP, SOLVER, STATUSES
 from bayesrace.vehicles.parameters import CarParameters
+from codegen.build import HOST
 from codegen.compiler import FLAGS
 from codegen.fmu.definition import FmuDefinition
-from codegen.fmu.resources import PATH_FILE, WEIGHTS_FILE, path_resource, weights_resource
 from codegen.fmu.variables import Variable
+from codegen.host_files import PATH_FILE, WEIGHTS_FILE, path_file, weights_file
 
 __all__ = ["controller_fmu"]
 
 _NATIVE: Final = Path(__file__).parent / "native"
-_SOURCES: Final = (
-    "controller.c",
-    "controller_fallback.c",
-    "controller_fallback.h",
-    "controller_resources.c",
-    "controller_resources.h",
-)
 _NOT_NEEDED: Final = ("br_clock.c",)
 """Of the artefact: without a clock there are no budgets, and two runs are equal."""
 
@@ -50,32 +45,15 @@ _STATE: Final = (
 _NO_LIMIT_MPS: Final = 100.0
 """NO_SPEED_LIMIT in C: the racing line knows no higher speed."""
 
-_SETTINGS: Final = (
-    ("q_position", "1/m2", True, "weight of the squared position error"),
-    ("r_duty", "1", True, "weight of the squared change of the duty cycle"),
-    ("r_delta_rate", "s2/rad2", True, "weight of the squared steering rate"),
-    ("s_slack", "1/m2", False, "weight of the squared track violation; 0: no track constraints"),
-    ("margin_m", "m", False, "distance kept from the track edges"),
-    ("tolerance", "1", True, "KKT residual of a converged step"),
-    ("defect_max", "1", True, "largest dynamics defect (m, rad, m/s, 10 rad/s) of a usable plan"),
-    ("settle", "1", False, "a step ends at this stationarity and tenth of the defect; 0: neither"),
-)
-"""Name, unit, whether it must be above 0, description."""
-
-_COUNTS: Final = (
-    ("iterations", "SQP iterations that a step may use"),
-    ("iterations_cold", "the same for the first step and after a reset"),
-)
-
 _STATUSES: Final = tuple(text for _, text, _ in STATUSES[:-1])
 """br_mpc_status in order, but for the last: a step without a budget is never out of time."""
 
-_WITHOUT_STEP: Final = {
-    "STATUS_UNPREDICTABLE": (252, "not predictable"),
-    "STATUS_NO_STEP": (253, "none yet"),
-    "STATUS_REFUSED": (255, "refused"),
-}
-"""Statuses of a cycle without a step: name in C, number as in ``controller/driver.py``, meaning."""
+_WITHOUT_STEP: Final = {"UNPREDICTABLE": "not predictable", "HALTED": "none yet",
+                        "STEP_FAILED": "refused"}  # fmt: skip
+"""Of :data:`bayesrace.native_interface.NO_STEP`, those of an FMU, and what they mean here."""
+
+_LIMITS: Final = ("d_min", "d_max", "delta_max_rad", "delta_rate_max_radps")
+"""Parameters that the car has, not the settings."""
 
 _FALLBACK: Final = (
     ("shifted_s", "shifted_s", "s", False, "how long a plan may be driven without a new one"),
@@ -110,7 +88,8 @@ def controller_fmu(
             f"{artefact} was built for car '{manifest.car}-{manifest.car_digest}', not "
             f"'{car.name}-{car.digest()}': run 'bayesrace build'"
         )
-    sources = [path for path in sorted(artefact.glob("*.[ch]")) if path.name not in _NOT_NEEDED]
+    sources = [*sorted(artefact.glob("*.[ch]")), *sorted((artefact / HOST).iterdir())]
+    sources = [path for path in sources if path.name not in _NOT_NEEDED]
     return FmuDefinition(
         name=f"BayesRace controller ({car.name}, {manifest.model})",
         identifier="bayesrace_controller",
@@ -118,18 +97,16 @@ def controller_fmu(
         version=version,
         kind="cs",
         variables=_variables(manifest, car, settings, fallback),
-        sources=(*(_NATIVE / name for name in _SOURCES), *sources),
+        sources=(_NATIVE / "controller.c", *sources),
         trees={"daqp": artefact / "daqp"},
         archives=(artefact / "libdaqpstat.a",),
         flags=_flags(cpu),
         constants={
-            "CONTROLLER_IDENTITY": manifest.discretisation,
             "NO_SPEED_LIMIT": _NO_LIMIT_MPS,
-            **{name: number for name, (number, _) in _WITHOUT_STEP.items()},
         },
         resources={
-            PATH_FILE: path_resource(rows, spacing_m),
-            WEIGHTS_FILE: weights_resource(weights, manifest.discretisation, manifest.gp_capacity),
+            PATH_FILE: path_file(rows, spacing_m),
+            WEIGHTS_FILE: weights_file(weights, manifest.discretisation, manifest.gp_capacity),
         },
         documentation=_documentation(manifest, weights, cpu),
         default_step_s=manifest.step_s,
@@ -155,8 +132,7 @@ def _variables(
 ) -> tuple[Variable, ...]:
     return (
         *_inputs(),
-        *_objective(settings),
-        *_limits(car),
+        *_parameters(manifest, car, settings),
         *_timing(manifest, fallback),
         *_outputs(),
     )
@@ -194,38 +170,39 @@ def _inputs() -> list[Variable]:
     ]
 
 
-def _objective(settings: Mapping[str, float]) -> list[Variable]:
-    def start(name: str) -> float:
-        off = name == "s_slack" and not settings.get("constraints", True)
-        return 0.0 if off else float(_value(settings, name))
+def _parameters(
+    manifest: Manifest, car: CarParameters, settings: Mapping[str, float]
+) -> list[Variable]:
+    """The problem's and the solver's, which the car's limits and the settings give values."""
 
-    reals = [
-        _parameter(name, unit, text, start(name), positive)
-        for name, unit, positive, text in _SETTINGS
-    ]
-    counts = [
+    def start(name: str) -> float:
+        if name == "s_slack" and not settings.get("constraints", True):
+            return 0.0
+        return float(getattr(car, name) if name in _LIMITS else _value(settings, name))
+
+    own = [
         Variable(
+            one.name,
+            "parameter",
+            one.text,
+            unit=one.unit,
+            start=start(one.name),
+            min=0.0 if one.positive else one.low if isfinite(one.low) else None,
+            max=one.high if isfinite(one.high) else None,
+            exclusive=one.positive,
+            tunable=True,
+        )
+        for one in manifest.problem.parameters
+    ]
+    of_solver = [
+        _parameter(name, "1", text, start(name), rule == "> 0")
+        if kind == "double"
+        else Variable(
             name, "parameter", text, "integer", start=start(name), min=1, max=1000, tunable=True
         )
-        for name, text in _COUNTS
+        for name, kind, text, rule in SOLVER
     ]
-    return [*reals, *counts]
-
-
-def _limits(car: CarParameters) -> list[Variable]:
-    d_min, d_max = "lowest duty cycle (full brake)", "highest duty cycle"
-    return [
-        Variable("d_min", "parameter", d_min, unit="1", start=car.d_min, max=0.0, tunable=True),
-        Variable("d_max", "parameter", d_max, unit="1", start=car.d_max, min=0.0, tunable=True),
-        _parameter("delta_max_rad", "rad", "limit of the steering angle", car.delta_max_rad, True),
-        _parameter(
-            "delta_rate_max_radps",
-            "rad/s",
-            "limit of the steering rate",
-            car.delta_rate_max_radps,
-            True,
-        ),
-    ]
+    return [*own, *of_solver]
 
 
 def _timing(manifest: Manifest, fallback: Mapping[str, float]) -> list[Variable]:
@@ -279,7 +256,8 @@ def _outputs() -> list[Variable]:
     ) -> Variable:
         return Variable(name, "output", text, kind, unit, dependencies=None)
 
-    numbered = (*enumerate(_STATUSES), *_WITHOUT_STEP.values())
+    others = ((n, _WITHOUT_STEP[name]) for name, n, _ in NO_STEP if name in _WITHOUT_STEP)
+    numbered = (*enumerate(_STATUSES), *others)
     statuses = ", ".join(f"{number} {text}" for number, text in numbered)
     return [
         output("d", "duty cycle", "real", "1"),
@@ -331,7 +309,7 @@ def _documentation(manifest: Manifest, weights: GpWeights | None, cpu: str) -> s
         "braking along it; <code>fallback_level</code> tells. What is not finite is never passed "
         "on.</p>"
         f"<p>Racing line and weights are in <code>resources/{PATH_FILE}</code> and "
-        f"<code>resources/{WEIGHTS_FILE}</code> (format: sources/controller_resources.h), loaded "
+        f"<code>resources/{WEIGHTS_FILE}</code> (format: sources/br_files.h), loaded "
         "and checked at instantiation: exchange them without compiling.</p>"
         f"<p>The binary is compiled for the CPU '{escape(cpu)}'.</p>"
     )

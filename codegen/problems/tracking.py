@@ -33,8 +33,8 @@ _PARAMETERS = (
     Parameter("r_delta_rate", "s2/rad2", "weight of the squared steering rate", positive=True),
     Parameter("s_slack", "1/m2", "weight of the squared track violation; 0: no track", low=0),
     Parameter("margin_m", "m", "distance kept from the track edges", low=0),
-    Parameter("d_min", "1", "lowest duty cycle (full brake)"),
-    Parameter("d_max", "1", "highest duty cycle"),
+    Parameter("d_min", "1", "lowest duty cycle (full brake)", high=0),
+    Parameter("d_max", "1", "highest duty cycle", low=0),
     Parameter("delta_max_rad", "rad", "limit of the steering angle", positive=True),
     Parameter("delta_rate_max_radps", "rad/s", "limit of the steering rate", positive=True),
 )

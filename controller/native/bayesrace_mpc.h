@@ -24,8 +24,8 @@
 #include <stddef.h>
 
 #include "br_config.h"    /* generated: BR_N, BR_TS, BR_GP_CAPACITY, BR_MODEL_NAME */
-#include "br_interface.h" /* generated: br_mpc_error, br_mpc_status, br_mpc_info, BR_ABI */
 #include "br_problem.h"   /* generated: sizes, br_mpc_parameters, br_mpc_reference */
+#include "br_interface.h" /* generated: br_mpc_error, br_mpc_status, br_mpc_info, BR_ABI */
 
 #ifdef __cplusplus
 extern "C" {
@@ -161,8 +161,8 @@ BR_API br_mpc_error br_mpc_predict(const br_mpc *mpc, const double x[BR_NX], con
  * if nothing is prepared. */
 BR_API br_mpc_error br_mpc_rehearse(br_mpc *mpc);
 
-/* Plan of the last step, row major: x (BR_N + 1) x BR_NX, u BR_N x BR_NU. br_mpc_prepare does not
- * change it. */
+/* Plan of the last step, row major: x (BR_N + 1) x BR_NX, u BR_N x BR_NU; NULL for what is not
+ * wanted. br_mpc_prepare does not change it. */
 BR_API br_mpc_error br_mpc_get_plan(const br_mpc *mpc, double *x, double *u);
 BR_API br_mpc_error br_mpc_get_reference(const br_mpc *mpc, br_mpc_reference reference[BR_N]);
 

@@ -19,8 +19,7 @@ br_mpc_error br_mpc_init(void *memory, size_t size, br_mpc **out) {
 
 static int valid(const br_mpc_parameters *p) {
     const double numbers[] = {p->tolerance, p->defect_max, p->settle};
-    return br_all_finite(numbers, sizeof numbers / sizeof numbers[0]) && p->tolerance > 0 &&
-           p->defect_max > 0 && p->settle >= 0 && p->iterations >= 1 && p->iterations_cold >= 1 &&
+    return br_all_finite(numbers, sizeof numbers / sizeof numbers[0]) && BR_SOLVER_VALID(p) &&
            br_valid_parameters(p);
 }
 
@@ -69,9 +68,9 @@ void br_mpc_reset(br_mpc *mpc) {
 }
 
 br_mpc_error br_mpc_get_plan(const br_mpc *mpc, double *x, double *u) {
-    if (!mpc || !x || !u) return BR_ERROR_NULL;
-    memcpy(x, mpc->answer_x, sizeof mpc->answer_x);
-    memcpy(u, mpc->answer_u, sizeof mpc->answer_u);
+    if (!mpc) return BR_ERROR_NULL;
+    if (x) memcpy(x, mpc->answer_x, sizeof mpc->answer_x);
+    if (u) memcpy(u, mpc->answer_u, sizeof mpc->answer_u);
     return BR_OK;
 }
 

@@ -124,6 +124,7 @@ static void solve(br_mpc *mpc, double u[BR_NU], br_mpc_status *status, br_mpc_in
     mpc->unfinished = unfinished ? mpc->unfinished + mpc->info.iterations : 0;
     memcpy(mpc->answer_x, mpc->plan.x, sizeof mpc->answer_x);
     memcpy(mpc->answer_u, mpc->plan.u, sizeof mpc->answer_u);
+    mpc->info.status = *status;
     if (info) *info = mpc->info;
 }
 
@@ -146,6 +147,7 @@ static br_mpc_error begin(br_mpc *mpc, const request *r, int *plausible) {
     br_timer_start(&mpc->timer, r->budget_s);
     *r->status = BR_BAD_STATE; /* until there is something better to say */
     memset(&mpc->info, 0, sizeof mpc->info);
+    mpc->info.status = BR_BAD_STATE;
     if (r->info) *r->info = mpc->info;
     if (!mpc->has_parameters) return BR_ERROR_NOT_READY;
     if (!(r->elapsed_s >= 0 && isfinite(r->elapsed_s))) return BR_ERROR_TIME;

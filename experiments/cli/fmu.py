@@ -132,7 +132,7 @@ def _controller(
     from codegen.fmu.controller import controller_fmu
     from codegen.settings import BuildSettings
     from controller.assembly import read_settings
-    from controller.fallback import FallbackSettings
+    from controller.cycle_settings import FallbackSettings
     from controller.path_table import make_path_table
     from controller.settings import MpcSettings
 

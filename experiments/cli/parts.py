@@ -150,7 +150,7 @@ def controller(
 
 
 def _compensation(delay: str) -> dict[str, str | float]:
-    """The option's words as :class:`controller.compensation.CompensationSettings`."""
+    """The option's words as :class:`controller.cycle_settings.CompensationSettings`."""
     if delay in ("measured", "off"):
         return {"mode": delay}
     try:

@@ -1,4 +1,4 @@
-"""``tracks``, ``raceline``, ``collect``, ``train``, ``build``: each with files in and out."""
+"""``tracks`` to ``export``: what is done before driving, each with files in and out."""
 
 import shutil
 from enum import StrEnum
@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from bayesrace.errors import InputError
+from bayesrace.tracks import DEFAULT_RACE_TRACK
 from bayesrace.vehicles import DEFAULT_CAR
 from experiments.cli.options import (
     Car,
@@ -142,6 +143,8 @@ def collect(
     from bayesrace.raceline import read_raceline_for
     from bayesrace.tracks import load_track
     from bayesrace.vehicles import get_car
+    from codegen.build import build
+    from codegen.settings import BuildSettings
     from controller.pure_pursuit import PurePursuitSettings
     from experiments.collect import collect as drive
     from plant.vehicle import open_vehicle
@@ -152,7 +155,10 @@ def collect(
     line = read_raceline_for(raceline, course, parameters)
     with open_vehicle(parameters, fmu, fmu_map) as vehicle:
         duration_s = duration or parameters.tuning.pursuit.drive_s
-        samples = drive(course, line, parameters, out, duration_s, settings, vehicle=vehicle)
+        artefact, _ = build(BuildSettings(car=parameters))
+        samples = drive(
+            course, line, parameters, artefact, out, duration_s, settings, vehicle=vehicle
+        )
     typer.echo(f"{samples} samples: {out}")
 
 
@@ -265,6 +271,54 @@ def build(
     typer.echo(str(folder))
 
 
+def export(
+    out: Annotated[Path, typer.Argument(help="Folder to write into.")],
+    track: TrackName = DEFAULT_RACE_TRACK,
+    raceline: Annotated[
+        Path | None, typer.Option(help="Racing line file [computed].", show_default=False)
+    ] = None,
+    weights: Annotated[
+        Path | None, typer.Option(help="GP weights; none is the uncorrected model.")
+    ] = None,
+    settings: Annotated[Path | None, typer.Option(help="OCP settings (JSON).")] = None,
+    artefact: Annotated[
+        Path | None, typer.Option(help="Folder of 'bayesrace build' [built].", show_default=False)
+    ] = None,
+    car: Car = DEFAULT_CAR,
+) -> None:
+    """Write what a C program drives with: racing line, weights, settings (examples/c_host)."""
+    from bayesrace.gp.weights import read_weights
+    from bayesrace.manifest import read_manifest
+    from bayesrace.raceline import read_raceline_for
+    from bayesrace.raceline.cached import racing_line
+    from bayesrace.tracks import load_track
+    from bayesrace.vehicles import get_car
+    from codegen.build import build as make
+    from codegen.host_files import export as write
+    from codegen.settings import BuildSettings
+    from controller.assembly import read_settings
+    from controller.cycle_settings import driving_values
+    from controller.path_table import make_path_table
+    from controller.process_settings import ControllerSettings
+    from controller.settings import MpcSettings
+
+    parameters, process = get_car(car), ControllerSettings()
+    course = load_track(track, parameters.width_m)
+    line = (
+        racing_line(course, parameters)
+        if raceline is None
+        else read_raceline_for(raceline, course, parameters)
+    )
+    table = make_path_table(course, line, parameters.tuning.path.spacing_m)
+    values = read_settings(settings, MpcSettings).parameters(parameters) | driving_values(
+        parameters, process.fallback, process.compensation, process.stale_s
+    )
+    manifest = read_manifest(artefact or make(BuildSettings(car=parameters))[0])
+    learned = None if weights is None else read_weights(weights)
+    write(out, manifest, table.rows, table.spacing_m, values, learned)
+    typer.echo(f"{course.name}, {line.lap_time_s:.3f} s by its racing line: {out}")
+
+
 def _replace(source: str, target: str) -> None:
     """Copies beside the target and renames: a running controller keeps the library it loaded."""
     beside = f"{target}.new"
@@ -274,5 +328,5 @@ def _replace(source: str, target: str) -> None:
 
 def register(app: typer.Typer) -> None:
     """Adds this module's subcommands."""
-    for command in (tracks, cars, raceline, collect, train, build):
+    for command in (tracks, cars, raceline, collect, train, build, export):
         app.command()(command)

@@ -149,8 +149,7 @@ static void check_null(br_mpc *mpc, const double *table, int rows, double spacin
     CHECK(br_mpc_predict(mpc, NULL, u, 0, x) == BR_ERROR_NULL);
     CHECK(br_mpc_predict(mpc, x, NULL, 0, x) == BR_ERROR_NULL);
     CHECK(br_mpc_predict(mpc, x, u, 0, NULL) == BR_ERROR_NULL);
-    CHECK(br_mpc_get_plan(mpc, NULL, plan_u) == BR_ERROR_NULL);
-    CHECK(br_mpc_get_plan(mpc, plan_x, NULL) == BR_ERROR_NULL);
+    CHECK(br_mpc_get_plan(NULL, plan_x, plan_u) == BR_ERROR_NULL);
     CHECK(br_mpc_get_reference(NULL, reference) == BR_ERROR_NULL);
     CHECK(br_mpc_evaluate(mpc, NULL, x, plan_x, jacobian, hessian) == BR_ERROR_NULL);
     br_mpc_reset(NULL);

@@ -1,13 +1,13 @@
-/* Loads the controller FMU's resources from one folder after another:
+/* Loads racing line and weights from one folder after another:
  *
- *   fmu_resources IDENTITY FOLDER...
+ *   host_files IDENTITY FOLDER...
  *
  * One line for each: 0, or -1 and why. Code 1: refused without a reason, or taken without use. */
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
-#include "controller_resources.h"
+#include "br_files.h"
 
 int main(int argc, char **argv) {
     const size_t size = br_mpc_memory_size();
@@ -18,7 +18,7 @@ int main(int argc, char **argv) {
         memset(text, 0x55, sizeof text);
         br_mpc *mpc;
         if (br_mpc_init(block, size, &mpc)) return 2;
-        const int failed = resources_load(mpc, argv[i], argv[1], text, sizeof text);
+        const int failed = br_files_load(mpc, argv[i], argv[1], text, sizeof text);
         if (failed && (!memchr(text, 0, sizeof text) || strlen(text) < 20)) return 1;
         printf("%d %s\n", failed, failed ? text : "");
     }

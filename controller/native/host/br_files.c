@@ -1,18 +1,18 @@
-/* See controller_resources.h. Bytes are put together one by one, so that the host's byte order and
+/* See br_files.h. Bytes are put together one by one, so that the host's byte order and
  * alignment do not matter. */
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
-#include "controller_resources.h"
+#include "br_files.h"
 
 #define HEAD_BYTES 32
 #define SCHEMA 1
 #define GP_HEAD_BYTES (2 * 4 + (2 + BR_NZ) * 8)
 #define PATH_BYTES_MAX (8 + (size_t)BR_PATH_CAPACITY * BR_PATH_COLUMNS * 8)
 #define WEIGHTS_BYTES_MAX \
-    (RESOURCE_IDENTITY_BYTES + BR_NE * (GP_HEAD_BYTES + (size_t)BR_GP_CAPACITY * (BR_NZ + 1) * 8))
+    (BR_IDENTITY_BYTES + BR_NE * (GP_HEAD_BYTES + (size_t)BR_GP_CAPACITY * (BR_NZ + 1) * 8))
 
 /* A file being read, and what is left of it. */
 typedef struct {
@@ -25,11 +25,11 @@ typedef struct {
 } reader;
 
 static int wrong(const reader *r, const char *what, const char *remedy) {
-    snprintf(r->text, r->text_size, "resources/%s %s: %s", r->name, what, remedy);
+    snprintf(r->text, r->text_size, "%s %s: %s", r->name, what, remedy);
     return -1;
 }
 
-static const char *const ANEW = "export the FMU again, or put the file back";
+static const char *const ANEW = "export it again, or put the file back";
 
 static uint64_t read_integer(reader *r, int bytes) {
     uint64_t value = 0;
@@ -56,19 +56,23 @@ static uint64_t fnv1a(const unsigned char *data, size_t n) {
     return hash;
 }
 
-/* The whole file in memory, at most this long, head checked and passed. */
-static int open_file(reader *r, const char *folder, const char *magic, size_t body_max) {
-    const size_t length = strlen(folder) + strlen(r->name) + 2;
+/* The file of the folder, opened; NULL: there is none. */
+static FILE *opened(const char *folder, const char *name) {
+    const size_t length = strlen(folder) + strlen(name) + 2;
     char *path = malloc(length);
-    const size_t most = HEAD_BYTES + body_max + 1;
-    r->data = malloc(most);
-    if (!path || !r->data) {
-        free(path);
-        return wrong(r, "does not fit into memory", "close other programs");
-    }
-    snprintf(path, length, "%s/%s", folder, r->name);
+    if (!path) return NULL;
+    snprintf(path, length, "%s/%s", folder, name);
     FILE *file = fopen(path, "rb");
     free(path);
+    return file;
+}
+
+/* The whole file in memory, at most this long, head checked and passed. */
+static int open_file(reader *r, const char *folder, const char *magic, size_t body_max) {
+    const size_t most = HEAD_BYTES + body_max + 1;
+    r->data = malloc(most);
+    if (!r->data) return wrong(r, "does not fit into memory", "close other programs");
+    FILE *file = opened(folder, r->name);
     if (!file) return wrong(r, "is missing or cannot be read", ANEW);
     const size_t size = fread(r->data, 1, most, file);
     const int failed = ferror(file);
@@ -79,7 +83,7 @@ static int open_file(reader *r, const char *folder, const char *magic, size_t bo
     r->left = size;
     if (memcmp(r->at, magic, 8)) return wrong(r, "is a file of another kind", ANEW);
     r->at += 8, r->left -= 8;
-    if (read_integer(r, 4) != SCHEMA) return wrong(r, "has another schema", "export the FMU again");
+    if (read_integer(r, 4) != SCHEMA) return wrong(r, "has another schema", "export it again");
     const uint64_t body = read_integer(r, 4), hash = read_integer(r, 8);
     (void)read_integer(r, 8);
     if (body != r->left) return wrong(r, "is cut off or too long", ANEW);
@@ -90,7 +94,7 @@ static int open_file(reader *r, const char *folder, const char *magic, size_t bo
 static int load_path(reader *r, br_mpc *mpc) {
     const size_t row = BR_PATH_COLUMNS * 8;
     if (r->left < 8 + row || (r->left - 8) % row)
-        return wrong(r, "does not hold whole rows", "write it with codegen.fmu.resources");
+        return wrong(r, "does not hold whole rows", "export it again");
     const double spacing = read_double(r);
     const size_t count = r->left / row;
     double *table = malloc(count * row);
@@ -98,7 +102,7 @@ static int load_path(reader *r, br_mpc *mpc) {
     read_doubles(r, table, count * BR_PATH_COLUMNS);
     const br_mpc_error error = br_mpc_set_path(mpc, table, (int)count, spacing);
     free(table);
-    return error ? wrong(r, br_mpc_error_text(error), "export the FMU again") : 0;
+    return error ? wrong(r, br_mpc_error_text(error), "export it again") : 0;
 }
 
 /* One output; its arrays follow each other in numbers. */
@@ -108,7 +112,7 @@ static int load_output(reader *r, br_mpc_gp *gp, double *numbers) {
     if (kernel > BR_KERNEL_MATERN25) return wrong(r, "has an unknown kernel", "train again");
     if (n > BR_GP_CAPACITY)
         return wrong(r, "has more training points than this controller has room for",
-                     "train with fewer points or export with a larger capacity");
+                     "train with fewer points or build with a larger capacity");
     gp->kernel = (int)kernel;
     gp->n = (int)n;
     gp->offset = read_double(r);
@@ -123,12 +127,12 @@ static int load_output(reader *r, br_mpc_gp *gp, double *numbers) {
 }
 
 static int load_weights(reader *r, br_mpc *mpc, const char *identity) {
-    if (r->left < RESOURCE_IDENTITY_BYTES) return wrong(r, "is cut off", ANEW);
-    if (strncmp((const char *)r->at, identity, RESOURCE_IDENTITY_BYTES))
+    if (r->left < BR_IDENTITY_BYTES) return wrong(r, "is cut off", ANEW);
+    if (strncmp((const char *)r->at, identity, BR_IDENTITY_BYTES))
         return wrong(r, "was learned for another model, car or time step",
                      "train with those of this controller");
-    r->at += RESOURCE_IDENTITY_BYTES;
-    r->left -= RESOURCE_IDENTITY_BYTES;
+    r->at += BR_IDENTITY_BYTES;
+    r->left -= BR_IDENTITY_BYTES;
     const size_t each = BR_NZ + (size_t)BR_GP_CAPACITY * (BR_NZ + 1);
     double *numbers = malloc(BR_NE * each * sizeof *numbers);
     if (!numbers) return wrong(r, "does not fit into memory", "close other programs");
@@ -145,10 +149,9 @@ static int load_weights(reader *r, br_mpc *mpc, const char *identity) {
     return failed;
 }
 
-int resources_load(br_mpc *mpc, const char *folder, const char *identity, char *text,
-                   size_t size) {
-    reader path = {.name = RESOURCE_PATH, .text = text, .text_size = size};
-    reader weights = {.name = RESOURCE_WEIGHTS, .text = text, .text_size = size};
+int br_files_load(br_mpc *mpc, const char *folder, const char *identity, char *text, size_t size) {
+    reader path = {.name = BR_FILE_PATH, .text = text, .text_size = size};
+    reader weights = {.name = BR_FILE_WEIGHTS, .text = text, .text_size = size};
     int failed = open_file(&path, folder, "BRFMPATH", PATH_BYTES_MAX) || load_path(&path, mpc);
     free(path.data);
     if (failed) return -1;
@@ -156,4 +159,58 @@ int resources_load(br_mpc *mpc, const char *folder, const char *identity, char *
              load_weights(&weights, mpc, identity);
     free(weights.data);
     return failed ? -1 : 0;
+}
+
+/* --- settings --------------------------------------------------------------------------------- */
+
+typedef struct {
+    const char *name;
+    double *numbers; /* or */
+    int *whole;
+    int count, found;
+} setting;
+
+/* The numbers of one line into the setting of its name. */
+static int take_line(const reader *r, char *line, setting *settings, int count) {
+    const char *name = strtok(line, " \t\r\n");
+    if (!name) return 0;
+    int i = 0;
+    while (i < count && strcmp(settings[i].name, name)) ++i;
+    if (i == count) return wrong(r, "has an unknown name", name);
+    for (int k = 0; k < settings[i].count; ++k) {
+        const char *word = strtok(NULL, " \t\r\n");
+        char *end = NULL;
+        const double value = word ? strtod(word, &end) : 0;
+        if (!word || *end) return wrong(r, "lacks a number", name);
+        if (settings[i].whole) *settings[i].whole = (int)value;
+        else settings[i].numbers[k] = value;
+    }
+    settings[i].found = 1;
+    return strtok(NULL, " \t\r\n") ? wrong(r, "has a number too many", name) : 0;
+}
+
+int br_files_settings(const char *folder, br_mpc_parameters *parameters, br_driving *driving,
+                      char *text, size_t size) {
+    const reader r = {.name = BR_FILE_SETTINGS, .text = text, .text_size = size};
+    br_mpc_parameters *p = parameters;
+    br_driving *d = driving;
+#define PARAMETER(field) {.name = #field, .numbers = &p->field, .count = 1},
+#define COUNT(field) {.name = #field, .whole = &p->field, .count = 1},
+#define REAL(field) {.name = #field, .numbers = (double *)&d->field, .count = sizeof d->field / 8},
+#define WHOLE(field) {.name = #field, .whole = &d->field, .count = 1},
+    setting settings[] = {BR_PARAMETERS(PARAMETER) BR_SOLVER_FIELDS(PARAMETER, COUNT)
+                              BR_DRIVING_FIELDS(REAL, WHOLE)};
+    const int count = sizeof settings / sizeof settings[0];
+    FILE *file = opened(folder, r.name);
+    if (!file) return wrong(&r, "is missing or cannot be read", ANEW);
+    char line[256];
+    int failed = 0;
+    while (!failed && fgets(line, sizeof line, file)) {
+        line[strcspn(line, "#")] = 0;
+        failed = take_line(&r, line, settings, count);
+    }
+    fclose(file);
+    for (int i = 0; i < count && !failed; ++i)
+        if (!settings[i].found) failed = wrong(&r, "lacks a line", settings[i].name);
+    return failed;
 }

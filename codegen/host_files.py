@@ -1,0 +1,123 @@
+"""Racing line, weights and settings as files for controllers that run without Python.
+
+C programs (examples/c_host) and the controller's FMU load them by controller/native/host, where
+br_files.h describes the formats. Being data, they can be exchanged without compiling anything.
+"""
+
+import struct
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from bayesrace.errors import InputError
+from bayesrace.files import write_whole
+from bayesrace.gp.weights import KERNELS, GpWeights, zero_weights
+from bayesrace.manifest import Manifest
+
+__all__ = [
+    "HEAD",
+    "IDENTITY_BYTES",
+    "PATH_FILE",
+    "SETTINGS_FILE",
+    "WEIGHTS_FILE",
+    "export",
+    "path_file",
+    "settings_file",
+    "weights_file",
+]
+
+PATH_FILE: Final = "path.bin"
+WEIGHTS_FILE: Final = "weights.bin"
+SETTINGS_FILE: Final = "settings.txt"
+
+PATH_COLUMNS: Final = 7
+"""BR_PATH_COLUMNS in controller/native/bayesrace_mpc.h."""
+
+PATH_CAPACITY: Final = 8192
+"""BR_PATH_CAPACITY there."""
+
+_SCHEMA: Final = 1
+HEAD: Final = struct.Struct("<8sIIQQ")
+IDENTITY_BYTES: Final = 256
+
+
+def _fnv1a(data: bytes) -> int:
+    value = 14695981039346656037
+    for byte in data:
+        value = (value ^ byte) * 1099511628211 & 0xFFFFFFFFFFFFFFFF
+    return value
+
+
+def _file(magic: bytes, body: bytes, room: int = 0) -> bytes:
+    return HEAD.pack(magic, _SCHEMA, len(body), _fnv1a(body), room) + body
+
+
+def path_file(rows: ArrayLike, spacing_m: float) -> bytes:
+    """The file of a racing line: rows (n, 7) of ``br_mpc_set_path``, every ``spacing_m``."""
+    table = np.ascontiguousarray(rows, dtype="<f8")
+    if table.ndim != 2 or table.shape[1] != PATH_COLUMNS or not 8 <= len(table) <= PATH_CAPACITY:
+        raise InputError(
+            f"path table has shape {table.shape}, not (8 to {PATH_CAPACITY}, {PATH_COLUMNS})"
+        )
+    if not np.isfinite(table).all():
+        raise InputError("path table holds a number that is not finite")
+    return _file(b"BRFMPATH", struct.pack("<d", spacing_m) + table.tobytes())
+
+
+def weights_file(weights: GpWeights | None, identity: str, capacity: int) -> bytes:
+    """The file of the residual's weights; None: no correction.
+
+    ``identity``: of the discretised model that the controller predicts with, ``capacity``: training
+    points that it has room for. InputError for weights of another model or with more.
+    """
+    if weights is None:
+        weights = zero_weights("none", identity)
+    if weights.discretisation != identity:
+        raise InputError(
+            f"weights '{weights.version}' were learned for {weights.discretisation}, this "
+            f"controller predicts with {identity}: train with the same car and discretisation"
+        )
+    if max(weights.counts) > capacity:
+        raise InputError(
+            f"weights '{weights.version}' have {max(weights.counts)} points, the controller was "
+            f"built for {capacity}: train with fewer points or build with a larger capacity"
+        )
+    name = identity.encode()
+    if len(name) >= IDENTITY_BYTES:
+        raise InputError(f"the model's identity '{identity}' is too long for a weights file")
+    parts = [name.ljust(IDENTITY_BYTES, b"\0")]
+    for output in weights.outputs:
+        scale = output.y_scale * output.signal_variance
+        kernel = KERNELS.index(output.kernel)
+        parts.append(struct.pack("<IIdd", kernel, output.count, output.y_mean, scale))
+        numbers = (output.length_scales, output.inputs, output.alpha)
+        parts += [np.ascontiguousarray(array, dtype="<f8").tobytes() for array in numbers]
+    return _file(b"BRFMGPWT", b"".join(parts), capacity)
+
+
+def settings_file(values: Mapping[str, float | Sequence[float]]) -> str:
+    """The file of the settings: parameters of the problem and its solver, and of the cycle."""
+    lines = []
+    for name, value in values.items():
+        numbers = value if isinstance(value, Sequence) else (value,)
+        lines.append(" ".join([name, *(repr(number) for number in numbers)]))
+    return "\n".join([*lines, ""])
+
+
+def export(
+    folder: Path,
+    manifest: Manifest,
+    rows: ArrayLike,
+    spacing_m: float,
+    values: Mapping[str, float | Sequence[float]],
+    weights: GpWeights | None,
+) -> None:
+    """Writes all three files for a built controller; arguments as of the functions above."""
+    folder.mkdir(parents=True, exist_ok=True)
+    learned = weights_file(weights, manifest.discretisation, manifest.gp_capacity)
+    write_whole(folder / PATH_FILE, path_file(rows, spacing_m))
+    write_whole(folder / WEIGHTS_FILE, learned)
+    write_whole(folder / SETTINGS_FILE, settings_file(values))

@@ -1,0 +1,69 @@
+"""Settings of the control cycle around the step: fallback and delay compensation."""
+
+from typing import Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from bayesrace.vehicles.parameters import CarParameters
+
+__all__ = ["CompensationSettings", "FallbackSettings", "driving_values"]
+
+
+class FallbackSettings(BaseModel):
+    """How far down, how fast: see controller/native/br_fallback.c."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    shifted_s: float = Field(
+        default=0.1, ge=0, le=2, description="how long after its first input a plan may be driven"
+    )
+    recover_cycles: int = Field(
+        default=3,
+        ge=1,
+        le=100,
+        description="usable solutions in a row that end braking; the last of them is driven. "
+        "A car that stands drives the first",
+    )
+    tolerance: float = Field(
+        default=1e-3, ge=0, le=0.1, description="excess over a limit that is clipped, not refused"
+    )
+
+
+class CompensationSettings(BaseModel):
+    """Over which delay the state is predicted: see controller/native/br_delay.c."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    mode: Literal["measured", "fixed", "off"] = Field(
+        "measured", description="off: the state is taken as it is, as if everything were at once"
+    )
+    delay_s: float = Field(0.0, ge=0, le=1, description="delay from basis to acting if fixed")
+    longest_s: float = Field(
+        0.5, gt=0, le=1, description="no prediction goes farther; a longer delay is not covered"
+    )
+
+
+_MODES: Final = ("off", "measured", "fixed")
+
+
+def driving_values(
+    car: CarParameters,
+    fallback: FallbackSettings,
+    compensation: CompensationSettings,
+    stale_s: float,
+) -> dict[str, float | tuple[float, ...]]:
+    """The numbers of :data:`bayesrace.native_interface.DRIVING` by name."""
+    return {
+        "u_low": (car.d_min, -car.delta_rate_max_radps),
+        "u_high": (car.d_max, car.delta_rate_max_radps),
+        "brake_fade_mps": car.brake_fade_mps,
+        "standing_mps": car.tuning.driving.standing_mps,
+        "stop_mps2": car.tuning.driving.stop_mps2,
+        "shifted_s": fallback.shifted_s,
+        "limit_tolerance": fallback.tolerance,
+        "recover_cycles": fallback.recover_cycles,
+        "compensation": _MODES.index(compensation.mode),
+        "delay_s": compensation.delay_s,
+        "longest_s": compensation.longest_s,
+        "stale_s": stale_s,
+    }

@@ -1,0 +1,330 @@
+/* The control cycle: stop and go, delay compensation, the step, the fallback. */
+#include <math.h>
+#include <stdint.h>
+#include <string.h>
+
+#include "br_cycle.h"
+
+#if BR_HAS_PATH
+
+#define JUMP 2.0          /* a plan that costs more than so many times the one before, shifted, */
+#define JUMP_BY 0.01      /* and so much more */
+#define LONGEST_S 1.0     /* longest piece of dead reckoning */
+#define LEAST_BUDGET 0.1  /* what a step gets however late its cycle began: share of the budget */
+
+struct br_cycle {
+    br_controller controller;
+    br_mpc *mpc; /* the compiled controller's, and what its last step reported; NULL: another's */
+    br_mpc_info info;
+    br_driving settings;
+    int has_settings;
+    br_mpc_clock clock;
+    void *context;
+    br_stream stream;
+    br_delay delay;
+    br_fallback fallback;
+    br_counters counters;
+    br_solution solution;
+    br_decision decision; /* of the newest cycle */
+    int halted;           /* the phase of a car that is not to be driven; 0: drive */
+    int stopping;         /* a stop is under way: since, from which speed */
+    double stopping_s, stopping_mps;
+    int stepped; /* a step has been made, for that moment */
+    double stepped_s;
+    double vx_mps; /* the newest that is known */
+    int reckoned;  /* where the car may be, and when, if no state tells */
+    double reckoned_s, reckoned_x[BR_NX];
+};
+
+size_t br_cycle_memory_size(void) { return sizeof(br_cycle); }
+
+br_mpc_error br_cycle_init(void *memory, size_t size, const br_controller *controller, int hold,
+                           br_cycle **out) {
+    if (!memory || !controller || !out) return BR_ERROR_NULL;
+    if (size < sizeof(br_cycle) || (uintptr_t)memory % 64) return BR_ERROR_MEMORY;
+    br_cycle *cycle = memory;
+    memset(cycle, 0, sizeof *cycle);
+    cycle->controller = *controller;
+    cycle->halted = hold ? BR_PHASE_READY : 0;
+    br_stream_init(&cycle->stream);
+    cycle->decision = (br_decision){.status = BR_HALTED, .level = BR_STOP};
+    *out = cycle;
+    return BR_OK;
+}
+
+/* --- the compiled controller ------------------------------------------------------------------ */
+
+static int mpc_step(void *self, const double x[BR_NX], const double u_before[BR_NU],
+                    double elapsed_s, double budget_s, br_solution *solution) {
+    br_cycle *cycle = self;
+    br_mpc_status status;
+    if (br_mpc_step(cycle->mpc, x, u_before, elapsed_s, budget_s, solution->u, &status,
+                    &cycle->info))
+        return BR_STEP_FAILED;
+    solution->rows = BR_N;
+    solution->plan_step_s = BR_TS;
+    br_mpc_get_plan(cycle->mpc, NULL, solution->plan_u);
+    solution->second_start = cycle->info.second_start;
+    solution->cost = cycle->info.cost;
+    solution->shifted_cost = cycle->info.shifts < 0 ? -1 : cycle->info.shifted_cost;
+    return status <= BR_ACCEPTABLE ? 0 : (int)status;
+}
+
+static void mpc_prepare(void *self, double period_s, double budget_s) {
+    br_mpc_prepare(((br_cycle *)self)->mpc, period_s, budget_s);
+}
+
+static void mpc_rehearse(void *self) { br_mpc_rehearse(((br_cycle *)self)->mpc); }
+
+static int mpc_predict(void *self, const double x[BR_NX], const double u[BR_NU], double duration_s,
+                       double x_next[BR_NX]) {
+    return br_mpc_predict(((br_cycle *)self)->mpc, x, u, duration_s, x_next) ? -1 : 0;
+}
+
+static void mpc_reset(void *self) { br_mpc_reset(((br_cycle *)self)->mpc); }
+
+static void mpc_limit_speed(void *self, double limit_mps, double rate_mps2) {
+    br_mpc_set_speed_limit(((br_cycle *)self)->mpc, limit_mps, rate_mps2);
+}
+
+br_mpc_error br_cycle_drive_mpc(void *memory, size_t size, br_mpc *mpc, int hold, br_cycle **out) {
+    const br_controller compiled = {
+        .self = memory,
+        .step = mpc_step,
+        .prepare = mpc_prepare,
+        .rehearse = mpc_rehearse,
+        .predict = mpc_predict,
+        .reset = mpc_reset,
+        .limit_speed = mpc_limit_speed,
+    };
+    if (!mpc) return BR_ERROR_NULL;
+    const br_mpc_error error = br_cycle_init(memory, size, &compiled, hold, out);
+    if (!error) (*out)->mpc = mpc;
+    return error;
+}
+
+/* --- settings and counters -------------------------------------------------------------------- */
+
+const br_mpc_info *br_cycle_info(const br_cycle *cycle) { return &cycle->info; }
+
+const br_counters *br_cycle_counters(const br_cycle *cycle) { return &cycle->counters; }
+
+br_mpc_error br_cycle_set_driving(br_cycle *cycle, const br_driving *s) {
+    if (!cycle || !s) return BR_ERROR_NULL;
+    const double positive[] = {s->brake_fade_mps, s->stop_mps2, s->longest_s, s->stale_s};
+    const double others[] = {s->standing_mps, s->shifted_s, s->limit_tolerance, s->delay_s};
+    int valid = s->recover_cycles >= 1 && s->compensation >= 0 && s->compensation <= 2;
+    for (int i = 0; i < 4; ++i)
+        valid &= isfinite(positive[i]) && positive[i] > 0 && isfinite(others[i]) && others[i] >= 0;
+    for (int i = 0; i < BR_NU; ++i)
+        valid &= isfinite(s->u_low[i]) && isfinite(s->u_high[i]) && s->u_low[i] < s->u_high[i];
+    if (!valid) return BR_ERROR_PARAMETERS;
+    if (s->compensation != 1) cycle->counters.delay_s = s->compensation ? s->delay_s : 0;
+    cycle->settings = *s;
+    cycle->has_settings = 1;
+    return BR_OK;
+}
+
+br_mpc_error br_cycle_set_clock(br_cycle *cycle, br_mpc_clock clock, void *context) {
+    if (!cycle) return BR_ERROR_NULL;
+    cycle->clock = clock;
+    cycle->context = context;
+    return BR_OK;
+}
+
+/* --- states, runs, commands ------------------------------------------------------------------- */
+
+br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state) {
+    if (!isfinite(state->time_s)) return BR_STATE_FOREIGN;
+    const br_measured *newest = &cycle->stream.newest;
+    const int begins = !cycle->stream.has_newest || newest->epoch != state->epoch ||
+                       newest->run != state->run;
+    const br_reception reception = br_stream_accept(&cycle->stream, state, &cycle->counters);
+    if (reception != BR_STATE_NEW) return reception;
+    if (begins) {
+        memset(&cycle->fallback, 0, sizeof cycle->fallback); /* the plan is of another run */
+        cycle->delay.count = 0; /* no input is under way; the delay is still the best guess */
+        cycle->controller.reset(cycle->controller.self);
+        cycle->stepped = cycle->stopping = cycle->reckoned = 0;
+    }
+    if (!state->lockstep)
+        br_delay_observe(&cycle->delay, &cycle->settings, state, &cycle->counters.delay_s);
+    return BR_STATE_NEW;
+}
+
+void br_cycle_end(br_cycle *cycle) {
+    cycle->counters.phase = BR_PHASE_WAITING;
+    cycle->stream.ended = 1;
+}
+
+int br_cycle_forget(br_cycle *cycle) {
+    cycle->counters.phase = BR_PHASE_WAITING;
+    return br_stream_forget(&cycle->stream, &cycle->counters);
+}
+
+void br_cycle_stop(br_cycle *cycle) { cycle->halted = BR_PHASE_STOPPED; }
+
+void br_cycle_go(br_cycle *cycle) {
+    cycle->halted = cycle->stopping = 0;
+    cycle->controller.limit_speed(cycle->controller.self, INFINITY, 0);
+}
+
+/* --- one cycle -------------------------------------------------------------------------------- */
+
+static double now(const br_cycle *cycle) {
+    return cycle->clock ? cycle->clock(cycle->context) : 0;
+}
+
+/* Whether a stop on command is still under way; sets the speed that it has got to. Driven to
+ * standstill, the car stays on the line and points along it, fit to go on. */
+static int slowing(br_cycle *cycle, double basis_s) {
+    const br_driving *s = &cycle->settings;
+    const double vx_mps = cycle->stream.newest.x[BR_INDEX_VX];
+    const int rolling = fabs(vx_mps) > s->standing_mps;
+    if (!cycle->stopping && !rolling) return 0;
+    if (!cycle->stopping) { /* just told, or a rolling car taken over on hold */
+        cycle->stopping = 1;
+        cycle->stopping_s = basis_s;
+        cycle->stopping_mps = fmax(vx_mps, 0);
+    }
+    const double since_s = basis_s - cycle->stopping_s;
+    const double limit_mps = fmax(cycle->stopping_mps - s->stop_mps2 * since_s, 0);
+    cycle->controller.limit_speed(cycle->controller.self, limit_mps, s->stop_mps2);
+    if (limit_mps > 0 || rolling) return 1;
+    return cycle->stopping = 0;
+}
+
+/* Not to be driven: braked. The next step will be the first of a new drive. */
+static void halt(br_cycle *cycle, double acting_s) {
+    br_decision *decision = &cycle->decision;
+    if (cycle->stepped) cycle->controller.reset(cycle->controller.self);
+    cycle->stepped = 0;
+    br_fallback_brake(&cycle->fallback, &cycle->settings, cycle->stream.newest.x[BR_INDEX_VX],
+                      acting_s, decision->u);
+    decision->level = BR_STOP;
+    decision->status = BR_HALTED;
+    cycle->counters.phase = cycle->halted;
+}
+
+/* How fast the car may still be: by the model, braking since it was last seen. A duty cycle that
+ * brakes a rolling car drives a standing one backwards. What the model cannot follow leaves the
+ * speed as it was last known. */
+static void reckon(br_cycle *cycle, double basis_s) {
+    const br_measured *newest = &cycle->stream.newest;
+    const br_controller *controller = &cycle->controller;
+    double u[BR_NU], *x = cycle->reckoned_x;
+    if (!cycle->reckoned) {
+        cycle->reckoned_s = newest->time_s + cycle->settings.stale_s;
+        if (br_delay_at_acting(&cycle->delay, &cycle->settings, controller, newest,
+                               cycle->reckoned_s, cycle->counters.delay_s, x, u))
+            return;
+        cycle->reckoned = 1;
+    }
+    const double duration_s = fmin(fmax(basis_s - cycle->reckoned_s, 0), LONGEST_S);
+    if (controller->predict(controller->self, x, cycle->decision.u, duration_s, x)) return;
+    cycle->reckoned_s = basis_s;
+    cycle->vx_mps = x[BR_INDEX_VX];
+}
+
+static void count(br_cycle *cycle, int status) {
+    const br_solution *solution = &cycle->solution;
+    cycle->counters.failed += status == BR_STEP_FAILED;
+    cycle->counters.second_starts += solution->second_start > 0;
+    if (solution->shifted_cost >= 0)
+        cycle->counters.cost_jumps += solution->cost > JUMP * solution->shifted_cost + JUMP_BY;
+}
+
+static int step(br_cycle *cycle, double acting_s, double budget_s) {
+    const br_measured *newest = &cycle->stream.newest;
+    const br_controller *controller = &cycle->controller;
+    double x[BR_NX], u[BR_NU];
+    if (newest->lockstep) {
+        memcpy(x, newest->x, sizeof x);
+        memcpy(u, newest->u_applied, sizeof u);
+    } else if (br_delay_at_acting(&cycle->delay, &cycle->settings, controller, newest,
+                                  cycle->decision.basis_s, cycle->counters.delay_s, x, u)) {
+        return BR_UNPREDICTABLE;
+    }
+    /* Where the delay measured has fallen, the moment of acting may even go back. */
+    const double elapsed_s = cycle->stepped ? fmax(acting_s - cycle->stepped_s, 0) : 0;
+    cycle->stepped = 1;
+    cycle->stepped_s = acting_s;
+    br_solution *solution = &cycle->solution;
+    solution->rows = solution->second_start = 0;
+    solution->cost = solution->shifted_cost = -1;
+    const double begin_s = now(cycle);
+    const int status = controller->step(controller->self, x, u, elapsed_s, budget_s, solution);
+    cycle->decision.step_us = (now(cycle) - begin_s) * 1e6;
+    cycle->decision.stepped = status != BR_STEP_FAILED;
+    count(cycle, status);
+    return status;
+}
+
+/* The input of a car that is to be driven: the solution's, or the fallback's. */
+static void drive(br_cycle *cycle, double acting_s, double budget_s, double spent_s) {
+    const double begin_s = now(cycle);
+    br_decision *decision = &cycle->decision;
+    const br_measured *newest = &cycle->stream.newest;
+    /* Where states come seldom, the next one is no sooner to be had. */
+    const double stale_s = fmax(cycle->settings.stale_s, 2 * cycle->counters.interval_s);
+    if (decision->basis_s - newest->time_s > stale_s) {
+        decision->status = BR_NO_STATE;
+        reckon(cycle, decision->basis_s);
+    } else {
+        cycle->reckoned = 0;
+        cycle->vx_mps = newest->x[BR_INDEX_VX];
+        decision->status =
+            step(cycle, acting_s, fmax(budget_s - spent_s, LEAST_BUDGET * budget_s));
+    }
+    if (budget_s > 0) decision->late_s = spent_s + now(cycle) - begin_s - budget_s;
+    decision->level = br_fallback_decide(
+        &cycle->fallback, &cycle->settings, decision->status ? NULL : &cycle->solution,
+        cycle->vx_mps, acting_s, fmax(decision->late_s, 0), decision->u);
+    cycle->counters.levels[decision->level] += 1;
+    const int driving = decision->level == BR_SOLUTION ? BR_PHASE_DRIVING : BR_PHASE_FALLBACK;
+    cycle->counters.phase = cycle->halted ? cycle->halted : driving;
+}
+
+br_mpc_error br_cycle_decide(br_cycle *cycle, double basis_s, double budget_s, double spent_s,
+                             br_decision *out) {
+    if (!cycle || !out) return BR_ERROR_NULL;
+    if (!cycle->has_settings || !cycle->stream.has_newest) return BR_ERROR_NOT_READY;
+    if (!isfinite(basis_s) || !isfinite(budget_s) || !isfinite(spent_s)) return BR_ERROR_TIME;
+    br_decision *decision = &cycle->decision;
+    const br_measured *newest = &cycle->stream.newest;
+    decision->epoch = newest->epoch;
+    decision->run = newest->run;
+    decision->seq = newest->seq;
+    decision->basis_s = basis_s;
+    decision->delay_s = newest->lockstep ? 0 : cycle->counters.delay_s;
+    decision->stepped = 0;
+    decision->step_us = decision->late_s = 0;
+    const double acting_s = basis_s + decision->delay_s;
+    if (cycle->halted && !slowing(cycle, basis_s)) halt(cycle, acting_s);
+    else drive(cycle, acting_s, budget_s, spent_s);
+    br_delay_sent(&cycle->delay, basis_s, decision->u);
+    *out = *decision;
+    return BR_OK;
+}
+
+br_mpc_error br_cycle_answer(br_cycle *cycle, const br_measured *state, double basis_s,
+                             double budget_s, double spent_s, br_decision *decision) {
+    if (!cycle || !state || !decision) return BR_ERROR_NULL;
+    if (br_cycle_observe(cycle, state) != BR_STATE_NEW) return BR_ERROR_STATE;
+    return br_cycle_decide(cycle, basis_s, budget_s, spent_s, decision);
+}
+
+/* A car is being driven: a step has been made, and no halt since. */
+void br_cycle_prepare(br_cycle *cycle, double period_s, double budget_s) {
+    if (cycle->stepped) cycle->controller.prepare(cycle->controller.self, period_s, budget_s);
+}
+
+void br_cycle_rehearse(br_cycle *cycle) {
+    if (!cycle->stepped) return;
+    double x[BR_NX], u[BR_NU];
+    br_delay_at_acting(&cycle->delay, &cycle->settings, &cycle->controller, &cycle->stream.newest,
+                       cycle->decision.basis_s, cycle->counters.delay_s, x, u);
+    cycle->controller.rehearse(cycle->controller.self);
+}
+
+#endif

@@ -1,0 +1,92 @@
+/* A bad solution never reaches the actuators: what is sent instead, step by step down.
+ *
+ * Level 0 the solution; 1 the previous plan, shifted, for a bounded time; 2 braking along the
+ * plan's steering, held when the plan is over; 3 standing still. From level 1 the next usable
+ * solution leads back; from 2 several in a row, so that a controller that works every other cycle
+ * does not jerk the car. A standing car is not jerked: it drives the next one. Where only the first
+ * step after a cold start is usable it would stand for ever. */
+#include <math.h>
+#include <string.h>
+
+#include "br_cycle.h"
+
+#if BR_HAS_PATH
+
+#define ROUNDING 1e-6 /* of a time, or of a row */
+
+static void limited(const br_driving *s, const double u[BR_NU], double safe[BR_NU]) {
+    for (int i = 0; i < BR_NU; ++i) {
+        const double low = s->u_low[i], high = s->u_high[i];
+        safe[i] = u[i] < low ? low : u[i] > high ? high : u[i];
+    }
+}
+
+static int usable(const br_driving *s, const double u[BR_NU]) {
+    double safe[BR_NU];
+    limited(s, u, safe);
+    for (int i = 0; i < BR_NU; ++i)
+        if (!isfinite(u[i]) || fabs(u[i] - safe[i]) > s->limit_tolerance) return 0;
+    return 1;
+}
+
+/* The plan is kept only of solutions that were fit to be driven, and none that is no number. */
+static void keep(br_fallback *fallback, const br_solution *solution, double time_s) {
+    const int rows = solution->rows < BR_N ? solution->rows : BR_N;
+    fallback->rows = rows;
+    fallback->plan_s = time_s;
+    fallback->row_s = solution->plan_step_s;
+    for (int i = 0; i < rows * BR_NU; ++i)
+        if (!isfinite(solution->plan_u[i])) fallback->rows = 0;
+    memcpy(fallback->plan, solution->plan_u, sizeof fallback->plan);
+}
+
+/* Row of the plan that is due; BR_N: none any more. */
+static int row_due(const br_fallback *fallback, double time_s) {
+    if (!fallback->rows) return 0;
+    const double row = (time_s - fallback->plan_s) / fallback->row_s + ROUNDING;
+    return !(row > 0) ? 0 : row >= BR_N ? BR_N : (int)row;
+}
+
+br_level br_fallback_brake(const br_fallback *fallback, const br_driving *s, double vx_mps,
+                           double time_s, double u[BR_NU]) {
+    const int row = row_due(fallback, time_s), rolling = vx_mps > s->brake_fade_mps;
+    const double nothing[BR_NU] = {0};
+    limited(s, rolling && row < fallback->rows ? fallback->plan[row] : nothing, u);
+    const double share = fmin(fmax(vx_mps / s->brake_fade_mps, 0), 1);
+    u[BR_INDEX_DUTY] = isfinite(vx_mps) ? s->u_low[BR_INDEX_DUTY] * share : 0;
+    return rolling ? BR_BRAKE : BR_STOP;
+}
+
+static br_level step_down(const br_fallback *fallback, const br_driving *s, double vx_mps,
+                          double time_s, double u[BR_NU]) {
+    const int row = row_due(fallback, time_s);
+    const int recent = time_s - fallback->plan_s <= s->shifted_s + ROUNDING;
+    if (!recent || row >= fallback->rows || fallback->to_recover)
+        return br_fallback_brake(fallback, s, vx_mps, time_s, u);
+    limited(s, fallback->plan[row], u);
+    return BR_SHIFTED_PLAN;
+}
+
+/* The input u that acts late_s after time_s, always finite and within the limits. solution: for one
+ * that acts at time_s; NULL: there is none. */
+br_level br_fallback_decide(br_fallback *fallback, const br_driving *s,
+                            const br_solution *solution, double vx_mps, double time_s,
+                            double late_s, double u[BR_NU]) {
+    const double acting_s = time_s + late_s;
+    if (!solution || !usable(s, solution->u)) {
+        const br_level level = step_down(fallback, s, vx_mps, acting_s, u);
+        if (level >= BR_BRAKE) fallback->to_recover = s->recover_cycles;
+        return level;
+    }
+    keep(fallback, solution, time_s);
+    if (fallback->to_recover > 1 && vx_mps > s->brake_fade_mps) {
+        fallback->to_recover -= 1;
+        return br_fallback_brake(fallback, s, vx_mps, acting_s, u);
+    }
+    fallback->to_recover = 0;
+    if (row_due(fallback, acting_s) > 0) return step_down(fallback, s, vx_mps, acting_s, u);
+    limited(s, solution->u, u);
+    return BR_SOLUTION;
+}
+
+#endif

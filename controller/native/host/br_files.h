@@ -1,0 +1,41 @@
+/* Racing line, weights and settings from files, for hosts without Python and for the FMU. With
+ * input/output and heap, and therefore no part of the library. 'bayesrace export' writes the files.
+ *
+ * Racing line and weights are little-endian, begin with a head of 32 bytes and end exactly where it
+ * says:
+ *
+ *   0   magic, 8 bytes: "BRFMPATH" or "BRFMGPWT"
+ *   8   schema, u32: 1
+ *   12  body's length in bytes, u32
+ *   16  FNV-1a hash (64 bit) of the body, u64
+ *   24  training points per output that the controller has room for, u64: for tools, not read here
+ *
+ * Body of path.bin: spacing [m] f64, then rows of BR_PATH_COLUMNS f64, see br_mpc_set_path.
+ * Body of weights.bin: identity of the discretised model, 256 bytes, zero padded; for each of the
+ * BR_NE outputs kernel u32, points n u32, offset f64, scale f64, BR_NZ length scales f64, inputs
+ * n x BR_NZ f64, alpha n f64, see br_mpc_gp.
+ *
+ * settings.txt: a line for each member of br_mpc_parameters and br_driving, its name and its number,
+ * or its numbers; what comes after # is a comment.
+ *
+ * Whatever a file holds, nothing is read beyond it.
+ */
+#ifndef BR_FILES_H
+#define BR_FILES_H
+
+#include "bayesrace_cycle.h"
+
+#define BR_FILE_PATH "path.bin"
+#define BR_FILE_WEIGHTS "weights.bin"
+#define BR_FILE_SETTINGS "settings.txt"
+#define BR_IDENTITY_BYTES 256
+
+/* Racing line and weights of the folder into mpc. 0, or -1 and a sentence in text. identity: of the
+ * model that mpc predicts with (BR_MODEL_IDENTITY); weights for another one are refused. */
+int br_files_load(br_mpc *mpc, const char *folder, const char *identity, char *text, size_t size);
+
+/* The settings of the folder. 0, or -1 and a sentence in text. */
+int br_files_settings(const char *folder, br_mpc_parameters *parameters, br_driving *driving,
+                      char *text, size_t size);
+
+#endif

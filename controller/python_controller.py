@@ -1,0 +1,121 @@
+"""A control law written in Python, driven by the control cycle in C as the compiled one is.
+
+For comparisons, data collection and tests: it stands behind the same fallback, delay compensation
+and stop. Each call costs some microseconds for the way from C into Python.
+"""
+
+import ctypes as ct
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from bayesrace.errors import InputError
+from controller.driver import STEP_FAILED
+from controller.interface import Array, ControlLaw, StepOutput
+from controller.native_library import Artefact
+
+__all__ = ["PythonController"]
+
+_DOUBLES: Final = ct.POINTER(ct.c_double)
+_STEP = ct.CFUNCTYPE(
+    ct.c_int, ct.c_void_p, _DOUBLES, _DOUBLES, ct.c_double, ct.c_double, ct.c_void_p
+)
+_PREPARE = ct.CFUNCTYPE(None, ct.c_void_p, ct.c_double, ct.c_double)
+_REHEARSE = _RESET = ct.CFUNCTYPE(None, ct.c_void_p)
+_PREDICT = ct.CFUNCTYPE(ct.c_int, ct.c_void_p, _DOUBLES, _DOUBLES, ct.c_double, _DOUBLES)
+_LIMIT_SPEED = ct.CFUNCTYPE(None, ct.c_void_p, ct.c_double, ct.c_double)
+
+
+class _Functions(ct.Structure):
+    """br_controller in controller/native/bayesrace_cycle.h."""
+
+    _fields_ = [
+        ("self", ct.c_void_p),
+        ("step", _STEP),
+        ("prepare", _PREPARE),
+        ("rehearse", _REHEARSE),
+        ("predict", _PREDICT),
+        ("reset", _RESET),
+        ("limit_speed", _LIMIT_SPEED),
+    ]
+
+
+class PythonController:
+    """See :class:`controller.interface.Controller`."""
+
+    port = None
+    """It has nowhere to put weights."""
+    weights_version = ""
+
+    def __init__(self, artefact: Path, law: ControlLaw) -> None:
+        """``artefact``: any built for a car; its control cycle is used, its step is not."""
+        self.artefact = Artefact(artefact)
+        self.law = law
+        self.last_error = ""
+        self._result = StepOutput(u=np.zeros(2))
+        self._functions = _Functions(
+            None,
+            _STEP(self._step),
+            _PREPARE(lambda *_: None),
+            _REHEARSE(lambda _: None),
+            _PREDICT(self._predict),
+            _RESET(lambda _: self.law.reset()),
+            _LIMIT_SPEED(
+                lambda _, limit_mps, rate_mps2: self.law.limit_speed(limit_mps, rate_mps2)
+            ),
+        )
+
+    def begin_cycle(self, memory: ct.c_void_p, size: int, hold: bool, cycle: ct.c_void_p) -> int:
+        """With this object's functions."""
+        init = self.artefact.library.br_cycle_init
+        return int(init(memory, size, ct.byref(self._functions), hold, ct.byref(cycle)))
+
+    def result(self) -> StepOutput:
+        """What the law returned."""
+        return self._result
+
+    def adopt_weights(self, version: str) -> None:
+        """Never asked."""
+        raise InputError("a control law in Python takes no weights")
+
+    def set_weights(self, data: bytes) -> str:
+        """Always refused."""
+        raise InputError("a control law in Python takes no weights")
+
+    def _step(
+        self, _: Any, x: Any, u_before: Any, elapsed_s: float, budget_s: float, solution: int
+    ) -> int:
+        try:
+            output = self.law.step(_array(x, 7), _array(u_before, 2), elapsed_s, budget_s)
+            self._fill(self.artefact.Solution.from_address(solution), output)
+        except Exception as error:
+            # Whatever it is, the car must not be left without an answer.
+            self.last_error = f"{type(error).__name__}: {error}"
+            return STEP_FAILED
+        self._result = output
+        return output.status
+
+    def _fill(self, solution: Any, output: StepOutput) -> None:
+        rows = min(len(output.plan_u), self.artefact.manifest.horizon)
+        solution.u[:] = output.u.tolist()
+        solution.rows = rows
+        solution.plan_u[: 2 * rows] = output.plan_u[:rows].ravel().tolist()
+        solution.plan_step_s = output.plan_step_s
+        solution.second_start = output.second_start
+        solution.cost, solution.shifted_cost = output.cost, output.cost_shifted
+
+    def _predict(self, _: Any, x: Any, u: Any, duration_s: float, x_next: Any) -> int:
+        try:
+            after = self.law.predict(_array(x, 7), _array(u, 2), duration_s).tolist()
+            for i, value in enumerate(after):
+                x_next[i] = value
+        except Exception as error:
+            self.last_error = f"{type(error).__name__}: {error}"
+            return -1
+        return 0
+
+
+def _array(pointer: Any, count: int) -> Array:
+    """A copy."""
+    return np.array(pointer[:count])

@@ -1,0 +1,73 @@
+"""A control cycle around a control law that the test writes, without plant or messages."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesrace.messages import State
+from bayesrace.vehicles import default_car
+from controller.cycle_settings import CompensationSettings, FallbackSettings
+from controller.driver import Driver
+from controller.interface import StepOutput
+from controller.python_controller import PythonController
+
+__all__ = ["STEP_S", "ScriptedLaw", "scripted_driver", "state"]
+
+Floats = NDArray[np.float64]
+
+STEP_S = 0.02
+
+
+class ScriptedLaw:
+    """Answers by a function of the state; without one it raises."""
+
+    def __init__(
+        self,
+        answer: Callable[[Floats], StepOutput] | None = None,
+        model: Callable[[Floats, Floats, float], Floats] = lambda x, _u, _s: x,
+    ) -> None:
+        self.answer, self.predict = answer, model
+
+    def reset(self) -> None:
+        """It has no past."""
+
+    def limit_speed(self, limit_mps: float, rate_mps2: float) -> None:
+        """It aims at nothing."""
+
+    def step(
+        self, x: Floats, u_previous: Floats, elapsed_s: float, budget_s: float = 0.0
+    ) -> StepOutput:
+        """By the function."""
+        if self.answer is None:
+            raise RuntimeError("no step today")
+        return self.answer(x)
+
+
+def scripted_driver(
+    artefact: Path,
+    law: ScriptedLaw,
+    fallback: FallbackSettings | None = None,
+    compensation: CompensationSettings | None = None,
+    stale_s: float = 1e3,
+) -> Driver:
+    """The default car's, driven by the law."""
+    controller = PythonController(artefact, law)
+    return Driver(
+        controller,
+        default_car(),
+        fallback or FallbackSettings(),
+        compensation or CompensationSettings(),
+        stale_s,
+    )
+
+
+def state(seq: int, **changes: Any) -> State:
+    """A state of a free-running plant that samples every 20 ms."""
+    values: dict[str, Any] = {
+        "source_time_ns": 0, "epoch": 1, "run": 1, "time_s": seq * STEP_S, "x": (0.0,) * 7,
+        "u_applied": (0.0, 0.0), "lap": 0, "lockstep": False, "answers": (), "final": False,
+    }  # fmt: skip
+    return State(seq=seq, **(values | changes))

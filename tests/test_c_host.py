@@ -1,0 +1,189 @@
+"""A C program hosts the whole controller: to the bit as Python does, and over UDP."""
+
+import shutil
+import socket
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bayesrace.gp.weights import GpWeights
+from bayesrace.log import LogReader, LogWriter
+from bayesrace.manifest import read_manifest
+from bayesrace.messages import ACTUATION, STATE, TELEMETRY, State
+from bayesrace.vehicles import CarParameters
+from codegen.build import HOST
+from codegen.compiler import find_compiler
+from codegen.host_files import SETTINGS_FILE, export
+from controller.cycle_settings import driving_values
+from controller.driver import Level
+from controller.mpc import PredictiveController
+from controller.native_step import NativeStep
+from controller.process_settings import ControllerSettings
+from experiments.closed_loop import ClosedLoop
+from tests.conftest import SETTINGS, Circuit
+from tests.native_programs import SANITIZED, native_program
+from tests.programs import ROOT
+
+SOURCE = ROOT / "examples" / "c_host"
+LAPS = 1
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory, kinematic_artefact: Path) -> Path:
+    """Made as its user makes it."""
+    if not shutil.which("make"):
+        pytest.skip("make is not installed")
+    folder = tmp_path_factory.mktemp("c_host")
+    for name in ("main.c", "Makefile"):
+        shutil.copy(SOURCE / name, folder)
+    compiler = " ".join(find_compiler().command)
+    line = ["make", "-C", str(folder), f"ARTEFACT={kinematic_artefact}", f"CC={compiler}"]
+    subprocess.run(line, check=True, capture_output=True, timeout=120)
+    return folder / "c_host"
+
+
+@pytest.fixture(scope="module")
+def data(
+    tmp_path_factory: pytest.TempPathFactory,
+    kinematic_artefact: Path,
+    circuit: Circuit,
+    car: CarParameters,
+    weights: GpWeights,
+) -> Path:
+    """Racing line, weights and settings."""
+    folder = tmp_path_factory.mktemp("data")
+    process = ControllerSettings()
+    values = SETTINGS.parameters(car) | driving_values(
+        car, process.fallback, process.compensation, process.stale_s
+    )
+    table = circuit.table
+    export(folder, read_manifest(kinematic_artefact), table.rows, table.spacing_m, values, weights)
+    return folder
+
+
+def line_of(state: State) -> str:
+    """As the program reads it."""
+    numbers = (state.epoch, state.run, state.seq, state.time_s, int(state.lockstep),
+               int(state.final), *state.x, *state.u_applied, *state.answers[2::3])  # fmt: skip
+    return " ".join(map(repr, numbers)) + "\n"
+
+
+def test_a_recorded_drive_is_answered_to_the_bit(
+    program: Path,
+    data: Path,
+    tmp_path: Path,
+    native: NativeStep,
+    circuit: Circuit,
+    car: CarParameters,
+) -> None:
+    log = LogWriter(tmp_path / "log.mcap")
+    loop = ClosedLoop(car, circuit.track, circuit.line, PredictiveController(native), log=log)
+    loop.drive(LAPS)
+    log.close()
+    reader = LogReader(tmp_path / "log.mcap")
+    told = "".join(line_of(state) for state in reader.select(STATE))
+    done = subprocess.run(
+        [program, data], input=told, capture_output=True, text=True, check=True, timeout=120
+    )
+    rows = [line.split() for line in done.stdout.splitlines()]
+    actuations, telemetry = reader.select(ACTUATION), reader.select(TELEMETRY)
+    assert len(rows) == len(actuations) > 100
+    for row, sent, how in zip(rows, actuations, telemetry, strict=True):
+        assert tuple(map(int, row[:3])) == (sent.epoch, sent.run, sent.state_seq)
+        assert tuple(map(float, row[3:6])) == (sent.basis_s, *sent.u)
+        assert tuple(map(int, row[6:])) == (sent.status, how.fallback)
+
+
+@pytest.fixture
+def plant(program: Path, data: Path) -> Iterator[socket.socket]:
+    """A socket that is connected to the program."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    line = [str(program), str(data), "--udp", str(port)]
+    with subprocess.Popen(line, stderr=subprocess.PIPE, text=True) as host:
+        assert host.stderr is not None
+        assert "listening" in host.stderr.readline()
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+            one.settimeout(20.0)
+            one.connect(("127.0.0.1", port))
+            yield one
+        host.terminate()
+
+
+def test_over_udp_states_are_answered_and_silence_ends_at_the_fallback(
+    plant: socket.socket, circuit: Circuit
+) -> None:
+    x = tuple(map(float, circuit.start(v_mps=1.5)))
+    state = State(0, 0, 7, 3, 0.0, x, (0.0, 0.0), 0, False, (), False)
+    plant.send(b"no state")
+    plant.send(line_of(state).encode())
+    levels, seqs = [], []
+    for _ in range(40):  # one state, then nothing
+        row = plant.recv(4096).split()
+        seqs.append(tuple(map(int, row[:3])))
+        levels.append(int(row[7]))
+    assert set(seqs) == {(7, 3, 0)}
+    assert levels[0] == Level.SOLUTION
+    assert levels == sorted(levels)
+    assert levels[-1] >= Level.BRAKE
+    plant.settimeout(2.0)
+    with pytest.raises(TimeoutError):  # silence for a second: it says no more
+        [plant.recv(4096) for _ in range(1000)]
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        (("margin_m", "margin"), "settings.txt has an unknown name: margin"),
+        (("u_low ", "u_low 0 "), "settings.txt has a number too many: u_low"),
+        (("r_duty ", "r_duty x"), "settings.txt lacks a number: r_duty"),
+        (("stale_s", "# stale_s"), "settings.txt lacks a line: stale_s"),
+        (("stale_s ", "stale_s -"), "out of its range"),
+    ],
+)
+def test_unusable_settings_are_named(
+    program: Path, data: Path, tmp_path: Path, change: tuple[str, str], fault: str
+) -> None:
+    shutil.copytree(data, tmp_path, dirs_exist_ok=True)
+    file = tmp_path / SETTINGS_FILE
+    file.write_text(file.read_text().replace(*change))
+    done = subprocess.run(
+        [program, tmp_path], input="", capture_output=True, text=True, check=False, timeout=60
+    )
+    assert done.returncode == 1
+    assert fault in done.stderr
+
+
+@pytest.mark.check
+def test_no_sanitizer_finds_anything_whatever_the_states_say(
+    kinematic_artefact: Path, data: Path, circuit: Circuit, tmp_path: Path
+) -> None:
+    """Runs, plants, numbers and times in disorder, and numbers that are none; lockstep and not."""
+    host = kinematic_artefact / HOST
+    also = (f"-I{host}", str(host / "br_files.c"))
+    source = SOURCE / "main.c"
+    program = native_program(kinematic_artefact, source, tmp_path / "host", *SANITIZED, also=also)
+    random, lines = np.random.default_rng(4), []
+    odd = ("nan", "inf", "-inf", "1e300", "-1", "0", "9223372036854775807", "-9223372036854775808")
+    x = tuple(map(float, circuit.start(v_mps=1.5)))
+    for k in range(500):
+        answers = (0.0, 0.0, 0.02) * int(random.integers(0, 64))
+        lockstep = bool(k // 100 % 2)
+        told = State(k, 0, 1, 1, 0.02 * k, x, (0.0, 0.0), 0, lockstep, answers, k % 90 == 89)
+        words = line_of(told).split()
+        for _ in range(int(random.integers(0, 3)) if k % 3 == 0 else 0):
+            at = random.integers(len(words))
+            words[at] = str(random.choice(odd[4:] if at < 3 else odd))  # epoch, run, seq: whole
+        lines.append(" ".join(words))
+    done = subprocess.run(
+        [program, data], input="\n".join(lines), capture_output=True, text=True, check=False,
+        timeout=200,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-4000:]
+    inputs = np.array([line.split()[4:6] for line in done.stdout.splitlines()], dtype=float)
+    assert len(inputs) > 250
+    assert np.isfinite(inputs).all()
