@@ -14,6 +14,7 @@ __all__ = [
     "DECISION",
     "DELAYS",
     "DRIVING",
+    "ENVIRONMENT",
     "ERRORS",
     "INFO",
     "LEVELS",
@@ -140,6 +141,14 @@ PHASES: Final = (
 DELAYS: Final = 64
 """Most measured delays that come with one state."""
 
+ENVIRONMENT: Final = (
+    ("speed_limit_mps", "double", "the reference moves along the line at most this fast"),
+    ("speed_limit_rate_mps2", "double", "by how much the limit falls along the horizon"),
+)
+"""What a step takes into account beside the car's own state: name, type, meaning.
+
+With infinity and 0 nothing is limited."""
+
 MEASURED: Final = (
     ("epoch", "int64", "random number of the plant's process"),
     ("run", "int64", "number of the run"),
@@ -212,8 +221,8 @@ _FUNCTIONS: Final = 7
 """Version of the functions in the public headers: increase it with each change of a signature."""
 
 _TABLES: Final = (
-    SOLVER, INFO, STATUSES, ERRORS, NO_STEP, LEVELS, PHASES, DELAYS, MEASURED, DRIVING, SOLUTION,
-    DECISION, COUNTERS, _FUNCTIONS,
+    SOLVER, INFO, STATUSES, ERRORS, NO_STEP, LEVELS, PHASES, DELAYS, ENVIRONMENT, MEASURED,
+    DRIVING, SOLUTION, DECISION, COUNTERS, _FUNCTIONS,
 )  # fmt: skip
 
 ABI: Final = zlib.crc32(repr(_TABLES).encode()) & 0x7FFFFFFF
@@ -270,6 +279,7 @@ def c_interface() -> str:
         *_enum("", [(name, n, text) for n, (name, text) in enumerate(LEVELS)], "br_level"),
         *_enum("PHASE_", [(name, n, text) for n, (name, text) in enumerate(PHASES)], "br_phase"),
         *_struct(INFO, "br_mpc_info"),
+        *_struct(ENVIRONMENT, "br_environment"),
         *_struct(MEASURED, "br_measured"),
         *_struct(DRIVING, "br_driving"),
         *_struct(SOLUTION, "br_solution"),

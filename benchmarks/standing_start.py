@@ -50,7 +50,7 @@ class Rig:
 
     def __init__(self, controller: PredictiveController, length_m: float) -> None:
         car = get_car(DEFAULT_CAR)
-        self._step, self._length_m = controller.native, length_m
+        self._length_m = length_m
         compensation = CompensationSettings(mode="fixed", delay_s=0.0)
         settings = ControllerSettings(compensation=compensation, stale_s=STALE_S)
         self._driver = Cycle(controller, car, settings).driver
@@ -78,10 +78,14 @@ class Rig:
     def under_way(self) -> bool:
         """Whether the next second brings it on along the line."""
         self.cycles(1)
-        before_m = self._step.info.s_ref_m
+        before_m = self._where_m()
         self.cycles(SECOND)
-        ahead_m = (self._step.info.s_ref_m - before_m) % self._length_m
+        ahead_m = (self._where_m() - before_m) % self._length_m
         return UNDER_WAY_M < ahead_m < self._length_m / 2
+
+    def _where_m(self) -> float:
+        output = self._driver.decision.output
+        return 0.0 if output is None else output.s_ref_m
 
 
 def poses(line: RaceLine, count: int, random: np.random.Generator) -> Iterator[NDArray[np.float64]]:

@@ -14,8 +14,8 @@ from bayesrace.native_interface import NO_STEP
 from bayesrace.transport import Numbering
 from bayesrace.vehicles.parameters import CarParameters
 from controller.cycle_settings import CompensationSettings, FallbackSettings, driving_values
-from controller.interface import Controller, StepOutput
-from controller.native_library import aligned_memory
+from controller.interface import Controller, Environment, StepOutput
+from controller.native_library import EnvironmentStructure, aligned_memory
 
 __all__ = [
     "HALTED",
@@ -190,14 +190,21 @@ class Driver:
         self.newest = state
         return True
 
-    def decide(self, basis_s: float, budget_s: float = 0.0, spent_s: float = 0.0) -> Decision:
+    def decide(
+        self,
+        basis_s: float,
+        budget_s: float = 0.0,
+        spent_s: float = 0.0,
+        environment: Environment | None = None,
+    ) -> Decision:
         """The input on the basis of plant time ``basis_s``, by the newest state.
 
         ``budget_s``: how long after its release the cycle should be done; 0: no limit but the
         step's own. ``spent_s``: how long ago the release is. InputError before the first state.
         """
         decided, decision = self._decided, self.decision
-        error = self._decide(self._cycle, basis_s, budget_s, spent_s, self._decided_at)
+        around = None if environment is None else ct.byref(EnvironmentStructure(*environment))
+        error = self._decide(self._cycle, around, basis_s, budget_s, spent_s, self._decided_at)
         self.controller.artefact.check(error, "control cycle")
         decision.d, decision.delta_rate = decided.u
         decision.level, decision.status = _LEVELS[decided.level], decided.status

@@ -1,8 +1,9 @@
 """What the control cycle drives: the compiled controller, or a control law written in Python."""
 
 import ctypes as ct
+import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +12,7 @@ if TYPE_CHECKING:
     from controller.native_library import Artefact
     from controller.takeover import WeightsPort
 
-__all__ = ["NO_PLAN", "Array", "ControlLaw", "Controller", "StepOutput"]
+__all__ = ["NO_PLAN", "Array", "ControlLaw", "Controller", "Environment", "StepOutput"]
 
 Array = npt.NDArray[np.float64]
 
@@ -19,6 +20,13 @@ NO_PLAN: Final[Array] = np.zeros((0, 2))
 """``plan_u`` of a controller that does not look ahead."""
 
 _NO_STATES: Final[Array] = np.zeros((0, 7))
+
+
+class Environment(NamedTuple):
+    """What limits the car besides: :data:`bayesrace.native_interface.ENVIRONMENT`."""
+
+    speed_limit_mps: float = math.inf
+    speed_limit_rate_mps2: float = 0.0
 
 
 @dataclass(slots=True)
@@ -94,7 +102,12 @@ class ControlLaw(Protocol):
         """Forget everything about the past: the next state is the first of a run or a drive."""
 
     def step(
-        self, x: Array, u_previous: Array, elapsed_s: float, budget_s: float = 0.0
+        self,
+        x: Array,
+        u_previous: Array,
+        environment: Environment,
+        elapsed_s: float,
+        budget_s: float = 0.0,
     ) -> StepOutput:
         """The input for state ``x`` (7,), where ``u_previous`` (2,) acted until now.
 
@@ -105,9 +118,3 @@ class ControlLaw(Protocol):
 
     def predict(self, x: Array, u: Array, duration_s: float) -> Array:
         """State (7,) after ``duration_s`` (at most 1 s) with input ``u`` (2,) held."""
-
-    def limit_speed(self, limit_mps: float, rate_mps2: float) -> None:
-        """From the next step on aim at no more than this speed, falling by the rate from there on.
-
-        ``math.inf`` and 0: no limit.
-        """

@@ -18,6 +18,7 @@ from bayesrace.native_interface import (
     DECISION,
     DELAYS,
     DRIVING,
+    ENVIRONMENT,
     INFO,
     LEVELS,
     MEASURED,
@@ -26,7 +27,15 @@ from bayesrace.native_interface import (
     STATUSES,
 )
 
-__all__ = ["Artefact", "Gp", "StepInfo", "StepStatus", "aligned_memory", "parameters_type"]
+__all__ = [
+    "Artefact",
+    "EnvironmentStructure",
+    "Gp",
+    "StepInfo",
+    "StepStatus",
+    "aligned_memory",
+    "parameters_type",
+]
 
 _ALIGNMENT: Final = 64
 
@@ -94,6 +103,12 @@ class Gp(ct.Structure):
         ("inputs", ct.c_void_p),
         ("alpha", ct.c_void_p),
     ]
+
+
+class EnvironmentStructure(ct.Structure):
+    """br_environment, in the order of :class:`controller.interface.Environment`."""
+
+    _fields_ = _fields(ENVIRONMENT)
 
 
 class StepInfo(ct.Structure):
@@ -200,9 +215,8 @@ def _declare(library: ct.CDLL) -> None:
         "mpc_set_weights": [pointer] * 2,
         "mpc_stage_weights": [pointer] * 2,
         "mpc_set_clock": [pointer] * 3,
-        "mpc_set_speed_limit": [pointer, real, real],
         "mpc_reset": [pointer],
-        "mpc_step": [*[pointer] * 3, real, real, *[pointer] * 3],
+        "mpc_step": [*[pointer] * 4, real, real, *[pointer] * 3],
         "mpc_solve": [*[pointer] * 3, real, real, *[pointer] * 4],
         "mpc_prepare": [pointer, real, real],
         "mpc_rehearse": [pointer],
@@ -222,7 +236,7 @@ def _declare(library: ct.CDLL) -> None:
         "cycle_set_driving": [pointer] * 2,
         "cycle_set_clock": [pointer] * 3,
         "cycle_observe": [pointer] * 2,
-        "cycle_decide": [pointer, *[real] * 3, pointer],
+        "cycle_decide": [pointer, pointer, *[real] * 3, pointer],
         "cycle_prepare": [pointer, real, real],
         "cycle_counters": [pointer],
         **{f"cycle_{name}": [pointer] for name in ("rehearse", "stop", "go", "end", "forget")},

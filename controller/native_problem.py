@@ -12,8 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from bayesrace.errors import InputError
+from controller.interface import Environment
 from controller.native_library import (
     Artefact,
+    EnvironmentStructure,
     Gp,
     StepInfo,
     StepStatus,
@@ -141,13 +143,15 @@ class NativeProblem:
         *,
         elapsed_s: float | None = None,
         budget_s: float = 0.0,
+        environment: Environment | None = None,
     ) -> StepStatus:
         """One control step from the measured state x (nx,); results in ``u`` and ``info``.
 
         ``u_before`` (nu,): the input that acts now; a number stands for all components.
         ``elapsed_s``: since the state of the call before, of whatever status; None: one stage Ts.
         ``budget_s``: iterate until settled or within this time from now; 0: the iteration limits
-        of the settings alone. InputError if ``elapsed_s`` is negative or not finite.
+        of the settings alone. InputError if ``elapsed_s`` is negative or not finite, or a limit of
+        the ``environment`` no limit.
         """
         self._x[:] = x
         self._u_before[:] = u_before
@@ -156,6 +160,7 @@ class NativeProblem:
                 self._mpc,
                 self._x_address,
                 self._u_before_address,
+                None if environment is None else ct.byref(EnvironmentStructure(*environment)),
                 self._step_s if elapsed_s is None else elapsed_s,
                 budget_s,
                 self._u_address,

@@ -38,11 +38,6 @@ class NativeStep(NativeProblem):
         """Weights, limits and tolerances of the OCP; effective from the next step."""
         self.set_values(settings.parameters(car))
 
-    def set_speed_limit(self, limit_mps: float, rate_mps2: float = 0.0) -> None:
-        """The reference moves at most this fast, and by the rate less along the horizon."""
-        error = self._library.br_mpc_set_speed_limit(self._mpc, limit_mps, rate_mps2)
-        self._check(error, "speed limit")
-
     def set_path(self, table: PathTable) -> None:
         """Racing line and track; copied."""
         rows = np.ascontiguousarray(table.rows, dtype=np.float64)

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.errors import InputError
 from bayesrace.vehicles.parameters import CarParameters
-from controller.interface import Array, StepOutput
+from controller.interface import Array, Environment, StepOutput
 
 __all__ = ["PurePursuit", "PurePursuitSettings"]
 
@@ -74,7 +74,6 @@ class PurePursuit:
         self._noise = np.zeros(2)
         self._output = StepOutput(u=np.zeros(2))
         self._predicted = np.zeros(7)
-        self._limit_mps = math.inf
 
     def reset(self) -> None:
         """Search the whole line; begin the disturbance anew."""
@@ -95,19 +94,21 @@ class PurePursuit:
         after[6] = min(max(delta, -self._car.delta_max_rad), self._car.delta_max_rad)
         return after
 
-    def limit_speed(self, limit_mps: float, rate_mps2: float) -> None:
-        """The target speed is no higher; it does not look ahead for the rate."""
-        self._limit_mps = limit_mps
-
     def step(
-        self, x: Array, u_previous: Array, elapsed_s: float = 0.0, budget_s: float = 0.0
+        self,
+        x: Array,
+        u_previous: Array,
+        environment: Environment = Environment(),  # noqa: B008 - immutable
+        elapsed_s: float = 0.0,
+        budget_s: float = 0.0,
     ) -> StepOutput:
-        """Steer towards the target point, hold the line's speed."""
+        """Steer towards the target point, hold the line's speed, or the limit's as it is now."""
         car, settings, output = self._car, self._settings, self._output
         px, py, psi, vx, delta = (float(x[i]) for i in (0, 1, 2, 3, 6))
         nearest = self._nearest = self._follow(px, py)
         self._excite()
         target_speed, delta_target = self._targets(nearest, px, py, psi, vx)
+        target_speed = min(target_speed, environment.speed_limit_mps)
         d = (
             self._tuning.speed_gain_spm * (target_speed - vx)
             + self._hold(vx)
@@ -134,7 +135,7 @@ class PurePursuit:
         alpha = math.atan2(dy, dx) - psi
         delta = math.atan2(2 * car.wheelbase_m * math.sin(alpha), math.hypot(dx, dy))
         speed = max(settings.speed_scale * float(self._speeds[ahead]), tuning.speed_min_mps)
-        return min(speed, self._limit_mps), min(max(delta, -car.delta_max_rad), car.delta_max_rad)
+        return speed, min(max(delta, -car.delta_max_rad), car.delta_max_rad)
 
     def _hold(self, vx: float) -> float:
         """Duty cycle that about balances rolling resistance at this speed."""

@@ -12,19 +12,18 @@ import numpy as np
 
 from bayesrace.errors import InputError
 from controller.driver import STEP_FAILED
-from controller.interface import Array, ControlLaw, StepOutput
+from controller.interface import Array, ControlLaw, Environment, StepOutput
 from controller.native_library import Artefact
 
 __all__ = ["PythonController"]
 
 _DOUBLES: Final = ct.POINTER(ct.c_double)
 _STEP = ct.CFUNCTYPE(
-    ct.c_int, ct.c_void_p, _DOUBLES, _DOUBLES, ct.c_double, ct.c_double, ct.c_void_p
+    ct.c_int, ct.c_void_p, _DOUBLES, _DOUBLES, _DOUBLES, ct.c_double, ct.c_double, ct.c_void_p
 )
 _PREPARE = ct.CFUNCTYPE(None, ct.c_void_p, ct.c_double, ct.c_double)
 _REHEARSE = _RESET = ct.CFUNCTYPE(None, ct.c_void_p)
 _PREDICT = ct.CFUNCTYPE(ct.c_int, ct.c_void_p, _DOUBLES, _DOUBLES, ct.c_double, _DOUBLES)
-_LIMIT_SPEED = ct.CFUNCTYPE(None, ct.c_void_p, ct.c_double, ct.c_double)
 
 
 class _Functions(ct.Structure):
@@ -37,7 +36,6 @@ class _Functions(ct.Structure):
         ("rehearse", _REHEARSE),
         ("predict", _PREDICT),
         ("reset", _RESET),
-        ("limit_speed", _LIMIT_SPEED),
     ]
 
 
@@ -61,9 +59,6 @@ class PythonController:
             _REHEARSE(lambda _: None),
             _PREDICT(self._predict),
             _RESET(lambda _: self.law.reset()),
-            _LIMIT_SPEED(
-                lambda _, limit_mps, rate_mps2: self.law.limit_speed(limit_mps, rate_mps2)
-            ),
         )
 
     def begin_cycle(self, memory: ct.c_void_p, size: int, hold: bool, cycle: ct.c_void_p) -> int:
@@ -84,10 +79,18 @@ class PythonController:
         raise InputError("a control law in Python takes no weights")
 
     def _step(
-        self, _: Any, x: Any, u_before: Any, elapsed_s: float, budget_s: float, solution: int
+        self,
+        _: Any,
+        x: Any,
+        u_before: Any,
+        environment: Any,
+        elapsed_s: float,
+        budget_s: float,
+        solution: int,
     ) -> int:
+        around = Environment(environment[0], environment[1])
         try:
-            output = self.law.step(_array(x, 7), _array(u_before, 2), elapsed_s, budget_s)
+            output = self.law.step(_array(x, 7), _array(u_before, 2), around, elapsed_s, budget_s)
             self._fill(self.artefact.Solution.from_address(solution), output)
         except Exception as error:
             # Whatever it is, the car must not be left without an answer.

@@ -29,7 +29,7 @@ from bayesrace.vehicles.models import e_kinematic
 from codegen.ocp import OcpNlp
 from codegen.problems.tracking import tracking
 from controller.assembly import compiled_controller
-from controller.interface import StepOutput
+from controller.interface import Environment, StepOutput
 from controller.native_step import NativeStep, StepStatus
 from controller.python_controller import PythonController
 from controller.settings import MpcSettings
@@ -217,11 +217,13 @@ class _Recorder:
         """By the model of both."""
         return self._step.predict(x, u, duration_s)
 
-    def limit_speed(self, limit_mps: float, rate_mps2: float) -> None:
-        """Nothing stops here."""
-
     def step(
-        self, x: Floats, u_previous: Floats, elapsed_s: float, budget_s: float = 0.0
+        self,
+        x: Floats,
+        u_previous: Floats,
+        environment: Environment,
+        elapsed_s: float,
+        budget_s: float = 0.0,
     ) -> StepOutput:
         """Records the problem and both answers."""
         step, converged, recording = self._step, self._converged, self.recording

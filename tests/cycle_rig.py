@@ -11,7 +11,7 @@ from bayesrace.messages import State
 from bayesrace.vehicles import default_car
 from controller.cycle_settings import CompensationSettings, FallbackSettings
 from controller.driver import Driver
-from controller.interface import StepOutput
+from controller.interface import Environment, StepOutput
 from controller.python_controller import PythonController
 
 __all__ = ["STEP_S", "ScriptedLaw", "scripted_driver", "state"]
@@ -34,11 +34,13 @@ class ScriptedLaw:
     def reset(self) -> None:
         """It has no past."""
 
-    def limit_speed(self, limit_mps: float, rate_mps2: float) -> None:
-        """It aims at nothing."""
-
     def step(
-        self, x: Floats, u_previous: Floats, elapsed_s: float, budget_s: float = 0.0
+        self,
+        x: Floats,
+        u_previous: Floats,
+        environment: Environment,
+        elapsed_s: float,
+        budget_s: float = 0.0,
     ) -> StepOutput:
         """By the function."""
         if self.answer is None:

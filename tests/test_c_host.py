@@ -1,5 +1,6 @@
 """A C program hosts the whole controller: to the bit as Python does, and over UDP."""
 
+import contextlib
 import shutil
 import socket
 import subprocess
@@ -121,18 +122,19 @@ def test_over_udp_states_are_answered_and_silence_ends_at_the_fallback(
     state = State(0, 0, 7, 3, 0.0, x, (0.0, 0.0), 0, False, (), False)
     plant.send(b"no state")
     plant.send(line_of(state).encode())
-    levels, seqs = [], []
-    for _ in range(40):  # one state, then nothing
-        row = plant.recv(4096).split()
-        seqs.append(tuple(map(int, row[:3])))
-        levels.append(int(row[7]))
-    assert set(seqs) == {(7, 3, 0)}
+    rows = [plant.recv(4096).split()]
+    plant.settimeout(3.0)
+    with contextlib.suppress(
+        TimeoutError
+    ):  # one state, then nothing: after a second it says no more
+        while len(rows) < 1000:
+            rows.append(plant.recv(4096).split())
+    levels = [int(row[7]) for row in rows]
+    assert {tuple(map(int, row[:3])) for row in rows} == {(7, 3, 0)}
     assert levels[0] == Level.SOLUTION
     assert levels == sorted(levels)
     assert levels[-1] >= Level.BRAKE
-    plant.settimeout(2.0)
-    with pytest.raises(TimeoutError):  # silence for a second: it says no more
-        [plant.recv(4096) for _ in range(1000)]
+    assert len(rows) < 100
 
 
 @pytest.mark.parametrize(

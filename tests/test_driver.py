@@ -23,7 +23,7 @@ from controller.driver import (
     Level,
     Phase,
 )
-from controller.interface import StepOutput
+from controller.interface import Environment, StepOutput
 from controller.mpc import PredictiveController
 from controller.native_step import NativeStep, StepStatus
 from tests.conftest import SETTINGS, Circuit, discrete
@@ -56,6 +56,7 @@ class Rig:
         self.u = np.zeros(2)
         self.seq = 0
         self.epoch = 1
+        self.environment: Environment | None = None
 
     def state(self, **changes: Any) -> State:
         values: dict[str, Any] = {
@@ -68,7 +69,8 @@ class Rig:
         """A state arrives, is answered, and the plant drives on."""
         told = self.state(**changes)
         self.driver.observe(told)
-        decision = self.driver.decide(told.time_s, budget_s or 1e-9 * (late_s > 0), late_s)
+        budget_s = budget_s or 1e-9 * (late_s > 0)
+        decision = self.driver.decide(told.time_s, budget_s, late_s, self.environment)
         self.advance(decision)
         return decision
 

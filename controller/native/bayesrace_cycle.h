@@ -5,7 +5,7 @@
  * the messages and keeps the time; examples/c_host is one without Python, controller/ the one of
  * the controller process.
  *
- *   br_cycle_answer(cycle, &state, state.time_s, budget, 0, &decision);   a state has arrived
+ *   br_cycle_answer(cycle, &state, NULL, state.time_s, budget, 0, &decision);   a state has arrived
  *   (send decision.u)
  *   br_cycle_prepare(cycle, period, budget);              while waiting for the next one
  *
@@ -27,15 +27,15 @@ extern "C" {
 typedef struct {
     void *self;
     /* 0, or a status that says why solution is not usable. Arguments as of br_mpc_step. */
-    int (*step)(void *self, const double x[BR_NX], const double u_before[BR_NU], double elapsed_s,
-                double budget_s, br_solution *solution);
+    int (*step)(void *self, const double x[BR_NX], const double u_before[BR_NU],
+                const br_environment *environment, double elapsed_s, double budget_s,
+                br_solution *solution);
     void (*prepare)(void *self, double period_s, double budget_s);
     void (*rehearse)(void *self);
     /* 0, or -1: the model cannot follow. x_next may be x. As br_mpc_predict. */
     int (*predict)(void *self, const double x[BR_NX], const double u[BR_NU], double duration_s,
                    double x_next[BR_NX]);
     void (*reset)(void *self);
-    void (*limit_speed)(void *self, double limit_mps, double rate_mps2);
 } br_controller;
 
 typedef struct br_cycle br_cycle;
@@ -71,15 +71,18 @@ BR_API br_mpc_error br_cycle_set_clock(br_cycle *cycle, br_mpc_clock clock, void
  * silent: no single message locks out the plant. */
 BR_API br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state);
 
-/* The input on the basis of plant time basis_s, by the newest state. budget_s: how long after its
+/* The input on the basis of plant time basis_s, by the newest state. environment: as of br_mpc_step;
+ * a stop on command limits the speed as well. budget_s: how long after its
  * release the cycle should be done, spent_s: how long that is ago; the step has what is left, and
  * a tenth of the budget at least. No budget, no limit: 0. A decision that comes after its budget is
  * one for an input that acts so much later. BR_ERROR_NOT_READY without settings or state. */
-BR_API br_mpc_error br_cycle_decide(br_cycle *cycle, double basis_s, double budget_s,
-                                    double spent_s, br_decision *decision);
+BR_API br_mpc_error br_cycle_decide(br_cycle *cycle, const br_environment *environment,
+                                    double basis_s, double budget_s, double spent_s,
+                                    br_decision *decision);
 
 /* Both in one: 0, or BR_ERROR_STATE for a state that is not to be answered. */
-BR_API br_mpc_error br_cycle_answer(br_cycle *cycle, const br_measured *state, double basis_s,
+BR_API br_mpc_error br_cycle_answer(br_cycle *cycle, const br_measured *state,
+                                    const br_environment *environment, double basis_s,
                                     double budget_s, double spent_s, br_decision *decision);
 
 /* br_mpc_prepare for a state that is expected a period after the last one, where one is. */

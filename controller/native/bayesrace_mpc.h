@@ -8,7 +8,7 @@
  *
  * A control period, with or without the preparation:
  *
- *   br_mpc_step(mpc, x, u_before, elapsed, budget, u, &status, &info);   the state is here
+ *   br_mpc_step(mpc, x, u_before, NULL, elapsed, budget, u, &status, &info);   the state is here
  *   (send u)
  *   br_mpc_prepare(mpc, period, budget);                          while waiting for the next one
  *
@@ -93,11 +93,6 @@ BR_API br_mpc_error br_mpc_set_weights(br_mpc *mpc, const br_mpc_gp outputs[BR_N
 BR_API br_mpc_error br_mpc_stage_weights(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]);
 BR_API br_mpc_error br_mpc_adopt_weights(br_mpc *mpc);
 
-/* The reference moves along the line at most this fast [m/s], and at every stage by rate [m/s^2]
- * times BR_TS less, down to standstill: for a stop on the line. INFINITY and 0, as after init, are
- * no limit. For the control loop, too. BR_ERROR_PARAMETERS if negative or not a number. */
-BR_API br_mpc_error br_mpc_set_speed_limit(br_mpc *mpc, double limit_mps, double rate_mps2);
-
 /* The clock that budgets are measured with, NULL for none (then there are no budgets). It is read
  * from within br_mpc_step, br_mpc_solve and br_mpc_prepare only, in their thread. */
 BR_API br_mpc_error br_mpc_set_clock(br_mpc *mpc, br_mpc_clock clock, void *context);
@@ -119,6 +114,10 @@ BR_API void br_mpc_reset(br_mpc *mpc);
  * x: measured state. u_before: the input that acts now. u: first input of the plan; written
  * only for BR_CONVERGED and BR_ACCEPTABLE. info may be NULL.
  *
+ * environment: what limits the car besides. The reference moves along the line at most at the speed
+ * limit, and at every stage by its rate times BR_TS less, down to standstill: for a stop on the line.
+ * NULL: nothing does. BR_ERROR_PARAMETERS if a number is negative or none.
+ *
  * elapsed_s: time from the state of the call before to this one, whether that was solved or not.
  * The plan is shifted by whole stages as soon as it lags behind by half a stage, so that it is
  * never more than that out of step: BR_TS shifts it once, a tenth of that every tenth time, a
@@ -132,8 +131,9 @@ BR_API void br_mpc_reset(br_mpc *mpc);
  * that fails does not take back a usable plan found before it. After BR_TIME_LIMIT the next step
  * goes on from where this one stopped. */
 BR_API br_mpc_error br_mpc_step(br_mpc *mpc, const double x[BR_NX], const double u_before[BR_NU],
-                                double elapsed_s, double budget_s, double u[BR_NU],
-                                br_mpc_status *status, br_mpc_info *info);
+                                const br_environment *environment, double elapsed_s,
+                                double budget_s, double u[BR_NU], br_mpc_status *status,
+                                br_mpc_info *info);
 
 /* The same with a reference of the caller's own planner, stages 1..BR_N. */
 BR_API br_mpc_error br_mpc_solve(br_mpc *mpc, const double x[BR_NX], const double u_before[BR_NU],

@@ -12,7 +12,6 @@ br_mpc_error br_mpc_init(void *memory, size_t size, br_mpc **out) {
     memset(mpc, 0, sizeof *mpc);
     br_qp_init(&mpc->qp);
     br_weights_init(mpc);
-    mpc->path.speed_limit = INFINITY;
     *out = mpc;
     return BR_OK;
 }
@@ -30,14 +29,6 @@ br_mpc_error br_mpc_set_parameters(br_mpc *mpc, const br_mpc_parameters *paramet
     mpc->has_parameters = 1;
     mpc->qp.factorised = mpc->qp.evaluated = 0;
     br_evaluate_penalties(mpc);
-    return BR_OK;
-}
-
-br_mpc_error br_mpc_set_speed_limit(br_mpc *mpc, double limit_mps, double rate_mps2) {
-    if (!mpc) return BR_ERROR_NULL;
-    if (!(limit_mps >= 0) || !(rate_mps2 >= 0) || !isfinite(rate_mps2)) return BR_ERROR_PARAMETERS;
-    mpc->path.speed_limit = limit_mps;
-    mpc->path.speed_limit_rate = rate_mps2;
     return BR_OK;
 }
 

@@ -55,11 +55,12 @@ br_mpc_error br_cycle_init(void *memory, size_t size, const br_controller *contr
 /* --- the compiled controller ------------------------------------------------------------------ */
 
 static int mpc_step(void *self, const double x[BR_NX], const double u_before[BR_NU],
-                    double elapsed_s, double budget_s, br_solution *solution) {
+                    const br_environment *environment, double elapsed_s, double budget_s,
+                    br_solution *solution) {
     br_cycle *cycle = self;
     br_mpc_status status;
-    if (br_mpc_step(cycle->mpc, x, u_before, elapsed_s, budget_s, solution->u, &status,
-                    &cycle->info))
+    if (br_mpc_step(cycle->mpc, x, u_before, environment, elapsed_s, budget_s, solution->u,
+                    &status, &cycle->info))
         return BR_STEP_FAILED;
     solution->rows = BR_N;
     solution->plan_step_s = BR_TS;
@@ -83,10 +84,6 @@ static int mpc_predict(void *self, const double x[BR_NX], const double u[BR_NU],
 
 static void mpc_reset(void *self) { br_mpc_reset(((br_cycle *)self)->mpc); }
 
-static void mpc_limit_speed(void *self, double limit_mps, double rate_mps2) {
-    br_mpc_set_speed_limit(((br_cycle *)self)->mpc, limit_mps, rate_mps2);
-}
-
 br_mpc_error br_cycle_drive_mpc(void *memory, size_t size, br_mpc *mpc, int hold, br_cycle **out) {
     const br_controller compiled = {
         .self = memory,
@@ -95,7 +92,6 @@ br_mpc_error br_cycle_drive_mpc(void *memory, size_t size, br_mpc *mpc, int hold
         .rehearse = mpc_rehearse,
         .predict = mpc_predict,
         .reset = mpc_reset,
-        .limit_speed = mpc_limit_speed,
     };
     if (!mpc) return BR_ERROR_NULL;
     const br_mpc_error error = br_cycle_init(memory, size, &compiled, hold, out);
@@ -164,10 +160,7 @@ int br_cycle_forget(br_cycle *cycle) {
 
 void br_cycle_stop(br_cycle *cycle) { cycle->halted = BR_PHASE_STOPPED; }
 
-void br_cycle_go(br_cycle *cycle) {
-    cycle->halted = cycle->stopping = 0;
-    cycle->controller.limit_speed(cycle->controller.self, INFINITY, 0);
-}
+void br_cycle_go(br_cycle *cycle) { cycle->halted = cycle->stopping = 0; }
 
 /* --- one cycle -------------------------------------------------------------------------------- */
 
@@ -175,9 +168,9 @@ static double now(const br_cycle *cycle) {
     return cycle->clock ? cycle->clock(cycle->context) : 0;
 }
 
-/* Whether a stop on command is still under way; sets the speed that it has got to. Driven to
+/* Whether a stop on command is still under way; limits the speed to what it has got to. Driven to
  * standstill, the car stays on the line and points along it, fit to go on. */
-static int slowing(br_cycle *cycle, double basis_s) {
+static int slowing(br_cycle *cycle, double basis_s, br_environment *environment) {
     const br_driving *s = &cycle->settings;
     const double vx_mps = cycle->stream.newest.x[BR_INDEX_VX];
     const int rolling = fabs(vx_mps) > s->standing_mps;
@@ -189,7 +182,8 @@ static int slowing(br_cycle *cycle, double basis_s) {
     }
     const double since_s = basis_s - cycle->stopping_s;
     const double limit_mps = fmax(cycle->stopping_mps - s->stop_mps2 * since_s, 0);
-    cycle->controller.limit_speed(cycle->controller.self, limit_mps, s->stop_mps2);
+    if (limit_mps < environment->speed_limit_mps)
+        *environment = (br_environment){limit_mps, s->stop_mps2};
     if (limit_mps > 0 || rolling) return 1;
     return cycle->stopping = 0;
 }
@@ -234,7 +228,8 @@ static void count(br_cycle *cycle, int status) {
         cycle->counters.cost_jumps += solution->cost > JUMP * solution->shifted_cost + JUMP_BY;
 }
 
-static int step(br_cycle *cycle, double acting_s, double budget_s) {
+static int step(br_cycle *cycle, const br_environment *environment, double acting_s,
+                double budget_s) {
     const br_measured *newest = &cycle->stream.newest;
     const br_controller *controller = &cycle->controller;
     double x[BR_NX], u[BR_NU];
@@ -253,7 +248,8 @@ static int step(br_cycle *cycle, double acting_s, double budget_s) {
     solution->rows = solution->second_start = 0;
     solution->cost = solution->shifted_cost = -1;
     const double begin_s = now(cycle);
-    const int status = controller->step(controller->self, x, u, elapsed_s, budget_s, solution);
+    const int status = controller->step(controller->self, x, u, environment, elapsed_s, budget_s,
+                                        solution);
     cycle->decision.step_us = (now(cycle) - begin_s) * 1e6;
     cycle->decision.stepped = status != BR_STEP_FAILED;
     count(cycle, status);
@@ -261,7 +257,8 @@ static int step(br_cycle *cycle, double acting_s, double budget_s) {
 }
 
 /* The input of a car that is to be driven: the solution's, or the fallback's. */
-static void drive(br_cycle *cycle, double acting_s, double budget_s, double spent_s) {
+static void drive(br_cycle *cycle, const br_environment *environment, double acting_s,
+                  double budget_s, double spent_s) {
     const double begin_s = now(cycle);
     br_decision *decision = &cycle->decision;
     const br_measured *newest = &cycle->stream.newest;
@@ -273,8 +270,8 @@ static void drive(br_cycle *cycle, double acting_s, double budget_s, double spen
     } else {
         cycle->reckoned = 0;
         cycle->vx_mps = newest->x[BR_INDEX_VX];
-        decision->status =
-            step(cycle, acting_s, fmax(budget_s - spent_s, LEAST_BUDGET * budget_s));
+        decision->status = step(cycle, environment, acting_s,
+                                fmax(budget_s - spent_s, LEAST_BUDGET * budget_s));
     }
     if (budget_s > 0) decision->late_s = spent_s + now(cycle) - begin_s - budget_s;
     decision->level = br_fallback_decide(
@@ -285,8 +282,8 @@ static void drive(br_cycle *cycle, double acting_s, double budget_s, double spen
     cycle->counters.phase = cycle->halted ? cycle->halted : driving;
 }
 
-br_mpc_error br_cycle_decide(br_cycle *cycle, double basis_s, double budget_s, double spent_s,
-                             br_decision *out) {
+br_mpc_error br_cycle_decide(br_cycle *cycle, const br_environment *environment, double basis_s,
+                             double budget_s, double spent_s, br_decision *out) {
     if (!cycle || !out) return BR_ERROR_NULL;
     if (!cycle->has_settings || !cycle->stream.has_newest) return BR_ERROR_NOT_READY;
     if (!isfinite(basis_s) || !isfinite(budget_s) || !isfinite(spent_s)) return BR_ERROR_TIME;
@@ -300,18 +297,21 @@ br_mpc_error br_cycle_decide(br_cycle *cycle, double basis_s, double budget_s, d
     decision->stepped = 0;
     decision->step_us = decision->late_s = 0;
     const double acting_s = basis_s + decision->delay_s;
-    if (cycle->halted && !slowing(cycle, basis_s)) halt(cycle, acting_s);
-    else drive(cycle, acting_s, budget_s, spent_s);
+    br_environment around = {.speed_limit_mps = INFINITY};
+    if (environment) around = *environment;
+    if (cycle->halted && !slowing(cycle, basis_s, &around)) halt(cycle, acting_s);
+    else drive(cycle, &around, acting_s, budget_s, spent_s);
     br_delay_sent(&cycle->delay, basis_s, decision->u);
     *out = *decision;
     return BR_OK;
 }
 
-br_mpc_error br_cycle_answer(br_cycle *cycle, const br_measured *state, double basis_s,
-                             double budget_s, double spent_s, br_decision *decision) {
+br_mpc_error br_cycle_answer(br_cycle *cycle, const br_measured *state,
+                             const br_environment *environment, double basis_s, double budget_s,
+                             double spent_s, br_decision *decision) {
     if (!cycle || !state || !decision) return BR_ERROR_NULL;
     if (br_cycle_observe(cycle, state) != BR_STATE_NEW) return BR_ERROR_STATE;
-    return br_cycle_decide(cycle, basis_s, budget_s, spent_s, decision);
+    return br_cycle_decide(cycle, environment, basis_s, budget_s, spent_s, decision);
 }
 
 /* A car is being driven: a step has been made, and no halt since. */

@@ -63,7 +63,7 @@ typedef struct {
     double table[BR_PATH_CAPACITY][BR_PATH_COLUMNS];
     int known;     /* the projection of the step before is valid */
     double s;      /* arc length of the last projection */
-    double speed_limit, speed_limit_rate; /* see br_mpc_set_speed_limit */
+    double speed_limit, speed_limit_rate; /* of the environment */
     double age;    /* time since then */
 } br_path;
 

@@ -164,14 +164,26 @@ static br_mpc_error begin(br_mpc *mpc, const request *r, int *plausible) {
     return BR_OK;
 }
 
+/* The speed limits of the environment; -1 if they are none. */
+static int take_environment(br_mpc *mpc, const br_environment *environment) {
+    static const br_environment open = {.speed_limit_mps = INFINITY};
+    const br_environment *e = environment ? environment : &open;
+    const double limit = e->speed_limit_mps, rate = e->speed_limit_rate_mps2;
+    if (!(limit >= 0) || !(rate >= 0) || !isfinite(rate)) return -1;
+    mpc->path.speed_limit = limit;
+    mpc->path.speed_limit_rate = rate;
+    return 0;
+}
+
 br_mpc_error br_mpc_step(br_mpc *mpc, const double x[BR_NX], const double u_before[BR_NU],
-                         double elapsed_s, double budget_s, double u[BR_NU], br_mpc_status *status,
-                         br_mpc_info *info) {
+                         const br_environment *environment, double elapsed_s, double budget_s,
+                         double u[BR_NU], br_mpc_status *status, br_mpc_info *info) {
     int plausible;
     const request r = {x, u_before, elapsed_s, budget_s, u, status, info};
     const br_mpc_error error = begin(mpc, &r, &plausible);
     if (error) return error;
     if (!mpc->path.ready) return BR_ERROR_NOT_READY; /* as always without a path */
+    if (take_environment(mpc, environment)) return BR_ERROR_PARAMETERS;
     if (!plausible) return BR_OK;
 #if BR_HAS_PATH
     br_path_plan(&mpc->path, x, mpc->reference, &mpc->info.lateral_m);

@@ -108,7 +108,7 @@ static int answer(host *h, const char *line, char *out, size_t size) {
         return 0;
     }
     const double budget_s = state.lockstep ? 0 : SHARE * h->period_s;
-    if (br_cycle_answer(h->cycle, &state, state.time_s, budget_s, 0, &decision)) return 0;
+    if (br_cycle_answer(h->cycle, &state, NULL, state.time_s, budget_s, 0, &decision)) return 0;
     h->newest = state;
     h->driving = !state.lockstep;
     h->arrived_s = br_mpc_monotonic(NULL);
@@ -143,7 +143,7 @@ static int bridge(host *h, char *out, size_t size) {
     }
     if (!h->driving) return 0;
     const double basis_s = h->newest.time_s + since_s;
-    if (br_cycle_decide(h->cycle, basis_s, SHARE * h->period_s, 0, &decision)) return 0;
+    if (br_cycle_decide(h->cycle, NULL, basis_s, SHARE * h->period_s, 0, &decision)) return 0;
     return write_decision(out, size, &decision);
 }
 

@@ -114,12 +114,10 @@ static void set_path(controller *c, int count) {
     }
 }
 
-static void set_speed_limit(controller *c, int count) {
-    const double limit = number(1, 1), rate = number(0, 5);
-    for (int i = 0; i < count; ++i) {
-        const br_mpc_error error = br_mpc_set_speed_limit(c[i].mpc, limit, rate);
-        CHECK(error == BR_OK || error == BR_ERROR_PARAMETERS);
-    }
+static br_environment around;
+
+static void set_speed_limit(void) {
+    around = (br_environment){number(1, 1), number(0, 5)};
 }
 
 static void set_weights(controller *c, int count) {
@@ -181,9 +179,10 @@ static void step(controller *c, int count, int own_reference, double budget) {
             (&reference[0].x)[cell] += value;
             error = br_mpc_solve(c[i].mpc, x, before, elapsed, budget, reference, u[i], &status[i], &info[i]);
         } else {
-            error = br_mpc_step(c[i].mpc, x, before, elapsed, budget, u[i], &status[i], &info[i]);
+            error = br_mpc_step(c[i].mpc, x, before, &around, elapsed, budget, u[i], &status[i], &info[i]);
         }
-        CHECK(error == BR_OK || error == BR_ERROR_NOT_READY || error == BR_ERROR_TIME);
+        CHECK(error == BR_OK || error == BR_ERROR_NOT_READY || error == BR_ERROR_TIME ||
+              error == BR_ERROR_PARAMETERS); /* of the environment */
         if (!error) check_answer(u[i], status[i], &info[i]);
     }
     if (error) return;
@@ -238,7 +237,7 @@ static void call(controller *c, int count) {
             for (int i = 0; i < count; ++i) br_mpc_reset(c[i].mpc);
         break;
     case 4:
-        if (what & 0x40) set_speed_limit(c, count);
+        if (what & 0x40) set_speed_limit();
         else c->tick = number(1e-4, 1e-4);
         break;
     case 5: CHECK(br_mpc_set_clock(c->mpc, what & 0x40 ? ticking : NULL, c) == BR_OK); break;
@@ -266,6 +265,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
     parameters = usual;
     const double start[BR_NX] = {RADIUS_M, 0, 1.5707963267948966, 1.5, 0, 0, 0};
     memcpy(x, start, sizeof x);
+    around = (br_environment){INFINITY, 0};
     if (first < 0xf0) /* else the calls must do with what they find */
         for (int i = 0; i < count; ++i) {
             CHECK(br_mpc_set_parameters(c[i].mpc, &usual) == BR_OK);

@@ -92,12 +92,12 @@ static void check_memory_errors(char *block, size_t size) {
 static void check_not_ready(br_mpc *mpc, const br_mpc_parameters *p) {
     double x[BR_NX] = {0}, u[BR_NU] = {7, 7};
     br_mpc_status status;
-    CHECK(br_mpc_step(mpc, x, none, BR_TS, 0, u, &status, NULL) == BR_ERROR_NOT_READY);
+    CHECK(br_mpc_step(mpc, x, none, NULL, BR_TS, 0, u, &status, NULL) == BR_ERROR_NOT_READY);
     CHECK(br_mpc_prepare(mpc, BR_TS, 0) == BR_ERROR_NOT_READY);
     CHECK(br_mpc_predict(mpc, x, u, 0, x) == BR_ERROR_NOT_READY);
     CHECK(br_mpc_set_parameters(mpc, p) == BR_OK);
     CHECK(br_mpc_prepare(mpc, BR_TS, 0) == BR_OK); /* no plan yet: nothing to do */
-    CHECK(br_mpc_step(mpc, x, none, BR_TS, 0, u, &status, NULL) == BR_ERROR_NOT_READY); /* no path */
+    CHECK(br_mpc_step(mpc, x, none, NULL, BR_TS, 0, u, &status, NULL) == BR_ERROR_NOT_READY); /* no path */
     CHECK(u[0] == 7 && u[1] == 7);
 }
 
@@ -138,10 +138,10 @@ static void check_null(br_mpc *mpc, const double *table, int rows, double spacin
     CHECK(br_mpc_set_path(mpc, table, BR_PATH_CAPACITY + 1, spacing) == BR_ERROR_PATH);
     CHECK(br_mpc_set_weights(NULL, NULL) == BR_ERROR_NULL);
     CHECK(br_mpc_set_weights(mpc, NULL) == BR_ERROR_NULL);
-    CHECK(br_mpc_step(NULL, x, none, BR_TS, 0, u, &status, NULL) == BR_ERROR_NULL);
-    CHECK(br_mpc_step(mpc, NULL, none, BR_TS, 0, u, &status, NULL) == BR_ERROR_NULL);
-    CHECK(br_mpc_step(mpc, x, none, BR_TS, 0, NULL, &status, NULL) == BR_ERROR_NULL);
-    CHECK(br_mpc_step(mpc, x, none, BR_TS, 0, u, NULL, NULL) == BR_ERROR_NULL);
+    CHECK(br_mpc_step(NULL, x, none, NULL, BR_TS, 0, u, &status, NULL) == BR_ERROR_NULL);
+    CHECK(br_mpc_step(mpc, NULL, none, NULL, BR_TS, 0, u, &status, NULL) == BR_ERROR_NULL);
+    CHECK(br_mpc_step(mpc, x, none, NULL, BR_TS, 0, NULL, &status, NULL) == BR_ERROR_NULL);
+    CHECK(br_mpc_step(mpc, x, none, NULL, BR_TS, 0, u, NULL, NULL) == BR_ERROR_NULL);
     CHECK(br_mpc_solve(mpc, x, none, BR_TS, 0, NULL, u, &status, NULL) == BR_ERROR_NULL);
     CHECK(br_mpc_prepare(NULL, BR_TS, 0) == BR_ERROR_NULL);
     CHECK(br_mpc_set_clock(NULL, NULL, NULL) == BR_ERROR_NULL);
@@ -160,7 +160,7 @@ static void check_times(br_mpc *mpc) {
     double x[BR_NX] = {0}, u[BR_NU] = {0};
     br_mpc_status status;
     for (size_t i = 0; i < sizeof bad / sizeof bad[0]; ++i) {
-        CHECK(br_mpc_step(mpc, x, none, bad[i], 0, u, &status, NULL) == BR_ERROR_TIME);
+        CHECK(br_mpc_step(mpc, x, none, NULL, bad[i], 0, u, &status, NULL) == BR_ERROR_TIME);
         CHECK(br_mpc_prepare(mpc, bad[i], 0) == BR_ERROR_TIME);
         CHECK(br_mpc_predict(mpc, x, u, bad[i], x) == BR_ERROR_TIME);
     }
@@ -253,7 +253,7 @@ int main(int argc, char **argv) {
         const double budget = second_half ? (i % 6) * 1e-4 : 0;
         interlude(mpc, i, second_half, weights, none);
         if (second_half && i % 9 == 8) spoiled_solve(mpc, x, d, i);
-        const br_mpc_error error = br_mpc_step(mpc, x, (double[BR_NU]){d}, elapsed, budget, u, &status, &info);
+        const br_mpc_error error = br_mpc_step(mpc, x, (double[BR_NU]){d}, NULL, elapsed, budget, u, &status, &info);
         predict(mpc, x, u, (i % 10) * 0.01);
         if (status > BR_ACCEPTABLE) CHECK(u[0] == -9 && u[1] == -9);
         else CHECK(isfinite(u[0]) && isfinite(u[1]) && info.defect <= parameters.defect_max);

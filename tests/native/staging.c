@@ -84,7 +84,7 @@ static int control(const double nominal[BR_NX]) {
         const br_mpc_error predicted = br_mpc_predict(mpc, x, u, BR_TS, x);
         CHECK(predicted == BR_OK || predicted == BR_ERROR_STATE);
         x[0] = 1, x[1] = 0, x[2] = 1.5707963, x[3] = 1, x[4] = x[5] = x[6] = 0;
-        CHECK(br_mpc_step(mpc, x, (double[BR_NU]){0}, BR_TS, 0, u, &status, NULL) == BR_OK);
+        CHECK(br_mpc_step(mpc, x, (double[BR_NU]){0}, NULL, BR_TS, 0, u, &status, NULL) == BR_OK);
         CHECK(br_mpc_prepare(mpc, BR_TS, 0) == BR_OK);
         CHECK(in_use(nominal) == number);
         if (taken < 5) round = 0; /* the other thread has not come far yet */

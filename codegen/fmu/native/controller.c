@@ -127,14 +127,12 @@ static br_measured measured(fmu_instance *instance) {
 
 static double known(double value) { return isfinite(value) ? value : -1; }
 
-/* refused: a parameter or the speed limit. */
-static void tell(fmu_instance *instance, const br_decision *decision, int refused) {
+static void tell(fmu_instance *instance, const br_decision *decision) {
     static const br_mpc_info nothing;
     const controller *c = instance->model;
-    const int stepped = decision->stepped && !refused;
-    const br_mpc_info *info = stepped ? br_cycle_info(c->cycle) : &nothing;
+    const br_mpc_info *info = decision->stepped ? br_cycle_info(c->cycle) : &nothing;
     double *v = instance->value;
-    const int status = refused ? BR_STEP_FAILED : stepped ? info->status : decision->status;
+    const int status = decision->stepped ? info->status : decision->status;
     v[FMU_V_d] = decision->u[BR_INDEX_DUTY];
     v[FMU_V_delta_rate] = decision->u[BR_INDEX_DELTA_RATE];
     v[FMU_V_fallback_level] = decision->level;
@@ -144,7 +142,7 @@ static void tell(fmu_instance *instance, const br_decision *decision, int refuse
     v[FMU_V_stationarity] = known(info->stationarity);
     v[FMU_V_defect] = known(info->defect);
     v[FMU_V_slack_max_m] = known(info->slack_max_m);
-    if (!stepped || status == BR_BAD_STATE) return; /* projected nothing */
+    if (!decision->stepped || status == BR_BAD_STATE) return; /* projected nothing */
     v[FMU_V_s_ref_m] = info->s_ref_m;
     v[FMU_V_lateral_m] = info->lateral_m;
 }
@@ -154,15 +152,13 @@ int fmu_model_step(fmu_instance *instance, double h) {
     controller *c = instance->model;
     const double *v = instance->value;
     if (!due(c, instance->time, v[FMU_V_period])) return 0;
-    double limit = v[FMU_V_speed_limit];
-    if (limit >= NO_SPEED_LIMIT) limit = INFINITY;
+    br_environment around = {v[FMU_V_speed_limit], v[FMU_V_speed_limit_rate]};
+    if (around.speed_limit_mps >= NO_SPEED_LIMIT) around.speed_limit_mps = INFINITY;
     const int failed = take_parameters(instance);
-    const int refused =
-        failed || br_mpc_set_speed_limit(c->mpc, limit, v[FMU_V_speed_limit_rate]) != BR_OK;
-    br_measured state = measured(instance);
-    if (refused) state.x[BR_INDEX_X] = NAN; /* nothing is solved: the fallback answers */
+    if (failed) around.speed_limit_mps = NAN; /* the step refuses: the fallback answers */
+    const br_measured state = measured(instance);
     br_decision decision;
-    br_cycle_answer(c->cycle, &state, instance->time, 0, 0, &decision);
-    tell(instance, &decision, refused);
+    br_cycle_answer(c->cycle, &state, &around, instance->time, 0, 0, &decision);
+    tell(instance, &decision);
     return failed;
 }
