@@ -175,7 +175,7 @@ def print_laps(fmus: dict[str, Path], prepared: Prepared, folder: Path, console:
     for cpu in ("native", "portable"):
         for version, fmu in zip(VERSIONS, fmus.values(), strict=True):
             definition = controller_fmu(
-                artefact, car, path.rows, path.spacing_m, MpcSettings().model_dump(),
+                artefact, car, path.rows, path.spacing_m, MpcSettings().parameters(car),
                 FallbackSettings().model_dump() | {"brake_fade_mps": car.brake_fade_mps},
                 weights, version, cpu,
             )  # fmt: skip

@@ -1,5 +1,7 @@
 """Run-time settings of the OCP (paper, equation 8) and of the SQP that solves it."""
 
+from typing import Any
+
 from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.vehicles import CarParameters
@@ -7,17 +9,23 @@ from bayesrace.vehicles import CarParameters
 __all__ = ["MpcSettings"]
 
 
+def _objective(text: str) -> Any:
+    return Field(None, gt=0, description=f"{text}; the car's, from its tuning, without")
+
+
 class MpcSettings(BaseModel):
     """All of these can change between two steps; nothing needs a recompilation."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    q_position: float = Field(1.0, gt=0, description="Q: squared position error [1/m^2]")
-    r_duty: float = Field(0.002, gt=0, description="R: squared change of the duty cycle")
-    r_delta_rate: float = Field(3e-5, gt=0, description="R: squared steering rate [s^2/rad^2]")
-    s_slack: float = Field(100.0, gt=0, description="S: squared track violation [1/m^2]")
+    q_position: float | None = _objective("Q: squared position error [1/m^2]")
+    r_duty: float | None = _objective("R: squared change of the duty cycle")
+    r_delta_rate: float | None = _objective("R: squared steering rate [s^2/rad^2]")
+    s_slack: float | None = _objective("S: squared track violation [1/m^2]")
     constraints: bool = Field(True, description="track constraints (8d) on or off")
-    margin_m: float = Field(0.01, ge=0, description="distance kept from the track edges")
+    margin_m: float | None = Field(
+        None, ge=0, description="distance kept from the track edges [m]; the car's without"
+    )
     tolerance: float = Field(1e-6, gt=0, description="KKT residual of a converged step")
     defect_max: float = Field(
         0.03, gt=0, description="largest dynamics defect (m, rad, m/s, 10 rad/s) of a usable plan"
@@ -45,7 +53,9 @@ class MpcSettings(BaseModel):
 
     def parameters(self, car: CarParameters) -> dict[str, float]:
         """Run-time parameters of the tracking problem and settings of its solver, by name."""
-        values = self.model_dump(exclude={"constraints"})
-        values["s_slack"] = self.s_slack if self.constraints else 0.0
+        values = car.tuning.objective.model_dump()
+        values |= self.model_dump(exclude={"constraints"}, exclude_none=True)
+        if not self.constraints:
+            values["s_slack"] = 0.0
         limits = ("d_min", "d_max", "delta_max_rad", "delta_rate_max_radps")
         return values | {name: getattr(car, name) for name in limits}

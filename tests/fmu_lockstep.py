@@ -145,7 +145,7 @@ def exported_controllers(
             "car": car,
             "rows": circuit.table.rows,
             "spacing_m": circuit.table.spacing_m,
-            "settings": RACING.model_dump(),
+            "settings": RACING.parameters(car),
             "fallback": FALLBACK.model_dump() | {"brake_fade_mps": car.brake_fade_mps},
             "weights": weights,
         }

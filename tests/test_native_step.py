@@ -159,38 +159,43 @@ def test_the_converged_best_case_step_is_the_solution_of_ipopt(
 # --- residuals, recomputed from the plan alone -------------------------------------------------
 
 
-def objective(problem: Problem, x: Floats, u: Floats, s: MpcSettings) -> tuple[float, float]:
+def objective(problem: Problem, x: Floats, u: Floats, s: dict[str, float]) -> tuple[float, float]:
     """Equation (8) at a plan in plain numpy: cost and largest slack."""
     ref = problem.reference
     along = np.sum(ref[:, 2:4] * x[1:, :2], axis=1)
-    over = np.maximum(along - ref[:, 5] + s.margin_m, ref[:, 4] + s.margin_m - along)
+    over = np.maximum(along - ref[:, 5] + s["margin_m"], ref[:, 4] + s["margin_m"] - along)
     slack = np.maximum(0.0, over)
     change = np.diff(np.r_[problem.d_previous, u[:, 0]])
-    cost = s.q_position * np.sum((x[1:, :2] - ref[:, :2]) ** 2) + s.r_duty * np.sum(change**2)
-    cost += s.r_delta_rate * np.sum(u[:, 1] ** 2) + s.s_slack * np.sum(slack**2)
+    cost = s["q_position"] * np.sum((x[1:, :2] - ref[:, :2]) ** 2) + s["r_duty"] * np.sum(change**2)
+    cost += s["r_delta_rate"] * np.sum(u[:, 1] ** 2) + s["s_slack"] * np.sum(slack**2)
     return float(cost), float(slack.max())
 
 
 def stationarity_at_least(
-    problem: Problem, x: Floats, u: Floats, f: ca.Function, s: MpcSettings, car: CarParameters
+    problem: Problem,
+    x: Floats,
+    u: Floats,
+    f: ca.Function,
+    settings: MpcSettings,
+    car: CarParameters,
 ) -> float:
     """Norm of the Lagrangian's gradient in the inputs for the *best* multipliers.
 
     Costates by the adjoint recursion with CasADi's Jacobian; the multipliers of active bounds
     with their proper signs by least squares.
     """
-    n, ref = len(u), problem.reference
+    n, ref, s = len(u), problem.reference, settings.parameters(car)
     jacobian = f.factory("partials", ["x", "u"], ["jac:x_next:x", "jac:x_next:u"])
     along = np.sum(ref[:, 2:4] * x[1:, :2], axis=1)
-    over, under = along - ref[:, 5] + s.margin_m, ref[:, 4] + s.margin_m - along
-    push = 2 * s.s_slack * (np.maximum(0, over) - np.maximum(0, under))
+    over, under = along - ref[:, 5] + s["margin_m"], ref[:, 4] + s["margin_m"] - along
+    push = 2 * s["s_slack"] * (np.maximum(0, over) - np.maximum(0, under))
     change = np.r_[np.diff(np.r_[problem.d_previous, u[:, 0]]), 0.0]
     gradient, p = np.zeros((n, 2)), np.zeros(7)
     rows: list[tuple[Floats, float]] = []
     for k in range(n, 0, -1):
-        p[:2] += 2 * s.q_position * (x[k, :2] - ref[k - 1, :2]) + push[k - 1] * ref[k - 1, 2:4]
+        p[:2] += 2 * s["q_position"] * (x[k, :2] - ref[k - 1, :2]) + push[k - 1] * ref[k - 1, 2:4]
         a, b = (np.asarray(ca.densify(m)) for m in jacobian(x[k - 1], u[k - 1]))
-        own = [2 * s.r_duty * (change[k - 1] - change[k]), 2 * s.r_delta_rate * u[k - 1, 1]]
+        own = [2 * s["r_duty"] * (change[k - 1] - change[k]), 2 * s["r_delta_rate"] * u[k - 1, 1]]
         gradient[k - 1] = own + b.T @ p
         p = a.T @ p
         if abs(x[k, 6]) > car.delta_max_rad - AT_BOUND:  # delta_k = delta_0 + Ts sum of rates
@@ -228,7 +233,7 @@ def check_residuals(
         0.0,
     )
     assert info.bound == pytest.approx(beyond, abs=1e-15)
-    cost, slack = objective(problem, x, u, s)
+    cost, slack = objective(problem, x, u, s.parameters(car))
     assert info.cost == pytest.approx(cost, rel=1e-10)
     assert info.slack_max_m == pytest.approx(slack, abs=1e-14)
     return stationarity_at_least(problem, x, u, f, s, car)

@@ -18,6 +18,7 @@ __all__ = [
     "REFERENCE_WHEELBASE_M",
     "DrivingTuning",
     "GateTuning",
+    "ObjectiveTuning",
     "PathTuning",
     "PlausibleTuning",
     "PursuitTuning",
@@ -159,6 +160,16 @@ class ScaleTuning(_Section):
     steering_rad: float = _number(1.0, NONE, "steering angle [rad]")
 
 
+class ObjectiveTuning(_Section):
+    """Weights of the OCP's cost, where its settings state none."""
+
+    q_position: float = _number(1.0, (-2.0, 0.0), "Q: squared position error [1/m^2]")
+    r_duty: float = _number(0.002, NONE, "R: squared change of the duty cycle [1]")
+    r_delta_rate: float = _number(3e-5, (1.0, -1.0), "R: squared steering rate [s^2/rad^2]")
+    s_slack: float = _number(100.0, (-2.0, 0.0), "S: squared track violation [1/m^2]")
+    margin_m: float = _number(0.01, LENGTH, "distance kept from the track edges [m]")
+
+
 class PursuitTuning(_Section):
     """Pure pursuit, which drives for training data."""
 
@@ -226,6 +237,7 @@ class Tuning(_Section):
     turn: TurnTuning
     plausible: PlausibleTuning
     scale: ScaleTuning
+    objective: ObjectiveTuning
     pursuit: PursuitTuning
     gate: GateTuning
     driving: DrivingTuning

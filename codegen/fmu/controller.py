@@ -52,9 +52,6 @@ _WITHOUT_STEP: Final = {"UNPREDICTABLE": "not predictable", "HALTED": "none yet"
                         "STEP_FAILED": "refused"}  # fmt: skip
 """Of :data:`bayesrace.native_interface.NO_STEP`, those of an FMU, and what they mean here."""
 
-_LIMITS: Final = ("d_min", "d_max", "delta_max_rad", "delta_rate_max_radps")
-"""Parameters that the car has, not the settings."""
-
 _FALLBACK: Final = (
     ("shifted_s", "shifted_s", "s", False, "how long a plan may be driven without a new one"),
     ("tolerance", "limit_tolerance", "1", False, "excess over a limit that is clipped"),
@@ -76,11 +73,12 @@ def controller_fmu(
 ) -> FmuDefinition:
     """The controller of a built artefact on one racing line, ready for :func:`codegen.fmu.pack`.
 
-    ``rows`` (n, 7), ``spacing_m``: the table of ``controller.path_table``; ``settings``: the fields
-    of ``controller.settings.MpcSettings``; ``fallback``: those of ``FallbackSettings``; both become
-    start values of parameters. ``cpu``: "portable" runs on any of its kind; "native" only on one
-    like this, faster, and gives the bits of the artefact's own library; else a value for the
-    compiler's ``-march``. InputError for an artefact of another car, foreign weights, a bad table.
+    ``rows`` (n, 7), ``spacing_m``: the table of ``controller.path_table``; ``settings``: the
+    parameters of problem and solver (``controller.settings.MpcSettings.parameters``); ``fallback``:
+    the fields of ``FallbackSettings``; both become start values of parameters. ``cpu``: "portable"
+    runs on any of its kind; "native" only on one like this, faster, and gives the bits of the
+    artefact's own library; else a value for the compiler's ``-march``. InputError for an artefact
+    of another car, foreign weights, a bad table.
     """
     manifest = read_manifest(artefact)
     if (manifest.car, manifest.car_digest) != (car.name, car.digest()):
@@ -96,7 +94,7 @@ def controller_fmu(
         description=f"GP-MPC racing controller for the car '{car.name}', {manifest.model} model",
         version=version,
         kind="cs",
-        variables=_variables(manifest, car, settings, fallback),
+        variables=_variables(manifest, settings, fallback),
         sources=(_NATIVE / "controller.c", *sources),
         trees={"daqp": artefact / "daqp"},
         archives=(artefact / "libdaqpstat.a",),
@@ -125,14 +123,11 @@ def _flags(cpu: str) -> tuple[str, ...]:
 
 
 def _variables(
-    manifest: Manifest,
-    car: CarParameters,
-    settings: Mapping[str, float],
-    fallback: Mapping[str, float],
+    manifest: Manifest, settings: Mapping[str, float], fallback: Mapping[str, float]
 ) -> tuple[Variable, ...]:
     return (
         *_inputs(),
-        *_parameters(manifest, car, settings),
+        *_parameters(manifest, settings),
         *_timing(manifest, fallback),
         *_outputs(),
     )
@@ -170,15 +165,11 @@ def _inputs() -> list[Variable]:
     ]
 
 
-def _parameters(
-    manifest: Manifest, car: CarParameters, settings: Mapping[str, float]
-) -> list[Variable]:
-    """The problem's and the solver's, which the car's limits and the settings give values."""
+def _parameters(manifest: Manifest, settings: Mapping[str, float]) -> list[Variable]:
+    """The problem's and the solver's."""
 
     def start(name: str) -> float:
-        if name == "s_slack" and not settings.get("constraints", True):
-            return 0.0
-        return float(getattr(car, name) if name in _LIMITS else _value(settings, name))
+        return float(_value(settings, name))
 
     own = [
         Variable(

@@ -146,7 +146,7 @@ def _controller(
         car,
         table.rows,
         table.spacing_m,
-        read_settings(settings, MpcSettings).model_dump(),
+        read_settings(settings, MpcSettings).parameters(car),
         FallbackSettings().model_dump() | {"brake_fade_mps": car.brake_fade_mps},
         None if weights is None else read_weights(weights),
         version,
