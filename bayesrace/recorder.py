@@ -149,8 +149,6 @@ class Recorder:
     def _write(self, sample: Any) -> None:
         now_ns = time.monotonic_ns()
         key, data = str(sample.key_expr), sample.payload.to_bytes()
-        if not data:  # an inbox of the same session waking itself
-            return
         self._quiet_since_ns = now_ns
         if not self._known(key):
             self.counters.unrecorded += 1

@@ -77,7 +77,7 @@ class Run:
         self._simulator = simulator
         self._inbox = inbox
         self._publisher = publisher
-        self._decode = decoder
+        self._decoder = decoder
         self._counters = counters
         self._react = react
         self._beat = beat
@@ -126,7 +126,7 @@ class Run:
             if item is None:
                 return self._timed_out(seq)
             if item.kind is Kind.MESSAGE:
-                actuation = self._decode(item.value)
+                actuation: Actuation | None = item.value
                 if actuation is None:
                     continue
                 self._numbering.note(actuation.seq)
@@ -140,8 +140,8 @@ class Run:
 
     def _timed_out(self, seq: int) -> End:
         text = f"no actuation for state {seq} within {self.request.actuation_timeout_s:g} s"
-        if self._decode.last_reason:
-            text += f"; last refused message: {self._decode.last_reason}"
+        if self._decoder.last_reason:
+            text += f"; last refused message: {self._decoder.last_reason}"
         return End("actuation_timeout", text)
 
     # Free-running ------------------------------------------------------------------------------
@@ -193,7 +193,7 @@ class Run:
         """Takes what has arrived since the last time; returns what ends the run, if anything."""
         while (item := self._inbox.get()) is not None:
             if item.kind is Kind.MESSAGE:
-                actuation = self._decode(item.value)
+                actuation = item.value
                 if actuation is None:
                     continue
                 self._numbering.note(actuation.seq)

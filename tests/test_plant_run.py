@@ -10,7 +10,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from bayesrace.messages import Actuation, Decoder, RunRequest, State, encode
+from bayesrace.messages import Actuation, Decoder, RunRequest, State
 from bayesrace.transport import Inbox, Item, Kind, Numbering, Publisher
 from bayesrace.vehicles import get_car
 from plant.run import Run, RunCounters
@@ -47,8 +47,8 @@ class Controller:
                 "run": state.run, "state_seq": state.seq, "basis_s": state.time_s,
                 "u": (1.0, 0.0), "weights_version": "", "status": 0,
             }  # fmt: skip
-            data = encode(Actuation(**(values | changes)))
-            self._items.append(Item(Kind.MESSAGE, "actuation", data, time.monotonic_ns()))
+            actuation = Actuation(**(values | changes))
+            self._items.append(Item(Kind.MESSAGE, "actuation", actuation, time.monotonic_ns()))
 
     def get(self) -> Item | None:
         return self._items.popleft() if self._items else None

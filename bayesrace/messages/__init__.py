@@ -1,6 +1,6 @@
 """What crosses a process boundary: message types, their table, and the strict codec."""
 
-from bayesrace.messages.codec import LARGEST_BYTES, Decoder, decode, encode, json_schema, peek_seq
+from bayesrace.messages.codec import LARGEST_BYTES, Decoder, decode, encode, json_schema
 from bayesrace.messages.rules import Scalar
 from bayesrace.messages.table import (
     ACCEPTED,
@@ -86,5 +86,4 @@ __all__ = [
     "decode",
     "encode",
     "json_schema",
-    "peek_seq",
 ]
