@@ -27,7 +27,7 @@ FLUSH_PERIOD_S: Final = 0.2
 _BATCH_S: Final = 0.002
 _CHANNEL_CAPACITY: Final = 1 << 16
 _MOST_KEYS: Final = 256
-"""A log's own keys are eight; the format has room for 65,535."""
+"""A log's own keys are ten; the format has room for 65,535."""
 
 
 def _in_table(key: str) -> bool:

@@ -19,6 +19,7 @@ from bayesrace.messages import (
     STATE,
     STATUS,
     STOP,
+    TRUTH,
     Event,
     Reply,
     RunRequest,
@@ -105,6 +106,7 @@ class PlantProcess:
         self._numbering = Numbering()
         self._heartbeat = Heartbeat(session, self.name, "plant")
         self._states = Publisher(session, STATE, self.name)
+        self._truths = Publisher(session, TRUTH, self.name)
         self._events = Publisher(session, EVENT, self.name, "plant")
         self._counters = RunCounters()
         self._run: Run | None = None
@@ -178,6 +180,7 @@ class PlantProcess:
                 self._simulator,
                 self.inbox,
                 self._states,
+                self._truths,
                 self._decoder,
                 self._counters,
                 self._numbering,

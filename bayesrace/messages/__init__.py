@@ -18,6 +18,7 @@ from bayesrace.messages.table import (
     STOP,
     TELEMETRY,
     TOPICS,
+    TRUTH,
     WEIGHTS,
     Qos,
     Service,
@@ -28,6 +29,7 @@ from bayesrace.messages.types import (
     END_REASONS,
     PHASES,
     Actuation,
+    CarSample,
     ClockReading,
     ClockRequest,
     Command,
@@ -41,6 +43,7 @@ from bayesrace.messages.types import (
     StatusRequest,
     StopRequest,
     Telemetry,
+    Truth,
 )
 
 __all__ = [
@@ -62,8 +65,10 @@ __all__ = [
     "STOP",
     "TELEMETRY",
     "TOPICS",
+    "TRUTH",
     "WEIGHTS",
     "Actuation",
+    "CarSample",
     "ClockReading",
     "ClockRequest",
     "Command",
@@ -82,6 +87,7 @@ __all__ = [
     "StopRequest",
     "Telemetry",
     "Topic",
+    "Truth",
     "car_key",
     "decode",
     "encode",

@@ -17,6 +17,7 @@ from bayesrace.messages import (
     CLOCK,
     STATE,
     TELEMETRY,
+    TRUTH,
     ClockRequest,
 )
 from bayesrace.tracks import Track
@@ -132,12 +133,13 @@ class Observer:
         self._inbox = Inbox(session, car)
         self._take: dict[str, Callable[[Any], None]] = {
             STATE.name: self._state,
+            TRUTH.name: self.course.truth,
             ACTUATION.name: self.cycles.actuation,
             TELEMETRY.name: self.cycles.telemetry,
         }
         self._decoders = [
             self._inbox.subscribe(topic, newest=_CAPACITY)
-            for topic in (STATE, ACTUATION, TELEMETRY)
+            for topic in (STATE, TRUTH, ACTUATION, TELEMETRY)
         ]
 
     def begin(self) -> None:
@@ -176,7 +178,6 @@ class Observer:
         if message.lockstep:
             self.lockstep += 1
             return
-        self.course.state(message)
         self.cycles.state(message)
 
     def _sampled(self, at_ns: int) -> None:
