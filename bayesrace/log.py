@@ -144,6 +144,10 @@ class LogReader:
         found = (record for record in self._records() if isinstance(record, Metadata))
         return {record.name: dict(record.metadata) for record in found}
 
+    def channels(self) -> set[str]:
+        """The keys that it holds messages of."""
+        return {record.topic for record in self._records() if isinstance(record, Channel)}
+
     def messages(self, topics: Collection[Topic[Any]] = TOPICS) -> Iterator[Entry[Any]]:
         """The messages of these topics, typed; those that cannot be decoded are counted."""
         decoders = {topic.name: Decoder(topic.message) for topic in topics}

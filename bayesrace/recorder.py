@@ -27,7 +27,7 @@ FLUSH_PERIOD_S: Final = 0.2
 _BATCH_S: Final = 0.002
 _CHANNEL_CAPACITY: Final = 1 << 16
 _MOST_KEYS: Final = 256
-"""A log's own keys are eight; the format has room for 65,535."""
+"""A log's own keys are ten; the format has room for 65,535."""
 
 
 def _in_table(key: str) -> bool:
@@ -149,8 +149,6 @@ class Recorder:
     def _write(self, sample: Any) -> None:
         now_ns = time.monotonic_ns()
         key, data = str(sample.key_expr), sample.payload.to_bytes()
-        if not data:  # an inbox of the same session waking itself
-            return
         self._quiet_since_ns = now_ns
         if not self._known(key):
             self.counters.unrecorded += 1

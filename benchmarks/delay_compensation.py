@@ -18,7 +18,7 @@ import numpy as np
 from rich.console import Console
 
 from bayesrace.log import LogReader
-from bayesrace.messages import EVENT, STATE, TELEMETRY, Event
+from bayesrace.messages import EVENT, TELEMETRY, TRUTH, Event
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK, Track
 from bayesrace.transport import Director, Endpoints, Publisher, free_endpoint, open_session
@@ -84,7 +84,7 @@ def drive(files: Prepared, delay_ms: float, mode: str, laps: int) -> Outcome:
 def analyse(log: Path, track: Track, laps: int) -> Outcome:
     """Lap times, and samples off track until the last lap's end."""
     reader = LogReader(log)
-    states = reader.select(STATE)
+    states = reader.select(TRUTH)
     telemetry = reader.select(TELEMETRY)
     xy = np.array([state.x[:2] for state in states])
     time_s = np.array([state.time_s for state in states])

@@ -22,7 +22,7 @@ from rich.console import Console
 
 from bayesrace.gp.weights import read_weights
 from bayesrace.log import LogReader, LogWriter
-from bayesrace.messages import EVENT, STATE, Event
+from bayesrace.messages import EVENT, TRUTH, Event
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import DEFAULT_RACE_TRACK
 from bayesrace.transport import Director, Endpoints, Publisher, free_endpoint, open_session
@@ -72,7 +72,7 @@ def over_zenoh(prepared: Prepared, folder: Path) -> Iterator[Callable[[int, Path
 
 def states_of(log: Path) -> np.ndarray:
     """States (n, 7) of the one run in a log."""
-    return np.array([state.x for state in LogReader(log).select(STATE)])
+    return np.array([state.x for state in LogReader(log).select(TRUTH)])
 
 
 def main() -> None:

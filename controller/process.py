@@ -18,7 +18,6 @@ from bayesrace.messages import (
     STATE,
     TELEMETRY,
     Actuation,
-    Decoder,
     Scalar,
     State,
     decode,
@@ -80,17 +79,15 @@ class ControllerProcess:
         self.name = settings.name or settings.car.name
         self._cycle = Cycle(controller, settings.car, settings)
         self._driver, self._timing = self._cycle.driver, self._cycle.timing
-        self._decoder: Decoder[State] = Decoder(State)
         self._actuations = Publisher(session, ACTUATION, self.name)
         self._telemetry = Publisher(session, TELEMETRY, self.name)
         self._schedule = Schedule(settings.rate_hz)
         self._arrived_ns = 0
-        self._payload = b""
         self._serve_ns = 0
         """When the next request may be served."""
         self._told = False
         inbox = self.inbox = Inbox(session, self.name)
-        inbox.subscribe(STATE, newest=NEWEST)
+        self._decoder = inbox.subscribe(STATE, newest=NEWEST)
         self._service = Service(
             session, inbox, self.name, settings.rate_hz, self._driver, controller, self._counters,
             self._words, controller.port is not None,
@@ -147,13 +144,10 @@ class ControllerProcess:
         if item.kind is not Kind.MESSAGE:
             self._service.react(item)
             return None
-        begin_ns = time.perf_counter_ns()
-        state = self._decoder(item.value)
-        self._timing.decode_us = (time.perf_counter_ns() - begin_ns) * 1e-3
-        if state is None or not self._driver.observe(state):
+        self._timing.decode_us = (time.monotonic_ns() - item.received_ns) * 1e-3
+        if item.value is None or not self._driver.observe(item.value):
             return None
-        self._payload = item.value
-        return self._noted(state, item.received_ns)
+        return self._noted(item.value, item.received_ns)
 
     def _noted(self, state: State, arrived_ns: int) -> State:
         if self._takeover is not None:
@@ -292,7 +286,7 @@ class ControllerProcess:
         """
         state = self._driver.newest
         if state is not None:
-            decode(State, self._payload)
+            decode(State, encode(state))
             self._driver.rehearse()
             encode(self._actuation(state, self._driver.decision))
 

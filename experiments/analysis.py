@@ -32,7 +32,7 @@ from experiments.results import (
     write_result,
 )
 from learning.dataset import Dataset
-from learning.logs import dataset_from_messages
+from learning.logs import dataset_from_messages, fallback_cycles
 from learning.validation import Validation, validate
 
 __all__ = [
@@ -88,7 +88,7 @@ class DrivenRun:
     @property
     def counted(self) -> slice:
         """The samples that count: up to the last counted crossing, or all."""
-        return slice(0, self.laps.after[-1] if self.finished else len(self.record.states))
+        return slice(0, self.laps.after[-1] if self.finished else len(self.record.truth))
 
     def lap(self, number: int) -> slice:
         """Samples of the lap with that number, from 0, with one beyond each end."""
@@ -137,7 +137,7 @@ class DrivenRun:
             fallbacks=self.record.fallbacks,
             weights_version=self.record.weights_version,
             trajectory_sha256=self.digest(),
-            samples=len(self.record.states),
+            samples=len(self.record.truth),
             ended=self.ended,
         )
 
@@ -166,7 +166,7 @@ class RaceAnalysis:
         car = self.recording.car
         step_s = self.recording.discretisation.step_s
         try:
-            return dataset_from_messages(run.states, run.telemetry, car, step_s)
+            return dataset_from_messages(run.truth, fallback_cycles(run.telemetry), car, step_s)
         except InputError:  # cut off before its second state
             return None
 
@@ -197,6 +197,7 @@ class RaceAnalysis:
             real_time_factor=_real_time_factor(recording.runs),
             complete=not (gaps or recording.truncated or recording.refused),
             gaps=gaps,
+            judged_by="truth" if recording.truth else "measurement",
         )
 
     def _metrics(self, controller: str) -> dict[str, GpMetrics]:

@@ -22,11 +22,13 @@ from bayesrace.messages import (
     EVENT,
     STATE,
     TELEMETRY,
+    TRUTH,
     Event,
     Message,
     Scalar,
     State,
     Topic,
+    Truth,
     car_key,
     encode,
 )
@@ -40,8 +42,9 @@ from controller.driver import Decision
 from controller.interface import Controller
 from controller.process_settings import ControllerSettings
 from experiments.drive import RunPlan, announcement, run_request
-from experiments.laps import LapTimes, time_laps
-from learning.dataset import Dataset, dataset_from_arrays, filter_dataset
+from experiments.laps import LapTimes, Trajectory, time_laps
+from learning.dataset import Dataset
+from learning.logs import dataset_from_messages
 from plant.lockstep import CarRun, End, drive_lockstep
 from plant.simulator import Simulator
 from plant.vehicle import Vehicle
@@ -59,20 +62,15 @@ _LIMIT_S: Final = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Driven:
-    """One run: what the plant told and what the controller decided, by state."""
+class Driven(Trajectory):
+    """One run: the truth, what was measured of it, and what the controller decided."""
 
     car: CarParameters
     track: Track
     step_s: float
-    x: Floats
-    """States, shape (n, 7)."""
-    u: Floats
-    """Inputs that acted from each state to the next, shape (n - 1, 2)."""
-    time_s: Floats
-    """Plant time of the states, shape (n,)."""
-    lap: NDArray[np.int64]
-    """Start-line crossings up to each state, shape (n,)."""
+    truth: list[Truth]
+    states: list[State]
+    """As measured, one for each truth."""
     statuses: NDArray[np.int64]
     """Of the controller's steps, shape (m,); m is n - 1, or n if the car failed or left."""
     levels: NDArray[np.int64]
@@ -110,10 +108,14 @@ class Driven:
         return self.track.project_path(self.x[:, :2])
 
     def samples(self) -> Dataset:
-        """What can be learned from; cycles driven by the fallback are left out."""
-        count = len(self.u)
-        driven = dataset_from_arrays(self.car, self.step_s, self.x[: count + 1], self.u)
-        return filter_dataset(driven.select(self.levels[:count] == 0, "fallback"))
+        """What can be learned from the measurements, as from the run's log.
+
+        Cycles driven by the fallback are left out. InputError if the run ended before its second
+        state.
+        """
+        cycles = zip(self.states, self.levels, strict=False)
+        fallback = {(state.run, state.seq) for state, level in cycles if level > 0}
+        return dataset_from_messages(self.states, fallback, self.car, self.step_s)
 
     def __str__(self) -> str:
         laps = " ".join(f"{t:.3f}" for t in self.laps_s) or "did not finish"
@@ -172,6 +174,7 @@ class ClosedLoop:
             request = replace(request, x0=tuple(map(float, x0)))
         run = CarRun(request, self._vehicle, _EPOCH)
         self._states: list[State] = []
+        self._truth: list[Truth] = []
         self._decided: list[tuple[int, int]] = []
         self._step_us: list[float] = []
         second_starts = self._cycle.driver.count("second_starts")
@@ -183,19 +186,18 @@ class ClosedLoop:
             self._cycle.driver.lost(silent=False)
         if self._log is not None:
             self._log.ends(run, end)
-        states = self._states
+        states, truth = self._states, self._truth
         self._seq = states[-1].seq + 1
         if len(states) > 1 and states[-1].time_s == states[-2].time_s:
             states.pop()  # a fault of the plant repeats the last state
+            truth.pop()
         decided = np.array(self._decided, dtype=np.int64).reshape(-1, 2)
         return Driven(
             self._car,
             self._track,
             self._vehicle.step_s,
-            np.array([state.x for state in states]),
-            np.array([state.u_applied for state in states[1:]]).reshape(-1, 2),
-            np.array([state.time_s for state in states]),
-            np.array([state.lap for state in states]),
+            truth,
+            states,
             decided[:, 0],
             decided[:, 1],
             np.array(self._step_us),
@@ -203,11 +205,13 @@ class ClosedLoop:
             end,
         )
 
-    def _exchange(self, state: State) -> tuple[float, ...]:
+    def _exchange(self, state: State, truth: Truth) -> tuple[float, ...]:
         """Hands the state to the controller; what it answers."""
         self._states.append(state)
+        self._truth.append(truth)
         if self._log is not None:
             self._log.write(STATE, state)
+            self._log.write(TRUTH, truth)
         self._cycle.driver.observe(state)
         if not state.final:
             self._cycle.answer(state, self._send)

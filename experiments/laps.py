@@ -1,20 +1,51 @@
-"""Lap times of a trajectory."""
+"""Where a car was in truth, and its lap times."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesrace.messages import Truth
 from bayesrace.tracks import StartLine, Track
 
-__all__ = ["LapTimes", "time_laps"]
+__all__ = ["LapTimes", "Trajectory", "time_laps"]
 
 Floats = NDArray[np.float64]
 
 SHORT_CUT: Final = 0.15
 """A leap along the centreline from one sample to the next of more than this share of the track
 leaves out a piece of it: what comes after is no lap. (At 4 m/s a sample is .08 m.)"""
+
+
+class Trajectory:
+    """A run as arrays: what is judged is :attr:`truth`, never what was measured."""
+
+    truth: Sequence[Truth]
+    """In order, one a sampling period."""
+
+    @cached_property
+    def x(self) -> Floats:
+        """States, shape (n, 7)."""
+        return np.array([one.x for one in self.truth], dtype=np.float64).reshape(-1, 7)
+
+    @cached_property
+    def u(self) -> Floats:
+        """Inputs that acted from each state to the next, shape (max(n - 1, 0), 2)."""
+        acted = [one.u_applied for one in self.truth[1:]]
+        return np.array(acted, dtype=np.float64).reshape(-1, 2)
+
+    @cached_property
+    def time_s(self) -> Floats:
+        """Plant time of the states, shape (n,)."""
+        return np.array([one.time_s for one in self.truth], dtype=np.float64)
+
+    @cached_property
+    def lap(self) -> NDArray[np.int64]:
+        """Start-line crossings up to each state, shape (n,)."""
+        return np.array([one.lap for one in self.truth], dtype=np.int64)
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from experiments.collect import collect
 from experiments.progress import Stages
 from experiments.settings import PreparationSettings
 from learning.dataset import Dataset
-from learning.logs import dataset_from_messages
+from learning.logs import dataset_from_messages, fallback_cycles
 from learning.training import Progress, TrainingSettings, train
 from plant.simulator import PLANT
 from plant.vehicle import open_vehicle
@@ -212,8 +212,8 @@ def training_drive(
         states = reader.select(STATE)
         if reader.truncated or reader.refused:
             raise InputError(f"{log} is damaged")
-        step_s = settings.discretisation.step_s
-        return dataset_from_messages(states, reader.select(TELEMETRY), car, step_s)
+        fallback = fallback_cycles(reader.select(TELEMETRY))
+        return dataset_from_messages(states, fallback, car, settings.discretisation.step_s)
 
     return Training(course, path, kept(path, make, read))
 

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
@@ -20,14 +20,17 @@ from bayesrace.messages import (
     EVENT,
     STATE,
     TELEMETRY,
+    TRUTH,
     Actuation,
     Event,
     State,
     Telemetry,
+    Truth,
 )
 from bayesrace.raceline import RaceLine, read_raceline
 from bayesrace.tracks import Track, read_track
 from bayesrace.vehicles import DEFAULT_CAR, CarParameters, described_car
+from experiments.laps import Trajectory
 
 __all__ = ["RUN_EVENT", "PlannedRun", "Recording", "RunRecord", "read_recording"]
 
@@ -57,30 +60,15 @@ class PlannedRun:
 
 
 @dataclass(eq=False)
-class RunRecord:
+class RunRecord(Trajectory):
     """All messages of one run, in the order in which they arrived."""
 
     plan: PlannedRun
     states: list[State] = field(default_factory=list)
+    truth: list[Truth] = field(default_factory=list)
     actuations: list[Actuation] = field(default_factory=list)
     telemetry: list[Telemetry] = field(default_factory=list)
     events: list[Event] = field(default_factory=list)
-
-    @cached_property
-    def x(self) -> Floats:
-        """States, shape (n, 7)."""
-        return np.array([state.x for state in self.states], dtype=np.float64).reshape(-1, 7)
-
-    @cached_property
-    def time_s(self) -> Floats:
-        """Plant time of the states, shape (n,)."""
-        return np.array([state.time_s for state in self.states], dtype=np.float64)
-
-    @cached_property
-    def u_applied(self) -> Floats:
-        """Inputs that acted from each state to the next, shape (max(n - 1, 0), 2)."""
-        applied = [state.u_applied for state in self.states[1:]]
-        return np.array(applied, dtype=np.float64).reshape(-1, 2)
 
     @cached_property
     def solve_us(self) -> Floats:
@@ -105,9 +93,11 @@ class RunRecord:
 
     @property
     def gaps(self) -> int:
-        """Messages missing by their numbers, and states missing at the beginning."""
+        """Messages missing by their numbers, states missing at the beginning, and states whose
+        truth is missing."""
         streams: tuple[Sequence[Any], ...] = (self.states, self.actuations, self.telemetry)
         missing = sum(_missing(message.seq for message in stream) for stream in streams)
+        missing += len({one.seq for one in self.states} - {one.seq for one in self.truth})
         if len(self.states) > 1 and self.states[0].time_s > 0:
             step_s = self.states[1].time_s - self.states[0].time_s
             missing += round(self.states[0].time_s / step_s) if step_s > 0 else 1
@@ -146,6 +136,8 @@ class Recording:
     track: Track
     line: RaceLine
     runs: list[RunRecord]
+    truth: bool
+    """The log tells what was true; without, as of a real car, what was measured is taken for it."""
     truncated: bool
     """The log ends without its end mark."""
     refused: int
@@ -185,13 +177,21 @@ def read_recording(run_dir: Path) -> Recording:
     reader = LogReader(run_dir / "run.mcap")
     runs: dict[int, RunRecord] = {}
     started_ns: int | None = None
-    for entry in reader.messages((STATE, ACTUATION, TELEMETRY, EVENT)):
+    for entry in reader.messages((STATE, TRUTH, ACTUATION, TELEMETRY, EVENT)):
         started_ns = entry.log_time_ns if started_ns is None else started_ns
         _sort_in(runs, entry.message)
     planned = [record for _, record in sorted(runs.items()) if record.plan.controller]
+    truth = any(record.truth for record in planned)
+    if not truth:
+        for record in planned:
+            record.truth = [_taken_for_true(state) for state in record.states]
     return Recording(
-        run_dir, settings, track, line, planned, reader.truncated, reader.refused, started_ns
+        run_dir, settings, track, line, planned, truth, reader.truncated, reader.refused, started_ns
     )
+
+
+def _taken_for_true(state: State) -> Truth:
+    return Truth(*(getattr(state, one.name) for one in fields(Truth)))
 
 
 def _sort_in(runs: dict[int, RunRecord], message: Any) -> None:
@@ -201,11 +201,11 @@ def _sort_in(runs: dict[int, RunRecord], message: Any) -> None:
         runs.setdefault(plan.run, RunRecord(plan)).plan = plan
         return
     record = runs.setdefault(message.run, RunRecord(PlannedRun(message.run, "", "")))
-    if isinstance(message, State):
-        states = record.states
-        # A fault of the plant repeats the last state: no time has passed.
-        if not (message.final and states and message.time_s == states[-1].time_s):
-            states.append(message)
+    if isinstance(message, State | Truth):
+        samples: list[Any] = record.states if isinstance(message, State) else record.truth
+        # A fault of the plant repeats the last sample: no time has passed.
+        if not (samples and message.time_s == samples[-1].time_s):
+            samples.append(message)
     elif isinstance(message, Actuation):
         record.actuations.append(message)
     elif isinstance(message, Telemetry):

@@ -1,6 +1,7 @@
 """The outcome of a race: the content of ``result.json``, and nothing that is not in it."""
 
 from pathlib import Path
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -93,6 +94,10 @@ class RaceResult(_Frozen):
     )
     complete: bool = Field(description="the log is whole: no message missing, refused or cut off")
     gaps: int = Field(description="messages missing by their numbers")
+    judged_by: Literal["truth", "measurement"] = Field(
+        "measurement",
+        description="what laps and GP metrics are made of: measurement if the log holds no truth",
+    )
 
     def lap(self, controller: str) -> LapResult | None:
         """The last run of that controller, None if it did not drive."""

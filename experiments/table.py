@@ -167,6 +167,9 @@ def _print_notes(result: RaceResult, console: Console) -> None:
         elif (count := len(lap.lap_times_s)) < result.settings.laps:
             text = f"{lap.controller} finished {count} of {result.settings.laps} laps: {lap.ended}"
             console.print(Text(text, style="yellow"))
+    if result.judged_by == "measurement":
+        text = "the log holds no truth: laps and GPs are judged by what was measured"
+        console.print(Text(text, style="yellow"))
     if not result.complete:
         lost = (
             f"{result.gaps} message(s) missing" if result.gaps else "cut off or in part unreadable"

@@ -119,13 +119,17 @@ def validate_weights(
 ) -> Validated:
     """Judges weights on logs (MCAP) or arrays (``.npz``), filtered as for training.
 
-    The discretisation is the one that the weights were learned with. ``car``: theirs, needed where
-    it is not built in. InputError for drives of another car or step, or without samples.
+    They are judged by what was true; by what was measured, if that is all that a log holds, as that
+    of a real car. The discretisation is the one that the weights were learned with. ``car``:
+    theirs, needed where it is not built in. InputError for drives of another car or step, or
+    without samples.
     """
     car = car or get_car(weights.car)
     discretisation = discretisation_of(weights.discretisation, car)
-    samples = read_samples(drives, car, name, discretisation, runs=runs)
-    data = samples.dataset
+    measured, data = (
+        read_samples(drives, car, name, discretisation, runs, truth).dataset
+        for truth in (False, True)
+    )
     if len(data) == 0:
         counts = left_out(data.dropped)
         raise InputError(f"validation: no samples left (left out: {counts}); drive longer")
@@ -161,6 +165,6 @@ def validate_weights(
         dropped=dict(data.dropped),
         threshold=threshold,
         uncertain=int(validation.uncertain(threshold).sum()),
-        learned_from=bool(weights.dataset_digest) and weights.dataset_digest == data.digest(),
+        learned_from=bool(weights.dataset_digest) and weights.dataset_digest == measured.digest(),
     )
     return Validated(result, validation, data)

@@ -3,21 +3,22 @@
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.errors import InputError
 from bayesrace.vehicles.parameters import CarParameters
 
 __all__ = [
     "Dataset",
-    "FilterSettings",
+    "Tolerance",
     "concatenate",
     "dataset_from_arrays",
     "filter_dataset",
     "left_out",
+    "tolerances",
 ]
 
 Floats = NDArray[np.float64]
@@ -126,35 +127,60 @@ def concatenate(datasets: Sequence[Dataset]) -> Dataset:
     return Dataset(first.car, first.step_s, x, u, x_next, dropped)
 
 
-class FilterSettings(BaseModel):
-    """Which samples are fit to learn from."""
+@dataclass(frozen=True, slots=True)
+class Tolerance:
+    """How far a measured signal may be from what it must be for its sample to be kept."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-    tolerance: float = Field(
-        default=1e-6,
-        ge=0,
-        description="excess over a limit, or over the steering's own motion, allowed",
-    )
+    value: float
+    unit: str
+    why: str
 
 
-def filter_dataset(dataset: Dataset, settings: FilterSettings | None = None) -> Dataset:
+_ROUNDING: Final = 1e-6
+"""Beyond what a plant errs that computes or sends in single precision: 2.4e-7 at 5 rad/s."""
+
+
+def tolerances(car: CarParameters) -> dict[str, Tolerance]:
+    """The tolerance of each signal that samples are filtered by."""
+    return {
+        "time": Tolerance(
+            _ROUNDING, "s", "two states are one step apart, up to rounding; else there is a gap"
+        ),
+        "vx": Tolerance(
+            car.tuning.gate.moving_mps,
+            "m/s",
+            "least speed, by the car's tuning: slower, the car stands",
+        ),
+        "d": Tolerance(_ROUNDING, "-", "beyond a limit of the car by rounding only"),
+        "delta_rate": Tolerance(_ROUNDING, "rad/s", "beyond its limit by rounding only"),
+        "delta": Tolerance(
+            _ROUNDING, "rad", "beyond its limit by rounding only, before and after the step"
+        ),
+        "delta change": Tolerance(
+            _ROUNDING,
+            "rad",
+            "step times delta_rate, up to rounding; else it is not the input that acted",
+        ),
+    }
+
+
+def filter_dataset(dataset: Dataset) -> Dataset:
     """Leaves out standstill, samples outside the car's limits, and steering that does not add up.
 
-    The last means delta_{k+1} != delta_k + step * delta_rate: the recorded input is not what acted.
+    Each within its tolerance, :func:`tolerances`. The last means delta_{k+1} != delta_k + step *
+    delta_rate.
     """
-    settings = settings or FilterSettings()
-    car, slack = dataset.car, settings.tolerance
-    moving = dataset.x[:, 3] >= car.tuning.gate.moving_mps
-    kept = dataset.select(moving, "standstill")
+    car = dataset.car
+    slack = {signal: tolerance.value for signal, tolerance in tolerances(car).items()}
+    kept = dataset.select(dataset.x[:, 3] >= slack["vx"], "standstill")
     d, rate = kept.u.T
     angle = np.maximum(np.abs(kept.x[:, 6]), np.abs(kept.x_next[:, 6]))
     within = (
-        (d >= car.d_min - slack)
-        & (d <= car.d_max + slack)
-        & (np.abs(rate) <= car.delta_rate_max_radps + slack)
-        & (angle <= car.delta_max_rad + slack)
+        (d >= car.d_min - slack["d"])
+        & (d <= car.d_max + slack["d"])
+        & (np.abs(rate) <= car.delta_rate_max_radps + slack["delta_rate"])
+        & (angle <= car.delta_max_rad + slack["delta"])
     )
     kept = kept.select(within, "outside limits")
     drift = kept.x_next[:, 6] - kept.x[:, 6] - kept.step_s * kept.u[:, 1]
-    return kept.select(np.abs(drift) <= slack, "steering does not match its rate")
+    return kept.select(np.abs(drift) <= slack["delta change"], "steering does not match its rate")

@@ -13,12 +13,12 @@ from pydantic import ValidationError
 
 from bayesrace.errors import InputError
 from bayesrace.integrators import Discretisation
-from bayesrace.log import LogReader
-from bayesrace.messages import STATE, TELEMETRY, State, Telemetry, car_key
+from bayesrace.log import LogReader, topic_of
+from bayesrace.messages import STATE, TELEMETRY, TRUTH, CarSample, Telemetry, car_key
 from bayesrace.vehicles import CarParameters, described_car
-from learning.dataset import Dataset, FilterSettings, filter_dataset
+from learning.dataset import Dataset, filter_dataset, tolerances
 
-__all__ = ["LogFacts", "dataset_from_log", "dataset_from_messages", "log_facts"]
+__all__ = ["LogFacts", "dataset_from_log", "dataset_from_messages", "fallback_cycles", "log_facts"]
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,8 @@ class LogFacts:
 
     names: tuple[str, ...]
     """Cars in the network whose states it holds, by the keys."""
+    truth: bool
+    """It holds what was true besides what was measured."""
     car: CarParameters | None
     """The car that drove, by who recorded it; None if that is not told."""
     discretisation: Discretisation | None
@@ -36,7 +38,9 @@ class LogFacts:
 def log_facts(path: str | os.PathLike[str]) -> LogFacts:
     """Reads what there is about the car; InputError if it is no log or its metadata are damaged."""
     reader = LogReader(Path(path))
-    names = {entry.key.split("/")[1]: None for entry in reader.messages((STATE,))}
+    keys = [(topic_of(key), key.split("/")[1]) for key in reader.channels()]
+    names = sorted(name for topic, name in keys if topic is STATE)
+    truth = any(topic is TRUTH for topic, _ in keys)
     metadata = reader.metadata()
     told: dict[str, Any] = dict(metadata.get("collect") or metadata.get("drive") or {})
     try:
@@ -45,34 +49,40 @@ def log_facts(path: str | os.PathLike[str]) -> LogFacts:
         given = told.get("discretisation")
         discretisation = None if given is None else Discretisation.model_validate(given)
         car = described_car(told["car"]) if told.get("car") else None
-        return LogFacts(tuple(names), car, discretisation)
+        return LogFacts(tuple(names), truth, car, discretisation)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except (ValueError, AttributeError, ValidationError) as error:
         raise InputError(f"{path}: its settings cannot be read ({error})") from error
 
 
+def fallback_cycles(telemetry: Iterable[Telemetry]) -> set[tuple[int, int]]:
+    """Run and number of the states that the fallback has answered."""
+    return {(message.run, message.state_seq) for message in telemetry if message.fallback > 0}
+
+
 def dataset_from_messages(
-    states: Iterable[State],
-    telemetry: Iterable[Telemetry],
+    states: Iterable[CarSample],
+    fallback: Collection[tuple[int, int]],
     car: CarParameters,
     step_s: float,
     runs: Collection[int] | None = None,
-    settings: FilterSettings | None = None,
 ) -> Dataset:
     """Filtered samples from consecutive states of the same run (all runs, or those named).
 
-    The input of sample k is ``u_applied`` of the state after it: what acted, not what was asked.
-    A missing state ends the stretch ("gap"); cycles driven by the fallback are left out.
+    ``states``: as measured, to learn from; the truth, to judge what was learned. ``fallback``: run
+    and number of the states whose cycles are left out, :func:`fallback_cycles`. The input of sample
+    k is ``u_applied`` of the state after it: what acted, not what was asked. A missing state ends
+    the stretch ("gap").
     """
-    fallback = {(m.run, m.state_seq) for m in telemetry if m.fallback > 0}
+    slack_s = tolerances(car)["time"].value
     wanted = [state for state in states if runs is None or state.run in runs]
     x, u, x_next, driven = [], [], [], []
     gaps = 0
     for now, after in itertools.pairwise(wanted):
-        if now.run != after.run or (after.final and after.time_s == now.time_s):
+        if now.run != after.run or after.time_s == now.time_s:
             continue  # a fault of the plant repeats the last state: no time has passed
-        if after.seq != now.seq + 1 or abs(after.time_s - now.time_s - step_s) > 1e-6:
+        if after.seq != now.seq + 1 or abs(after.time_s - now.time_s - step_s) > slack_s:
             gaps += 1
             continue
         x.append(now.x)
@@ -89,7 +99,7 @@ def dataset_from_messages(
         )
     dropped = {"gap": gaps} if gaps else {}
     samples = Dataset(car, step_s, np.array(x), np.array(u), np.array(x_next), dropped)
-    return filter_dataset(samples.select(np.array(driven), "fallback"), settings)
+    return filter_dataset(samples.select(np.array(driven), "fallback"))
 
 
 def dataset_from_log(
@@ -97,26 +107,27 @@ def dataset_from_log(
     car: CarParameters,
     step_s: float,
     runs: Collection[int] | None = None,
-    settings: FilterSettings | None = None,
     name: str = "",
+    truth: bool = False,
 ) -> Dataset:
     """Filtered samples of ``car`` from a run's MCAP log; see :func:`dataset_from_messages`.
 
-    ``name``: its name in the network, if that is another one than its own. InputError if it is no
-    log or holds no driving of this car.
+    ``name``: its name in the network, if that is another one than its own. ``truth``: what was true
+    in place of what was measured. InputError if it is no log or holds no driving of this car.
     """
     reader = LogReader(Path(path))
-    keys = {car_key(topic.key, name or car.name) for topic in (STATE, TELEMETRY)}
-    states: list[State] = []
-    telemetry: list[Telemetry] = []
-    for entry in reader.messages((STATE, TELEMETRY)):
+    topics = TRUTH if truth else STATE, TELEMETRY
+    keys = {car_key(topic.key, name or car.name) for topic in topics}
+    states: list[CarSample] = []
+    fallback: set[tuple[int, int]] = set()
+    for entry in reader.messages(topics):
         if entry.key not in keys:
             continue
-        if isinstance(entry.message, State):
+        if isinstance(entry.message, CarSample):
             states.append(entry.message)
-        elif entry.message.fallback > 0:  # others say nothing here, and each carries a plan
-            telemetry.append(entry.message)
+        else:
+            fallback |= fallback_cycles([entry.message])
     try:
-        return dataset_from_messages(states, telemetry, car, step_s, runs, settings)
+        return dataset_from_messages(states, fallback, car, step_s, runs)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error

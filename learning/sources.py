@@ -8,7 +8,7 @@ from bayesrace.errors import InputError
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.vehicles import CarParameters, builtin_cars
 from learning.arrays import car_of_npz, dataset_from_npz
-from learning.dataset import Dataset, FilterSettings, concatenate, filter_dataset
+from learning.dataset import Dataset, concatenate, filter_dataset
 from learning.logs import LogFacts, dataset_from_log, log_facts
 
 __all__ = ["Samples", "read_samples"]
@@ -82,15 +82,16 @@ def read_samples(
     car: CarParameters | None = None,
     name: str = "",
     discretisation: Discretisation | None = None,
-    settings: FilterSettings | None = None,
     runs: Collection[int] | None = None,
+    truth: bool = False,
 ) -> Samples:
     """All samples of logs (MCAP) and arrays (``.npz``), filtered, in the order given.
 
     ``car``: what drove, where the files do not tell; ``name``: its name in the network, where a log
     holds several; ``discretisation``: what the residual is to be made with, else what the logs
-    name, else the default; ``runs``: those of the logs, all without. InputError if cars,
-    discretisations or steps differ, or if two files hold the same samples.
+    name, else the default; ``runs``: those of the logs, all without; ``truth``: what was true in
+    place of what was measured, of the logs that hold it. InputError if cars, discretisations or
+    steps differ, or if two files hold the same samples.
     """
     if not paths:
         raise InputError("no samples given; name at least one log, or --data FILE.npz")
@@ -104,10 +105,11 @@ def read_samples(
     for source in sources:
         if source.facts is None:
             raw = dataset_from_npz(source.path, parameters, used.step_s)
-            samples = filter_dataset(raw, settings)
+            samples = filter_dataset(raw)
         else:
             driver = _driver(source.path, source.facts, name)
-            samples = dataset_from_log(source.path, parameters, used.step_s, runs, settings, driver)
+            true = truth and source.facts.truth
+            samples = dataset_from_log(source.path, parameters, used.step_s, runs, driver, true)
         digest = samples.digest()
         if digest in datasets and len(samples):
             raise InputError(

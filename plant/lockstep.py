@@ -10,9 +10,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from bayesrace.messages import RunRequest, State
+from bayesrace.messages import RunRequest, State, Truth
 from plant.fmu.faults import FmuFault
 from plant.laps import LineCounter
+from plant.sensors import measure
 from plant.vehicle import Vehicle
 
 __all__ = ["CarRun", "End", "drive_lockstep", "fault_end"]
@@ -34,7 +35,7 @@ def fault_end(fault: FmuFault) -> End:
 
 
 class CarRun:
-    """The car of one run: reset to its start, sampled as states, its laps counted, its end found.
+    """The car of one run: reset to its start, sampled, its laps counted, its end found.
 
     Raises InputError if the car cannot be in the start state, FmuFault if it fails at that.
     """
@@ -63,10 +64,12 @@ class CarRun:
         """Plant time since the start."""
         return self.vehicle.time_s
 
-    def sample(self, seq: int, answers: tuple[float, ...] = (), final: bool = False) -> State:
-        """The state as the sensors tell it now."""
+    def sample(
+        self, seq: int, answers: tuple[float, ...] = (), final: bool = False
+    ) -> tuple[State, Truth]:
+        """What the sensors measure now, and what they measure it of."""
         vehicle, request = self.vehicle, self.request
-        return State(
+        truth = Truth(
             seq,
             time.monotonic_ns(),
             self._epoch,
@@ -75,10 +78,8 @@ class CarRun:
             tuple(vehicle.x.tolist()),
             vehicle.u_applied,
             self._line.crossings,
-            request.lockstep,
-            answers,
-            final,
         )
+        return measure(truth, request.lockstep, answers, final), truth
 
     def finished(self) -> End | None:
         """Counts laps in the state that has just been reached; what ends the run, if anything."""
@@ -96,19 +97,19 @@ class CarRun:
 def drive_lockstep(
     car: CarRun,
     first_seq: int,
-    exchange: Callable[[State], tuple[float, ...] | End],
+    exchange: Callable[[State, Truth], tuple[float, ...] | End],
     beat: Callable[[], End | None] = lambda: None,
 ) -> End:
     """Drives in lockstep until something ends the run.
 
-    ``exchange`` hands over a state, numbered from ``first_seq`` on, and returns the input (2,) that
-    answers it, or what ends the run; nothing answers a final state. ``beat`` is called once a
-    period; what it returns, if anything, ends the run, too.
+    ``exchange`` hands over a state, numbered from ``first_seq`` on, then its truth, and returns the
+    input (2,) that answers the state, or what ends the run; nothing answers a final state. ``beat``
+    is called once a period; what it returns, if anything, ends the run, too.
     """
     seq = first_seq
     end: End | None = None
     while True:
-        answer = exchange(car.sample(seq, final=end is not None))
+        answer = exchange(*car.sample(seq, final=end is not None))
         if end is not None:
             return end
         if isinstance(answer, End):

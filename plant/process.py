@@ -19,14 +19,12 @@ from bayesrace.messages import (
     STATE,
     STATUS,
     STOP,
-    Actuation,
-    Decoder,
+    TRUTH,
     Event,
     Reply,
     RunRequest,
     Scalar,
     Status,
-    peek_seq,
 )
 from bayesrace.realtime import RealtimeSettings, prepare_thread
 from bayesrace.transport import (
@@ -108,8 +106,8 @@ class PlantProcess:
         self._numbering = Numbering()
         self._heartbeat = Heartbeat(session, self.name, "plant")
         self._states = Publisher(session, STATE, self.name)
+        self._truths = Publisher(session, TRUTH, self.name)
         self._events = Publisher(session, EVENT, self.name, "plant")
-        self._decoder: Decoder[Actuation] = Decoder(Actuation, _log)
         self._counters = RunCounters()
         self._run: Run | None = None
         self._run_number = 0
@@ -119,7 +117,7 @@ class PlantProcess:
         self._director_gone_ns: int | None = None
         """Since when whoever directs is gone; None: is there, or never was."""
         inbox = self.inbox = Inbox(session, self.name)
-        inbox.subscribe(ACTUATION, newest=NEWEST)
+        self._decoder = inbox.subscribe(ACTUATION, newest=NEWEST, logger=_log)
         for service in (RUN, STOP):
             inbox.serve(service)
         inbox.serve(STATUS, "plant")
@@ -182,6 +180,7 @@ class PlantProcess:
                 self._simulator,
                 self.inbox,
                 self._states,
+                self._truths,
                 self._decoder,
                 self._counters,
                 self._numbering,
@@ -198,9 +197,8 @@ class PlantProcess:
 
     def _overheard(self, item: Item) -> None:
         """An actuation when nothing is driven: received, and no more."""
-        seq = peek_seq(item.value)
-        if seq is not None:
-            self._numbering.note(seq)
+        if item.value is not None:
+            self._numbering.note(item.value.seq)
 
     def _controller_there(self) -> bool:
         deadline = time.monotonic() + self._settings.controller_wait_s

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 from typing import Final, NamedTuple
 
 from bayesrace.clock import sleep_until_ns
-from bayesrace.messages import Actuation, Decoder, RunRequest, State
+from bayesrace.messages import Actuation, Decoder, RunRequest, State, Truth
 from bayesrace.transport import LOCKSTEP_SPIN_S, Inbox, Item, Kind, Numbering, Publisher
 from plant.fmu.faults import FmuFault
 from plant.lockstep import CarRun, End, drive_lockstep, fault_end
@@ -60,7 +60,8 @@ class Run:
         request: RunRequest,
         simulator: Vehicle,
         inbox: Inbox,
-        publisher: Publisher[State],
+        states: Publisher[State],
+        truths: Publisher[Truth],
         decoder: Decoder[Actuation],
         counters: RunCounters,
         numbering: Numbering,
@@ -76,14 +77,14 @@ class Run:
         self._delay_ns = round(delay_s * 1e9)
         self._simulator = simulator
         self._inbox = inbox
-        self._publisher = publisher
-        self._decode = decoder
+        self._states, self._truths = states, truths
+        self._decoder = decoder
         self._counters = counters
         self._react = react
         self._beat = beat
         self._numbering = numbering
         # Running by the wall clock:
-        self._outbox: deque[tuple[int, State]] = deque()
+        self._outbox: deque[tuple[int, State, Truth]] = deque()
         self._sampled_ns: dict[int, int] = {}
         self._waiting: list[_Waiting] = []
         self._held: Actuation | None = None
@@ -103,18 +104,23 @@ class Run:
         if self.request.lockstep:
             self._inbox.spin_s = LOCKSTEP_SPIN_S
             try:
-                first = self._publisher.next_seq
+                first = self._states.next_seq
                 return drive_lockstep(self._car, first, self._exchange, self._beat)
             finally:
                 self._inbox.spin_s = 0.0
         with self._inbox.stamped():
             return self._wall_clock()
 
+    def _send(self, state: State, truth: Truth) -> None:
+        """The truth goes second: it must not delay the measurement."""
+        self._states.put(state, lockstep=state.lockstep)
+        self._truths.put(truth, lockstep=state.lockstep)
+
     # Lockstep ----------------------------------------------------------------------------------
 
-    def _exchange(self, state: State) -> tuple[float, ...] | End:
+    def _exchange(self, state: State, truth: Truth) -> tuple[float, ...] | End:
         """Sends the state and waits for its answer; nothing answers the last one."""
-        self._publisher.put(state, lockstep=True)
+        self._send(state, truth)
         return () if state.final else self._answer_to(state.seq)
 
     def _answer_to(self, seq: int) -> tuple[float, ...] | End:
@@ -126,7 +132,7 @@ class Run:
             if item is None:
                 return self._timed_out(seq)
             if item.kind is Kind.MESSAGE:
-                actuation = self._decode(item.value)
+                actuation: Actuation | None = item.value
                 if actuation is None:
                     continue
                 self._numbering.note(actuation.seq)
@@ -140,18 +146,18 @@ class Run:
 
     def _timed_out(self, seq: int) -> End:
         text = f"no actuation for state {seq} within {self.request.actuation_timeout_s:g} s"
-        if self._decode.last_reason:
-            text += f"; last refused message: {self._decode.last_reason}"
+        if self._decoder.last_reason:
+            text += f"; last refused message: {self._decoder.last_reason}"
         return End("actuation_timeout", text)
 
     # Free-running ------------------------------------------------------------------------------
 
     def _wall_clock(self) -> End:
         period_ns = round(self._simulator.step_s * 1e9)
-        seq = self._publisher.next_seq
+        seq = self._states.next_seq
         first = self._car.sample(seq)
-        start_ns = first.source_time_ns
-        self._enqueue(first)
+        start_ns = first[0].source_time_ns
+        self._enqueue(*first)
         while True:
             begin_ns = start_ns + self._simulator.steps * period_ns
             self._sleep_and_send(begin_ns + period_ns)
@@ -165,7 +171,7 @@ class Run:
             if end is not None and end.reason == "left_world":
                 return end  # no message could carry this state
             seq += 1
-            self._enqueue(self._car.sample(seq, answers, final=end is not None))
+            self._enqueue(*self._car.sample(seq, answers, final=end is not None))
             if end is not None:
                 if self._outbox:
                     self._sleep_and_send(self._outbox[-1][0])
@@ -173,27 +179,27 @@ class Run:
             if (end := self._beat()) is not None:
                 return end
 
-    def _enqueue(self, state: State) -> None:
+    def _enqueue(self, state: State, truth: Truth) -> None:
         """Send the state when its delay is over; keep in mind when it was sampled."""
         self._sampled_ns[state.seq] = state.source_time_ns
         self._sampled_ns.pop(state.seq - _REMEMBERED, None)
-        self._outbox.append((state.source_time_ns + self._delay_ns, state))
+        self._outbox.append((state.source_time_ns + self._delay_ns, state, truth))
         self._sleep_and_send(0)
 
     def _sleep_and_send(self, until_ns: int) -> None:
         """Sleep, sending the states whose delay is over in the meantime."""
         outbox = self._outbox
         while outbox and outbox[0][0] <= max(until_ns, time.monotonic_ns()):
-            due_ns, state = outbox.popleft()
+            due_ns, state, truth = outbox.popleft()
             sleep_until_ns(due_ns)
-            self._publisher.put(state, lockstep=False)
+            self._send(state, truth)
         sleep_until_ns(until_ns)
 
     def _receive(self) -> End | None:
         """Takes what has arrived since the last time; returns what ends the run, if anything."""
         while (item := self._inbox.get()) is not None:
             if item.kind is Kind.MESSAGE:
-                actuation = self._decode(item.value)
+                actuation = item.value
                 if actuation is None:
                     continue
                 self._numbering.note(actuation.seq)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.log import LogWriter
-from bayesrace.messages import State, Telemetry, encode
+from bayesrace.messages import State, Telemetry, Truth, encode
 from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import Model
 from learning.dataset import Dataset, dataset_from_arrays
@@ -67,10 +67,14 @@ def write_log(
     data: Dataset,
     name: str = "orca",
     metadata: Mapping[str, Mapping[str, str]] | None = None,
+    truth: Dataset | None = None,
 ) -> Path:
-    """A log of one unbroken drive, as a plant's states."""
+    """A log of one unbroken drive, as a plant's states and, if it is given, their truth."""
     log = LogWriter(path, metadata)
     for one in logged(data, 0):
         log.write(f"bayesrace/{name}/state", encode(one), 1 + one.seq, one.seq)
+    for one in [] if truth is None else logged(truth, 0):
+        sample = Truth(*(getattr(one, field.name) for field in fields(Truth)))
+        log.write(f"bayesrace/{name}/truth", encode(sample), 1 + one.seq, one.seq)
     log.close()
     return path

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bayesrace.gp.weights import write_weights, zero_weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.log import LogWriter
-from bayesrace.messages import Actuation, Event, Message, State, Telemetry, encode
+from bayesrace.messages import Actuation, Event, Message, State, Telemetry, Truth, encode
 from bayesrace.raceline import RaceLine, write_raceline
 from bayesrace.tracks import Track, write_track
 from bayesrace.vehicles import get_car
@@ -62,7 +62,7 @@ def circle(angle: Floats, radius: Floats | float) -> Floats:
 
 @dataclass
 class Drive:
-    """One run: who, its states, the executed times of its steps, cycles with a fallback."""
+    """One run: who, where the car was, the execution times of its steps, cycles with a fallback."""
 
     controller: str
     x: Floats
@@ -72,12 +72,15 @@ class Drive:
     ended: str | None = "2 lap(s) done"
     lockstep: bool = True
     drop: tuple[int, ...] = ()
-    """States that are missing in the log."""
+    """Samples that are missing in the log."""
+    measured: Floats | None = None
+    """What the sensors measured, if not what was true."""
 
 
 class _Log:
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, truth: bool) -> None:
         self._writer = LogWriter(path)
+        self._truth = truth
         self._next: dict[str, int] = {}
         self.now_ns = 1_000_000_000
 
@@ -97,17 +100,19 @@ class _Log:
             "run": run, "controller": drive.controller, "weights_version": drive.weights,
         }  # fmt: skip
         self.event(run, "race", "run", f"run {run}", data)
-        for k, x in enumerate(drive.x):
+        measured = drive.x if drive.measured is None else drive.measured
+        for k, (x, seen) in enumerate(zip(drive.x, measured, strict=True)):
             self.now_ns += round(WALL_S * 1e9)
             seq = self.seq("state")
             if k in drive.drop:
                 continue
             u = (0.5, 0.0) if k else (0.0, 0.0)
-            now, time_s, state = self.now_ns, STEP_S * k, tuple(x.tolist())
+            now, time_s = self.now_ns, STEP_S * k
             final = k == len(drive.x) - 1
-            self.put(
-                "state", State(seq, now, 1, run, time_s, state, u, 0, drive.lockstep, (), final)
-            )
+            sample = seq, now, 1, run, time_s
+            self.put("state", State(*sample, tuple(seen), u, 0, drive.lockstep, (), final))
+            if self._truth:
+                self.put("truth", Truth(*sample, tuple(x), u, 0))
             if final:
                 break
             actuation = self.seq("actuation")
@@ -147,8 +152,13 @@ class _Log:
         self._writer.close()
 
 
-def write_race(path: Path, drives: Sequence[Drive], weights: bool = True) -> Path:
-    """Writes the directory as a race does; the GPs know nothing (their mean is zero)."""
+def write_race(
+    path: Path, drives: Sequence[Drive], weights: bool = True, truth: bool = True
+) -> Path:
+    """Writes the directory as a race does; the GPs know nothing (their mean is zero).
+
+    ``truth`` False: as of a real car, of which only measurements are known.
+    """
     path.mkdir(parents=True, exist_ok=True)
     settings = {
         "car": "orca", "track": "some/where/circle.csv", "train_track": "paddock", "laps": 2,
@@ -162,7 +172,7 @@ def write_race(path: Path, drives: Sequence[Drive], weights: bool = True) -> Pat
         identity = PREDICTION.identity("e_kinematic", get_car("orca"))
         for name in ("bayesrace", "updated"):
             write_weights(path / f"weights-{name}.bin", zero_weights("orca", identity, name))
-    log = _Log(path / "run.mcap")
+    log = _Log(path / "run.mcap", truth)
     for number, drive in enumerate(drives, 1):
         log.drive(number, drive)
     log.close()

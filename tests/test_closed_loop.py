@@ -1,6 +1,7 @@
 """The closed loop in one process: the same run, to the bit, as two processes over Zenoh."""
 
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import pytest
 
 from bayesrace.gp.weights import read_weights
 from bayesrace.log import LogReader, LogWriter
-from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY, Event
+from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY, TRUTH, Event
 from bayesrace.raceline import read_raceline
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import load_track
@@ -41,14 +42,14 @@ CLOCKS = {
 
 
 def told(log: Path) -> list[dict[str, Any]]:
-    """States, actuations and telemetry, all fields but the clocks', and how the runs ended."""
+    """States, their truth, actuations and telemetry, all fields but the clocks', and how the runs
+    ended."""
     reader = LogReader(log)
-    messages = [entry.message for entry in reader.messages((STATE, ACTUATION, TELEMETRY))]
+    messages = [entry.message for entry in reader.messages((STATE, TRUTH, ACTUATION, TELEMETRY))]
     messages.sort(key=lambda one: (type(one).__name__, one.seq))
     rows = [
-        {name: getattr(one, name) for name in one.__slots__ if name not in CLOCKS}
-        | {"seq": one.seq}
-        for one in messages
+        {one.name: getattr(message, one.name) for one in fields(message) if one.name not in CLOCKS}
+        for message in messages
     ]
     ends = [
         {name: event.data[name] for name in ("reason", "time_s", "laps", "braked", "clipped")}
@@ -98,9 +99,10 @@ def test_a_run_is_that_of_two_processes_over_zenoh_to_the_bit(
     assert second.x.shape == (51, 7)
     assert second.u.shape == (*second.levels.shape, 2) == (50, 2)
     assert not second.statuses.any()
-    states = LogReader(tmp_path / "own.mcap").select(STATE)
+    truth = LogReader(tmp_path / "own.mcap").select(TRUTH)
+    assert len(truth) == len(LogReader(tmp_path / "own.mcap").select(STATE))
     for run, one in enumerate(driven, 1):
-        assert np.array_equal(one.x, [state.x for state in states if state.run == run])
+        assert np.array_equal(one.x, [sample.x for sample in truth if sample.run == run])
 
 
 class Failing(Simulator):

@@ -19,7 +19,7 @@ import pytest
 
 from bayesrace.errors import InputError
 from bayesrace.log import LogReader
-from bayesrace.messages import STATE, TELEMETRY, State
+from bayesrace.messages import STATE, TELEMETRY, State, Truth
 from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
 from bayesrace.vehicles import get_car
 from experiments.recording import PlannedRun, RunRecord, _sort_in
@@ -247,7 +247,10 @@ def test_a_repeated_last_state_is_no_gap_and_no_sample() -> None:
     runs = {1: record}
     for message in states:
         _sort_in(runs, message)
-    assert [one.seq for one in record.states] == [0, 1, 2]
+        _sort_in(
+            runs, Truth(message.seq, message.seq, 1, 1, message.time_s, message.x, (0.1, 0.0), 0)
+        )
+    assert [one.seq for one in record.states] == [one.seq for one in record.truth] == [0, 1, 2]
     assert record.gaps == 0
     data = dataset_from_messages(states, [], get_car("orca"), 0.02)
     assert (len(data), data.dropped.get("gap", 0)) == (2, 0)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from hdrh.log import HistogramLogReader
 
-from bayesrace.messages import Actuation, State, Status, Telemetry
+from bayesrace.messages import Actuation, State, Status, Telemetry, Truth
 from experiments.latency.bare_loop import BareRun, read_bare_run, run_bare_loop
 from experiments.latency.course import Course
 from experiments.latency.histograms import LegHistogram, curve, distribution, new_histogram
@@ -356,8 +356,7 @@ def test_course_counts_laps_and_samples_off_the_track() -> None:
     on, off = track.position(1.0), track.position(1.0) + track.normal(1.0) * 0.5
     for k in range(700):
         x, y = off if k % 100 == 99 else on
-        u = (0.0, 0.0)
         place = (float(x), float(y), 0.0, 1.0, 0.0, 0.0, 0.0)
-        course.state(State(k, 0, 1, 1, 0.0, place, u, 3 + k // 300, False, (), False))
+        course.truth(Truth(k, 0, 1, 1, 0.0, place, (0.0, 0.0), 3 + k // 300))
     assert (course.laps, course.states, course.off_track_samples) == (2, 700, 7)
     assert Course(None).off_track_samples is None

@@ -49,7 +49,7 @@ def test_samples_are_those_of_the_log(states: list[State]) -> None:
     lossy = [one for one in states if one.seq not in (30, 31, 120)]
     fallbacks = (10, 60, 61, 199)
     taken, rest = fed(lossy, fallbacks)
-    log = dataset_from_messages(lossy, [telemetry(7, k, 1) for k in fallbacks], CAR, STEP_S)
+    log = dataset_from_messages(lossy, [(7, k) for k in fallbacks], CAR, STEP_S)
     got = samples(taken + rest)
     np.testing.assert_array_equal(got.x, log.x)
     np.testing.assert_array_equal(got.u, log.u)

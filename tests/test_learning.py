@@ -1,5 +1,6 @@
 """Learning: samples, residual, likelihood, training, validation."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +17,16 @@ from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from learning.arrays import dataset_from_npz
 from learning.crossvalidation import held_out
-from learning.dataset import Dataset, concatenate, filter_dataset
+from learning.dataset import Dataset, concatenate, filter_dataset, tolerances
 from learning.hyperparameters import BOUNDS, maximise, starts
 from learning.likelihood import MarginalLikelihood
-from learning.logs import dataset_from_log, dataset_from_messages
+from learning.logs import dataset_from_log, dataset_from_messages, fallback_cycles
 from learning.residual import identity, residual
 from learning.subset import evenly, most_informative
 from learning.training import TrainingSettings, train
 from learning.validation import predictive_sigma, validate
 from tests.driven import CAR, QUICK, STEP_S, drive, logged, telemetry
+from tests.programs import ROOT
 
 Floats = NDArray[np.float64]
 
@@ -78,6 +80,40 @@ def test_filter_counts_what_it_leaves_out(driven: Dataset) -> None:
     }
 
 
+@pytest.mark.parametrize("share", [0.9, 1.1])
+@pytest.mark.parametrize("signal", ["vx", "d", "delta_rate", "delta", "delta change"])
+def test_a_sample_is_kept_within_the_tolerance_of_each_signal(signal: str, share: float) -> None:
+    slack = tolerances(CAR)[signal].value
+    x, u = np.array([0, 0, 0, 1.0, 0, 0, 0]), np.array([0.5, 0.0])
+    if signal == "vx":
+        x[3] = slack / share
+    elif signal == "d":
+        u[0] = CAR.d_max + share * slack
+    elif signal == "delta_rate":
+        u[1] = -CAR.delta_rate_max_radps - share * slack
+    elif signal == "delta":
+        x[6] = CAR.delta_max_rad + share * slack
+    x_next = x.copy()
+    x_next[6] += STEP_S * u[1] + share * slack * (signal == "delta change")
+    kept = filter_dataset(Dataset(CAR, STEP_S, x[None], u[None], x_next[None]))
+    assert len(kept) == (share < 1)
+
+
+@pytest.mark.parametrize("share", [0.9, 1.1])
+def test_states_are_consecutive_within_the_tolerance_of_time(driven: Dataset, share: float) -> None:
+    late_s = share * tolerances(CAR)["time"].value
+    states = logged(driven, 0)
+    states[-1] = replace(states[-1], time_s=states[-1].time_s + late_s)
+    data = dataset_from_messages(states, (), CAR, STEP_S)
+    assert dict(data.dropped) == ({} if share < 1 else {"gap": 1})
+
+
+def test_the_table_of_tolerances_is_that_of_the_documentation() -> None:
+    text = (ROOT / "docs/learning.md").read_text()
+    for signal, one in tolerances(CAR).items():
+        assert f"| {signal} | {one.unit} | {one.value:g} | {one.why} |" in text
+
+
 def test_datasets_are_checked(driven: Dataset) -> None:
     with pytest.raises(InputError, match="shape"):
         Dataset(CAR, STEP_S, driven.x, driven.u[:-1], driven.x_next)
@@ -98,7 +134,7 @@ def test_datasets_are_checked(driven: Dataset) -> None:
 
 def test_messages_become_the_samples_that_were_driven(driven: Dataset) -> None:
     states = logged(driven, 0)
-    data = dataset_from_messages(states, [telemetry(0, 5, 0)], CAR, STEP_S)
+    data = dataset_from_messages(states, fallback_cycles([telemetry(0, 5, 0)]), CAR, STEP_S)
     assert np.array_equal(data.x, driven.x)
     assert np.array_equal(data.u, driven.u)
     assert np.array_equal(data.x_next, driven.x_next)
@@ -108,7 +144,7 @@ def test_messages_become_the_samples_that_were_driven(driven: Dataset) -> None:
 def test_gaps_fallback_and_other_runs_are_left_out(driven: Dataset) -> None:
     first, second = logged(driven, 0), logged(driven, 1)
     messages = first[:10] + first[11:] + second
-    seen = [telemetry(0, 3, 1), telemetry(0, 4, 2), telemetry(1, 3, 0)]
+    seen = fallback_cycles([telemetry(0, 3, 1), telemetry(0, 4, 2), telemetry(1, 3, 0)])
     everything = dataset_from_messages(messages, seen, CAR, STEP_S)
     assert dict(everything.dropped) == {"gap": 1, "fallback": 2}
     assert len(everything) == 2 * len(driven) - 2 - 2

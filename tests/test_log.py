@@ -14,7 +14,7 @@ from mcap.writer import CompressionType, Writer
 
 from bayesrace.errors import InputError
 from bayesrace.log import LogReader, LogWriter, _unpacked
-from bayesrace.messages import EVENT, STATE, Event, State, decode, encode
+from bayesrace.messages import EVENT, STATE, Event, State, encode
 from bayesrace.recorder import Recorder
 from bayesrace.transport import Endpoints, Inbox, Publisher, free_endpoint, open_session
 from tests.programs import ROOT, until
@@ -192,7 +192,7 @@ def test_a_log_that_cannot_be_written_is_an_event(
         until(failed, "the failure")
         item = inbox.get(20.0)
         assert item is not None
-        event = decode(Event, item.value)
+        event = item.value
         assert (event.source, event.kind) == ("recorder", "recorder_failed")
         assert f"cannot write the log {path}: No space left on device" in event.text
         with pytest.raises(InputError, match="No space left"):

@@ -10,7 +10,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from bayesrace.messages import Actuation, Decoder, RunRequest, State, encode
+from bayesrace.messages import Actuation, Decoder, RunRequest, State, Truth
 from bayesrace.transport import Inbox, Item, Kind, Numbering, Publisher
 from bayesrace.vehicles import get_car
 from plant.run import Run, RunCounters
@@ -33,13 +33,18 @@ class Controller:
         self._answer = answer
         self._items: deque[Item] = deque()
         self.states: list[State] = []
+        self.truth: list[Truth] = []
 
     @property
     def next_seq(self) -> int:
         return len(self.states)
 
-    def put(self, state: State, *, lockstep: bool) -> None:
+    def put(self, state: State | Truth, *, lockstep: bool) -> None:
         assert not lockstep
+        if isinstance(state, Truth):
+            self.truth.append(state)
+            return
+        assert len(self.truth) == len(self.states), "the truth comes before its measurement"
         self.states.append(state)
         for changes in self._answer(state):
             values = {
@@ -47,8 +52,8 @@ class Controller:
                 "run": state.run, "state_seq": state.seq, "basis_s": state.time_s,
                 "u": (1.0, 0.0), "weights_version": "", "status": 0,
             }  # fmt: skip
-            data = encode(Actuation(**(values | changes)))
-            self._items.append(Item(Kind.MESSAGE, "actuation", data, time.monotonic_ns()))
+            actuation = Actuation(**(values | changes))
+            self._items.append(Item(Kind.MESSAGE, "actuation", actuation, time.monotonic_ns()))
 
     def get(self) -> Item | None:
         return self._items.popleft() if self._items else None
@@ -79,7 +84,8 @@ def execute(answer: Any, delay_s: float = 0.0) -> tuple[list[State], RunCounters
     )  # fmt: skip
     run = Run(
         request, simulator, cast(Inbox, controller), cast(Publisher[State], controller),
-        Decoder(Actuation), counters, Numbering(), lambda _: None, lambda: None, EPOCH, delay_s,
+        cast(Publisher[Truth], controller), Decoder(Actuation), counters, Numbering(),
+        lambda _: None, lambda: None, EPOCH, delay_s,
     )  # fmt: skip
     run.execute()
     return controller.states, counters, simulator.guard.counters

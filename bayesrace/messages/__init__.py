@@ -1,6 +1,6 @@
 """What crosses a process boundary: message types, their table, and the strict codec."""
 
-from bayesrace.messages.codec import LARGEST_BYTES, Decoder, decode, encode, json_schema, peek_seq
+from bayesrace.messages.codec import LARGEST_BYTES, Decoder, decode, encode, json_schema
 from bayesrace.messages.rules import Scalar
 from bayesrace.messages.table import (
     ACCEPTED,
@@ -18,6 +18,7 @@ from bayesrace.messages.table import (
     STOP,
     TELEMETRY,
     TOPICS,
+    TRUTH,
     WEIGHTS,
     Qos,
     Service,
@@ -28,6 +29,7 @@ from bayesrace.messages.types import (
     END_REASONS,
     PHASES,
     Actuation,
+    CarSample,
     ClockReading,
     ClockRequest,
     Command,
@@ -41,6 +43,7 @@ from bayesrace.messages.types import (
     StatusRequest,
     StopRequest,
     Telemetry,
+    Truth,
 )
 
 __all__ = [
@@ -62,8 +65,10 @@ __all__ = [
     "STOP",
     "TELEMETRY",
     "TOPICS",
+    "TRUTH",
     "WEIGHTS",
     "Actuation",
+    "CarSample",
     "ClockReading",
     "ClockRequest",
     "Command",
@@ -82,9 +87,9 @@ __all__ = [
     "StopRequest",
     "Telemetry",
     "Topic",
+    "Truth",
     "car_key",
     "decode",
     "encode",
     "json_schema",
-    "peek_seq",
 ]

@@ -20,6 +20,7 @@ from bayesrace.messages.types import (
     StatusRequest,
     StopRequest,
     Telemetry,
+    Truth,
 )
 
 __all__ = [
@@ -38,6 +39,7 @@ __all__ = [
     "STOP",
     "TELEMETRY",
     "TOPICS",
+    "TRUTH",
     "WEIGHTS",
     "Qos",
     "Service",
@@ -102,6 +104,7 @@ _NEWS: Final = Qos("data", express=True, reliable=True, wall_clock_blocks=True)
 STATE: Final = Topic(
     "state", "bayesrace/{car}/state", State, ("plant",), "each period (50 Hz by default)", _CONTROL
 )
+TRUTH: Final = Topic("truth", "bayesrace/{car}/truth", Truth, ("plant",), "each state", _REPORT)
 ACTUATION: Final = Topic(
     "actuation", "bayesrace/{car}/actuation", Actuation, ("controller",), "each cycle", _CONTROL
 )
@@ -124,7 +127,7 @@ HEARTBEAT: Final = Topic(
     "10 Hz",
     _REPORT,
 )
-TOPICS: Final[tuple[Topic[Any], ...]] = (STATE, ACTUATION, TELEMETRY, EVENT, HEARTBEAT)
+TOPICS: Final[tuple[Topic[Any], ...]] = (STATE, TRUTH, ACTUATION, TELEMETRY, EVENT, HEARTBEAT)
 
 RUN: Final = Service("run", "bayesrace/{car}/plant/run", RunRequest, Reply, 20.0, False)
 STOP: Final = Service("stop", "bayesrace/{car}/plant/stop", StopRequest, Reply, 5.0, False)

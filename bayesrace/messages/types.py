@@ -24,6 +24,7 @@ __all__ = [
     "END_REASONS",
     "PHASES",
     "Actuation",
+    "CarSample",
     "ClockReading",
     "ClockRequest",
     "Command",
@@ -37,6 +38,7 @@ __all__ = [
     "StatusRequest",
     "StopRequest",
     "Telemetry",
+    "Truth",
 ]
 
 END_REASONS: Final = (
@@ -76,8 +78,8 @@ class Message:
 
 
 @dataclass(frozen=True, slots=True)
-class State(Message):
-    """What the sensors tell: ``bayesrace/{car}/state``; ``source_time_ns`` is when they did."""
+class CarSample(Message):
+    """The car at one moment, as measured or in truth; ``source_time_ns`` is that moment."""
 
     epoch: Count
     """Random number of the plant's process: what answers another one's states is not for this one,
@@ -92,6 +94,13 @@ class State(Message):
     """d [-] and delta_rate [rad/s] that acted during the period before; zeros at the start."""
     lap: Signed
     """Start-line crossings so far, forwards minus backwards."""
+
+
+@dataclass(frozen=True, slots=True)
+class State(CarSample):
+    """What the sensors measure, and all that controller and learning know of the car:
+    ``bayesrace/{car}/state``."""
+
     lockstep: Annotated[bool, Flag()]
     """True if the plant waits for the actuation that answers this very message."""
     answers: Annotated[tuple[float, ...], Vector(3, limit=1e15, rows=64)]
@@ -101,6 +110,12 @@ class State(Message):
     final: Annotated[bool, Flag()]
     """True in the last state of a run: nothing that answers it will act. After a fault of the plant
     it repeats the state before, time included."""
+
+
+@dataclass(frozen=True, slots=True)
+class Truth(CarSample):
+    """What the sensors of the :class:`State` with the same ``seq`` were to measure, for the log and
+    for who judges a drive: ``bayesrace/{car}/truth``. A real car sends none."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,6 @@ from bayesrace.messages import (
     STATUS,
     STOP,
     WEIGHTS,
-    Decoder,
     Event,
     Message,
     Reply,
@@ -208,7 +207,6 @@ class Director:
     def __init__(self, session: Any, car: str) -> None:
         self._session = session
         self._car = car
-        self._decode = Decoder(Event)
         self.inbox = Inbox(session, car)
         self.inbox.subscribe(EVENT)
         self.inbox.watch("plant")
@@ -302,10 +300,9 @@ class Director:
                 if item.kind is Kind.ALIVE and item.name in lost:
                     del lost[item.name]
                     deadline = deadline if lost else last
-                if item.kind is Kind.MESSAGE:
-                    event = self._decode(item.value)
-                    if event is not None and event.run == run and event.kind == "run_ended":
-                        return event
+                event = item.value
+                if isinstance(event, Event) and (event.run, event.kind) == (run, "run_ended"):
+                    return event
         if lost:
             raise InputError(f"{' and '.join(lost.values())} during run {run}")
         raise InputError(f"run {run} of car '{self._car}' did not end in {timeout_s:g} s")

@@ -1,21 +1,23 @@
 """One place where a thread waits for everything that can happen to it, with a time limit.
 
-Messages come through Zenoh's own channel, which the waiting thread reads itself: one hand-over
+Each topic has a channel of Zenoh's own, which the waiting thread reads itself: one hand-over
 between threads less than a callback that fills a queue, which halves the round trip (docs/
 decisions/). Requests, the coming and going of other processes and signals are put into a queue by
-callbacks. The channel's ``recv`` knows no time limit and sees no queue, so whoever adds to the
-queue, and a clock thread, wakes it with an empty message that never leaves the session.
+callbacks. No call waits for several channels and a queue, so the thread looks at all of them and
+sleeps between two looks: 0.05 ms at first, longer the longer it has waited.
 """
 
+import logging
 import os
 import queue
 import socket
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from enum import Enum
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 
 import zenoh
 
@@ -25,6 +27,7 @@ from bayesrace.messages import (
     ALIVE,
     CLOCK,
     ClockReading,
+    Decoder,
     Message,
     Service,
     Topic,
@@ -45,9 +48,12 @@ __all__ = [
     "decode_request",
 ]
 
+M = TypeVar("M", bound=Message)
+
 _CAPACITY: Final = 10_000
-"""Items, and messages, waiting at most; a thread this far behind is broken, and memory must not
-follow it. A full channel holds back the senders: those of the wall clock drop, by the table."""
+"""Items, and messages of a topic, waiting at most; a thread this far behind is broken, and memory
+must not follow it. A full channel holds back the senders: those of the wall clock drop, by the
+table."""
 
 _REQUESTS: Final = 16
 """At most so many requests wait; more are turned away, so that no backlog builds up."""
@@ -63,10 +69,12 @@ LOCKSTEP_SPIN_S: Final = 0.002
 than the answer: measured, the round trip falls from 270 to 90 us."""
 
 _POLL_S: Final = 5e-5
-"""Sleep between two looks of :meth:`Inbox.poll`."""
-
-_TICK_S: Final = 0.05
-"""How late a time limit or a signal may be noticed by a waiting thread."""
+"""Shortest sleep between two looks ..."""
+_IDLE_S: Final = 2e-3
+"""... and the longest: how late a thread that has waited for long may notice something. 500 looks a
+second take 2 % of a CPU."""
+_SHARE: Final = 0.125
+"""Length of a sleep between these two, as a share of the time waited so far."""
 
 
 class Kind(Enum):
@@ -129,16 +137,25 @@ class Item(NamedTuple):
     name: str
     """Topic, service or source; empty for signals."""
     value: Any
-    """MESSAGE: bytes; REQUEST: :class:`Request`; SIGNAL: its number; else None."""
+    """MESSAGE: the message, None if the topic's decoder has refused it; REQUEST: :class:`Request`;
+    SIGNAL: its number; else None."""
     received_ns: int
     """Own monotonic clock on arrival."""
+
+
+class _Stream(NamedTuple):
+    """One topic as it arrives."""
+
+    name: str
+    key: str
+    channel: Any
+    decoder: Decoder[Any]
 
 
 class Inbox:
     """Items for one thread. Declare what may arrive, then :meth:`get`.
 
-    What is declared lives as long as the inbox, so keep it; the session must be closed (``with``),
-    or the process would not end.
+    What is declared lives as long as the inbox, so keep it.
     """
 
     def __init__(self, session: Any, car: str) -> None:
@@ -146,10 +163,8 @@ class Inbox:
         self._car = car
         self._items: queue.SimpleQueue[Item] = queue.SimpleQueue()
         self._declared: list[Any] = []
-        self._topic = self._key = ""
-        self._channel: Any = None
-        self._bell: Any = None
-        self._waiting = False
+        self._streams: deque[_Stream] = deque()
+        """In the order in which they are looked at next."""
         self._stamping = False
         self.alive: set[str] = set()
         """Sources whose liveliness token is there, as of the items taken so far."""
@@ -161,27 +176,28 @@ class Inbox:
         self.spin_s = 0.0
         """How long :meth:`get` polls before it sleeps; 0 wherever others need the CPU."""
 
-    def subscribe(self, topic: Topic[Any], source: str = "*", newest: int | None = None) -> None:
-        """Let the topic's messages arrive, as bytes, under the topic's name; one topic only.
+    def subscribe(
+        self,
+        topic: Topic[M],
+        source: str = "*",
+        newest: int | None = None,
+        logger: logging.Logger | None = None,
+    ) -> Decoder[M]:
+        """Let the topic's messages arrive, decoded, under the topic's name; any number of topics.
 
         ``newest``: of those waiting, only so many are kept, the newest; the others are let go.
+        Returns the topic's decoder, which counts what it refuses; ``logger`` as in
+        :class:`Decoder`.
         """
-        if self._channel is not None:
-            raise ValueError(f"this inbox has topic '{self._topic}' already")
         key = car_key(topic.key, self._car, source)
-        self._topic, self._key = topic.name, key
         channel: Any = zenoh.handlers.FifoChannel(_CAPACITY)
         if newest is not None:
             channel = zenoh.handlers.RingChannel(newest)
         subscriber = self._session.declare_subscriber(key, channel)
-        self._channel = subscriber.handler
-        self._bell = self._session.declare_publisher(
-            car_key(topic.key, self._car, source if source != "*" else "bell"),
-            allowed_destination=zenoh.Locality.SESSION_LOCAL,
-        )
-        self._declared += [subscriber, self._bell]
-        # No daemon: one that is inside Zenoh when the interpreter ends takes the process down.
-        threading.Thread(target=self._tick, name="inbox-clock").start()
+        decoder = Decoder(topic.message, logger)
+        self._declared.append(subscriber)
+        self._streams.append(_Stream(topic.name, key, subscriber.handler, decoder))
+        return decoder
 
     def serve(self, service: Service[Any, Any], source: str = "") -> None:
         """Let the service's requests arrive; what comes when many wait is turned away, counted."""
@@ -191,7 +207,7 @@ class Inbox:
                 self.turned_away += 1
                 request.turn_away(f"{_REQUESTS} requests wait already")
                 return
-            self._add(Item(Kind.REQUEST, service.name, request, time.monotonic_ns()))
+            self._enqueue(Item(Kind.REQUEST, service.name, request, time.monotonic_ns()))
 
         self._declared.append(
             declare_service(self._session, service, self._car, arrived, source=source)
@@ -218,7 +234,8 @@ class Inbox:
 
         def on_token(sample: Any) -> None:
             there = sample.kind == zenoh.SampleKind.PUT
-            self._add(Item(Kind.ALIVE if there else Kind.GONE, source, None, time.monotonic_ns()))
+            kind = Kind.ALIVE if there else Kind.GONE
+            self._enqueue(Item(kind, source, None, time.monotonic_ns()))
 
         key = car_key(ALIVE, self._car, source)
         self._declared.append(
@@ -236,30 +253,24 @@ class Inbox:
             yield
 
     def get(self, timeout_s: float = 0.0) -> Item | None:
-        """The next item; None if nothing arrives in time."""
+        """The next item, the topics in turn; None if nothing arrives in time."""
         if self._stamping:
-            self._empty_channel()
-        if self._channel is None or self._stamping:
-            return self._noted(self._from_queue(timeout_s))
-        now = time.monotonic()
-        deadline, spin_until = now + timeout_s, now + min(self.spin_s, timeout_s)
+            self._empty_channels()
+        if self._stamping or not self._streams:
+            return self._from_queue(timeout_s)
+        begin = time.monotonic()
         while True:
-            if not self._items.empty():
-                return self._noted(self._from_queue(0.0))
-            sample = self._channel.try_recv()
-            if sample is None:
-                now = time.monotonic()
-                if now >= deadline:
-                    return None
-                if now < spin_until:
-                    os.sched_yield()  # the thread that receives may be waiting for this very CPU
-                    continue
-                self._waiting = True
-                sample = self._channel.recv()
-                self._waiting = False
-            data: bytes = sample.payload.to_bytes()
-            if data:
-                return Item(Kind.MESSAGE, self._topic, data, time.monotonic_ns())
+            item = self._from_channels() if self._items.empty() else self.other()
+            if item is not None:
+                return item
+            waited_s = time.monotonic() - begin
+            if waited_s >= timeout_s:
+                return None
+            if waited_s < self.spin_s:
+                os.sched_yield()  # the thread that receives may be waiting for this very CPU
+                continue
+            sleep_s = min(max(_SHARE * waited_s, _POLL_S), _IDLE_S)
+            time.sleep(min(sleep_s, timeout_s - waited_s))
 
     def poll(self, until_ns: int) -> Item | None:
         """The next message, looked for until the monotonic clock says ``until_ns``.
@@ -267,83 +278,80 @@ class Inbox:
         For fixed-rate loops: wakes to the tenth of a millisecond without another thread's help, and
         leaves the CPU to the thread that brings the message (docs/decisions/). Looks at least once.
         """
-        while True:
-            sample = self._channel.try_recv()
-            now_ns = time.monotonic_ns()
-            if sample is not None:
-                data: bytes = sample.payload.to_bytes()
-                if data:
-                    return Item(Kind.MESSAGE, self._topic, data, now_ns)
-            elif now_ns >= until_ns:
+        while (item := self._from_channels()) is None:
+            if time.monotonic_ns() >= until_ns:
                 return None
-            else:
-                time.sleep(_POLL_S)
+            time.sleep(_POLL_S)
+        return item
 
     def other(self) -> Item | None:
         """The next item that is no message, of those that are there; does not wait."""
-        return self._noted(self._from_queue(0.0))
+        return self._from_queue(0.0)
 
     @contextmanager
     def stamped(self) -> Iterator[None]:
         """For the block, the transport's own thread takes the messages as they arrive, so that
         ``received_ns`` is right even if the owner sleeps meanwhile."""
 
-        def on_sample(sample: Any) -> None:
-            data: bytes = sample.payload.to_bytes()
-            if data:
-                self._enqueue(Item(Kind.MESSAGE, self._topic, data, time.monotonic_ns()))
+        def stamping(name: str) -> Any:
+            def on_sample(sample: Any) -> None:
+                data: bytes = sample.payload.to_bytes()
+                self._enqueue(Item(Kind.MESSAGE, name, data, time.monotonic_ns()))
+
+            return _direct(on_sample)
 
         self._stamping = True
-        subscriber = self._session.declare_subscriber(self._key, _direct(on_sample))
         try:
-            yield
+            with ExitStack() as stack:
+                for stream in self._streams:
+                    subscriber = self._session.declare_subscriber(stream.key, stamping(stream.name))
+                    stack.callback(subscriber.undeclare)
+                yield
         finally:
-            subscriber.undeclare()
-            self._empty_channel()
+            self._empty_channels()
             self._stamping = False
 
-    def _empty_channel(self) -> None:
+    def _empty_channels(self) -> None:
         """Lets go of what was stamped: each message there keeps a buffer of the transport's."""
-        while self._channel.try_recv() is not None:
-            pass
+        for stream in self._streams:
+            while stream.channel.try_recv() is not None:
+                pass
+
+    def _from_channels(self) -> Item | None:
+        """The next message of those that are there, beginning with the topic after the last one."""
+        streams = self._streams
+        for _ in range(len(streams)):
+            stream = streams[0]
+            streams.rotate(-1)
+            sample = stream.channel.try_recv()
+            if sample is not None:
+                now_ns = time.monotonic_ns()
+                message = stream.decoder(sample.payload.to_bytes())
+                return Item(Kind.MESSAGE, stream.name, message, now_ns)
+        return None
 
     def _from_queue(self, timeout_s: float) -> Item | None:
         try:
-            return self._items.get(timeout_s > 0, max(timeout_s, 0.0))
+            item = self._items.get(timeout_s > 0, max(timeout_s, 0.0))
         except queue.Empty:
             return None
-
-    def _noted(self, item: Item | None) -> Item | None:
-        if item is not None and item.kind is Kind.ALIVE:
+        if item.kind is Kind.MESSAGE:
+            decoder = next(one.decoder for one in self._streams if one.name == item.name)
+            return item._replace(value=decoder(item.value))
+        if item.kind is Kind.ALIVE:
             self.alive.add(item.name)
-        elif item is not None and item.kind is Kind.GONE:
+        elif item.kind is Kind.GONE:
             self.alive.discard(item.name)
-        elif item is not None and item.kind is Kind.REQUEST:
+        elif item.kind is Kind.REQUEST:
             self._room.release()
         return item
 
     def _enqueue(self, item: Item) -> None:
+        """From another thread."""
         if self._items.qsize() >= _CAPACITY:
             self.overflowed += 1
             return
         self._items.put(item)
-
-    def _add(self, item: Item) -> None:
-        """From another thread: into the queue, and wake who waits at the channel."""
-        self._enqueue(item)
-        if self._waiting:
-            with suppress(zenoh.ZError):  # the session has been closed meanwhile
-                self._bell.put(b"")
-
-    def _tick(self) -> None:
-        """Wakes a waiting thread often enough to see its time limit and its signals; ends with the
-        session."""
-        # RuntimeError: asked while the session is being closed.
-        with suppress(zenoh.ZError, RuntimeError):
-            while not self._session.is_closed():
-                time.sleep(_TICK_S)
-                if self._waiting:
-                    self._bell.put(b"")
 
 
 def _direct(callback: Callable[[Any], None]) -> Any:

@@ -1,6 +1,6 @@
 """Where the car was: laps, and samples off the track."""
 
-from bayesrace.messages import State
+from bayesrace.messages import Truth
 from bayesrace.tracks import Track
 
 __all__ = ["Course"]
@@ -9,7 +9,7 @@ _BATCH = 256
 
 
 class Course:
-    """Follows the states of a run; projected in batches, so that little is kept."""
+    """Follows the truth of a run; projected in batches, so that little is kept."""
 
     def __init__(self, track: Track | None) -> None:
         self._track = track
@@ -19,8 +19,8 @@ class Course:
         self._last_lap = 0
         self.states = 0
 
-    def state(self, message: State) -> None:
-        """The next state."""
+    def truth(self, message: Truth) -> None:
+        """The next sample."""
         self.states += 1
         if self._first_lap is None:
             self._first_lap = message.lap

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from bayesrace.errors import InputError
-from bayesrace.messages import Decoder, Event, Status
+from bayesrace.messages import Event, Status
 from bayesrace.tracks import Track
 from bayesrace.transport import Director, Kind
 from experiments.latency.memory import MemoryWatch
@@ -71,7 +71,6 @@ class Measurement:
             self.out,
         )  # fmt: skip
         self.memory = MemoryWatch(self.pids, self.duration_s)
-        self._events = Decoder(Event)
 
     def settle(self, until_ns: int) -> None:
         """Follows the run without counting."""
@@ -129,10 +128,8 @@ class Measurement:
                 self.interrupted, self.ended_early = True, "interrupted"
             elif item.kind is Kind.GONE:
                 self._gone(item.name)
-            elif item.kind is Kind.MESSAGE:
-                event = self._events(item.value)
-                if event is not None and event.kind == "run_ended":
-                    self.ended_early = event.text
+            elif isinstance(item.value, Event) and item.value.kind == "run_ended":
+                self.ended_early = item.value.text
 
     def _gone(self, source: str) -> None:
         text = f"the {source} of car '{self.car}' vanished"

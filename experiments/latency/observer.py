@@ -11,21 +11,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-import zenoh
-
 from bayesrace.errors import InputError
 from bayesrace.messages import (
     ACTUATION,
     CLOCK,
     STATE,
     TELEMETRY,
+    TRUTH,
     ClockRequest,
-    Decoder,
-    Topic,
-    car_key,
 )
 from bayesrace.tracks import Track
-from bayesrace.transport import ask
+from bayesrace.transport import Inbox, ask
 from experiments.latency.clocks import ClockPair, Exchange, OffsetEstimator
 from experiments.latency.course import Course
 from experiments.latency.histograms import LegHistogram
@@ -134,10 +130,16 @@ class Observer:
         self._elapsed_s = 0.0
         """Of the cycles judged so far, on the plant's clock."""
         self.histograms: dict[str, LegHistogram] = {}
-        self._streams = [
-            _Stream(session, car, STATE, self._state),
-            _Stream(session, car, ACTUATION, self.cycles.actuation),
-            _Stream(session, car, TELEMETRY, self.cycles.telemetry),
+        self._inbox = Inbox(session, car)
+        self._take: dict[str, Callable[[Any], None]] = {
+            STATE.name: self._state,
+            TRUTH.name: self.course.truth,
+            ACTUATION.name: self.cycles.actuation,
+            TELEMETRY.name: self.cycles.telemetry,
+        }
+        self._decoders = [
+            self._inbox.subscribe(topic, newest=_CAPACITY)
+            for topic in (STATE, TRUTH, ACTUATION, TELEMETRY)
         ]
 
     def begin(self) -> None:
@@ -153,8 +155,9 @@ class Observer:
 
     def drain(self) -> None:
         """Takes in what has arrived."""
-        for stream in self._streams:
-            stream.drain()
+        while (item := self._inbox.get()) is not None:
+            if item.value is not None:
+                self._take[item.name](item.value)
         self.cycles.settle()
 
     def finish(self) -> None:
@@ -169,13 +172,12 @@ class Observer:
     @property
     def refused_messages(self) -> int:
         """What could not be decoded."""
-        return sum(stream.decoder.refused for stream in self._streams)
+        return sum(decoder.refused for decoder in self._decoders)
 
     def _state(self, message: Any) -> None:
         if message.lockstep:
             self.lockstep += 1
             return
-        self.course.state(message)
         self.cycles.state(message)
 
     def _sampled(self, at_ns: int) -> None:
@@ -198,23 +200,3 @@ class Observer:
     def _record(self, leg: str, value_ns: int) -> None:
         if self._counting:
             self.histograms[leg].record(value_ns)
-
-
-class _Stream:
-    """One topic's messages, waiting in Zenoh."""
-
-    def __init__(
-        self, session: Any, car: str, topic: Topic[Any], take: Callable[[Any], None]
-    ) -> None:
-        self.decoder: Decoder[Any] = Decoder(topic.message)
-        self._take = take
-        self._subscriber = session.declare_subscriber(
-            car_key(topic.key, car), zenoh.handlers.RingChannel(_CAPACITY)
-        )
-
-    def drain(self) -> None:
-        """Decodes what has arrived."""
-        while (sample := self._subscriber.handler.try_recv()) is not None:
-            message = self.decoder(sample.payload.to_bytes())
-            if message is not None:
-                self._take(message)

@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -93,8 +93,8 @@ class Collector:
         self._laps = 0
         self._seen = (-1, -1)
         """Run and number of the last state that telemetry is there for."""
-        self._fallbacks: dict[tuple[int, int], Telemetry] = {}
-        """Run and number of the state to the telemetry of a cycle that the fallback drove."""
+        self._fallbacks: dict[tuple[int, int], None] = {}
+        """Run and number of the states that the fallback has answered, in order."""
 
     def state(self, state: State) -> None:
         """A state of the plant."""
@@ -121,8 +121,7 @@ class Collector:
         if message.fallback > 0:
             if len(self._fallbacks) >= 2 * MOST_STATES:
                 del self._fallbacks[next(iter(self._fallbacks))]
-            key = message.run, message.state_seq
-            self._fallbacks[key] = replace(message, plan_x=(), plan_u=())
+            self._fallbacks[message.run, message.state_seq] = None
 
     def actuation(self, message: Actuation) -> None:
         """Of any cycle: it names the weights that drive."""
@@ -185,10 +184,11 @@ class Collector:
 
     def _driven(self, stretch: _Stretch) -> Driven:
         first, last = stretch.states[0], stretch.states[-1]
-        cycles = [
+        fallbacks = [
             key for key in self._fallbacks if key[0] == first.run and first.seq <= key[1] < last.seq
         ]
-        fallbacks = [self._fallbacks.pop(key) for key in cycles]
+        for key in fallbacks:
+            del self._fallbacks[key]
         try:
             samples = dataset_from_messages(stretch.states, fallbacks, self._car, self._step_s)
         except InputError:  # no two states that are a step apart

@@ -115,6 +115,7 @@ def _facts(analysis: RaceAnalysis, result: RaceResult) -> list[tuple[str, str]]:
         ("seed", str(summary.seed)),
         ("track constraints", "on" if summary.constraints else "off"),
         ("racing line, flying", f"{line.lap_time_s:.3f} s"),
+        ("judged by", result.judged_by),
     ]
     if result.real_time_factor is not None:
         facts.append(("lockstep at", f"{result.real_time_factor:.1f} × real time"))
@@ -164,7 +165,7 @@ def _uncertain(analysis: RaceAnalysis) -> list[tuple[str, int, int]]:
 def _figures(analysis: RaceAnalysis, picture: Path) -> dict[str, str]:
     """Name to SVG; a figure that has nothing to show is left out."""
     runs, track, line = analysis.runs, analysis.track, analysis.line
-    driven = [run for run in runs if len(run.record.states) > 1]
+    driven = [run for run in runs if len(run.record.truth) > 1]
     figures: dict[str, str] = {}
     with figure_style():
         laps = laps_on_track(driven, track, line)

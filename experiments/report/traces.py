@@ -52,7 +52,7 @@ class _Lap:
 
 
 def _first_laps(runs: Sequence[DrivenRun], track: Track) -> list[_Lap]:
-    return [_Lap(run, track, 0) for run in runs if len(run.record.states) > 1]
+    return [_Lap(run, track, 0) for run in runs if len(run.record.truth) > 1]
 
 
 def _flying_laps(runs: Sequence[DrivenRun], track: Track) -> list[_Lap]:
@@ -82,7 +82,7 @@ def _figure(heights: Sequence[float], track: Track) -> tuple[Figure, list[Axes]]
 
 
 def _legend(figure: Figure, runs: Sequence[DrivenRun], more: Sequence[Line2D] = ()) -> None:
-    looks = [look(run.controller) for run in runs if len(run.record.states) > 1]
+    looks = [look(run.controller) for run in runs if len(run.record.truth) > 1]
     lines = [Line2D([], [], color=item.colour, linewidth=2, label=item.name) for item in looks]
     figure.legend(handles=[*lines, *more], loc="upper right", ncols=len(lines) + len(more))
 
@@ -163,11 +163,11 @@ def inputs_figure(runs: Sequence[DrivenRun], track: Track, car: CarParameters) -
 
 
 def _duty(run: DrivenRun) -> Floats:
-    return _held(run.record.u_applied[:, 0])
+    return _held(run.record.u[:, 0])
 
 
 def _steering_rate(run: DrivenRun) -> Floats:
-    return _held(run.record.u_applied[:, 1])
+    return _held(run.record.u[:, 1])
 
 
 def _held(u: Floats) -> Floats:

@@ -1,0 +1,152 @@
+"""Truth and measurement: a sensor that errs misleads controller and learning, and no judge."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bayesrace.gp.weights import zero_weights
+from bayesrace.integrators import PREDICTION
+from bayesrace.log import LogReader, LogWriter
+from bayesrace.messages import STATE, TRUTH, State, Truth
+from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles.models import dynamic
+from controller.pure_pursuit import PurePursuit
+from controller.python_controller import PythonController
+from experiments.analysis import analyse, read_race
+from experiments.closed_loop import ClosedLoop, Driven
+from experiments.results import RaceResult
+from experiments.validation import validate_weights
+from learning.logs import dataset_from_log
+from learning.residual import identity
+from plant import sensors
+from tests.conftest import Circuit
+from tests.driven import CAR, STEP_S, drive, write_log
+from tests.synthetic_race import LAP_S, Drive, circle, write_race
+
+ERROR = np.array([0.0, 0.0, 0.0, 0.0, 0.1, 0.2, 0.0])
+"""Of vy and omega, which pure pursuit does not look at: the car drives on as it did."""
+TWO_LAPS = np.array([2 * np.pi * k * STEP_S / LAP_S for k in range(137)])
+
+
+def erring(*arguments: Any) -> State:
+    """Adds :data:`ERROR`, and has counted no lap."""
+    exact = sensors.measure(*arguments)
+    return replace(exact, x=tuple(np.array(exact.x) + ERROR), lap=0)
+
+
+class Spy(PurePursuit):
+    """Keeps what it is given."""
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.given: list[Any] = []
+
+    def step(self, x: Any, *arguments: Any, **options: Any) -> Any:
+        """As pure pursuit."""
+        self.given.append(x.copy())
+        return super().step(x, *arguments, **options)
+
+
+@pytest.fixture
+def drives(
+    circuit: Circuit, car: CarParameters, kinematic_artefact: Path
+) -> Callable[[Path], tuple[Driven, Spy]]:
+    line = circuit.line
+
+    def drive_once(log: Path) -> tuple[Driven, Spy]:
+        spy, writer = Spy(car, line.x_m, line.y_m, line.vx_mps), LogWriter(log)
+        controller = PythonController(kinematic_artefact, spy)
+        driven = ClosedLoop(car, circuit.track, line, controller, log=writer).drive(1)
+        writer.close()
+        return driven, spy
+
+    return drive_once
+
+
+def test_a_sensor_that_errs_misleads_the_controller_and_learning_alone(
+    drives: Callable[[Path], tuple[Driven, Spy]],
+    car: CarParameters,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    exact, spy = drives(tmp_path / "exact.mcap")
+    assert np.array_equal(exact.x[:-1], spy.given)
+    monkeypatch.setattr("plant.lockstep.measure", erring)
+    erred, spy = drives(tmp_path / "erred.mcap")
+    # The car, its laps and its excursions are the same, and so is the end by the plant's count.
+    assert np.array_equal(erred.x, exact.x)
+    assert (erred.laps_s, erred.end, erred.lap[-1]) == (exact.laps_s, exact.end, 1)
+    assert np.array_equal(erred.off_track_m, exact.off_track_m)
+    # The controller and the samples have the error.
+    assert np.array_equal(spy.given, exact.x[:-1] + ERROR)
+    step_s, log = exact.step_s, tmp_path / "erred.mcap"
+    measured, true = (dataset_from_log(log, car, step_s, truth=one) for one in (False, True))
+    assert erred.samples().digest() == measured.digest()
+    assert np.array_equal(measured.x, true.x + ERROR)
+    assert true.digest() == exact.samples().digest()
+    # The log has both, number by number.
+    states, truths = LogReader(log).select(STATE), LogReader(log).select(TRUTH)
+    assert [one.seq for one in states] == [one.seq for one in truths]
+    assert {one.lap for one in states} == {0}
+    assert np.array_equal([one.x for one in truths], exact.x)
+
+
+def test_types_of_truth_and_measurement_differ() -> None:
+    assert not issubclass(Truth, State)
+    assert not issubclass(State, Truth)
+
+
+def judged(folder: Path, measured: Any, truth: bool = True) -> RaceResult:
+    """Two runs on a circle, and what the sensors say of them."""
+    names = "bayesrace", "bestcase"
+    x = circle(TWO_LAPS, 1.0)
+    runs = [Drive(name, x, measured=measured) for name in names]
+    return analyse(write_race(folder, runs, truth=truth))
+
+
+def test_a_race_is_judged_by_the_truth(tmp_path: Path) -> None:
+    """Laps, excursions, the trajectory's digest and the metrics of the GPs."""
+    elsewhere = circle(TWO_LAPS, 1.5)
+    elsewhere[:, 3:6] += 0.3
+    result = judged(tmp_path / "erred", elsewhere)
+    assert result == judged(tmp_path / "exact", None)
+    assert (result.complete, result.judged_by) == (True, "truth")
+    assert result.laps[0].off_track_samples == 0
+    run = read_race(tmp_path / "erred").recording.runs[0]
+    assert np.array_equal([state.x for state in run.states], elsewhere)
+
+
+def test_without_a_truth_a_race_is_judged_by_what_was_measured(tmp_path: Path) -> None:
+    """As of a real car, or from a log made before there was a truth."""
+    elsewhere = circle(TWO_LAPS, 1.5)
+    result = judged(tmp_path, elsewhere, truth=False)
+    assert (result.complete, result.judged_by) == (True, "measurement")
+    assert result.laps[0].off_track_samples == result.laps[0].samples
+
+
+def test_a_truth_that_is_missing_is_a_gap(tmp_path: Path) -> None:
+    judged(tmp_path, None)
+    run = read_race(tmp_path).recording.runs[0]
+    del run.truth[5:8], run.truth[-1]
+    assert run.gaps == 4
+
+
+def test_weights_are_validated_by_the_truth_and_know_their_samples_by_the_measurement(
+    tmp_path: Path,
+) -> None:
+    data = drive(dynamic(CAR), 90, seed=2)
+    erred = replace(data, x=data.x + ERROR, x_next=data.x_next + ERROR)
+    write_log(tmp_path / "exact.mcap", data)
+    write_log(tmp_path / "erred.mcap", erred, truth=data)
+    weights = replace(
+        zero_weights("orca", identity(data, PREDICTION)), dataset_digest=erred.digest()
+    )
+    of_exact, of_erred = (
+        validate_weights(weights, [tmp_path / f"{name}.mcap"]).result for name in ("exact", "erred")
+    )
+    assert (of_exact.learned_from, of_erred.learned_from) == (False, True)
+    assert of_erred.model_copy(update={"learned_from": False}) == of_exact
