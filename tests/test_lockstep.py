@@ -31,7 +31,7 @@ from tests.pursuit_rig import CONTROLLER, PATIENCE_S, PLANT, Rig, running_rig, s
 FAILING = """
 class Failing(PurePursuit):
     count = 0
-    def step(self, x, u_previous, elapsed_s, budget_s):
+    def step(self, x, u_previous, *others):
         self.count += 1
         if 50 < self.count <= 60:
             raise RuntimeError("no step today")
