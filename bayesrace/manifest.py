@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_whole
 from bayesrace.native_interface import ABI
+from bayesrace.vehicles.parameters import CarParameters
 
 __all__ = [
     "LIBRARY",
@@ -79,6 +80,19 @@ class Manifest(BaseModel):
     flags: list[str]
     build_hash: str = Field(description="hash of everything that shaped the artefact")
     library_sha256: str
+
+    def check_car(self, car: CarParameters, artefact: Path) -> None:
+        """InputError if this artefact was built for another car, or solves another problem."""
+        if self.problem.name != "tracking":
+            raise InputError(
+                f"{artefact} solves the problem '{self.problem.name}', which drives no car: run "
+                "'bayesrace build'"
+            )
+        if (self.car, self.car_digest) != (car.name, car.digest()):
+            raise InputError(
+                f"{artefact} was built for car '{self.car}-{self.car_digest}', not "
+                f"'{car.name}-{car.digest()}': run 'bayesrace build'"
+            )
 
     def check_points(self, points: int) -> None:
         """InputError if GPs of so many points do not fit into this controller."""

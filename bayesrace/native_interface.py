@@ -10,6 +10,7 @@ from typing import Final
 
 __all__ = [
     "ABI",
+    "COMPENSATIONS",
     "COUNTERS",
     "DECISION",
     "DELAYS",
@@ -21,6 +22,7 @@ __all__ = [
     "MEASURED",
     "NO_STEP",
     "PHASES",
+    "RECEPTIONS",
     "SOLUTION",
     "SOLVER",
     "STATUSES",
@@ -138,6 +140,20 @@ PHASES: Final = (
 )
 """Life cycle of a controller, from 0 on: name, meaning."""
 
+RECEPTIONS: Final = (
+    ("NEW", "it is now the newest one"),
+    ("STALE", "older than one before"),
+    ("FOREIGN", "of another plant or run, or far ahead"),
+)
+"""What became of a state that has arrived, from 0 on: name, meaning."""
+
+COMPENSATIONS: Final = (
+    ("OFF", "the state is taken as it is"),
+    ("MEASURED", "over the delay that the plant measures"),
+    ("FIXED", "over the delay of the settings"),
+)
+"""Modes of the delay compensation, from 0 on: name, meaning."""
+
 DELAYS: Final = 64
 """Most measured delays that come with one state."""
 
@@ -171,7 +187,7 @@ DRIVING: Final = (
     ("shifted_s", "double", "how long after its first input a plan may be driven"),
     ("limit_tolerance", "double", "excess over a limit that is clipped, not refused"),
     ("recover_cycles", "int", "usable solutions in a row that end braking"),
-    ("compensation", "int", "the delay: 0 none, 1 measured, 2 fixed"),
+    ("compensation", "int", "br_compensation"),
     ("delay_s", "double", "the fixed one"),
     ("longest_s", "double", "no prediction goes farther"),
     ("stale_s", "double", "age from which a state is fallen back from"),
@@ -194,6 +210,7 @@ DECISION: Final = (
     ("status", "int", "of the step, 0: usable; or why there was none"),
     ("level", "int", "of the fallback"),
     ("stepped", "int", "1: a step has been made"),
+    ("error", "int", "br_mpc_error of a step that is broken"),
     ("epoch", "int64", "of the state that this answers"),
     ("run", "int64", "of that state"),
     ("seq", "int64", "of that state"),
@@ -221,8 +238,8 @@ _FUNCTIONS: Final = 7
 """Version of the functions in the public headers: increase it with each change of a signature."""
 
 _TABLES: Final = (
-    SOLVER, INFO, STATUSES, ERRORS, NO_STEP, LEVELS, PHASES, DELAYS, ENVIRONMENT, MEASURED,
-    DRIVING, SOLUTION, DECISION, COUNTERS, _FUNCTIONS,
+    SOLVER, INFO, STATUSES, ERRORS, NO_STEP, LEVELS, PHASES, RECEPTIONS, COMPENSATIONS, DELAYS,
+    ENVIRONMENT, MEASURED, DRIVING, SOLUTION, DECISION, COUNTERS, _FUNCTIONS,
 )  # fmt: skip
 
 ABI: Final = zlib.crc32(repr(_TABLES).encode()) & 0x7FFFFFFF
@@ -235,6 +252,10 @@ _ARRAYS: Final = {
     "delays": ("double", str(DELAYS)),
     "levels": ("int64_t", str(len(LEVELS))),
 }
+
+
+def _numbered(table: Iterable[tuple[str, str]]) -> list[tuple[str, int, str]]:
+    return [(name, n, text) for n, (name, text) in enumerate(table)]
 
 
 def _enum(prefix: str, table: Iterable[tuple[str, int, str]], name: str) -> list[str]:
@@ -259,8 +280,9 @@ def _struct(table: Iterable[tuple[str, ...]], name: str) -> list[str]:
 
 
 def _each(table: Iterable[tuple[str, ...]]) -> str:
-    """The members of a structure as arguments of one of two macros."""
-    return " ".join(f"{'WHOLE' if kind == 'int' else 'REAL'}({name})" for name, kind, *_ in table)
+    """The numbers of a structure, arrays left out, as arguments of one of two macros."""
+    macros = {"double": "REAL", "int": "WHOLE"}
+    return " ".join(f"{macros[kind]}({name})" for name, kind, *_ in table if kind in macros)
 
 
 def c_interface() -> str:
@@ -273,11 +295,13 @@ def c_interface() -> str:
         "#include <stdint.h>",
         f"#define BR_ABI {ABI}",
         f"#define BR_DELAYS {DELAYS}",
-        *_enum("", [(name, n, text) for n, (name, text) in enumerate(ERRORS)], "br_mpc_error"),
+        *_enum("", _numbered(ERRORS), "br_mpc_error"),
         *_enum("", statuses, "br_mpc_status"),
         *_enum("", NO_STEP, "br_no_step"),
-        *_enum("", [(name, n, text) for n, (name, text) in enumerate(LEVELS)], "br_level"),
-        *_enum("PHASE_", [(name, n, text) for n, (name, text) in enumerate(PHASES)], "br_phase"),
+        *_enum("", _numbered(LEVELS), "br_level"),
+        *_enum("PHASE_", _numbered(PHASES), "br_phase"),
+        *_enum("STATE_", _numbered(RECEPTIONS), "br_reception"),
+        *_enum("COMPENSATION_", _numbered(COMPENSATIONS), "br_compensation"),
         *_struct(INFO, "br_mpc_info"),
         *_struct(ENVIRONMENT, "br_environment"),
         *_struct(MEASURED, "br_measured"),

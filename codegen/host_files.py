@@ -5,7 +5,7 @@ br_files.h describes the formats. Being data, they can be exchanged without comp
 """
 
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -98,13 +98,9 @@ def weights_file(weights: GpWeights | None, identity: str, capacity: int) -> byt
     return _file(b"BRFMGPWT", b"".join(parts), capacity)
 
 
-def settings_file(values: Mapping[str, float | Sequence[float]]) -> str:
+def settings_file(values: Mapping[str, float]) -> str:
     """The file of the settings: parameters of the problem and its solver, and of the cycle."""
-    lines = []
-    for name, value in values.items():
-        numbers = value if isinstance(value, Sequence) else (value,)
-        lines.append(" ".join([name, *(repr(number) for number in numbers)]))
-    return "\n".join([*lines, ""])
+    return "".join(f"{name} {value!r}\n" for name, value in values.items())
 
 
 def export(
@@ -112,7 +108,7 @@ def export(
     manifest: Manifest,
     rows: ArrayLike,
     spacing_m: float,
-    values: Mapping[str, float | Sequence[float]],
+    values: Mapping[str, float],
     weights: GpWeights | None,
 ) -> None:
     """Writes all three files for a built controller; arguments as of the functions above."""

@@ -4,9 +4,10 @@ from typing import Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from bayesrace.native_interface import COMPENSATIONS
 from bayesrace.vehicles.parameters import CarParameters
 
-__all__ = ["CompensationSettings", "FallbackSettings", "driving_values"]
+__all__ = ["CompensationSettings", "FallbackSettings", "cycle_values", "input_limits"]
 
 
 class FallbackSettings(BaseModel):
@@ -43,19 +44,17 @@ class CompensationSettings(BaseModel):
     )
 
 
-_MODES: Final = ("off", "measured", "fixed")
+_MODES: Final = tuple(name.lower() for name, _ in COMPENSATIONS)
 
 
-def driving_values(
+def cycle_values(
     car: CarParameters,
     fallback: FallbackSettings,
     compensation: CompensationSettings,
     stale_s: float,
-) -> dict[str, float | tuple[float, ...]]:
-    """The numbers of :data:`bayesrace.native_interface.DRIVING` by name."""
+) -> dict[str, float]:
+    """The numbers of :data:`bayesrace.native_interface.DRIVING` by name, limits left out."""
     return {
-        "u_low": (car.d_min, -car.delta_rate_max_radps),
-        "u_high": (car.d_max, car.delta_rate_max_radps),
         "brake_fade_mps": car.brake_fade_mps,
         "standing_mps": car.tuning.driving.standing_mps,
         "stop_mps2": car.tuning.driving.stop_mps2,
@@ -67,3 +66,9 @@ def driving_values(
         "longest_s": compensation.longest_s,
         "stale_s": stale_s,
     }
+
+
+def input_limits(car: CarParameters) -> dict[str, tuple[float, float]]:
+    """The limits of duty cycle and steering rate there."""
+    rate = car.delta_rate_max_radps
+    return {"u_low": (car.d_min, -rate), "u_high": (car.d_max, rate)}

@@ -10,10 +10,15 @@ from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 
 from bayesrace.messages import State
-from bayesrace.native_interface import NO_STEP
+from bayesrace.native_interface import NO_STEP, RECEPTIONS
 from bayesrace.transport import Numbering
 from bayesrace.vehicles.parameters import CarParameters
-from controller.cycle_settings import CompensationSettings, FallbackSettings, driving_values
+from controller.cycle_settings import (
+    CompensationSettings,
+    FallbackSettings,
+    cycle_values,
+    input_limits,
+)
 from controller.interface import Controller, Environment, StepOutput
 from controller.native_library import EnvironmentStructure, aligned_memory
 
@@ -52,8 +57,7 @@ class Phase(StrEnum):
 
 
 _PHASES, _LEVELS = tuple(Phase), tuple(Level)
-_NEW, _FOREIGN = 0, 2
-"""BR_STATE_NEW and BR_STATE_FOREIGN; between them, one that is too old."""
+_NEW, _STALE, _FOREIGN = range(len(RECEPTIONS))
 
 
 @dataclass(slots=True)
@@ -89,15 +93,17 @@ class Driver:
         hold: bool = False,
     ) -> None:
         """``stale_s``: age from which a state is no longer predicted forward but fallen back
-        from. ``hold``: wait for :meth:`go`."""
+        from. ``hold``: wait for :meth:`go`. InputError if the controller's artefact drives no car.
+        """
         self.controller = controller
         artefact = controller.artefact
+        artefact.check_cycle()
         library = self._library = artefact.library
         self._memory, memory = aligned_memory(library.br_cycle_memory_size())
         self._cycle = ct.c_void_p()
         size = library.br_cycle_memory_size()
         artefact.check(controller.begin_cycle(memory, size, hold, self._cycle), "control cycle")
-        values = driving_values(car, fallback, compensation, stale_s)
+        values = cycle_values(car, fallback, compensation, stale_s) | input_limits(car)
         settings = ct.byref(artefact.Driving(**values))
         artefact.check(library.br_cycle_set_driving(self._cycle, settings), "cycle settings")
         clock = ct.cast(library.br_mpc_monotonic, ct.c_void_p)
@@ -108,6 +114,8 @@ class Driver:
         self._decided_at = ct.addressof(self._decided)
         self._decide = library.br_cycle_decide
         self._refused: State | None = None
+        self.last_error = ""
+        """Of the last step that was broken; empty if none was."""
         self.decision = Decision()
         """Of the newest cycle."""
         self.newest: State | None = None
@@ -206,11 +214,15 @@ class Driver:
         around = None if environment is None else ct.byref(EnvironmentStructure(*environment))
         error = self._decide(self._cycle, around, basis_s, budget_s, spent_s, self._decided_at)
         self.controller.artefact.check(error, "control cycle")
+        self.controller.raise_pending()
         decision.d, decision.delta_rate = decided.u
         decision.level, decision.status = _LEVELS[decided.level], decided.status
         decision.basis_s, decision.delay_s = decided.basis_s, decided.delay_s
         decision.step_us, decision.late_s = decided.step_us, decided.late_s
-        decision.output = self.controller.result() if decided.stepped else None
+        decision.output = self.controller.result(self._cycle) if decided.stepped else None
+        if decision.status == STEP_FAILED:
+            text = self._library.br_mpc_error_text(decided.error).decode()
+            self.last_error = self.controller.last_error or text
         return decision
 
     def prepare(self, period_s: float, budget_s: float = 0.0) -> None:

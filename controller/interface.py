@@ -67,8 +67,11 @@ class Controller(Protocol):
     def begin_cycle(self, memory: ct.c_void_p, size: int, hold: bool, cycle: ct.c_void_p) -> int:
         """Makes the br_cycle that drives it in that memory; returns a br_mpc_error."""
 
-    def result(self) -> StepOutput:
+    def result(self, cycle: ct.c_void_p) -> StepOutput:
         """Of the last step of that cycle; valid until the next."""
+
+    def raise_pending(self) -> None:
+        """Raises what C could not: what ends the program, such as KeyboardInterrupt."""
 
     @property
     def last_error(self) -> str:

@@ -21,7 +21,6 @@ class PredictiveController:
         ``port``: how a process takes over new ones; without, :meth:`set_weights` does."""
         self.native = step
         self.port = port
-        self._info = step.info
         self._version = weights_version
         self._output = StepOutput(
             u=step.plan_u[0],
@@ -31,7 +30,7 @@ class PredictiveController:
         )
 
     last_error = ""
-    """Its steps end with a status."""
+    """The cycle knows it."""
 
     @property
     def artefact(self) -> Artefact:
@@ -59,15 +58,15 @@ class PredictiveController:
         """With the compiled step, called from C."""
         native = self.native
         drive = native.artefact.library.br_cycle_drive_mpc
-        error = int(drive(memory, size, native.handle, hold, ct.byref(cycle)))
-        if not error:
-            address = native.artefact.library.br_cycle_info(cycle)
-            self._info = StepInfo.from_address(address)
-        return error
+        return int(drive(memory, size, native.handle, hold, ct.byref(cycle)))
 
-    def result(self) -> StepOutput:
-        """Of the last step; the plan, too, if it is not usable."""
-        info, output = self._info, self._output
+    def raise_pending(self) -> None:
+        """Nothing: its step is C."""
+
+    def result(self, cycle: ct.c_void_p) -> StepOutput:
+        """Of the cycle's last step; the plan, too, if it is not usable."""
+        info = StepInfo.from_address(self.artefact.library.br_cycle_info(cycle))
+        output = self._output
         self.native.read_plan()
         # Acceptable and converged may both be driven; the residuals below tell them apart.
         output.status = 0 if StepStatus(info.status).usable else info.status

@@ -166,6 +166,13 @@ class Artefact:
     Decision: Any
     Counters: Any
 
+    def check_cycle(self) -> None:
+        """InputError if it has no control cycle: its problem does not follow a path."""
+        if not hasattr(self.library, "br_cycle_init"):
+            raise InputError(
+                f"problem '{self.manifest.problem.name}' drives no car: run 'bayesrace build'"
+            )
+
     def check(self, error: int, what: str) -> None:
         """InputError with the library's words, if there is an error."""
         if error:
@@ -246,12 +253,13 @@ def _declare(library: ct.CDLL) -> None:
     for name, types in arguments.items():
         function = getattr(library, f"br_{name}")
         function.argtypes = types
-        function.restype = _RETURNS.get(name.partition("_")[2], whole)
+        function.restype = _RETURNS.get(name, whole)
 
 
 _RETURNS: Final[dict[str, Any]] = {
-    "memory_size": ct.c_size_t,
-    **dict.fromkeys(("error_text", "status_text"), ct.c_char_p),
-    **dict.fromkeys(("info", "counters"), ct.c_void_p),
-    **dict.fromkeys(("reset", "stop", "go", "end"), None),
+    **dict.fromkeys(("mpc_memory_size", "cycle_memory_size"), ct.c_size_t),
+    **dict.fromkeys(("mpc_error_text", "mpc_status_text"), ct.c_char_p),
+    **dict.fromkeys(("cycle_info", "cycle_counters"), ct.c_void_p),
+    **dict.fromkeys(("mpc_reset", "cycle_prepare", "cycle_rehearse"), None),
+    **dict.fromkeys(("cycle_stop", "cycle_go", "cycle_end"), None),
 }

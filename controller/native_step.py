@@ -21,17 +21,7 @@ class NativeStep(NativeProblem):
     def __init__(self, artefact: Path, car: CarParameters, settings: MpcSettings) -> None:
         """InputError if it was built for another car."""
         super().__init__(artefact)
-        if self.manifest.problem.name != "tracking":
-            raise InputError(
-                f"{artefact} solves the problem '{self.manifest.problem.name}', which drives no "
-                "car: run 'bayesrace build'"
-            )
-        built_for = (self.manifest.car, self.manifest.car_digest)
-        if built_for != (car.name, car.digest()):
-            raise InputError(
-                f"{artefact} was built for car '{'-'.join(built_for)}', not "
-                f"'{car.name}-{car.digest()}': run 'bayesrace build'"
-            )
+        self.manifest.check_car(car, artefact)
         self.set_parameters(car, settings)
 
     def set_parameters(self, car: CarParameters, settings: MpcSettings) -> None:

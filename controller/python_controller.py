@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from bayesrace.errors import InputError
-from controller.driver import STEP_FAILED
+from controller.driver import STEP_FAILED, UNPREDICTABLE
 from controller.interface import Array, ControlLaw, Environment, StepOutput
 from controller.native_library import Artefact
 
@@ -51,6 +51,8 @@ class PythonController:
         self.artefact = Artefact(artefact)
         self.law = law
         self.last_error = ""
+        self._pending: BaseException | None = None
+        self._was_reset = True
         self._result = StepOutput(u=np.zeros(2))
         self._functions = _Functions(
             None,
@@ -58,7 +60,7 @@ class PythonController:
             _PREPARE(lambda *_: None),
             _REHEARSE(lambda _: None),
             _PREDICT(self._predict),
-            _RESET(lambda _: self.law.reset()),
+            _RESET(self._reset),
         )
 
     def begin_cycle(self, memory: ct.c_void_p, size: int, hold: bool, cycle: ct.c_void_p) -> int:
@@ -66,9 +68,15 @@ class PythonController:
         init = self.artefact.library.br_cycle_init
         return int(init(memory, size, ct.byref(self._functions), hold, ct.byref(cycle)))
 
-    def result(self) -> StepOutput:
+    def result(self, cycle: ct.c_void_p) -> StepOutput:
         """What the law returned."""
         return self._result
+
+    def raise_pending(self) -> None:
+        """An interrupt while the law was at work."""
+        pending, self._pending = self._pending, None
+        if pending is not None:
+            raise pending
 
     def adopt_weights(self, version: str) -> None:
         """Never asked."""
@@ -77,6 +85,21 @@ class PythonController:
     def set_weights(self, data: bytes) -> str:
         """Always refused."""
         raise InputError("a control law in Python takes no weights")
+
+    def _caught(self, error: BaseException) -> None:
+        """C knows no exceptions: what is raised is kept, and the cycle falls back."""
+        self.last_error = f"{type(error).__name__}: {error}"
+        if not isinstance(error, Exception):
+            self._pending = error
+
+    def _reset(self, _: Any) -> None:
+        self._was_reset = False
+        try:
+            self.law.reset()
+        except BaseException as error:
+            self._caught(error)
+        else:
+            self._was_reset = True
 
     def _step(
         self,
@@ -88,13 +111,16 @@ class PythonController:
         budget_s: float,
         solution: int,
     ) -> int:
-        around = Environment(environment[0], environment[1])
+        if not self._was_reset:
+            return STEP_FAILED
         try:
+            around = Environment(environment[0], environment[1])
             output = self.law.step(_array(x, 7), _array(u_before, 2), around, elapsed_s, budget_s)
             self._fill(self.artefact.Solution.from_address(solution), output)
-        except Exception as error:
-            # Whatever it is, the car must not be left without an answer.
-            self.last_error = f"{type(error).__name__}: {error}"
+            if not 0 <= output.status < UNPREDICTABLE:
+                raise ValueError(f"status {output.status} is not from 0 to {UNPREDICTABLE - 1}")
+        except BaseException as error:
+            self._caught(error)
             return STEP_FAILED
         self._result = output
         return output.status
@@ -110,11 +136,10 @@ class PythonController:
 
     def _predict(self, _: Any, x: Any, u: Any, duration_s: float, x_next: Any) -> int:
         try:
-            after = self.law.predict(_array(x, 7), _array(u, 2), duration_s).tolist()
-            for i, value in enumerate(after):
-                x_next[i] = value
-        except Exception as error:
-            self.last_error = f"{type(error).__name__}: {error}"
+            after = self.law.predict(_array(x, 7), _array(u, 2), duration_s)
+            np.ctypeslib.as_array(x_next, (7,))[:] = after
+        except BaseException as error:
+            self._caught(error)
             return -1
         return 0
 

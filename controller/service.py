@@ -103,9 +103,10 @@ class Service:
         )
 
     def _words(self) -> str:
-        words, failed = [self._text], self._driver.count("failed")
+        driver, words = self._driver, [self._text]
+        failed = driver.count("failed")
         if failed:
-            words.append(f"{failed} step(s) failed, the last {self._controller.last_error}")
+            words.append(f"{failed} step(s) failed, the last {driver.last_error}")
         if more := self._own_words():
             words.append(more)
         return "; ".join(words)

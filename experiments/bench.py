@@ -245,7 +245,12 @@ class _Recorder:
                 status.usable and other is StepStatus.CONVERGED,
             )
         )
-        return StepOutput(step.u, 0 if status.usable else status, plan_u=step.plan_u)
+        return StepOutput(
+            step.u,
+            0 if status.usable else status,
+            plan_u=step.plan_u,
+            plan_step_s=step.manifest.step_s,
+        )
 
 
 def _peers(recording: _Recording, count: int) -> list[_Problem]:

@@ -5,6 +5,7 @@ import shutil
 import socket
 import subprocess
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from bayesrace.vehicles import CarParameters
 from codegen.build import HOST
 from codegen.compiler import find_compiler
 from codegen.host_files import SETTINGS_FILE, export
-from controller.cycle_settings import driving_values
+from controller.cycle_settings import cycle_values
 from controller.driver import Level
 from controller.mpc import PredictiveController
 from controller.native_step import NativeStep
@@ -57,7 +58,7 @@ def data(
     """Racing line, weights and settings."""
     folder = tmp_path_factory.mktemp("data")
     process = ControllerSettings()
-    values = SETTINGS.parameters(car) | driving_values(
+    values = SETTINGS.parameters(car) | cycle_values(
         car, process.fallback, process.compensation, process.stale_s
     )
     table = circuit.table
@@ -137,11 +138,34 @@ def test_over_udp_states_are_answered_and_silence_ends_at_the_fallback(
     assert len(rows) < 100
 
 
+def test_over_udp_nobody_else_ends_the_run_or_takes_its_answers(
+    plant: socket.socket, circuit: Circuit
+) -> None:
+    x = tuple(map(float, circuit.start(v_mps=1.5)))
+    state = State(0, 0, 7, 3, 0.0, x, (0.0, 0.0), 0, False, (), False)
+    plant.send(line_of(state).encode())
+    plant.recv(4096)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        stranger.connect(plant.getpeername())
+        stranger.settimeout(0.2)
+        for said in ("hello", line_of(replace(state, epoch=8, seq=1, final=True))):
+            stranger.send(said.encode())
+        with pytest.raises(TimeoutError):
+            stranger.recv(4096)
+    for _ in range(3):  # the inputs of the car that drives on blind come to it
+        plant.recv(4096)
+    plant.send(line_of(replace(state, seq=1, time_s=0.3)).encode())
+    while plant.recv(4096).split()[2] != b"1":
+        pass
+
+
 @pytest.mark.parametrize(
     ("change", "fault"),
     [
         (("margin_m", "margin"), "settings.txt has an unknown name: margin"),
-        (("u_low ", "u_low 0 "), "settings.txt has a number too many: u_low"),
+        (("stale_s ", "stale_s 1 "), "settings.txt has more than a number: stale_s"),
+        (("iterations ", "iterations 1."), "settings.txt has no whole number from 0 to 1000"),
+        (("stale_s", "# " + 600 * "x"), "settings.txt has a line that is too long"),
         (("r_duty ", "r_duty x"), "settings.txt lacks a number: r_duty"),
         (("stale_s", "# stale_s"), "settings.txt lacks a line: stale_s"),
         (("stale_s ", "stale_s -"), "out of its range"),

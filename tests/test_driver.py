@@ -1,6 +1,7 @@
 """The controller between a state and an input: stop and go, and each level of the fallback by a
 real cause, with the compiled step."""
 
+import gc
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from bayesrace.messages import State
 from bayesrace.native_interface import LEVELS, PHASES
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import CarParameters, default_car
 from bayesrace.vehicles.models import dynamic
 from controller.cycle_settings import CompensationSettings, FallbackSettings
 from controller.driver import (
@@ -209,7 +210,7 @@ def test_a_step_that_raises_is_counted_and_stepped_down_from(kinematic_artefact:
     decision = driver.decide(3 * STEP_S)
     assert (decision.status, decision.level) == (STEP_FAILED, Level.SHIFTED_PLAN)
     assert (driver.count("failed"), decision.output) == (1, None)
-    assert driver.controller.last_error == "RuntimeError: no step today"
+    assert driver.last_error == "RuntimeError: no step today"
 
 
 def test_stop_and_go(rig: Rig) -> None:
@@ -282,6 +283,86 @@ def test_another_plant_begins_anew_and_its_forerunner_is_not_heard(rig: Rig) -> 
     assert not rig.driver.observe(left_over)
     assert rig.driver.count("foreign") == 1
     assert rig.cycle().level is Level.SOLUTION
+
+
+@pytest.mark.parametrize(
+    ("broken", "text"),
+    [
+        ({"step": lambda *_: 1 / 0}, "ZeroDivisionError"),
+        ({"step": lambda *_: StepOutput(u=np.zeros(2), status=253)}, "status 253 is not from 0"),
+        ({"reset": lambda: [][0]}, "IndexError"),
+        ({"predict": lambda *_: np.zeros(71)}, "ValueError"),
+    ],
+    ids=["step", "status", "reset", "predict"],
+)
+def test_whatever_a_law_in_python_does_ends_in_the_fallback(
+    kinematic_artefact: Path, monkeypatch: pytest.MonkeyPatch, broken: dict[str, Any], text: str
+) -> None:
+    law = ScriptedLaw(lambda _: StepOutput(u=np.zeros(2)))
+    for name, function in broken.items():
+        monkeypatch.setattr(law, name, function)
+    driver = scripted_driver(
+        kinematic_artefact, law, compensation=CompensationSettings(mode="fixed", delay_s=0.02)
+    )
+    driver.observe(state(0))
+    decision = driver.decide(0.0)
+    assert decision.status == (UNPREDICTABLE if "predict" in broken else STEP_FAILED)
+    assert decision.level is Level.STOP
+    assert text in driver.controller.last_error
+
+
+def test_an_interrupt_in_a_law_is_not_lost(kinematic_artefact: Path) -> None:
+    def interrupted(_: Floats) -> StepOutput:
+        raise KeyboardInterrupt
+
+    driver = scripted_driver(kinematic_artefact, ScriptedLaw(interrupted))
+    driver.observe(state(0))
+    with pytest.raises(KeyboardInterrupt):
+        driver.decide(0.0)
+
+
+def test_two_cycles_of_one_controller_tell_their_own_results(
+    native: NativeStep, circuit: Circuit
+) -> None:
+    first = Rig(native, circuit)
+    cost = first.cycle().output.cost  # type: ignore[union-attr]
+    second = Rig(native, circuit)
+    second.x[3] = 0.3
+    assert second.cycle().output.cost != cost  # type: ignore[union-attr]
+    del second
+    gc.collect()
+    assert first.cycle().level is Level.SOLUTION
+
+
+def test_a_step_that_is_refused_is_told_why(native: NativeStep, circuit: Circuit) -> None:
+    rig = Rig(native, circuit)
+    rig.environment = Environment(speed_limit_mps=-1.0)
+    assert rig.cycle().status == STEP_FAILED
+    assert rig.driver.last_error == "a parameter is not finite or out of its range"
+
+
+def test_a_stop_and_a_speed_limit_hold_together(kinematic_artefact: Path) -> None:
+    """The lower speed, and of the rates by which both fall along the horizon, the higher."""
+    seen: list[Environment] = []
+
+    class Law(ScriptedLaw):
+        def step(self, x: Any, u: Any, environment: Environment, *others: float) -> StepOutput:
+            seen.append(environment)
+            return super().step(x, u, environment, *others)
+
+    law = Law(lambda _: StepOutput(u=np.zeros(2)))
+    driver = scripted_driver(kinematic_artefact, law)
+    moving = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+    driver.observe(state(0, x=moving))
+    driver.decide(0.0, environment=Environment(2.0, 0.5))
+    driver.stop()
+    for seq, environment in enumerate((Environment(2.0, 5.0), Environment(0.4, 0.5)), 1):
+        driver.observe(state(seq, x=moving))
+        driver.decide(seq * STEP_S, environment=environment)
+    stop_mps2 = default_car().tuning.driving.stop_mps2
+    assert seen[0] == (2.0, 0.5)
+    assert seen[1] == (1.0, 5.0)
+    assert seen[2] == (0.4, stop_mps2)
 
 
 def test_second_starts_and_jumps_of_the_cost_are_counted(kinematic_artefact: Path) -> None:

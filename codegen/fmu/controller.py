@@ -81,11 +81,7 @@ def controller_fmu(
     of another car, foreign weights, a bad table.
     """
     manifest = read_manifest(artefact)
-    if (manifest.car, manifest.car_digest) != (car.name, car.digest()):
-        raise InputError(
-            f"{artefact} was built for car '{manifest.car}-{manifest.car_digest}', not "
-            f"'{car.name}-{car.digest()}': run 'bayesrace build'"
-        )
+    manifest.check_car(car, artefact)
     sources = [*sorted(artefact.glob("*.[ch]")), *sorted((artefact / HOST).iterdir())]
     sources = [path for path in sources if path.name not in _NOT_NEEDED]
     return FmuDefinition(

@@ -26,7 +26,8 @@ extern "C" {
  * functions. None may block; self comes back as it was given. */
 typedef struct {
     void *self;
-    /* 0, or a status that says why solution is not usable. Arguments as of br_mpc_step. */
+    /* 0, or a status of its own (1 to 251, or BR_STEP_FAILED) that says why solution is not usable.
+     * Arguments as of br_mpc_step. */
     int (*step)(void *self, const double x[BR_NX], const double u_before[BR_NU],
                 const br_environment *environment, double elapsed_s, double budget_s,
                 br_solution *solution);
@@ -40,20 +41,15 @@ typedef struct {
 
 typedef struct br_cycle br_cycle;
 
-/* What became of a state that has arrived. */
-typedef enum {
-    BR_STATE_NEW = 0,     /* it is now the newest one */
-    BR_STATE_STALE = 1,   /* older than one before */
-    BR_STATE_FOREIGN = 2  /* of another plant or run, or far ahead */
-} br_reception;
-
 BR_API size_t br_cycle_memory_size(void);
 
-/* hold: wait for br_cycle_go. The memory is aligned to 64 bytes. */
+/* hold: wait for br_cycle_go. The memory is aligned to 64 bytes. BR_ERROR_NULL, too, if a function
+ * of the controller is missing. */
 BR_API br_mpc_error br_cycle_init(void *memory, size_t size, const br_controller *controller,
                                   int hold, br_cycle **out);
 
-/* The same for the compiled controller, whose last result is then at br_cycle_info. */
+/* The same for the compiled controller, whose last result is then at br_cycle_info. Such a cycle
+ * must stay where it is in memory. */
 BR_API br_mpc_error br_cycle_drive_mpc(void *memory, size_t size, br_mpc *mpc, int hold,
                                        br_cycle **out);
 BR_API const br_mpc_info *br_cycle_info(const br_cycle *cycle);
@@ -62,7 +58,8 @@ BR_API const br_mpc_info *br_cycle_info(const br_cycle *cycle);
  * finite or out of its range. */
 BR_API br_mpc_error br_cycle_set_driving(br_cycle *cycle, const br_driving *settings);
 
-/* The clock that budgets and execution times are measured with; NULL for none. */
+/* The clock that budgets and execution times are measured with, also that of br_cycle_drive_mpc's
+ * controller; NULL for none. */
 BR_API br_mpc_error br_cycle_set_clock(br_cycle *cycle, br_mpc_clock clock, void *context);
 
 /* A state has arrived. A run is one stream of states: one plant (epoch), one run number, rising
@@ -80,7 +77,8 @@ BR_API br_mpc_error br_cycle_decide(br_cycle *cycle, const br_environment *envir
                                     double basis_s, double budget_s, double spent_s,
                                     br_decision *decision);
 
-/* Both in one: 0, or BR_ERROR_STATE for a state that is not to be answered. */
+/* Both in one. BR_ERROR_STATE for a state that is not to be answered; after another error the state
+ * has been taken, and br_cycle_decide decides on it. */
 BR_API br_mpc_error br_cycle_answer(br_cycle *cycle, const br_measured *state,
                                     const br_environment *environment, double basis_s,
                                     double budget_s, double spent_s, br_decision *decision);

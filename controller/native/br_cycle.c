@@ -9,7 +9,6 @@
 
 #define JUMP 2.0          /* a plan that costs more than so many times the one before, shifted, */
 #define JUMP_BY 0.01      /* and so much more */
-#define LONGEST_S 1.0     /* longest piece of dead reckoning */
 #define LEAST_BUDGET 0.1  /* what a step gets however late its cycle began: share of the budget */
 
 struct br_cycle {
@@ -41,6 +40,9 @@ size_t br_cycle_memory_size(void) { return sizeof(br_cycle); }
 br_mpc_error br_cycle_init(void *memory, size_t size, const br_controller *controller, int hold,
                            br_cycle **out) {
     if (!memory || !controller || !out) return BR_ERROR_NULL;
+    if (!controller->step || !controller->prepare || !controller->rehearse ||
+        !controller->predict || !controller->reset)
+        return BR_ERROR_NULL;
     if (size < sizeof(br_cycle) || (uintptr_t)memory % 64) return BR_ERROR_MEMORY;
     br_cycle *cycle = memory;
     memset(cycle, 0, sizeof *cycle);
@@ -59,9 +61,9 @@ static int mpc_step(void *self, const double x[BR_NX], const double u_before[BR_
                     br_solution *solution) {
     br_cycle *cycle = self;
     br_mpc_status status;
-    if (br_mpc_step(cycle->mpc, x, u_before, environment, elapsed_s, budget_s, solution->u,
-                    &status, &cycle->info))
-        return BR_STEP_FAILED;
+    cycle->decision.error = br_mpc_step(cycle->mpc, x, u_before, environment, elapsed_s, budget_s,
+                                        solution->u, &status, &cycle->info);
+    if (cycle->decision.error) return BR_STEP_FAILED;
     solution->rows = BR_N;
     solution->plan_step_s = BR_TS;
     br_mpc_get_plan(cycle->mpc, NULL, solution->plan_u);
@@ -101,21 +103,25 @@ br_mpc_error br_cycle_drive_mpc(void *memory, size_t size, br_mpc *mpc, int hold
 
 /* --- settings and counters -------------------------------------------------------------------- */
 
-const br_mpc_info *br_cycle_info(const br_cycle *cycle) { return &cycle->info; }
+const br_mpc_info *br_cycle_info(const br_cycle *cycle) { return cycle ? &cycle->info : NULL; }
 
-const br_counters *br_cycle_counters(const br_cycle *cycle) { return &cycle->counters; }
+const br_counters *br_cycle_counters(const br_cycle *cycle) {
+    return cycle ? &cycle->counters : NULL;
+}
 
 br_mpc_error br_cycle_set_driving(br_cycle *cycle, const br_driving *s) {
     if (!cycle || !s) return BR_ERROR_NULL;
     const double positive[] = {s->brake_fade_mps, s->stop_mps2, s->longest_s, s->stale_s};
     const double others[] = {s->standing_mps, s->shifted_s, s->limit_tolerance, s->delay_s};
-    int valid = s->recover_cycles >= 1 && s->compensation >= 0 && s->compensation <= 2;
+    int valid = s->recover_cycles >= 1 && s->compensation >= BR_COMPENSATION_OFF &&
+                s->compensation <= BR_COMPENSATION_FIXED && s->longest_s <= BR_PREDICT_MAX_S;
     for (int i = 0; i < 4; ++i)
         valid &= isfinite(positive[i]) && positive[i] > 0 && isfinite(others[i]) && others[i] >= 0;
     for (int i = 0; i < BR_NU; ++i)
         valid &= isfinite(s->u_low[i]) && isfinite(s->u_high[i]) && s->u_low[i] < s->u_high[i];
     if (!valid) return BR_ERROR_PARAMETERS;
-    if (s->compensation != 1) cycle->counters.delay_s = s->compensation ? s->delay_s : 0;
+    if (s->compensation == BR_COMPENSATION_FIXED) cycle->counters.delay_s = s->delay_s;
+    if (s->compensation == BR_COMPENSATION_OFF) cycle->counters.delay_s = 0;
     cycle->settings = *s;
     cycle->has_settings = 1;
     return BR_OK;
@@ -125,13 +131,17 @@ br_mpc_error br_cycle_set_clock(br_cycle *cycle, br_mpc_clock clock, void *conte
     if (!cycle) return BR_ERROR_NULL;
     cycle->clock = clock;
     cycle->context = context;
-    return BR_OK;
+    return cycle->mpc ? br_mpc_set_clock(cycle->mpc, clock, context) : BR_OK;
 }
 
 /* --- states, runs, commands ------------------------------------------------------------------- */
 
 br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state) {
-    if (!isfinite(state->time_s)) return BR_STATE_FOREIGN;
+    if (!cycle || !state) return BR_STATE_FOREIGN;
+    if (!isfinite(state->time_s)) {
+        cycle->counters.foreign += 1;
+        return BR_STATE_FOREIGN;
+    }
     const br_measured *newest = &cycle->stream.newest;
     const int begins = !cycle->stream.has_newest || newest->epoch != state->epoch ||
                        newest->run != state->run;
@@ -149,18 +159,24 @@ br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state) {
 }
 
 void br_cycle_end(br_cycle *cycle) {
+    if (!cycle) return;
     cycle->counters.phase = BR_PHASE_WAITING;
     cycle->stream.ended = 1;
 }
 
 int br_cycle_forget(br_cycle *cycle) {
+    if (!cycle) return 0;
     cycle->counters.phase = BR_PHASE_WAITING;
     return br_stream_forget(&cycle->stream, &cycle->counters);
 }
 
-void br_cycle_stop(br_cycle *cycle) { cycle->halted = BR_PHASE_STOPPED; }
+void br_cycle_stop(br_cycle *cycle) {
+    if (cycle) cycle->halted = BR_PHASE_STOPPED;
+}
 
-void br_cycle_go(br_cycle *cycle) { cycle->halted = cycle->stopping = 0; }
+void br_cycle_go(br_cycle *cycle) {
+    if (cycle) cycle->halted = cycle->stopping = 0;
+}
 
 /* --- one cycle -------------------------------------------------------------------------------- */
 
@@ -182,8 +198,10 @@ static int slowing(br_cycle *cycle, double basis_s, br_environment *environment)
     }
     const double since_s = basis_s - cycle->stopping_s;
     const double limit_mps = fmax(cycle->stopping_mps - s->stop_mps2 * since_s, 0);
-    if (limit_mps < environment->speed_limit_mps)
-        *environment = (br_environment){limit_mps, s->stop_mps2};
+    /* Both limits are kept by the lower one falling at the higher rate; NaN is left to be refused. */
+    if (limit_mps < environment->speed_limit_mps) environment->speed_limit_mps = limit_mps;
+    if (s->stop_mps2 > environment->speed_limit_rate_mps2)
+        environment->speed_limit_rate_mps2 = s->stop_mps2;
     if (limit_mps > 0 || rolling) return 1;
     return cycle->stopping = 0;
 }
@@ -214,7 +232,7 @@ static void reckon(br_cycle *cycle, double basis_s) {
             return;
         cycle->reckoned = 1;
     }
-    const double duration_s = fmin(fmax(basis_s - cycle->reckoned_s, 0), LONGEST_S);
+    const double duration_s = fmin(fmax(basis_s - cycle->reckoned_s, 0), BR_PREDICT_MAX_S);
     if (controller->predict(controller->self, x, cycle->decision.u, duration_s, x)) return;
     cycle->reckoned_s = basis_s;
     cycle->vx_mps = x[BR_INDEX_VX];
@@ -270,8 +288,8 @@ static void drive(br_cycle *cycle, const br_environment *environment, double act
     } else {
         cycle->reckoned = 0;
         cycle->vx_mps = newest->x[BR_INDEX_VX];
-        decision->status = step(cycle, environment, acting_s,
-                                fmax(budget_s - spent_s, LEAST_BUDGET * budget_s));
+        const double left_s = fmax(budget_s - spent_s, LEAST_BUDGET * budget_s);
+        decision->status = step(cycle, environment, acting_s, budget_s > 0 ? left_s : 0);
     }
     if (budget_s > 0) decision->late_s = spent_s + now(cycle) - begin_s - budget_s;
     decision->level = br_fallback_decide(
@@ -294,7 +312,7 @@ br_mpc_error br_cycle_decide(br_cycle *cycle, const br_environment *environment,
     decision->seq = newest->seq;
     decision->basis_s = basis_s;
     decision->delay_s = newest->lockstep ? 0 : cycle->counters.delay_s;
-    decision->stepped = 0;
+    decision->stepped = decision->error = 0;
     decision->step_us = decision->late_s = 0;
     const double acting_s = basis_s + decision->delay_s;
     br_environment around = {.speed_limit_mps = INFINITY};
@@ -316,11 +334,11 @@ br_mpc_error br_cycle_answer(br_cycle *cycle, const br_measured *state,
 
 /* A car is being driven: a step has been made, and no halt since. */
 void br_cycle_prepare(br_cycle *cycle, double period_s, double budget_s) {
-    if (cycle->stepped) cycle->controller.prepare(cycle->controller.self, period_s, budget_s);
+    if (cycle && cycle->stepped) cycle->controller.prepare(cycle->controller.self, period_s, budget_s);
 }
 
 void br_cycle_rehearse(br_cycle *cycle) {
-    if (!cycle->stepped) return;
+    if (!cycle || !cycle->stepped) return;
     double x[BR_NX], u[BR_NU];
     br_delay_at_acting(&cycle->delay, &cycle->settings, &cycle->controller, &cycle->stream.newest,
                        cycle->decision.basis_s, cycle->counters.delay_s, x, u);

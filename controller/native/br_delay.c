@@ -9,8 +9,6 @@
 
 #include "br_cycle.h"
 
-enum { OFF = 0, MEASURED = 1 };
-
 /* The lower median. */
 static double median(const double *values, int n) {
     double ordered[BR_MEDIAN_OF];
@@ -24,7 +22,7 @@ static double median(const double *values, int n) {
 
 void br_delay_observe(br_delay *delay, const br_driving *settings, const br_measured *state,
                       double *delay_s) {
-    if (settings->compensation != MEASURED) return;
+    if (settings->compensation != BR_COMPENSATION_MEASURED) return;
     int some = 0;
     for (int i = 0; i < state->delays && i < BR_DELAYS; ++i) {
         if (!(state->delays_s[i] >= 0)) continue; /* overtaken: it never acts */
@@ -58,7 +56,7 @@ int br_delay_at_acting(br_delay *delay, const br_driving *settings, const br_con
     const double end_s = fmin(basis_s + delay_s, now_s + settings->longest_s);
     memcpy(x, state->x, sizeof state->x);
     memcpy(u, state->u_applied, sizeof state->u_applied);
-    if (settings->compensation == OFF) return 0;
+    if (settings->compensation == BR_COMPENSATION_OFF) return 0;
     while (delay->count > 1 && sent(delay, 1)->basis_s + delay_s <= now_s)
         drop_first(delay); /* has stopped acting */
     for (int i = 0; i < delay->count; ++i) {

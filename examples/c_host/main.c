@@ -14,11 +14,11 @@
 #include <arpa/inet.h>
 #include <errno.h>
 #include <math.h>
+#include <poll.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <sys/socket.h>
-#include <sys/time.h>
 
 #include "br_files.h"
 
@@ -44,6 +44,7 @@ static void *block(size_t size) { return aligned_alloc(64, (size + 63) / 64 * 64
 
 static int set_up(host *h, const char *data) {
     char text[256];
+    if (br_mpc_abi() != BR_ABI) return failed("library", "not that of the headers: build anew");
     br_mpc_parameters parameters;
     br_driving driving;
     br_mpc_error error = br_mpc_init(block(br_mpc_memory_size()), br_mpc_memory_size(), &h->mpc);
@@ -56,7 +57,6 @@ static int set_up(host *h, const char *data) {
     if (!error) error = br_cycle_drive_mpc(block(size), size, h->mpc, 0, &h->cycle);
     if (!error) error = br_cycle_set_driving(h->cycle, &driving);
     if (error) return failed(data, br_mpc_error_text(error));
-    br_mpc_set_clock(h->mpc, br_mpc_monotonic, NULL);
     br_cycle_set_clock(h->cycle, br_mpc_monotonic, NULL);
     return 0;
 }
@@ -97,21 +97,18 @@ static int write_decision(char *line, size_t size, const br_decision *d) {
 
 /* Takes a line; the length of the answer, 0 if there is none to be given, -1 if it is no state. */
 static int answer(host *h, const char *line, char *out, size_t size) {
+    const double arrived_s = br_mpc_monotonic(NULL);
     br_measured state;
     br_decision decision;
     int final;
     if (read_state(line, &state, &final)) return -1;
-    if (final) {
-        h->driving = 0;
-        br_cycle_observe(h->cycle, &state);
-        br_cycle_end(h->cycle);
-        return 0;
-    }
-    const double budget_s = state.lockstep ? 0 : SHARE * h->period_s;
-    if (br_cycle_answer(h->cycle, &state, NULL, state.time_s, budget_s, 0, &decision)) return 0;
+    if (br_cycle_observe(h->cycle, &state) != BR_STATE_NEW) return 0;
     h->newest = state;
-    h->driving = !state.lockstep;
-    h->arrived_s = br_mpc_monotonic(NULL);
+    h->driving = !state.lockstep && !final;
+    h->arrived_s = arrived_s;
+    if (final) br_cycle_end(h->cycle);
+    const double budget_s = state.lockstep ? 0 : SHARE * h->period_s;
+    if (final || br_cycle_decide(h->cycle, NULL, state.time_s, budget_s, 0, &decision)) return 0;
     return write_decision(out, size, &decision);
 }
 
@@ -147,27 +144,47 @@ static int bridge(host *h, char *out, size_t size) {
     return write_decision(out, size, &decision);
 }
 
-static int serve_udp(host *h, int port) {
-    const int in = socket(AF_INET, SOCK_DGRAM, 0);
-    const struct timeval period = {.tv_usec = (suseconds_t)(1e6 * h->period_s)};
-    struct sockaddr_in here = {.sin_family = AF_INET, .sin_port = htons((uint16_t)port)}, plant;
+/* Whether a datagram is there before the host's clock says due_s; -1: an error. */
+static int wait_until(int in, double due_s) {
+    struct pollfd one = {.fd = in, .events = POLLIN};
+    const double left_s = fmax(due_s - br_mpc_monotonic(NULL), 0);
+    const int ready = poll(&one, 1, (int)ceil(1e3 * left_s));
+    return ready < 0 && errno != EINTR ? -1 : ready > 0;
+}
+
+static int open_socket(int port) {
+    struct sockaddr_in here = {.sin_family = AF_INET, .sin_port = htons((uint16_t)port)};
     here.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
-    setsockopt(in, SOL_SOCKET, SO_RCVTIMEO, &period, sizeof period);
-    if (in < 0 || bind(in, (struct sockaddr *)&here, sizeof here))
-        return failed("UDP", strerror(errno));
+    const int in = socket(AF_INET, SOCK_DGRAM, 0);
+    return in < 0 || bind(in, (struct sockaddr *)&here, sizeof here) ? -1 : in;
+}
+
+static int serve_udp(host *h, int port) {
+    const int in = open_socket(port);
+    if (in < 0) return failed("UDP", strerror(errno));
     fprintf(stderr, "c_host: listening on port %d\n", port);
+    struct sockaddr_in plant = {0}; /* whose state counts */
+    double due_s = 0;         /* of the next input if no state comes */
     for (;;) {
         char line[LINE], out[LINE];
-        socklen_t size = sizeof plant;
-        const ssize_t got =
-            recvfrom(in, line, sizeof line - 1, 0, (struct sockaddr *)&plant, &size);
-        if (got < 0 && errno != EAGAIN && errno != EINTR) return failed("UDP", strerror(errno));
-        if (got >= 0) line[got] = 0;
-        const int length =
-            got < 0 ? bridge(h, out, sizeof out) : answer(h, line, out, sizeof out);
-        if (length <= 0) continue; /* nothing to say, or no state: whoever can may send anything */
+        const int ready = wait_until(in, due_s);
+        if (ready < 0) return failed("UDP", strerror(errno));
+        int length = 0;
+        if (ready) {
+            struct sockaddr_in from;
+            socklen_t size = sizeof from;
+            const ssize_t got =
+                recvfrom(in, line, sizeof line - 1, 0, (struct sockaddr *)&from, &size);
+            line[got > 0 ? got : 0] = 0;
+            length = answer(h, line, out, sizeof out); /* anyone may send anything: not all counts */
+            if (length > 0) plant = from;
+        }
+        const int bridged = length <= 0 && br_mpc_monotonic(NULL) >= due_s;
+        if (bridged) length = bridge(h, out, sizeof out);
+        if (length > 0 || bridged) due_s = br_mpc_monotonic(NULL) + h->period_s;
+        if (length <= 0) continue;
         sendto(in, out, (size_t)length, 0, (struct sockaddr *)&plant, sizeof plant);
-        if (got >= 0) prepare(h);
+        if (!bridged) prepare(h);
     }
 }
 

@@ -297,7 +297,7 @@ def export(
     from codegen.host_files import export as write
     from codegen.settings import BuildSettings
     from controller.assembly import read_settings
-    from controller.cycle_settings import driving_values
+    from controller.cycle_settings import cycle_values
     from controller.path_table import make_path_table
     from controller.process_settings import ControllerSettings
     from controller.settings import MpcSettings
@@ -310,10 +310,12 @@ def export(
         else read_raceline_for(raceline, course, parameters)
     )
     table = make_path_table(course, line, parameters.tuning.path.spacing_m)
-    values = read_settings(settings, MpcSettings).parameters(parameters) | driving_values(
+    values = read_settings(settings, MpcSettings).parameters(parameters) | cycle_values(
         parameters, process.fallback, process.compensation, process.stale_s
     )
-    manifest = read_manifest(artefact or make(BuildSettings(car=parameters))[0])
+    folder = artefact or make(BuildSettings(car=parameters))[0]
+    manifest = read_manifest(folder)
+    manifest.check_car(parameters, folder)
     learned = None if weights is None else read_weights(weights)
     write(out, manifest, table.rows, table.spacing_m, values, learned)
     typer.echo(f"{course.name}, {line.lap_time_s:.3f} s by its racing line: {out}")

@@ -65,7 +65,7 @@ static int take_parameters(fmu_instance *instance) {
         .shifted_s = v[FMU_V_shifted_s],
         .limit_tolerance = v[FMU_V_limit_tolerance],
         .recover_cycles = (int)v[FMU_V_recover_cycles],
-        .compensation = 2,
+        .compensation = BR_COMPENSATION_FIXED,
         .delay_s = delay_s,
         .longest_s = delay_s > 0 ? delay_s : 1,
         .stale_s = 1, /* every step has its state */
@@ -158,7 +158,7 @@ int fmu_model_step(fmu_instance *instance, double h) {
     if (failed) around.speed_limit_mps = NAN; /* the step refuses: the fallback answers */
     const br_measured state = measured(instance);
     br_decision decision;
-    br_cycle_answer(c->cycle, &state, &around, instance->time, 0, 0, &decision);
+    if (br_cycle_answer(c->cycle, &state, &around, instance->time, 0, 0, &decision)) return -1;
     tell(instance, &decision);
     return failed;
 }

@@ -1,5 +1,6 @@
 /* See br_files.h. Bytes are put together one by one, so that the host's byte order and
  * alignment do not matter. */
+#include <math.h>
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -9,6 +10,8 @@
 
 #define HEAD_BYTES 32
 #define SCHEMA 1
+#define LINE_BYTES 512
+#define WHOLE_MAX 1000
 #define GP_HEAD_BYTES (2 * 4 + (2 + BR_NZ) * 8)
 #define PATH_BYTES_MAX (8 + (size_t)BR_PATH_CAPACITY * BR_PATH_COLUMNS * 8)
 #define WEIGHTS_BYTES_MAX \
@@ -165,28 +168,35 @@ int br_files_load(br_mpc *mpc, const char *folder, const char *identity, char *t
 
 typedef struct {
     const char *name;
-    double *numbers; /* or */
+    double *number; /* or */
     int *whole;
-    int count, found;
+    int found;
 } setting;
 
-/* The numbers of one line into the setting of its name. */
+#define SPACE " \t\r\n"
+
+/* The number of one line, "name number", into the setting of its name. */
 static int take_line(const reader *r, char *line, setting *settings, int count) {
-    const char *name = strtok(line, " \t\r\n");
-    if (!name) return 0;
+    line[strcspn(line, "#")] = 0;
+    char *name = line + strspn(line, SPACE);
+    if (!*name) return 0;
+    char *at = name + strcspn(name, SPACE), *end;
+    if (*at) *at++ = 0;
     int i = 0;
     while (i < count && strcmp(settings[i].name, name)) ++i;
     if (i == count) return wrong(r, "has an unknown name", name);
-    for (int k = 0; k < settings[i].count; ++k) {
-        const char *word = strtok(NULL, " \t\r\n");
-        char *end = NULL;
-        const double value = word ? strtod(word, &end) : 0;
-        if (!word || *end) return wrong(r, "lacks a number", name);
-        if (settings[i].whole) *settings[i].whole = (int)value;
-        else settings[i].numbers[k] = value;
-    }
+    const double value = strtod(at, &end);
+    if (end == at) return wrong(r, "lacks a number", name);
+    if (end[strspn(end, SPACE)]) return wrong(r, "has more than a number", name);
     settings[i].found = 1;
-    return strtok(NULL, " \t\r\n") ? wrong(r, "has a number too many", name) : 0;
+    if (!settings[i].whole) {
+        *settings[i].number = value;
+        return 0;
+    }
+    if (!(value >= 0 && value <= WHOLE_MAX && value == floor(value)))
+        return wrong(r, "has no whole number from 0 to 1000", name);
+    *settings[i].whole = (int)value;
+    return 0;
 }
 
 int br_files_settings(const char *folder, br_mpc_parameters *parameters, br_driving *driving,
@@ -194,23 +204,27 @@ int br_files_settings(const char *folder, br_mpc_parameters *parameters, br_driv
     const reader r = {.name = BR_FILE_SETTINGS, .text = text, .text_size = size};
     br_mpc_parameters *p = parameters;
     br_driving *d = driving;
-#define PARAMETER(field) {.name = #field, .numbers = &p->field, .count = 1},
-#define COUNT(field) {.name = #field, .whole = &p->field, .count = 1},
-#define REAL(field) {.name = #field, .numbers = (double *)&d->field, .count = sizeof d->field / 8},
-#define WHOLE(field) {.name = #field, .whole = &d->field, .count = 1},
-    setting settings[] = {BR_PARAMETERS(PARAMETER) BR_SOLVER_FIELDS(PARAMETER, COUNT)
-                              BR_DRIVING_FIELDS(REAL, WHOLE)};
+#define OF_PARAMETERS(field) {.name = #field, .number = &p->field},
+#define COUNT_OF_PARAMETERS(field) {.name = #field, .whole = &p->field},
+#define OF_DRIVING(field) {.name = #field, .number = &d->field},
+#define COUNT_OF_DRIVING(field) {.name = #field, .whole = &d->field},
+    setting settings[] = {BR_PARAMETERS(OF_PARAMETERS)
+                              BR_SOLVER_FIELDS(OF_PARAMETERS, COUNT_OF_PARAMETERS)
+                                  BR_DRIVING_FIELDS(OF_DRIVING, COUNT_OF_DRIVING)};
     const int count = sizeof settings / sizeof settings[0];
     FILE *file = opened(folder, r.name);
     if (!file) return wrong(&r, "is missing or cannot be read", ANEW);
-    char line[256];
+    char line[LINE_BYTES];
     int failed = 0;
-    while (!failed && fgets(line, sizeof line, file)) {
-        line[strcspn(line, "#")] = 0;
-        failed = take_line(&r, line, settings, count);
-    }
+    while (!failed && fgets(line, sizeof line, file))
+        failed = strlen(line) + 1 < sizeof line ? take_line(&r, line, settings, count)
+                                                : wrong(&r, "has a line that is too long", line);
     fclose(file);
     for (int i = 0; i < count && !failed; ++i)
         if (!settings[i].found) failed = wrong(&r, "lacks a line", settings[i].name);
+    d->u_low[BR_INDEX_DUTY] = p->d_min;
+    d->u_high[BR_INDEX_DUTY] = p->d_max;
+    d->u_high[BR_INDEX_DELTA_RATE] = p->delta_rate_max_radps;
+    d->u_low[BR_INDEX_DELTA_RATE] = -p->delta_rate_max_radps;
     return failed;
 }

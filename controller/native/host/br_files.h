@@ -16,7 +16,8 @@
  * n x BR_NZ f64, alpha n f64, see br_mpc_gp.
  *
  * settings.txt: a line for each member of br_mpc_parameters and br_driving, its name and its number,
- * or its numbers; what comes after # is a comment.
+ * or its numbers, in the C locale; what comes after # is a comment. The limits of the inputs are the
+ * parameters'.
  *
  * Whatever a file holds, nothing is read beyond it.
  */
@@ -24,6 +25,10 @@
 #define BR_FILES_H
 
 #include "bayesrace_cycle.h"
+
+#ifdef __cplusplus
+extern "C" {
+#endif
 
 #define BR_FILE_PATH "path.bin"
 #define BR_FILE_WEIGHTS "weights.bin"
@@ -38,4 +43,7 @@ int br_files_load(br_mpc *mpc, const char *folder, const char *identity, char *t
 int br_files_settings(const char *folder, br_mpc_parameters *parameters, br_driving *driving,
                       char *text, size_t size);
 
+#ifdef __cplusplus
+}
+#endif
 #endif
