@@ -196,7 +196,7 @@ def test_no_sanitizer_finds_anything_whatever_the_states_say(
     random, lines = np.random.default_rng(4), []
     odd = ("nan", "inf", "-inf", "1e300", "-1", "0", "9223372036854775807", "-9223372036854775808")
     x = tuple(map(float, circuit.start(v_mps=1.5)))
-    for k in range(500):
+    for k in range(300):
         answers = (0.0, 0.0, 0.02) * int(random.integers(0, 64))
         lockstep = bool(k // 100 % 2)
         told = State(k, 0, 1, 1, 0.02 * k, x, (0.0, 0.0), 0, lockstep, answers, k % 90 == 89)
@@ -211,5 +211,5 @@ def test_no_sanitizer_finds_anything_whatever_the_states_say(
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-4000:]
     inputs = np.array([line.split()[4:6] for line in done.stdout.splitlines()], dtype=float)
-    assert len(inputs) > 250
+    assert len(inputs) > 150
     assert np.isfinite(inputs).all()

@@ -18,8 +18,10 @@ from bayesrace.transport import Director, Endpoints, Publisher, free_endpoint, o
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
 from controller.assembly import compiled_controller
+from controller.mpc import PredictiveController
 from controller.pure_pursuit import PurePursuit, PurePursuitSettings
 from controller.python_controller import PythonController
+from controller.settings import MpcSettings
 from experiments.closed_loop import ClosedLoop
 from experiments.collect import collect
 from experiments.drive import RunPlan, execute
@@ -129,6 +131,22 @@ def test_a_fault_of_the_car_ends_the_run(
     arguments = circuit.track, line, car, kinematic_artefact, log, 2.0, PurePursuitSettings()
     with pytest.raises(FmuFault, match="it has crashed"):
         collect(*arguments, vehicle=vehicle)
+
+
+def test_without_track_constraints_another_problem_is_solved(
+    circuit: Circuit, car: CarParameters, kinematic_artefact: Path
+) -> None:
+    def controller(constraints: bool) -> PredictiveController:
+        settings = MpcSettings(constraints=constraints)
+        return compiled_controller(
+            kinematic_artefact, car, circuit.track, circuit.line, settings=settings
+        )
+
+    driven = [
+        ClosedLoop(car, circuit.track, circuit.line, controller(one)).drive(0, 2.0)
+        for one in (True, False)
+    ]
+    assert not np.array_equal(driven[0].x, driven[1].x)
 
 
 def test_samples_are_those_of_its_log(

@@ -31,8 +31,8 @@ from tests.test_gp_weights import BODY, make_weights, reseal
 
 pytestmark = pytest.mark.unmeasured
 
-MESSAGES = 380_000
-WEIGHTS = 20_000
+MESSAGES = 240_000
+WEIGHTS = 16_000
 WORKERS = 2
 SCHEMAS = {kind: json_schema(kind)["properties"] for kind in KINDS}
 
