@@ -134,11 +134,9 @@ def rig(tmp_path: Path, course: Course) -> Iterator[Rig]:
 def test_a_controller_started_again_takes_over_the_car(tmp_path: Path) -> None:
     """A larger and faster course, so that the car still rolls a second after it began to brake.
 
-    It is wide, because the car goes straight on until then, for longer beside other work.
-
     How long it really took is logged: ``pytest --log-cli-level=INFO``.
     """
-    course = gentle_course(tmp_path, speed_mps=2.0, scale=3.0, half_width_m=1.5)
+    course = gentle_course(tmp_path, speed_mps=2.0, scale=3.0)
     with rigged(tmp_path, course) as rig:
         _take_over(rig)
 
