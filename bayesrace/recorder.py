@@ -3,6 +3,7 @@
 What is written is handed to the system at least every 0.2 s: a killed process loses at most that.
 """
 
+import functools
 import logging
 import threading
 import time
@@ -16,7 +17,7 @@ import zenoh
 
 from bayesrace.errors import InputError
 from bayesrace.log import LogWriter, topic_of
-from bayesrace.messages import EVENT, Event, car_key, encode
+from bayesrace.messages import EVENT, HEARTBEAT, Event, car_key, encode
 from bayesrace.messages.codec import peek_seq
 
 __all__ = ["FLUSH_PERIOD_S", "Recorder", "RecorderCounters"]
@@ -34,6 +35,11 @@ def _in_table(key: str) -> bool:
     """Whether the table has this very key, of whatever car."""
     topic, source = topic_of(key), key.rsplit("/", 1)[-1]
     return topic is not None and ("{source}" not in topic.key or source in topic.sources)
+
+
+@functools.lru_cache(_MOST_KEYS)
+def _is_heartbeat(key: str) -> bool:
+    return topic_of(key) is HEARTBEAT
 
 
 @dataclass(slots=True)
@@ -93,7 +99,7 @@ class Recorder:
             thread.start()
 
     def settle(self, quiet_s: float = 0.1, at_most_s: float = 2.0) -> None:
-        """Wait until nothing has arrived for a while; then all of it can be read from the file.
+        """Wait until nothing but heartbeats has arrived for a while; all else is in the file then.
 
         Raises InputError if the log cannot be written any more, such as on a full disk.
         """
@@ -149,7 +155,8 @@ class Recorder:
     def _write(self, sample: Any) -> None:
         now_ns = time.monotonic_ns()
         key, data = str(sample.key_expr), sample.payload.to_bytes()
-        self._quiet_since_ns = now_ns
+        if not _is_heartbeat(key):  # those never end
+            self._quiet_since_ns = now_ns
         if not self._known(key):
             self.counters.unrecorded += 1
             return

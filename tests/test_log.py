@@ -3,6 +3,7 @@
 import errno
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from mcap.writer import CompressionType, Writer
 
 from bayesrace.errors import InputError
 from bayesrace.log import LogReader, LogWriter, _unpacked
-from bayesrace.messages import EVENT, STATE, Event, State, encode
+from bayesrace.messages import EVENT, HEARTBEAT, STATE, Event, State, Status, encode
 from bayesrace.recorder import Recorder
 from bayesrace.transport import Endpoints, Inbox, Publisher, free_endpoint, open_session
 from tests.programs import ROOT, until
@@ -166,6 +167,32 @@ def test_a_log_that_is_deleted_is_a_failure(tmp_path: Path) -> None:
         until(lambda: recorder.failed, "the recorder notices")
         with pytest.raises(InputError, match=r"log\.mcap: it has been deleted"):
             recorder.close()
+
+
+def test_heartbeats_do_not_keep_a_recorder_from_settling(tmp_path: Path) -> None:
+    endpoint, stop = free_endpoint(), threading.Event()
+    with (
+        open_session(Endpoints(listen=(endpoint,))) as other,
+        open_session(Endpoints(connect=(endpoint,))) as session,
+        Recorder(session, "orca", tmp_path / "log.mcap") as recorder,
+    ):
+        publisher = Publisher(other, HEARTBEAT, "orca", "plant")
+
+        def beats() -> None:
+            while not stop.wait(0.02):
+                seq = publisher.next_seq
+                status = Status(seq, 0, "plant", "idle", 0, 0, "", "", 0.0, -1.0, 0.0, {})
+                publisher.put(status, lockstep=False)
+
+        beating = threading.Thread(target=beats)
+        beating.start()
+        begin_s = time.monotonic()
+        recorder.settle(at_most_s=20.0)
+        waited_s = time.monotonic() - begin_s
+        stop.set()
+        beating.join()
+    assert waited_s < 15.0
+    assert len(LogReader(tmp_path / "log.mcap").select(HEARTBEAT)) > 2
 
 
 def test_a_log_that_cannot_be_written_is_an_event(
