@@ -198,7 +198,8 @@ def test_several_processes_of_one_name_are_told(pair: tuple[Any, Any]) -> None:
 
     there(1)
     with pytest.raises(InputError, match="2 processes are the controller of car 'orca'; end all"):
-        there(2)
+        for _ in range(20):  # beside other work an answer may come too late to count
+            there(2)
 
 
 def test_a_request_that_is_turned_away_hears_that_the_process_is_busy(
