@@ -74,8 +74,6 @@ class Decision:
     """Prediction from there to the moment of acting."""
     step_us: float = 0.0
     """Execution time of the step."""
-    late_s: float = 0.0
-    """How much later than its budget it was made; not above 0: in time."""
     output: StepOutput | None = None
     """Of the step, if one was made."""
 
@@ -218,7 +216,7 @@ class Driver:
         decision.d, decision.delta_rate = decided.u
         decision.level, decision.status = _LEVELS[decided.level], decided.status
         decision.basis_s, decision.delay_s = decided.basis_s, decided.delay_s
-        decision.step_us, decision.late_s = decided.step_us, decided.late_s
+        decision.step_us = decided.step_us
         decision.output = self.controller.result(self._cycle) if decided.stepped else None
         if decision.status == STEP_FAILED:
             text = self._library.br_mpc_error_text(decided.error).decode()

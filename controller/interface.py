@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from controller.native_library import Artefact
     from controller.takeover import WeightsPort
 
-__all__ = ["NO_PLAN", "Array", "ControlLaw", "Controller", "Environment", "StepOutput"]
+__all__ = ["NO_LIMITS", "NO_PLAN", "Array", "ControlLaw", "Controller", "Environment", "StepOutput"]
 
 Array = npt.NDArray[np.float64]
 
@@ -27,6 +27,9 @@ class Environment(NamedTuple):
 
     speed_limit_mps: float = math.inf
     speed_limit_rate_mps2: float = 0.0
+
+
+NO_LIMITS: Final = Environment()
 
 
 @dataclass(slots=True)

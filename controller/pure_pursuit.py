@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.errors import InputError
 from bayesrace.vehicles.parameters import CarParameters
-from controller.interface import Array, Environment, StepOutput
+from controller.interface import NO_LIMITS, Array, Environment, StepOutput
 
 __all__ = ["PurePursuit", "PurePursuitSettings"]
 
@@ -98,7 +98,7 @@ class PurePursuit:
         self,
         x: Array,
         u_previous: Array,
-        environment: Environment = Environment(),  # noqa: B008 - immutable
+        environment: Environment = NO_LIMITS,
         elapsed_s: float = 0.0,
         budget_s: float = 0.0,
     ) -> StepOutput:

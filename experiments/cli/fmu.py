@@ -10,7 +10,7 @@ from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from bayesrace.tracks import DEFAULT_RACE_TRACK
 from bayesrace.vehicles import DEFAULT_CAR
-from experiments.cli.options import Car, OutFile, writable
+from experiments.cli.options import Car, OutFile, path_on, writable
 
 if TYPE_CHECKING:
     from bayesrace.vehicles import CarParameters
@@ -125,22 +125,14 @@ def _controller(
     cpu: str,
 ) -> "FmuDefinition":
     from bayesrace.gp.weights import read_weights
-    from bayesrace.raceline import read_raceline_for
-    from bayesrace.raceline.cached import racing_line
-    from bayesrace.tracks import load_track
     from codegen.build import build
     from codegen.fmu.controller import controller_fmu
     from codegen.settings import BuildSettings
     from controller.assembly import read_settings
     from controller.cycle_settings import FallbackSettings
-    from controller.path_table import make_path_table
     from controller.settings import MpcSettings
 
-    course = load_track(track, car.width_m)
-    line = (
-        racing_line(course, car) if raceline is None else read_raceline_for(raceline, course, car)
-    )
-    table = make_path_table(course, line, car.tuning.path.spacing_m)
+    table = path_on(track, raceline, car)
     return controller_fmu(
         artefact or build(BuildSettings(car=car))[0],
         car,

@@ -9,6 +9,8 @@ from bayesrace.errors import InputError
 
 if TYPE_CHECKING:
     from bayesrace.transport import Endpoints
+    from bayesrace.vehicles import CarParameters
+    from controller.path_table import PathTable
 
 __all__ = [
     "Car",
@@ -23,6 +25,7 @@ __all__ = [
     "Seed",
     "TrackName",
     "connect_to",
+    "path_on",
     "writable",
 ]
 
@@ -52,6 +55,20 @@ def connect_to(given: list[str] | None) -> "Endpoints":
     from bayesrace.transport import CONTROLLER_ENDPOINT, PLANT_ENDPOINT, Endpoints
 
     return Endpoints(connect=tuple(given or (PLANT_ENDPOINT, CONTROLLER_ENDPOINT)))
+
+
+def path_on(track: str, raceline: Path | None, car: "CarParameters") -> "PathTable":
+    """What the planner follows: the racing line of the file, or computed where there is none."""
+    from bayesrace.raceline import read_raceline_for
+    from bayesrace.raceline.cached import racing_line
+    from bayesrace.tracks import load_track
+    from controller.path_table import make_path_table
+
+    course = load_track(track, car.width_m)
+    line = (
+        racing_line(course, car) if raceline is None else read_raceline_for(raceline, course, car)
+    )
+    return make_path_table(course, line, car.tuning.path.spacing_m)
 
 
 def writable(path: Path | None) -> Path | None:

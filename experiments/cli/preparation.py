@@ -19,6 +19,7 @@ from experiments.cli.options import (
     RaceLineFile,
     Seed,
     TrackName,
+    path_on,
     writable,
 )
 
@@ -289,27 +290,17 @@ def export(
     """Write what a C program drives with: racing line, weights, settings (examples/c_host)."""
     from bayesrace.gp.weights import read_weights
     from bayesrace.manifest import read_manifest
-    from bayesrace.raceline import read_raceline_for
-    from bayesrace.raceline.cached import racing_line
-    from bayesrace.tracks import load_track
     from bayesrace.vehicles import get_car
     from codegen.build import build as make
     from codegen.host_files import export as write
     from codegen.settings import BuildSettings
     from controller.assembly import read_settings
     from controller.cycle_settings import cycle_values
-    from controller.path_table import make_path_table
     from controller.process_settings import ControllerSettings
     from controller.settings import MpcSettings
 
     parameters, process = get_car(car), ControllerSettings()
-    course = load_track(track, parameters.width_m)
-    line = (
-        racing_line(course, parameters)
-        if raceline is None
-        else read_raceline_for(raceline, course, parameters)
-    )
-    table = make_path_table(course, line, parameters.tuning.path.spacing_m)
+    table = path_on(track, raceline, parameters)
     values = read_settings(settings, MpcSettings).parameters(parameters) | cycle_values(
         parameters, process.fallback, process.compensation, process.stale_s
     )
@@ -318,7 +309,7 @@ def export(
     manifest.check_car(parameters, folder)
     learned = None if weights is None else read_weights(weights)
     write(out, manifest, table.rows, table.spacing_m, values, learned)
-    typer.echo(f"{course.name}, {line.lap_time_s:.3f} s by its racing line: {out}")
+    typer.echo(f"{track}, {parameters.name}: {out}")
 
 
 def _replace(source: str, target: str) -> None:
