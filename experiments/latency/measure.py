@@ -92,6 +92,7 @@ class Measurement:
                 self._wait(min(_LOOK_S, left_ns * 1e-9))
                 self._look((time.monotonic_ns() - began_ns) * 1e-9)
             self.elapsed_s = (time.monotonic_ns() - began_ns) * 1e-9
+            self.memory.look(self.elapsed_s)  # at least once: the looks before may have come late
             self.observer.drain()
             self._conclude()
 
