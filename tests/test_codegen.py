@@ -22,7 +22,7 @@ from bayesrace.native_interface import ABI, INFO, STATUSES
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import MODELS
 from codegen.build import build, build_hash, generate
-from codegen.compiler import CompileError, Compiler, find_compiler
+from codegen.compiler import FLAGS, CompileError, Compiler, find_compiler
 from codegen.problems.problem import Problem
 from codegen.settings import BuildSettings
 from codegen.stage import linearise_function
@@ -44,6 +44,10 @@ def _fresh_compiler_search() -> Iterator[None]:
 
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty cache, filled by a compiler that does not optimise, which is what takes its time."""
+    optimised = Compiler.shared_library
+    quick = tuple(flag for flag in FLAGS if flag != "-O3")
+    monkeypatch.setattr(Compiler, "shared_library", lambda *how: optimised(*how, quick))
     monkeypatch.setenv("BAYESRACE_CACHE", str(tmp_path / "cache"))
     return tmp_path / "cache"
 
