@@ -9,6 +9,14 @@
 #include "bayesrace_mpc.h"
 #include "br_vector.h"
 
+/* Before loops over states, inputs, rows and their nonzeros, which have constant bounds: unrolled,
+ * the problem's sparsity is in the code, and no table is read. */
+#ifdef __clang__
+#define BR_UNROLL _Pragma("unroll")
+#else
+#define BR_UNROLL _Pragma("GCC unroll 16")
+#endif
+
 #define BR_M (BR_NU * BR_N)                      /* condensed variables */
 #define BR_MP (((BR_M + 7) / 8) * 8)             /* padded to whole vectors */
 #define BR_ROWS (BR_M + BR_NR * BR_N)            /* input bounds, then the problem's, row by row */
