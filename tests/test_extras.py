@@ -1,4 +1,4 @@
-"""A controller host needs few packages: the controller drives in an environment that has no others."""
+"""A controller host needs few packages: the controller drives without any other."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""Plant and controllers as processes of their own: started for a block, immune, never left behind."""
+"""Plant and controllers as processes: started for a block, immune, never left behind."""
 
 from pathlib import Path
 
