@@ -34,7 +34,7 @@ SOLVER: Final = (
     ("tolerance", "double", "KKT residual (scaled) of a converged step", "> 0"),
     ("defect_max", "double", "largest dynamics defect of a usable plan", "> 0"),
     (
-        "settle",
+        "early_stop_tol",
         "double",
         "a step ends at this stationarity and tenth of it as defect, or earlier: see br_step.c",
         ">= 0",

@@ -57,7 +57,7 @@ static void decide(br_mpc *mpc, const double target[2]) {
     }
 }
 
-void br_turn(br_mpc *mpc) {
+void br_turnaround(br_mpc *mpc) {
     double target[2], x[BR_NX], next[BR_NX];
     if (!mpc->turn && fabs(mpc->x0[BR_INDEX_VX]) >= BR_TURN_SLOW_MPS) return;
     br_path_ahead(&mpc->path, BR_TURN_AHEAD_M, target);
