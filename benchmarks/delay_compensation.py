@@ -2,7 +2,7 @@
 
     python -m benchmarks.delay_compensation [--track NAME|FILE.csv] [--train-track …] [--laps 3]
 
-Plant and controller are processes of their own and run by the wall clock; the plant holds back each
+Plant and controller are processes of their own and run in real time; the plant holds back each
 state and each actuation for the delay (``bayesrace plant --delay``), so the input acts twice the
 delay later, plus what messages and the step take. Prints a table in Markdown; some four minutes.
 """

@@ -250,7 +250,7 @@ def test_what_anybody_may_write_or_others_own_is_not_loaded(
     artefact: Path, car: CarParameters, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (artefact / LIBRARY).chmod(0o777)
-    with pytest.raises(InputError, match=r"may be written by anybody.*chmod"):
+    with pytest.raises(InputError, match=r"is writable for every user.*chmod"):
         load(artefact, car)
     (artefact / LIBRARY).chmod(0o755)
     monkeypatch.setattr("os.geteuid", lambda: 12345)

@@ -134,7 +134,7 @@ typedef struct {
 
 /* The spare one of the two weight buffers, and whose it is. */
 enum {
-    BR_SPARE_FREE = 0, /* nobody's */
+    BR_SPARE_FREE = 0, /* not in use */
     BR_SPARE_TAKEN,    /* one thread writes it, or exchanges the two */
     BR_SPARE_STAGED    /* complete, to be adopted */
 };

@@ -74,15 +74,15 @@ def main() -> None:
     except (typer.Abort, KeyboardInterrupt):
         _fail("interrupted", _INTERRUPTED)
     except Exception as error:
-        told = _in_words(error)
-        if told is None:
+        text = _in_words(error)
+        if text is None:
             raise
         ours = isinstance(error, RuntimeError) and not isinstance(error, RecursionError)
-        _fail(told, 1 if ours else 2)
+        _fail(text, 1 if ours else 2)
 
 
 def _in_words(error: Exception) -> str | None:
-    """What a user is told; None for a fault of the program's own, which gets a traceback."""
+    """The message for the user; None for a fault of the program's own, which gets a traceback."""
     match error:
         case InputError():
             return str(error)
