@@ -94,7 +94,8 @@ def latency(
     if json_file:
         write_whole(json_file, result.model_dump_json(indent=1) + "\n")
     console.print(f"{out}", highlight=False, soft_wrap=True)
-    run.raise_if_broken()
+    if run.error is not None:
+        raise run.error
 
 
 def register(app: typer.Typer) -> None:

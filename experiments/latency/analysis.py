@@ -1,5 +1,6 @@
 """From the log of a run, and what is known beside it, to the numbers of the report."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -11,19 +12,28 @@ from numpy.typing import NDArray
 
 from bayesrace.tracks import Track
 from experiments.latency.clocks import ClockMap
-from experiments.latency.columns import MOST_CYCLES, Columns, Tables, fallen, read_tables, split
-from experiments.latency.legs import ANSWER, LEGS, Cycles, Values
-from experiments.latency.results import BareLoop, Clocks, LatencyResult, LegResult, Memory
+from experiments.latency.columns import (
+    MOST_CYCLES,
+    Columns,
+    begins_anew,
+    read_tables,
+    split,
+)
+from experiments.latency.legs import ANSWER, LEGS, Cycles
+from experiments.latency.results import BareLoop, Clocks, LatencyResult, LegResult, Memory, Traffic
 from experiments.latency.series import Series
 from experiments.latency.settings import LatencySettings
-from experiments.latency.traffic import heartbeats, traffic
 
 __all__ = ["Analysis", "Beside", "analyse"]
 
+Floats = NDArray[np.float64]
+
+_IN_FLIGHT: Final = 2
+"""So many messages more at the one end of a part than at the other end may be in flight."""
+
 _BATCH: Final = 4096
 _INTERVALS: Final = 60
-_SHORTEST_S: Final = 2.0
-"""Intervals of the histogram logs and of the medians."""
+"""Of the histogram logs and of the medians, at most; each takes two seconds at least."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +53,7 @@ class Analysis:
     result: LatencyResult
     series: dict[str, Series]
     """By leg, and of the bare loop; one without values is left out."""
-    edges_s: NDArray[np.float64]
+    edges_s: Floats
     """Of the intervals of logs and medians, since the first state that counts."""
     begin_s: float
     """Calendar time of that state."""
@@ -57,20 +67,22 @@ def analyse(log: Path, settings: LatencySettings, track: Track | None, beside: B
     # Runs in real time, or those in lockstep if there are no others.
     chosen = [part for part in parts if not part["states"]["lockstep"][0]] or parts
     cycles = [Cycles(part) for part in chosen]
-    clocks = [ClockMap.of(*one.exchanges()) for one in cycles]
-    values = [leg for one, clock in zip(cycles, clocks, strict=True) for leg in one.legs(clock)]
-    begin_ns = int(cycles[0].states["at"][0])
-    series = {leg: found for leg in LEGS if (found := _series(leg, values, begin_ns))}
-    known = [(part, clock) for part, clock in zip(chosen, clocks, strict=True) if clock]
-    messages = traffic(known)
-    clock = _clocks([clock for _, clock in known])
+    begin_ns = cycles[0].states["at"][0]
+    span_s = float(np.ptp(np.concatenate([one.states["at"] for one in cycles]))) * 1e-9
+    series = _series([one.legs() for one in cycles], begin_ns)
+    clock = _clocks([one.clock for one in cycles if one.clock is not None])
     legs = {leg: _leg(leg, one, clock) for leg, one in series.items()}
-    timing = _timing(chosen, cycles, settings)
-    restarts = int(np.count_nonzero(np.diff(tables["states"]["epoch"])))
-    restarts += int(np.count_nonzero(fallen(tables["actuations"])))
-    unobserved = sum(one.unobserved for one in cycles)
+    counts = sum((one.counts() for one in cycles), Counter())
+    messages = _traffic(counts, len(cycles))
+    period_us = counts["length_ns"] * 1e-3 / counts["periods"] if counts["periods"] else None
+    rate_hz = float(tables["heartbeats"]["rate_hz"].max(initial=0.0))
+    rate_hz = rate_hz or (1e6 / period_us if period_us else 0.0)
+    restarts = np.count_nonzero(np.diff(tables["states"]["epoch"]))
+    restarts += np.count_nonzero(begins_anew(tables["actuations"]))
     remarks = {
-        f"{unobserved} messages are missing in the log; the run may have had them": unobserved,
+        f"{counts['unobserved']} messages are missing in the log; the run may have had them": (
+            counts["unobserved"]
+        ),
         f"{refused} messages of the log could not be decoded": refused,
         f"plant or controller was restarted {restarts} times": restarts,
         f"{len(parts) - len(chosen)} runs in lockstep are left out": len(parts) > len(chosen),
@@ -84,45 +96,56 @@ def analyse(log: Path, settings: LatencySettings, track: Track | None, beside: B
     result = LatencyResult(
         car=car,
         track=settings.track,
+        rate_hz=rate_hz,
+        duration_s=span_s,
         load=settings.load,
         attached=bool(settings.attach),
         recorded=settings.log is not None,
-        started=datetime.fromtimestamp(begin_ns // 10**9, UTC).astimezone().isoformat(),
+        started=datetime.fromtimestamp(begin_ns // 1e9, UTC).astimezone().isoformat(),
         host=beside.host,
-        legs_us=legs,
         state_to_actuation_us=legs.get(ANSWER),
-        **timing,
-        bare_loop_us=bare,
+        legs_us=legs,
+        ticks=counts["cycles"] + counts["skipped"],
+        skipped=counts["skipped"],
+        deadline_misses=counts["missed"],
+        overruns=counts["overruns"] if len(tables["heartbeats"]) else None,
+        fallbacks=counts["fallbacks"],
         bare_loop_misses=bare.misses if bare else None,
+        bare_loop_us=bare,
+        mean_period_us=period_us,
+        rate_error=None if period_us is None else period_us * rate_hz * 1e-6 - 1.0,
         sent=sum(one.sent for one in messages.values()) if messages else None,
         received=sum(one.received for one in messages.values()) if messages else None,
         lost=sum(one.lost for one in messages.values()) if messages else None,
         traffic=messages,
-        rss=dict(beside.rss),
         rss_growth_bytes=max((one.growth_bytes for one in beside.rss.values()), default=None),
-        repeated_answers=sum(one.repeated for one in cycles),
-        overtaken_answers=sum(int((one.answers["acting_s"] < 0).sum()) for one in cycles),
-        unobserved=unobserved,
+        rss=dict(beside.rss),
+        repeated_answers=counts["repeated"],
+        overtaken_answers=counts["overtaken"],
+        unobserved=counts["unobserved"],
         restarts=restarts,
         **_drive(tables["truth"], track),
         clocks=clock,
         notes=[*beside.notes, *(text for text, true in remarks.items() if true)],
     )
-    count = int(np.clip(result.duration_s // _SHORTEST_S, 1, _INTERVALS))
-    edges_s = np.linspace(0.0, max(result.duration_s, 1e-3), count + 1)
+    edges_s = np.linspace(0.0, max(span_s, 1e-3), int(np.clip(span_s // 2.0, 1, _INTERVALS)) + 1)
     if beside.bare:
         series["bare_loop"] = beside.bare[0]
     return Analysis(result, series, edges_s, begin_ns * 1e-9)
 
 
-def _series(leg: str, values: Sequence[Values], begin_ns: int) -> Series | None:
-    """The values of one leg, all parts together, by rising time; None without any."""
-    several = [one for one in values if one.leg == leg and len(one.ns)]
-    if not several:
-        return None
-    at, ns = (np.concatenate([one[k] for one in several]) for k in (1, 2))
-    order = np.argsort(at, kind="stable")
-    return Series((at[order] - begin_ns) * 1e-9, ns[order])
+def _series(
+    parts: Sequence[Mapping[str, tuple[Floats, Floats]]], begin_ns: float
+) -> dict[str, Series]:
+    """The values of each leg, all parts together, by rising time."""
+    found = {}
+    for leg in LEGS:
+        columns = [np.array(legs[leg]) for legs in parts if leg in legs]
+        at, ns = np.concatenate(columns, axis=1) if columns else ((), ())
+        if len(at):
+            order = np.argsort(at, kind="stable")
+            found[leg] = Series((at[order] - begin_ns) * 1e-9, ns[order])
+    return found
 
 
 def _leg(leg: str, series: Series, clocks: Clocks | None) -> LegResult:
@@ -136,30 +159,18 @@ def _leg(leg: str, series: Series, clocks: Clocks | None) -> LegResult:
     )
 
 
-def _timing(
-    parts: Sequence[Tables], cycles: Sequence[Cycles], settings: LatencySettings
-) -> dict[str, Any]:
-    """Deadlines and periods by the telemetry, rate and overruns by the heartbeats."""
-    ticks = np.concatenate([one.ticks for one in cycles])
-    beats = [heartbeats(part, controller=True) for part in parts]
-    over = [int(np.ptp(one["overruns"])) for one in beats if len(one)]
-    rates = np.concatenate([one["rate_hz"] for one in beats])
-    skipped = sum(one.skipped for one in cycles)
-    periods, length_ns = np.sum([one.periods for one in cycles], axis=0).tolist()
-    period_us = length_ns * 1e-3 / periods if periods else None
-    rate_hz = float(rates.max(initial=0.0)) or (1e6 / period_us if period_us else settings.rate_hz)
-    at = np.concatenate([one.states["at"] for one in cycles])
-    return {
-        "rate_hz": rate_hz,
-        "duration_s": float(np.ptp(at)) * 1e-9,
-        "ticks": len(ticks) + skipped,
-        "skipped": skipped,
-        "deadline_misses": int(ticks["missed"].sum()),
-        "overruns": sum(over) if over else None,
-        "fallbacks": int((ticks["fallback"] > 0).sum()),
-        "mean_period_us": period_us,
-        "rate_error": None if period_us is None else period_us * rate_hz * 1e-6 - 1.0,
-    }
+def _traffic(counts: Counter[str], parts: int) -> dict[str, Traffic]:
+    """Of states and of actuations, if they are counted."""
+    found = {}
+    for stream in ("states", "actuations"):
+        if f"{stream}_sent" in counts:
+            sent, received, lost = (counts[f"{stream}_{k}"] for k in ("sent", "received", "lost"))
+            left = sent - received - lost
+            found[stream] = Traffic(
+                sent=sent, received=received, lost=lost, in_flight=left,
+                complete=abs(left) <= parts * _IN_FLIGHT,
+            )  # fmt: skip
+    return found
 
 
 def _drive(truth: Columns, track: Track | None) -> dict[str, Any]:
@@ -181,16 +192,15 @@ def _clocks(clocks: Sequence[ClockMap]) -> Clocks | None:
         return None
     shared = all(one.shared for one in clocks)
     uncertainty_us = max(one.uncertainty for one in clocks) * 1e-3
-    offset_ns = 0 if shared else int(clocks[-1].offset[-1])
+    offset_s = 0.0 if shared else float(clocks[-1].offset[-1]) * 1e-9
     text = (
-        f"the controller's is {abs(offset_ns) * 1e-9:.6f} s "
-        f"{'behind' if offset_ns < 0 else 'ahead of'} the plant's; legs from one to the other are "
-        f"corrected, ± {uncertainty_us:.0f} us"
+        f"the controller's is {abs(offset_s):.6f} s {'behind' if offset_s < 0 else 'ahead of'} the "
+        f"plant's; legs from one to the other are corrected, ± {uncertainty_us:.0f} us"
     )
     return Clocks(
         shared=shared,
         text="plant and controller read one clock" if shared else text,
-        offset_us=offset_ns * 1e-3,
+        offset_us=offset_s * 1e6,
         uncertainty_us=uncertainty_us,
         exchanges=sum(one.exchanges for one in clocks),
     )

@@ -24,11 +24,8 @@ from experiments.latency.results import BareLoop
 from experiments.latency.series import Series
 from experiments.processes import child
 
-__all__ = ["bare_result", "read_bare_loop", "run_bare_loop", "running_beside"]
+__all__ = ["bare_loop", "bare_result", "read_bare_loop", "running_beside"]
 
-Ints = NDArray[np.int64]
-
-_MODULE: Final = "experiments.latency.beside"
 _FILE: Final = "bare_loop.npy"
 
 
@@ -37,14 +34,15 @@ def running_beside(
     out: Path, load: int, realtime: RealtimeSettings, rate_hz: float, begin_ns: int, count: int
 ) -> Iterator[None]:
     """A bare loop of ``count`` periods from ``begin_ns`` on, and ``load`` busy processes; at the
-    block's end, the file of the loop is written to the folder ``out``."""
-    line = ["--parent-pid", str(os.getpid())]
-    loop = {"path": str(out / _FILE), "realtime": realtime.model_dump(), "count": count,
-            "period_ns": round(1e9 / rate_hz), "begin_ns": begin_ns}  # fmt: skip
+    block's end the loop's wake-up errors are in the folder ``out``."""
+    line, module = ["--parent-pid", str(os.getpid())], "experiments.latency.beside"
+    loop = {"path": str(out / _FILE), "realtime": realtime.model_dump(), "count": count}
+    loop |= {"period_ns": round(1e9 / rate_hz), "begin_ns": begin_ns}
     with ExitStack() as stack:
         for _ in range(load):
-            stack.enter_context(child(line, out / "load.log", _MODULE))
-        bare = stack.enter_context(child([*line, json.dumps(loop)], out / "bare_loop.log", _MODULE))
+            stack.enter_context(child(line, out / "load.log", module))
+        log = out / "bare_loop.log"
+        bare = stack.enter_context(child([*line, json.dumps(loop)], log, module))
         yield
         bare.wait(1.0)
 
@@ -60,36 +58,37 @@ def read_bare_loop(out: Path, rate_hz: float) -> tuple[Series, BareLoop] | None:
     return bare_result(late_ns, round(1e9 / rate_hz), refused) if len(late_ns) else None
 
 
-def bare_result(late_ns: Ints, period_ns: int, refused: list[str]) -> tuple[Series, BareLoop]:
+def bare_result(
+    late_ns: NDArray[np.int64], period_ns: int, refused: list[str]
+) -> tuple[Series, BareLoop]:
     """The same from how late the loop woke at each release that was not passed over."""
     passed, count = late_ns // period_ns, len(late_ns)
-    releases = np.arange(count) + np.cumsum(passed) - passed
-    woken_ns = releases * period_ns + late_ns
-    series = Series((releases * period_ns).astype(np.float64) * 1e-9, late_ns)
+    released_s = (np.arange(count) + np.cumsum(passed) - passed) * (period_ns * 1e-9)
+    woken_s = released_s + late_ns * 1e-9
+    series = Series(released_s.astype(np.float64), late_ns.astype(np.float64))
+    skipped = int(passed.sum())
     return series, BareLoop(
         **series.distribution().model_dump(),
         misses=int((passed > 0).sum()),
-        skipped=int(passed.sum()),
-        ticks=count + int(passed.sum()),
-        mean_period_us=float(np.ptp(woken_ns)) * 1e-3 / (count - 1) if count > 1 else None,
+        skipped=skipped,
+        ticks=count + skipped,
+        mean_period_us=float(np.ptp(woken_s)) * 1e6 / (count - 1) if count > 1 else None,
         refused=refused,
     )
 
 
-def run_bare_loop(
-    late_ns: Ints,
+def bare_loop(
+    count: int,
     period_ns: int,
     begin_ns: int,
     ended: Callable[[], bool] = lambda: False,
     clock: Callable[[], int] = time.monotonic_ns,
     sleep: Callable[[int], None] = sleep_until_ns,
-) -> int:
-    """Sleeps from release to release, from ``begin_ns`` on for as many as ``late_ns`` holds.
-
-    Fills ``late_ns``; returns how many wake-ups there were: fewer if releases were passed over.
-    """
-    release_ns, end_ns = begin_ns, begin_ns + len(late_ns) * period_ns
-    woken = 0
+) -> NDArray[np.int64]:
+    """Sleeps from release to release, ``count`` of them from ``begin_ns`` on or until it has
+    ``ended``; how late it woke at each that was not passed over [ns]."""
+    late_ns = np.full(count, -1, dtype=np.int64)  # filled: no page is touched first in the loop
+    release_ns, end_ns, woken = begin_ns, begin_ns + count * period_ns, 0
     while release_ns < end_ns and not ended():
         sleep(release_ns)
         late = clock() - release_ns
@@ -97,24 +96,21 @@ def run_bare_loop(
             late_ns[woken] = late
             woken += 1
             release_ns += (late // period_ns + 1) * period_ns
-    return woken
+    return late_ns[:woken]
 
 
-def _bare_loop(path: str, realtime: Any, count: int, period_ns: int, begin_ns: int) -> None:
-    """The process; SIGTERM ends it early, with what there is."""
+def _run(path: str, realtime: Any, count: int, period_ns: int, begin_ns: int) -> None:
+    """The bare loop as a process; SIGTERM ends it early, with what there is."""
     signals: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, _frame: signals.append(number))
-    for refused in prepare_thread(RealtimeSettings(**realtime)):
-        sys.stdout.write(f"{refused}\n")
-    late_ns = np.full(count, -1, dtype=np.int64)  # filled: no page is touched first in the loop
-    woken = run_bare_loop(late_ns, period_ns, begin_ns, lambda: bool(signals))
-    np.save(path, late_ns[:woken])
+    sys.stdout.writelines(f"{one}\n" for one in prepare_thread(RealtimeSettings(**realtime)))
+    np.save(path, bare_loop(count, period_ns, begin_ns, lambda: bool(signals)))
 
 
 if __name__ == "__main__":
     die_with_parent(int(sys.argv[2]))
     if sys.argv[3:]:
-        _bare_loop(**json.loads(sys.argv[3]))
+        _run(**json.loads(sys.argv[3]))
     else:
         while True:
             pass

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 __all__ = ["ClockMap"]
 
-Ints = NDArray[np.int64]
+Floats = NDArray[np.float64]
 
 _DRIFT: Final = 200e-6
 """Of one clock against another at most: quartz is within 100 ppm on either side."""
@@ -30,14 +30,14 @@ class ClockMap:
     shared: bool
     """It is one clock: no exchange contradicts an offset of zero."""
     exchanges: int
-    uncertainty: int
+    uncertainty: float
     """The largest of the run, from the first exchange to the last one; 0 if shared."""
-    at: Ints
+    at: Floats
     """Controller's clock, rising."""
-    offset: Ints
+    offset: Floats
 
     @classmethod
-    def of(cls, sampled: Ints, received: Ints, sent: Ints, arrived: Ints) -> Self | None:
+    def of(cls, sampled: Floats, received: Floats, sent: Floats, arrived: Floats) -> Self | None:
         """The map that exchanges give, in the order of their four times: the first and the last one
         by the plant's clock, the others by the controller's. None without any."""
         if not len(received):
@@ -45,23 +45,17 @@ class ClockMap:
         order = np.argsort(received, kind="stable")
         at, most, least = received[order], (received - sampled)[order], (sent - arrived)[order]
         shared = bool((most >= 0).all() and (least <= 0).all())
-        # The middle is rounded down, so half of the difference is rounded up; and the clocks run
-        # apart during the exchange itself.
-        offset = (most + least) // 2
-        half = (most - least + 1) // 2 + 1 + _DRIFT * (arrived - sampled)[order]
+        # The clocks run apart also during an exchange.
+        half = (most - least) / 2 + _DRIFT * (arrived - sampled)[order]
         drifted = _DRIFT * (at - at[0])
         before = np.minimum.accumulate(half - drifted) + drifted
         after = np.minimum.accumulate((half + drifted)[::-1])[::-1] - drifted
-        bound = np.minimum(before, after) + 1
+        bound = np.minimum(before, after) + 1.0
         best = half <= bound
-        return cls(shared, len(at), 0 if shared else int(bound.max()) + 1, at[best], offset[best])
+        offset = (most + least)[best] / 2
+        return cls(shared, len(at), 0.0 if shared else float(bound.max()), at[best], offset)
 
-    def to_plant(self, controller: Ints) -> Ints:
+    def to_plant(self, controller: Floats) -> Floats:
         """Readings of the controller's clock in terms of the plant's."""
-        if self.shared:
-            return controller
-        # Differences fit into 64-bit floats; the clocks themselves do not.
-        x, nodes = (controller - self.at[0]).astype(float), (self.at - self.at[0]).astype(float)
-        change = np.interp(x, nodes, (self.offset - self.offset[0]).astype(float))
-        plant: Ints = controller - self.offset[0] - np.rint(change).astype(np.int64)
-        return plant
+        offset = 0.0 if self.shared else np.interp(controller, self.at, self.offset)
+        return np.asarray(controller - offset)

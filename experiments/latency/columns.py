@@ -1,5 +1,6 @@
 """Reads a log into tables of numbers, and splits them where numbers or clocks begin anew."""
 
+from array import array
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
@@ -11,11 +12,11 @@ from bayesrace import messages
 from bayesrace.errors import InputError
 from bayesrace.log import LogReader, topic_of
 
-__all__ = ["MOST_CYCLES", "Columns", "Tables", "fallen", "read_tables", "split"]
+__all__ = ["MOST_CYCLES", "Columns", "Tables", "begins_anew", "read_tables", "split"]
 
 Columns = NDArray[Any]
-"""A structured array: the columns of :data:`_COLUMNS` besides ``n``, the message's number in the
-log, and ``at``, calendar time at the recorder [ns]."""
+"""A structured array of 64-bit floats, in which the nanoseconds of a hundred days are exact: the
+columns of :data:`_COLUMNS`; ``n``, the message's number in the log; ``at``, calendar time [ns]."""
 
 Tables = dict[str, Columns]
 
@@ -31,10 +32,7 @@ _COLUMNS: Final = {
     "wake_us decode_us prepare_us solve_us encode_us",
     "heartbeats": "controller seq epoch sent received lost overruns rate_hz",
 }
-"""Numbers with a unit in their name are floats; all others, and times in ns, are integers."""
-
-_CHUNK: Final = 10_000
-"""Rows that wait as Python's numbers, which take many times the space of the array's."""
+"""Times without a unit in their name are in ns, by the clock of the sender."""
 
 
 def read_tables(
@@ -51,7 +49,7 @@ def read_tables(
     if (name or len(cars) > 1) and name not in cars:
         raise InputError(f"{path} holds cars {', '.join(sorted(cars))}; choose one with --name")
     name = name or "".join(cars)
-    tables = {table: _Table(columns) for table, columns in _COLUMNS.items()}
+    tables = {table: array("d") for table in _COLUMNS}
     end_ns, cycles = float("inf"), 0
     for n, entry in enumerate(reader.messages()):
         at, message = entry.log_time_ns, entry.message
@@ -65,10 +63,14 @@ def read_tables(
             if table == "states":
                 end_ns = end_ns if cycles else at + round(1e9 * duration_s)
                 cycles += 1
-            tables[table].add(n, at, *row)
+            tables[table].extend((n, at, *row))
     if not cycles:
         raise InputError(f"{path} holds no states of a car after {warm_up_s:g} s of driving")
-    return {table: one.array() for table, one in tables.items()}, name, reader.refused
+    found = {
+        table: np.frombuffer(tables[table], [(one, float) for one in ("n", "at", *names.split())])
+        for table, names in _COLUMNS.items()
+    }
+    return found, name, reader.refused
 
 
 def split(tables: Tables) -> Iterator[Tables]:
@@ -80,27 +82,23 @@ def split(tables: Tables) -> Iterator[Tables]:
     """
     states, actuations = tables["states"], tables["actuations"]
     other = (np.diff(states["epoch"]) != 0) | (np.diff(states["run"]) != 0)
-    bounds = np.union1d(states["n"][1:][other], actuations["n"][1:][fallen(actuations)])
+    bounds = np.union1d(states["n"][1:][other], actuations["n"][1:][begins_anew(actuations)])
     for part in range(len(bounds) + 1):
         rows = {
             name: table[np.searchsorted(bounds, table["n"], side="right") == part]
             for name, table in tables.items()
         }
+        for name in rows if len(rows["states"]) else ():
+            for column in {"epoch", "run"} & set(_COLUMNS[name].split()):
+                rows[name] = rows[name][rows[name][column] == rows["states"][column][0]]
         if len(rows["states"]):
-            yield {name: _of_run(table, rows["states"][0]) for name, table in rows.items()}
+            yield rows
 
 
-def fallen(table: Columns) -> NDArray[np.bool_]:
+def begins_anew(table: Columns) -> NDArray[np.bool_]:
     """Whether the sender began its numbers again, from each row to the next one."""
     found: NDArray[np.bool_] = np.diff(table["seq"]) <= 0
     return found
-
-
-def _of_run(table: Columns, state: Any) -> Columns:
-    """The rows that name no other plant process or run than this state does."""
-    for name in {"epoch", "run"} & set(table.dtype.names or ()):
-        table = table[table[name] == state[name]]
-    return table
 
 
 def _rows(message: Any) -> Iterator[tuple[str, tuple[Any, ...]]]:
@@ -121,34 +119,7 @@ def _rows(message: Any) -> Iterator[tuple[str, tuple[Any, ...]]]:
             yield "ticks", (*cycle, m.missed, m.fallback, *parts)
         case messages.Status():
             stream = "states" if m.source == "controller" else "actuations"
-            names = f"{stream}_received", f"{stream}_lost", "overruns"
-            counts = (_count(m.counters.get(name)) for name in names)
+            counts = [m.counters.get(f"{stream}_{name}") for name in ("received", "lost")]
+            counts = [v if type(v) is int else 0 for v in (*counts, m.counters.get("overruns"))]
             here = m.source == "controller", m.seq, m.epoch, m.source_time_ns
             yield "heartbeats", (*here, *counts, m.rate_hz)
-
-
-def _count(value: object) -> int:
-    return value if type(value) is int else 0
-
-
-class _Table:
-    """A table that grows."""
-
-    def __init__(self, columns: str) -> None:
-        names, floats = ("n", "at", *columns.split()), ("_s", "_us", "_m", "_hz")
-        self._dtype = np.dtype([(name, float if name.endswith(floats) else int) for name in names])
-        self._rows: list[tuple[Any, ...]] = []
-        self._chunks: list[Columns] = []
-
-    def add(self, *row: Any) -> None:
-        self._rows.append(row)
-        if len(self._rows) == _CHUNK:
-            self._pack()
-
-    def array(self) -> Columns:
-        self._pack()
-        return np.concatenate(self._chunks)
-
-    def _pack(self) -> None:
-        self._chunks.append(np.array(self._rows, self._dtype))
-        self._rows.clear()

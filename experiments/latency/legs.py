@@ -4,18 +4,19 @@ Durations that one process measured are exact. What lies between the clocks of b
 good as the map of one clock to the other (:mod:`experiments.latency.clocks`).
 """
 
-from collections.abc import Iterator
-from typing import Final, NamedTuple
+from collections import Counter
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from experiments.latency.clocks import ClockMap
 from experiments.latency.columns import Columns, Tables
+from experiments.latency.traffic import heartbeats, traffic
 
-__all__ = ["ANSWER", "LEGS", "Cycles", "Values"]
+__all__ = ["ANSWER", "LEGS", "Cycles"]
 
-Ints = NDArray[np.int64]
+Floats = NDArray[np.float64]
 
 LEGS: Final = {
     "wake_up": ("wake-up error", "controller"),
@@ -37,17 +38,6 @@ other. In the order of a cycle; docs/latency.md says from where to where each go
 ANSWER: Final = "state_to_actuation"
 """The leg that counts."""
 
-_MOST_NS: Final = 1e15
-
-
-class Values(NamedTuple):
-    """One leg, cycle by cycle."""
-
-    leg: str
-    at: Ints
-    """Calendar time at the recorder [ns]."""
-    ns: Ints
-
 
 class Cycles:
     """The messages of one plant and controller process, joined by the state that they answer.
@@ -65,69 +55,72 @@ class Cycles:
         self._starts = self.ticks[_first(self.ticks, "state")]
         """The first cycle of each state."""
         self._sent, self._arrived = _paired(self._known(self.actuations), self.answers)
-        streams = (self.states, self.actuations, tables["ticks"])
-        self.unobserved = sum(map(_missing, streams))
-        """Messages missing in the log, by their numbers; the run itself may have had them."""
+        self._arrived_at = self._sampled(self._arrived) + self._arrived["arrival_s"] * 1e9
+        self.clock = ClockMap.of(*self._exchanges())
+        self._tables = tables
 
-    def exchanges(self) -> tuple[Ints, Ints, Ints, Ints]:
+    def _exchanges(self) -> tuple[Floats, Floats, Floats, Floats]:
         """The first answer to each state as an exchange of timestamps: sampled at the plant,
         received and sent by the controller's clock, arrived at the plant [ns]."""
         k = _first(self._arrived, "state")
-        sent, arrived = self._sent[k], self._arrived[k]
-        _, i, j = np.intersect1d(self._starts["state"], sent["state"], return_indices=True)
-        sampled = self._sampled(arrived)
-        arrival = sampled + _ns(arrived["arrival_s"] * 1e9)
-        return sampled[j], self._starts["received"][i], sent["sent"][j], arrival[j]
+        _, i, j = np.intersect1d(
+            self._starts["state"], self._arrived["state"][k], return_indices=True
+        )
+        starts, k = self._starts[i], k[j]
+        return self._sampled(starts), starts["received"], self._sent["sent"][k], self._arrived_at[k]
 
-    def legs(self, clock: ClockMap | None) -> Iterator[Values]:
-        """All legs that the messages give; those between both clocks only with a map of them."""
-        ticks, starts, answers = self.ticks, self._starts, self.answers
-        for leg, column in (
-            ("wake_up", "wake_us"), ("prepare", "prepare_us"), ("feedback", "solve_us"),
-            ("encode", "encode_us"),
-        ):  # fmt: skip
-            yield Values(leg, ticks["at"], _ns(ticks[column] * 1e3))
-        yield Values("decode", starts["at"], _ns(starts["decode_us"] * 1e3))
-        yield Values("release_wait", starts["at"], starts["released"] - starts["received"])
+    def legs(self) -> dict[str, tuple[Floats, Floats]]:
+        """Calendar times at the recorder, and values, of each leg that the messages give [ns]."""
+        ticks, starts = self.ticks, self._starts
+        first = self.answers[_first(self.answers, "state")]
+        acted = self.answers[self.answers["acting_s"] >= 0]
         # Every cycle sends one actuation and one telemetry message, with equal numbers.
         _, i, j = np.intersect1d(self.actuations["seq"], ticks["seq"], return_indices=True)
-        made = self.actuations["sent"][i]
-        yield Values("compute", ticks["at"][j], made - ticks["released"][j])
-        first = answers[_first(answers, "state")]
-        yield Values(ANSWER, first["at"], _ns(first["arrival_s"] * 1e9))
-        acted = answers[answers["acting_s"] >= 0]
-        yield Values("acting", acted["at"], _ns(acted["acting_s"] * 1e9))
-        if clock is not None:
-            for leg, rows, column in (
-                ("state_transport", starts, "received"), ("state_age", ticks, "released")
-            ):  # fmt: skip
-                yield Values(leg, rows["at"], clock.to_plant(rows[column]) - self._sampled(rows))
-            arrived = self._sampled(self._arrived) + _ns(self._arrived["arrival_s"] * 1e9)
-            transport = arrived - clock.to_plant(self._sent["sent"])
-            yield Values("actuation_transport", self._arrived["at"], transport)
+        made, released = self.actuations["sent"][i], ticks["released"][j]
+        legs = {
+            "wake_up": (ticks["at"], ticks["wake_us"] * 1e3),
+            "decode": (starts["at"], starts["decode_us"] * 1e3),
+            "release_wait": (starts["at"], starts["released"] - starts["received"]),
+            "feedback": (ticks["at"], ticks["solve_us"] * 1e3),
+            "compute": (ticks["at"][j], made - released),
+            "encode": (ticks["at"], ticks["encode_us"] * 1e3),
+            "state_to_actuation": (first["at"], first["arrival_s"] * 1e9),
+            "acting": (acted["at"], acted["acting_s"] * 1e9),
+            "prepare": (ticks["at"], ticks["prepare_us"] * 1e3),
+        }
+        if self.clock is not None:
+            readings = starts["received"], ticks["released"], self._sent["sent"]
+            received, released, sent = map(self.clock.to_plant, readings)
+            legs["state_transport"] = starts["at"], received - self._sampled(starts)
+            legs["state_age"] = ticks["at"], released - self._sampled(ticks)
+            legs["actuation_transport"] = self._arrived["at"], self._arrived_at - sent
+        return legs
 
-    @property
-    def skipped(self) -> int:
-        """Releases passed over, by the numbers of the cycles."""
-        passed = np.diff(self.ticks["tick"]) - np.diff(self.ticks["seq"])
-        return int(np.maximum(passed, 0).sum())
+    def counts(self) -> Counter[str]:
+        """What can be added up over the parts of a log; messages as :func:`traffic` names them."""
+        ticks, answers = self.ticks, self.answers
+        streams = self.states, self.actuations, self._tables["ticks"]
+        beats = heartbeats(self._tables, controller=True)
+        found = {
+            "cycles": len(ticks),
+            "skipped": np.maximum(np.diff(ticks["tick"]) - np.diff(ticks["seq"]), 0).sum(),
+            "missed": ticks["missed"].sum(),
+            "fallbacks": np.count_nonzero(ticks["fallback"]),
+            "overruns": np.diff(beats["overruns"]).sum(),
+            "periods": np.diff(ticks["seq"]).sum(),
+            "length_ns": np.diff(ticks["released"]).sum(),
+            "repeated": len(answers) - len(_first(answers, "state")),
+            "overtaken": np.count_nonzero(answers["acting_s"] < 0),
+            # By their numbers; the run itself may have had them.
+            "unobserved": sum((np.diff(np.unique(one["seq"])) - 1.0).sum() for one in streams),
+        }
+        if self.clock is not None:
+            found |= traffic(self._tables, self.clock)
+        return Counter({name: int(count) for name, count in found.items()})
 
-    @property
-    def periods(self) -> tuple[int, int]:
-        """Periods from the first cycle to the last one, and their total length [ns]."""
-        if not len(self.ticks):
-            return 0, 0
-        first, last = self.ticks[0], self.ticks[-1]
-        return int(last["seq"] - first["seq"]), int(last["released"] - first["released"])
-
-    @property
-    def repeated(self) -> int:
-        """Answers to a state that had been answered already."""
-        return len(self.answers) - len(_first(self.answers, "state"))
-
-    def _sampled(self, rows: Columns) -> Ints:
+    def _sampled(self, rows: Columns) -> Floats:
         """When the state of each row was, on the plant's clock."""
-        found: Ints = self.states["sampled"][np.searchsorted(self.states["seq"], rows["state"])]
+        found: Floats = self.states["sampled"][np.searchsorted(self.states["seq"], rows["state"])]
         return found
 
     def _known(self, rows: Columns) -> Columns:
@@ -135,17 +128,9 @@ class Cycles:
         return rows[np.isin(rows["state"], self.states["seq"])]
 
 
-def _ns(values: NDArray[np.float64]) -> Ints:
-    return np.rint(np.clip(values, -_MOST_NS, _MOST_NS)).astype(np.int64)
-
-
-def _first(table: Columns, key: str = "seq") -> Ints:
+def _first(table: Columns, key: str = "seq") -> NDArray[np.intp]:
     """Indices of the first row of each key, by rising keys."""
     return np.unique(table[key], return_index=True)[1]
-
-
-def _missing(table: Columns) -> int:
-    return int(np.ptp(table["seq"])) + 1 - len(_first(table)) if len(table) else 0
 
 
 def _paired(one: Columns, other: Columns) -> tuple[Columns, Columns]:

@@ -13,7 +13,7 @@ from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from bayesrace.messages import Event
 from bayesrace.recorder import Recorder
-from bayesrace.tracks import load_track
+from bayesrace.tracks import Track, load_track
 from bayesrace.transport import Director, Endpoints, Item, Kind, free_endpoint, open_session
 from bayesrace.vehicles import write_car
 from experiments.drive import RunPlan, run_request, wait_for_both
@@ -28,6 +28,8 @@ from experiments.progress import Stages
 from experiments.settings import PreparationSettings
 
 __all__ = ["LatencyError", "Run", "measure"]
+
+_LOG: Final = "run.mcap"
 
 _START_S: Final = 60.0
 """For processes to start on a machine that is busy."""
@@ -46,7 +48,7 @@ class LatencyError(RuntimeError):
 
 @dataclass
 class Run:
-    """A run while it is recorded, and what is known of it then besides the log."""
+    """A run while it is recorded, and what is known of it besides the log."""
 
     settings: LatencySettings
     children: dict[str, Child] = field(default_factory=dict)
@@ -54,19 +56,8 @@ class Run:
     rss: dict[str, Memory] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     ended_early: str = ""
-    interrupted: bool = False
-
-    def raise_if_broken(self) -> None:
-        """KeyboardInterrupt or LatencyError, if the recording ended early though it should not."""
-        if self.interrupted:
-            raise KeyboardInterrupt
-        if self.ended_early and not self.settings.attach:
-            raise LatencyError(self.ended_early)
-
-    def endings(self) -> list[str]:
-        """How the processes ended that have."""
-        time.sleep(0.2)  # the system reports a death a moment after the network does
-        return endings(self.children.values())
+    error: BaseException | None = None
+    """LatencyError or KeyboardInterrupt, if the recording ended early though it should not have."""
 
     def watch(self, director: Director, recorder: Recorder, begin_ns: int, end_ns: int) -> None:
         """Lets the time pass, until the run ends, a process started here ends, or a signal."""
@@ -80,18 +71,20 @@ class Run:
                 if time.monotonic_ns() >= warm_ns:
                     self.look_at_memory()
             self.look_at_memory()  # at least once: the looks before may have come late
+        if self.ended_early and self.children and self.error is None:
+            ended = [self.ended_early, *_endings(self.children)]
+            self.error = LatencyError("; ".join(ended))
+        self.notes += [f"ended early: {self.ended_early}"] if self.ended_early else []
 
     def _react(self, item: Item) -> None:
         if item.kind is Kind.SIGNAL:
-            self.interrupted, self.ended_early = True, "interrupted"
-        elif item.kind is Kind.GONE:
-            text = f"the {item.name} of car '{self.settings.car_name}' vanished"
-            if item.name in self.children:
-                self.ended_early = "; ".join([text, *self.endings()])
-            else:
-                self.notes.append(text)
+            self.error, self.ended_early = KeyboardInterrupt(), "interrupted"
         elif isinstance(item.value, Event) and item.value.kind == "run_ended":
             self.ended_early = item.value.text
+        elif item.kind is Kind.GONE:
+            text = f"the {item.name} of car '{self.settings.car_name}' vanished"
+            self.ended_early = text if item.name in self.children else ""
+            self.notes += [] if self.ended_early else [text]
 
     def look_at_memory(self) -> None:
         """Takes note of the resident memory of the processes that were started here."""
@@ -99,9 +92,9 @@ class Run:
             with suppress(OSError, IndexError, ValueError):  # it is gone, or there is no /proc
                 pages = int(Path(f"/proc/{process.pid}/statm").read_text().split()[1])
                 now = pages * os.sysconf("SC_PAGE_SIZE")
-                begin = self.rss.get(name, Memory(begin_bytes=now, most_bytes=now))
-                most = max(now, begin.most_bytes)
-                self.rss[name] = Memory(begin_bytes=begin.begin_bytes, most_bytes=most)
+                begin = self.rss[name].begin_bytes if name in self.rss else now
+                most = max(now, self.rss[name].most_bytes) if name in self.rss else now
+                self.rss[name] = Memory(begin_bytes=begin, most_bytes=most)
 
 
 def measure(settings: LatencySettings, out: Path, stages: Stages) -> tuple[LatencyResult, Run]:
@@ -113,50 +106,51 @@ def measure(settings: LatencySettings, out: Path, stages: Stages) -> tuple[Laten
     if (out / RESULT).exists():
         raise InputError(f"{out} holds a measurement already; choose another folder or remove it")
     track = load_track(settings.track, settings.car.width_m) if settings.track else None
-    run, beside, log = Run(settings), Beside(), settings.log
-    if log is None:
-        log = out / "run.mcap"
-        beside = _record(run, out, log, stages)
+    run, beside = Run(settings), Beside()
+    if settings.log is None:
+        beside = _record(run, track, out, stages)
     with stages.stage("analyse the log"):
         try:
-            analysis = analyse(log, settings, track, beside)
-        except InputError:
-            run.raise_if_broken()
-            raise
+            analysis = analyse(settings.log or out / _LOG, settings, track, beside)
+        except InputError as error:
+            raise run.error or error from None
         out.mkdir(parents=True, exist_ok=True)
         write_whole(out / "settings.json", settings.model_dump_json(indent=1) + "\n")
         write_files(out, analysis)
     return analysis.result, run
 
 
-def _record(run: Run, out: Path, log: Path, stages: Stages) -> Beside:
+def _record(run: Run, track: Track | None, out: Path, stages: Stages) -> Beside:
     """Records the run, and the machine beside it."""
-    settings, name = run.settings, run.settings.car_name
+    settings, name, start = run.settings, run.settings.car_name, not run.settings.attach
     ends = settings.attach or (free_endpoint(), free_endpoint())
-    lines = {} if settings.attach else _lines(settings, ends, out, stages)
+    lines = _lines(settings, ends, out, stages) if start else {}
     out.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
-        with stages.stage("start plant and controller" if lines else "attach"):
+        with stages.stage("start plant and controller" if start else "attach"):
             for source, line in lines.items():
                 run.children[source] = stack.enter_context(child(line, out / f"{source}.log"))
             stack.enter_context(_explained(run))
             session = stack.enter_context(open_session(Endpoints(connect=ends)))
             director = Director(session, name)
-            if lines:
+            if start:
                 wait_for_both(director, list(run.children.values()), _START_S)
             else:
                 director.wait_for(("plant", "controller"), _ATTACH_S)
             rate_hz, phase = director.status("controller").rate_hz, director.status("plant").phase
-            if settings.attach and (phase != "running" or not rate_hz):
+            if not start and (phase != "running" or not rate_hz):
                 raise InputError(
                     f"car '{name}' is not driving in real time (plant: {phase}); "
                     "start a run with 'bayesrace drive --mode realtime'"
                 )
             about = {"latency": {"settings": settings.model_dump_json()}}
-            recorder = stack.enter_context(Recorder(session, name, log, about))
-            if lines:
-                stack.enter_context(_driving(director, settings))
-        begin_ns = time.monotonic_ns() + (round(settings.warm_up_s * 1e9) if lines else 0)
+            recorder = stack.enter_context(Recorder(session, name, out / _LOG, about))
+            if track is not None and start:
+                limit_s = settings.warm_up_s + settings.duration_s + _AFTERWARDS_S
+                plan = RunPlan(1, "bayesrace", 0, limit_s, lockstep=False)
+                director.start(run_request(track, plan))
+                stack.callback(_stop, director)
+        begin_ns = time.monotonic_ns() + round(settings.warm_up_s * 1e9)
         end_ns = begin_ns + round(settings.duration_s * 1e9)
         count = round(settings.duration_s * rate_hz)
         with (
@@ -164,7 +158,6 @@ def _record(run: Run, out: Path, log: Path, stages: Stages) -> Beside:
             stages.stage(f"record {settings.duration_s:g} s"),
         ):
             run.watch(director, recorder, begin_ns, end_ns)
-    run.notes += [f"ended early: {run.ended_early}"] if run.ended_early else []
     return Beside(socket.gethostname(), read_bare_loop(out, rate_hz), run.rss, run.notes)
 
 
@@ -187,17 +180,9 @@ def _lines(
     return {"plant": ["plant", *both], "controller": controller}
 
 
-@contextmanager
-def _driving(director: Director, settings: LatencySettings) -> Iterator[None]:
-    """A run without end around the track, for the block."""
-    limit_s = settings.warm_up_s + settings.duration_s + _AFTERWARDS_S
-    track = load_track(settings.track, settings.car.width_m)
-    director.start(run_request(track, RunPlan(1, "bayesrace", 0, limit_s, lockstep=False)))
-    try:
-        yield
-    finally:
-        with suppress(InputError):  # the plant may be what was lost
-            director.stop("measured")
+def _stop(director: Director) -> None:
+    with suppress(InputError):  # the plant may be what was lost
+        director.stop("measured")
 
 
 @contextmanager
@@ -206,6 +191,11 @@ def _explained(run: Run) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        if not (ended := run.endings()):
-            raise
-        raise LatencyError("; ".join([str(error), *ended])) from error
+        if ended := _endings(run.children):
+            raise LatencyError("; ".join([str(error), *ended])) from error
+        raise
+
+
+def _endings(children: dict[str, Child]) -> list[str]:
+    time.sleep(0.2)  # the system reports a death a moment after the network does
+    return endings(children.values())

@@ -34,7 +34,7 @@ class Series:
 
     at_s: Floats
     """Since the beginning, rising."""
-    ns: NDArray[np.int64]
+    ns: Floats
 
     def distribution(self) -> Distribution:
         """Percentiles."""
@@ -42,7 +42,7 @@ class Series:
         numbers = dict(zip(("p50", "p90", "p99", "p999", "max"), values.tolist(), strict=True))
         return Distribution(**numbers, count=len(self.ns))
 
-    def intervals(self, edges_s: Floats) -> list[NDArray[np.int64]]:
+    def intervals(self, edges_s: Floats) -> list[Floats]:
         """The values of each interval; the outer ones take what lies beyond."""
         return np.split(self.ns, np.searchsorted(self.at_s, edges_s[1:-1]))
 
@@ -58,7 +58,7 @@ class Series:
             log.output_legend()
             for k, values in enumerate(self.intervals(edges_s)):
                 histogram = new_histogram()
-                for value in np.clip(values, 0, _LARGEST_NS).tolist():
+                for value in np.rint(values).clip(0, _LARGEST_NS).astype(np.int64).tolist():
                     histogram.record_value(value)
                 if len(values):
                     begin_s = max(float(edges_s[k]), 1e-6)  # 0 means the histogram's own
