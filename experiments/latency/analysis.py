@@ -36,14 +36,14 @@ _INTERVALS: Final = 60
 """Of the histogram logs and of the medians, at most; each takes two seconds at least."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Beside:
     """What is known of a measurement besides its log; of a recorded run: nothing."""
 
     host: str = ""
     bare: tuple[Series, BareLoop] | None = None
-    rss: Mapping[str, Memory] = field(default_factory=dict)
-    notes: Sequence[str] = ()
+    rss: dict[str, Memory] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,19 +80,20 @@ def analyse(log: Path, settings: LatencySettings, track: Track | None, beside: B
     restarts = np.count_nonzero(np.diff(tables["states"]["epoch"]))
     restarts += np.count_nonzero(begins_anew(tables["actuations"]))
     remarks = {
-        f"{counts['unobserved']} messages are missing in the log; the run may have had them": (
-            counts["unobserved"]
+        "messages are missing in the log; the run may have had them": counts["unobserved"],
+        "messages of the log could not be decoded": refused,
+        "restarts of plant or controller": restarts,
+        "runs in lockstep are left out": len(parts) - len(chosen),
+        "runs are in lockstep, without deadlines and wake-ups": (
+            len(chosen) if chosen[0]["states"]["lockstep"][0] else 0
         ),
-        f"{refused} messages of the log could not be decoded": refused,
-        f"plant or controller was restarted {restarts} times": restarts,
-        f"{len(parts) - len(chosen)} runs in lockstep are left out": len(parts) > len(chosen),
-        "lockstep: the plant waits, so there are neither deadlines nor wake-ups": (
-            chosen[0]["states"]["lockstep"][0]
+        "cycles are the most for one analysis; the log goes on": (
+            MOST_CYCLES if len(tables["states"]) >= MOST_CYCLES else 0
         ),
-        f"only the first {MOST_CYCLES:,} cycles": len(tables["states"]) >= MOST_CYCLES,
-        "no bare loop to compare the misses with": beside.host and not beside.bare,
     }
     bare = beside.bare[1] if beside.bare else None
+    by_name = ("skipped", "deadline_misses", "fallbacks", "repeated_answers", "overtaken_answers",
+               "unobserved")  # fmt: skip
     result = LatencyResult(
         car=car,
         track=settings.track,
@@ -106,27 +107,23 @@ def analyse(log: Path, settings: LatencySettings, track: Track | None, beside: B
         state_to_actuation_us=legs.get(ANSWER),
         legs_us=legs,
         ticks=counts["cycles"] + counts["skipped"],
-        skipped=counts["skipped"],
-        deadline_misses=counts["missed"],
+        **{name: counts[name] for name in by_name},
         overruns=counts["overruns"] if len(tables["heartbeats"]) else None,
-        fallbacks=counts["fallbacks"],
         bare_loop_misses=bare.misses if bare else None,
         bare_loop_us=bare,
         mean_period_us=period_us,
-        rate_error=None if period_us is None else period_us * rate_hz * 1e-6 - 1.0,
-        sent=sum(one.sent for one in messages.values()) if messages else None,
-        received=sum(one.received for one in messages.values()) if messages else None,
-        lost=sum(one.lost for one in messages.values()) if messages else None,
+        rate_error=period_us * rate_hz * 1e-6 - 1.0 if period_us else None,
+        **{
+            name: sum(getattr(one, name) for one in messages.values()) if messages else None
+            for name in ("sent", "received", "lost")
+        },
         traffic=messages,
         rss_growth_bytes=max((one.growth_bytes for one in beside.rss.values()), default=None),
-        rss=dict(beside.rss),
-        repeated_answers=counts["repeated"],
-        overtaken_answers=counts["overtaken"],
-        unobserved=counts["unobserved"],
+        rss=beside.rss,
         restarts=restarts,
         **_drive(tables["truth"], track),
         clocks=clock,
-        notes=[*beside.notes, *(text for text, true in remarks.items() if true)],
+        notes=[*beside.notes, *(f"{many} {text}" for text, many in remarks.items() if many)],
     )
     edges_s = np.linspace(0.0, max(span_s, 1e-3), int(np.clip(span_s // 2.0, 1, _INTERVALS)) + 1)
     if beside.bare:

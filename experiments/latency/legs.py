@@ -104,13 +104,13 @@ class Cycles:
         found = {
             "cycles": len(ticks),
             "skipped": np.maximum(np.diff(ticks["tick"]) - np.diff(ticks["seq"]), 0).sum(),
-            "missed": ticks["missed"].sum(),
+            "deadline_misses": ticks["missed"].sum(),
             "fallbacks": np.count_nonzero(ticks["fallback"]),
             "overruns": np.diff(beats["overruns"]).sum(),
             "periods": np.diff(ticks["seq"]).sum(),
             "length_ns": np.diff(ticks["released"]).sum(),
-            "repeated": len(answers) - len(_first(answers, "state")),
-            "overtaken": np.count_nonzero(answers["acting_s"] < 0),
+            "repeated_answers": len(answers) - len(_first(answers, "state")),
+            "overtaken_answers": np.count_nonzero(answers["acting_s"] < 0),
             # By their numbers; the run itself may have had them.
             "unobserved": sum((np.diff(np.unique(one["seq"])) - 1.0).sum() for one in streams),
         }

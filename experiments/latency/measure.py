@@ -47,14 +47,12 @@ class LatencyError(RuntimeError):
 
 
 @dataclass
-class Run:
+class Run(Beside):
     """A run while it is recorded, and what is known of it besides the log."""
 
-    settings: LatencySettings
+    car: str = ""
     children: dict[str, Child] = field(default_factory=dict)
     """Plant and controller, if they were started here."""
-    rss: dict[str, Memory] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
     ended_early: str = ""
     error: BaseException | None = None
     """LatencyError or KeyboardInterrupt, if the recording ended early though it should not have."""
@@ -82,7 +80,7 @@ class Run:
         elif isinstance(item.value, Event) and item.value.kind == "run_ended":
             self.ended_early = item.value.text
         elif item.kind is Kind.GONE:
-            text = f"the {item.name} of car '{self.settings.car_name}' vanished"
+            text = f"the {item.name} of car '{self.car}' vanished"
             self.ended_early = text if item.name in self.children else ""
             self.notes += [] if self.ended_early else [text]
 
@@ -106,12 +104,12 @@ def measure(settings: LatencySettings, out: Path, stages: Stages) -> tuple[Laten
     if (out / RESULT).exists():
         raise InputError(f"{out} holds a measurement already; choose another folder or remove it")
     track = load_track(settings.track, settings.car.width_m) if settings.track else None
-    run, beside = Run(settings), Beside()
+    run = Run(car=settings.car_name)
     if settings.log is None:
-        beside = _record(run, track, out, stages)
+        _record(run, settings, track, out, stages)
     with stages.stage("analyse the log"):
         try:
-            analysis = analyse(settings.log or out / _LOG, settings, track, beside)
+            analysis = analyse(settings.log or out / _LOG, settings, track, run)
         except InputError as error:
             raise run.error or error from None
         out.mkdir(parents=True, exist_ok=True)
@@ -120,9 +118,11 @@ def measure(settings: LatencySettings, out: Path, stages: Stages) -> tuple[Laten
     return analysis.result, run
 
 
-def _record(run: Run, track: Track | None, out: Path, stages: Stages) -> Beside:
+def _record(
+    run: Run, settings: LatencySettings, track: Track | None, out: Path, stages: Stages
+) -> None:
     """Records the run, and the machine beside it."""
-    settings, name, start = run.settings, run.settings.car_name, not run.settings.attach
+    start = not settings.attach
     ends = settings.attach or (free_endpoint(), free_endpoint())
     lines = _lines(settings, ends, out, stages) if start else {}
     out.mkdir(parents=True, exist_ok=True)
@@ -132,7 +132,7 @@ def _record(run: Run, track: Track | None, out: Path, stages: Stages) -> Beside:
                 run.children[source] = stack.enter_context(child(line, out / f"{source}.log"))
             stack.enter_context(_explained(run))
             session = stack.enter_context(open_session(Endpoints(connect=ends)))
-            director = Director(session, name)
+            director = Director(session, run.car)
             if start:
                 wait_for_both(director, list(run.children.values()), _START_S)
             else:
@@ -140,11 +140,11 @@ def _record(run: Run, track: Track | None, out: Path, stages: Stages) -> Beside:
             rate_hz, phase = director.status("controller").rate_hz, director.status("plant").phase
             if not start and (phase != "running" or not rate_hz):
                 raise InputError(
-                    f"car '{name}' is not driving in real time (plant: {phase}); "
+                    f"car '{run.car}' is not driving in real time (plant: {phase}); "
                     "start a run with 'bayesrace drive --mode realtime'"
                 )
             about = {"latency": {"settings": settings.model_dump_json()}}
-            recorder = stack.enter_context(Recorder(session, name, out / _LOG, about))
+            recorder = stack.enter_context(Recorder(session, run.car, out / _LOG, about))
             if track is not None and start:
                 limit_s = settings.warm_up_s + settings.duration_s + _AFTERWARDS_S
                 plan = RunPlan(1, "bayesrace", 0, limit_s, lockstep=False)
@@ -158,7 +158,8 @@ def _record(run: Run, track: Track | None, out: Path, stages: Stages) -> Beside:
             stages.stage(f"record {settings.duration_s:g} s"),
         ):
             run.watch(director, recorder, begin_ns, end_ns)
-    return Beside(socket.gethostname(), read_bare_loop(out, rate_hz), run.rss, run.notes)
+    run.host, run.bare = socket.gethostname(), read_bare_loop(out, rate_hz)
+    run.notes += [] if run.bare else ["no bare loop to compare the misses with: it was lost"]
 
 
 def _lines(

@@ -1,5 +1,6 @@
 """The report: a table on the terminal, and the files."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -68,18 +69,16 @@ def _lines(result: LatencyResult) -> list[tuple[str, bool]]:
     drive += "" if result.laps is None else f" · laps {result.laps}"
     if result.off_track_samples is not None:
         drive += f" · off track {result.off_track_samples} of {result.states} samples"
-    lines = [(_timing(result), False), (_messages(result), not complete)]
-    lines.append((drive, bool(result.off_track_samples)))
-    if result.rss:
-        each = (
-            f"{name} {one.growth_bytes / 1024:.0f} kB on {one.begin_bytes / 2**20:.1f} MB"
-            for name, one in result.rss.items()
-        )
-        lines.append((f"resident memory grew by {', '.join(each)}", False))
-    text = (
-        result.clocks.text if result.clocks else "not compared, as no answer says when it arrived"
-    )
-    lines.append((f"clocks: {text}", False))
+    text = result.clocks.text if result.clocks else "no answer says when it arrived at the plant"
+    lines = [
+        (_timing(result), False),
+        ("; ".join(_messages(result)) or "messages not counted: no heartbeats", not complete),
+        (drive, bool(result.off_track_samples)),
+        (f"clocks: {text}", False),
+    ]
+    for name, one in result.rss.items():
+        growth = f"{one.growth_bytes / 1024:.0f} kB on {one.begin_bytes / 2**20:.1f} MB"
+        lines.append((f"resident memory of the {name} grew by {growth}", False))
     if result.attached:
         lines.append((f"the bare loop is that of this machine, {result.host}", False))
     return lines + [(note, True) for note in result.notes]
@@ -96,12 +95,8 @@ def _timing(result: LatencyResult) -> str:
     return line
 
 
-def _messages(result: LatencyResult) -> str:
-    parts = []
+def _messages(result: LatencyResult) -> Iterator[str]:
     for name, one in result.traffic.items():
-        line = f"{name} {one.sent} sent = {one.received} received + {one.lost} lost"
-        if one.in_flight:
-            what = "in flight" if one.complete else "NOT ACCOUNTED FOR"
-            line += f" {one.in_flight:+d} {what}"
-        parts.append(line)
-    return "; ".join(parts) or "messages not counted: the log has no heartbeats"
+        what = "in flight" if one.complete else "NOT ACCOUNTED FOR"
+        left = f" {one.in_flight:+d} {what}" if one.in_flight else ""
+        yield f"{name} {one.sent} sent = {one.received} received + {one.lost} lost{left}"
