@@ -18,7 +18,7 @@ def latency(
     rate: Annotated[float, typer.Option(min=1, max=500, help="Of plant and controller [Hz].")] = 50,
     duration: Annotated[
         float | None,
-        typer.Option(min=1, max=40_000, help="Time that counts [s] [20; of a log all of it]."),
+        typer.Option(min=1, max=20_000, help="Time that counts [s] [20; of a log all of it]."),
     ] = None,
     load: Annotated[int, typer.Option(min=0, max=1024, help="Busy processes beside.")] = 0,
     out: Annotated[

@@ -20,8 +20,8 @@ columns of :data:`_COLUMNS`; ``n``, the message's number in the log; ``at``, cal
 
 Tables = dict[str, Columns]
 
-MOST_CYCLES: Final = 2_000_000
-"""Of one analysis: 11 h at 50 Hz. Each takes 0.5 kB of memory and 0.2 ms."""
+MOST_CYCLES: Final = 1_000_000
+"""Of one analysis: 5.5 h at 50 Hz. Each takes some 2 kB of memory and 0.3 ms."""
 
 _COLUMNS: Final = {
     "states": "seq sampled epoch run lockstep",
