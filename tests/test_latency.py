@@ -127,6 +127,7 @@ def test_cycles_skipped_and_messages_unobserved_are_counted_apart(path: Path) ->
             if k == 7:  # two releases passed over
                 system.ticks += 2
             system.tick(seq, seen=k not in (12, 13))
+        system.state()
     result = report_of(path).result
     assert result.skipped == 2
     assert result.unobserved == 5  # two actuations, two of telemetry, a state
@@ -139,17 +140,29 @@ def test_warm_up_and_what_comes_after_the_duration_do_not_count(path: Path) -> N
         for _ in range(250):
             system.cycle()
     result = report_of(path, warm_up_s=1.0, duration_s=2.0).result
-    assert result.legs_us["decode"].count == 101
+    assert result.legs_us["decode"].count == 100
     assert result.states == 151  # all of the drive until then, and its laps
     assert result.laps == 1
     with pytest.raises(InputError, match="no states"):
         report_of(path, warm_up_s=6.0)
 
 
+def test_cycles_after_the_end_of_a_run_do_not_count(path: Path) -> None:
+    """The controller predicts the last state forward and falls back, until it gives up."""
+    with Loop(path) as system:
+        system.cycle()
+        seq = system.state()
+        for k in range(20):
+            system.tick(seq, released_ns=k * PERIOD_NS)
+    result = report_of(path).result
+    assert result.ticks == result.legs_us["state_age"].count == 1
+
+
 def test_a_log_in_lockstep_gives_the_legs_of_the_controller(path: Path) -> None:
     with Loop(path, lockstep=True) as system:
         for _ in range(5):
             system.tick(system.state())
+        system.state()
     result = report_of(path).result
     assert result.legs_us["compute"].count == 5
     assert ANSWER not in result.legs_us

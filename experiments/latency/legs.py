@@ -51,7 +51,9 @@ class Cycles:
         states = tables["states"]
         self.states = states[_first(states)]
         self.actuations = tables["actuations"]
-        self.ticks, self.answers = (self._known(tables[name]) for name in ("ticks", "answers"))
+        self.answers, ticks = self._known(tables["answers"]), self._known(tables["ticks"])
+        # After the last state the controller predicts and falls back, until it gives up.
+        self.ticks = ticks[ticks["n"] < self.states["n"][-1]]
         self._starts = self.ticks[_first(self.ticks, "state")]
         """The first cycle of each state."""
         self._sent, self._arrived = _paired(self._known(self.actuations), self.answers)

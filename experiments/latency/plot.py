@@ -41,12 +41,12 @@ def plot(path: Path, analysis: Analysis) -> None:
     with figure_style():
         figure = Figure(figsize=(11.0, 4.6), layout="constrained")
         left, right = figure.subplots(1, 2, width_ratios=(1.15, 1.0))
+        _percentiles(left, analysis)
+        _budget(right, analysis)
         for axes in (left, right):
             axes.yaxis.set_major_formatter(
                 lambda us, _: f"{us:g} µs" if us < 1e3 else f"{us / 1e3:g} ms"
             )
-        _percentiles(left, analysis)
-        _budget(right, analysis)
         figure.suptitle(title, x=0.01, ha="left", fontsize=10)
         write_png(figure, path, dpi=130)
 
@@ -92,5 +92,7 @@ def _budget(axes: Axes, analysis: Analysis) -> None:
             label=LEGS[leg][0],
         )  # fmt: skip
     axes.stairs(medians[ANSWER], edges_s, baseline=None, color=INK, label=LEGS[ANSWER][0])
-    axes.set(xlim=(0.0, edges_s[-1]), ylim=(0.0, 1.45 * np.nanmax([*tops[-1], _LEAST_US])))
+    axes.set(
+        xlim=(0.0, edges_s[-1]), ylim=(0.0, 1.45 * np.nanmax([*tops[-1], *medians[ANSWER], 1.0]))
+    )
     axes.legend(loc="upper left", ncols=2, reverse=True)
