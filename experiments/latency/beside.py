@@ -1,8 +1,8 @@
 """Processes that run beside what is measured: a bare loop, and busy processes.
 
 The bare loop does nothing but sleep to absolute deadlines, at the same rate and with the same
-scheduling. What it suffers is the machine's doing, not the program's. As for the controller, a
-release is missed when nothing could be done before the next one: here, when it wakes after that.
+scheduling. Its errors come from the machine, not from the program. As for the controller, a release
+is missed when nothing could be done before the next one: here, when the loop wakes after that.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Records a run, started here or running elsewhere, and has its log analysed."""
+"""Records a run, started here or running elsewhere, and analyses its log."""
 
 import os
 import socket
@@ -36,8 +36,8 @@ _START_S: Final = 60.0
 _ATTACH_S: Final = 10.0
 _AFTERWARDS_S: Final = 60.0
 """The run's own time limit is this much later than its end by request."""
-_LOOK_S: Final = 0.5
-"""Between two looks at the memory of the processes."""
+_SAMPLE_S: Final = 0.5
+"""Between two samples of the memory of the processes."""
 _MEMORY_S: Final = 60.0
 """Memory that a process takes in its first minute, or third of a shorter run, is no growth."""
 
@@ -62,13 +62,13 @@ class Run(Beside):
         warm_ns = begin_ns + min(round(_MEMORY_S * 1e9), (end_ns - begin_ns) // 3)
         with director.inbox.catching_signals():
             while not self.ended_early and (left_ns := end_ns - time.monotonic_ns()) > 0:
-                item = director.inbox.get(min(left_ns * 1e-9, _LOOK_S))
+                item = director.inbox.get(min(left_ns * 1e-9, _SAMPLE_S))
                 if item is not None:
                     self._react(item)
                 self.ended_early = self.ended_early or recorder.failed
                 if time.monotonic_ns() >= warm_ns:
-                    self.look_at_memory()
-            self.look_at_memory()  # at least once: the looks before may have come late
+                    self.sample_memory()
+            self.sample_memory()  # at least once: those before may have come late
         if self.ended_early and self.children and self.error is None:
             ended = [self.ended_early, *_endings(self.children)]
             self.error = LatencyError("; ".join(ended))
@@ -84,8 +84,8 @@ class Run(Beside):
             self.ended_early = text if item.name in self.children else ""
             self.notes += [] if self.ended_early else [text]
 
-    def look_at_memory(self) -> None:
-        """Takes note of the resident memory of the processes that were started here."""
+    def sample_memory(self) -> None:
+        """Samples the resident memory of the processes that were started here."""
         for name, process in self.children.items():
             with suppress(OSError, IndexError, ValueError):  # it is gone, or there is no /proc
                 pages = int(Path(f"/proc/{process.pid}/statm").read_text().split()[1])

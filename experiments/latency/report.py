@@ -69,7 +69,7 @@ def _lines(result: LatencyResult) -> list[tuple[str, bool]]:
     drive += "" if result.laps is None else f" · laps {result.laps}"
     if result.off_track_samples is not None:
         drive += f" · off track {result.off_track_samples} of {result.states} samples"
-    text = result.clocks.text if result.clocks else "no answer says when it arrived at the plant"
+    text = result.clocks.text if result.clocks else "no state reports when an answer arrived"
     lines = [
         (_timing(result), False),
         ("; ".join(_messages(result)) or "messages not counted: no heartbeats", not complete),

@@ -73,7 +73,7 @@ class Memory(_Frozen):
 
 
 class LatencyResult(_Frozen):
-    """One measurement; null is what neither the log of the run nor the measurement says."""
+    """One measurement; null: not known from the log or the measurement."""
 
     car: str
     track: str = Field(description="empty if not known")
@@ -108,5 +108,5 @@ class LatencyResult(_Frozen):
     laps: int | None
     states: int = Field(description="true states in the log, those of the warm-up included")
     off_track_samples: int | None = Field(description="of these states")
-    clocks: Clocks | None = Field(description="null: no answer says when it arrived")
+    clocks: Clocks | None = Field(description="null: no state reports when an answer arrived")
     notes: list[str] = Field(description="what a reader must know, such as an early end")

@@ -1,7 +1,7 @@
 """Messages sent, received and lost: the sender's numbers against the receiver's counters.
 
-A heartbeat of the receiver says what it had received and counted as lost until then; what had been
-sent until then follows from the numbers and times in the log. Messages are counted between two
+A heartbeat of the receiver carries what it had received and counted as lost until then; what had
+been sent until then follows from the numbers and times in the log. Messages are counted between two
 heartbeats, of the first and of the last second, at which the fewest were in flight.
 """
 
