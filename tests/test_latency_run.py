@@ -222,6 +222,12 @@ def test_bad_options_get_one_line(cli: Cli, arguments: list[str], words: str) ->
     refused(cli("latency", "--out", "run", *arguments), words)
 
 
+@pytest.mark.parametrize("name", ["latency.json", "run.mcap"])
+def test_a_measurement_is_never_overwritten(cli: Cli, tmp_path: Path, name: str) -> None:
+    (tmp_path / name).touch()
+    refused(cli("latency", "--out", tmp_path), "holds a measurement already")
+
+
 # Attached --------------------------------------------------------------------------------------
 
 

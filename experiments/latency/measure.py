@@ -90,9 +90,9 @@ class Run(Beside):
             with suppress(OSError, IndexError, ValueError):  # it is gone, or there is no /proc
                 pages = int(Path(f"/proc/{process.pid}/statm").read_text().split()[1])
                 now = pages * os.sysconf("SC_PAGE_SIZE")
-                begin = self.rss[name].begin_bytes if name in self.rss else now
-                most = max(now, self.rss[name].most_bytes) if name in self.rss else now
-                self.rss[name] = Memory(begin_bytes=begin, most_bytes=most)
+                before = self.rss.get(name, Memory(begin_bytes=now, most_bytes=now))
+                most = max(now, before.most_bytes)
+                self.rss[name] = before.model_copy(update={"most_bytes": most})
 
 
 def measure(settings: LatencySettings, out: Path, stages: Stages) -> tuple[LatencyResult, Run]:
@@ -101,7 +101,7 @@ def measure(settings: LatencySettings, out: Path, stages: Stages) -> tuple[Laten
     Raises InputError for unusable settings, LatencyError if a process is lost before anything is
     measured; no process outlives the call.
     """
-    if (out / RESULT).exists():
+    if any((out / name).exists() for name in (RESULT, *(() if settings.log else (_LOG,)))):
         raise InputError(f"{out} holds a measurement already; choose another folder or remove it")
     track = load_track(settings.track, settings.car.width_m) if settings.track else None
     run = Run(car=settings.car_name)
