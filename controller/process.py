@@ -101,7 +101,6 @@ class ControllerProcess:
             )  # fmt: skip
             self._takeover = self._courier.takeover
             self._courier.start()
-        inbox.tell_time("controller")
         inbox.watch("plant")
         inbox.announce("controller")
 

@@ -121,7 +121,6 @@ class PlantProcess:
         for service in (RUN, STOP):
             inbox.serve(service)
         inbox.serve(STATUS, "plant")
-        inbox.tell_time("plant")
         inbox.watch("controller")
         inbox.watch("director")
         inbox.announce("plant")

@@ -7,8 +7,6 @@ from typing import Any, Final, Generic, Literal, TypeVar
 from bayesrace.errors import InputError
 from bayesrace.messages.types import (
     Actuation,
-    ClockReading,
-    ClockRequest,
     Command,
     Event,
     Message,
@@ -27,7 +25,6 @@ __all__ = [
     "ACCEPTED",
     "ACTUATION",
     "ALIVE",
-    "CLOCK",
     "COMMAND",
     "EVENT",
     "HEARTBEAT",
@@ -147,9 +144,8 @@ ACCEPTED: Final[Service[Message, Message]] = Service(
 file of the weights in use with its time of acceptance and the digests of those given up; empty if
 there is nothing to tell."""
 COMMAND: Final = Service("command", "bayesrace/{car}/controller/command", Command, Reply, 5.0)
-CLOCK: Final = Service("clock", "bayesrace/{car}/{source}/clock", ClockRequest, ClockReading, 2.0)
 SERVICES: Final[tuple[Service[Any, Any], ...]] = (
-    RUN, STOP, STATUS, WEIGHTS, ROLLBACK, ACCEPTED, COMMAND, CLOCK
+    RUN, STOP, STATUS, WEIGHTS, ROLLBACK, ACCEPTED, COMMAND
 )  # fmt: skip
 
 ALIVE: Final = "bayesrace/{car}/alive/{source}"

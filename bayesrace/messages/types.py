@@ -25,8 +25,6 @@ __all__ = [
     "PHASES",
     "Actuation",
     "CarSample",
-    "ClockReading",
-    "ClockRequest",
     "Command",
     "Event",
     "Message",
@@ -257,19 +255,6 @@ class Command(Message):
     """stop: brake to standstill and stay there; go: drive (again)."""
     text: Long
     """Why; it comes back in the controller's status."""
-
-
-@dataclass(frozen=True, slots=True)
-class ClockRequest(Message):
-    """Asked of ``bayesrace/{car}/plant/clock`` and ``…/controller/clock``."""
-
-
-@dataclass(frozen=True, slots=True)
-class ClockReading(Message):
-    """The clock of a process, ``source_time_ns``, read between request and answer."""
-
-    host: Short
-    """Of the process; for people."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,6 @@ sleeps between two looks: 0.05 ms at first, longer the longer it has waited.
 import logging
 import os
 import queue
-import socket
 import threading
 import time
 from collections import deque
@@ -25,8 +24,6 @@ from bayesrace.errors import InputError
 from bayesrace.interrupts import catching_signals
 from bayesrace.messages import (
     ALIVE,
-    CLOCK,
-    ClockReading,
     Decoder,
     Message,
     Service,
@@ -212,17 +209,6 @@ class Inbox:
         self._declared.append(
             declare_service(self._session, service, self._car, arrived, source=source)
         )
-
-    def tell_time(self, source: str) -> None:
-        """Answer requests for this process's clock, at once in the transport's own thread."""
-        host = socket.gethostname()[:200]
-
-        def on_query(query: Any) -> None:
-            query.reply(query.key_expr, encode(ClockReading(0, time.monotonic_ns(), host)))
-            query.drop()
-
-        key = car_key(CLOCK.key, self._car, source)
-        self._declared.append(self._session.declare_queryable(key, _direct(on_query)))
 
     def announce(self, source: str) -> None:
         """Declare own liveliness token: last, when everything else is in place."""
