@@ -14,25 +14,24 @@ from bayesrace.files import write_whole
 from bayesrace.messages import Event
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import Track, load_track
-from bayesrace.transport import Director, Endpoints, Item, Kind, free_endpoint, open_session
+from bayesrace.transport import Director, Endpoints, Item, Kind, open_session
 from bayesrace.vehicles import write_car
-from experiments.drive import RunPlan, run_request, wait_for_both
+from experiments.drive import RunPlan, run_request
 from experiments.latency.analysis import Beside, analyse
 from experiments.latency.beside import read_bare_loop, running_beside
 from experiments.latency.report import RESULT, write_files
 from experiments.latency.results import LatencyResult, Memory
 from experiments.latency.settings import LatencySettings
-from experiments.preparation import prepare
-from experiments.processes import Child, child, endings
+from experiments.preparation import Prepared, prepare
+from experiments.processes import Child, endings
 from experiments.progress import Stages
 from experiments.settings import PreparationSettings
+from experiments.system import started_system
 
 __all__ = ["LatencyError", "Run", "measure"]
 
 _LOG: Final = "run.mcap"
 
-_START_S: Final = 60.0
-"""For processes to start on a machine that is busy."""
 _ATTACH_S: Final = 10.0
 _AFTERWARDS_S: Final = 60.0
 """The run's own time limit is this much later than its end by request."""
@@ -123,19 +122,19 @@ def _record(
 ) -> None:
     """Records the run, and the machine beside it."""
     start = not settings.attach
-    ends = settings.attach or (free_endpoint(), free_endpoint())
-    lines = _lines(settings, ends, out, stages) if start else {}
+    files = _files(settings, stages) if start else None
     out.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         with stages.stage("start plant and controller" if start else "attach"):
-            for source, line in lines.items():
-                run.children[source] = stack.enter_context(child(line, out / f"{source}.log"))
             stack.enter_context(_explained(run))
-            session = stack.enter_context(open_session(Endpoints(connect=ends)))
-            director = Director(session, run.car)
-            if start:
-                wait_for_both(director, list(run.children.values()), _START_S)
+            if files is not None:
+                plant, both = _options(settings, out)
+                system = stack.enter_context(started_system(run.car, out, plant, both))
+                stack.enter_context(system.controller([*files.arguments, *plant]))
+                session, director, run.children = system.session, system.director, system.children
             else:
+                session = stack.enter_context(open_session(Endpoints(connect=settings.attach)))
+                director = Director(session, run.car)
                 director.wait_for(("plant", "controller"), _ATTACH_S)
             rate_hz, phase = director.status("controller").rate_hz, director.status("plant").phase
             if not start and (phase != "running" or not rate_hz):
@@ -162,23 +161,22 @@ def _record(
     run.notes += [] if run.bare else ["no bare loop to compare the misses with: it was lost"]
 
 
-def _lines(
-    settings: LatencySettings, ends: tuple[str, ...], out: Path, stages: Stages
-) -> dict[str, list[str]]:
-    """The command lines of plant and controller, with the files that they need."""
-    files = prepare(
+def _files(settings: LatencySettings, stages: Stages) -> Prepared:
+    """What plant and controller are started with."""
+    return prepare(
         PreparationSettings(car=settings.car), (settings.track,), stages,
         raceline=settings.raceline, weights=settings.weights, artefact=settings.artefact,
     )  # fmt: skip
-    out.mkdir(parents=True, exist_ok=True)
+
+
+def _options(settings: LatencySettings, out: Path) -> tuple[list[str], list[str]]:
+    """Options that name the car, and further ones, all of them of plant and controller."""
     realtime, car_file = settings.realtime, out / "car.toml"
     write_car(car_file, settings.car)
-    both = ["--car", str(car_file), "--name", settings.car_name, "--endpoint", ends[0]]
-    both += ["--rate", repr(settings.rate_hz), "--parent-pid", str(os.getpid())]
+    both = ["--name", settings.car_name, "--rate", repr(settings.rate_hz)]
     both += ["--lock-memory"] if realtime.lock_memory else []
     both += ["--fifo", str(realtime.fifo)] if realtime.fifo else []
-    controller = ["controller", *files.arguments, "--listen", ends[1], *both]
-    return {"plant": ["plant", *both], "controller": controller}
+    return ["--car", str(car_file)], both
 
 
 def _stop(director: Director) -> None:
@@ -192,8 +190,8 @@ def _explained(run: Run) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        if ended := _endings(run.children):
-            raise LatencyError("; ".join([str(error), *ended])) from error
+        if _endings(run.children):
+            raise LatencyError(str(error)) from error  # which says how they ended
         raise
 
 
