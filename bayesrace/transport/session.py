@@ -205,7 +205,7 @@ class Publisher(Generic[M]):
         self._blocking = _declare(session, key, topic, blocking=True)
         self._dropping = (
             self._blocking
-            if topic.qos.wall_clock_blocks and waits
+            if topic.qos.realtime_blocks and waits
             else _declare(session, key, topic, blocking=False)
         )
         self.next_seq = 0
@@ -229,5 +229,5 @@ def _declare(session: Any, key: str, topic: Topic[Any], *, blocking: bool) -> An
         express=topic.qos.express,
         priority=getattr(zenoh.Priority, topic.qos.priority.upper()),
         congestion_control=control.BLOCK if blocking else control.DROP,
-        reliability=reliability.RELIABLE if topic.qos.reliable else reliability.BEST_EFFORT,
+        reliability=reliability.RELIABLE,
     )
