@@ -36,6 +36,7 @@ from bayesrace.transport import (
     Item,
     Kind,
     Publisher,
+    decode_request,
     free_endpoint,
     open_session,
 )
@@ -101,7 +102,7 @@ class Fake:
         if item.value.service is STATUS:
             item.value.answer(self.status(0))
             return
-        self.heard.append(item.value.message())
+        self.heard.append(decode_request(item.value)[0])
         text = self.refuses or f"{self.heard[-1].command}: as you say"
         item.value.answer(Reply(0, 0, not self.refuses, text, {}))
 
@@ -193,15 +194,15 @@ def test_two_processes_under_one_name_are_noticed(fakes: Fakes) -> None:
     ones = fakes("a", "controller"), fakes("a", "controller")
     picture = picture_of(where(*ones))
     assert picture.as_json()["cars"]["a"]["controller"]["processes"] == 2
-    assert "2 processes answer to this name" in rendered(picture)
+    assert "2 processes answer under this name" in rendered(picture)
 
 
 def test_absence_is_an_error_that_says_what_to_do(fakes: Fakes) -> None:
     nowhere = Endpoints(connect=(free_endpoint(),))
-    with pytest.raises(InputError, match=f"nobody answers at {nowhere.connect[0]} .*--endpoint"):
+    with pytest.raises(InputError, match=f"no connection to {nowhere.connect[0]} .*--endpoint"):
         picture_of(nowhere, patience_s=0.3)
     one, two = fakes("a", "plant"), fakes("b", "plant")
-    with pytest.raises(InputError, match=r"no car 'c' at .*; there are: a, b"):
+    with pytest.raises(InputError, match=r"no car 'c' at .*; cars found: a, b"):
         picture_of(where(one, two), "c", patience_s=1.0)
 
 
@@ -244,10 +245,10 @@ def test_status_on_the_command_line(fakes: Fakes, cli: Cli) -> None:
     assert set(content["cars"]["a"]["plant"]) == FIELDS
     one.mute = two.mute = True
     done = cli("status", "--json", "--timeout", "0.5", *options(one, two))
-    refused(done, "none of the processes found answers within 0.5 s")
+    refused(done, "no answer within 0.5 s from the processes found")
     assert json.loads(done.out)["cars"]["a"]["plant"]["answering"] is False
     done = cli("status", "--timeout", "0.3", "--endpoint", free_endpoint())
-    refused(done, "nobody answers at")
+    refused(done, "no connection to")
 
 
 def test_watching_prints_a_line_for_each_heartbeat_until_interrupted(fakes: Fakes) -> None:
@@ -325,7 +326,7 @@ def test_stop_and_go_reach_the_controller_with_a_reason(fakes: Fakes, cli: Cli) 
     two.mute = True
     refused(
         cli("stop", "--timeout", "0.5", *options(one, two)),
-        "stop of car 'a' no answer within 0.5 s",
+        "stop of car 'a' failed: no answer within 0.5 s",
     )
 
 
@@ -334,7 +335,7 @@ def test_of_several_cars_one_must_be_named(fakes: Fakes) -> None:
     endpoints = where(*ones)
     with open_session(endpoints) as session:
         found = find(session, endpoints, PATIENCE_S)
-        with pytest.raises(InputError, match="several cars are there: a, b; choose one with"):
+        with pytest.raises(InputError, match="several cars found: a, b; choose one with"):
             pick(found, "", everybody=False)
         assert pick(found, "", everybody=True) == ["a", "b"]
         assert pick(find(session, endpoints, PATIENCE_S, "b"), "b", everybody=False) == ["b"]
@@ -358,7 +359,7 @@ def test_all_are_stopped_though_one_hangs_and_one_refuses(fakes: Fakes, cli: Cli
     assert isinstance(answers["c"], Reply)
     assert answers["c"].accepted
     done = cli("stop", "--all", "--timeout", "0.5", *options(*ones))
-    refused(done, "'a' no answer", "'b' refused: no")
+    refused(done, "'a' failed: no answer", "'b' refused: no")
     assert "c: stop: as you say" in done.out
     assert len(ones[2].heard) == 2
 
@@ -433,7 +434,7 @@ def test_the_router_command_forwards_and_ends_on_sigterm(fakes: Fakes) -> None:
 
 
 def test_a_router_that_cannot_listen_says_so(cli: Cli) -> None:
-    refused(cli("router", "--listen", "tcp/localhost"), "lacks a port")
+    refused(cli("router", "--listen", "tcp/localhost"), "is not of the form protocol/address:port")
 
 
 # With the real processes -------------------------------------------------------------------------
@@ -491,7 +492,7 @@ def test_real_processes_that_know_only_the_router_are_watched_stopped_and_restar
             until(lambda: phase("controller") is None, "the controller gone")
             done = run("stop", "--timeout", "0.5", "--endpoint", endpoint)
             assert done.returncode == 2
-            assert "no controller can be reached, only the plant of one" in done.stderr
+            assert "no controller found, only the plant of one" in done.stderr
             started.append(start(*controller, *here))
             until(lambda: phase("controller") == "driving", "another controller driving")
     finally:

@@ -1,4 +1,4 @@
-"""A process's status at 10 Hz, from within its loop."""
+"""Publishing a process's status at 10 Hz from within its loop."""
 
 import time
 from collections.abc import Callable
@@ -10,23 +10,23 @@ from bayesrace.transport.session import Publisher
 __all__ = ["HEARTBEAT_S", "Heartbeat"]
 
 HEARTBEAT_S: Final = 0.1
-"""Between two heartbeats."""
+"""Period of heartbeats."""
 
 _PERIOD_NS: Final = round(HEARTBEAT_S * 1e9)
 
 
 class Heartbeat:
-    """Publishes when it is due; call :meth:`beat` as often as convenient."""
+    """Publishes the status when it is due; call :meth:`beat` as often as convenient."""
 
     def __init__(self, session: Any, car: str, source: Literal["plant", "controller"]) -> None:
         self._publisher = Publisher(session, HEARTBEAT, car, source)
         self._due_ns = 0
 
     def beat(self, status: Callable[[int], Status]) -> None:
-        """``status`` makes the message of this number, if it is time for one."""
+        """Publish ``status(seq)`` if it is due."""
         now_ns = time.monotonic_ns()
         if now_ns < self._due_ns:
             return
-        # On the grid, so that a loop's jitter does not slow it; from now if that has been left.
+        # On a grid, so that a loop's jitter does not slow it; a new grid after a stall.
         self._due_ns = max(self._due_ns + _PERIOD_NS, now_ns + _PERIOD_NS // 2)
         self._publisher.put(status(self._publisher.next_seq), lockstep=False)

@@ -74,7 +74,7 @@ class Measurement:
 
     def settle(self, until_ns: int) -> None:
         """Follows the run without counting."""
-        with self.director.inbox.catching_signals():
+        with self.director.inbox.receive_signals():
             while not self.ended_early and (left_ns := until_ns - time.monotonic_ns()) > 0:
                 self._wait(min(_LOOK_S, left_ns * 1e-9))
                 self.observer.drain()
@@ -87,7 +87,7 @@ class Measurement:
         self.observer.begin()
         began_ns = time.monotonic_ns()
         end_ns = began_ns + round(self.duration_s * 1e9)
-        with self.director.inbox.catching_signals():
+        with self.director.inbox.receive_signals():
             while not self.ended_early and (left_ns := end_ns - time.monotonic_ns()) > 0:
                 self._wait(min(_LOOK_S, left_ns * 1e-9))
                 self._look((time.monotonic_ns() - began_ns) * 1e-9)
