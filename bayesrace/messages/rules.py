@@ -38,11 +38,9 @@ class Integer:
 
     def check(self, value: Any) -> int:
         """The number; ValueError if it is of another type or outside the range."""
-        if type(value) is not int:
-            raise ValueError(f"expected an integer, got {type(value).__name__}")
-        if not self.low <= value <= self.high:
-            raise ValueError(f"{value} is outside [{self.low}, {self.high}]")
-        return value
+        if type(value) is int and self.low <= value <= self.high:
+            return value
+        raise ValueError(f"{value!r:.40} is not an integer within [{self.low}, {self.high}]")
 
 
 @dataclass(frozen=True)
@@ -54,11 +52,9 @@ class Real:
 
     def check(self, value: Any) -> float:
         """The number; ValueError if it is of another type or outside the range."""
-        if type(value) is not float:
-            raise ValueError(f"expected a float, got {type(value).__name__}")
-        if not self.low <= value <= self.high:
-            raise ValueError(f"{value} is outside [{self.low:g}, {self.high:g}]")
-        return value
+        if type(value) is float and self.low <= value <= self.high:
+            return value
+        raise ValueError(f"{value!r:.40} is not a float within [{self.low:g}, {self.high:g}]")
 
 
 @dataclass(frozen=True)
@@ -67,9 +63,9 @@ class Flag:
 
     def check(self, value: Any) -> bool:
         """The flag; ValueError if it is of another type."""
-        if type(value) is not bool:
-            raise ValueError(f"expected true or false, got {type(value).__name__}")
-        return value
+        if type(value) is bool:
+            return value
+        raise ValueError(f"{value!r:.40} is not true or false")
 
 
 @dataclass(frozen=True)
@@ -80,11 +76,9 @@ class Text:
 
     def check(self, value: Any) -> str:
         """The text; ValueError if it is of another type or too long."""
-        if type(value) is not str:
-            raise ValueError(f"expected text, got {type(value).__name__}")
-        if len(value) > self.longest:
-            raise ValueError(f"text of {len(value)} characters, at most {self.longest} allowed")
-        return value
+        if type(value) is str and len(value) <= self.longest:
+            return value
+        raise ValueError(f"{value!r:.40} is not text of at most {self.longest} characters")
 
 
 @dataclass(frozen=True)
@@ -95,9 +89,9 @@ class Choice:
 
     def check(self, value: Any) -> str:
         """The word; ValueError if it is none of them."""
-        if type(value) is not str or value not in self.words:
-            raise ValueError(f"expected one of {', '.join(self.words)}")
-        return value
+        if type(value) is str and value in self.words:
+            return value
+        raise ValueError(f"{value!r:.40} is not one of {', '.join(self.words)}")
 
 
 @dataclass(frozen=True)
@@ -114,13 +108,11 @@ class Vector:
     def check(self, value: Any) -> tuple[float, ...]:
         """The numbers; ValueError if one is no float in range, or their count is wrong."""
         if type(value) is not list:
-            raise ValueError(f"expected an array, got {type(value).__name__}")
-        count = len(value)
-        if self.rows is None:
-            if count != self.length:
-                raise ValueError(f"expected {self.length} numbers, got {count}")
-        elif count % self.length or count > self.rows * self.length:
-            raise ValueError(f"{count} numbers are not up to {self.rows} rows of {self.length}")
+            raise ValueError(f"{value!r:.40} is not an array")
+        count, length = len(value), self.length
+        if count != length and (self.rows is None or count % length or count > self.most):
+            shape = "" if self.rows is None else f"up to {self.rows} rows of "
+            raise ValueError(f"{count} numbers are not {shape}{length}")
         limit = self.limit
         for number in value:
             if type(number) is not float or not -limit <= number <= limit:
@@ -143,10 +135,8 @@ class Scalars:
 
     def check(self, value: Any) -> Mapping[str, Scalar]:
         """The map, read-only; ValueError if it is too large or holds something else."""
-        if type(value) is not dict:
-            raise ValueError(f"expected a map, got {type(value).__name__}")
-        if len(value) > self.most:
-            raise ValueError(f"{len(value)} entries, at most {self.most} allowed")
+        if type(value) is not dict or len(value) > self.most:
+            raise ValueError(f"{value!r:.40} is not a map of at most {self.most} entries")
         characters = 0
         for name, scalar in value.items():
             if type(name) is not str or len(name) > 100:

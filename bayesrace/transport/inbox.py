@@ -92,7 +92,7 @@ class Inbox:
     """
 
     def __init__(self, session: Any, car: str | None, capacity: int = _CAPACITY) -> None:
-        """``car``: None for all cars. ``capacity``: messages and tokens that the queue takes."""
+        """``car``: None for all cars, to receive only. ``capacity``: of the queue."""
         self._session = session
         self._car = car
         self._capacity = capacity
@@ -147,19 +147,16 @@ class Inbox:
                 self.requests_rejected += 1
                 request.reject(f"{_REQUESTS} requests are waiting; try again")
 
-        car = self._car or ""
-        self._declared.append(
-            declare_service(self._session, service, car, on_request, source=source)
-        )
+        self._serve(service, on_request, source)
 
     def serve_clock(self, source: str) -> None:
         """Answer requests for this process's clock, at once in the transport's thread."""
-        host, car = socket.gethostname()[:200], self._car or ""
+        host = socket.gethostname()[:200]
 
         def on_request(request: Request) -> None:
             request.answer(ClockReading(0, time.monotonic_ns(), host))
 
-        self._declared.append(declare_service(self._session, CLOCK, car, on_request, source=source))
+        self._serve(CLOCK, on_request, source)
 
     def announce(self, source: str) -> None:
         """Declare this process's liveliness token: last, when everything else is in place."""
@@ -190,7 +187,7 @@ class Inbox:
         self._queue.put(item)
 
     def get(self, timeout_s: float = 0.0) -> Item | None:
-        """The next item, first of the queue, then of the channels in turn; None after the timeout."""
+        """The next item, of the queue or else of the channels in turn; None after the timeout."""
         if self._stamping:
             self._empty_channels()
         if self._stamping or not self._channels:
@@ -247,6 +244,13 @@ class Inbox:
         if self._car is None:
             return template.format(car="*", source=source)
         return car_key(template, self._car, source)
+
+    def _serve(
+        self, service: Service[Any, Any], on_request: Callable[[Request], None], source: str
+    ) -> None:
+        self._declared.append(
+            declare_service(self._session, service, self._car or "", on_request, source=source)
+        )
 
     def _into_queue(self, name: str, key: str) -> Any:
         def on_sample(sample: Any) -> None:
