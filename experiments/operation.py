@@ -167,7 +167,7 @@ def follow(session: Any, picture: Picture, name: str, period_s: float) -> Iterat
     with inbox.receive_signals():
         while True:
             if (now_s := time.monotonic()) >= due_s:
-                picture.silence(now_s)
+                picture.expire(now_s)
                 yield None
                 # After a slow display there is still time to receive.
                 due_s = time.monotonic() + period_s

@@ -1,4 +1,4 @@
-"""Looking after running cars: who is found, what is shown, who obeys, and who forwards."""
+"""Operating running cars: finding them, their status, stop and go, and the router."""
 
 import json
 import os
@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -48,6 +47,7 @@ from experiments.status_table import COUNTERS_SHOWN, StatusTable
 from tests.command_line import Cli, refused
 from tests.conftest import Circuit
 from tests.programs import ROOT, environment, finish, run, start, until
+from tests.test_transport import take
 
 pytestmark = pytest.mark.wall_clock
 
@@ -68,7 +68,7 @@ class Fake:
     source: str
     endpoints: Endpoints
     mute: bool = False
-    """It is there and does not answer."""
+    """It is present and does not answer."""
     refuses: str = ""
     beats: bool = True
     text: str = "all is well"
@@ -112,7 +112,7 @@ Fakes = Callable[..., Fake]
 
 @pytest.fixture
 def fakes() -> Iterator[Fakes]:
-    """Starts fakes, each listening on an endpoint of its own unless told otherwise."""
+    """Starts fakes, each listening on an endpoint of its own by default."""
     over = threading.Event()
     threads = []
 
@@ -172,13 +172,13 @@ def test_every_car_is_found_and_json_has_the_documented_form(fakes: Fakes) -> No
 
 
 def test_a_named_car_is_found_without_waiting_for_the_absent(fakes: Fakes) -> None:
-    """An endpoint where nobody listens costs no time if what was asked for is there."""
+    """An endpoint without a listener costs no time if the named car is found."""
     one, two = fakes("a", "plant"), fakes("a", "controller")
     endpoints = Endpoints(connect=(free_endpoint(), *where(one, two).connect))
     assert set(picture_of(endpoints, "a", patience_s=600.0).cars) == {"a"}
 
 
-def test_who_is_there_but_hangs_is_shown_as_such(fakes: Fakes) -> None:
+def test_a_present_process_that_hangs_is_shown_as_such(fakes: Fakes) -> None:
     one, two = fakes("a", "plant", mute=True), fakes("a", "controller")
     picture = picture_of(where(one, two))
     content = picture.as_json()["cars"]["a"]
@@ -206,7 +206,7 @@ def test_absence_is_an_error_that_says_what_to_do(fakes: Fakes) -> None:
         picture_of(where(one, two), "c", patience_s=1.0)
 
 
-def test_the_table_shows_what_an_operator_looks_for(fakes: Fakes) -> None:
+def test_the_table_shows_phase_rate_misses_and_counters(fakes: Fakes) -> None:
     one, two = fakes("a", "plant"), fakes("a", "controller", text="\x1b[2Jgone \x07")
     text = rendered(picture_of(where(one, two)))
     row = next(line for line in text.splitlines() if "controller" in line).split()
@@ -230,10 +230,10 @@ def test_a_heartbeat_that_stops_is_no_answer_any_more() -> None:
     picture = Picture({"a": {"plant": Process(status, "", 1, arrived_s=100.0)}})
     answering = []
     for now_s in (100.5, 102.0):
-        picture.silence(now_s)
+        picture.expire(now_s)
         answering.append(picture.answering)
     assert answering == [True, False]
-    assert picture.as_json()["cars"]["a"]["plant"]["fault"] == "silent"
+    assert picture.as_json()["cars"]["a"]["plant"]["fault"] == "no heartbeat for 1 s"
 
 
 def test_status_on_the_command_line(fakes: Fakes, cli: Cli) -> None:
@@ -263,7 +263,7 @@ def test_watching_prints_a_line_for_each_heartbeat_until_interrupted(fakes: Fake
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_a_reader_that_leaves_ends_the_watch_without_complaint(fakes: Fakes) -> None:
+def test_a_closed_pipe_ends_the_watch_without_an_error(fakes: Fakes) -> None:
     one = fakes("a", "plant")
     watching = start("status", "--watch", "--json", *options(one))
     assert watching.stdout is not None
@@ -365,15 +365,6 @@ def test_all_are_stopped_though_one_hangs_and_one_refuses(fakes: Fakes, cli: Cli
 
 
 # router ------------------------------------------------------------------------------------------
-
-
-def take(inbox: Inbox, kind: Kind) -> Item:
-    deadline = time.monotonic() + PATIENCE_S
-    while (left := deadline - time.monotonic()) > 0:
-        item = inbox.get(left)
-        if item is not None and item.kind is kind:
-            return item
-    raise AssertionError(f"no {kind} within {PATIENCE_S} s")
 
 
 @pytest.mark.parametrize("mode", ["peer", "router"])

@@ -59,6 +59,7 @@ class Kind(Enum):
     ALIVE = "alive"
     GONE = "gone"
     SIGNAL = "signal"
+    RESULT = "result"
 
 
 class Item(NamedTuple):
@@ -69,7 +70,7 @@ class Item(NamedTuple):
     """Topic, service or source; empty for signals."""
     value: Any
     """MESSAGE: the message, None if the topic's decoder has refused it; REQUEST: :class:`Request`;
-    SIGNAL: its number; else None."""
+    SIGNAL: its number; RESULT: what another thread of this process has :meth:`put`; else None."""
     received_ns: int
     """Own monotonic clock on arrival."""
     key: str = ""

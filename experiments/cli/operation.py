@@ -21,8 +21,7 @@ __all__ = ["register"]
 
 Name = Annotated[str, typer.Option(help="Name of the car.")]
 Timeout = Annotated[
-    float,
-    typer.Option(min=0.1, max=60.0, help="Seconds to find cars, and for their answers."),
+    float, typer.Option(min=0.1, max=60.0, help="Seconds to find cars, and for their answers.")
 ]
 Reason = Annotated[str, typer.Option(help="The reason, shown in the controller's status.")]
 
@@ -49,6 +48,7 @@ def status(
     Without --name: all cars found. A process that is present and does not answer is shown as such;
     if none answers, that is an error.
     """
+    from rich.live import Live
 
     from bayesrace.transport import open_session
     from experiments.operation import ask_statuses, find, follow
@@ -63,7 +63,10 @@ def status(
                 if car is not None:
                     _print_json(picture, car)
         elif watch:
-            _redraw(picture, follow(session, picture, name, _PERIOD_S))
+            with Live(console=Terminal(), auto_refresh=False) as live:
+                for car in follow(session, picture, name, _PERIOD_S):
+                    if car is None:  # once a period, not for each heartbeat
+                        live.update(StatusTable(picture, brief=True), refresh=True)
         elif as_json:
             _print_json(picture)
         else:
@@ -73,19 +76,6 @@ def status(
             f"no answer within {timeout:g} s from the processes found; they hang or are of another "
             "release, or the network is slow (--timeout)"
         )
-
-
-def _redraw(picture: "Picture", updates: Iterator[str | None]) -> None:
-    """Shows the table on the terminal once a period, not for each heartbeat of a car."""
-    from rich.live import Live
-
-    from experiments.status_table import StatusTable
-    from experiments.terminal import Terminal
-
-    with Live(console=Terminal(), auto_refresh=False) as live:
-        for car in updates:
-            if car is None:
-                live.update(StatusTable(picture, brief=True), refresh=True)
 
 
 def _print_json(picture: "Picture", car: str | None = None) -> None:
@@ -109,8 +99,7 @@ def stop(
     reason: Reason = "",
     everybody: Annotated[bool, typer.Option("--all", help="Stop all cars found.")] = False,
     run: Annotated[
-        bool,
-        typer.Option("--run", help="End the plant's run instead, after its client has died."),
+        bool, typer.Option("--run", help="End the plant's run instead, after its client has died.")
     ] = False,
     timeout: Timeout = 2.0,
 ) -> None:
