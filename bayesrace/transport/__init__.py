@@ -1,8 +1,8 @@
 """Zenoh, wrapped thinly.
 
-``session`` opens a session with explicit endpoints and publishes; ``inbox`` is the one subscriber,
-with ``requests`` for what it serves; ``client`` sends requests, ``director`` starts and follows
-runs; ``numbering`` counts losses and ``heartbeat`` publishes a status.
+``session`` opens a session with explicit endpoints; ``publisher`` sends messages, ``inbox`` is the
+one subscriber, with ``requests`` for what it serves; ``client`` sends requests, ``director`` starts
+and follows runs; ``numbering`` counts losses.
 """
 
 from bayesrace.transport.client import (
@@ -16,15 +16,14 @@ from bayesrace.transport.client import (
     send_weights,
 )
 from bayesrace.transport.director import Director, RefusedError
-from bayesrace.transport.heartbeat import HEARTBEAT_S, Heartbeat
 from bayesrace.transport.inbox import LOCKSTEP_SPIN_S, NEWEST, Inbox, Item, Kind
 from bayesrace.transport.numbering import Numbering
+from bayesrace.transport.publisher import HEARTBEAT_S, Heartbeat, Publisher
 from bayesrace.transport.requests import Request, declare_service, decode_request
 from bayesrace.transport.session import (
     CONTROLLER_ENDPOINT,
     PLANT_ENDPOINT,
     Endpoints,
-    Publisher,
     free_endpoint,
     open_session,
 )

@@ -1,4 +1,4 @@
-"""Zenoh sessions with explicit endpoints, and publishers with the table's quality of service.
+"""Zenoh sessions with explicit endpoints.
 
 Topology of a run: the plant listens; the controller connects to the plant and listens itself;
 recorders and directors connect to both, because peers do not forward for each other. Or all connect
@@ -10,23 +10,18 @@ import json
 import os
 import re
 import socket
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, Final, Generic, Literal, TypeVar, get_args
+from typing import Any, Final, Literal, get_args
 
 import zenoh
 from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.errors import InputError
-from bayesrace.messages import Message, Topic, car_key, encode
 
 __all__ = [
-    "CONTROLLER_ENDPOINT", "PLANT_ENDPOINT", "Endpoints", "Publisher", "Role", "free_endpoint",
-    "open_session",
+    "CONTROLLER_ENDPOINT", "PLANT_ENDPOINT", "Endpoints", "Role", "free_endpoint", "open_session",
 ]  # fmt: skip
-
-M = TypeVar("M", bound=Message)
 
 Role = Literal["plant", "controller", "observer"]
 """Zenoh region of a process; an observer is any other process than plant and controller. A router
@@ -157,33 +152,3 @@ def free_endpoint() -> str:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
-class Publisher(Generic[M]):
-    """Sends one topic's messages with the table's quality of service, and numbers them."""
-
-    def __init__(
-        self, session: Any, topic: Topic[M], car: str, source: str = "", *, waits: bool = True
-    ) -> None:
-        """``waits`` False: never block in real time, whatever the table says: for control loops."""
-        control = zenoh.CongestionControl
-        settings = {
-            "express": topic.qos.express,
-            "priority": getattr(zenoh.Priority, topic.qos.priority.upper()),
-            "reliability": zenoh.Reliability.RELIABLE,
-        }
-        key, declare = car_key(topic.key, car, source), session.declare_publisher
-        self._lockstep = declare(key, congestion_control=control.BLOCK, **settings)
-        realtime = control.BLOCK if topic.qos.realtime_blocks and waits else control.DROP
-        self._realtime = declare(key, congestion_control=realtime, **settings)
-        self.next_seq = 0
-        """``seq`` that the next message must have."""
-        self.sent_ns: int | None = None
-        """Monotonic clock after the newest message was sent."""
-
-    def put(self, message: M, *, lockstep: bool) -> None:
-        """Send; in lockstep blocks rather than lose the message, in real time drops it rather than
-        block (unless the table says otherwise)."""
-        (self._lockstep if lockstep else self._realtime).put(encode(message))
-        self.next_seq = message.seq + 1
-        self.sent_ns = time.monotonic_ns()
