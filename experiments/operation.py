@@ -90,8 +90,9 @@ class _Place(NamedTuple):
 
 def _place(key: str) -> _Place | None:
     """Car and source of the key of a token or heartbeat; None if the table has no such process."""
-    _, car, _, source = key.split("/")
-    return _Place(car, source) if is_car_name(car) and source in SOURCES else None
+    parts = key.split("/")
+    known = len(parts) == 4 and is_car_name(parts[1]) and parts[3] in SOURCES
+    return _Place(parts[1], parts[3]) if known else None
 
 
 def _not_found(session: Any, endpoints: Endpoints, timeout_s: float, name: str) -> InputError:

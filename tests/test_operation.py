@@ -41,7 +41,7 @@ from bayesrace.transport import (
 )
 from bayesrace.transport.session import Role
 from experiments.drive import RunPlan, run_request
-from experiments.operation import ask_statuses, command, find, pick
+from experiments.operation import ask_statuses, command, find, follow, pick
 from experiments.picture import Picture, Process
 from experiments.status_table import COUNTERS_SHOWN, StatusTable
 from tests.command_line import Cli, refused
@@ -261,6 +261,15 @@ def test_watching_prints_a_line_for_each_heartbeat_until_interrupted(fakes: Fake
     watching.send_signal(signal.SIGINT)
     done = finish(watching)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_messages_on_keys_of_no_car_do_not_end_the_watch(fakes: Fakes) -> None:
+    with open_session(where(fakes("a", "plant"))) as session:
+        updates = follow(session, Picture({}), "", 60.0)
+        assert next(updates) is None
+        for key in ("bayesrace/**", "bayesrace/*/status/*", "bayesrace/a b/status/plant"):
+            session.put(key, b"junk")
+        assert next(updates) == "a"
 
 
 def test_a_closed_pipe_ends_the_watch_without_an_error(fakes: Fakes) -> None:

@@ -142,8 +142,7 @@ def is_car_name(name: str) -> bool:
 
 
 def car_key(template: str, car: str, source: str = "") -> str:
-    """A key of the table for one car, and one source where the key has it; InputError at a bad
-    name."""
+    """A key of the table for one car and, where it has one, source; InputError at a bad name."""
     if not is_car_name(car):
         raise InputError(
             f"car name '{car[:60]}' cannot be part of a key; "

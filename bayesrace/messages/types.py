@@ -73,8 +73,10 @@ class CarSample(Message):
 
 @dataclass(frozen=True, slots=True)
 class State(CarSample):
-    """Measured state of the car, on ``bayesrace/{car}/state``; the only input of controller and
-    learning."""
+    """Measured state of the car, on ``bayesrace/{car}/state``.
+
+    The only input of controller and learning.
+    """
 
     lockstep: Annotated[bool, Flag()]
     """True if the plant waits for the actuation that answers this very message."""
@@ -219,8 +221,10 @@ class StatusRequest(Message):
 
 @dataclass(frozen=True, slots=True)
 class RollbackRequest(Message):
-    """Request on ``bayesrace/{car}/controller/rollback`` to restore the previous weights; the
-    answer is a :class:`Reply`."""
+    """Request on ``bayesrace/{car}/controller/rollback`` to restore the previous weights.
+
+    The answer is a :class:`Reply`.
+    """
 
     text: Long
     """The reason, for the event."""

@@ -170,7 +170,7 @@ class Inbox:
         def on_token(sample: Any) -> None:
             kind = Kind.ALIVE if sample.kind == zenoh.SampleKind.PUT else Kind.GONE
             key = str(sample.key_expr)
-            self._offer(kind, key.split("/")[-1], None, key)
+            self._offer(kind, key.split("/")[-1] if source == "*" else source, None, key)
 
         tokens, handler = self._session.liveliness(), in_transport_thread(on_token)
         self._declared.append(

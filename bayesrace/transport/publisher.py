@@ -40,8 +40,11 @@ class Publisher(Generic[M]):
         """Monotonic clock after the newest message was sent."""
 
     def put(self, message: M, *, lockstep: bool) -> None:
-        """Send; in lockstep blocks rather than lose the message, in real time drops it rather than
-        block (unless the table says otherwise)."""
+        """Send the message.
+
+        In lockstep blocks rather than lose it; in real time drops it rather than block, unless the
+        table says otherwise.
+        """
         (self._lockstep if lockstep else self._realtime).put(encode(message))
         self.next_seq = message.seq + 1
         self.sent_ns = time.monotonic_ns()
