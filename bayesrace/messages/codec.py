@@ -27,6 +27,9 @@ _NAME_HEAD_BYTES: Final = 5
 _UNKNOWN_NAMES: Final = 20
 """More fields than a message has are still read, to be named in the refusal."""
 
+_LOG_PERIOD_NS: Final = 1_000_000_000
+"""Between two lines of a decoder in the log."""
+
 _MALFORMED: Final = (ValueError, TypeError, OverflowError, msgpack.UnpackException)
 
 
@@ -159,22 +162,19 @@ class Decoder(Generic[M]):
     input or output.
     """
 
-    def __init__(
-        self, kind: type[M], logger: logging.Logger | None = None, log_period_s: float = 1.0
-    ) -> None:
-        self.kind = kind
+    def __init__(self, kind: type[M], logger: logging.Logger | None = None) -> None:
+        self._kind = kind
         self.accepted = 0
         self.refused = 0
         self.last_reason = ""
         self._logger = logger
-        self._period_ns = int(log_period_s * 1e9)
         self._next_log_ns = 0
         self._logged = 0
 
     def __call__(self, data: bytes) -> M | None:
         """The message, or None if it was refused."""
         try:
-            message = decode(self.kind, data)
+            message = decode(self._kind, data)
         except InputError as error:
             self.refused += 1
             self.last_reason = str(error)
@@ -189,7 +189,7 @@ class Decoder(Generic[M]):
         now_ns, count = time.monotonic_ns(), self.refused - self._logged
         if count and now_ns >= self._next_log_ns:
             logger.warning("refused %d message(s), the last: %s", count, self.last_reason)
-            self._logged, self._next_log_ns = self.refused, now_ns + self._period_ns
+            self._logged, self._next_log_ns = self.refused, now_ns + _LOG_PERIOD_NS
 
 
 def peek_seq(data: bytes) -> int | None:
