@@ -59,7 +59,7 @@ class Run(Beside):
     def watch(self, director: Director, recorder: Recorder, begin_ns: int, end_ns: int) -> None:
         """Lets the time pass, until the run ends, a process started here ends, or a signal."""
         warm_ns = begin_ns + min(round(_MEMORY_S * 1e9), (end_ns - begin_ns) // 3)
-        with director.inbox.catching_signals():
+        with director.inbox.receive_signals():
             while not self.ended_early and (left_ns := end_ns - time.monotonic_ns()) > 0:
                 item = director.inbox.get(min(left_ns * 1e-9, _SAMPLE_S))
                 if item is not None:
