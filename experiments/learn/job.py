@@ -1,20 +1,21 @@
 """``bayesrace learn`` from its settings to its folder."""
 
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from pathlib import Path
 
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import GpWeights, read_weights
+from bayesrace.gp.weights import read_weights
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.manifest import read_manifest
 from bayesrace.tracks import load_track
 from bayesrace.transport import Endpoints, open_session
 from bayesrace.vehicles import CarParameters
-from experiments.learn.figure import References, draw, references
-from experiments.learn.journal import Journal, Record
+from experiments.learn.journal import Journal, resumable_settings
 from experiments.learn.loop import Learner
-from experiments.learn.settings import LearnSettings
-from learning.dataset import Dataset
+from experiments.learn.records import LearnSettings, Record, UpdateRecord
+from experiments.learn.report import draw, references
+from learning.pool import recalled
 from learning.residual import discretisation_of
 from learning.sources import read_samples
 
@@ -24,24 +25,23 @@ __all__ = ["discretisation_from", "learn"]
 def discretisation_from(
     car: CarParameters, weights: Path | None, artefact: Path | None, points: int, folder: Path
 ) -> Discretisation:
-    """What the controller predicts with, by its artefact or by weights for it; else the default.
+    """The controller's, by its artefact or by weights for it; else the default.
 
-    In a folder that is gone on with, what it was learned for takes the place of weights and
-    default. InputError if artefact and weights contradict each other, or the points do not fit.
+    In a folder to resume, its own takes the place of weights and default. InputError if artefact
+    and weights contradict each other, or the points do not fit.
     """
-    told: dict[Discretisation, str] = {}
-    default = PREDICTION
-    if Journal.resumable(folder):
-        weights, default = None, Journal.settings_in(folder).discretisation
+    found: dict[Discretisation, str] = {}
+    before = resumable_settings(folder)
     if artefact is not None:
         manifest = read_manifest(artefact)
         manifest.check_points(points)
-        told[discretisation_of(manifest.discretisation, car)] = str(artefact)
-    if weights is not None:
-        told.setdefault(discretisation_of(read_weights(weights).discretisation, car), str(weights))
-    if len(told) > 1:
-        raise InputError(f"{' and '.join(told.values())} are for different discretisations")
-    return next(iter(told), default)
+        found[discretisation_of(manifest.discretisation, car)] = str(artefact)
+    if weights is not None and before is None:
+        name = read_weights(weights).discretisation
+        found.setdefault(discretisation_of(name, car), str(weights))
+    if len(found) > 1:
+        raise InputError(f"{' and '.join(found.values())} are for different discretisations")
+    return next(iter(found), PREDICTION if before is None else before.discretisation)
 
 
 def learn(
@@ -52,45 +52,35 @@ def learn(
     weights: Path | None,
     say: Callable[[str], None],
 ) -> Record:
-    """Learns until the settings' number of laps, or a signal; what its folder then tells.
+    """Learns until the settings' number of laps, or a signal; returns the folder's record.
 
-    ``data`` and ``weights`` are to begin with: in a folder that is gone on with they are not read.
-    InputError for what cannot be used; a plant or a controller that is not there is none: it is
-    waited for.
+    ``data`` and ``weights`` are to begin with, and not read in a folder to resume. InputError for
+    what cannot be used; a plant or a controller that is not there is waited for.
     """
-    width_m = settings.car.width_m
-    track = None if settings.track is None else load_track(settings.track, width_m)
+    track = None if settings.track is None else load_track(settings.track, settings.car.width_m)
     beside = references(settings.compare)
-    unread = []
-    if Journal.resumable(folder):
-        unread = [name for name, given in (("--data", data), ("--weights", weights)) if given]
+    unread = [name for name, one in (("--data", data), ("--weights", weights)) if one]
+    if resumable_settings(folder) is not None:
         data, weights = (), None
-    samples = _samples(settings, data)  # what cannot be used is told before there is a folder
-    given = None if weights is None else _weights(settings, weights)
-    with Journal(folder, settings) as journal:
+    # What cannot be used is reported before there is a folder.
+    given = None if weights is None else read_weights(weights)
+    if given is not None and given.car != settings.car.name:
+        raise InputError(f"{weights} is for the car '{given.car}', not '{settings.car.name}'")
+    samples = (
+        read_samples(data, settings.car, "", settings.discretisation).dataset if data else None
+    )
+    with closing(Journal(folder, settings)) as journal:
+        if journal.resumed:
+            why = f"; {' and '.join(unread)} not read: only to begin with" if unread else ""
+            say(f"going on in {folder} after lap {len(journal.record.laps)}{why}")
+        elif given is not None:
+            known = samples is not None and given.dataset_digest == samples.digest()
+            stages = {} if known else {"kept": recalled(given, settings.car)}
+            stages |= {} if samples is None else {"new": samples}
+            journal.add_update(UpdateRecord(after_lap=0), given, **stages)
+        elif samples is not None:
+            journal.add_driven(samples)
         with open_session(endpoints) as session:
-            learner = Learner(
-                session, settings, journal, track, say, lambda: _draw(journal, beside)
-            )
-            learner.begin(samples, given, unread)
-            learner.run()
-        _draw(journal, beside)
+            Learner(session, settings, journal, say, track=track, beside=beside).run()
+        draw(journal.record, beside, folder / "laps.png")
         return journal.record
-
-
-def _draw(journal: Journal, beside: References) -> None:
-    draw(journal.record, beside, journal.path(Journal.FILES.plot))
-
-
-def _samples(settings: LearnSettings, data: Sequence[Path]) -> Dataset | None:
-    if not data:
-        return None
-    found = read_samples(data, settings.car, "", settings.discretisation)
-    return found.dataset
-
-
-def _weights(settings: LearnSettings, path: Path) -> GpWeights:
-    weights = read_weights(path)
-    if weights.car != settings.car.name:
-        raise InputError(f"{path} is for the car '{weights.car}', not '{settings.car.name}'")
-    return weights

@@ -1,60 +1,150 @@
-"""What the controller makes of published weights."""
+"""Publishing weights to a controller, and what it makes of them."""
 
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
 
-from bayesrace.messages import Reply, Scalar
+from bayesrace.files import read_whole
+from bayesrace.gp.weights import MAX_BYTES
+from bayesrace.messages import Event, Reply, Scalar, Status
+from bayesrace.transport import send_weights
+from experiments.learn.journal import Journal
+from experiments.learn.records import UpdateRecord
 
-__all__ = ["Answer", "NotTakenOverError"]
+__all__ = ["NotTakenOverError", "Publisher", "in_words"]
 
 
 class NotTakenOverError(RuntimeError):
-    """The controller was asked and said no; the message is its reason."""
+    """A controller has refused weights or a rollback; the message is its reason."""
 
 
-@dataclass(frozen=True)
-class Answer:
-    """What a controller said to new weights, or to going back."""
+def in_words(reply: Reply) -> str:
+    """A controller's answer to new weights, or to a rollback, as a text."""
+    cycle, number, why_not = (reply.data.get(key) for key in ("cycle", "number", "not_kept"))
+    if not reply.accepted:
+        again = " for now, try again" if reply.data.get("again") is True else ""
+        return f"refused{again}: {reply.text}"
+    if cycle is None:
+        return f"taken over: {reply.text}"
+    which = "" if number is None else f" (acceptance {number})"
+    return f"taken over at cycle {cycle}{which}{f', but not kept: {why_not}' if why_not else ''}"
 
-    accepted: bool
-    text: str
-    """Its words: what now, or why not."""
-    version: str = ""
-    """In use from now on, or refused."""
-    before: str = ""
-    """Of the weights given up, after going back."""
-    cycle: int | None = None
-    """Cycle of the controller from which on; None if it does not say."""
-    acceptance: int | None = None
-    """Number of this takeover among all of the car's."""
-    again: bool = False
-    """Not accepted for a reason that passes: the same may be accepted later."""
-    not_kept: str = ""
-    """Why the controller would not have them after a restart; empty if it has them or no store."""
 
-    @classmethod
-    def of(cls, reply: Reply) -> "Answer":
-        """What is in the data of a reply; what is missing there, or of another type, is not."""
-        return cls(
-            reply.accepted,
-            reply.text,
-            str(reply.data.get("version", "")),
-            str(reply.data.get("from_version", "")),
-            _count(reply.data.get("cycle")),
-            _count(reply.data.get("number")),
-            not reply.accepted and reply.data.get("again") is True,
-            str(reply.data.get("not_kept", "")),
-        )
+class Publisher:
+    """Sends the weights of updates and notes what becomes of them; for the job's thread.
+
+    A thread of its own waits for the answers; :meth:`poll` notes those that have arrived. Weights
+    without an answer, or refused for now, stay pending: they are sent to the next controller that
+    appears. Weights refused or rolled back are not sent again.
+    """
+
+    def __init__(
+        self, session: Any, car: str, journal: Journal, say: Callable[[str], None]
+    ) -> None:
+        self._session, self._car, self._journal, self._say = session, car, journal, say
+        self._thread = ThreadPoolExecutor(1, "learn-publisher")
+        self._sent: deque[tuple[str, Future[Reply]]] = deque()
+        self.present = False
+        """A heartbeat has come since the controller appeared or disappeared."""
+        self.closed = False
+        """Nothing is sent any more: what is pending is for the next job."""
+        self.in_use = ""
+        """Version that the controller drives with; empty while that is unknown, or for none."""
 
     @property
-    def words(self) -> str:
-        """For people."""
-        if not self.accepted:
-            return f"refused{' for now, try again' if self.again else ''}: {self.text}"
-        if self.cycle is None:
-            return f"taken over: {self.text}"
-        which = "" if self.acceptance is None else f" (acceptance {self.acceptance})"
-        kept = f", but not kept: {self.not_kept}" if self.not_kept else ""
-        return f"taken over at cycle {self.cycle}{which}{kept}"
+    def busy(self) -> bool:
+        """An answer is missing."""
+        return bool(self._sent)
+
+    def offer(self, update: UpdateRecord) -> None:
+        """Sends the weights of an update if the controller is there and has not declined them."""
+        version = update.version
+        updates = self._journal.record.updates
+        verdicts = {one.verdict for one in updates if one.version == version}
+        if verdicts & {"refused", "rolled back"}:
+            self._note(version, "not sent", "the same weights have been declined before")
+        elif version == self.in_use:
+            self._note(version, "accepted", "in use already")
+        elif self.present:
+            self._send(update)
+        else:
+            self._say(f"no controller of car '{self._car}' is there; {version} is pending")
+
+    def heartbeat(self, status: Status) -> None:
+        """The controller is there, and its status names the weights that it drives with.
+
+        One that has just appeared is sent what is pending, or else the last accepted weights if it
+        drives with other ones.
+        """
+        if status.source != "controller":
+            return
+        version = self.in_use = status.weights_version
+        if not self.present:
+            self.present = True
+            self._appeared(version)
+        elif not self.busy:
+            update = self._journal.update_of(version)
+            if update is not None and update.verdict in ("pending", "superseded"):
+                self._note(version, "accepted", "in use")  # the answer was lost
+
+    def event(self, event: Event) -> None:
+        """Notes what the controller has rolled back."""
+        if event.source == "controller" and event.kind == "weights_rolled_back":
+            version = str(event.data.get("from_version", ""))
+            update = self._journal.change_update(version, verdict="rolled back", answer=event.text)
+            ours = "" if update is None else f" (learned after lap {update.after_lap})"
+            self._say(f"rolled back: {version}{ours}: {event.text}")
+
+    def poll(self) -> None:
+        """Notes the answers that have arrived."""
+        while self._sent and self._sent[0][1].done():
+            version, request = self._sent.popleft()
+            if request.cancelled():
+                continue
+            error = request.exception()
+            reply = None if error else request.result()
+            if reply is None or (not reply.accepted and reply.data.get("again") is True):
+                why = str(error) if reply is None else in_words(reply)
+                self._say(f"{version}: {why}")
+                self._journal.change_update(version, answer=why)
+            elif reply.accepted:
+                self._note(version, "accepted", in_words(reply), reply)
+            else:
+                self._note(version, "refused", reply.text)
+
+    def wait(self) -> None:
+        """Waits for the answer that is missing, and notes it."""
+        self._thread.shutdown(wait=True, cancel_futures=True)
+        self.poll()
+
+    def _appeared(self, version: str) -> None:
+        last, updates = self._journal.last_accepted, self._journal.record.updates
+        if updates and updates[-1].verdict == "pending":
+            self.offer(updates[-1])
+        elif last is not None and version != last.version:
+            drives_with = version or "no weights"
+            self._say(f"the controller drives with {drives_with}; sending {last.version}")
+            self._send(last)
+
+    def _send(self, update: UpdateRecord) -> None:
+        def call() -> Reply:
+            data = read_whole(self._journal.folder / update.file, "weights file", MAX_BYTES)
+            return send_weights(self._session, self._car, data)
+
+        if not self.closed:
+            self._sent.append((update.version, self._thread.submit(call)))
+
+    def _note(self, version: str, verdict: str, answer: str, reply: Reply | None = None) -> None:
+        """Changes the update and says so, unless its rollback came before the answer."""
+        update = self._journal.update_of(version)
+        if update is not None and update.verdict != "rolled back":
+            data = {} if reply is None else reply.data
+            cycle, number = (_count(data.get(key)) for key in ("cycle", "number"))
+            self._journal.change_update(
+                version, verdict=verdict, answer=answer, cycle=cycle, acceptance=number
+            )
+            self._say(f"{version}: {'refused: ' if verdict == 'refused' else ''}{answer}")
 
 
 def _count(value: Scalar | None) -> int | None:
