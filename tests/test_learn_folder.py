@@ -11,9 +11,7 @@ import pytest
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import read_weights, zero_weights
 from bayesrace.integrators import PERFECT, PREDICTION
-from bayesrace.transport import Endpoints
 from bayesrace.vehicles.models import dynamic
-from experiments.learn.job import discretisation_from, learn
 from experiments.learn.journal import MOST_WEIGHTS, Journal
 from experiments.learn.records import LearnSettings, UpdateRecord
 from learning.pool import MOST_NEW
@@ -113,20 +111,3 @@ def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
     (tmp_path / "letter.txt").write_text("dear")
     with pytest.raises(InputError, match="something else"):
         Journal(tmp_path, SETTINGS)
-
-
-def test_what_cannot_be_used_leaves_no_folder(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="gone"):
-        learn(SETTINGS, Endpoints(), tmp_path / "job", [], tmp_path / "gone", print)
-    assert not (tmp_path / "job").exists()
-
-
-def test_a_resumed_job_learns_for_the_same_discretisation(tmp_path: Path) -> None:
-    """Weights to begin with are not read."""
-    gone = tmp_path / "gone"
-    with opened(
-        tmp_path / "job", SETTINGS.model_copy(update={"discretisation": PERFECT})
-    ) as journal:
-        journal.add_driven(None, lap(1, 5.0))
-    assert discretisation_from(CAR, gone, None, 400, tmp_path / "job") == PERFECT
-    assert discretisation_from(CAR, None, None, 400, tmp_path / "new") == PREDICTION

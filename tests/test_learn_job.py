@@ -53,10 +53,13 @@ class Desk:
         """New weights are published, and answered."""
         if answer is not None:
             self.answers[version] = answer
-        weights = zero_weights(CAR.name, NAME, version)
-        update = self.journal.add_update(UpdateRecord(after_lap=1), weights)
-        self.publisher.offer(update)
+        self.offer(version)
         self.work()
+
+    def offer(self, version: str) -> None:
+        update = UpdateRecord(after_lap=1)
+        self.journal.add_update(update, zero_weights(CAR.name, NAME, version))
+        self.publisher.offer(update)
 
     def work(self) -> None:
         """Until no answer is missing."""
@@ -122,8 +125,7 @@ def test_declined_weights_are_reported_and_not_sent_again(desk: Desk) -> None:
 def test_an_answer_after_the_rollback_changes_nothing(desk: Desk) -> None:
     desk.start_controller()
     desk.answers["a"] = yes("a")
-    weights = zero_weights(CAR.name, NAME, "a")
-    desk.publisher.offer(desk.journal.add_update(UpdateRecord(after_lap=1), weights))
+    desk.offer("a")
     desk.roll_back("a")
     desk.work()
     assert desk.verdict("a") == "rolled back"

@@ -11,7 +11,7 @@ import os
 import signal
 import sqlite3
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -21,12 +21,13 @@ import pytest
 from numpy.typing import NDArray
 from rich.console import Console
 
+from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights, decode_weights, write_weights, zero_weights
-from bayesrace.integrators import PREDICTION
+from bayesrace.integrators import PERFECT, PREDICTION
 from bayesrace.messages import HEARTBEAT, STATE, Message, Reply, State, Status, encode
 from bayesrace.transport import Endpoints, Inbox, Item, Kind
 from bayesrace.vehicles.models import dynamic
-from experiments.learn import collector, job, journal, loop, publishing
+from experiments.learn import collector, job, journal, publishing
 from experiments.learn.publishing import Publisher
 from experiments.learn.records import LearnSettings, Record
 from experiments.learn.report import print_laps
@@ -118,10 +119,9 @@ class Jobs:
 
         for module, name, value in (
             (collector, "_DELAY_S", 0.0),
-            (loop, "_TICK_S", 0.001),
-            (loop, "Trainer", lambda _: FakeTrainer(jobs)),
-            (loop, "Inbox", Fed),
-            (loop, "draw", lambda *_: None),
+            (job, "_TICK_S", 0.001),
+            (job, "Trainer", lambda _: FakeTrainer(jobs)),
+            (job, "Inbox", Fed),
             (job, "draw", lambda *_: None),
             (job, "open_session", no_network),
         ):
@@ -147,7 +147,9 @@ class Jobs:
         if end:
             self._arrive.append(Item(Kind.SIGNAL, "", signal.SIGINT, 0))
         given = () if data is None else (data,)
-        return job.learn(settings, Endpoints(), folder, given, weights, self.said.append)
+        return job.learn(
+            settings, Endpoints(), folder, self.said.append, data=given, weights=weights
+        )
 
     @property
     def learned(self) -> Dataset:
@@ -315,6 +317,23 @@ def learned() -> GpWeights:
     weights = zero_weights(CAR.name, NAME, "given")
     known = replace(weights.outputs[0], inputs=FIRST.features[:5], alpha=np.ones(5))
     return replace(weights, outputs=(known, *weights.outputs[1:]))
+
+
+def test_a_resumed_job_learns_for_the_same_discretisation(tmp_path: Path, jobs: Jobs) -> None:
+    """Weights to begin with are not read."""
+    perfect = LearnSettings(car=CAR, discretisation=PERFECT)
+    with closing(journal.Journal(tmp_path / "job", perfect)) as opened:
+        opened.add_driven(FIRST)
+    jobs.run(tmp_path / "job", weights=tmp_path / "gone", end=True)
+    resumable = journal.resumable_settings(tmp_path / "job")
+    assert resumable is not None
+    assert resumable.discretisation == PERFECT
+
+
+def test_what_cannot_be_used_leaves_no_folder(tmp_path: Path, jobs: Jobs) -> None:
+    with pytest.raises(InputError, match="gone"):
+        jobs.run(tmp_path / "job", weights=tmp_path / "gone")
+    assert not (tmp_path / "job").exists()
 
 
 # The controller's answer -----------------------------------------------------------------------

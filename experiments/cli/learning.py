@@ -195,7 +195,6 @@ def learn(
     given the same --out, this too goes on where it was. Start a run with 'bayesrace drive'.
     """
     from bayesrace.vehicles import get_car
-    from experiments.learn.job import discretisation_from
     from experiments.learn.job import learn as follow
     from experiments.learn.records import LearnSettings
     from experiments.learn.report import print_laps
@@ -206,7 +205,6 @@ def learn(
     settings = LearnSettings(
         car=parameters,
         name=name or parameters.name,
-        discretisation=discretisation_from(parameters, weights, artefact, points, folder),
         points=points,
         keep=keep,
         laps=laps or (None if watch else 1),
@@ -214,7 +212,10 @@ def learn(
         compare=compare,
         seed=seed,
     )
-    record = follow(settings, connect_to(endpoint), folder, data or [], weights, typer.echo)
+    record = follow(
+        settings, connect_to(endpoint), folder, typer.echo,
+        data=data or (), weights=weights, artefact=artefact,
+    )  # fmt: skip
     print_laps(record)
     typer.echo(str(folder))
 

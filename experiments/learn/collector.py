@@ -3,7 +3,7 @@
 import time
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -18,19 +18,16 @@ from learning.logs import dataset_from_messages
 __all__ = ["MOST_STATES", "Collector", "Stretch"]
 
 MOST_STATES: Final = 10_000
-"""A stretch without the end of a lap is cut here (200 s at 50 Hz), which bounds the memory while a
-car stands."""
+"""A stretch without the end of a lap is cut here (200 s at 50 Hz), which bounds the memory."""
 
 _DELAY_S: Final = 0.5
-"""A stretch is given out so long after its end: telemetry follows the actuation, and names the
-cycles that the fallback drove."""
+"""A stretch is given out so long after its end: telemetry comes after the actuation."""
 
 _FAR_S: Final = 0.1
 """Between two states further apart the time at which the car crossed the line is unknown."""
 
 _WORTH_REPORTING: Final = 50
-"""A stretch without the end of a lap is reported as useless from so many states on; between the
-last lap and the end of a run there are fewer."""
+"""A shorter stretch that is no lap, such as the end of a run, is not reported as useless."""
 
 _REMEDIES: Final = {
     "standstill": "the car stood still, or nearly; see 'bayesrace status' for why",
@@ -50,18 +47,13 @@ class Stretch:
     """What is driven up to the end of a lap, or a part of it."""
 
     flying: bool = False
-    begin_s: float | None = None
-    """Plant time when the lap began; None if that was not seen."""
+    begin_s: float | None = None  # plant time when the lap began, if that was seen
     states: list[State] = field(default_factory=list)
     versions: dict[str, None] = field(default_factory=dict)
-    end_s: float = 0.0
-    """Monotonic clock."""
-    samples: Dataset | None = None
-    """None before the end, or if no two states are one step apart."""
-    lap: LapRecord | None = None
-    """The lap that ended with this stretch, without its number; None if none did."""
-    why_not: str = ""
-    """Why none of it can be learned from, and the remedy; empty if some of it can."""
+    end_s: float = 0.0  # monotonic clock
+    samples: Dataset | None = None  # None if no two states are one step apart
+    lap: LapRecord | None = None  # the lap that ended with this stretch, without its number
+    why_not: str = ""  # why none of it can be learned from, and the remedy
 
 
 class Collector:
@@ -77,8 +69,7 @@ class Collector:
         self._line = None if track is None else StartLine(track)
         self._open = Stretch()
         self._ended: deque[Stretch] = deque()
-        self._run = (-1, -1)
-        self._laps = 0
+        self._run, self._laps = (-1, -1), 0
         self._fallbacks: dict[tuple[int, int], None] = {}
         """Run and number of the states that the fallback has answered, oldest first."""
 
@@ -100,7 +91,7 @@ class Collector:
             self._run = (-1, -1)
 
     def telemetry(self, message: Telemetry) -> None:
-        """Adds the telemetry of a cycle."""
+        """Adds the telemetry of a cycle, which names the cycles that the fallback drove."""
         if message.fallback > 0:
             if len(self._fallbacks) >= 2 * MOST_STATES:
                 del self._fallbacks[next(iter(self._fallbacks))]
@@ -151,29 +142,27 @@ class Collector:
         self._open = following
 
     def _evaluate(self, stretch: Stretch) -> None:
-        states, run = stretch.states, stretch.states[0].run
-        first, last = states[0].seq, states[-1].seq
+        states, lap = stretch.states, stretch.lap
+        run, first, last = states[0].run, states[0].seq, states[-1].seq
         # The last state's own cycle belongs to the next stretch, or there is none.
         fallbacks = [key for key in self._fallbacks if key[0] == run and first <= key[1] < last]
         for key in fallbacks:
             del self._fallbacks[key]
-        facts: dict[str, Any] = {"versions": list(stretch.versions), "fallbacks": len(fallbacks)}
         why_not = ""
         try:
             samples = dataset_from_messages(states, fallbacks, self._car, self._step_s)
         except InputError as error:
             why_not = str(error)
         else:
-            stretch.samples = samples
-            facts |= {"samples": len(samples), "left_out": samples.dropped}
+            stretch.samples, dropped = samples, samples.dropped
             if not len(samples):
-                reason = max(samples.dropped, key=lambda one: samples.dropped[one])
+                reason = max(dropped, key=lambda one: dropped[one])
                 why_not = _REMEDIES.get(reason, f"the samples are left out: {reason}")
-        if stretch.lap is not None or len(states) >= _WORTH_REPORTING:
-            stretch.why_not = why_not
-        if stretch.lap is None:
-            return
-        if self._track is not None:
-            path = self._track.project_path(np.array([state.x[:2] for state in states]))
-            facts["off_track_m"] = max(float(np.max(path.off_track_m)), 0.0)
-        stretch.lap = stretch.lap.model_copy(update=facts)
+            if lap is not None:
+                lap.samples, lap.left_out = len(samples), dropped
+        stretch.why_not = why_not if lap is not None or len(states) >= _WORTH_REPORTING else ""
+        if lap is not None:
+            lap.versions, lap.fallbacks = list(stretch.versions), len(fallbacks)
+            if self._track is not None:
+                path = self._track.project_path(np.array([state.x[:2] for state in states]))
+                lap.off_track_m = max(float(np.max(path.off_track_m)), 0.0)

@@ -53,7 +53,7 @@ class Journal:
             raise InputError(f"{folder} holds something else; choose another folder")
         folder.mkdir(parents=True, exist_ok=True)
         self._database, before, self.record, stages = _open(path)
-        self.folder, self._settings, self.resumed = folder, settings, before is not None
+        self.folder, self.settings, self.resumed = folder, settings, before is not None
         for what in ("car", "name", "discretisation"):
             if before is not None and getattr(before, what) != getattr(settings, what):
                 self.close()
@@ -65,7 +65,7 @@ class Journal:
         self._samples = {name: self._dataset(stages.get(name, b"")) for name in names}
         clear_partials(folder)
         if self.resumed:
-            self._save()
+            self.save()
 
     def close(self) -> None:
         """Releases the folder; nothing may be written after this."""
@@ -95,55 +95,41 @@ class Journal:
         return next(updates, None) if version else None
 
     def add_driven(self, samples: Dataset | None, lap: LapRecord | None = None) -> None:
-        """Adds samples, and the lap that ended with them, if one did."""
+        """Adds samples, and the lap that ended with them, if one did, with its number."""
         if lap is not None:
             self.record.laps.append(lap)
+            lap.lap = len(self.record.laps)
         if samples is not None or lap is not None:
-            self._save(new=_joined(self._samples["new"], samples or self._dataset()))
+            self.save(new=_joined(self._samples["new"], samples or self._dataset()))
 
     def take_samples(self) -> list[Dataset]:
         """For a training: the samples kept, and all others, which are in stage ``learning`` now."""
         learning = _joined(self._samples["learning"], self._samples["new"])
-        self._save(learning=learning, new=self._dataset())
+        self.save(learning=learning, new=self._dataset())
         return [self._samples["kept"], learning]
 
     def add_update(
         self, update: UpdateRecord, weights: GpWeights | None, **samples: Dataset
-    ) -> UpdateRecord:
-        """Adds an update with its weights and its file; those still pending are superseded.
+    ) -> None:
+        """Adds an update with its weights in a file; those still pending are superseded.
 
-        ``samples``: stages that change with it. Returns the whole update.
+        ``samples``: stages that change with it.
         """
-        updates = self.record.updates
+        for one in self.record.updates:
+            one.verdict = "superseded" if one.verdict == "pending" else one.verdict
         if weights is not None:
-            file = f"weights-{len(updates):04d}.bin"
-            write_weights(self.folder / file, weights)
-            facts = {
-                "version": weights.version, "file": file, "points": max(weights.counts),
-                "metrics": {name: weights.metrics.get(name, {}) for name in OUTPUTS},
-            }  # fmt: skip
-            update = update.model_copy(update=facts)
-        for index, one in enumerate(updates):
-            if one.verdict == "pending":
-                updates[index] = one.model_copy(update={"verdict": "superseded"})
-        updates.append(update)
-        self._save(**samples)
-        return update
-
-    def change_update(self, version: str, **changes: object) -> UpdateRecord | None:
-        """Changes the last update of this version; None if it is not one of this job's."""
-        update = self.update_of(version)
-        if update is not None:
-            index = len(self.record.updates) - 1 - self.record.updates[::-1].index(update)
-            self.record.updates[index] = update.model_copy(update=changes)
-            self._save()
-        return update
+            update.version, update.points = weights.version, max(weights.counts)
+            update.metrics = {name: weights.metrics.get(name, {}) for name in OUTPUTS}
+            update.file = f"weights-{len(self.record.updates):04d}.bin"
+            write_weights(self.folder / update.file, weights)
+        self.record.updates.append(update)
+        self.save(**samples)
 
     def remark(self, text: str) -> None:
         """Notes why a drive gave nothing to learn from, unless that is noted already."""
         if text not in self.record.remarks:
             self.record.remarks = [*self.record.remarks, text][-_MOST_REMARKS:]
-            self._save()
+            self.save()
 
     def drop_weights(self, in_use: str) -> None:
         """Deletes old weights files, and those that a killed job has left without an update.
@@ -157,15 +143,11 @@ class Journal:
             if path.name not in names:
                 path.unlink()
 
-    def _dataset(self, data: bytes = b"") -> Dataset:
-        x, u, x_next = np.split(np.frombuffer(data, "<f8").reshape(-1, 16), [7, 9], axis=1)
-        return Dataset(self._settings.car, self._settings.discretisation.step_s, x, u, x_next)
-
-    def _save(self, **samples: Dataset) -> None:
+    def save(self, **samples: Dataset) -> None:
         """Writes settings, record and these samples as one transaction, then ``laps.json``."""
         self._samples |= samples
         record = self.record.model_dump_json(indent=1) + "\n"
-        content = {"settings": self._settings.model_dump_json(), "record": record} | {
+        content = {"settings": self.settings.model_dump_json(), "record": record} | {
             stage: np.hstack((one.x, one.u, one.x_next)).astype("<f8").tobytes()
             for stage, one in samples.items()
         }
@@ -176,6 +158,10 @@ class Journal:
             path = self.folder / _DATABASE
             raise InputError(f"cannot write {path}: {error}; the job can be resumed") from None
         write_whole(self.folder / "laps.json", record)
+
+    def _dataset(self, data: bytes = b"") -> Dataset:
+        x, u, x_next = np.split(np.frombuffer(data, "<f8").reshape(-1, 16), [7, 9], axis=1)
+        return Dataset(self.settings.car, self.settings.discretisation.step_s, x, u, x_next)
 
 
 def resumable_settings(folder: Path) -> LearnSettings | None:

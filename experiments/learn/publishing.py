@@ -7,10 +7,10 @@ from typing import Any
 
 from bayesrace.files import read_whole
 from bayesrace.gp.weights import MAX_BYTES
-from bayesrace.messages import Event, Reply, Scalar, Status
+from bayesrace.messages import Event, Reply, Status
 from bayesrace.transport import send_weights
 from experiments.learn.journal import Journal
-from experiments.learn.records import UpdateRecord
+from experiments.learn.records import UpdateRecord, Verdict
 
 __all__ = ["NotTakenOverError", "Publisher", "in_words"]
 
@@ -44,7 +44,7 @@ class Publisher:
     ) -> None:
         self._session, self._car, self._journal, self._say = session, car, journal, say
         self._thread = ThreadPoolExecutor(1, "learn-publisher")
-        self._sent: deque[tuple[str, Future[Reply]]] = deque()
+        self._sent: deque[tuple[UpdateRecord, Future[Reply]]] = deque()
         self.present = False
         """A heartbeat has come since the controller appeared or disappeared."""
         self.closed = False
@@ -59,13 +59,12 @@ class Publisher:
 
     def offer(self, update: UpdateRecord) -> None:
         """Sends the weights of an update if the controller is there and has not declined them."""
-        version = update.version
-        updates = self._journal.record.updates
+        version, updates = update.version, self._journal.record.updates
         verdicts = {one.verdict for one in updates if one.version == version}
         if verdicts & {"refused", "rolled back"}:
-            self._note(version, "not sent", "the same weights have been declined before")
+            self._note(update, "not sent", "the same weights have been declined before")
         elif version == self.in_use:
-            self._note(version, "accepted", "in use already")
+            self._note(update, "accepted", "in use already")
         elif self.present:
             self._send(update)
         else:
@@ -86,32 +85,36 @@ class Publisher:
         elif not self.busy:
             update = self._journal.update_of(version)
             if update is not None and update.verdict in ("pending", "superseded"):
-                self._note(version, "accepted", "in use")  # the answer was lost
+                self._note(update, "accepted", "in use")  # the answer was lost
 
     def event(self, event: Event) -> None:
         """Notes what the controller has rolled back."""
         if event.source == "controller" and event.kind == "weights_rolled_back":
             version = str(event.data.get("from_version", ""))
-            update = self._journal.change_update(version, verdict="rolled back", answer=event.text)
-            ours = "" if update is None else f" (learned after lap {update.after_lap})"
-            self._say(f"rolled back: {version}{ours}: {event.text}")
+            if (update := self._journal.update_of(version)) is not None:
+                update.verdict, update.answer = "rolled back", event.text
+                self._journal.save()
+                version += f" (learned after lap {update.after_lap})"
+            self._say(f"rolled back: {version}: {event.text}")
 
     def poll(self) -> None:
         """Notes the answers that have arrived."""
         while self._sent and self._sent[0][1].done():
-            version, request = self._sent.popleft()
+            update, request = self._sent.popleft()
             if request.cancelled():
                 continue
             error = request.exception()
             reply = None if error else request.result()
             if reply is None or (not reply.accepted and reply.data.get("again") is True):
                 why = str(error) if reply is None else in_words(reply)
-                self._say(f"{version}: {why}")
-                self._journal.change_update(version, answer=why)
+                self._note(update, update.verdict, why)
             elif reply.accepted:
-                self._note(version, "accepted", in_words(reply), reply)
+                cycle, number = reply.data.get("cycle"), reply.data.get("number")
+                update.cycle = cycle if type(cycle) is int else None
+                update.acceptance = number if type(number) is int else None
+                self._note(update, "accepted", in_words(reply))
             else:
-                self._note(version, "refused", reply.text)
+                self._note(update, "refused", reply.text)
 
     def wait(self) -> None:
         """Waits for the answer that is missing, and notes it."""
@@ -133,19 +136,10 @@ class Publisher:
             return send_weights(self._session, self._car, data)
 
         if not self.closed:
-            self._sent.append((update.version, self._thread.submit(call)))
+            self._sent.append((update, self._thread.submit(call)))
 
-    def _note(self, version: str, verdict: str, answer: str, reply: Reply | None = None) -> None:
-        """Changes the update and says so, unless its rollback came before the answer."""
-        update = self._journal.update_of(version)
-        if update is not None and update.verdict != "rolled back":
-            data = {} if reply is None else reply.data
-            cycle, number = (_count(data.get(key)) for key in ("cycle", "number"))
-            self._journal.change_update(
-                version, verdict=verdict, answer=answer, cycle=cycle, acceptance=number
-            )
-            self._say(f"{version}: {'refused: ' if verdict == 'refused' else ''}{answer}")
-
-
-def _count(value: Scalar | None) -> int | None:
-    return value if type(value) is int else None
+    def _note(self, update: UpdateRecord, verdict: Verdict, answer: str) -> None:
+        if update.verdict != "rolled back":  # that event may come before the answer
+            update.verdict, update.answer = verdict, answer
+            self._journal.save()
+        self._say(f"{update.version}: {'refused: ' if verdict == 'refused' else ''}{answer}")

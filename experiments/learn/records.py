@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.vehicles import CarSetting, default_car
 
-__all__ = ["LapRecord", "LearnSettings", "Record", "UpdateRecord"]
+__all__ = ["LapRecord", "LearnSettings", "Record", "UpdateRecord", "Verdict"]
 
 Verdict = Literal[
     "pending", "accepted", "refused", "rolled back", "not sent", "superseded", "failed"
@@ -18,12 +18,10 @@ Verdict = Literal[
 before; ``not sent``: the same were refused or rolled back before; ``failed``: the training."""
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class LearnSettings(_Frozen):
+class LearnSettings(BaseModel):
     """Settings of ``bayesrace learn``."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
     car: CarSetting = Field(default_factory=default_car)
     name: str = Field(
@@ -39,7 +37,7 @@ class LearnSettings(_Frozen):
     seed: int = Field(0, ge=0, description="of the optimiser's starts")
 
 
-class LapRecord(_Frozen):
+class LapRecord(BaseModel):
     """One lap that was driven."""
 
     lap: int = Field(0, description="number in this folder, from 1")
@@ -53,7 +51,7 @@ class LapRecord(_Frozen):
     off_track_m: float | None = Field(None, description="deepest excursion; null without a track")
 
 
-class UpdateRecord(_Frozen):
+class UpdateRecord(BaseModel):
     """One training, and what became of its weights."""
 
     after_lap: int = Field(description="last lap that it learned from; 0: only the data given")
