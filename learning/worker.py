@@ -101,7 +101,7 @@ class Trainer:
             # A session of its own: Ctrl-C at the terminal is for the job, which ends its worker.
             self._process = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=log, stderr=log,
-                env={**os.environ, **threads}, start_new_session=True,
+                env={**os.environ, **threads}, start_new_session=True, bufsize=0,
             )  # fmt: skip
         with suppress(ProcessLookupError):  # at once: its imports take a while, too
             os.setpriority(os.PRIO_PROCESS, self._process.pid, NICE)
@@ -117,7 +117,6 @@ class Trainer:
         if process.stdin is not None:
             with suppress(BrokenPipeError):  # it has died, which poll() reports
                 process.stdin.write(b"\n")
-                process.stdin.flush()
 
     def poll(self) -> Outcome | None:
         """The outcome, once; None while the task runs, or without one. An error if it died."""

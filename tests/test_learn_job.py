@@ -65,7 +65,7 @@ class Desk:
         """Until no answer is missing."""
         self.publisher._thread.submit(int).result()
         self.publisher.poll()
-        assert not self.publisher.busy
+        assert not self.publisher.unanswered
 
     def heartbeat(self, drives_with: str) -> None:
         self.publisher.heartbeat(controller_status(drives_with))

@@ -120,8 +120,8 @@ class Learner:
             Event: self._publisher.event,
             Status: self._publisher.heartbeat,
         }
-        self._due = journal.has_new
-        """A training is to start as soon as the one before has ended and its answer is there."""
+        self._due = True
+        """A training is to start if there are samples, once the one before has its answer."""
         self._laps = 0
         self._remarked: set[str] = set()
         self._missing_at_s = time.monotonic() + _MISSING_S
@@ -147,7 +147,7 @@ class Learner:
 
     def _done(self) -> bool:
         enough = self._settings.laps is not None and self._laps >= self._settings.laps
-        busy = self._due or self._trainer.busy or self._publisher.busy
+        busy = self._due or self._trainer.busy or self._publisher.unanswered
         return self._ending or (enough and not busy)
 
     def _end(self) -> None:
@@ -158,7 +158,7 @@ class Learner:
             self._handle_rest()
             for stretch in self._collector.take(at_once=True):
                 self._add(stretch)
-        if self._publisher.busy:
+        if self._publisher.unanswered:
             self._say("waiting for the controller's answer; Ctrl-C ends without it")
         self._publisher.wait()  # for seconds; an interrupt now loses no more than the answer
         self._handle_rest()
@@ -198,24 +198,21 @@ class Learner:
         self._journal.add_driven(stretch.samples, lap)
         if lap is not None:
             self._say(_in_words(lap))
-        if why_not:
+        if why_not and why_not not in self._remarked:
+            self._remarked.add(why_not)
             self._journal.remark(why_not)
-            if why_not not in self._remarked:
-                self._remarked.add(why_not)
-                self._say(f"nothing to learn from: {why_not}")
+            self._say(f"nothing to learn from: {why_not}")
 
     def _start_training(self) -> None:
         journal, settings = self._journal, self._settings
-        if not self._due or self._trainer.busy or self._publisher.busy:
+        if not self._due or self._trainer.busy or self._publisher.unanswered:
             return
         self._due, self._after_lap = False, len(journal.record.laps)
-        if not journal.has_new:
-            return
-        threads = max(1, (os.cpu_count() or 1) - 1)
-        training = TrainingSettings(capacity=settings.points, seed=settings.seed, threads=threads)
-        samples, initial = journal.take_samples(), journal.initial
-        task = Task(settings.discretisation, samples, initial, training, settings.keep)
-        self._trainer.start(task)
+        samples, threads = journal.take_samples(), max(1, (os.cpu_count() or 1) - 1)
+        how = TrainingSettings(capacity=settings.points, seed=settings.seed, threads=threads)
+        if len(samples[-1]):
+            model, initial = settings.discretisation, journal.initial
+            self._trainer.start(Task(model, samples, initial, how, settings.keep))
 
     def _finish_training(self) -> None:
         if (outcome := self._trainer.poll()) is None:

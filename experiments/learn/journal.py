@@ -72,11 +72,6 @@ class Journal:
         self._database.close()
 
     @property
-    def has_new(self) -> bool:
-        """There are samples that no training has learned from."""
-        return len(self._samples["learning"]) + len(self._samples["new"]) > 0
-
-    @property
     def last_accepted(self) -> UpdateRecord | None:
         """The newest update that a controller took over and kept, if its file exists."""
         accepted = (one for one in reversed(self.record.updates) if one.verdict == "accepted")
@@ -105,7 +100,8 @@ class Journal:
     def take_samples(self) -> list[Dataset]:
         """For a training: the samples kept, and all others, which are in stage ``learning`` now."""
         learning = _joined(self._samples["learning"], self._samples["new"])
-        self.save(learning=learning, new=self._dataset())
+        if len(learning):
+            self.save(learning=learning, new=self._dataset())
         return [self._samples["kept"], learning]
 
     def add_update(

@@ -44,18 +44,14 @@ class Publisher:
     ) -> None:
         self._session, self._car, self._journal, self._say = session, car, journal, say
         self._thread = ThreadPoolExecutor(1, "learn-publisher")
-        self._sent: deque[tuple[UpdateRecord, Future[Reply]]] = deque()
+        self.unanswered: deque[tuple[UpdateRecord, Future[Reply]]] = deque()
+        """Updates that were sent, oldest first, with what will be the answer."""
         self.present = False
         """A heartbeat has come since the controller appeared or disappeared."""
         self.closed = False
         """Nothing is sent any more: what is pending is for the next job."""
         self.in_use = ""
         """Version that the controller drives with; empty while that is unknown, or for none."""
-
-    @property
-    def busy(self) -> bool:
-        """An answer is missing."""
-        return bool(self._sent)
 
     def offer(self, update: UpdateRecord) -> None:
         """Sends the weights of an update if the controller is there and has not declined them."""
@@ -78,14 +74,17 @@ class Publisher:
         """
         if status.source != "controller":
             return
-        version = self.in_use = status.weights_version
-        if not self.present:
-            self.present = True
-            self._appeared(version)
-        elif not self.busy:
-            update = self._journal.update_of(version)
-            if update is not None and update.verdict in ("pending", "superseded"):
-                self._note(update, "accepted", "in use")  # the answer was lost
+        appeared, self.present, self.in_use = not self.present, True, status.weights_version
+        update, last = self._journal.update_of(self.in_use), self._journal.last_accepted
+        newest = self._journal.record.updates[-1:]
+        if appeared and newest and newest[0].verdict == "pending":
+            self.offer(newest[0])
+        elif appeared and last is not None and self.in_use != last.version:
+            drives_with = self.in_use or "no weights"
+            self._say(f"the controller drives with {drives_with}; sending {last.version}")
+            self._send(last)
+        elif update and update.verdict in ("pending", "superseded") and not self.unanswered:
+            self._note(update, "accepted", "in use")  # the answer was lost
 
     def event(self, event: Event) -> None:
         """Notes what the controller has rolled back."""
@@ -99,8 +98,8 @@ class Publisher:
 
     def poll(self) -> None:
         """Notes the answers that have arrived."""
-        while self._sent and self._sent[0][1].done():
-            update, request = self._sent.popleft()
+        while self.unanswered and self.unanswered[0][1].done():
+            update, request = self.unanswered.popleft()
             if request.cancelled():
                 continue
             error = request.exception()
@@ -121,22 +120,13 @@ class Publisher:
         self._thread.shutdown(wait=True, cancel_futures=True)
         self.poll()
 
-    def _appeared(self, version: str) -> None:
-        last, updates = self._journal.last_accepted, self._journal.record.updates
-        if updates and updates[-1].verdict == "pending":
-            self.offer(updates[-1])
-        elif last is not None and version != last.version:
-            drives_with = version or "no weights"
-            self._say(f"the controller drives with {drives_with}; sending {last.version}")
-            self._send(last)
-
     def _send(self, update: UpdateRecord) -> None:
         def call() -> Reply:
             data = read_whole(self._journal.folder / update.file, "weights file", MAX_BYTES)
             return send_weights(self._session, self._car, data)
 
         if not self.closed:
-            self._sent.append((update, self._thread.submit(call)))
+            self.unanswered.append((update, self._thread.submit(call)))
 
     def _note(self, update: UpdateRecord, verdict: Verdict, answer: str) -> None:
         if update.verdict != "rolled back":  # that event may come before the answer
