@@ -112,7 +112,7 @@ class Trainer:
         process = self.prepare()
         os.truncate(self._log, 0)  # the process appends: it goes on at the beginning
         (self._folder / _OUTCOME).unlink(missing_ok=True)
-        (self._folder / _TASK).write_bytes(pickle.dumps(task))
+        write_whole(self._folder / _TASK, pickle.dumps(task))
         self.busy = True
         if process.stdin is not None:
             with suppress(BrokenPipeError):  # it has died, which poll() reports

@@ -40,7 +40,7 @@ class Desk:
         self.sent: list[str] = []
         self.said: list[str] = []
         monkeypatch.setattr(publishing, "send_weights", self._send)
-        self.publisher = Publisher(None, "orca", journal, self.said.append)
+        self.publisher = Publisher(None, journal, self.said.append)
 
     def _send(self, _session: Any, _car: str, data: bytes) -> Reply:
         version = decode_weights(data).version

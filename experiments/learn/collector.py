@@ -23,12 +23,6 @@ MOST_STATES: Final = 10_000
 _DELAY_S: Final = 0.5
 """A stretch is given out so long after its end: telemetry comes after the actuation."""
 
-_FAR_S: Final = 0.1
-"""Between two states further apart the time at which the car crossed the line is unknown."""
-
-_WORTH_REPORTING: Final = 50
-"""A shorter stretch that is no lap, such as the end of a run, is not reported as useless."""
-
 _REMEDIES: Final = {
     "standstill": "the car stood still, or nearly; see 'bayesrace status' for why",
     "gap": "messages are lost; give the network and this machine less to do",
@@ -126,7 +120,7 @@ class Collector:
 
     def _crossing_s(self, states: list[State]) -> float | None:
         """Plant time at the line; None if the states around it are missing."""
-        if len(states) < 2 or states[-1].time_s - states[-2].time_s > _FAR_S:
+        if len(states) < 2 or states[-1].time_s - states[-2].time_s > 0.1:
             return None
         before, after = states[-2], states[-1]
         fraction = 1.0
@@ -160,7 +154,8 @@ class Collector:
                 why_not = _REMEDIES.get(reason, f"the samples are left out: {reason}")
             if lap is not None:
                 lap.samples, lap.left_out = len(samples), dropped
-        stretch.why_not = why_not if lap is not None or len(states) >= _WORTH_REPORTING else ""
+        # A short stretch that is no lap, such as the end of a run, may well be of no use.
+        stretch.why_not = why_not if lap is not None or len(states) >= 50 else ""
         if lap is not None:
             lap.versions, lap.fallbacks = list(stretch.versions), len(fallbacks)
             if self._track is not None:

@@ -6,7 +6,6 @@ start again at any time.
 """
 
 import os
-import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -32,19 +31,14 @@ from learning.worker import Task, Trainer
 
 __all__ = ["Learner", "learn"]
 
-Say = Callable[[str], None]
-"""Prints a line on the terminal."""
-
 _TICK_S: Final = 0.1
-_MISSING_S: Final = 5.0
-"""A plant or a controller missing for so long is reported."""
 
 
 def learn(
     settings: LearnSettings,
     endpoints: Endpoints,
     folder: Path,
-    say: Say,
+    say: Callable[[str], None],
     *,
     data: Sequence[Path] = (),
     weights: Path | None = None,
@@ -99,13 +93,18 @@ class Learner:
     """One job: :meth:`run` it once, in the main thread."""
 
     def __init__(
-        self, session: Any, journal: Journal, say: Say, track: Track | None, beside: References
+        self,
+        session: Any,
+        journal: Journal,
+        say: Callable[[str], None],
+        track: Track | None,
+        beside: References,
     ) -> None:
-        """``track``: times laps; ``beside``: drawn for comparison."""
+        """``say``: prints a line; ``track``: times laps; ``beside``: drawn for comparison."""
         settings = self._settings = journal.settings
         self._journal, self._say, self._beside = journal, say, beside
         self._collector = Collector(settings.car, settings.discretisation.step_s, track)
-        self._publisher = Publisher(session, settings.name, journal, say)
+        self._publisher = Publisher(session, journal, say)
         self._trainer = Trainer(journal.folder)
         self._inbox = Inbox(session, settings.name)
         for topic in TOPICS:
@@ -124,19 +123,18 @@ class Learner:
         """A training is to start if there are samples, once the one before has its answer."""
         self._laps = 0
         self._remarked: set[str] = set()
-        self._missing_at_s = time.monotonic() + _MISSING_S
         self._ending = False
 
     def run(self) -> None:
         """Follows the car until the wanted number of laps is learned from, or a signal."""
         self._trainer.prepare()
+        self._say(f"waiting for plant and controller of car '{self._settings.name}'")
         with self._inbox.stamped():
             try:
                 with self._inbox.catching_signals():
                     while not self._done():
                         if (item := self._inbox.get(_TICK_S)) is not None:
                             self._handle(item)
-                        self._report_missing()
                         for stretch in self._collector.take():
                             self._add(stretch)
                         self._publisher.poll()
@@ -178,17 +176,10 @@ class Learner:
             self._publisher.present &= item.name != "controller"
             if item.kind is Kind.GONE:
                 self._say(f"the {item.name} is gone; waiting for it")
-            elif len(self._inbox.alive) == 2:
+            elif missing := {"plant", "controller"} - self._inbox.alive:
+                self._say(f"the {item.name} is there; waiting for the {missing.pop()}")
+            else:
                 self._say(f"following car '{self._settings.name}'")
-
-    def _report_missing(self) -> None:
-        missing = sorted({"plant", "controller"} - self._inbox.alive)
-        if not missing:
-            self._missing_at_s = time.monotonic() + _MISSING_S
-        elif time.monotonic() > self._missing_at_s:
-            self._missing_at_s = float("inf")
-            what = " and no ".join(missing)
-            self._say(f"no {what} of car '{self._settings.name}' yet; waiting")
 
     def _add(self, stretch: Stretch) -> None:
         lap, why_not = stretch.lap, stretch.why_not

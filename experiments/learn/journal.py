@@ -1,10 +1,10 @@
 """The folder of a learning job: ``learn.db``, and the files made beside it.
 
 ``learn.db`` (SQLite, one table of named contents) holds all that a job needs to resume: its
-settings, its :class:`~.records.Record`, and its samples in three stages: ``new`` (driven since the
-last training began), ``learning`` (taken by a training) and ``kept`` (by the last training that
-ended). Each change is one transaction that is on the disk when it ends: after a kill or a power
-failure at any moment every sample is in one stage.
+:class:`~.records.Record`, and its samples in three stages: ``new`` (driven since the last training
+began), ``learning`` (taken by a training) and ``kept`` (by the last training that ended). Each
+change is one transaction that is on the disk when it ends: after a kill or a power failure at any
+moment every sample is in one stage.
 """
 
 import sqlite3
@@ -25,9 +25,6 @@ __all__ = ["MOST_WEIGHTS", "Journal", "resumable_settings"]
 
 MOST_WEIGHTS: Final = 20
 """Weights files kept, the newest; besides, those that are in use or were last accepted."""
-
-_MOST_REMARKS: Final = 50
-"""Each cause is there once, but some name a number."""
 
 _DATABASE: Final = "learn.db"
 _SCHEMA: Final = """
@@ -52,7 +49,8 @@ class Journal:
         if folder.is_dir() and not path.exists() and any(folder.iterdir()):
             raise InputError(f"{folder} holds something else; choose another folder")
         folder.mkdir(parents=True, exist_ok=True)
-        self._database, before, self.record, stages = _open(path)
+        self._database, self.record, stages = _open(path)
+        before, self.record.settings = self.record.settings, settings
         self.folder, self.settings, self.resumed = folder, settings, before is not None
         for what in ("car", "name", "discretisation"):
             if before is not None and getattr(before, what) != getattr(settings, what):
@@ -124,7 +122,7 @@ class Journal:
     def remark(self, text: str) -> None:
         """Notes why a drive gave nothing to learn from, unless that is noted already."""
         if text not in self.record.remarks:
-            self.record.remarks = [*self.record.remarks, text][-_MOST_REMARKS:]
+            self.record.remarks = [*self.record.remarks, text][-50:]  # some name a number
             self.save()
 
     def drop_weights(self, in_use: str) -> None:
@@ -140,13 +138,12 @@ class Journal:
                 path.unlink()
 
     def save(self, **samples: Dataset) -> None:
-        """Writes settings, record and these samples as one transaction, then ``laps.json``."""
+        """Writes the record and these samples as one transaction, then ``laps.json``."""
         self._samples |= samples
         record = self.record.model_dump_json(indent=1) + "\n"
-        content = {"settings": self.settings.model_dump_json(), "record": record} | {
-            stage: np.hstack((one.x, one.u, one.x_next)).astype("<f8").tobytes()
-            for stage, one in samples.items()
-        }
+        content: dict[str, str | bytes] = {"record": record}
+        for stage, data in samples.items():
+            content[stage] = np.hstack((data.x, data.u, data.x_next)).astype("<f8").tobytes()
         try:
             with self._database as database:
                 database.executemany("REPLACE INTO content VALUES (?, ?)", content.items())
@@ -167,22 +164,19 @@ def resumable_settings(folder: Path) -> LearnSettings | None:
     """
     if not (folder / _DATABASE).is_file():
         return None
-    database, settings, _, _ = _open(folder / _DATABASE)
+    database, record, _ = _open(folder / _DATABASE)
     database.close()
-    return settings
+    return record.settings
 
 
-def _open(path: Path) -> tuple[sqlite3.Connection, LearnSettings | None, Record, dict[str, bytes]]:
-    """The database, locked until it is closed, and the settings, record and samples in it."""
+def _open(path: Path) -> tuple[sqlite3.Connection, Record, dict[str, bytes]]:
+    """The database, locked until it is closed, and the record and the samples in it."""
     database = sqlite3.connect(path, timeout=0)
     try:
         database.executescript(_SCHEMA)
         content: dict[str, Any] = dict(database.execute("SELECT name, data FROM content"))
-        if not content:
-            return database, None, Record(), {}
-        settings = LearnSettings.model_validate_json(content.pop("settings"))
-        return database, settings, Record.model_validate_json(content.pop("record")), content
-    except (sqlite3.Error, ValueError, KeyError) as error:  # pydantic's are ValueErrors
+        return database, Record.model_validate_json(content.pop("record", "{}")), content
+    except (sqlite3.Error, ValueError) as error:  # pydantic's are ValueErrors
         database.close()
         why = f"{path} cannot be read ({str(error).splitlines()[0]}); restore it"
         if getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_BUSY:

@@ -39,10 +39,9 @@ class Publisher:
     appears. Weights refused or rolled back are not sent again.
     """
 
-    def __init__(
-        self, session: Any, car: str, journal: Journal, say: Callable[[str], None]
-    ) -> None:
-        self._session, self._car, self._journal, self._say = session, car, journal, say
+    def __init__(self, session: Any, journal: Journal, say: Callable[[str], None]) -> None:
+        self._session, self._journal, self._say = session, journal, say
+        self._car = journal.settings.name
         self._thread = ThreadPoolExecutor(1, "learn-publisher")
         self.unanswered: deque[tuple[UpdateRecord, Future[Reply]]] = deque()
         """Updates that were sent, oldest first, with what will be the answer."""

@@ -72,6 +72,7 @@ class Record(BaseModel):
     """Everything that a job reports."""
 
     schema_version: Literal[2] = 2
+    settings: LearnSettings | None = Field(None, description="of the last job")
     laps: list[LapRecord] = []
     updates: list[UpdateRecord] = []
     remarks: list[str] = Field([], description="why a drive gave nothing to learn from, each once")
