@@ -102,7 +102,7 @@ def draw(record: Record, beside: References, path: Path) -> None:
             )  # fmt: skip
         for lap, time_s in laps:
             if time_s > top:
-                axes.annotate(f" ↑ {time_s:.2f} s", (lap.lap, top), va="center", fontsize=6.5)
+                axes.annotate(f"↑ {time_s:.2f} s\n", (lap.lap, top), ha="center", fontsize=6.5)
         green = look("bayesrace-updated").colour
         for label, marker, colour, verdicts in (
             ("new weights taken over", "|", green, {"accepted"}),
