@@ -105,10 +105,10 @@ class Jobs:
         class Fed(Inbox):
             @contextmanager
             def stamped(self) -> Iterator[None]:
-                jobs.put = self._items.put
+                jobs.put = self.put
                 with super().stamped():
                     for item in jobs._arrive:
-                        self._items.put(item)
+                        self.put(item)
                     yield
 
         self.put: Callable[[Item], None] = self._arrive.append

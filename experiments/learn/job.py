@@ -131,7 +131,7 @@ class Learner:
         self._say(f"waiting for plant and controller of car '{self._settings.name}'")
         with self._inbox.stamped():
             try:
-                with self._inbox.catching_signals():
+                with self._inbox.receive_signals():
                     while not self._done():
                         if (item := self._inbox.get(_TICK_S)) is not None:
                             self._handle(item)
