@@ -1,28 +1,22 @@
-"""How well weights predict the residual of a drive that they were not trained on."""
+"""Comparison of weights with the residual of a drive that they were not trained on."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.linalg import cho_factor, solve_triangular
 
+from bayesrace.arrays import Flags, Floats
 from bayesrace.errors import InputError
-from bayesrace.gp.expression import evaluate_mean, kernel_matrix
+from bayesrace.gp.expression import evaluate_mean
 from bayesrace.gp.weights import OUTPUTS, GpOutput, GpWeights
 from bayesrace.integrators import Discretisation
 from learning.dataset import Dataset
+from learning.posterior import Covariance, Posterior
 from learning.residual import identity, residual
 from learning.scores import NORMAL_95, PredictionErrors
 
 __all__ = ["Validation", "predictive_sigma", "validate"]
-
-Floats = NDArray[np.float64]
-
-_AT_ONCE: Final = 4096
-"""Samples whose covariances with all training points are in memory together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +42,7 @@ class Validation:
         """Half the width of the 95 % interval about the mean."""
         return NORMAL_95 * self.sigma
 
-    def uncertain(self, threshold: float) -> NDArray[np.bool_]:
+    def uncertain(self, threshold: float) -> Flags:
         """Samples (n,) whose largest standard deviation, over the outputs, is above this.
 
         The paper's mark, which compares m/s and rad/s with one number.
@@ -57,32 +51,16 @@ class Validation:
 
 
 def _output_sigma(output: GpOutput, z: Floats) -> Floats:
-    prior = output.signal_variance + output.noise_variance
-    if output.count == 0:
-        return np.full(len(z), output.y_scale * np.sqrt(prior))
-    signal = output.signal_variance
-    own = signal * kernel_matrix(output.kernel, output.inputs, output.inputs, output.length_scales)
-    own[np.diag_indices_from(own)] += output.noise_variance
-    try:
-        factor, _ = cho_factor(own, lower=True)
-    except np.linalg.LinAlgError as error:
-        raise InputError("GP weights: covariance of the inputs is singular; train again") from error
-    explained = np.empty(len(z))
-    for begin in range(0, len(z), _AT_ONCE):
-        rows = slice(begin, begin + _AT_ONCE)
-        cross = signal * kernel_matrix(output.kernel, output.inputs, z[rows], output.length_scales)
-        whitened = solve_triangular(factor, cross, lower=True, check_finite=False)
-        explained[rows] = np.einsum("ij,ij->j", whitened, whitened)
-    variance = np.maximum(prior - explained, output.noise_variance)
-    sigma: Floats = output.y_scale * np.sqrt(variance)
-    return sigma
+    covariance = Covariance(
+        output.kernel, output.signal_variance, output.length_scales, output.noise_variance
+    )
+    # The uncertainty does not depend on the targets.
+    _, sigma = Posterior(covariance, output.inputs, np.zeros(output.count)).predict(z)
+    return output.y_scale * sigma
 
 
 def predictive_sigma(weights: GpWeights, z: Floats) -> Floats:
-    """Predictive standard deviation (m, 3) at features ``z`` (m, 6), noise included, SI units.
-
-    sigma^2 = y_scale^2 (s^2 + noise - s^4 k' (s^2 K + noise I)^-1 k).
-    """
+    """Predictive standard deviation (m, 3) at features ``z`` (m, 6), noise included, SI units."""
     return np.column_stack([_output_sigma(output, z) for output in weights.outputs])
 
 

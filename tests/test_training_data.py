@@ -159,7 +159,7 @@ def test_damaged_files_are_read_or_refused(
 # Logs --------------------------------------------------------------------------------------------
 
 
-def test_a_log_tells_its_car_and_discretisation(tmp_path: Path, driven: Dataset) -> None:
+def test_a_log_names_its_car_and_discretisation(tmp_path: Path, driven: Dataset) -> None:
     facts = log_facts(write_log(tmp_path / "bare.mcap", driven))
     assert (facts.names, facts.car, facts.discretisation) == (("orca",), None, None)
     given = {"car": "orca", "discretisation": PREDICTION.model_dump()}
@@ -195,7 +195,7 @@ def test_a_step_in_single_precision_is_the_step_that_is_meant(
     assert len(read_samples(paths).dataset) == len(driven) + len(other)
 
 
-def test_a_damaged_file_is_told_as_such(tmp_path: Path) -> None:
+def test_a_damaged_file_is_reported_as_such(tmp_path: Path) -> None:
     """It does not name its car either, but that is not what is wrong with it."""
     (tmp_path / "x.npz").write_bytes(b"PK, and no more")
     with pytest.raises(InputError, match=r"x\.npz: not arrays"):

@@ -29,7 +29,7 @@ REPORT: Final = "report.html"
 PICTURE: Final = "lap.png"
 
 _TEMPLATE: Final = "report.html.j2"
-_PACKAGES: Final = ("bayesrace", "casadi", "numpy", "scikit-learn", "eclipse-zenoh")
+_PACKAGES: Final = ("bayesrace", "casadi", "numpy", "scipy", "eclipse-zenoh")
 
 
 class _Card(NamedTuple):
