@@ -14,10 +14,9 @@ from bayesrace.vehicles import CarParameters, get_car
 from experiments.notation import UNCERTAIN
 from experiments.results import GpMetrics
 from learning.dataset import Dataset, left_out
-from learning.horizon import HORIZON, mismatch
 from learning.residual import discretisation_of
 from learning.sources import read_samples
-from learning.validation import Validation, validate
+from learning.validation import HORIZON, Validation, mismatch, validate
 
 __all__ = [
     "Drift",

@@ -10,5 +10,5 @@ In the order of use:
 4. :mod:`.folds` cuts a drive for cross-validation, :mod:`.scores` rates predictions,
    :mod:`.target` and :mod:`.assessment` rate kernels and choices of samples.
 5. :mod:`.training` puts these together; :mod:`.pool` and :mod:`.worker` repeat it lap by lap.
-6. :mod:`.validation` and :mod:`.horizon` compare weights with another drive.
+6. :mod:`.validation` compares weights with another drive.
 """

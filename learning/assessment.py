@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from bayesrace.arrays import Rows
-from learning.hyperparameters import Fit, best
+from learning.hyperparameters import Fit
 from learning.posterior import Covariance, Posterior
 from learning.subset import at_random
 from learning.target import Target
@@ -23,16 +23,14 @@ _DRAWS: Final = 5
 """Random choices that the baseline is the mean of."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class KernelScore:
     """How one kernel, at its best hyperparameters, explains one output (SI units)."""
 
     output: str
     kernel: str
-    log_likelihood: float
     rmse: float
     log_density: float
-    coverage: float
     chosen: bool
 
 
@@ -53,23 +51,25 @@ class ChoiceScore:
 
 def choose_kernel(target: Target, fits: Sequence[Fit]) -> tuple[Fit, list[KernelScore]]:
     """Best start per kernel by likelihood, then best kernel by held-out log density."""
-    kinds = dict.fromkeys(fit.kind for fit in fits)
-    candidates = [best([fit for fit in fits if fit.kind == kind]) for kind in kinds]
-    held = [Posterior(c.covariance, target.z, target.y).held_out(target.folds) for c in candidates]
-    chosen = int(np.argmax([errors.log_density for errors in held]))
-    scores = [
+    best: dict[str, Fit] = {}
+    for fit in fits:
+        best[fit.kind] = max(best.get(fit.kind, fit), fit, key=lambda one: one.log_likelihood)
+    held = {
+        kind: Posterior(fit.covariance, target.z, target.y).held_out(target.folds)
+        for kind, fit in best.items()
+    }
+    chosen = max(held, key=lambda kind: held[kind].log_density)
+    scale = target.y_scale
+    return best[chosen], [
         KernelScore(
             output=target.name,
-            kernel=fit.kind,
-            log_likelihood=fit.log_likelihood,
-            rmse=errors.rmse * target.y_scale,
-            log_density=errors.log_density - math.log(target.y_scale),
-            coverage=errors.coverage,
-            chosen=number == chosen,
+            kernel=kind,
+            rmse=errors.rmse * scale,
+            log_density=errors.log_density - math.log(scale),
+            chosen=kind == chosen,
         )
-        for number, (fit, errors) in enumerate(zip(candidates, held, strict=True))
+        for kind, errors in held.items()
     ]
-    return candidates[chosen], scores
 
 
 def choice_scores(

@@ -13,7 +13,6 @@ condition number of 1000 points below 2.5e10, well within float64.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -25,7 +24,7 @@ from bayesrace.gp.weights import FEATURES
 from learning.likelihood import MarginalLikelihood, PairDistances
 from learning.posterior import Covariance
 
-__all__ = ["BOUNDS", "TOLERANCE", "Fit", "best", "maximise", "starts"]
+__all__ = ["BOUNDS", "TOLERANCE", "Fit", "maximise", "starts"]
 
 BOUNDS: Final = np.log([(1e-2, 25.0)] + [(1e-1, 1e2)] * len(FEATURES) + [(1e-6, 1.0)])
 """Lower and upper bound of theta, (8, 2)."""
@@ -88,8 +87,3 @@ def maximise(
         options={"maxiter": iterations, "ftol": tolerance, "gtol": 1e-5},
     )
     return Fit(kind, np.asarray(result.x), float(-result.fun / scale))
-
-
-def best(fits: Sequence[Fit]) -> Fit:
-    """The fit of largest likelihood; the first of equals."""
-    return max(fits, key=lambda fit: fit.log_likelihood)

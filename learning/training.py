@@ -170,18 +170,13 @@ def _targets(dataset: Dataset, discretisation: Discretisation, folds: int) -> li
             f"{remedy}"
         )
     z, y = dataset.features, residual(dataset, discretisation)
-    for name, column in zip(FEATURES, z.T, strict=True):
-        _check_varies(column, f"{name} is {column[0]:g} in every sample; vary it while driving")
-    for name, column in zip(OUTPUTS, y.T, strict=True):
-        fault = f"the residual of {name} is {column[0]:g} in every sample: nothing to learn"
-        _check_varies(column, fault)
+    names = (*FEATURES, *(f"the residual of {output}" for output in OUTPUTS))
+    for name, column in zip(names, (*z.T, *y.T), strict=True):
+        if column.std() <= _CONSTANT * max(1.0, float(np.abs(column).max())):
+            fault = f"{name} is {column[0]:g} in every sample"
+            raise InputError(f"GP training: {fault}: nothing to learn; vary the driving")
     number = stretches(dataset, folds)
     return [Target.of(name, z, column, number) for name, column in zip(OUTPUTS, y.T, strict=True)]
-
-
-def _check_varies(column: Floats, fault: str) -> None:
-    if column.std() <= _CONSTANT * max(1.0, float(np.abs(column).max())):
-        raise InputError(f"GP training: {fault}")
 
 
 def _starts(

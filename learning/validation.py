@@ -1,22 +1,36 @@
-"""Comparison of weights with the residual of a drive that they were not trained on."""
+"""Comparison of weights with a drive that they were not trained on.
+
+Over one step, the prediction is compared with the residual (:func:`validate`). Over a controller's
+horizon, the model is stepped from a driven state on with the inputs that acted, without any
+correction on the way (:func:`mismatch`); the difference at the end is the error of the controller's
+plan. The paper draws the same (its figures of model mismatch with and without GPs).
+"""
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
-from bayesrace.arrays import Flags, Floats
+from bayesrace.arrays import Flags, Floats, Rows
 from bayesrace.errors import InputError
+from bayesrace.gp.corrected import corrected_function
 from bayesrace.gp.expression import evaluate_mean
-from bayesrace.gp.weights import OUTPUTS, GpOutput, GpWeights
+from bayesrace.gp.weights import OUTPUTS, GpWeights
 from bayesrace.integrators import Discretisation
 from learning.dataset import Dataset
 from learning.posterior import Covariance, Posterior
-from learning.residual import identity, residual
+from learning.residual import NOMINAL, identity, residual
 from learning.scores import NORMAL_95, PredictionErrors
 
-__all__ = ["Validation", "predictive_sigma", "validate"]
+__all__ = ["HORIZON", "Validation", "mismatch", "predictive_sigma", "unbroken", "validate"]
+
+HORIZON: Final = 20
+"""Stages of the controller's default horizon."""
+
+_MAX_STARTS: Final = 2000
+"""Predictions per horizon at most, evenly spread over the samples."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,18 +64,17 @@ class Validation:
         return np.asarray(self.sigma.max(axis=1) > threshold)
 
 
-def _output_sigma(output: GpOutput, z: Floats) -> Floats:
-    covariance = Covariance(
-        output.kernel, output.signal_variance, output.length_scales, output.noise_variance
-    )
-    # The uncertainty does not depend on the targets.
-    _, sigma = Posterior(covariance, output.inputs, np.zeros(output.count)).predict(z)
-    return output.y_scale * sigma
-
-
 def predictive_sigma(weights: GpWeights, z: Floats) -> Floats:
     """Predictive standard deviation (m, 3) at features ``z`` (m, 6), noise included, SI units."""
-    return np.column_stack([_output_sigma(output, z) for output in weights.outputs])
+    columns = []
+    for output in weights.outputs:
+        covariance = Covariance(
+            output.kernel, output.signal_variance, output.length_scales, output.noise_variance
+        )
+        # The uncertainty does not depend on the targets.
+        _, sigma = Posterior(covariance, output.inputs, np.zeros(output.count)).predict(z)
+        columns.append(output.y_scale * sigma)
+    return np.column_stack(columns)
 
 
 def validate(weights: GpWeights, dataset: Dataset, discretisation: Discretisation) -> Validation:
@@ -88,3 +101,35 @@ def validate(weights: GpWeights, dataset: Dataset, discretisation: Discretisatio
             "uncertainty; train again"
         )
     return Validation(truth, mean, sigma, metrics)
+
+
+def unbroken(dataset: Dataset, steps: int) -> Rows:
+    """Rows at which ``steps`` consecutive samples of one drive begin."""
+    if len(dataset) < steps:
+        return np.zeros(0, dtype=np.int64)
+    joined = (dataset.x_next[:-1] == dataset.x[1:]).all(axis=1)
+    before = np.concatenate(([0], np.cumsum(joined)))
+    return np.flatnonzero(before[steps - 1 :] - before[: len(before) - steps + 1] == steps - 1)
+
+
+def mismatch(
+    dataset: Dataset,
+    discretisation: Discretisation,
+    weights: GpWeights | None,
+    steps: int = HORIZON,
+) -> Floats:
+    """Driven minus predicted states after ``steps`` steps, open loop, (m, 7), SI units.
+
+    One row for each sample that ``steps`` consecutive ones begin with, or for evenly chosen ones.
+    ``weights`` None: the nominal model. InputError for weights of another discretised model.
+    """
+    step = corrected_function(NOMINAL(dataset.car), discretisation, weights)
+    first = unbroken(dataset, steps)
+    if len(first) > _MAX_STARTS:
+        first = first[np.linspace(0, len(first) - 1, _MAX_STARTS).astype(np.int64)]
+    if len(first) == 0:
+        return np.zeros((0, 7))
+    x = dataset.x[first].T
+    for k in range(steps):
+        x = np.asarray(step(x, dataset.u[first + k].T), dtype=np.float64)
+    return dataset.x_next[first + steps - 1] - x.T

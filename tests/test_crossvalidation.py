@@ -78,12 +78,12 @@ def test_an_interval_is_not_judged_by_the_errors_that_it_was_fitted_to() -> None
     raw = PredictionErrors(error, np.ones(1000))
     whole = replace(raw, sigma=raw.sigma * np.sqrt(raw.variance_scale))
     assert whole.coverage == pytest.approx(0.95, abs=0.001)
-    honest = raw.calibrated(folds)
-    assert np.mean(np.abs(honest.error[900:]) < 1.96 * honest.sigma[900:]) < 0.15
-    assert honest.sigma[900:] == pytest.approx(
+    scaled = raw.calibrated(folds)
+    assert np.mean(np.abs(scaled.error[900:]) < 1.96 * scaled.sigma[900:]) < 0.15
+    assert scaled.sigma[900:] == pytest.approx(
         np.sqrt(PredictionErrors(error[:900], raw.sigma[:900]).variance_scale)
     )
-    assert honest.log_density < whole.log_density
+    assert scaled.log_density < whole.log_density
 
 
 def test_calibration_widens_and_never_narrows() -> None:

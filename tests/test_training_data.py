@@ -224,14 +224,14 @@ def test_the_plans_in_a_log_are_not_kept(tmp_path: Path, driven: Dataset) -> Non
 def test_a_car_under_another_name_is_known_by_its_log(
     tmp_path: Path, driven: Dataset, other: Dataset
 ) -> None:
-    told = write_log(tmp_path / "a.mcap", driven, "red", {"drive": {"car": "orca"}})
-    assert same(read_samples([told]).dataset, driven)
-    silent = write_log(tmp_path / "b.mcap", other, "red")
+    named = write_log(tmp_path / "a.mcap", driven, "red", {"drive": {"car": "orca"}})
+    assert same(read_samples([named]).dataset, driven)
+    unnamed = write_log(tmp_path / "b.mcap", other, "red")
     with pytest.raises(InputError, match="--car"):
-        read_samples([silent])
-    assert same(read_samples([silent], car=CAR).dataset, other)
+        read_samples([unnamed])
+    assert same(read_samples([unnamed], car=CAR).dataset, other)
     with pytest.raises(InputError, match="no states of car 'blue'"):
-        read_samples([told], name="blue")
+        read_samples([named], name="blue")
 
 
 def test_mixed_cars_are_refused(tmp_path: Path, driven: Dataset, other: Dataset) -> None:

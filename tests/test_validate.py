@@ -22,10 +22,9 @@ from experiments.validation import ValidationResult, validate_weights
 from learning.arrays import write_npz
 from learning.assessment import ChoiceScore, KernelScore
 from learning.dataset import Dataset, concatenate
-from learning.horizon import mismatch, unbroken
 from learning.residual import identity
 from learning.training import train
-from learning.validation import validate
+from learning.validation import mismatch, unbroken, validate
 from tests.driven import CAR, QUICK, STEP_S, drive, write_log
 
 Program = Callable[..., int]
@@ -295,15 +294,7 @@ def test_train_keeps_to_the_controllers_room(
 
 def test_tables_of_training_fit_a_terminal() -> None:
     kernels = [
-        KernelScore(
-            output=output,
-            kernel=kernel,
-            log_likelihood=1.0,
-            rmse=0.000123456,
-            log_density=-12.345,
-            coverage=0.95,
-            chosen=kernel == "rbf",
-        )
+        KernelScore(output, kernel, 0.000123456, -12.345, kernel == "rbf")
         for output in OUTPUTS
         for kernel in ("matern05", "matern15", "matern25", "rbf")
     ]
