@@ -14,7 +14,6 @@ import numpy as np
 from bayesrace.arrays import Rows
 from learning.hyperparameters import Fit
 from learning.posterior import Covariance, Posterior
-from learning.subset import at_random
 from learning.target import Target
 
 __all__ = ["ChoiceScore", "KernelScore", "choice_scores", "choose_kernel"]
@@ -86,5 +85,6 @@ def choice_scores(
         density = float(np.mean([one.log_density for one in held])) - math.log(target.y_scale)
         return ChoiceScore(target.name, choice, len(choices[0]), rmse, density)
 
-    draws = [at_random(len(target.y), len(rows), seed + draw) for draw in range(_DRAWS)]
+    generators = [np.random.default_rng(seed + draw) for draw in range(_DRAWS)]
+    draws = [one.choice(len(target.y), len(rows), replace=False) for one in generators]
     return [score("all", target.tests), score("greedy", rows), score("random", *draws)]

@@ -61,7 +61,7 @@ class Posterior:
             self._factor = cho_factor(matrix, lower=True, overwrite_a=True)
         except np.linalg.LinAlgError as error:
             raise InputError(
-                "GP: the covariance of the samples is singular; leave out repeated ones, and train"
+                "GP: the covariance of the samples is singular; train without repeated samples"
             ) from error
         self.alpha: Floats = cho_solve(self._factor, y)
         """K^-1 y, (n,)."""

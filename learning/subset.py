@@ -8,7 +8,7 @@ from bayesrace.arrays import Floats, Rows
 from bayesrace.errors import InputError
 from bayesrace.gp.expression import kernel_matrix
 
-__all__ = ["MAX_BYTES", "at_random", "evenly", "most_informative"]
+__all__ = ["MAX_BYTES", "evenly", "most_informative"]
 
 MAX_BYTES: Final = 1 << 32
 """Upper limit of the memory for a choice."""
@@ -19,12 +19,6 @@ def evenly(count: int, wanted: int) -> Rows:
     if count <= wanted:
         return np.arange(count)
     return np.floor((np.arange(wanted) + 0.5) * count / wanted).astype(np.int64)
-
-
-def at_random(count: int, wanted: int, seed: int) -> Rows:
-    """``wanted`` of ``count`` indices at random, sorted: the baseline of a choice."""
-    random = np.random.default_rng(seed)
-    return np.sort(random.choice(count, min(count, wanted), replace=False)).astype(np.int64)
 
 
 def most_informative(

@@ -23,7 +23,6 @@ from learning.hyperparameters import BOUNDS, Fit, maximise, starts
 from learning.likelihood import MarginalLikelihood, PairDistances
 from learning.posterior import Covariance, Posterior
 from learning.residual import discretisation_of, identity, residual
-from learning.subset import at_random
 from learning.target import Target
 from learning.training import MAX_SAMPLES, Training, TrainingSettings, fit, train
 from learning.validation import predictive_sigma
@@ -123,14 +122,6 @@ def test_prediction_by_stretches_leaves_the_stretch_out(driven: Dataset) -> None
     assert without.error[5] == target.y[5]
     assert without.sigma[5] == pytest.approx(np.sqrt(2.02))
     assert without.sigma[100] < without.sigma[5]
-
-
-def test_random_choice_is_seeded_and_without_repetition() -> None:
-    rows = at_random(100, 30, seed=4)
-    assert len(set(rows.tolist())) == 30
-    assert list(rows) == sorted(rows)
-    assert np.array_equal(rows, at_random(100, 30, seed=4))
-    assert len(at_random(10, 30, seed=0)) == 10
 
 
 def test_training_that_is_interrupted_begins_nothing_more(
