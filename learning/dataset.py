@@ -48,7 +48,7 @@ class Dataset:
         for name, width in (("x", 7), ("u", 2), ("x_next", 7)):
             array = np.array(getattr(self, name), dtype=np.float64)
             if array.shape != (count, width):
-                expected = f"({count}, {width})"
+                expected = f"(n, {width}) with n = {count}"
                 raise InputError(f"dataset: {name} has shape {array.shape}, expected {expected}")
             if not np.isfinite(array).all():
                 row = int(np.argmin(np.isfinite(array).all(axis=1)))

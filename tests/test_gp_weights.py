@@ -164,6 +164,8 @@ def test_any_bytes_decode_or_are_refused(noise: bytes) -> None:
         lambda body: body["outputs"][0]["alpha"].update(shape=[-1]),
         lambda body: body["outputs"][0]["alpha"].update(shape=[True]),
         lambda body: body["outputs"][0]["alpha"].update(shape=[4]),
+        lambda body: body["outputs"][0]["alpha"].update(shape=None),
+        lambda body: body["outputs"][0].update(signal_variance=2),  # encoded as an integer
         lambda body: body["outputs"][0]["alpha"].update(shape=[2**40]),
         lambda body: body["outputs"][0]["alpha"].update(f64le="text"),
         lambda body: body["outputs"][0]["inputs"].update(shape=[6, 5]),

@@ -75,6 +75,7 @@ def test_the_published_form_needs_car_and_step(tmp_path: Path, driven: Dataset) 
     ("changes", "words"),
     [
         ({"car": None}, "need 'car'"),
+        ({"x": None, "u": None, "x_next": None, "states": np.zeros((6, 4))}, "need 'car'"),
         ({"step_s": None}, "need 'car'"),
         ({"x_next": None}, "need 'car'"),
         ({"inputs": np.zeros((3, 2))}, "need 'car'"),

@@ -140,7 +140,7 @@ class GpOutput:
     def __post_init__(self) -> None:
         if self.kernel not in KERNELS:
             known = ", ".join(KERNELS)
-            raise InputError(f"GP weights: unknown kernel {self.kernel!r}; known: {known}")
+            raise InputError(f"GP weights: unknown kernel {self.kernel!r:.40}; known: {known}")
         _validate(self)
         width, shapes = len(FEATURES), [self.length_scales.shape, self.inputs.shape]
         if self.alpha.ndim != 1 or shapes != [(width,), (self.count, width)]:
@@ -286,7 +286,7 @@ def decode_weights(data: bytes) -> GpWeights:
         weights = GpWeights(**body, outputs=outputs)
     except InputError:
         raise
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
         raise InputError("GP weights: the body does not describe weights; train again") from error
     if made_for != (list(FEATURES), list(OUTPUTS)):
         raise InputError(f"GP weights: made for other features or outputs than {FEATURES}")
