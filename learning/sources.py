@@ -45,8 +45,12 @@ def read_samples(
         raise InputError("no samples given; name at least one log, or --data FILE.npz")
     logs = {path: log_facts(path) for path in paths if path.suffix.lower() != ".npz"}
     drivers = {path: _driver(path, facts, name) for path, facts in logs.items()}
-    cars = {path: car_of_npz(path) for path in paths if path not in logs}
-    cars |= {path: logs[path].car or builtin_cars().get(drivers[path]) for path in logs}
+    cars = {
+        path: logs[path].car or builtin_cars().get(drivers[path])
+        if path in logs
+        else car_of_npz(path)
+        for path in paths
+    }
     driven = _common("cars", cars | {Path("--car"): car}, lambda one: f"'{one.identity}'")
     if driven is None:
         raise InputError("no file names its car; name it with --car")
@@ -81,12 +85,12 @@ def _driver(path: Path, facts: LogFacts, name: str) -> str:
 
 
 def _common(what: str, named: Mapping[Path, T | None], text: Callable[[T], str]) -> T | None:
-    """The value that all sources name, None if none does; InputError if they differ by ``text``."""
-    values = {text(value): (value, path) for path, value in named.items() if value is not None}
-    if len(values) > 1:
-        listed = "; ".join(f"{one} ({path})" for one, (_, path) in values.items())
+    """The first named value, None if there is none; InputError if others differ by ``text``."""
+    sources = {path: value for path, value in named.items() if value is not None}
+    if len({text(value) for value in sources.values()}) > 1:
+        listed = "; ".join(f"{text(value)} ({path})" for path, value in sources.items())
         raise InputError(f"different {what} cannot be mixed: {listed}; give logs of one kind")
-    return next(iter(values.values()))[0] if values else None
+    return next(iter(sources.values()), None)
 
 
 def _described(one: Discretisation) -> str:
