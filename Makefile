@@ -114,7 +114,7 @@ NO_COMPILER = $(if $(ZIG:,%=%),@echo "no C compiler here: installing ziglang")
 
 $(VENV)/.ready: $(SHAPED_BY)
 	$(NO_COMPILER)
-	$(INSTALL) ".$(ZIG:,%=[%])"
+	$(INSTALL) ".[race$(ZIG)]"
 	@touch $@
 
 $(VENV)/.ready-test: $(SHAPED_BY)

@@ -109,7 +109,7 @@ BR_API void br_mpc_reset(br_mpc *mpc);
 /* One control step: projects the car on the racing line, makes the reference, solves, checks.
  * A problem without a path has none of that (BR_ERROR_NOT_READY): br_mpc_solve serves it.
  * Where the car stands and points away from the line, the reference (br_mpc_get_reference) leads it
- * round at a walking pace instead, with the track's edges farther out: see br_turn.c.
+ * round at a walking pace instead, with the track's edges farther out: see br_turnaround.c.
  *
  * x: measured state. u_before: the input that acts now. u: first input of the plan; written
  * only for BR_CONVERGED and BR_ACCEPTABLE. info may be NULL.
@@ -125,7 +125,7 @@ BR_API void br_mpc_reset(br_mpc *mpc);
  * not finite.
  *
  * budget_s: time from the call within which it should return; needs a clock. The step then
- * iterates until settled (settle 0: converged) or as long as another iteration, at the longest
+ * iterates until an early stop (early_stop_tol 0: until converged) or as long as another iteration, at the longest
  * duration seen, fits, and returns the best usable plan. The first iteration is always done.
  * Without a clock or with budget_s <= 0 the iteration limits alone count. Either way an iteration
  * that fails does not take back a usable plan found before it. After BR_TIME_LIMIT the next step

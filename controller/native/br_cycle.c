@@ -26,12 +26,12 @@ struct br_cycle {
     br_solution solution;
     br_decision decision; /* of the newest cycle */
     int halted;           /* the phase of a car that is not to be driven; 0: drive */
-    int stopping;         /* a stop is under way: since, from which speed */
+    int stopping;         /* a stop has begun: since, from which speed */
     double stopping_s, stopping_mps;
     int stepped; /* a step has been made, for that moment */
     double stepped_s;
     double vx_mps; /* the newest that is known */
-    int reckoned;  /* where the car may be, and when, if no state tells */
+    int reckoned;  /* where the car may be, and when, without a state */
     double reckoned_s, reckoned_x[BR_NX];
 };
 
@@ -149,7 +149,7 @@ br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state) {
     if (reception != BR_STATE_NEW) return reception;
     if (begins) {
         memset(&cycle->fallback, 0, sizeof cycle->fallback); /* the plan is of another run */
-        cycle->delay.count = 0; /* no input is under way; the delay is still the best guess */
+        cycle->delay.count = 0; /* no input is on its way; the delay is still the best guess */
         cycle->controller.reset(cycle->controller.self);
         cycle->stepped = cycle->stopping = cycle->reckoned = 0;
     }
@@ -184,14 +184,14 @@ static double now(const br_cycle *cycle) {
     return cycle->clock ? cycle->clock(cycle->context) : 0;
 }
 
-/* Whether a stop on command is still under way; limits the speed to what it has got to. Driven to
+/* Whether a stop on command is not over yet; limits the speed to what it has got to. Driven to
  * standstill, the car stays on the line and points along it, fit to go on. */
 static int slowing(br_cycle *cycle, double basis_s, br_environment *environment) {
     const br_driving *s = &cycle->settings;
     const double vx_mps = cycle->stream.newest.x[BR_INDEX_VX];
     const int rolling = fabs(vx_mps) > s->standing_mps;
     if (!cycle->stopping && !rolling) return 0;
-    if (!cycle->stopping) { /* just told, or a rolling car taken over on hold */
+    if (!cycle->stopping) { /* just commanded, or a rolling car taken over on hold */
         cycle->stopping = 1;
         cycle->stopping_s = basis_s;
         cycle->stopping_mps = fmax(vx_mps, 0);

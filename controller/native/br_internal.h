@@ -9,6 +9,14 @@
 #include "bayesrace_mpc.h"
 #include "br_vector.h"
 
+/* Before loops over states, inputs, rows and their nonzeros, which have constant bounds: unrolled,
+ * the problem's sparsity is in the code, and no table is read. */
+#ifdef __clang__
+#define BR_UNROLL _Pragma("unroll")
+#else
+#define BR_UNROLL _Pragma("GCC unroll 16")
+#endif
+
 #define BR_M (BR_NU * BR_N)                      /* condensed variables */
 #define BR_MP (((BR_M + 7) / 8) * 8)             /* padded to whole vectors */
 #define BR_ROWS (BR_M + BR_NR * BR_N)            /* input bounds, then the problem's, row by row */
@@ -113,7 +121,7 @@ typedef struct {
     br_mpc_info info;
     br_mpc_status status;
     double residual, worth;
-} br_best;
+} br_incumbent;
 
 /* Time within a call, by the host's clock. */
 typedef struct {
@@ -126,7 +134,7 @@ typedef struct {
 
 /* The spare one of the two weight buffers, and whose it is. */
 enum {
-    BR_SPARE_FREE = 0, /* nobody's */
+    BR_SPARE_FREE = 0, /* not in use */
     BR_SPARE_TAKEN,    /* one thread writes it, or exchanges the two */
     BR_SPARE_STAGED    /* complete, to be adopted */
 };
@@ -155,8 +163,8 @@ struct br_mpc {
     int prepared, prepared_iterations;
     br_plan plan;
     br_plan before;      /* the plan that the iteration at hand started from */
-    br_best best;
-    br_best first;       /* the plan that a second start has to beat */
+    br_incumbent incumbent;
+    br_incumbent first;       /* the plan that a second start has to beat */
     unsigned starts;     /* second ones in a row */
     unsigned futile;     /* tries in a row since one was better */
     unsigned looks;      /* second starts of br_mpc_prepare */
@@ -186,8 +194,8 @@ void br_path_plan(br_path *path, const double x[BR_NX], br_mpc_reference referen
                   double *lateral);
 void br_path_ahead(const br_path *path, double distance, double point[2]);
 
-/* br_turn.c */
-void br_turn(br_mpc *mpc);
+/* br_turnaround.c */
+void br_turnaround(br_mpc *mpc);
 
 /* br_stage.c */
 void br_stage_linearise(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
@@ -244,12 +252,12 @@ void br_undo_preparation(br_mpc *mpc);
 br_mpc_status br_start_again(br_mpc *mpc, br_mpc_status status, unsigned turn);
 int br_iteration_limit(const br_mpc *mpc);
 
-/* br_best.c */
-void br_best_begin(br_mpc *mpc);
-void br_best_keep(br_mpc *mpc, br_mpc_status status, int lowest);
-br_mpc_status br_best_restore(br_mpc *mpc, br_mpc_status status);
-void br_first_keep(br_mpc *mpc, br_mpc_status status);
-br_mpc_status br_first_compare(br_mpc *mpc, br_mpc_status status, int *second);
+/* br_incumbent.c */
+void br_incumbent_reset(br_mpc *mpc);
+void br_incumbent_keep(br_mpc *mpc, br_mpc_status status, int lowest);
+br_mpc_status br_incumbent_restore(br_mpc *mpc, br_mpc_status status);
+void br_first_plan_keep(br_mpc *mpc, br_mpc_status status);
+br_mpc_status br_first_plan_compare(br_mpc *mpc, br_mpc_status status, int *second);
 
 /* br_residuals.c */
 int br_all_finite(const double *values, int n);

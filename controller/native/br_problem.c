@@ -13,8 +13,8 @@ static const double *input_before(const br_mpc *mpc, int k) {
     return k ? mpc->plan.u[k - 1] : mpc->u_before;
 }
 
-/* Of all stages at the plan, unless they are known: whoever changes the plan, the reference, the
- * input before or the parameters clears qp.evaluated. */
+/* Of all stages at the plan, unless they are known: code that changes the plan, the reference,
+ * the input before or the parameters clears qp.evaluated. */
 void br_evaluate_terms(br_mpc *mpc) {
     if (mpc->qp.evaluated) return;
     mpc->qp.evaluated = 1;

@@ -81,15 +81,18 @@ combine(double *restrict out, const int columns, const int add, const int count,
 static void propagate_sensitivity(double (*restrict next)[BR_MP], double (*restrict g)[BR_MP],
                                   const br_stage *stage, int k) {
     const int columns = padded(BR_NU * k);
+    BR_UNROLL
     for (int i = 0; i < BR_NX; ++i) {
         double weight[BR_NX];
         const double *rows[BR_NX];
         int count = 0;
+        BR_UNROLL
         for (int n = BR_A_START[i]; n < BR_A_START[i + 1]; ++n, ++count) {
             weight[count] = stage->jacobian[i][BR_A_INDEX[n]];
             rows[count] = g[BR_A_INDEX[n]];
         }
         combine(next[i], columns, 0, count, weight, rows);
+        BR_UNROLL
         for (int c = 0; c < BR_NU; ++c) next[i][BR_NU * k + c] = stage->jacobian[i][BR_NX + c];
     }
 }
@@ -119,30 +122,37 @@ static void hessian_rows(br_mpc *mpc, int k, double tau, double (*restrict p)[BR
     double(*restrict g)[BR_MP] = qp->g[k];
     double weight[2 * BR_NX];
     const double *rows[2 * BR_NX];
+    BR_UNROLL
     for (int r = 0; r < BR_NU; ++r) {
         double *restrict row = qp->h[BR_NU * k + r];
         int count = 0;
+        BR_UNROLL
         for (int n = BR_BT_START[r]; n < BR_BT_START[r + 1]; ++n, ++count) {
             weight[count] = stage->jacobian[BR_BT_INDEX[n]][BR_NX + r];
             rows[count] = p[BR_BT_INDEX[n]];
         }
         combine(row, columns, 0, count, weight, rows);
         count = 0;
+        BR_UNROLL
         for (int n = BR_WUX_START[r]; n < BR_WUX_START[r + 1]; ++n, ++count) {
             weight[count] = tau * stage->hessian[BR_NX + r][BR_WUX_INDEX[n]];
             rows[count] = g[BR_WUX_INDEX[n]];
         }
         combine(row, before, 1, count, weight, rows);
+        BR_UNROLL
         for (int c = 0; c < BR_NU; ++c)
             row[BR_NU * k + c] += tau * stage->hessian[BR_NX + r][BR_NX + c];
     }
     if (k == 0) return;
+    BR_UNROLL
     for (int i = 0; i < BR_NX; ++i) {
         int count = 0;
+        BR_UNROLL
         for (int n = BR_AT_START[i]; n < BR_AT_START[i + 1]; ++n, ++count) {
             weight[count] = stage->jacobian[BR_AT_INDEX[n]][i];
             rows[count] = p[BR_AT_INDEX[n]];
         }
+        BR_UNROLL
         for (int n = BR_WXX_START[i]; n < BR_WXX_START[i + 1]; ++n, ++count) {
             weight[count] = tau * stage->hessian[i][BR_WXX_INDEX[n]];
             rows[count] = g[BR_WXX_INDEX[n]];
@@ -150,10 +160,12 @@ static void hessian_rows(br_mpc *mpc, int k, double tau, double (*restrict p)[BR
         combine(p_next[i], before, 0, count, weight, rows);
     }
     br_stage_curvature *second = &qp->second[k - 1];
+    BR_UNROLL
     for (int n = 0; n < BR_CXX_NNZ; ++n) {
         rows[0] = g[BR_CXX_COLUMN[n]];
         combine(p_next[BR_CXX_ROW[n]], before, 1, 1, &second->cost_xx[n], rows);
     }
+    BR_UNROLL
     for (int n = 0; n < BR_RXX_NNZ; ++n) {
         weight[0] = tau * second->rows_xx[n];
         rows[0] = g[BR_RXX_COLUMN[n]];
@@ -194,21 +206,27 @@ static void condense_gradient(br_mpc *mpc, double tau) {
         if (k < BR_N) {
             const br_stage *stage = &mpc->stage[k];
             const double *dx = qp->xbar[k];
+            BR_UNROLL
             for (int c = 0; c < BR_NU; ++c) {
                 double sum = qp->terms[k].in_u[c] + (k + 1 < BR_N ? qp->terms[k + 1].in_u_before[c] : 0.0);
                 for (int j = 0; j < BR_NX; ++j) sum += stage->jacobian[j][BR_NX + c] * p[j];
+                BR_UNROLL
                 for (int n = BR_WUX_START[c]; n < BR_WUX_START[c + 1]; ++n)
                     sum += tau * stage->hessian[BR_NX + c][BR_WUX_INDEX[n]] * dx[BR_WUX_INDEX[n]];
                 qp->gradient[BR_NU * k + c] = sum;
             }
+            BR_UNROLL
             for (int i = 0; i < BR_NX; ++i) {
+                BR_UNROLL
                 for (int n = BR_AT_START[i]; n < BR_AT_START[i + 1]; ++n)
                     next[i] += stage->jacobian[BR_AT_INDEX[n]][i] * p[BR_AT_INDEX[n]];
+                BR_UNROLL
                 for (int n = BR_WXX_START[i]; n < BR_WXX_START[i + 1]; ++n)
                     next[i] += tau * stage->hessian[i][BR_WXX_INDEX[n]] * dx[BR_WXX_INDEX[n]];
             }
         }
         if (k) {
+            BR_UNROLL
             for (int i = 0; i < BR_NX; ++i) next[i] += qp->terms[k - 1].in_x[i];
             br_add_curvature(&qp->second[k - 1], tau, qp->xbar[k], next);
         }
@@ -261,12 +279,14 @@ static inline __attribute__((always_inline)) void fill_rows(br_qp *qp, const int
 
 /* Columns of y for these rows of the problem: their sensitivities h_x G to all inputs. */
 static void fill_sensitivities(br_qp *qp, const int first, const int last) {
+    BR_UNROLL
     for (int r = first; r < last; ++r)
         for (int k = 0; k < BR_N; ++k) {
             BR_ALIGNED double row[BR_MP];
             double weight[BR_NX];
             const double *sensitivity[BR_NX];
             int count = 0;
+            BR_UNROLL
             for (int n = BR_ROW_START[r]; n < BR_ROW_START[r + 1]; ++n, ++count) {
                 const int i = BR_ROW_INDEX[n];
                 weight[count] = r < BR_NR_EARLY ? BR_ROW_CONSTANT[BR_NX * r + i] : qp->terms[k].gradient[n];

@@ -44,10 +44,14 @@ static double stationarity(const br_mpc *mpc) {
     for (int k = BR_N; k >= 1; --k) {
         const br_stage_terms *terms = &mpc->qp.terms[k - 1];
         const br_stage *stage = &mpc->stage[k - 1];
+        BR_UNROLL
         for (int i = 0; i < BR_NX; ++i) p[i] += terms->in_x[i];
+        BR_UNROLL
         for (int r = 0; r < BR_NR; ++r)
+            BR_UNROLL
             for (int n = BR_ROW_START[r]; n < BR_ROW_START[r + 1]; ++n)
                 p[BR_ROW_INDEX[n]] += multiplier[BR_ROW(r, k - 1)] * terms->gradient[n];
+        BR_UNROLL
         for (int c = 0; c < BR_NU; ++c) {
             const double later = k < BR_N ? mpc->qp.terms[k].in_u_before[c] : 0.0;
             double through = 0;
@@ -57,7 +61,9 @@ static double stationarity(const br_mpc *mpc) {
             size = br_worse(size, fabs(through));
         }
         double next[BR_NX] = {0};
+        BR_UNROLL
         for (int i = 0; i < BR_NX; ++i)
+            BR_UNROLL
             for (int n = BR_AT_START[i]; n < BR_AT_START[i + 1]; ++n)
                 next[i] += stage->jacobian[BR_AT_INDEX[n]][i] * p[BR_AT_INDEX[n]];
         memcpy(p, next, sizeof p);
@@ -74,6 +80,7 @@ void br_residuals(br_mpc *mpc) {
     info->defect = info->cost = info->slack_max_m = 0;
     for (int k = 0; k <= BR_N; ++k) {
         const double *model = k ? mpc->stage[k - 1].f : mpc->x0;
+        BR_UNROLL
         for (int i = 0; i < BR_NX; ++i) {
             const double gap = fabs(model[i] - mpc->plan.x[k][i]);
             info->defect = br_worse(info->defect, gap / BR_STATE_SCALE[i]);

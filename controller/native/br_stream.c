@@ -1,4 +1,4 @@
-/* Which states count: those of the plant and the run under way, each newer than the one before. */
+/* Which states count: those of the current plant and run, each newer than the one before. */
 #include <math.h>
 
 #include "br_cycle.h"

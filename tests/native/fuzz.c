@@ -81,7 +81,7 @@ static void make_path(void) {
 static const br_mpc_parameters usual = {
     .q_position = 1, .r_duty = 5e-3, .r_delta_rate = 1e-4, .s_slack = 100, .margin_m = 0.01,
     .d_min = -0.1, .d_max = 1, .delta_max_rad = 0.35, .delta_rate_max_radps = 5,
-    .tolerance = 1e-6, .defect_max = 0.1, .settle = 1e-4, .iterations = 3, .iterations_cold = 12,
+    .tolerance = 1e-6, .defect_max = 0.1, .early_stop_tol = 1e-4, .iterations = 3, .iterations_cold = 12,
 };
 
 static br_mpc_parameters parameters;

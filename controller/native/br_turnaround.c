@@ -1,7 +1,7 @@
 /* Turning round: what the planner does where the car is slow and points away from its line.
  *
  * A horizon is too short for a turn to pay: whichever way the car sets off, it first gets farther
- * from the reference, and the optimal plan is to stand still for ever. So the reference is laid
+ * from the reference, and the optimal plan is to stand still for ever. So the reference runs
  * along the turn itself: where the corrected model goes when it steers to one side at a walking
  * pace until it faces the line again. The track's edges do not count on the way; the car may
  * have been across one already, and its turning circle can be wider than the track. All numbers
@@ -57,7 +57,7 @@ static void decide(br_mpc *mpc, const double target[2]) {
     }
 }
 
-void br_turn(br_mpc *mpc) {
+void br_turnaround(br_mpc *mpc) {
     double target[2], x[BR_NX], next[BR_NX];
     if (!mpc->turn && fabs(mpc->x0[BR_INDEX_VX]) >= BR_TURN_SLOW_MPS) return;
     br_path_ahead(&mpc->path, BR_TURN_AHEAD_M, target);
