@@ -101,7 +101,6 @@ class ControllerProcess:
             )  # fmt: skip
             self._takeover = self._courier.takeover
             self._courier.start()
-        inbox.tell_time("controller")
         inbox.watch("plant")
         inbox.announce("controller")
 
@@ -243,7 +242,7 @@ class ControllerProcess:
         if self._takeover is not None:
             self._takeover.between_cycles(self._next_cycle)
         if min(end_ns, time.monotonic_ns()) >= self._serve_ns:
-            item = self.inbox.other()
+            item = self.inbox.poll_queue()
             if item is not None:
                 self._serve_ns = time.monotonic_ns() + _SERVE_NS
                 self._service.react(item)
@@ -334,7 +333,7 @@ class ControllerProcess:
             "states_foreign": driver.count("foreign"),
             "refused": self._decoder.refused,
             "overflowed": self.inbox.overflowed,
-            "turned_away": self.inbox.turned_away,
+            "requests_rejected": self.inbox.requests_rejected,
             **({} if self._courier is None else self._courier.status()),
             "actuations_sent": self._actuations.next_seq,
         }
@@ -358,7 +357,7 @@ def main(settings: ControllerSettings, controller: Controller) -> int:
                 process.name,
                 ", ".join(settings.endpoints.connect) or "(connects to us)",
             )
-            with process.inbox.catching_signals():
+            with process.inbox.receive_signals():
                 process.serve()
         finally:
             process.close()

@@ -1,7 +1,7 @@
 """Directs one run of a waiting plant and controller, from the start line to the last lap."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -10,9 +10,8 @@ from bayesrace.messages import Event, RunRequest, Scalar
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import StartLine, Track
 from bayesrace.transport import Director, Publisher, RefusedError
-from experiments.processes import Child, endings
 
-__all__ = ["RunPlan", "announcement", "execute", "run_request", "wait_for_both"]
+__all__ = ["RunPlan", "announcement", "execute", "run_request"]
 
 _ABSENCE_S = 10.0
 """In real time a process may be away for so long: a link comes back, a controller is started
@@ -56,20 +55,6 @@ def run_request(track: Track, plan: RunPlan) -> RunRequest:
         max_time_s=plan.max_time_s,
         actuation_timeout_s=5.0 if plan.lockstep else 0.2,
     )
-
-
-def wait_for_both(director: Director, children: Sequence[Child], timeout_s: float) -> None:
-    """Waits for plant and controller, as long as the processes that are to be them live.
-
-    InputError if they are not there in time.
-    """
-    deadline = time.monotonic() + timeout_s
-    while True:
-        try:
-            return director.wait_for(("plant", "controller"), 0.5)
-        except InputError:
-            if endings(children) or time.monotonic() > deadline:
-                raise
 
 
 def announcement(plan: RunPlan, seq: int, weights_version: str) -> Event:

@@ -121,7 +121,6 @@ class PlantProcess:
         for service in (RUN, STOP):
             inbox.serve(service)
         inbox.serve(STATUS, "plant")
-        inbox.tell_time("plant")
         inbox.watch("controller")
         inbox.watch("director")
         inbox.announce("plant")
@@ -275,7 +274,7 @@ class PlantProcess:
             "runs": self._runs,
             "refused": self._decoder.refused,
             "overflowed": self.inbox.overflowed,
-            "turned_away": self.inbox.turned_away,
+            "requests_rejected": self.inbox.requests_rejected,
             "states_sent": self._states.next_seq,
             "actuations_received": self._numbering.received,
             "actuations_lost": self._numbering.lost,
@@ -330,6 +329,6 @@ def main(settings: PlantSettings) -> int:
             _log.warning("%s", refusal)
         where = ", ".join(settings.endpoints.listen)
         _log.info("plant of car '%s', %s, on %s", process.name, _played_by(settings), where)
-        with process.inbox.catching_signals():
+        with process.inbox.receive_signals():
             process.serve()
     return 0

@@ -66,7 +66,8 @@ static void look_elsewhere(br_mpc *mpc) {
     br_timer *timer = &mpc->timer;
     if (mpc->turn) return; /* there is one way to turn */
     timer->deadline -= 2 * timer->iteration;
-    if (!br_timer_allows(timer, br_timer_now(timer), BR_SECOND_START_ITERATIONS * timer->iteration)) return;
+    if (!br_timer_allows(timer, br_timer_now(timer), BR_SECOND_START_ITERATIONS * timer->iteration))
+        return;
     if (!mpc->linearised) br_sqp_linearise(mpc);
     memset(&mpc->info, 0, sizeof mpc->info);
     br_residuals(mpc);

@@ -15,7 +15,8 @@
 
 /* Angle to the point, seen from the car; positive left. */
 static double bearing(const double x[BR_NX], const double to[2]) {
-    return remainder(atan2(to[1] - x[BR_INDEX_Y], to[0] - x[BR_INDEX_X]) - x[BR_INDEX_PSI], 2 * M_PI);
+    return remainder(atan2(to[1] - x[BR_INDEX_Y], to[0] - x[BR_INDEX_X]) - x[BR_INDEX_PSI],
+                     2 * M_PI);
 }
 
 /* The side to turn to: the nearer one, or, with the line behind, the one with more room. */
@@ -23,11 +24,13 @@ static double side(const double x[BR_NX], double away, const br_mpc_reference *h
     if (fabs(away) < BR_TURN_BEHIND_RAD) return copysign(1, away);
     const double along = here->normal_x * x[BR_INDEX_X] + here->normal_y * x[BR_INDEX_Y];
     const double room_left = here->upper - along, room_right = along - here->lower;
-    const double facing = here->normal_x * -sin(x[BR_INDEX_PSI]) + here->normal_y * cos(x[BR_INDEX_PSI]);
+    const double facing =
+        here->normal_x * -sin(x[BR_INDEX_PSI]) + here->normal_y * cos(x[BR_INDEX_PSI]);
     return copysign(1, (room_left - room_right) * facing);
 }
 
-/* Angle still to be turned by; below zero where the car has turned too far, by a quarter at most. */
+/* Angle still to be turned by; below zero where the car has turned too far, by a quarter at most.
+ */
 static double remaining(double turn, double away) {
     const double angle = turn * away;
     return angle < -M_PI / 2 ? angle + 2 * M_PI : angle;
@@ -51,7 +54,8 @@ static void decide(br_mpc *mpc, const double target[2]) {
     } else if (mpc->turn) {
         if (remaining(mpc->turn, away) < BR_TURN_FACED_RAD) mpc->turn = 0;
     } else if (fabs(away) > BR_TURN_AWAY_RAD &&
-               fabs(remainder(away - bearing_on_line(&mpc->path, target), 2 * M_PI)) > BR_TURN_AWAY_RAD) {
+               fabs(remainder(away - bearing_on_line(&mpc->path, target), 2 * M_PI)) >
+                   BR_TURN_AWAY_RAD) {
         mpc->turn = side(x, away, &mpc->reference[0]);
         mpc->warm = 0;
     }
@@ -72,7 +76,8 @@ void br_turnaround(br_mpc *mpc) {
         const double rate = (steering - x[BR_INDEX_DELTA]) / BR_TS;
         double *u = mpc->turn_u[k];
         u[BR_INDEX_DUTY] = fmin(fmax(BR_TURN_THROTTLE_SPM * (pace - x[BR_INDEX_VX]), 0), p->d_max);
-        u[BR_INDEX_DELTA_RATE] = fmin(fmax(rate, -p->delta_rate_max_radps), p->delta_rate_max_radps);
+        u[BR_INDEX_DELTA_RATE] =
+            fmin(fmax(rate, -p->delta_rate_max_radps), p->delta_rate_max_radps);
         br_stage_advance(&mpc->gp[mpc->gp_in_use], x, u, BR_TS, next);
         memcpy(x, next, sizeof x);
         br_mpc_reference *reference = &mpc->reference[k];
