@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from bayesrace.errors import InputError
 from plant.fmu.inspection import Variable
-from plant.fmu.map import parse_map, wire
+from plant.fmu.map import wire
+from plant.fmu.map_file import parse_map
 from plant.fmu.proposal import starting_map
 from tests.fmu_variables import description, given, own_fmu, taken, variable
 from tests.foreign_fmu import FOREIGN_MAP

@@ -11,7 +11,8 @@ from hypothesis import given as those
 from hypothesis import strategies as st
 
 from bayesrace.errors import InputError
-from plant.fmu.map import parse_map, wire
+from plant.fmu.map import wire
+from plant.fmu.map_file import parse_map
 from plant.fmu.package import read_description
 from tests.fmu_variables import (
     STATE,
@@ -35,7 +36,7 @@ def test_our_own_names_pass_to_the_bit_without_a_map() -> None:
     state = STATE + np.array([0, 0, 700.1, 0, 0, 0, 0])  # turns are the FMU's to count
     assert (read(wiring, our_names, state) == state).all()
     assert wiring.inputs == ("d", "delta_rate")
-    assert wiring.to_inputs(U, 0.2, 0.02) == list(U)
+    assert wiring.to_inputs(U, 0.2, (0.02,)) == list(U)
 
 
 def test_outputs_that_can_be_started_are() -> None:

@@ -1,16 +1,17 @@
 """The map file: TOML that says which of an FMU's variables mean what.
 
-Our value is ``sign * scale * theirs + offset`` for outputs, theirs is ``sign * scale * ours +
-offset`` for inputs and start values; the scale comes from the unit unless it is given.
+``ours = sign * scale * theirs + offset`` for outputs, ``theirs = sign * scale * ours + offset``
+for inputs and start values; the scale follows from the unit unless it is given.
 """
 
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -30,10 +31,8 @@ __all__ = [
     "Driven",
     "FmuMap",
     "FmuSection",
-    "HeadingRule",
     "Pick",
-    "QuaternionRule",
-    "VelocityRule",
+    "Value",
     "parse_map",
     "read_map",
 ]
@@ -48,15 +47,28 @@ def _plain(value: Any) -> Any:
 Value = Annotated[bool | int | float | str, PlainValidator(_plain)]
 
 
+def _of_one(sign: float) -> float:
+    if sign in (1.0, -1.0):
+        return sign
+    raise ValueError("sign is 1 or -1; a factor is `scale`")
+
+
+Sign = Annotated[float, AfterValidator(_of_one)]
+
+
 class _Section(BaseModel):
     model_config = ConfigDict(
         frozen=True, extra="forbid", allow_inf_nan=False, populate_by_name=True
     )
 
+    def _given(self) -> set[str]:
+        """Names of the variables that are given."""
+        return {name for name, value in self if isinstance(value, Pick | _Quaternion)}
+
 
 class _Affine(_Section):
     unit: str | None = Field(None, description="the FMU variable's unit; default: as it declares")
-    sign: float = Field(1.0, description="-1: positive the other way round")
+    sign: Sign = Field(1.0, description="-1: positive the other way round")
     scale: float | None = Field(None, description="factor in place of the unit's")
     offset: float | str = Field(
         0.0, description="added after scaling, in the unit of the result, or with one: '90 deg'"
@@ -64,8 +76,6 @@ class _Affine(_Section):
 
     @model_validator(mode="after")
     def _one_conversion(self) -> Self:
-        if self.sign not in (1.0, -1.0):
-            raise ValueError("sign is 1 or -1; a factor is `scale`")
         if self.scale == 0.0:
             raise ValueError("scale is 0, which loses the value")
         if self.scale is not None and self.unit is not None:
@@ -82,13 +92,13 @@ class Pick(_Affine):
 
 
 class Driven(_Affine):
-    """What of ours sets one of the FMU's variables."""
+    """The quantity of ours that sets one of the FMU's variables."""
 
     source: str = Field(alias="from")
 
     @classmethod
     def of(cls, entry: object, sources: Mapping[str, str]) -> Self | None:
-        """The entry as what drives it, in short too (``gas = "throttle"``); None: a constant."""
+        """The entry with its quantity, in short too (``gas = "throttle"``); None: a constant."""
         if isinstance(entry, cls):
             return entry
         return cls(source=entry) if isinstance(entry, str) and entry in sources else None
@@ -125,37 +135,28 @@ class FmuSection(_Section):
     )
 
 
-class QuaternionRule(_Section):
-    """The four parts of the rotation body → world."""
-
+class _Quaternion(_Section):
     w: Picked
     x: Picked
     y: Picked
     z: Picked
 
 
-class HeadingRule(_Section):
-    """[derive] psi: from a quaternion, or from cosine and sine."""
-
-    quaternion: QuaternionRule | None = None
+class _Heading(_Section):
+    quaternion: _Quaternion | None = Field(None, description="rotation body → world")
     cos: Picked | None = None
     sin: Picked | None = None
-    sign: float = 1.0
+    sign: Sign = 1.0
     offset: float | str = 0.0
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
-        pair = self.cos is not None and self.sin is not None
-        if (self.cos is None) != (self.sin is None) or pair == (self.quaternion is not None):
-            raise ValueError("give either quaternion = { w, x, y, z }, or cos and sin")
-        if self.sign not in (1.0, -1.0):
-            raise ValueError("sign is 1 or -1")
-        return self
+        if self._given() in ({"quaternion"}, {"cos", "sin"}):
+            return self
+        raise ValueError("give either quaternion = { w, x, y, z }, or cos and sin")
 
 
-class VelocityRule(_Section):
-    """[derive] velocity: from world velocities, or from speed (and slip angle)."""
-
+class _Velocity(_Section):
     world_x: Picked | None = None
     world_y: Picked | None = None
     speed: Picked | None = None
@@ -163,28 +164,42 @@ class VelocityRule(_Section):
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
-        world = self.world_x is not None and self.world_y is not None
-        halves = (self.world_x is None) != (self.world_y is None)
-        slip_alone = self.slip is not None and self.speed is None
-        if halves or slip_alone or world == (self.speed is not None):
-            raise ValueError(
-                "give either world_x and world_y, or speed (and slip; without it the car is taken "
-                "to move where it points)"
-            )
-        return self
+        if self._given() in ({"world_x", "world_y"}, {"speed"}, {"speed", "slip"}):
+            return self
+        raise ValueError(
+            "give either world_x and world_y, or speed (and slip; without it the car is taken to "
+            "move where it points)"
+        )
 
 
 class Derive(_Section):
-    """[derive]: what the FMU does not say and follows from what it says."""
+    """[derive]: quantities that the FMU does not give and that follow from others."""
 
-    psi: HeadingRule | None = None
-    velocity: VelocityRule | None = None
+    psi: _Heading | None = None
+    velocity: _Velocity | None = None
     omega: Literal["psi"] | None = None
     delta: Literal["delta_rate"] | None = None
 
+    def derived(self) -> set[str]:
+        """The quantities of [outputs] that follow from others."""
+        rules = {name for name, rule in self if rule is not None}
+        return rules - {"velocity"} | ({"vx", "vy"} if "velocity" in rules else set())
+
+    def picks(self) -> Iterator[tuple[str, str, Pick]]:
+        """Each variable that the rules read, with its quantity and its place in the map."""
+        quaternion = self.psi.quaternion if self.psi else None
+        for place, prefix, rule in (
+            ("psi", "", self.psi),
+            ("psi.quaternion", "q", quaternion),
+            ("velocity", "", self.velocity),
+        ):
+            for name, pick in rule or ():
+                if isinstance(pick, Pick):
+                    yield prefix + name, f"[derive] {place}.{name}", pick
+
 
 class FmuMap(_Section):
-    """A whole map; what it leaves out is looked for under our own names."""
+    """A whole map; for what it leaves out, variables with our own names are taken."""
 
     fmu: FmuSection = FmuSection()
     inputs: dict[str, Setting] = {}

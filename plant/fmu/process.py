@@ -1,0 +1,138 @@
+"""One worker process with an FMU loaded, which answers questions in bounded time.
+
+Whatever the FMU does (crash, exit, hang, print without end, write to its descriptors), a question
+is answered in time or raises :class:`WorkerFailed`.
+"""
+
+import json
+import os
+import select
+import shutil
+import signal
+import socket
+import struct
+import subprocess
+import tempfile
+import time
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, Final
+
+from bayesrace.interpreter import RUN_MODULE
+from plant.fmu.output import Output
+from plant.fmu.package import extract, library
+
+__all__ = ["SCRIBBLED", "FmuProcess", "WorkerFailed"]
+
+_GOODBYE_S: Final = 0.5
+"""For the FMU to free what it holds, when it is not needed any more."""
+
+SCRIBBLED: Final = "wrote to its process's connection with the plant"
+
+_LONGEST: Final = 1 << 20
+"""Bytes of an answer."""
+
+
+class WorkerFailed(Exception):  # noqa: N818
+    """The process did not answer as it should; the message says why."""
+
+
+class FmuProcess:
+    """A process with the FMU unpacked for itself; it does not outlive this one.
+
+    ``description``: fmpy's; ``told``: ``inputs`` and ``outputs`` of
+    :class:`plant.fmu.instance.Instance`, and the ``cpus`` to run on. InputError if the file is
+    damaged, or not for this computer.
+    """
+
+    def __init__(self, path: Path, description: Any, told: dict[str, Any]) -> None:
+        self.folder = Path(tempfile.mkdtemp(prefix="bayesrace-fmu-"))
+        try:
+            extract(path, self.folder)
+            told = told | {"library": str(library(path, self.folder, description))}
+            self._launch(told)
+        except BaseException:
+            shutil.rmtree(self.folder, ignore_errors=True)
+            raise
+
+    def _launch(self, told: dict[str, Any]) -> None:
+        ours, theirs = socket.socketpair()
+        # A read or write that has begun ends too, where the FMU writes to the connection.
+        for option in (socket.SO_RCVTIMEO, socket.SO_SNDTIMEO):
+            ours.setsockopt(socket.SOL_SOCKET, option, struct.pack("@ll", 1, 0))
+        reading, writing = os.pipe()
+        self._connection, self.output = Connection(ours.detach()), Output(reading)
+        ends = {"folder": str(self.folder), "parent": os.getpid(), "connection": theirs.fileno()}
+        with theirs:
+            self.popen = subprocess.Popen(
+                [*RUN_MODULE, "plant.fmu.worker", json.dumps(told | ends)],
+                stdin=subprocess.DEVNULL,
+                stdout=writing,
+                stderr=writing,
+                pass_fds=(theirs.fileno(),),
+                # Ctrl-C at the terminal is for the plant, which ends the run in order
+                start_new_session=True,
+            )
+        os.close(writing)
+        self._poll = select.poll()
+        self._poll.register(self._connection.fileno(), select.POLLIN)
+        self._poll.register(reading, select.POLLIN)
+
+    @property
+    def running(self) -> bool:
+        """Whether it lives."""
+        return self.popen.poll() is None
+
+    def ask(self, question: bytes, timeout_s: float, setting: str) -> bytes:
+        """The answer to a question; without one, to loading.
+
+        WorkerFailed if there is none within the time, which is called ``setting`` in the map.
+        """
+        deadline = time.monotonic() + timeout_s
+        try:
+            if question:
+                self._connection.send_bytes(question)
+            # No spinning here: on two cores it takes from the FMU what it saves in waking up.
+            while (left_s := deadline - time.monotonic()) > 0:
+                for descriptor, _ in self._poll.poll(left_s * 1e3):
+                    if descriptor == self._connection.fileno():
+                        return self._connection.recv_bytes(_LONGEST)
+                    if not self.output.pump():
+                        self._poll.unregister(descriptor)
+        except (EOFError, ConnectionError):
+            raise WorkerFailed(self._ended()) from None
+        except OSError:
+            raise WorkerFailed(SCRIBBLED) from None
+        if not self.running:  # what it has started may hold its end of the connection open
+            raise WorkerFailed(self._ended())
+        raise WorkerFailed(f"did not answer within {timeout_s:g} s ({setting} in the map's [fmu])")
+
+    def _ended(self) -> str:
+        """How it has ended, now that its connection is closed."""
+        try:
+            code = self.popen.wait(1.0)
+        except subprocess.TimeoutExpired:
+            return "closed its connection to the plant"
+        if code >= 0:
+            return f"ended its own process with exit code {code}"
+        with suppress(ValueError):
+            return f"crashed ({signal.Signals(-code).name})"
+        return f"crashed (signal {-code})"
+
+    def quit(self) -> None:
+        """Let it end in order, or not."""
+        self._connection.close()
+        with suppress(subprocess.TimeoutExpired):
+            self.popen.wait(_GOODBYE_S)
+        self.kill()
+
+    def kill(self) -> None:
+        """End it now, with what it has started in its session, and remove the unpacked FMU."""
+        with suppress(ProcessLookupError, PermissionError):  # it may have gone and left some behind
+            os.killpg(self.popen.pid, signal.SIGKILL)
+        self.popen.wait()
+        self._connection.close()
+        self.output.pump()
+        self.output.close()
+        shutil.rmtree(self.folder, ignore_errors=True)
