@@ -5,6 +5,7 @@ import math
 import tempfile
 import zipfile
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -98,7 +99,7 @@ def test_values_of_any_type_are_set_before_the_start(
     version: int, libraries: dict[int, Path], tmp_path: Path
 ) -> None:
     path = faulty_fmu(libraries[version], tmp_path / "f.fmu", version)
-    with faulty_host(path, ("vx", "gear_told", "light_told", "label_length")) as host:
+    with closing(faulty_host(path, ("vx", "gear_told", "light_told", "label_length"))) as host:
         three = {"soft": 0.5, "small": 255, "rows": 7} if version == 3 else {}
         host.start({"label": "Zürich", "vx": 1, "gear": 3, "light": True, **three})
         assert host.step((0.0, 0.0), 0.01)[1:] == [3.0, 1.0, len("Zürich".encode())]
@@ -109,7 +110,7 @@ def test_instances_share_a_process_unless_the_fmu_cannot(
 ) -> None:
     for token, attributes in (("good", ""), ("once", 'canBeInstantiatedOnlyOncePerProcess="true"')):
         path = faulty_fmu(libraries[2], tmp_path / "f.fmu", guid=token, attributes=attributes)
-        with faulty_host(path, (*STATES, "instances")) as host:
+        with closing(faulty_host(path, (*STATES, "instances"))) as host:
             first = process_of(host)
             told = [host.start({})[-1] for _ in range(2)]
             assert told == ([1.0, 2.0] if token == "good" else [1.0, 1.0])
@@ -128,7 +129,7 @@ FAULTS = {
     Mode.NOT_A_NUMBER: "gave vx = nan",
     Mode.FAIL: r"DoStep failed \(error\); its last words: a wheel came off",
     Mode.WORST: r"DoStep failed \(fatal\)",
-    Mode.REFUSE: r"DoStep (discarded the step \(it got to 0.04 s\)|failed \(discard\))",
+    Mode.REFUSE: r"DoStep failed \(discard\)",
     Mode.TERMINATE: "the FMU ended the simulation",
     Mode.CLOSE_ALL: "exit code|closed its connection",
     Mode.SCRIBBLE: "wrote to its process's connection|exit code",
@@ -193,13 +194,10 @@ def test_an_fmu_that_never_stops_talking_still_drives(
     assert "not shown" in shown
 
 
-def test_a_step_that_returns_early_is_taken_up_again(hosts: dict[int, FmuHost]) -> None:
+def test_a_step_that_returns_early_is_a_fault(hosts: dict[int, FmuHost]) -> None:
     host = hosts[3]
     host.start({"mode": float(Mode.EARLY), "vx": 1.0})
-    host.step((0.0, 0.0), 0.02)
-    assert host.time_s == pytest.approx(0.02)
-    host.start({"mode": float(Mode.STUCK), "vx": 1.0})
-    with pytest.raises(FmuFault, match="returned early"):
+    with pytest.raises(FmuFault, match=r"returned early at 0\.01 s"):
         host.step((0.0, 0.0), 0.02)
 
 
@@ -277,8 +275,8 @@ def test_what_is_no_fmu_for_this_plant_is_refused(
         (refusing, "Failed to instantiate"),
         (aborting, "SIGABRT.*no licence"),
     ):
-        with pytest.raises(InputError, match=why) as caught:
-            open_fmu(get_car("orca"), path)
+        with pytest.raises(InputError, match=why) as caught, open_fmu(get_car("orca"), path):
+            pass
         assert "\n" not in str(caught.value)
     assert not (tmp_path.parent / "evil.txt").exists()
     assert not list((tmp_path / "temporary").iterdir())

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,7 @@ CAR = get_car("orca")
 @pytest.fixture(scope="module")
 def host(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FmuHost]:
     path = faulty_fmu(faulty_library(2), tmp_path_factory.mktemp("fmu") / "faulty.fmu")
-    with faulty_host(path) as host:
+    with closing(faulty_host(path)) as host:
         yield host
 
 

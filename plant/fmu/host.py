@@ -1,7 +1,6 @@
 """A Co-Simulation FMU in a process of its own, behind calls that end in time.
 
-Whatever the FMU does, the plant gets an answer in time or a :class:`FmuFault` that says what
-happened.
+Whatever the FMU does, the plant gets an answer or a :class:`FmuFault` that says what happened.
 """
 
 import json
@@ -48,12 +47,9 @@ class FmuHost:
         self.time_s = 0.0
         """Time that the FMU has reached."""
         self._description, self._outputs = description, tuple(outputs)
-        self._answer = struct.Struct(f"=c{1 + len(self._outputs)}d")
-        self._told: dict[str, Any] = {
-            "cpus": sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [],
-            "inputs": tuple(inputs),
-            "outputs": tuple(outputs),
-        }
+        self._answer = struct.Struct(f"=c{1 + len(outputs)}d")
+        cpus = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+        self._told = {"cpus": cpus, "inputs": tuple(inputs), "outputs": tuple(outputs)}
         self._process: FmuProcess | None = None
         self._used = False
         try:
@@ -66,16 +62,13 @@ class FmuHost:
 
         Raises FmuFault if the FMU fails.
         """
-        process = self._process
         once = self._description.coSimulation.canBeInstantiatedOnlyOncePerProcess
-        if process is not None and (not process.running or (once and self._used)):
+        if self._process is not None and (not self._process.running or (once and self._used)):
             self.close()
-        if self._process is None:
-            self._launch()
+        process = self._process or self._launch()
+        process.output.restart()
         self._used, self.time_s = True, 0.0
-        self._running.output.restart()
-        question = b"s" + json.dumps(dict(values)).encode()
-        return self._values(question, self.startup_s, "startup_s", "while it was initialised")
+        return self._values(b"s" + json.dumps(dict(values)).encode(), "while it was initialised")
 
     def step(self, inputs: Sequence[float], step_s: float, count: int = 1) -> list[float]:
         """Its outputs after ``count`` communication steps of ``step_s``.
@@ -83,8 +76,7 @@ class FmuHost:
         ``inputs``: held for all of them, or a row for each, one after the other. FmuFault if the
         FMU fails; it is then gone, and :meth:`start` begins with a new one.
         """
-        question = b"d" + array("d", (step_s, count, *inputs)).tobytes()
-        return self._values(question, self.timeout_s, "timeout_s", "")
+        return self._values(b"d" + array("d", (step_s, count, *inputs)).tobytes())
 
     def close(self) -> None:
         """End the process and remove the unpacked files."""
@@ -92,38 +84,29 @@ class FmuHost:
         if process is not None:
             process.quit()
 
-    def __enter__(self) -> "FmuHost":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def fault(self, what: str, when: str = "") -> FmuFault:
         """Ends the process, which is no car any more; the fault to raise."""
-        words = ""
         process, self._process = self._process, None
+        words = process.output.last_words() if process is not None else ""
         if process is not None:
-            said = process.output.last_words()
-            words = f"; its last words: {said}" if said else ""
             process.kill()
         at = when or f"at t = {self.time_s:.6g} s"
-        return FmuFault(f"FMU {self.path.name} {at}: {what}{words}")
+        last = f"; its last words: {words}" if words else ""
+        return FmuFault(f"FMU {self.path.name} {at}: {what}{last}")
 
-    @property
-    def _running(self) -> FmuProcess:
+    def _launch(self) -> FmuProcess:
+        process = self._process = FmuProcess(self.path, self._description, self._told)
+        self._used = False
+        self._values(b"", "while it was loaded")
+        return process
+
+    def _values(self, question: bytes, when: str = "") -> list[float]:
+        """The outputs that the worker answers, all of them finite; ``when``: at the start."""
         if self._process is None:
             raise FmuFault(f"FMU {self.path.name}: it has failed, and no new run has been started")
-        return self._process
-
-    def _launch(self) -> None:
-        self._process = FmuProcess(self.path, self._description, self._told)
-        self._used = False
-        self._values(b"", self.startup_s, "startup_s", "while it was loaded")
-
-    def _values(self, question: bytes, timeout_s: float, setting: str, when: str) -> list[float]:
-        """The outputs that come as an answer, all of them finite."""
+        limit = ("startup_s", self.startup_s) if when else ("timeout_s", self.timeout_s)
         try:
-            answer = self._running.ask(question, timeout_s, setting)
+            answer = self._process.ask(question, *limit)
         except WorkerFailed as failure:
             raise self.fault(str(failure), when) from None
         if answer[:1] == b"f":

@@ -99,20 +99,19 @@ def inspect(path: Path) -> FmuDescription:
 
 def describe(raw: Any, platforms: tuple[str, ...] = ()) -> FmuDescription:
     """fmpy's ModelDescription ``raw`` as data of our own."""
+    simulation, experiment = raw.coSimulation, raw.defaultExperiment
     kinds = {
-        "Co-Simulation": raw.coSimulation,
+        "Co-Simulation": simulation,
         "Model Exchange": raw.modelExchange,
         "Scheduled Execution": raw.scheduledExecution,
     }
     units = {unit.name: unit.baseUnit for unit in raw.unitDefinitions}
-    simulation, experiment = raw.coSimulation, raw.defaultExperiment
+    variables = (one for one in raw.modelVariables if one.causality != "independent")
     return FmuDescription(
         model_name=raw.modelName or "?",
         fmi_version=raw.fmiVersion,
         interfaces=tuple(name for name, interface in kinds.items() if interface is not None),
-        variables=tuple(
-            _variable(one, units) for one in raw.modelVariables if one.causality != "independent"
-        ),
+        variables=tuple(_variable(one, units) for one in variables),
         description=raw.description or "",
         tool=raw.generationTool or "",
         platforms=platforms,

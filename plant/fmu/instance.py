@@ -4,23 +4,19 @@ It runs in the FMU's own process. A call that the FMU answers with more than a w
 :class:`CallFailed`.
 """
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any, Final
 
 from fmpy import read_model_description
 from fmpy.fmi1 import FMICallException
-from fmpy.fmi2 import fmi2Discard, fmi2LastSuccessfulTime, fmi2Terminated
+from fmpy.fmi2 import fmi2Discard, fmi2Terminated
 from fmpy.simulation import apply_start_values, instantiate_fmu
 
 __all__ = ["CallFailed", "Instance"]
 
 _STATUS: Final = ("ok", "warning", "discard", "error", "fatal", "pending")
 _ENDED: Final = "the FMU ended the simulation"
-
-_MOST_RETURNS: Final = 10_000
-"""Early returns within one step; more is no progress."""
 
 
 class CallFailed(Exception):  # noqa: N818
@@ -72,13 +68,10 @@ class Instance:
 
         self._initialised = False
         self.time_s = self._excess_s = 0.0
-        try:  # its events are its own to handle, and it is not asked to return early
+        folder, description, library = self._folder, self._description, self._library
+        try:  # its events are its own to handle, and it is not allowed to return early
             self._fmu = instantiate_fmu(
-                self._folder,
-                self._description,
-                "CoSimulation",
-                logger=log,
-                library_path=self._library,
+                folder, description, "CoSimulation", logger=log, library_path=library
             )
         except Exception as error:  # the loader's words, or the first function that is missing
             raise CallFailed(str(error)) from None
@@ -93,8 +86,7 @@ class Instance:
         with _calls():
             if self._two:
                 fmu.setupExperiment()
-            structural = {v.name for v in description.modelVariables if _structural(v)} & {*values}
-            if structural:
+            elif any(_structural(v) and v.name in values for v in description.modelVariables):
                 fmu.enterConfigurationMode()
                 values = apply_start_values(fmu, description, values, _structural)
                 fmu.exitConfigurationMode()
@@ -150,34 +142,21 @@ def _by_type(variables: Sequence[Any]) -> list[tuple[str, list[int], list[int]]]
 
 
 def _advance_2(fmu: Any, time_s: float, step_s: float) -> None:
-    def status(get: Callable[[int], Any], kind: int) -> Any:
-        try:
-            return get(kind)
-        except Exception:  # it does not say, or lacks the function, as FMI allows
-            return None
-
     try:
         fmu.doStep(time_s, step_s)
     except FMICallException as error:
-        if error.status != fmi2Discard:
-            raise
-        if status(fmu.getBooleanStatus, fmi2Terminated):
+        ended = False
+        if error.status == fmi2Discard:
+            with suppress(Exception):  # it may not say, or lack the function, as FMI allows
+                ended = fmu.getBooleanStatus(fmi2Terminated)
+        if ended:
             raise CallFailed(_ENDED) from None
-        reached_s = status(fmu.getRealStatus, fmi2LastSuccessfulTime)
-        reached = "" if reached_s is None else f" (it got to {reached_s:.6g} s)"
-        raise CallFailed(f"fmi2DoStep discarded the step{reached}") from None
+        raise
 
 
 def _advance_3(fmu: Any, time_s: float, step_s: float) -> None:
-    end_s = time_s + step_s
-    for _ in range(_MOST_RETURNS):
-        _, ended, early, reached_s = fmu.doStep(time_s, step_s)
-        if ended:
-            raise CallFailed(_ENDED)
-        if not early or end_s - reached_s <= 1e-12:
-            return
-        # It may return early only if it is allowed to; where it does all the same, go on.
-        if not time_s < reached_s < math.inf:
-            break
-        time_s, step_s = reached_s, end_s - reached_s
-    raise CallFailed(f"fmi3DoStep returned early at {reached_s:.6g} s, again and again")
+    _, ended, early, reached_s = fmu.doStep(time_s, step_s)
+    if ended:
+        raise CallFailed(_ENDED)
+    if early:  # nothing has allowed it to
+        raise CallFailed(f"fmi3DoStep returned early at {reached_s:.6g} s")

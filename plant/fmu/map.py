@@ -3,7 +3,7 @@
 One error names all that is missing or wrong, each with what to write into the map instead.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Final
 
 from bayesrace.errors import InputError
@@ -16,8 +16,6 @@ __all__ = ["wire"]
 
 _VELOCITY: Final = " or [derive] velocity = { world_x, world_y } or { speed, slip }"
 _HINTS: Final = {
-    "x": "",
-    "y": "",
     "psi": " or, from a quaternion or cosine and sine, [derive] psi = …",
     "vx": _VELOCITY,
     "vy": _VELOCITY,
@@ -26,14 +24,14 @@ _HINTS: Final = {
 }
 
 _NEEDED: Final = (
-    ({"d", "throttle"}, ("d",), "the duty cycle d [1] or its part `throttle`"),
+    (("d",), {"d", "throttle"}, "the duty cycle d [1] or its part `throttle`"),
     (
-        {"delta_rate", "delta"},
         ("delta_rate", "delta"),
+        {"delta_rate", "delta"},
         "the steering rate `delta_rate` [rad/s] or angle `delta` [rad]",
     ),
 )
-"""The quantities of which one must drive an input, our own names for that input, and words."""
+"""Our own names for an input, the quantities of which one must drive an input, and words."""
 
 
 def wire(fmu: FmuDescription, map_: FmuMap | None = None) -> Wiring:
@@ -41,22 +39,20 @@ def wire(fmu: FmuDescription, map_: FmuMap | None = None) -> Wiring:
 
     Raises InputError with all that is missing or wrong, and what to put into the map.
     """
+    name = fmu.model_name
     if not fmu.co_simulation:
         has = " and ".join(fmu.interfaces) or "no interface"
         raise InputError(
-            f"the FMU '{fmu.model_name}' has {has} only; export it for Co-Simulation to drive it"
+            f"the FMU '{name}' has {has} only; export it for Co-Simulation to drive it"
         )
     matching = _Matching(fmu, map_ or FmuMap())
-    wiring = matching.wiring()
-    if wiring is not None:
-        return wiring
-    said = f"the map does not fit the FMU '{fmu.model_name}'"
-    if map_ is None:
-        said = (
-            f"the FMU '{fmu.model_name}' does not have our names and units, and no map says what "
-            "its own are"
-        )
-    problems = "".join(f"\n  - {problem}" for problem in matching.problems)
+    matching.match()
+    if not matching.problems:
+        return matching.wiring()
+    said = f"the map does not fit the FMU '{name}'" if map_ else (
+        f"the FMU '{name}' does not have our names and units, and no map says what its own are"
+    )  # fmt: skip
+    problems = "\n  - ".join(("", *matching.problems))
     raise InputError(
         f"{said}:{problems}\n`bayesrace fmu inspect` lists its variables and writes a map"
     )
@@ -72,34 +68,34 @@ class _Matching:
         self._outputs: list[Link] = []
         self._starts: list[Link] = []
         self._fixed: dict[str, Value] = {}
-        self._heading = (1.0, 0.0)
+        self._heading_offset = 0.0
         self.problems: list[str] = []
 
-    def wiring(self) -> Wiring | None:
-        """The wiring; None if there are problems."""
+    def match(self) -> None:
+        """Take the sections of the map in turn."""
         map_ = self._map
         self._states()
-        for quantity, where, pick in map_.derive.picks():
+        for quantity, where, pick in map_.derive.read():
             self._try(where, self._output, quantity, pick)
-        self._try("[derive] psi", self._derived_heading)
         for name, entry in map_.inputs.items():
             self._try(f"[inputs] {name}", self._input, name, entry)
-        self._needed_inputs()
         self._other_inputs()
         for name, value in map_.parameters.items():
             self._try(f"[parameters] {name}", self._parameter, name, value)
         for name, entry in map_.start.items():
             self._try(f"[start] {name}", self._start, name, entry)
-        if self.problems:
-            return None
-        self._started_outputs()
+        self._try("[derive] psi", self._heading)
+
+    def wiring(self) -> Wiring:
+        """What the entries have become, if there are no problems."""
+        heading = self._map.derive.psi
         return Wiring(
             self._inputs,
             self._outputs,
-            self._starts,
+            [*self._starts, *self._started_outputs()],
             self._fixed,
-            heading=self._heading,
-            placed=map_.fmu.placed,
+            heading=(heading.sign if heading else 1.0, self._heading_offset),
+            placed=self._map.fmu.placed,
         )
 
     def _try(self, where: str, check: Callable[..., None], *arguments: object) -> None:
@@ -108,26 +104,21 @@ class _Matching:
         except InputError as error:
             self.problems.append(f"{where}: {error}")
 
-    # -- outputs ------------------------------------------------------------------------------
-
     def _states(self) -> None:
         """[outputs], and our own names where neither it nor [derive] says anything."""
-        derived, picks = self._map.derive.derived(), dict(self._map.outputs.items())
-        for quantity, hint in _HINTS.items():
-            pick = picks.get(quantity)  # type: ignore[call-overload]
+        derived, picks = self._map.derive.derived(), dict[str, Pick](self._map.outputs.items())
+        for quantity, unit in STATES.items():
             own = self._variables.get(quantity)
-            if pick is None and own is not None and own.readable:
-                pick = Pick(variable=quantity)
             if quantity in derived:
                 if quantity in picks:
                     self.problems.append(f"{quantity} is in [outputs] and in [derive]: give one")
-            elif pick is not None:
+            elif quantity in picks or (own and own.readable):
+                pick = picks.get(quantity) or Pick(variable=quantity)
                 self._try(f"[outputs] {quantity}", self._output, quantity, pick)
             else:
-                unit = STATES[quantity]
                 self.problems.append(
                     f"nothing gives our {quantity} [{unit}]: add to [outputs] {quantity} = "
-                    f'{{ variable = "…", unit = "{unit}" }}{hint}'
+                    f'{{ variable = "…", unit = "{unit}" }}{_HINTS.get(quantity, "")}'
                 )
 
     def _output(self, quantity: str, pick: Pick) -> None:
@@ -140,18 +131,15 @@ class _Matching:
         scale, offset = conversion(pick, variable, READINGS[quantity])
         self._outputs.append(Link(variable.name, quantity, scale, offset))
 
-    def _derived_heading(self) -> None:
-        if (rule := self._map.derive.psi) is not None:
-            self._heading = rule.sign, offset_of(rule.offset, "rad")
-
-    # -- inputs and parameters ----------------------------------------------------------------
+    def _heading(self) -> None:
+        if self._map.derive.psi:
+            self._heading_offset = offset_of(self._map.derive.psi.offset, "rad")
 
     def _link(self, name: str, driven: Driven, quantities: Mapping[str, str]) -> Link:
-        wanted = quantities.get(driven.source)
-        if wanted is None:
+        if driven.source not in quantities:
             raise InputError(f"from = '{driven.source}' is none of {', '.join(quantities)}")
         variable = scalar(self._variables, name)
-        scale, offset = conversion(driven, variable, wanted, outwards=True)
+        scale, offset = conversion(driven, variable, quantities[driven.source], outwards=True)
         return Link(name, driven.source, scale, offset, variable.lowest, variable.highest)
 
     def _input(self, name: str, entry: Driven | Value) -> None:
@@ -159,36 +147,38 @@ class _Matching:
         if variable.causality != "input":
             remedy = " it goes into [parameters]" if variable.causality == "parameter" else ""
             raise InputError(f"'{name}' is {a(variable.causality)}, not an input;{remedy}")
-        if driven := Driven.of(entry, COMMANDS):
-            self._inputs.append(self._link(name, driven, COMMANDS))
-        elif not isinstance(entry, Driven):
+        if isinstance(entry, Driven):
+            self._inputs.append(self._link(name, entry, COMMANDS))
+        else:
             self._fixed[name] = constant(variable, entry)
 
-    def _needed_inputs(self) -> None:
-        """Drive and steering by inputs with our own names where the map says nothing of them."""
-        entries = [Driven.of(entry, COMMANDS) for entry in self._map.inputs.values()]
-        sources = {entry.source for entry in entries if entry is not None}
-        inputs = {one.name for one in self._variables.values() if one.causality == "input"}
-        for quantities, names, words in _NEEDED:
-            own = [name for name in names if name in inputs and name not in self._map.inputs]
-            if own and not sources & quantities:
-                self._try(f"[inputs] {own[0]}", self._input, own[0], Driven(source=own[0]))
-            elif not sources & quantities:
+    def _other_inputs(self) -> None:
+        """Drive and steering by our own names; what nothing sets needs a start value of its own."""
+        named = self._map.inputs
+        free = {
+            name: one
+            for name, one in self._variables.items()
+            if one.causality == "input" and name not in named
+        }
+        sources = {entry.source for entry in named.values() if isinstance(entry, Driven)}
+        for names, quantities, words in _NEEDED:
+            own = next((name for name in names if name in free), None)
+            if sources & quantities:
+                continue
+            if own is not None:
+                self._try(f"[inputs] {own}", self._input, own, Driven(source=own))
+                del free[own]
+            else:
                 self.problems.append(
                     f"no input of the FMU takes {words}: add to [inputs] "
                     f'variable = {{ from = "{names[0]}", unit = "…" }}'
                 )
-
-    def _other_inputs(self) -> None:
-        """Inputs that nothing sets need a start value of the FMU's."""
-        covered = {*self._map.inputs, *(link.variable for link in self._inputs)}
-        for one in self._variables.values():
-            open_ = one.causality == "input" and one.start is None and one.name not in covered
-            if open_ and one.kind not in ("clock", "binary"):
-                self.problems.append(
-                    f"the FMU's input '{one.name}' has neither a start value nor a place in the "
-                    f'map: add a constant to [inputs], as "{one.name}" = 0.0'
-                )
+        self.problems += (
+            f"the FMU's input '{name}' has neither a start value nor a place in the map: add a "
+            f'constant to [inputs], as "{name}" = 0.0'
+            for name, one in free.items()
+            if one.start is None and one.kind not in ("clock", "binary")
+        )
 
     def _parameter(self, name: str, value: Value) -> None:
         variable = find(self._variables, name)
@@ -199,21 +189,19 @@ class _Matching:
             raise InputError(f"'{name}' is {a(what)}, not a parameter{into}")
         self._fixed[name] = constant(variable, value)
 
-    # -- start values -------------------------------------------------------------------------
-
     def _start(self, name: str, entry: Driven | Value) -> None:
         variable = find(self._variables, name)
-        if not variable.settable or variable.causality == "input":
-            hint = "it cannot be set before initialisation"
-            if variable.causality == "input":
-                hint = "a constant goes into [inputs]"
-            raise InputError(f"'{name}' is {a(variable.causality)}: {hint}")
-        if driven := Driven.of(entry, STARTS):
-            self._starts.append(self._link(name, driven, STARTS))
-        elif not isinstance(entry, Driven):
+        if variable.causality == "input":
+            raise InputError(f"'{name}' is an input: a constant goes into [inputs]")
+        if not variable.settable:
+            is_ = a(variable.causality)
+            raise InputError(f"'{name}' is {is_}: it cannot be set before initialisation")
+        if isinstance(entry, Driven):
+            self._starts.append(self._link(name, entry, STARTS))
+        else:
             self._fixed[name] = constant(variable, entry)
 
-    def _started_outputs(self) -> None:
+    def _started_outputs(self) -> Iterator[Link]:
         """Outputs whose start can be set are started, where the map says nothing else."""
         sources = {link.quantity for link in self._starts}
         for link in self._outputs:
@@ -221,5 +209,4 @@ class _Matching:
             free = link.quantity in STATES and link.quantity not in sources
             if free and one.initial == "exact" and one.settable and one.name not in self._map.start:
                 scale, offset = 1.0 / link.scale, -link.offset / link.scale
-                start = Link(one.name, link.quantity, scale, offset, one.lowest, one.highest)
-                self._starts.append(start)
+                yield Link(one.name, link.quantity, scale, offset, one.lowest, one.highest)

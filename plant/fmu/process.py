@@ -84,10 +84,10 @@ class FmuProcess:
         """Whether it lives."""
         return self.popen.poll() is None
 
-    def ask(self, question: bytes, timeout_s: float, setting: str) -> bytes:
-        """The answer to a question; without one, to loading.
+    def ask(self, question: bytes, setting: str, timeout_s: float) -> bytes:
+        """The answer to a question, or to loading; WorkerFailed if there is none in time.
 
-        WorkerFailed if there is none within the time, which is called ``setting`` in the map.
+        ``setting``: what the map calls the time.
         """
         deadline = time.monotonic() + timeout_s
         try:

@@ -58,6 +58,12 @@ _DRIVEN: Final = {
 }
 """Names of an input that takes this command."""
 
+_NEEDED: Final = {
+    ("d", "throttle"): 'the duty cycle or throttle, as: name = { from = "d", unit = "1" }',
+    ("delta_rate", "delta"): 'the steering, as: name = { from = "delta_rate", unit = "rad/s" }, or '
+    'the angle: { from = "delta", unit = "rad" }',
+}
+
 _UNIT_WORDS: Final = {
     "deg": "deg", "rad": "rad", "kmh": "km/h", "kph": "km/h", "mps": "m/s", "cm": "cm", "mm": "mm",
     "m": "m", "pct": "%", "percent": "%", "degps": "deg/s", "dps": "deg/s", "radps": "rad/s",
@@ -79,6 +85,7 @@ def starting_map(fmu: FmuDescription) -> str:
     readable.sort(key=lambda v: v.causality != "output")
     read = {name: _guess(readable, names, READINGS[name]) for name, names in _READ.items()}
     starts = _starts(fmu, read)
+    used = {one.name for one in starts.values()}
     step_s = fmu.default_step_s
     lines = [
         _comment(f"Map of the FMU '{fmu.model_name}' (FMI {fmu.fmi_version}) to the car."),
@@ -95,7 +102,11 @@ def starting_map(fmu: FmuDescription) -> str:
             if name not in starts and not _started(read[name])
         ),
         "\n[parameters]",
-        *_parameters(fmu, {variable.name for variable in starts.values()}),
+        *(
+            _parameter(v)
+            for v in fmu.variables
+            if v.causality == "parameter" and v.name not in used
+        ),
     ]
     return "\n".join(lines) + "\n"
 
@@ -111,16 +122,9 @@ def _inputs(inputs: Sequence[Variable]) -> Iterator[str]:
     for name, (source, variable) in driven.items():
         yield _entry(name, _table("from", source, variable), variable)
     sources = {source for source, _ in driven.values()}
-    if not sources & {"d", "throttle"}:
-        yield (
-            "# TO FILL IN: one that takes the duty cycle or throttle, as: name = "
-            '{ from = "d", unit = "1" }'
-        )
-    if not sources & {"delta_rate", "delta"}:
-        yield (
-            '# TO FILL IN: one that takes the steering, as: name = { from = "delta_rate", unit = '
-            '"rad/s" }, or the angle: { from = "delta", unit = "rad" }'
-        )
+    for quantities, what in _NEEDED.items():
+        if not sources.intersection(quantities):
+            yield f"# TO FILL IN: one that takes {what}"
     for variable in inputs:
         if variable.name not in driven:
             value, remark = _literal(variable), "stays"
@@ -166,18 +170,18 @@ def _outputs(read: Mapping[str, Variable | None]) -> Iterator[str]:
 
 def _starts(fmu: FmuDescription, read: Mapping[str, Variable | None]) -> dict[str, Variable]:
     """Start values for the quantities whose output cannot be started itself."""
-    settable = [
+    settable = [one for one in fmu.variables if one.settable and one.scalar]
+    starts = [
         one
-        for one in fmu.variables
-        if one.settable and one.causality != "input" and one.scalar
-        if _START_WORDS & set(_words(one.name))
+        for one in settable
+        if one.causality != "input" and not _START_WORDS.isdisjoint(_words(one.name))
     ]
-    guesses = {
-        name: _guess(settable, names, STATES[name], without=_START_WORDS)
+    return {
+        name: one
         for name, names in _STARTED.items()
         if not _started(read[name])
+        if (one := _guess(starts, names, STATES[name], without=_START_WORDS))
     }
-    return {name: one for name, one in guesses.items() if one is not None}
 
 
 def _started(variable: Variable | None) -> bool:
@@ -185,14 +189,10 @@ def _started(variable: Variable | None) -> bool:
     return variable is not None and variable.initial == "exact" and variable.settable
 
 
-def _parameters(fmu: FmuDescription, used: set[str]) -> Iterator[str]:
-    for one in fmu.variables:
-        if one.causality == "parameter" and one.name not in used and not one.array:
-            unit = f"[{one.unit_name}] " if one.unit_name else ""
-            yield _comment(f"{_key(one.name)} = {_literal(one) or 0}  # {unit}{one.description}")
-
-
-# -- guesses --------------------------------------------------------------------------------------
+def _parameter(variable: Variable) -> str:
+    unit = f"[{variable.unit_name}] " if variable.unit_name else ""
+    value = _literal(variable) or 0
+    return _comment(f"{_key(variable.name)} = {value}  # {unit}{variable.description}")
 
 
 def _guess(
@@ -250,9 +250,6 @@ def _turned(variable: Variable, quantity: str, *, outwards: bool) -> dict[str, s
         # our = ±theirs + 90°, thus theirs = ±our ∓ 90°
         entry["offset"] = '"-90 deg"' if outwards and not clockwise else '"90 deg"'
     return entry
-
-
-# -- TOML -----------------------------------------------------------------------------------------
 
 
 def _comment(text: str) -> str:

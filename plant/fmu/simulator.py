@@ -1,7 +1,8 @@
 """An FMU as the car: the same guard in front of it, and the same interface, as the equations."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Final
 
@@ -63,7 +64,7 @@ def _divides(step_s: float, period_s: float) -> bool:
 
 
 class FmuSimulator:
-    """A :class:`plant.vehicle.Vehicle` that an FMU computes; close it when done.
+    """A :class:`plant.vehicle.Vehicle` that an FMU computes.
 
     A command that holds for a while is one step of an FMU that takes steps of any size, and as
     many communication steps as fit of any other.
@@ -83,7 +84,6 @@ class FmuSimulator:
         self.substeps = round(period_s / part_s)
         self._host, self._wiring = host, wiring
         self._part_s, self._any_size = part_s, any_size
-        self._last_good: Array = self.x.copy()
 
     @property
     def time_s(self) -> float:
@@ -108,23 +108,13 @@ class FmuSimulator:
 
     def step_switched(self, commands: Sequence[tuple[int, Sequence[float] | None]]) -> None:
         """One period in which the command changes: (substeps, command) in order of time."""
-        self._last_good[:] = self.x
+        before = self.x.copy()
         try:
             self.u_applied = hold_in_turn(commands, self.substeps, self._hold)
         except FmuFault:
-            self.x[:] = self._last_good
+            self.x[:] = before
             raise
         self.steps += 1
-
-    def close(self) -> None:
-        """End the FMU."""
-        self._host.close()
-
-    def __enter__(self) -> "FmuSimulator":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _hold(self, u: Sequence[float] | None, count: int) -> tuple[float, float]:
         """Holds a command for ``count`` communication steps; what acted."""
@@ -149,12 +139,13 @@ class FmuSimulator:
         self.x[:] = x
 
 
+@contextmanager
 def open_fmu(
     car: CarParameters,
     path: str | os.PathLike[str],
     map_path: str | os.PathLike[str] | None = None,
     rate_hz: float = 50.0,
-) -> FmuSimulator:
+) -> Iterator[FmuSimulator]:
     """The FMU in ``path`` as ``car``, its variables named by the map file or ours.
 
     Raises InputError if the FMU, the map, or both together are not usable.
@@ -166,10 +157,8 @@ def open_fmu(
     wiring = wire(description, map_)
     section = (map_ or FmuMap()).fmu
     part_s = communication_step(description, section.step_s, period_s)
-    host = FmuHost(
-        Path(path), raw, wiring.inputs, wiring.outputs,
-        timeout_s=section.timeout_s, startup_s=section.startup_s,
-    )  # fmt: skip
     # A step size that the map asks for is kept, whatever else the FMU could do.
     any_size = description.variable_step and section.step_s is None
-    return FmuSimulator(car, host, wiring, period_s=period_s, part_s=part_s, any_size=any_size)
+    limits = {"timeout_s": section.timeout_s, "startup_s": section.startup_s}
+    with closing(FmuHost(Path(path), raw, wiring.inputs, wiring.outputs, **limits)) as host:
+        yield FmuSimulator(car, host, wiring, period_s=period_s, part_s=part_s, any_size=any_size)

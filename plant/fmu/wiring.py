@@ -123,7 +123,7 @@ class Wiring:
         self._scale, self._offset = np.array([(one.scale, one.offset) for one in outputs]).T
         self._psi = 0.0  # continued, in the FMU's world
         self._delta = 0.0  # integrated
-        self._shift = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))  # the FMU's start pose, and the asked one
+        self._turn, self._origin = 0.0, (0.0, 0.0)  # of the FMU's world in ours
 
     def start_values(self, x0: Sequence[float] | Array) -> dict[str, Value]:
         """Values to set before initialisation so that the car starts in ``x0``, (7,).
@@ -172,10 +172,18 @@ class Wiring:
         self._psi = 0.0 if self._placed else asked[2]
         self._delta = asked[6]
         said = self._read(outputs)
-        pose, wanted = (said["x"], said["y"], said["psi"]), (asked[0], asked[1], asked[2])
-        self._shift = (pose, wanted) if self._placed else (wanted, wanted)
-        if not self._placed:
-            _check_pose(pose, wanted)
+        x, y, psi = pose = said["x"], said["y"], said["psi"]
+        if self._placed:
+            self._turn = asked[2] - psi
+            dx, dy = _rotated(x, y, self._turn)
+            self._origin = asked[0] - dx, asked[1] - dy
+        elif POSE_TOLERANCE < np.abs(np.subtract(pose, asked[:3])).max() < math.inf:
+            raise InputError(
+                f"the FMU starts at x = {x:.4g} m, y = {y:.4g} m, psi = {psi:.4g} rad instead of "
+                f"{asked[0]:.4g}, {asked[1]:.4g}, {asked[2]:.4g}; name the variables that set its "
+                "pose in the map's [start] (and check units, signs and offsets), or let "
+                "`placed = true` in [fmu] move its world, if it starts at an origin of its own"
+            )
         return self._state(said, omega=asked[5])  # the heading has not changed yet
 
     def state(self, outputs: Sequence[float], u: Sequence[float], duration_s: float) -> Array:
@@ -210,13 +218,10 @@ class Wiring:
         return said
 
     def _state(self, said: Mapping[str, float], omega: float) -> Array:
-        (x_fmu, y_fmu, psi_fmu), (x, y, psi) = self._shift
-        x_said, y_said, psi_said = said["x"], said["y"], said["psi"]
-        if self._placed:
-            dx, dy = _rotated(x_said - x_fmu, y_said - y_fmu, psi - psi_fmu)
-            x_said, y_said, psi_said = x + dx, y + dy, psi_said + (psi - psi_fmu)
+        x, y = _rotated(said["x"], said["y"], self._turn)
+        x, y, psi = x + self._origin[0], y + self._origin[1], said["psi"] + self._turn
         omega, delta = said.get("omega", omega), said.get("delta", self._delta)
-        return np.array((x_said, y_said, psi_said, said["vx"], said["vy"], omega, delta))
+        return np.array((x, y, psi, said["vx"], said["vy"], omega, delta))
 
 
 def _rotated(x: float, y: float, angle_rad: float) -> tuple[float, float]:
@@ -225,16 +230,3 @@ def _rotated(x: float, y: float, angle_rad: float) -> tuple[float, float]:
         return math.nan, math.nan
     cosine, sine = math.cos(angle_rad), math.sin(angle_rad)
     return cosine * x - sine * y, sine * x + cosine * y
-
-
-def _check_pose(pose: tuple[float, float, float], asked: tuple[float, float, float]) -> None:
-    if not all(math.isfinite(value) for value in pose):
-        return  # the simulator names the output
-    if max(abs(is_ - want) for is_, want in zip(pose, asked, strict=True)) > POSE_TOLERANCE:
-        x, y, psi = pose
-        raise InputError(
-            f"the FMU starts at x = {x:.4g} m, y = {y:.4g} m, psi = {psi:.4g} rad instead of "
-            f"{asked[0]:.4g}, {asked[1]:.4g}, {asked[2]:.4g}; name the variables that set its "
-            "pose in the map's [start] (and check units, signs and offsets), or let "
-            "`placed = true` in [fmu] move its world, if it starts at an origin of its own"
-        )
