@@ -7,6 +7,7 @@ import json
 import math
 import os
 import struct
+import sys
 from array import array
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,8 +15,9 @@ from typing import Any
 
 from bayesrace.errors import InputError
 from plant.fmu.faults import FmuFault
-from plant.fmu.process import SCRIBBLED, FmuProcess, WorkerFailed
+from plant.fmu.process import FmuProcess, WorkerFailed
 from plant.fmu.wiring import Value
+from plant.fmu.worker import LONGEST
 
 __all__ = ["FmuHost"]
 
@@ -41,14 +43,14 @@ class FmuHost:
         timeout_s: float,
         startup_s: float,
     ) -> None:
-        if os.name != "posix":
-            raise InputError("an FMU as the plant needs Linux or macOS: run the plant there")
+        if sys.platform != "linux":
+            raise InputError("an FMU as the plant needs Linux: run the plant there")
         self.path, self.timeout_s, self.startup_s = path, timeout_s, startup_s
         self.time_s = 0.0
         """Time that the FMU has reached."""
         self._description, self._outputs = description, tuple(outputs)
         self._answer = struct.Struct(f"=c{1 + len(outputs)}d")
-        cpus = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+        cpus = sorted(os.sched_getaffinity(0))
         self._told = {"cpus": cpus, "inputs": tuple(inputs), "outputs": tuple(outputs)}
         self._process: FmuProcess | None = None
         self._used = False
@@ -68,7 +70,10 @@ class FmuHost:
         process = self._process or self._launch()
         process.output.restart()
         self._used, self.time_s = True, 0.0
-        return self._values(b"s" + json.dumps(dict(values)).encode(), "while it was initialised")
+        question = b"s" + json.dumps(dict(values)).encode()
+        if len(question) > LONGEST:
+            raise InputError(f"the map sets {len(values)} values, more than can be passed on")
+        return self._values(question, "while it was initialised")
 
     def step(self, inputs: Sequence[float], step_s: float, count: int = 1) -> list[float]:
         """Its outputs after ``count`` communication steps of ``step_s``.
@@ -112,7 +117,7 @@ class FmuHost:
         if answer[:1] == b"f":
             raise self.fault(answer[1:].decode(errors="replace"), when)
         if len(answer) != self._answer.size or answer[:1] != b"v":
-            raise self.fault(SCRIBBLED, when)
+            raise self.fault("wrote to its process's connection with the plant", when)
         _, self.time_s, *values = self._answer.unpack(answer)
         for name, value in zip(self._outputs, values, strict=True):
             if not math.isfinite(value):

@@ -4,8 +4,10 @@ It runs in the FMU's own process. A call that the FMU answers with more than a w
 :class:`CallFailed`.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+import ctypes
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
 from typing import Any, Final
 
 from fmpy import read_model_description
@@ -15,6 +17,8 @@ from fmpy.simulation import apply_start_values, instantiate_fmu
 
 __all__ = ["CallFailed", "Instance"]
 
+Transfer = tuple[Callable[[], object], Any, list[int]]
+
 _STATUS: Final = ("ok", "warning", "discard", "error", "fatal", "pending")
 _ENDED: Final = "the FMU ended the simulation"
 
@@ -23,15 +27,20 @@ class CallFailed(Exception):  # noqa: N818
     """The FMU did not do what it was called for; the message says what."""
 
 
-@contextmanager
-def _calls() -> Iterator[None]:
+class _Calls:
     """Turns a status worse than a warning into CallFailed."""
-    try:
-        yield
-    except FMICallException as error:
-        known = 0 <= error.status < len(_STATUS)
-        status = _STATUS[error.status] if known else f"illegal status {error.status}"
-        raise CallFailed(f"{error.function} failed ({status})") from None
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, _kind: object, error: object, _traceback: object) -> None:
+        if isinstance(error, FMICallException):
+            known = 0 <= error.status < len(_STATUS)
+            status = _STATUS[error.status] if known else f"illegal status {error.status}"
+            raise CallFailed(f"{error.function} failed ({status})") from None
+
+
+_CALLS: Final = _Calls()
 
 
 class Instance:
@@ -54,10 +63,8 @@ class Instance:
         self._description = read_model_description(folder, validate=False)
         self._two = self._description.fmiVersion == "2.0"
         variables = {variable.name: variable for variable in self._description.modelVariables}
-        self._inputs, self._outputs = (
-            _by_type([variables[name] for name in names]) for names in (inputs, outputs)
-        )
-        self._width, self._values = len(inputs), [0.0] * len(outputs)
+        self._inputs = [variables[name] for name in inputs]
+        self._outputs = [variables[name] for name in outputs]
         self._log = log
         self._make()
 
@@ -75,6 +82,23 @@ class Instance:
             )
         except Exception as error:  # the loader's words, or the first function that is missing
             raise CallFailed(str(error)) from None
+        self._set = self._transfers("Set", self._inputs)
+        self._get = self._transfers("Get", self._outputs)
+        self._values = [0.0] * len(self._outputs)
+
+    def _transfers(self, direction: str, variables: Sequence[Any]) -> list[Transfer]:
+        """For each type of variable: the call, its buffer, and positions among all values."""
+        version, sizes = ("fmi2", 1) if self._two else ("fmi3", 2)
+        transfers: list[Transfer] = []
+        for kind in {variable.type for variable in variables}:
+            positions = [i for i, variable in enumerate(variables) if variable.type == kind]
+            count = len(positions)
+            buffer = ((ctypes.c_float if kind == "Float32" else ctypes.c_double) * count)()
+            references = (ctypes.c_uint * count)(*(variables[i].valueReference for i in positions))
+            arguments = (self._fmu.component, references, count, buffer, count)[: 3 + sizes]
+            function = getattr(self._fmu, f"{version}{direction}{kind}")
+            transfers.append((partial(function, *arguments), buffer, positions))
+        return transfers
 
     def start(self, values: Mapping[str, Any]) -> None:
         """Set these values and initialise at time zero, a new instance if this one has run."""
@@ -83,7 +107,7 @@ class Instance:
             self._make()
         fmu, description = self._fmu, self._description
         self._initialised = True
-        with _calls():
+        with _CALLS:
             if self._two:
                 fmu.setupExperiment()
             elif any(_structural(v) and v.name in values for v in description.modelVariables):
@@ -96,13 +120,14 @@ class Instance:
 
     def step(self, step_s: float, count: int, inputs: Sequence[float]) -> None:
         """``count`` communication steps with inputs that hold, or with a row of them for each."""
-        begin_s, width = self.time_s, self._width
+        begin_s, width = self.time_s, len(self._inputs)
         advance = _advance_2 if self._two else _advance_3
-        with _calls():
+        with _CALLS:
             for k in range(count):
                 if row := inputs[k * width : (k + 1) * width]:
-                    for kind, references, positions in self._inputs:
-                        getattr(self._fmu, f"set{kind}")(references, [row[i] for i in positions])
+                    for set_, buffer, positions in self._set:
+                        buffer[:] = [row[position] for position in positions]
+                        set_()
                 advance(self._fmu, begin_s + k * step_s, step_s)
         # Kahan's sum: rounding does not add up.
         added_s = count * step_s - self._excess_s
@@ -111,10 +136,10 @@ class Instance:
 
     def values(self) -> list[float]:
         """The values of the outputs; zeros before initialisation."""
-        with _calls():
-            for kind, references, positions in self._outputs if self._initialised else ():
-                values = getattr(self._fmu, f"get{kind}")(references)
-                for position, value in zip(positions, values, strict=True):
+        with _CALLS:
+            for get, buffer, positions in self._get if self._initialised else ():
+                get()
+                for position, value in zip(positions, buffer, strict=True):
                     self._values[position] = value
         return self._values
 
@@ -129,16 +154,6 @@ class Instance:
 
 def _structural(variable: Any) -> bool:
     return bool(variable.causality == "structuralParameter")
-
-
-def _by_type(variables: Sequence[Any]) -> list[tuple[str, list[int], list[int]]]:
-    """Variables that one call transfers: type, references, positions among all values."""
-    groups: dict[str, tuple[str, list[int], list[int]]] = {}
-    for position, variable in enumerate(variables):
-        _, references, positions = groups.setdefault(variable.type, (variable.type, [], []))
-        references.append(variable.valueReference)
-        positions.append(position)
-    return list(groups.values())
 
 
 def _advance_2(fmu: Any, time_s: float, step_s: float) -> None:

@@ -10,28 +10,22 @@ import select
 import shutil
 import signal
 import socket
-import struct
 import subprocess
 import tempfile
 import time
 from contextlib import suppress
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final
 
 from bayesrace.interpreter import RUN_MODULE
 from plant.fmu.output import Output
 from plant.fmu.package import extract, library
+from plant.fmu.worker import LONGEST
 
-__all__ = ["SCRIBBLED", "FmuProcess", "WorkerFailed"]
+__all__ = ["FmuProcess", "WorkerFailed"]
 
 _GOODBYE_S: Final = 0.5
 """For the FMU to free what it holds, when it is not needed any more."""
-
-SCRIBBLED: Final = "wrote to its process's connection with the plant"
-
-_LONGEST: Final = 1 << 20
-"""Bytes of an answer."""
 
 
 class WorkerFailed(Exception):  # noqa: N818
@@ -57,12 +51,11 @@ class FmuProcess:
             raise
 
     def _launch(self, told: dict[str, Any]) -> None:
-        ours, theirs = socket.socketpair()
-        # A read or write that has begun ends too, where the FMU writes to the connection.
-        for option in (socket.SO_RCVTIMEO, socket.SO_SNDTIMEO):
-            ours.setsockopt(socket.SOL_SOCKET, option, struct.pack("@ll", 1, 0))
+        # The kernel keeps messages apart: what the FMU writes there is a message of its own.
+        self._socket, theirs = socket.socketpair(type=socket.SOCK_SEQPACKET)
+        self._socket.setblocking(False)
         reading, writing = os.pipe()
-        self._connection, self.output = Connection(ours.detach()), Output(reading)
+        self.output = Output(reading)
         ends = {"folder": str(self.folder), "parent": os.getpid(), "connection": theirs.fileno()}
         with theirs:
             self.popen = subprocess.Popen(
@@ -76,7 +69,7 @@ class FmuProcess:
             )
         os.close(writing)
         self._poll = select.poll()
-        self._poll.register(self._connection.fileno(), select.POLLIN)
+        self._poll.register(self._socket, select.POLLIN)
         self._poll.register(reading, select.POLLIN)
 
     @property
@@ -89,21 +82,22 @@ class FmuProcess:
 
         ``setting``: what the map calls the time.
         """
-        deadline = time.monotonic() + timeout_s
+        deadline, answering = time.monotonic() + timeout_s, self._socket.fileno()
         try:
             if question:
-                self._connection.send_bytes(question)
+                self._socket.send(question)
             # No spinning here: on two cores it takes from the FMU what it saves in waking up.
             while (left_s := deadline - time.monotonic()) > 0:
                 for descriptor, _ in self._poll.poll(left_s * 1e3):
-                    if descriptor == self._connection.fileno():
-                        return self._connection.recv_bytes(_LONGEST)
-                    if not self.output.pump():
-                        self._poll.unregister(descriptor)
-        except (EOFError, ConnectionError):
+                    if descriptor != answering:
+                        if not self.output.pump():
+                            self._poll.unregister(descriptor)
+                    elif answer := self._socket.recv(LONGEST):
+                        return answer
+                    else:
+                        raise WorkerFailed(self._ended())
+        except (ConnectionError, BlockingIOError):
             raise WorkerFailed(self._ended()) from None
-        except OSError:
-            raise WorkerFailed(SCRIBBLED) from None
         if not self.running:  # what it has started may hold its end of the connection open
             raise WorkerFailed(self._ended())
         raise WorkerFailed(f"did not answer within {timeout_s:g} s ({setting} in the map's [fmu])")
@@ -122,7 +116,7 @@ class FmuProcess:
 
     def quit(self) -> None:
         """Let it end in order, or not."""
-        self._connection.close()
+        self._socket.close()
         with suppress(subprocess.TimeoutExpired):
             self.popen.wait(_GOODBYE_S)
         self.kill()
@@ -132,7 +126,7 @@ class FmuProcess:
         with suppress(ProcessLookupError, PermissionError):  # it may have gone and left some behind
             os.killpg(self.popen.pid, signal.SIGKILL)
         self.popen.wait()
-        self._connection.close()
+        self._socket.close()
         self.output.pump()
         self.output.close()
         shutil.rmtree(self.folder, ignore_errors=True)

@@ -111,16 +111,10 @@ class Wiring:
         self.outputs = tuple(link.variable for link in outputs)
         self.follows_angle = any(link.quantity == "delta" for link in inputs)
         """Whether an input changes during a hold because the steering angle does."""
-        self._starts, self._fixed = tuple(starts), dict(fixed or {})
+        self._inputs, self._outputs, self._starts = tuple(inputs), tuple(outputs), tuple(starts)
+        self._fixed = dict(fixed or {})
         self._sign, self._zero = heading
         self._placed = placed
-        commands = list(COMMANDS)
-        self._sources = [commands.index(link.quantity) for link in inputs]
-        self._in_scale, self._in_offset, self._lowest, self._highest = np.array(
-            [(one.scale, one.offset, one.lowest, one.highest) for one in inputs]
-        ).T
-        self._quantities = [link.quantity for link in outputs]
-        self._scale, self._offset = np.array([(one.scale, one.offset) for one in outputs]).T
         self._psi = 0.0  # continued, in the FMU's world
         self._delta = 0.0  # integrated
         self._turn, self._origin = 0.0, (0.0, 0.0)  # of the FMU's world in ours
@@ -156,11 +150,13 @@ class Wiring:
         outside the range that the FMU declares are clipped, as an actuator stays at its stop.
         """
         d, rate = float(u[0]), float(u[1])
-        commands = np.array(
-            [(d, rate, delta_rad + time * rate, max(d, 0.0), max(-d, 0.0)) for time in times_s]
-        )
-        theirs = self._in_scale * commands[:, self._sources] + self._in_offset
-        rows: list[float] = np.clip(theirs, self._lowest, self._highest).ravel().tolist()
+        ours = {"d": d, "delta_rate": rate, "throttle": max(d, 0.0), "brake": max(-d, 0.0)}
+        rows: list[float] = []
+        for time_s in times_s:
+            ours["delta"] = delta_rad + time_s * rate
+            for one in self._inputs:
+                value = one.scale * ours[one.quantity] + one.offset
+                rows.append(min(max(value, one.lowest), one.highest))
         return rows
 
     def begin(self, outputs: Sequence[float], x0: Sequence[float] | Array) -> Array:
@@ -198,8 +194,8 @@ class Wiring:
 
     def _read(self, outputs: Sequence[float]) -> dict[str, float]:
         """What the rows and rules make of the outputs, in the FMU's world."""
-        ours = (self._scale * np.array(outputs) + self._offset).tolist()
-        said: dict[str, float] = dict(zip(self._quantities, ours, strict=True))
+        rows = zip(self._outputs, outputs, strict=True)
+        said = {one.quantity: one.scale * value + one.offset for one, value in rows}
         if "qw" in said:  # of any length; yaw is the z-y-x Euler angle
             w, x, y, z = (said[name] for name in _QUATERNION)
             said["sin"], said["cos"] = 2.0 * (w * z + x * y), w * w + x * x - y * y - z * z

@@ -13,54 +13,52 @@ import json
 import os
 import shutil
 import signal
+import socket
 import sys
 import threading
 from array import array
 from contextlib import suppress
-from multiprocessing.connection import Connection
 from typing import Any, Final
 
 from bayesrace.clock import die_with_parent
 
-__all__ = ["main"]
+__all__ = ["LONGEST", "main"]
+
+LONGEST: Final = 1 << 16
+"""Bytes of a question or an answer; the longest carry start values."""
 
 _LABELS: Final = ("info", "warning", "discard", "error", "fatal", "pending")
-_LONGEST: Final = 1000
-"""Characters of a message."""
+_LONGEST_MESSAGE: Final = 1000
+"""Characters of the log."""
 
 
 def _log(status: int, message: str) -> None:
     label = _LABELS[status] if 0 <= status < len(_LABELS) else str(status)
-    text = " ".join(message[:_LONGEST].split())
+    text = " ".join(message[:_LONGEST_MESSAGE].split())
     with suppress(OSError):  # the FMU may have closed it
         os.write(1, f"[FMU {label}] {text}\n".encode(errors="replace"))
 
 
-def _serve(connection: Connection, told: dict[str, Any]) -> None:
+def _serve(connection: socket.socket, told: dict[str, Any]) -> None:
     """Loads the FMU, then answers questions until the plant closes the connection."""
     from plant.fmu.instance import CallFailed, Instance  # brings fmpy, and takes its time
 
-    instance = None
-    question = b""
-    while True:
-        try:
-            if instance is None:
-                instance = Instance(**told, log=_log)
-            elif question[:1] == b"s":
+    try:
+        instance = Instance(**told, log=_log)
+        while True:
+            values = array("d", (instance.time_s, *instance.values()))
+            connection.send(b"v" + values.tobytes())
+            question = connection.recv(LONGEST)
+            if not question:
+                return instance.free()
+            if question[:1] == b"s":
                 instance.start(json.loads(question[1:]))
             else:
                 step_s, count, *inputs = array("d", question[1:])
                 instance.step(step_s, int(count), inputs)
-            values = array("d", (instance.time_s, *instance.values()))
-            connection.send_bytes(b"v" + values.tobytes())
-        except CallFailed as failure:  # the plant ends this process now
-            connection.send_bytes(b"f" + str(failure).encode(errors="replace")[:4000])
-        try:
-            question = connection.recv_bytes()
-        except (EOFError, ConnectionError):
-            break
-    if instance is not None:
-        instance.free()
+    except CallFailed as failure:  # the plant ends this process, once it has read the last words
+        connection.send(b"f" + str(failure).encode(errors="replace")[:4000])
+        connection.recv(1)
 
 
 def _end_with(parent: int, folder: str) -> None:
@@ -82,12 +80,13 @@ def main(arguments: list[str]) -> int:
     folder, descriptor = told["folder"], told.pop("connection")
     parent, cpus = told.pop("parent"), told.pop("cpus")
     _end_with(parent, folder)
-    if hasattr(os, "sched_setscheduler"):  # an FMU that hangs must not keep the plant off a CPU
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-        os.sched_setaffinity(0, cpus)
+    # An FMU that hangs must not keep the plant off a CPU.
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    os.sched_setaffinity(0, cpus)
     os.chdir(folder)  # what an FMU writes beside itself is removed with it
     os.set_inheritable(descriptor, False)  # not for what the FMU starts
-    _serve(Connection(descriptor), told)
+    with suppress(ConnectionError):  # the plant has ended
+        _serve(socket.socket(fileno=descriptor), told)
     shutil.rmtree(folder, ignore_errors=True)
     return 0
 
