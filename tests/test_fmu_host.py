@@ -131,8 +131,8 @@ FAULTS = {
     Mode.WORST: r"DoStep failed \(fatal\)",
     Mode.REFUSE: r"DoStep failed \(discard\)",
     Mode.TERMINATE: "the FMU ended the simulation",
-    Mode.CLOSE_ALL: "exit code|closed its connection",
-    Mode.SCRIBBLE: "wrote to its process's connection|exit code",
+    Mode.CLOSE_ALL: "exit code|closed its connection|SIGKILL",
+    Mode.SCRIBBLE: "wrote to its process's connection|SIGKILL",
     Mode.ORPHAN: r"crashed \(SIGABRT\)",
 }
 

@@ -81,7 +81,7 @@ def _factor(entry: Pick | Driven, variable: Variable, wanted: str) -> float:
             f"'{variable.name}' has the unit '{variable.unit_name}', which is not known; give "
             "`unit`, or `scale` instead of it"
         )
-    return 1.0  # neither says anything: SI
+    return 1.0  # neither names a unit: SI
 
 
 def offset_of(offset: float | str, wanted: str, factor: float = 1.0) -> float:

@@ -51,7 +51,7 @@ class FmuHost:
         self._description, self._outputs = description, tuple(outputs)
         self._answer = struct.Struct(f"=c{1 + len(outputs)}d")
         cpus = sorted(os.sched_getaffinity(0))
-        self._told = {"cpus": cpus, "inputs": tuple(inputs), "outputs": tuple(outputs)}
+        self._arguments = {"cpus": cpus, "inputs": tuple(inputs), "outputs": tuple(outputs)}
         self._process: FmuProcess | None = None
         self._used = False
         try:
@@ -100,7 +100,7 @@ class FmuHost:
         return FmuFault(f"FMU {self.path.name} {at}: {what}{last}")
 
     def _launch(self) -> FmuProcess:
-        process = self._process = FmuProcess(self.path, self._description, self._told)
+        process = self._process = FmuProcess(self.path, self._description, self._arguments)
         self._used = False
         self._values(b"", "while it was loaded")
         return process

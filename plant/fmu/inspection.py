@@ -5,20 +5,18 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 from plant.fmu.package import read_description
 from plant.fmu.units import Unit, unit_of
 
-__all__ = ["FmuDescription", "Kind", "Variable", "describe", "inspect"]
+__all__ = ["FmuDescription", "Variable", "describe", "inspect"]
 
-Kind = Literal["real", "integer", "boolean", "enumeration", "string", "binary", "clock"]
-
-_KINDS: Final[dict[str, Kind]] = {
+_KINDS: Final = {
     "Real": "real", "Float32": "real", "Float64": "real", "Boolean": "boolean",
     "Enumeration": "enumeration", "String": "string", "Binary": "binary", "Clock": "clock",
 }  # fmt: skip
-"""The others are integers of some width."""
+"""Of variables by FMI's types; the other types are integers of some width."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +24,7 @@ class Variable:
     """One of an FMU's variables."""
 
     name: str
-    kind: Kind
+    kind: str
     fmi_type: str
     causality: str
     variability: str

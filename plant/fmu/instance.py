@@ -144,7 +144,7 @@ class Instance:
         return self._values
 
     def free(self) -> None:
-        """Terminate and free the instance, whatever it says to that."""
+        """Terminate and free the instance, whatever it answers."""
         fmu = self._fmu
         with suppress(FMICallException):
             if self._initialised:  # before, FMI allows no end but to free it
@@ -162,7 +162,7 @@ def _advance_2(fmu: Any, time_s: float, step_s: float) -> None:
     except FMICallException as error:
         ended = False
         if error.status == fmi2Discard:
-            with suppress(Exception):  # it may not say, or lack the function, as FMI allows
+            with suppress(Exception):  # it may not know, or lack the function, as FMI allows
                 ended = fmu.getBooleanStatus(fmi2Terminated)
         if ended:
             raise CallFailed(_ENDED) from None

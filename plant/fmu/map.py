@@ -49,12 +49,12 @@ def wire(fmu: FmuDescription, map_: FmuMap | None = None) -> Wiring:
     matching.match()
     if not matching.problems:
         return matching.wiring()
-    said = f"the map does not fit the FMU '{name}'" if map_ else (
+    title = f"the map does not fit the FMU '{name}'" if map_ else (
         f"the FMU '{name}' does not have our names and units, and no map says what its own are"
     )  # fmt: skip
     problems = "\n  - ".join(("", *matching.problems))
     raise InputError(
-        f"{said}:{problems}\n`bayesrace fmu inspect` lists its variables and writes a map"
+        f"{title}:{problems}\n`bayesrace fmu inspect` lists its variables and writes a map"
     )
 
 

@@ -24,7 +24,7 @@ class Output:
         self._left, self._tail = _SHOWN, b""
 
     def restart(self) -> None:
-        """A new run: pass on again, and forget what the last one said."""
+        """A new run: pass on again, and forget the output of the last one."""
         self.pump()
         self._left, self._tail = _SHOWN, b""
 

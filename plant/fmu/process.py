@@ -35,22 +35,22 @@ class WorkerFailed(Exception):  # noqa: N818
 class FmuProcess:
     """A process with the FMU unpacked for itself; it does not outlive this one.
 
-    ``description``: fmpy's; ``told``: ``inputs`` and ``outputs`` of
+    ``description``: fmpy's; ``arguments``: ``inputs`` and ``outputs`` of
     :class:`plant.fmu.instance.Instance`, and the ``cpus`` to run on. InputError if the file is
     damaged, or not for this computer.
     """
 
-    def __init__(self, path: Path, description: Any, told: dict[str, Any]) -> None:
+    def __init__(self, path: Path, description: Any, arguments: dict[str, Any]) -> None:
         self.folder = Path(tempfile.mkdtemp(prefix="bayesrace-fmu-"))
         try:
             extract(path, self.folder)
-            told = told | {"library": str(library(path, self.folder, description))}
-            self._launch(told)
+            arguments = arguments | {"library": str(library(path, self.folder, description))}
+            self._launch(arguments)
         except BaseException:
             shutil.rmtree(self.folder, ignore_errors=True)
             raise
 
-    def _launch(self, told: dict[str, Any]) -> None:
+    def _launch(self, arguments: dict[str, Any]) -> None:
         # The kernel keeps messages apart: what the FMU writes there is a message of its own.
         self._socket, theirs = socket.socketpair(type=socket.SOCK_SEQPACKET)
         self._socket.setblocking(False)
@@ -59,7 +59,7 @@ class FmuProcess:
         ends = {"folder": str(self.folder), "parent": os.getpid(), "connection": theirs.fileno()}
         with theirs:
             self.popen = subprocess.Popen(
-                [*RUN_MODULE, "plant.fmu.worker", json.dumps(told | ends)],
+                [*RUN_MODULE, "plant.fmu.worker", json.dumps(arguments | ends)],
                 stdin=subprocess.DEVNULL,
                 stdout=writing,
                 stderr=writing,

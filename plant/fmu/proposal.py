@@ -239,13 +239,13 @@ def _stated_unit(variable: Variable) -> str | None:
 
 def _turned(variable: Variable, quantity: str, *, outwards: bool) -> dict[str, str]:
     """Sign, and a heading's zero, as far as the description says."""
-    said = variable.description.lower()
+    text = variable.description.lower()
     if quantity not in ("psi", "omega", "delta", "delta_rate", "vy"):
         return {}
-    clockwise = "clockwise" in said and not re.search(r"(counter|anti)[- ]?clockwise", said)
-    right = re.search(r"positive (to the )?right|right (is )?positive", said)
+    clockwise = "clockwise" in text and not re.search(r"(counter|anti)[- ]?clockwise", text)
+    right = re.search(r"positive (to the )?right|right (is )?positive", text)
     entry = {"sign": "-1"} if clockwise or right else {}
-    north = re.search(r"(from|to|relative to|zero (is )?at|0 (is|=)) (the )?(true )?north", said)
+    north = re.search(r"(from|to|relative to|zero (is )?at|0 (is|=)) (the )?(true )?north", text)
     if north and quantity == "psi":
         # our = ±theirs + 90°, thus theirs = ±our ∓ 90°
         entry["offset"] = '"-90 deg"' if outwards and not clockwise else '"90 deg"'
@@ -265,7 +265,8 @@ def _table(key: str, name: str, variable: Variable, quantity: str = "") -> str:
     """An inline table that says how to convert, or the FMU's name alone if it need not."""
     outwards = key == "from"
     stated = None if variable.unit_name else _stated_unit(variable)
-    full = {key: _string(name)} | _turned(variable, quantity or name, outwards=outwards)
+    turned = _turned(variable, name if outwards else quantity, outwards=outwards)
+    full = {key: _string(name)} | turned
     full |= {"unit": _string(stated)} if stated else {}
     return _inline(full) if outwards or len(full) > 1 else full[key]
 

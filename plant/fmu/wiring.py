@@ -167,8 +167,8 @@ class Wiring:
         asked = [float(value) for value in x0]
         self._psi = 0.0 if self._placed else asked[2]
         self._delta = asked[6]
-        said = self._read(outputs)
-        x, y, psi = pose = said["x"], said["y"], said["psi"]
+        ours = self._read(outputs)
+        x, y, psi = pose = ours["x"], ours["y"], ours["psi"]
         if self._placed:
             self._turn = asked[2] - psi
             dx, dy = _rotated(x, y, self._turn)
@@ -180,7 +180,7 @@ class Wiring:
                 "pose in the map's [start] (and check units, signs and offsets), or let "
                 "`placed = true` in [fmu] move its world, if it starts at an origin of its own"
             )
-        return self._state(said, omega=asked[5])  # the heading has not changed yet
+        return self._state(ours, omega=asked[5])  # the heading has not changed yet
 
     def state(self, outputs: Sequence[float], u: Sequence[float], duration_s: float) -> Array:
         """State (7,) after ``u`` acted for ``duration_s``; not finite where the outputs are not.
@@ -188,36 +188,36 @@ class Wiring:
         The heading is continuous as long as it changes by less than half a turn a call.
         """
         before = self._psi
-        said = self._read(outputs)
+        ours = self._read(outputs)
         self._delta += duration_s * float(u[1])
-        return self._state(said, omega=(self._psi - before) / duration_s)
+        return self._state(ours, omega=(self._psi - before) / duration_s)
 
     def _read(self, outputs: Sequence[float]) -> dict[str, float]:
         """What the rows and rules make of the outputs, in the FMU's world."""
         rows = zip(self._outputs, outputs, strict=True)
-        said = {one.quantity: one.scale * value + one.offset for one, value in rows}
-        if "qw" in said:  # of any length; yaw is the z-y-x Euler angle
-            w, x, y, z = (said[name] for name in _QUATERNION)
-            said["sin"], said["cos"] = 2.0 * (w * z + x * y), w * w + x * x - y * y - z * z
-        if "cos" in said:
-            sine, cosine = said["sin"], said["cos"]
+        ours = {one.quantity: one.scale * value + one.offset for one, value in rows}
+        if "qw" in ours:  # of any length; yaw is the z-y-x Euler angle
+            w, x, y, z = (ours[name] for name in _QUATERNION)
+            ours["sin"], ours["cos"] = 2.0 * (w * z + x * y), w * w + x * x - y * y - z * z
+        if "cos" in ours:
+            sine, cosine = ours["sin"], ours["cos"]
             angle = math.nan if sine == cosine == 0.0 else math.atan2(sine, cosine)
-            said["psi"] = self._sign * angle + self._zero
-        turns = (self._psi - said["psi"]) / TURN
+            ours["psi"] = self._sign * angle + self._zero
+        turns = (self._psi - ours["psi"]) / TURN
         # Nothing is added where the FMU counts turns itself: its value stays to the bit.
-        said["psi"] = said["psi"] + TURN * round(turns) if math.isfinite(turns) else math.nan
-        self._psi = said["psi"]
-        if "world_x" in said:
-            said["vx"], said["vy"] = _rotated(said["world_x"], said["world_y"], -said["psi"])
-        elif "speed" in said:
-            said["vx"], said["vy"] = _rotated(said["speed"], 0.0, said.get("slip", 0.0))
-        return said
+        ours["psi"] = ours["psi"] + TURN * round(turns) if math.isfinite(turns) else math.nan
+        self._psi = ours["psi"]
+        if "world_x" in ours:
+            ours["vx"], ours["vy"] = _rotated(ours["world_x"], ours["world_y"], -ours["psi"])
+        elif "speed" in ours:
+            ours["vx"], ours["vy"] = _rotated(ours["speed"], 0.0, ours.get("slip", 0.0))
+        return ours
 
-    def _state(self, said: Mapping[str, float], omega: float) -> Array:
-        x, y = _rotated(said["x"], said["y"], self._turn)
-        x, y, psi = x + self._origin[0], y + self._origin[1], said["psi"] + self._turn
-        omega, delta = said.get("omega", omega), said.get("delta", self._delta)
-        return np.array((x, y, psi, said["vx"], said["vy"], omega, delta))
+    def _state(self, ours: Mapping[str, float], omega: float) -> Array:
+        x, y = _rotated(ours["x"], ours["y"], self._turn)
+        x, y, psi = x + self._origin[0], y + self._origin[1], ours["psi"] + self._turn
+        omega, delta = ours.get("omega", omega), ours.get("delta", self._delta)
+        return np.array((x, y, psi, ours["vx"], ours["vy"], omega, delta))
 
 
 def _rotated(x: float, y: float, angle_rad: float) -> tuple[float, float]:

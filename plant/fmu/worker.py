@@ -39,12 +39,12 @@ def _log(status: int, message: str) -> None:
         os.write(1, f"[FMU {label}] {text}\n".encode(errors="replace"))
 
 
-def _serve(connection: socket.socket, told: dict[str, Any]) -> None:
+def _serve(connection: socket.socket, arguments: dict[str, Any]) -> None:
     """Loads the FMU, then answers questions until the plant closes the connection."""
     from plant.fmu.instance import CallFailed, Instance  # brings fmpy, and takes its time
 
     try:
-        instance = Instance(**told, log=_log)
+        instance = Instance(**arguments, log=_log)
         while True:
             values = array("d", (instance.time_s, *instance.values()))
             connection.send(b"v" + values.tobytes())
@@ -63,22 +63,27 @@ def _serve(connection: socket.socket, told: dict[str, Any]) -> None:
 
 def _end_with(parent: int, folder: str) -> None:
     """At SIGTERM or the parent's death: end, also while the FMU computes, and what it started."""
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
 
     def wait() -> None:
-        signal.sigwait({signal.SIGTERM})
+        with suppress(OSError):  # the FMU may close it
+            os.read(reading, 1)
         shutil.rmtree(folder, ignore_errors=True)
         os.killpg(os.getpid(), signal.SIGKILL)
 
     threading.Thread(target=wait, daemon=True).start()
+    # Python's own handler waits for the end of the FMU's call; the byte in the pipe does not.
+    signal.signal(signal.SIGTERM, lambda *_: None)
+    signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
     die_with_parent(parent)
 
 
-def main(arguments: list[str]) -> int:
+def main(argv: list[str]) -> int:
     """Serve the plant that has started this process; returns the exit code."""
-    told = json.loads(arguments[0])
-    folder, descriptor = told["folder"], told.pop("connection")
-    parent, cpus = told.pop("parent"), told.pop("cpus")
+    arguments = json.loads(argv[0])
+    folder, descriptor = arguments["folder"], arguments.pop("connection")
+    parent, cpus = arguments.pop("parent"), arguments.pop("cpus")
     _end_with(parent, folder)
     # An FMU that hangs must not keep the plant off a CPU.
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
@@ -86,7 +91,7 @@ def main(arguments: list[str]) -> int:
     os.chdir(folder)  # what an FMU writes beside itself is removed with it
     os.set_inheritable(descriptor, False)  # not for what the FMU starts
     with suppress(ConnectionError):  # the plant has ended
-        _serve(socket.socket(fileno=descriptor), told)
+        _serve(socket.socket(fileno=descriptor), arguments)
     shutil.rmtree(folder, ignore_errors=True)
     return 0
 
