@@ -59,7 +59,7 @@ def processes_of(session: int) -> list[str]:
 
 
 def assert_all_gone(session: int) -> None:
-    """Killed processes end a moment later: those left behind are nobody's children to wait for."""
+    """Killed processes end a moment later, and those left behind are not ours to wait for."""
     until(lambda: not processes_of(session), f"the end of session {session}", PATIENCE_S)
 
 
@@ -84,6 +84,13 @@ def test_a_row_of_inputs_for_each_step(hosts: dict[int, FmuHost]) -> None:
     host.start({})
     rows = host.step((0.0, 1.0, 0.0, 3.0), 0.01, 2)
     assert rows[6] == pytest.approx(0.04)
+
+
+def test_more_inputs_than_a_message_holds_are_a_fault(hosts: dict[int, FmuHost]) -> None:
+    host = hosts[2]
+    host.start({})
+    with pytest.raises(FmuFault, match="a longer step_s"):
+        host.step((0.0, 1.0) * 10_000, 1e-6, 10_000)
 
 
 def test_time_does_not_drift(hosts: dict[int, FmuHost]) -> None:
@@ -112,8 +119,8 @@ def test_instances_share_a_process_unless_the_fmu_cannot(
         path = faulty_fmu(libraries[2], tmp_path / "f.fmu", guid=token, attributes=attributes)
         with closing(faulty_host(path, (*STATES, "instances"))) as host:
             first = process_of(host)
-            told = [host.start({})[-1] for _ in range(2)]
-            assert told == ([1.0, 2.0] if token == "good" else [1.0, 1.0])
+            counted = [host.start({})[-1] for _ in range(2)]
+            assert counted == ([1.0, 2.0] if token == "good" else [1.0, 1.0])
             assert (process_of(host) is first) == (token == "good")
 
 

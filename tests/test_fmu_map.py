@@ -192,17 +192,17 @@ def test_what_does_not_fit_is_named_with_what_to_write(text: str, said: str) -> 
         wire(MIXED, parse_map(text))
 
 
-def test_all_problems_are_told_at_once() -> None:
+def test_all_problems_are_reported_at_once() -> None:
     fmu = description(given("speed", "km/h"), taken("pedal"), taken("wheel", start=None))
     with pytest.raises(InputError) as caught:
         wire(fmu)
-    said = str(caught.value)
+    text = str(caught.value)
     for quantity in ("x", "y", "psi", "vx", "vy", "omega", "delta"):
-        assert f"nothing gives our {quantity} [" in said
-    assert "the duty cycle" in said
-    assert "the steering rate" in said
-    assert "'wheel' has neither a start value nor a place in the map" in said
-    assert "fmu inspect" in said
+        assert f"nothing gives our {quantity} [" in text
+    assert "the duty cycle" in text
+    assert "the steering rate" in text
+    assert "'wheel' has neither a start value nor a place in the map" in text
+    assert "fmu inspect" in text
 
 
 def test_an_open_frequency_is_what_the_map_says_it_is() -> None:

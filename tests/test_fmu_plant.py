@@ -36,7 +36,7 @@ AT_S = 0.4
 """When the faults strike."""
 
 HANGS_S = 2.0
-"""A step that takes longer hangs. More than a machine stalls, less than anybody waits for."""
+"""A step that takes longer hangs. More than a machine stalls, less than a request waits."""
 
 
 FAULTS = {
@@ -167,9 +167,9 @@ def workers_of(plant: int) -> dict[int, Path]:
         with contextlib.suppress(OSError, ValueError):
             words = (entry / "cmdline").read_bytes().decode().split("\0")
             if "plant.fmu.worker" in words:
-                told = json.loads(words[words.index("plant.fmu.worker") + 1])
-                if told["parent"] == plant:
-                    found[int(entry.name)] = Path(told["folder"])
+                arguments = json.loads(words[words.index("plant.fmu.worker") + 1])
+                if arguments["parent"] == plant:
+                    found[int(entry.name)] = Path(arguments["folder"])
     return found
 
 
@@ -243,7 +243,7 @@ def test_a_repeated_last_state_is_no_gap_and_no_sample() -> None:
         return State(seq, seq, 1, 1, time_s, x, (0.1, 0.0), 0, True, (), final)
 
     states = [state(0, 0.0), state(1, 0.02), state(2, 0.04), state(3, 0.04, final=True)]
-    record = RunRecord(PlannedRun(1, "somebody", ""))
+    record = RunRecord(PlannedRun(1, "a controller", ""))
     runs = {1: record}
     for message in states:
         _sort_in(runs, message)

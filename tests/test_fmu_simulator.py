@@ -39,7 +39,7 @@ def host(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FmuHost]:
 def simulator(
     host: FmuHost, *, angle: bool = False, part_s: float = 1e-3, any_size: bool = True
 ) -> FmuSimulator:
-    """``angle``: the second input is told the steering angle."""
+    """``angle``: the second input takes the steering angle."""
     inputs = (Link("d", "d"), Link("delta_rate", "delta" if angle else "delta_rate"))
     links = [Link(name, name) for name in STATES]
     wiring = Wiring(inputs, links, links)
@@ -71,7 +71,7 @@ def test_a_command_that_changes_within_the_period_acts_from_there(
         assert car.u_applied == pytest.approx(((5 * 0.5 + 15 * CAR.d_min) / 20, 0.5))
         deltas.append(car.x[6])
     assert deltas[:2] == pytest.approx([0.02, 0.02])
-    # This FMU integrates its second input: the sum of the angles that it was told.
+    # This FMU integrates its second input: the sum of the angles sent.
     first = [0.01 + 0.002 * k for k in range(1, 6)]
     held = 0.01 + 1e-3 * sum(first)
     assert deltas[2] == pytest.approx(held + 0.015 * held)

@@ -196,7 +196,7 @@ def test_a_quaternion_of_zeros_is_no_heading() -> None:
 
 
 def test_a_foreign_vehicle_altogether() -> None:
-    """The names, units and signs of a model that nobody made for us."""
+    """The names, units and signs of another tool's model."""
     fmu = description(
         *(taken("PedalPercent", "%"), taken("SteerAngleCmd", "deg")),
         *(given("posEast", "cm"), given("posNorth", "cm"), given("compass", "deg")),

@@ -70,10 +70,7 @@ class FmuHost:
         process = self._process or self._launch()
         process.output.restart()
         self._used, self.time_s = True, 0.0
-        question = b"s" + json.dumps(dict(values)).encode()
-        if len(question) > LONGEST:
-            raise InputError(f"the map sets {len(values)} values, more than can be passed on")
-        return self._values(question, "while it was initialised")
+        return self._values(b"s" + json.dumps(dict(values)).encode(), "while it was initialised")
 
     def step(self, inputs: Sequence[float], step_s: float, count: int = 1) -> list[float]:
         """Its outputs after ``count`` communication steps of ``step_s``.
@@ -109,6 +106,10 @@ class FmuHost:
         """The outputs that the worker answers, all of them finite; ``when``: at the start."""
         if self._process is None:
             raise FmuFault(f"FMU {self.path.name}: it has failed, and no new run has been started")
+        if len(question) > LONGEST:
+            raise self.fault(
+                "too many values at once: set fewer in the map, or a longer step_s", when
+            )
         limit = ("startup_s", self.startup_s) if when else ("timeout_s", self.timeout_s)
         try:
             answer = self._process.ask(question, *limit)
