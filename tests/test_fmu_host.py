@@ -79,13 +79,6 @@ def test_it_drives_as_its_equations_say(version: int, hosts: dict[int, FmuHost])
     assert once == pytest.approx([x, y, psi, vx, 0.0, omega, delta], abs=1e-15)
 
 
-def test_a_row_of_inputs_for_each_step(hosts: dict[int, FmuHost]) -> None:
-    host = hosts[2]
-    host.start({})
-    rows = host.step((0.0, 1.0, 0.0, 3.0), 0.01, 2)
-    assert rows[6] == pytest.approx(0.04)
-
-
 def test_more_inputs_than_a_message_holds_are_a_fault(hosts: dict[int, FmuHost]) -> None:
     host = hosts[2]
     host.start({})

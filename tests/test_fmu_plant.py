@@ -145,12 +145,6 @@ def test_a_failed_start_is_a_refused_run(rig: Rig) -> None:
     assert rig.director.status("plant").phase == "idle"
 
 
-def test_talk_does_not_end_a_run(rig: Rig, tmp_path: Path) -> None:
-    changes = with_fault(Mode.FLOOD_LOG) | {"max_time_s": AT_S + 0.1}
-    end = rig.drive(tmp_path / "log", laps=0, **changes)
-    assert end.data["reason"] == "max_time"
-
-
 def test_a_slow_fmu_counts_as_overruns(wall_clock_rig: Rig, tmp_path: Path) -> None:
     """60 ms for a period of 20 ms."""
     before = int(wall_clock_rig.director.status("plant").counters["overruns"])

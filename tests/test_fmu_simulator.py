@@ -13,7 +13,7 @@ from bayesrace.vehicles import get_car
 from plant.fmu.faults import FmuFault
 from plant.fmu.host import FmuHost
 from plant.fmu.inspection import inspect
-from plant.fmu.simulator import FmuSimulator, communication_step, open_fmu
+from plant.fmu.simulator import FmuSimulator, communication_step
 from plant.fmu.wiring import Link, Wiring
 from tests.faulty_fmu import (
     PATIENCE_S,
@@ -112,12 +112,3 @@ def test_the_communication_step(tmp_path: Path) -> None:
     for wrong in (0.003, 0.04, 0.0):
         with pytest.raises(InputError, match="does not divide the plant's period"):
             step("", wrong)
-
-
-def test_our_own_names_need_no_map(tmp_path: Path) -> None:
-    path = faulty_fmu(faulty_library(3), tmp_path / "own.fmu", 3)
-    with open_fmu(CAR, path) as car:
-        car.reset((1.0, 2.0, 0.5, 1.0, 0, 0, 0))
-        np.testing.assert_array_equal(car.x, (1.0, 2.0, 0.5, 1.0, 0, 0, 0))
-        car.step((0.5, 1.0))
-        assert car.x[6] == pytest.approx(0.02)

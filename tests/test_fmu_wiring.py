@@ -180,25 +180,6 @@ def test_velocity_of_a_model_without_side_slip() -> None:
     assert_same(read(wiring, replacing("vx", "vy", v=lambda s: s["vx"]), state), state)
 
 
-def test_lengths_speeds_and_rates_in_declared_units() -> None:
-    fmu = own_fmu(
-        given("px", "cm"),
-        given("py", "mm"),
-        given("u", "km/h"),
-        given("r", "rpm"),
-        without=("x", "y", "vx", "omega"),
-    )
-    wiring = wire(fmu, parse_map('[outputs]\nx = "px"\ny = "py"\nvx = "u"\nomega = "r"'))
-    say = replacing(
-        *("x", "y", "vx", "omega"),
-        px=lambda s: 100 * s["x"],
-        py=lambda s: 1000 * s["y"],
-        u=lambda s: 3.6 * s["vx"],
-        r=lambda s: s["omega"] * 30 / math.pi,
-    )
-    assert_same(read(wiring, say, STATE), STATE)
-
-
 def test_yaw_rate_from_the_heading_across_the_wrap() -> None:
     fmu = own_fmu(given("hdg", "deg"), without=("psi", "omega"))
     wiring = wire(fmu, parse_map(f'[outputs]\n{COMPASS}\n[derive]\nomega = "psi"'))

@@ -17,7 +17,6 @@ from tests.fmu_variables import (
     Array,
     U,
     assert_same,
-    description,
     given,
     our_names,
     own_fmu,
@@ -27,7 +26,6 @@ from tests.fmu_variables import (
     values,
     variable,
 )
-from tests.foreign_fmu import FOREIGN_MAP
 
 # -- inputs ---------------------------------------------------------------------------------------
 
@@ -193,32 +191,3 @@ def test_a_quaternion_of_zeros_is_no_heading() -> None:
     wiring = wire(fmu, parse_map(rule))
     state = wiring.begin([0.0] * len(wiring.outputs), STATE)
     assert math.isnan(state[2])
-
-
-def test_a_foreign_vehicle_altogether() -> None:
-    """The names, units and signs of another tool's model."""
-    fmu = description(
-        *(taken("PedalPercent", "%"), taken("SteerAngleCmd", "deg")),
-        *(given("posEast", "cm"), given("posNorth", "cm"), given("compass", "deg")),
-        *(given("velEast", "km/h"), given("velNorth", "km/h"), given("turnRate", "deg/s")),
-    )
-    text = FOREIGN_MAP[: FOREIGN_MAP.index("[start]")]
-    wiring = wire(fmu, parse_map(text))
-
-    def say(state: Array) -> dict[str, float]:
-        x, y, psi, vx, vy, omega, _ = state
-        return {
-            "posEast": 100 * x,
-            "posNorth": 100 * y,
-            "compass": (90 - math.degrees(psi)) % 360,
-            "velEast": 3.6 * (math.cos(psi) * vx - math.sin(psi) * vy),
-            "velNorth": 3.6 * (math.sin(psi) * vx + math.cos(psi) * vy),
-            "turnRate": -math.degrees(omega),
-        }
-
-    start = STATE.copy()
-    start[6] -= 0.02 * U[1]
-    assert_same(wiring.begin(values(wiring, say(start)), start), start)
-    sent = dict(zip(wiring.inputs, wiring.to_inputs(U, start[6], (0.02,)), strict=True))
-    assert sent == pytest.approx({"PedalPercent": 40.0, "SteerAngleCmd": -math.degrees(STATE[6])})
-    assert_same(wiring.state(values(wiring, say(STATE)), U, 0.02), STATE)
