@@ -47,14 +47,13 @@ def communication_step(
             f"the map's step_s = {wanted_s:g} does not divide the plant's period of "
             f"{period_s:g} s; set it in [fmu] to a whole part of it, or change --rate"
         )
-    internal_s = description.internal_step_s
+    steps_s, otherwise_s = [description.internal_step_s, description.experiment_step_s], period_s
     if description.variable_step:
-        fine = internal_s is None or _divides(internal_s, _STEP_S)
-        return internal_s if internal_s and not fine and _divides(internal_s, period_s) else _STEP_S
-    for step_s in (internal_s, description.experiment_step_s):
-        if step_s is not None and _divides(step_s, period_s):
-            return step_s
-    return period_s
+        steps_s, otherwise_s = steps_s[:1], _STEP_S
+        if steps_s[0] is None or _divides(steps_s[0], _STEP_S):
+            return _STEP_S
+    fitting_s = (step_s for step_s in steps_s if step_s and _divides(step_s, period_s))
+    return next(fitting_s, otherwise_s)
 
 
 def _divides(step_s: float, period_s: float) -> bool:
