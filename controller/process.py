@@ -1,6 +1,6 @@
-"""The controller process: a fixed-rate loop by the wall clock, an answer to each state in lockstep.
+"""The controller process: a fixed-rate loop in real time, an answer to each state in lockstep.
 
-By the wall clock the loop keeps its rate whatever arrives: it wakes shortly before a release,
+In real time the loop keeps its rate whatever arrives: it wakes shortly before a release,
 looks for the state that is due, steps, sends, and does everything else (telemetry, requests,
 heartbeat, preparation of the next step) in the time that is left. It writes nothing to disk, waits
 for no one and logs nothing while it drives.
@@ -65,8 +65,8 @@ _GRACE: Final = 0.25
 period)."""
 
 _SERVE_NS: Final = 40_000_000
-"""Between two requests that are served while driving: each takes as long as a cycle, and whoever
-asks without end must not hold up the loop."""
+"""Between two requests that are served while driving: each takes as long as a cycle, and a
+flood of requests must not hold up the loop."""
 
 _SWITCH_S: Final = 1e-4
 
@@ -348,7 +348,7 @@ def main(settings: ControllerSettings, controller: Controller) -> int:
     die_with_parent(settings.parent_pid)
     with open_session(settings.endpoints, "controller") as session:
         process = ControllerProcess(session, settings, controller)
-        # A control thread that wants the interpreter's lock back has it this soon, whoever has it.
+        # The control thread gets the interpreter's lock back from another thread this soon.
         sys.setswitchinterval(_SWITCH_S)
         try:
             for refusal in prepare_thread(settings.realtime):

@@ -15,7 +15,7 @@ from experiments.processes import Child, endings
 __all__ = ["RunPlan", "announcement", "execute", "run_request", "wait_for_both"]
 
 _ABSENCE_S = 10.0
-"""By the wall clock a process may be away for so long: a link comes back, a controller is started
+"""In real time a process may be away for so long: a link comes back, a controller is started
 again, and the car waits at standstill."""
 
 _UNDRIVEN = 0.5
@@ -102,7 +102,7 @@ def execute(
     before = director.status("plant").counters
     try:
         director.start(run_request(track, plan))
-        # In lockstep simulated time passes faster than the clock's, but nobody promises it.
+        # In lockstep simulated time passes faster than real time, but that is no promise.
         absence_s = 1.0 if plan.lockstep else _ABSENCE_S
         end = director.wait_for_end(
             plan.run,
@@ -110,10 +110,10 @@ def execute(
             absence_s,
             lambda: recorder.failed if recorder else "",
         )
-    except RefusedError:  # the plant may be driving for somebody else
+    except RefusedError:  # the plant may be driving for another director
         raise
     except (InputError, KeyboardInterrupt):
-        with suppress(InputError):  # a car must not drive on when nobody watches it
+        with suppress(InputError):  # a car must not drive on unwatched
             director.stop("who started the run has left")
         raise
     if end.data.get("reason") not in _REGULAR:

@@ -3,7 +3,7 @@
 What ``bayesrace status --json`` prints is one object, ``{"cars": {NAME: {"plant": P, "controller":
 P}}}``, where P is null if no such process is there, and otherwise holds, always:
 
-- ``answering``: it has told its status; all from ``phase`` on is null if not;
+- ``answering``: it has sent its status; all from ``phase`` on is null if not;
 - ``fault``: why not, or null;
 - ``processes``: how many answered under this name; more than one is a mistake;
 - ``status_age_s``: since the status arrived here [s];
@@ -74,7 +74,7 @@ class Picture:
 
     @property
     def answering(self) -> bool:
-        """Whether any process has told its status."""
+        """Whether any process has sent its status."""
         return any(one.status for processes in self.cars.values() for one in processes.values())
 
     def put(self, car: str, source: str, process: Process | None) -> None:
@@ -88,7 +88,7 @@ class Picture:
             del self.cars[car]
 
     def silence(self, now_s: float) -> None:
-        """Takes the status from those that have not told it for a while."""
+        """Takes the status from those that have not sent it for a while."""
         for processes in self.cars.values():
             for source, one in processes.items():
                 if one.status is not None and now_s - one.arrived_s > _SILENT_S:

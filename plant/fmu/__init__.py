@@ -1,4 +1,4 @@
-"""An FMU of another tool as the car, and the car as an FMU for other tools (``export``).
+"""Any Co-Simulation FMU as the plant's car. The export of FMUs is in :mod:`codegen.fmu`.
 
 From the file to the car: ``inspection`` (the FMU's variables; ``units``) and ``map_file`` (what the
 user says of them) meet in ``map`` (``checks`` for each entry), which makes the ``wiring``.
