@@ -103,7 +103,7 @@ def describe(raw: Any, platforms: tuple[str, ...] = ()) -> FmuDescription:
         "Model Exchange": raw.modelExchange,
         "Scheduled Execution": raw.scheduledExecution,
     }
-    units = {unit.name: unit.baseUnit for unit in raw.unitDefinitions}
+    units = {unit.name: unit_of(unit.name, unit.baseUnit) for unit in raw.unitDefinitions}
     variables = (one for one in raw.modelVariables if one.causality != "independent")
     return FmuDescription(
         model_name=raw.modelName or "?",
@@ -128,7 +128,7 @@ def _number(text: Any, otherwise: Any = None) -> Any:
     return value if math.isfinite(value) else otherwise
 
 
-def _variable(raw: Any, units: Mapping[str, Any]) -> Variable:
+def _variable(raw: Any, units: Mapping[str, Unit | None]) -> Variable:
     declared = raw.declaredType
 
     def attribute(name: str) -> Any:
@@ -145,7 +145,7 @@ def _variable(raw: Any, units: Mapping[str, Any]) -> Variable:
         variability=raw.variability,
         initial=raw.initial,
         unit_name=unit_name,
-        unit=unit_of(unit_name, units.get(unit_name)),
+        unit=units[unit_name] if unit_name in units else unit_of(unit_name),
         lowest=_number(attribute("min"), -math.inf),
         highest=_number(attribute("max"), math.inf),
         start=raw.start,
