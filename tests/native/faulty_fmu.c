@@ -74,7 +74,6 @@ enum { /* modes; the numbers are those in tests/faulty_fmu.py */
        HUGE_VALUE,
        CLOSE_ALL,
        EARLY,
-       STUCK,
        SAY,
        WORST,
        SCRIBBLE,
@@ -261,10 +260,9 @@ EXPORT Status fmi3DoStep(fmi3Instance c, fmi3Float64 t, fmi3Float64 h, fmi3Boole
     (void)none;
     bool halfway = car->value[MODE] == EARLY && h > 1e-3;
     Status status = drive(car, t, halfway ? h / 2 : h);
-    if (car->value[MODE] == STUCK) car->time = t;
     *event = false;
     *terminate = car->ended;
-    *early = halfway || car->value[MODE] == STUCK;
+    *early = halfway;
     *last = car->time;
     return status;
 }
@@ -318,12 +316,6 @@ EXPORT Status fmi2GetBooleanStatus(fmi2Component c, const fmi2StatusKind kind, f
     const Car *car = c;
     *told = kind == fmi2Terminated && car->ended;
     return (Status)(car->value[MODE] == REFUSE ? DISCARD : OK); /* then it cannot tell */
-}
-
-EXPORT Status fmi2GetRealStatus(fmi2Component c, const fmi2StatusKind kind, Real *told) {
-    (void)kind;
-    *told = ((Car *)c)->time;
-    return (Status)OK;
 }
 #endif
 
