@@ -3,7 +3,6 @@
 from bayesrace.messages.codec import LARGEST_BYTES, Decoder, decode, encode, json_schema
 from bayesrace.messages.rules import Scalar
 from bayesrace.messages.table import (
-    ACCEPTED,
     ACTUATION,
     ALIVE,
     CLOCK,
@@ -47,7 +46,6 @@ from bayesrace.messages.types import (
 )
 
 __all__ = [
-    "ACCEPTED",
     "ACTUATION",
     "ALIVE",
     "CLOCK",

@@ -24,7 +24,6 @@ from bayesrace.messages.types import (
 )
 
 __all__ = [
-    "ACCEPTED",
     "ACTUATION",
     "ALIVE",
     "CLOCK",
@@ -85,13 +84,12 @@ class Topic(Generic[M]):
 
 @dataclass(frozen=True)
 class Service(Generic[M, A]):
-    """One row of the table of requests. ``request`` or ``answer`` None: the payload is no message,
-    but a weights file, or one in a frame."""
+    """One row of the table of requests. ``request`` None: the payload is a weights file."""
 
     name: str
     key: str
     request: type[M] | None
-    answer: type[A] | None
+    answer: type[A]
     timeout_s: float
     repeatable: bool = True
     """Asked twice, it does what it does once: a question that a link has lost is asked again."""
@@ -140,16 +138,10 @@ refused; waits for a first cycle, for others that sent theirs before, and for th
 ROLLBACK: Final = Service(
     "rollback", "bayesrace/{car}/controller/rollback", RollbackRequest, Reply, 20.0, False
 )
-ACCEPTED: Final[Service[Message, Message]] = Service(
-    "accepted", "bayesrace/{car}/controller/accepted", None, None, 2.0
-)
-"""Asked without payload, for who joins late. The answer (``controller/latecomer.py``) frames the
-file of the weights in use with its time of acceptance and the digests of those given up; empty if
-there is nothing to tell."""
 COMMAND: Final = Service("command", "bayesrace/{car}/controller/command", Command, Reply, 5.0)
 CLOCK: Final = Service("clock", "bayesrace/{car}/{source}/clock", ClockRequest, ClockReading, 2.0)
 SERVICES: Final[tuple[Service[Any, Any], ...]] = (
-    RUN, STOP, STATUS, WEIGHTS, ROLLBACK, ACCEPTED, COMMAND, CLOCK
+    RUN, STOP, STATUS, WEIGHTS, ROLLBACK, COMMAND, CLOCK
 )  # fmt: skip
 
 ALIVE: Final = "bayesrace/{car}/alive/{source}"

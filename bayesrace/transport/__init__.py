@@ -7,7 +7,6 @@ from bayesrace.transport.client import (
     ask_all,
     count_processes,
     decisive,
-    fetch_all,
     send_rollback,
     send_weights,
 )
@@ -54,7 +53,6 @@ __all__ = [
     "decisive",
     "declare_service",
     "decode_request",
-    "fetch_all",
     "free_endpoint",
     "open_session",
     "send_rollback",

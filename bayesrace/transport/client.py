@@ -36,7 +36,6 @@ __all__ = [
     "ask_all",
     "count_processes",
     "decisive",
-    "fetch_all",
     "send_rollback",
     "send_weights",
 ]
@@ -73,8 +72,6 @@ def ask(
     :func:`decisive` chooses among the valid answers. Raises InputError if there is no valid
     answer in time.
     """
-    if service.answer is None:
-        raise TypeError(f"the answer of '{service.name}' is not a message; use fetch_all")
     key = car_key(service.key, car, source)
     limit_s = service.timeout_s if timeout_s is None else timeout_s
     begin = time.monotonic()
@@ -118,7 +115,6 @@ def ask_all(
     keys: Collection[str],
     request: Message | bytes,
     timeout_s: float,
-    where: zenoh.Locality = zenoh.Locality.ANY,
     turned_away: list[str] | None = None,
 ) -> dict[str, list[bytes]]:
     """Every answer to one request, by key; all keys are asked at once.
@@ -138,7 +134,6 @@ def ask_all(
             consolidation=zenoh.ConsolidationMode.NONE,
             # Dropped, a question is never answered: on a loaded machine that ended a race.
             congestion_control=zenoh.CongestionControl.BLOCK,
-            allowed_destination=where,
         )
         for key in keys
     }
@@ -161,12 +156,6 @@ def count_processes(
     key = car_key(STATUS.key, car, source)
     request = StatusRequest(0, time.monotonic_ns())
     return len(_valid(Status, ask_all(session, (key,), request, timeout_s)[key]))
-
-
-def fetch_all(session: Any, service: Service[Any, Any], car: str) -> list[bytes]:
-    """The answers of all other processes, as bytes: for answers that are no messages."""
-    key = car_key(service.key, car)
-    return ask_all(session, (key,), b"", service.timeout_s, zenoh.Locality.REMOTE)[key]
 
 
 def decisive(answers: Sequence[A]) -> A | None:
