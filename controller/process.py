@@ -197,7 +197,7 @@ class ControllerProcess:
         """The cycle's messages; new weights are adopted before the next cycle is prepared."""
         self._send(state, decision)
         if self._adoption is not None:
-            self._adoption.in_lockstep(self._next_cycle)
+            self._adoption.between_cycles(self._next_cycle, lockstep=True)
 
     # Free-running ------------------------------------------------------------------------------
 

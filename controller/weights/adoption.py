@@ -80,19 +80,15 @@ class Adoption:
             return True
         return False
 
-    def between_cycles(self, cycle: int) -> None:
-        """Adopts what is offered; ``cycle``: number of the next one."""
-        if self.offers:
-            self._take(cycle)
+    def between_cycles(self, cycle: int, lockstep: bool = False) -> None:
+        """Adopts what is offered; ``cycle``: number of the next one.
 
-    def in_lockstep(self, cycle: int) -> None:
-        """The same; and lets the watch keep up, as the plant lets the controller."""
-        if self.offers:
-            self._take(cycle)
-        elif self._watched:
-            self._wait_for_watch(cycle)
-
-    def _take(self, cycle: int) -> None:
+        In lockstep it lets the watch keep up first, as the plant lets the controller.
+        """
+        if lockstep and self._watched:
+            self._wait_for_watch()
+        if not self.offers:
+            return
         begin_ns = time.perf_counter_ns()
         try:
             offer = self.offers.popleft()
@@ -108,18 +104,15 @@ class Adoption:
         self.longest_us = max(self.longest_us, offer.us)
         offer.done = True
 
-    def _wait_for_watch(self, cycle: int) -> None:
+    def _wait_for_watch(self) -> None:
+        """Until it has seen all states, or there is an offer: what it returns to, say."""
         recorded, deadline = self._states.recorded, time.monotonic() + _PATIENCE_S
-        while self.validator:
-            if self.offers:  # what the watch returns to, or something newer
-                return self._take(cycle)
+        while self.validator and not self.offers:
             revision, seen, worse = self._states.progress
             if revision == self._revision and not worse and seen >= recorded:
                 self._watched = seen < ALL
-                return None
+                return
             if time.monotonic() > deadline:
-                self.missed += 1
-                self._watched = False
-                return None
+                self.missed, self._watched = self.missed + 1, False
+                return
             time.sleep(_POLL_S)
-        return None

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import product
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -14,8 +15,7 @@ from bayesrace.gp.weights import OUTPUTS, UNITS, GpWeights, decode_weights
 from bayesrace.messages import Scalar
 from bayesrace.vehicles.parameters import CarParameters
 from controller.native_step import pack_weights
-from controller.weights.model import OneStepModel, plausible_samples
-from controller.weights.samples import Sample
+from controller.weights.prediction import OneStepModel, Sample, plausible_samples
 from controller.weights.settings import GateSettings
 
 __all__ = ["Checks", "Comparison", "Verdict"]
@@ -92,25 +92,20 @@ class Checks:
         return OneStepModel(self._artefact, self._car, weights)
 
     def _check_origin(self, weights: GpWeights) -> None:
-        name = f"weights '{weights.version}'"
-        if weights.car != self._car.name:
-            raise InputError(
-                f"{name} are those of the car '{weights.car}', this is '{self._car.name}': send "
-                "them to its controller"
-            )
         ahead_s = (weights.created_utc_ns - time.time_ns()) * 1e-9
-        if ahead_s > _CLOCKS_APART_S:
-            raise InputError(
-                f"{name} are dated {ahead_s:.3g} s ahead, and all others would be stale beside "
-                "them; set the clocks, and train again"
-            )
         older_s = (self._in_use_made_ns - weights.created_utc_ns) * 1e-9
-        if older_s > 0 and weights.created_utc_ns and self.in_use.weights is not None:
-            raise InputError(
-                f"{name} are stale: made {older_s:.3g} s before those in use, "
-                f"'{self.in_use.weights.version}'; train again, or return to earlier ones with "
-                "'bayesrace rollback'"
+        in_use, why_not = self.in_use.weights, ""
+        if weights.car != self._car.name:
+            why_not = f"those of the car '{weights.car}', this is '{self._car.name}'"
+        elif ahead_s > _CLOCKS_APART_S:
+            why_not = f"dated {ahead_s:.3g} s ahead: set the clocks, and train again"
+        elif in_use is not None and weights.created_utc_ns and older_s > 0:
+            why_not = (
+                f"stale: made {older_s:.3g} s before those in use, '{in_use.version}'; train "
+                "again, or return to earlier ones with 'bayesrace rollback'"
             )
+        if why_not:
+            raise InputError(f"weights '{weights.version}' are {why_not}")
 
     def _check_bounds(self, model: OneStepModel, samples: Sequence[Sample]) -> None:
         limit = np.array(self._car.tuning.gate.absurd)
@@ -149,7 +144,7 @@ class Checks:
         """Errors (n, 3) over the same samples; those that the nominal model lacks do not count."""
         usable = np.isfinite(nominal).all(axis=1)
         rmse = {
-            what: np.sqrt(np.mean(errors[usable] ** 2, axis=0)) if usable.any() else np.zeros(3)
+            what: np.sqrt((errors[usable] ** 2).sum(axis=0) / max(usable.sum(), 1))
             for what, errors in (("new", new), ("old", old), ("nominal", nominal))
         }
         settings = self.settings
@@ -158,12 +153,11 @@ class Checks:
         fine = rmse["new"] <= settings.worse_factor * np.minimum(rmse["old"], 1e12) + slack
         worse = " and ".join(name for name, good in zip(OUTPUTS, fine, strict=True) if not good)
         data: dict[str, Scalar] = {"samples": int(usable.sum())}
-        for what, errors in rmse.items():
-            for name, error in zip(OUTPUTS, errors, strict=True):
-                data[f"error_{what}_{name}"] = float(min(error, 1e12))
-        changes = ", ".join(
-            f"{name} {data[f'error_old_{name}']:.4g} to {data[f'error_new_{name}']:.4g} {unit}"
-            for name, unit in UNITS.items()
+        for (what, errors), (j, name) in product(rmse.items(), enumerate(OUTPUTS)):
+            data[f"error_{what}_{name}"] = float(min(errors[j], 1e12))
+        text = ", ".join(
+            f"{name} {old:.4g} to {new:.4g} {UNITS[name]}"
+            for name, old, new in zip(OUTPUTS, rmse["old"], rmse["new"], strict=True)
         )
-        text = f"one-step errors over {data['samples']} samples go from {changes}"
+        text = f"one-step errors over {data['samples']} samples go from {text}"
         return Comparison(worse, text, data)

@@ -63,10 +63,6 @@ class SharedStates:
         self._words = memoryview(self._map)[:24].cast("Q")
         self._next = self._words[0]
 
-    def close(self) -> None:
-        """Closes the descriptor; the memory stays as long as it is mapped."""
-        os.close(self.fd)
-
     def record(self, state: State, fallen_back: bool | None) -> None:
         """Keeps a state; for the control thread. ``fallen_back``: see :class:`StateRecord`."""
         number = self._next

@@ -107,9 +107,7 @@ class Supervisor:
         if self._process is not None:
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(1.0)
-            self._process.kill()
-            with suppress(subprocess.TimeoutExpired):
-                self._process.wait(1.0)
+            self._process.kill()  # no effect after its end
         self._connection = self._process = None
 
     def _start(self) -> Connection:

@@ -22,7 +22,7 @@ import msgpack
 
 from bayesrace.vehicles import described_car
 from controller.weights.checks import Checks
-from controller.weights.samples import Sample, Sampler
+from controller.weights.prediction import Sample, Sampler
 from controller.weights.settings import GateSettings
 from controller.weights.states import ALL, RING, SharedStates, StateRecord
 from controller.weights.watch import Watch

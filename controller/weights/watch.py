@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from bayesrace.messages import Scalar
 from controller.weights.checks import Checks, Comparison
-from controller.weights.samples import Sample
+from controller.weights.prediction import Sample
 
 __all__ = ["Watch"]
 

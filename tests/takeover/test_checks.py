@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from bayesrace.gp.weights import GpOutput, GpWeights, encode_weights
 from bayesrace.vehicles import CarParameters
 from controller.weights.checks import Checks, Verdict
-from controller.weights.model import plausible_samples
-from controller.weights.samples import Sample, Sampler
+from controller.weights.prediction import Sample, Sampler, plausible_samples
 from controller.weights.settings import GateSettings
 from controller.weights.states import StateRecord
 from controller.weights.watch import Watch

@@ -107,7 +107,7 @@ def test_an_offer_that_the_control_loop_does_not_adopt_is_withdrawn(
 def test_a_request_when_too_many_wait_is_refused_for_now(
     course: Course, again: GpWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("controller.weights.requests._MOST", 1)
+    monkeypatch.setattr("controller.weights.manager._MOST_WAITING", 1)
     with bench(course) as made:
         answers = [made.send(again)]
         made.offered()
@@ -125,7 +125,7 @@ def test_requests_are_answered_when_the_controller_ends(course: Course, again: G
         answers = [made.send(again)]
         made.offered()
         answers.append(made.roll_back())
-        until(lambda: len(made.manager._requests) == 1, "the second request waits")
+        until(lambda: made.manager._waiting.qsize() == 1, "the second request waits")
         made.manager.stop()
         answers.append(made.send(again))
         replies = [answer.result(60.0) for answer in answers]
@@ -153,7 +153,7 @@ def test_requests_are_answered_in_time_while_the_validator_is_silent(
     """A verdict that comes too late is ignored, and not taken for the answer to the next."""
     with bench(course, GateSettings(hang_s=3600)) as made:
         made.accept(again)
-        monkeypatch.setattr("controller.weights.requests._RETURN_S", 14.0)  # leaves a second
+        monkeypatch.setattr("controller.weights.manager._RETURN_S", 14.0)  # leaves a second
         victim = made.validator
         os.kill(victim, signal.SIGSTOP)
         try:
@@ -180,7 +180,7 @@ def test_a_request_to_roll_back_while_the_watch_does(
         made.drive(25, fallen_back=True)
         made.offered()
         answer = made.roll_back()
-        until(lambda: len(made.manager._requests) == 1, "the request has come")
+        until(lambda: made.manager._waiting.qsize() == 1, "the request has come")
         third = made.send(replace(again, version="third"))
         made.cycle()
         assert made.version == good.version
@@ -219,8 +219,8 @@ def test_a_disk_that_hangs_delays_neither_answer_nor_rollback(
     again: GpWeights,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("controller.weights.requests._RETURN_S", 12.0)
-    monkeypatch.setattr("controller.weights.requests._STORE_S", 1.0)
+    monkeypatch.setattr("controller.weights.manager._RETURN_S", 12.0)
+    monkeypatch.setattr("controller.weights.manager._STORE_S", 1.0)
     free, keep = threading.Event(), Store.keep
 
     def hangs(store: Store, history: History) -> None:
