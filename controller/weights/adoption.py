@@ -45,16 +45,15 @@ class Offer:
     revision: int
     """Of the weights in use: rises with each adoption, of new or of earlier ones."""
     watched: bool
-    """The validator compares what they predict while the car drives."""
     done: bool = False
     error: str = ""
     """Why they could not be adopted; else empty."""
     cycle: int = 0
     """First cycle that they can drive."""
     states: int = 0
-    """States recorded before."""
+    """States recorded before the adoption."""
     us: float = 0.0
-    """What the adoption has cost the control thread."""
+    """Time that the adoption has taken."""
 
 
 class Adoption:
@@ -71,7 +70,7 @@ class Adoption:
         self._revision, self._watched = 0, watched
         self.newest_us = self.longest_us = 0.0
         self.missed = 0
-        """How often the watch did not keep up in lockstep."""
+        """Times that the watch did not keep up in lockstep."""
 
     def withdraw(self) -> bool:
         """For the manager; False if the control thread is just adopting the offer: it counts."""

@@ -22,7 +22,7 @@ from controller.native_step import unpack_weights
 from controller.weights.adoption import Adoption, Offer, WeightsPort
 from controller.weights.settings import GateSettings
 from controller.weights.states import SharedStates
-from controller.weights.store import AcceptedWeights, digest_of
+from controller.weights.store import AcceptedWeights, Store, digest_of
 from controller.weights.supervisor import Supervisor
 
 __all__ = ["WeightUpdateManager"]
@@ -30,9 +30,8 @@ __all__ = ["WeightUpdateManager"]
 _log = logging.getLogger("bayesrace.controller")
 
 _RETURN_S: Final = 2.0
-"""Of a service's time: the way here and back, on a machine that stalls."""
 _STORE_S: Final = 5.0
-"""Of a service's time: for the store, after the adoption."""
+"""Shares of a service's time: for the way here and back, for the store after the adoption."""
 _ADOPT_S: Final = 5.0
 """The control loop, driving or idle, adopts within a cycle or a heartbeat; this is a stall."""
 
@@ -46,18 +45,17 @@ _MOST_WAITING: Final = 32
 _FILE_BYTES: Final = 100_000
 """Of a weights file, beyond its arrays."""
 
+_Data = dict[str, Scalar]
+_Outcome = tuple[bool, str, _Data]
+"""Whether a request is accepted, with text and data of answer and event."""
+
 _ENDS: Final = "the controller ends"
-_NOT_NOW: Final[Mapping[str, Scalar]] = {"again": True}
-"""Data of a refusal whose reason passes: the same request may be accepted later."""
-
-_News = tuple[str, dict[str, Scalar]]
-"""Text and data of an answer and an event."""
+_NOT_NOW: Final[_Data] = {"again": True}
+"""Data of a :class:`_NotNowError`."""
 
 
-class _RefusedError(Exception):
-    def __init__(self, text: str, data: Mapping[str, Scalar] = _NOT_NOW) -> None:
-        super().__init__(text)
-        self.data = data
+class _NotNowError(InputError):
+    """A refusal whose reason passes: the same request may be accepted later."""
 
 
 class _Pending(NamedTuple):
@@ -65,14 +63,10 @@ class _Pending(NamedTuple):
 
     request: Request
     arrived_s: float
-    answer_s: float
+    due_s: float
+    """Deadline of the adoption; the answer may wait for the store for ``_STORE_S`` longer."""
 
-    @property
-    def due_s(self) -> float:
-        """Deadline of verdict and adoption; the store has the time from then to ``answer_s``."""
-        return self.answer_s - _STORE_S
-
-    def reply(self, accepted: bool, text: str, data: Mapping[str, Scalar] = _NOT_NOW) -> None:
+    def reply(self, accepted: bool, text: str, data: Mapping[str, Scalar]) -> None:
         self.request.answer(Reply(0, time.monotonic_ns(), accepted, text[:2000], dict(data)))
 
 
@@ -96,6 +90,7 @@ class WeightUpdateManager:
         self._counts = {"weights_accepted": 0, "weights_refused": 0, "weights_rolled_back": 0}
         self._trouble, self._stopping = "", False
         self._writer = ThreadPoolExecutor(1, "weights-store")
+        self._writing: Future[None] | None = None
         self._waiting: Queue[_Pending] = Queue(_MOST_WAITING)
         self._most_bytes = 3 * 8 * 7 * (port.step.manifest.gp_capacity + 1) + _FILE_BYTES
         self._thread = threading.Thread(target=self._run, name="weights")
@@ -139,18 +134,19 @@ class WeightUpdateManager:
     def _arrive(self, request: Request) -> None:
         """In the transport's thread."""
         now_s = time.monotonic()
-        pending = _Pending(request, now_s, now_s + request.service.timeout_s - _RETURN_S)
+        due_s = now_s + request.service.timeout_s - _RETURN_S - _STORE_S
+        pending = _Pending(request, now_s, due_s)
         try:
             self._waiting.put_nowait(pending)
         except Full:
-            pending.reply(False, f"{_MOST_WAITING} requests wait already: try later")
+            pending.reply(False, f"{_MOST_WAITING} requests wait already: try later", _NOT_NOW)
         if self._stopping and not self._thread.is_alive():  # so no request is left behind
             self._refuse_waiting()
 
     def _refuse_waiting(self) -> None:
         with suppress(Empty):
             while True:
-                self._waiting.get_nowait().reply(False, _ENDS)
+                self._waiting.get_nowait().reply(False, _ENDS, _NOT_NOW)
 
     def _run(self) -> None:
         while not self._stopping:
@@ -168,31 +164,32 @@ class WeightUpdateManager:
         """From a request to its answer."""
         back = pending.request.service is ROLLBACK
         try:
-            text, data = self._back_on_request(pending) if back else self._update(pending)
-        except _RefusedError as refusal:
-            pending.reply(False, str(refusal), refusal.data)
-            if not back:
-                self._counts["weights_refused"] += 1
-                self._announce("weights_refused", str(refusal), refusal.data)
+            accepted, text, data = (self._back if back else self._update)(pending)
+        except InputError as refusal:
+            accepted, text = False, str(refusal)
+            data = _NOT_NOW if isinstance(refusal, _NotNowError) else {}
         except Exception:
-            pending.reply(False, "a fault of the controller's own: see its log")
+            pending.reply(False, "a fault of the controller's own: see its log", _NOT_NOW)
             raise
-        else:
-            pending.reply(True, text, data)
+        pending.reply(accepted, text, data)
+        if accepted:
             self._announce("weights_rolled_back" if back else "weights_accepted", text, data)
+        elif not back:
+            self._counts["weights_refused"] += 1
+            self._announce("weights_refused", text, data)
 
-    def _update(self, pending: _Pending) -> _News:
+    def _update(self, pending: _Pending) -> _Outcome:
         """Validates, stages, adopts and keeps the weights of a request."""
         data, size, history = pending.request.payload, pending.request.size, self._history
         if size > self._most_bytes:
-            raise _RefusedError(f"{size} bytes are more than any weights that would fit", {})
+            raise InputError(f"{size} bytes are more than any weights that would fit")
         if digest_of(data) in history.withdrawn:
             why_not = "these weights have been rolled back before: they predicted worse than others"
-            raise _RefusedError(f"{why_not}; train again", {})
+            raise InputError(f"{why_not}; train again")
         verdict = self._judge(data, pending.due_s)
         facts, packed, watched = verdict["data"], verdict["packed"], self._settings.watch_s > 0
         if not verdict["accepted"]:
-            raise _RefusedError(verdict["text"], facts)
+            return False, verdict["text"], facts
         offer = self._adopt(packed, facts["version"], watched, pending.due_s)
         new = history.accept(facts["version"], data, packed, proven=not watched)
         self._counts["weights_accepted"] += 1
@@ -200,7 +197,7 @@ class WeightUpdateManager:
         text = f"in use from cycle {offer.cycle} on, as number {new.number}; {verdict['text']}"
         return self._kept(pending, f"weights {new.version} {text}", facts)
 
-    def _back_on_request(self, pending: _Pending) -> _News:
+    def _back(self, pending: _Pending) -> _Outcome:
         """Returns to the weights before those in use."""
         message, why_not = decode_request(pending.request)
         if message is not None and pending.arrived_s < self._rolled_back_s:
@@ -208,7 +205,7 @@ class WeightUpdateManager:
         elif message is not None and len(self._history.entries) < 2:
             why_not = "there are no weights before those in use"
         if why_not:
-            raise _RefusedError(why_not, {})
+            raise InputError(why_not)
         target, why = self._history.entries[-2], f"on request: {message.text}"
         return self._kept(pending, *self._roll_back(target, "request", why, pending.due_s))
 
@@ -219,7 +216,7 @@ class WeightUpdateManager:
         compared = -1
         while compared != self._revision or self._verdict is None:
             if self._supervisor.trouble:
-                raise _RefusedError(f"{self._supervisor.trouble}; send them again in a moment")
+                raise _NotNowError(f"{self._supervisor.trouble}; send them again in a moment")
             if self._supervisor.ready and compared != self._revision:
                 compared, self._verdict = self._revision, None
                 self._checks += 1
@@ -230,7 +227,7 @@ class WeightUpdateManager:
     def _pause(self, until_s: float, why_not: str) -> None:
         """Waits a moment for the validator; refuses the request when time is over."""
         if self._stopping or time.monotonic() > until_s:
-            raise _RefusedError(_ENDS if self._stopping else why_not)
+            raise _NotNowError(_ENDS if self._stopping else why_not)
         time.sleep(_POLL_S)
         self._follow()
 
@@ -259,13 +256,12 @@ class WeightUpdateManager:
 
     def _lost(self, text: str) -> None:
         """The validator is gone; the car is driven on with what is in use."""
+        _log.warning("%s", text)
         self.adoption.validator = False
         self._announce("validator_ended", text, {})
 
     def _announce(self, kind: str, text: str, data: Mapping[str, Scalar]) -> None:
         """Publishes an event, on which no answer and no rollback depends."""
-        if not data:
-            _log.warning("%s", text)
         try:
             self._publish(kind, text, data)
         except Exception:
@@ -276,10 +272,7 @@ class WeightUpdateManager:
     def _adopt(self, packed: bytes, version: str, watched: bool, due_s: float) -> Offer:
         """Stages weights and waits until the control thread has adopted them."""
         offer = Offer(version, self._revision + 1, watched)
-        try:
-            self._port.step.stage_weights(unpack_weights(packed))
-        except InputError as error:
-            raise _RefusedError(str(error), {}) from None
+        self._port.step.stage_weights(unpack_weights(packed))
         self.adoption.offers.append(offer)
         until_s = min(time.monotonic() + _ADOPT_S, due_s)
         while not offer.done:
@@ -287,13 +280,15 @@ class WeightUpdateManager:
             late = self._stopping or time.monotonic() > until_s
             if late and self.adoption.withdraw():
                 why_not = f"the control loop did not adopt them within {_ADOPT_S:g} s"
-                raise _RefusedError(_ENDS if self._stopping else why_not)
+                raise _NotNowError(_ENDS if self._stopping else why_not)
         if offer.error:
-            raise _RefusedError(offer.error, {})
+            raise InputError(offer.error)
         self._revision, self._begin = offer.revision, offer.states
         return offer
 
-    def _roll_back(self, target: AcceptedWeights, by: str, why: str, due_s: float) -> _News:
+    def _roll_back(
+        self, target: AcceptedWeights, by: str, why: str, due_s: float
+    ) -> tuple[str, _Data]:
         """Returns to earlier weights."""
         left = self._history.in_use
         offer = self._adopt(target.packed, target.version, not target.proven, due_s)
@@ -317,7 +312,7 @@ class WeightUpdateManager:
         why = f"{self._history.in_use.version} {worse}"
         try:
             text, facts = self._roll_back(self._history.reference, "watch", why, math.inf)
-        except _RefusedError as refusal:  # the next validator comes to the same result
+        except InputError as refusal:  # the next validator comes to the same result
             self._supervisor.lose(f"was ended, as a rollback is not possible now ({refusal})")
             return
         self._rolled_back_s = time.monotonic()
@@ -327,30 +322,36 @@ class WeightUpdateManager:
     # Storing -------------------------------------------------------------------------------------
 
     def _keep(self) -> "Future[None] | None":
-        """Tells the validator what is in use, and begins to write it to the store."""
+        """Sends the validator what is in use, and has it written to the store."""
         self._supervisor.send(self._context())
-        if self._port.store is None:
-            return None
-        writing = self._writer.submit(self._port.store.keep, self._history.model_copy())
-        writing.add_done_callback(self._note_store)
-        return writing
+        if self._port.store is not None:
+            last = self._writing
+            if (
+                last is None or last.running() or last.done()
+            ):  # else it has not begun: one is enough
+                self._writing = self._writer.submit(self._write, self._port.store)
+        return self._writing
 
-    def _note_store(self, writing: "Future[None]") -> None:
+    def _write(self, store: Store) -> None:
         """In the store's thread."""
-        error = writing.exception()
-        self._trouble = f"accepted weights cannot be kept: {error}" if error else ""
-        if error:
+        try:
+            store.keep(self._history.model_copy())
+            self._trouble = ""
+        except InputError as error:
+            self._trouble = f"accepted weights cannot be kept: {error}"
+            _log.warning("%s", self._trouble)
             self._announce("weights_not_kept", self._trouble, {})
+            raise
 
-    def _kept(self, pending: _Pending, text: str, data: dict[str, Scalar]) -> _News:
-        """The answer, once the store is written; it says if that is not so."""
-        writing, error = self._keep(), None
+    def _kept(self, pending: _Pending, text: str, data: _Data) -> _Outcome:
+        """Acceptance, once the store is written; it says if that is not so."""
+        writing = self._keep()
         try:
             while writing is not None and not writing.done():
-                self._pause(pending.answer_s, "the store has not been written in time")
-            error = writing and writing.exception()
-        except _RefusedError as late:
+                self._pause(pending.due_s + _STORE_S, "the store has not been written in time")
+            error = None if writing is None else writing.exception()
+        except _NotNowError as late:
             error = late
-        if error is None:
-            return text, data
-        return f"{text}; not kept: {error}", {**data, "not_kept": str(error)}
+        if error is not None:
+            text, data = f"{text}; not kept: {error}", {**data, "not_kept": str(error)}
+        return True, text, data

@@ -82,15 +82,14 @@ class History(BaseModel):
         )  # fmt: skip
         self.next_number += 1
         reference, kept = self.reference, [*self.entries, new][-HISTORY:]
-        # All others may be bad.
         self.entries = kept if any(one.proven for one in kept) else [reference, *kept]
         return new
 
     def prove(self) -> AcceptedWeights:
         """Marks the weights in use as proven."""
-        self.entries = [*self.entries[:-1], self.in_use.model_copy(update={"proven": True})]
-        self.entries = self.entries[-HISTORY:]
-        return self.in_use
+        new = self.in_use.model_copy(update={"proven": True})
+        self.entries = [*self.entries[:-1], new][-HISTORY:]
+        return new
 
     def roll_back(self, target: AcceptedWeights, withdraw: bool) -> None:
         """Returns to ``target``; ``withdraw``: later weights are not to be accepted again."""
@@ -106,22 +105,19 @@ class Store:
     def __init__(self, folder: Path, discretisation: str) -> None:
         """InputError if it cannot be used or belongs to a controller that predicts otherwise."""
         self._folder, path = folder, folder / _INDEX
-        index = History()
+        index, why_not = History(), ""
         try:
             folder.mkdir(parents=True, exist_ok=True)
             if path.exists():
                 index = History.model_validate_json(read_text(path, "the store's index"))
         except OSError as error:
-            raise InputError(f"store {folder}: {error.strerror}; choose another folder") from None
+            why_not = str(error.strerror)
         except ValidationError:
-            raise InputError(
-                f"store {folder}: {_INDEX} is damaged; remove it, or choose another folder"
-            ) from None
+            why_not = f"{_INDEX} is damaged; remove it"
         if index.discretisation not in ("", discretisation):
-            raise InputError(
-                f"store {folder} holds weights for {index.discretisation}, this controller "
-                f"predicts with {discretisation}; choose another folder"
-            )
+            why_not = f"holds weights for {index.discretisation}, not for {discretisation}"
+        if why_not:
+            raise InputError(f"store {folder}: {why_not}; choose another folder")
         # A folder that cannot be written is an error now, not while the car drives.
         self._write_index(index.model_copy(update={"discretisation": discretisation}))
 

@@ -53,12 +53,13 @@ class Supervisor:
     def look(self) -> None:
         """Starts or ends a validator, if it is time to."""
         now_s = self._clock_s()
-        if self.ready:
-            if now_s - self._states.heartbeat_s > self._hang_s:
-                self.lose(f"hung, without a heartbeat for {self._hang_s:g} s")
-        elif now_s >= self._due_s and self._connection is not None:
+        if self.ready and now_s > self._states.heartbeat_s + self._hang_s:
+            self.lose(f"hung, without a heartbeat for {self._hang_s:g} s")
+        elif self.ready or now_s < self._due_s:
+            return
+        elif self._connection is not None:
             self.lose(f"was not ready within {_START_S:g} s")
-        elif now_s >= self._due_s:
+        else:
             try:
                 self._connection = self._start()
             except OSError as error:

@@ -40,7 +40,7 @@ def test_a_validator_killed_between_verdict_and_adoption(
         reply = made.settle(answer)
         assert (reply.accepted, reply.data["version"]) == (True, again.version)
         assert "not kept" not in reply.text
-        assert made.published("weights_accepted") == [reply.text]
+        until(lambda: made.published("weights_accepted") == [reply.text], "the event")
         if keeps:
             assert made.kept() == [again.version]
         made.ready(2)
@@ -188,7 +188,7 @@ def test_a_request_to_roll_back_while_the_watch_does(
         assert (reply.accepted, reply.text) == (False, "the watch has rolled back meanwhile")
         reply = made.settle(third)
         assert (reply.accepted, made.version) == (True, "third")
-        assert len(made.published("weights_rolled_back")) == 1
+        until(lambda: len(made.published("weights_rolled_back")) == 1, "the event")
         assert made.status("weights_rolled_back") == 1
         refused = made.settle(made.send(again))
         assert "rolled back before" in refused.text

@@ -68,7 +68,7 @@ def test_a_store_of_another_model_or_a_damaged_one_is_refused(
     tmp_path: Path, car: CarParameters
 ) -> None:
     Store(tmp_path, "d").keep(history(car, True))
-    with pytest.raises(InputError, match="predicts with e; choose another folder"):
+    with pytest.raises(InputError, match="weights for d, not for e; choose another folder"):
         Store(tmp_path, "e")
     for damaged in ("{", '{"entries": [{"number": 1}]}'):
         (tmp_path / "index.json").write_text(damaged)
