@@ -184,7 +184,7 @@ def send_rollback(session: Any, car: str, text: str, timeout_s: float | None = N
     """Back to the weights before those in use; ``text``: why. The answer, accepted or not.
 
     ``data`` of the answer: ``version`` and ``number`` of those in use from ``cycle`` on,
-    ``from_version`` and ``from_number`` of those given up.
+    ``from_version`` and ``from_number`` of those before.
     """
     request = RollbackRequest(0, time.monotonic_ns(), text[:2000])
     return ask(session, ROLLBACK, car, request, timeout_s=timeout_s)

@@ -129,7 +129,7 @@ class Checks:
         new, nominal = model.errors(samples), self.nominal.errors(samples)
         found = [
             self.compare(new, other.errors(samples), nominal)
-            for other in (self.in_use, self.reference)
+            for other in dict.fromkeys((self.in_use, self.reference))
         ]
         decisive = next((one for one in found if one.worse), found[0])
         facts |= decisive.data

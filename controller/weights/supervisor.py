@@ -27,6 +27,8 @@ is ready, as one that cannot start must not keep a CPU busy beside the control l
 _TRANSFER_S: Final = 5
 """For one message: a stopped process reads nothing, and a file fills the connection."""
 
+_BUFFER_BYTES: Final = 1 << 20
+
 Message = Mapping[str, Any]
 
 
@@ -125,4 +127,6 @@ class Supervisor:
             )
             for option in (socket.SO_SNDTIMEO, socket.SO_RCVTIMEO):
                 own.setsockopt(socket.SOL_SOCKET, option, struct.pack("ll", _TRANSFER_S, 0))
+            # A verdict fits, so that both sides never wait for each other to read.
+            other.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)
             return Connection(own.detach())

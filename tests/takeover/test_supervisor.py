@@ -22,7 +22,7 @@ AGAIN = "weights in use stay, and are not watched until it runs again"
 class States(SharedStates):
     """The test says when the last heartbeat was."""
 
-    heartbeat_s = 1000.0  # type: ignore[assignment]
+    heartbeat_s = 1000.0
 
 
 class Stage(Supervisor):
@@ -48,7 +48,7 @@ class Stage(Supervisor):
 
     def answers_ready(self) -> None:
         """The newest validator."""
-        self.states.heartbeat_s = self.now_s  # type: ignore[misc,assignment]
+        self.states.heartbeat_s = self.now_s
         self.others[-1].send_bytes(msgpack.packb({"kind": "ready"}))
         assert self.receive() == {"kind": "ready"}
         assert self.ready
@@ -142,7 +142,7 @@ def test_one_without_a_heartbeat_is_replaced(stage: Stage) -> None:
     stage.answers_ready()
     for _ in range(5):
         stage.now_s += 0.9 * HANG_S
-        stage.states.heartbeat_s = stage.now_s - 0.5 * HANG_S  # type: ignore[misc,assignment]
+        stage.states.heartbeat_s = stage.now_s - 0.5 * HANG_S
         stage.look()
     assert not stage.lost
     stage.now_s += 0.6 * HANG_S

@@ -144,13 +144,6 @@ def test_what_is_no_weights_file_is_refused(rig: Rig, good: GpWeights) -> None:
     assert rig.status().weights_version == good.version
 
 
-def test_stale_weights_are_refused(rig: Rig, good: GpWeights) -> None:
-    rig.send(replace(good, version="b", created_utc_ns=2_000_000_000))
-    assert "stale" in rig.refusal(
-        encode_weights(replace(good, version="a", created_utc_ns=1_000_000_000))
-    )
-
-
 def test_back_and_back_to_the_start(rig: Rig, good: GpWeights) -> None:
     for version in ("one", "two"):
         rig.send(replace(good, version=version))
