@@ -7,7 +7,6 @@ interpreter's lock or wakes another thread either: that would cost a hundred tim
 import time
 from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -65,19 +64,13 @@ class Adoption:
         self._states, self._adopt = states, adopt
         self.record: Callable[[State, bool | None], None] = states.record
         self.offers: deque[Offer] = deque(maxlen=1)
+        """The manager appends, and pops what the control thread does not take."""
         self.validator = False
         """The validator is running; set by the manager."""
         self._revision, self._watched = 0, watched
         self.newest_us = self.longest_us = 0.0
         self.missed = 0
         """Times that the watch did not keep up in lockstep."""
-
-    def withdraw(self) -> bool:
-        """For the manager; False if the control thread is just adopting the offer: it counts."""
-        with suppress(IndexError):
-            self.offers.pop()
-            return True
-        return False
 
     def between_cycles(self, cycle: int, lockstep: bool = False) -> None:
         """Adopts what is offered; ``cycle``: number of the next one.

@@ -277,10 +277,11 @@ class WeightUpdateManager:
         until_s = min(time.monotonic() + _ADOPT_S, due_s)
         while not offer.done:
             time.sleep(_POLL_S)
-            late = self._stopping or time.monotonic() > until_s
-            if late and self.adoption.withdraw():
+            if self._stopping or time.monotonic() > until_s:
                 why_not = f"the control loop did not adopt them within {_ADOPT_S:g} s"
-                raise _NotNowError(_ENDS if self._stopping else why_not)
+                with suppress(IndexError):  # else the control thread is just adopting them
+                    self.adoption.offers.pop()
+                    raise _NotNowError(_ENDS if self._stopping else why_not)
         if offer.error:
             raise InputError(offer.error)
         self._revision, self._begin = offer.revision, offer.states

@@ -1,6 +1,7 @@
 """What the compiled model predicts, and what the car did: one-step samples of recorded states."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -38,25 +39,23 @@ class Sampler:
     def __init__(self, step_s: float, moving_mps: float) -> None:
         """Leaves out samples that begin slower than ``moving_mps``."""
         self._step_s, self._moving_mps = step_s, moving_mps
-        self._first: StateRecord | None = None
-        self._last: StateRecord | None = None
-        self._impulse = np.zeros(2)
-        """Integral of the input since the first state."""
+        self._states: list[StateRecord] = []
+        """Those of the sample that is not complete yet."""
 
     def add(self, state: StateRecord) -> Sample | None:
         """The sample that this state completes, if any."""
-        first, last, self._last = self._first, self._last, state
-        if first is None or last is None or not _consecutive(last, state):
-            self._first, self._impulse = state, np.zeros(2)
-            return None
-        self._impulse += (state.time_s - last.time_s) * np.array(state.u_applied)
+        if self._states and not _consecutive(self._states[-1], state):
+            self._states = []
+        self._states.append(state)
+        states, first = self._states, self._states[0]
         duration_s = state.time_s - first.time_s
         if duration_s < self._step_s * (1 - 1e-6):
             return None
-        u = self._impulse / duration_s
-        self._first, self._impulse = state, np.zeros(2)
+        self._states = [state]
         if first.x[3] < self._moving_mps or duration_s > _LONGEST * self._step_s:
             return None
+        steps = ((b.time_s - a.time_s) * np.array(b.u_applied) for a, b in pairwise(states))
+        u = sum(steps, np.zeros(2)) / duration_s
         if abs(duration_s - self._step_s) < 1e-6 * self._step_s:
             duration_s = self._step_s  # for exactly one step the model takes no remainder
         return Sample(state.recorded_ns, duration_s, np.array(first.x), u, np.array(state.x))

@@ -57,7 +57,7 @@ class Validator:
         self._checks = Checks(settings, Path(first["artefact"]), car)
         self._sampler = Sampler(self._checks.step_s, car.tuning.gate.moving_mps)
         self._driven: deque[_Driven] = deque(maxlen=RING)
-        self._next = self._read_ns = 0
+        self._next = 0
         self._use(first)
         self._states.beat()
         self._answer("ready")
@@ -85,8 +85,9 @@ class Validator:
         """Longest wait for a message before the next look at states, or heartbeat."""
         if self._watch is None:
             return min(1.0, self._checks.settings.hang_s / _BEATS)
-        idle = time.monotonic_ns() - self._read_ns > _IDLE_NS
-        return _POLL_S if idle or not self._driven[-1][0].lockstep else _LOCKSTEP_POLL_S
+        newest = self._driven[-1][0] if self._driven else None
+        idle = newest is None or time.monotonic_ns() - newest.recorded_ns > _IDLE_NS
+        return _LOCKSTEP_POLL_S if newest and newest.lockstep and not idle else _POLL_S
 
     def _use(self, context: Mapping[str, Any]) -> None:
         """Watches what is in use, if it is unproven, over all states since its adoption."""
@@ -110,8 +111,6 @@ class Validator:
     def _read(self) -> list[_Driven]:
         """States that have been recorded meanwhile."""
         states, self._next = self._states.read(self._next)
-        if states:
-            self._read_ns = time.monotonic_ns()
         driven = [(state, self._sampler.add(state)) for state in states]
         self._driven += driven
         return driven
