@@ -25,9 +25,8 @@ _LONGEST_PAUSE_S: Final = 30.0
 """From an end to the next start; doubled from ``_RESTART_S`` for each process that ends before it
 is ready, as one that cannot start must not keep a CPU busy beside the control loop."""
 _TRANSFER_S: Final = 5
-"""For one message: a stopped process reads nothing, and a file fills the connection."""
-
 _BUFFER_BYTES: Final = 1 << 20
+"""For one message: a stopped process reads nothing, and a file fills the connection."""
 
 Message = Mapping[str, Any]
 
@@ -108,9 +107,10 @@ class Supervisor:
         if self._connection is not None:
             self._connection.close()
         if self._process is not None:
-            with suppress(subprocess.TimeoutExpired):
-                self._process.wait(1.0)
-            self._process.kill()  # no effect after its end
+            for end in (self._process.poll, self._process.kill):
+                end()
+                with suppress(subprocess.TimeoutExpired):
+                    self._process.wait(1.0)
         self._connection = self._process = None
 
     def _start(self) -> Connection:
