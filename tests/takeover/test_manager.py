@@ -89,6 +89,14 @@ def test_a_validator_that_is_replaced_watches_from_the_adoption_on(
         assert made.version == good.version
 
 
+def test_a_rollback_needs_no_validator(course: Course, good: GpWeights, again: GpWeights) -> None:
+    with bench(course) as made:
+        made.accept(again)
+        os.kill(made.validator, signal.SIGKILL)
+        made.gone()
+        assert made.settle(made.roll_back()).data["version"] == good.version
+
+
 def test_an_offer_that_the_control_loop_does_not_adopt_is_withdrawn(
     course: Course, good: GpWeights, again: GpWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
