@@ -2,9 +2,9 @@
 
     python -m controller.weights.validator SOCKET STATES
 
-Both arguments are file descriptors that it shares with the controller. Whatever a weights file does
-to the process that decodes it, it does to this one. It keeps nothing that its successor would miss:
-recent states are in the shared memory, and the first message says what is in use.
+Both arguments are file descriptors that it shares with the controller. A weights file that crashes
+or blocks the process that decodes it affects this process alone. It keeps no state that the next
+one needs: recent states are in the shared memory, and the first message says what is in use.
 """
 
 import os
