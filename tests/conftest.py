@@ -48,7 +48,7 @@ SETTINGS = MpcSettings(
     margin_m=0.0,
     tolerance=1e-6,
     defect_max=0.1,
-    settle=0.0,
+    early_stop_tol=0.0,
     iterations=1,
     iterations_cold=30,
 )

@@ -18,13 +18,9 @@
 _Static_assert(FMU_V_delta == FIRST_STATE + NX - 1 && FMU_V_delta_rate == FIRST_INPUT + NU - 1,
                "states, inputs and parameters lie together");
 
-size_t fmu_model_size(void)
-{
-    return 0;
-}
+size_t fmu_model_size(void) { return 0; }
 
-int fmu_model_create(fmu_instance *car, const char *resources)
-{
+int fmu_model_create(fmu_instance *car, const char *resources) {
     (void)car, (void)resources;
     return 0;
 }
@@ -35,8 +31,7 @@ int fmu_model_create(fmu_instance *car, const char *resources)
 #define D_APPLIED FMU_V_d_applied
 #define RATE_APPLIED FMU_V_delta_rate_applied
 
-int fmu_model_initialise(fmu_instance *car)
-{
+int fmu_model_initialise(fmu_instance *car) {
     double *v = car->value;
     if (fabs(v[DELTA]) > v[FMU_V_delta_max_rad]) {
         fmu_log(car, "the start value of delta, %g rad, is beyond delta_max_rad = %g rad", v[DELTA],
@@ -48,18 +43,11 @@ int fmu_model_initialise(fmu_instance *car)
 }
 
 /* the first of two equal values, as in Python: only then do signed zeros agree, too */
-static double least(double a, double b)
-{
-    return b < a ? b : a;
-}
+static double least(double a, double b) { return b < a ? b : a; }
 
-static double most(double a, double b)
-{
-    return b > a ? b : a;
-}
+static double most(double a, double b) { return b > a ? b : a; }
 
-static void guard(const double *v, double duration, double u[NU])
-{
+static void guard(const double *v, double duration, double u[NU]) {
     double d = v[FMU_V_d], rate = v[FMU_V_delta_rate];
     if (!(isfinite(d) && isfinite(rate))) { /* brake, less and less when slow; hold the steering */
         u[0] = v[FMU_V_d_min] * least(most(v[FMU_V_vx] / BRAKE_FADE_MPS, 0.0), 1.0);
@@ -73,8 +61,7 @@ static void guard(const double *v, double duration, double u[NU])
     u[1] = least(most(rate, -fastest), fastest);
 }
 
-static void substep(double x[NX], const double u[NU], const double p[NP], double h)
-{
+static void substep(double x[NX], const double u[NU], const double p[NP], double h) {
     double next[NX];
     const double *arg[car_substep_SZ_ARG] = {x, u, p, &h};
     double *res[car_substep_SZ_RES] = {next};
@@ -84,14 +71,12 @@ static void substep(double x[NX], const double u[NU], const double p[NP], double
     for (int i = 0; i < NX; i++) x[i] = next[i];
 }
 
-int fmu_model_step(fmu_instance *car, double h)
-{
+int fmu_model_step(fmu_instance *car, double h) {
     double *v = car->value, x[NX], u[NU];
     for (int i = 0; i < NX; i++) x[i] = v[FIRST_STATE + i];
     guard(v, h, u);
     double substeps = most(ceil(h * SUBSTEP_HZ - 1e-6), 1.0);
-    for (int i = 0; i < (int)substeps; i++)
-        substep(x, u, &v[FIRST_PARAMETER], h / substeps);
+    for (int i = 0; i < (int)substeps; i++) substep(x, u, &v[FIRST_PARAMETER], h / substeps);
     /* free of the integrator's rounding */
     double angle = v[FMU_V_delta_max_rad];
     x[6] = least(most(v[DELTA] + h * u[1], -angle), angle);
@@ -109,14 +94,12 @@ int fmu_model_step(fmu_instance *car, double h)
 
 #else
 
-int fmu_model_initialise(fmu_instance *car)
-{
+int fmu_model_initialise(fmu_instance *car) {
     (void)car;
     return 0;
 }
 
-int fmu_model_derivatives(const fmu_instance *car, double *dx)
-{
+int fmu_model_derivatives(const fmu_instance *car, double *dx) {
     const double *v = car->value;
     const double *arg[car_rates_SZ_ARG] = {&v[FIRST_STATE], &v[FIRST_INPUT], &v[FIRST_PARAMETER]};
     double *res[car_rates_SZ_RES] = {dx};
@@ -131,14 +114,12 @@ int fmu_model_derivatives(const fmu_instance *car, double *dx)
 
 int fmu_model_directional(const fmu_instance *car, const uint32_t *known, size_t n_known,
                           const double *seed, const uint32_t *unknown, size_t n_unknown,
-                          double *out)
-{
+                          double *out) {
     const double *v = car->value;
     double s[FMU_VALUES + 1] = {0}, rates[NX];
     for (size_t i = 0; i < n_known; i++) s[known[i]] += seed[i];
-    const double *arg[car_forward_SZ_ARG] = {
-        &v[FIRST_STATE],  &v[FIRST_INPUT],  &v[FIRST_PARAMETER],
-        &s[FIRST_STATE], &s[FIRST_INPUT], &s[FIRST_PARAMETER]};
+    const double *arg[car_forward_SZ_ARG] = {&v[FIRST_STATE], &v[FIRST_INPUT], &v[FIRST_PARAMETER],
+                                             &s[FIRST_STATE], &s[FIRST_INPUT], &s[FIRST_PARAMETER]};
     double *res[car_forward_SZ_RES] = {rates};
     int iw[car_forward_SZ_IW + 1];
     double w[car_forward_SZ_W + 1];
@@ -149,8 +130,7 @@ int fmu_model_directional(const fmu_instance *car, const uint32_t *known, size_t
 }
 
 int fmu_model_adjoint(const fmu_instance *car, const uint32_t *unknown, size_t n_unknown,
-                      const double *seed, const uint32_t *known, size_t n_known, double *out)
-{
+                      const double *seed, const uint32_t *known, size_t n_known, double *out) {
     const double *v = car->value;
     double s[FMU_VALUES + 1] = {0}, rates[NX] = {0}, part[NX + NU + NP];
     for (size_t i = 0; i < n_unknown; i++) {
@@ -159,8 +139,8 @@ int fmu_model_adjoint(const fmu_instance *car, const uint32_t *unknown, size_t n
         else
             s[unknown[i]] += seed[i]; /* a state depends on itself alone */
     }
-    const double *arg[car_reverse_SZ_ARG] = {&v[FIRST_STATE], &v[FIRST_INPUT],
-                                             &v[FIRST_PARAMETER], rates};
+    const double *arg[car_reverse_SZ_ARG] = {&v[FIRST_STATE], &v[FIRST_INPUT], &v[FIRST_PARAMETER],
+                                             rates};
     double *res[car_reverse_SZ_RES] = {part, part + NX, part + NX + NU};
     int iw[car_reverse_SZ_IW + 1];
     double w[car_reverse_SZ_W + 1];
