@@ -90,12 +90,16 @@ def dataset_from_messages(
         x_next.append(after.x)
         driven.append((now.run, now.seq) not in fallback)
     if not x:
-        steps = [b.time_s - a.time_s for a, b in itertools.pairwise(wanted) if a.run == b.run]
+        pairs = [(a, b) for a, b in itertools.pairwise(wanted) if a.run == b.run]
+        steps = [b.time_s - a.time_s for a, b in pairs if b.seq == a.seq + 1]
         if not steps:
-            raise InputError("the log has no two consecutive states; was the car driven?")
+            raise InputError(
+                "no two states follow one another; was the car driven, or does the network or the "
+                "machine lose messages? Give them less to do"
+            )
         raise InputError(
-            f"no two states are {step_s:g} s apart, but {float(np.median(steps)):g} s; learn with "
-            "the step that was driven with"
+            f"states are {float(np.median(steps)):.3g} s apart, the model's step is {step_s:g} s; "
+            f"drive with --rate {1 / step_s:g}, or learn for the controller that drove: --artefact"
         )
     dropped = {"gap": gaps} if gaps else {}
     samples = Dataset(car, step_s, np.array(x), np.array(u), np.array(x_next), dropped)

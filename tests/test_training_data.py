@@ -266,7 +266,7 @@ def test_mixed_discretisations_and_steps_are_refused(
     slow = save(tmp_path / "slow.npz", other, step_s=0.05)
     with pytest.raises(InputError, match=r"slow\.npz.*0\.05 s apart"):
         read_samples([logs[0], slow])
-    with pytest.raises(InputError, match=r"0\.01 s apart, but 0\.02 s"):
+    with pytest.raises(InputError, match=r"0\.02 s apart, the model.s step is 0\.01 s"):
         dataset_from_log(logs[0], CAR, 0.01)
 
 

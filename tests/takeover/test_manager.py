@@ -16,7 +16,7 @@ import pytest
 from bayesrace.gp.weights import GpWeights
 from controller.weights.settings import GateSettings
 from controller.weights.store import History, Store
-from experiments.learn.publishing import Answer
+from experiments.learn.publishing import in_words
 from tests.network.cars import Course
 from tests.programs import until
 from tests.takeover.bench import bench
@@ -274,7 +274,7 @@ def test_a_full_disk_does_not_stop_an_adoption(
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         assert "; not kept: store" in reply.text
-        assert ", but not kept: store" in Answer.of(reply).words
+        assert ", but not kept: store" in in_words(reply)
         assert "File too large" in reply.text
         assert (made.version, made.kept()) == (again.version, [])
         assert "File too large" in made.manager.text
