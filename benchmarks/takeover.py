@@ -1,10 +1,10 @@
-"""What takeovers cost a free-running control loop, beside the bare loop in the same run.
+"""What adoptions of weights cost a free-running control loop, beside the bare loop in one run.
 
     python -m benchmarks.takeover [--rate HZ] [--seconds S] [--rounds N]
 
-Stretches without and with a takeover every quarter of a second follow each other, so that what the
-machine does meanwhile hits both. Columns: cycles, takeovers, deadline misses, overruns, releases
-skipped; then the time that a takeover took in the control thread. Nothing else should run.
+Stretches without and with an adoption every quarter of a second follow each other, so that what the
+machine does meanwhile hits both. Columns: cycles, adoptions, deadline misses, overruns, releases
+skipped; then the time that an adoption took in the control thread. Nothing else should run.
 """
 
 import argparse
@@ -22,7 +22,7 @@ from tests.network.cars import gentle_course, start_controller, start_plant
 from tests.network.observer import Observer, observing
 from tests.programs import until
 
-COUNTED = ("ticks", "weights_taken", "deadline_misses", "overruns", "skipped")
+COUNTED = ("ticks", "weights_accepted", "deadline_misses", "overruns", "skipped")
 PAUSE_S = 0.25
 
 
@@ -47,18 +47,18 @@ def main() -> None:
             ) as observer,
         ):
             observer.start(1)
-            until(lambda: observer.status("controller")["counters"]["gatekeeper"], "gatekeeper")
+            until(lambda: observer.status("controller")["counters"]["validator"], "validator")
             time.sleep(3.0)
-            sums = {"bare": np.zeros(5, int), "takeovers": np.zeros(5, int)}
-            taken_us = []
+            sums = {"bare": np.zeros(5, int), "adoptions": np.zeros(5, int)}
+            adoption_us = []
             for number in range(2 * chosen.rounds):
-                kind = ("bare", "takeovers")[number % 2]
+                kind = ("bare", "adoptions")[number % 2]
                 before, end = counted(observer), time.monotonic() + chosen.seconds
                 while time.monotonic() < end:
-                    if kind == "takeovers":
+                    if kind == "adoptions":
                         version = f"v{time.monotonic_ns()}"
                         data = encode_weights(replace(weights, version=version))
-                        taken_us.append(observer.director.send_weights(data).data["takeover_us"])
+                        adoption_us.append(observer.director.send_weights(data).data["adoption_us"])
                     time.sleep(PAUSE_S)
                 sums[kind] += counted(observer) - before
             observer.stop()
@@ -66,8 +66,8 @@ def main() -> None:
     print(f"{'':10}", *(f"{name:>16}" for name in COUNTED))
     for kind, row in sums.items():
         print(f"{kind:10}", *(f"{count:16d}" for count in row))
-    shares = np.percentile(np.array(taken_us, float), [0, 50, 90, 100])
-    print("takeover, us: least {:.1f}, p50 {:.1f}, p90 {:.1f}, most {:.1f}".format(*shares))
+    shares = np.percentile(np.array(adoption_us, float), [0, 50, 90, 100])
+    print("adoption, us: least {:.1f}, p50 {:.1f}, p90 {:.1f}, most {:.1f}".format(*shares))
 
 
 def counted(observer: Observer) -> "np.ndarray[tuple[int], np.dtype[np.int_]]":

@@ -11,12 +11,12 @@ from bayesrace.gp.weights import GpWeights, decode_weights, encode_weights, read
 from bayesrace.raceline import RaceLine, read_raceline_for
 from bayesrace.tracks import Track, load_track
 from bayesrace.vehicles import CarParameters
-from controller.gate.store import Accepted, Store
 from controller.mpc import PredictiveController
-from controller.native_step import NativeStep
+from controller.native_step import NativeStep, pack_weights
 from controller.path_table import make_path_table
 from controller.settings import MpcSettings
-from controller.takeover import WeightsPort
+from controller.weights.adoption import WeightsPort
+from controller.weights.store import AcceptedWeights, History, Store, digest_of
 
 __all__ = ["compiled_controller", "predictive_controller", "read_settings"]
 
@@ -73,20 +73,18 @@ def predictive_controller(
     line = read_raceline_for(raceline, course, car)
     mpc = read_settings(settings, MpcSettings)
     step = compiled_controller(artefact, car, course, line, loaded, mpc).native
-    first = Accepted(0, "", b"", proven=True)
-    if loaded is not None:
-        first = Accepted(0, loaded.version, encode_weights(loaded), proven=True)
-    port = WeightsPort(artefact.resolve(), step, car, [first])
-    if store is not None:
-        _restore(port, Store(store, step.manifest.discretisation))
-        port.store = store
-    return PredictiveController(step, port.history[-1].version, port)
-
-
-def _restore(port: WeightsPort, store: Store) -> None:
-    """Takes up what an earlier controller has accepted."""
-    kept = store.load()
-    port.history += kept
-    port.next_number, port.withdrawn = store.next_number, list(store.withdrawn)
-    if kept:
-        port.step.set_weights(decode_weights(kept[-1].data))
+    version, data = ("", b"") if loaded is None else (loaded.version, encode_weights(loaded))
+    first = AcceptedWeights(
+        number=0,
+        version=version,
+        digest=digest_of(data),
+        proven=True,
+        data=data,
+        packed=pack_weights(loaded),
+    )
+    folder = None if store is None else Store(store, step.manifest.discretisation)
+    history = History(entries=[first]) if folder is None else folder.restore(first)
+    if history.in_use is not first:
+        step.set_weights(decode_weights(history.in_use.data))
+    port = WeightsPort(artefact.resolve(), step, car, history, folder)
+    return PredictiveController(step, history.in_use.version, port)

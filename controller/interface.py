@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 if TYPE_CHECKING:
     from controller.native_library import Artefact
-    from controller.takeover import WeightsPort
+    from controller.weights.adoption import WeightsPort
 
 __all__ = ["NO_LIMITS", "NO_PLAN", "Array", "ControlLaw", "Controller", "Environment", "StepOutput"]
 

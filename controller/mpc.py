@@ -6,7 +6,7 @@ from bayesrace.gp.weights import decode_weights
 from controller.interface import StepOutput
 from controller.native_library import Artefact, StepInfo, StepStatus
 from controller.native_step import NativeStep
-from controller.takeover import WeightsPort
+from controller.weights.adoption import WeightsPort
 
 __all__ = ["PredictiveController"]
 

@@ -1,18 +1,21 @@
 """The compiled tracking problem of one car: its limits, its path, its weights."""
 
+import ctypes as ct
 from pathlib import Path
 
 import numpy as np
 
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import KERNELS, GpWeights
+from bayesrace.gp.weights import FEATURES, KERNELS, OUTPUTS, GpWeights
 from bayesrace.vehicles import CarParameters
 from controller.native_library import Gp, StepInfo, StepStatus
 from controller.native_problem import NativeProblem, Reference
 from controller.path_table import PATH_COLUMNS, PathTable
 from controller.settings import MpcSettings
 
-__all__ = ["NativeStep", "Reference", "StepInfo", "StepStatus"]
+__all__ = [
+    "NativeStep", "Reference", "StepInfo", "StepStatus", "pack_weights", "unpack_weights"
+]  # fmt: skip
 
 
 class NativeStep(NativeProblem):
@@ -46,19 +49,37 @@ class NativeStep(NativeProblem):
                 f"controller predicts with {self.manifest.discretisation}: train with the same car "
                 "and discretisation"
             )
-        outputs = (Gp * self.manifest.problem.outputs)()
-        for target, output in zip(outputs, weights.outputs, strict=True):
-            if len(output.alpha) > self.manifest.gp_capacity:
-                raise InputError(
-                    f"weights '{weights.version}' have {len(output.alpha)} points, the controller "
-                    f"was built for {self.manifest.gp_capacity}: train with fewer points or build "
-                    "with a larger capacity"
-                )
-            target.kernel = KERNELS.index(output.kernel)
-            target.n = len(output.alpha)
-            target.offset = output.y_mean
-            target.scale = output.y_scale * output.signal_variance
-            target.length_scales = output.length_scales.ctypes.data
-            target.inputs = output.inputs.ctypes.data
-            target.alpha = output.alpha.ctypes.data
-        self._check(self._library.br_mpc_set_weights(self._mpc, outputs), "weights")
+        if max(weights.counts) > self.manifest.gp_capacity:
+            raise InputError(
+                f"weights '{weights.version}' have {max(weights.counts)} points, the controller "
+                f"was built for {self.manifest.gp_capacity}: train with fewer points or build "
+                "with a larger capacity"
+            )
+        packed = pack_weights(weights)
+        error = self._library.br_mpc_set_weights(self._mpc, unpack_weights(packed))
+        self._check(error, "weights")
+
+
+def pack_weights(weights: GpWeights | None) -> bytes:
+    """The arrays of the weights, for :func:`unpack_weights`; None: no correction."""
+    packed = b""
+    for output in () if weights is None else weights.outputs:
+        scale = output.y_scale * output.signal_variance
+        head = np.array([KERNELS.index(output.kernel), output.count, output.y_mean, scale])
+        for part in (head, output.length_scales, output.inputs, output.alpha):
+            packed += part.tobytes()
+    return packed
+
+
+def unpack_weights(packed: bytes) -> "ct.Array[Gp]":
+    """The outputs for the library; they point into ``packed``, so keep it."""
+    outputs = (Gp * len(OUTPUTS))()
+    numbers, at = np.frombuffer(packed), 0
+    for target in outputs if packed else ():
+        kernel, count, target.offset, target.scale = numbers[at : at + 4]
+        target.kernel, target.n = int(kernel), int(count)
+        target.length_scales = numbers.ctypes.data + 8 * (at + 4)
+        target.inputs = target.length_scales + 8 * len(FEATURES)
+        target.alpha = target.inputs + 8 * len(FEATURES) * target.n
+        at += 4 + len(FEATURES) * (1 + target.n) + target.n
+    return outputs

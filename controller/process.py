@@ -34,14 +34,14 @@ from bayesrace.transport import (
     Publisher,
     open_session,
 )
-from controller.courier import Courier
 from controller.cycle import Cycle
 from controller.driver import Decision
 from controller.interface import Controller
 from controller.process_settings import ControllerSettings
 from controller.schedule import Schedule
 from controller.service import Service
-from controller.takeover import Takeover
+from controller.weights.adoption import Adoption
+from controller.weights.manager import WeightUpdateManager
 
 __all__ = ["ControllerProcess", "ControllerSettings", "main"]
 
@@ -92,22 +92,22 @@ class ControllerProcess:
             session, inbox, self.name, settings.rate_hz, self._driver, controller, self._counters,
             self._words, controller.port is not None,
         )  # fmt: skip
-        self._courier: Courier | None = None
-        self._takeover: Takeover | None = None
+        self._weights: WeightUpdateManager | None = None
+        self._adoption: Adoption | None = None
         if controller.port is not None:
-            self._courier = Courier(
-                session, self.name, controller.port, settings.gate, controller.adopt_weights,
-                self._service.announce,
+            self._weights = WeightUpdateManager(
+                session, self.name, controller.port, settings.gate,
+                adopt=controller.adopt_weights, announce=self._service.announce,
             )  # fmt: skip
-            self._takeover = self._courier.takeover
-            self._courier.start()
+            self._adoption = self._weights.adoption
+            self._weights.start()
         inbox.watch("plant")
         inbox.announce("controller")
 
     def close(self) -> None:
         """Ends what the process has started."""
-        if self._courier is not None:
-            self._courier.stop()
+        if self._weights is not None:
+            self._weights.stop()
 
     def serve(self) -> None:
         """Until SIGINT or SIGTERM."""
@@ -126,8 +126,8 @@ class ControllerProcess:
         """Waits a little for a first state; serves whatever else happens, and logs it."""
         self._service.beat()
         item = self.inbox.get(HEARTBEAT_S)
-        if self._takeover is not None:
-            self._takeover.between_cycles(self._next_cycle)
+        if self._adoption is not None:
+            self._adoption.between_cycles(self._next_cycle)
         if item is None and (left := self._left_over()) is not None:
             return left
         if item is None:
@@ -146,11 +146,11 @@ class ControllerProcess:
         self._timing.decode_us = (time.monotonic_ns() - item.received_ns) * 1e-3
         if item.value is None or not self._driver.observe(item.value):
             return None
-        return self._noted(item.value, item.received_ns)
+        return self._recorded(item.value, item.received_ns)
 
-    def _noted(self, state: State, arrived_ns: int) -> State:
-        if self._takeover is not None:
-            self._takeover.note(state, self._driver.fallen_back)
+    def _recorded(self, state: State, arrived_ns: int) -> State:
+        if self._adoption is not None:
+            self._adoption.record(state, self._driver.fallen_back)
         self._arrived_ns = self._service.arrived_ns = arrived_ns
         return state
 
@@ -162,7 +162,7 @@ class ControllerProcess:
         left = self._driver.lost(silent=True) if self._silent() else None
         if left is None or not self._driver.observe(left):
             return None
-        return self._noted(left, time.monotonic_ns())
+        return self._recorded(left, time.monotonic_ns())
 
     def _leave(self, state: State | None) -> State | None:
         """Ends a loop, for want of states or with one that is not for it: the next one to drive."""
@@ -193,10 +193,10 @@ class ControllerProcess:
         return self._leave(state)
 
     def _send_in_lockstep(self, state: State, decision: Decision) -> None:
-        """The cycle's messages; new weights are taken over before the next cycle is prepared."""
+        """The cycle's messages; new weights are adopted before the next cycle is prepared."""
         self._send(state, decision)
-        if self._takeover is not None:
-            self._takeover.in_lockstep(self._next_cycle)
+        if self._adoption is not None:
+            self._adoption.between_cycles(self._next_cycle, lockstep=True)
 
     # Free-running ------------------------------------------------------------------------------
 
@@ -239,8 +239,8 @@ class ControllerProcess:
     def _rest(self) -> None:
         """The time until the next release: what has happened meanwhile, and the preparation."""
         end_ns = self._schedule.release_ns + round(self._settings.budget * self._schedule.period_ns)
-        if self._takeover is not None:
-            self._takeover.between_cycles(self._next_cycle)
+        if self._adoption is not None:
+            self._adoption.between_cycles(self._next_cycle)
         if min(end_ns, time.monotonic_ns()) >= self._serve_ns:
             item = self.inbox.poll_queue()
             if item is not None:
@@ -317,7 +317,7 @@ class ControllerProcess:
         return self._timing.ticks + self._timing.skipped
 
     def _words(self) -> str:
-        return "" if self._courier is None else self._courier.text
+        return "" if self._weights is None else self._weights.text
 
     def _counters(self) -> dict[str, Scalar]:
         """What the loop has counted, by name."""
@@ -334,7 +334,7 @@ class ControllerProcess:
             "refused": self._decoder.refused,
             "overflowed": self.inbox.overflowed,
             "requests_rejected": self.inbox.requests_rejected,
-            **({} if self._courier is None else self._courier.status()),
+            **({} if self._weights is None else self._weights.status()),
             "actuations_sent": self._actuations.next_seq,
         }
 

@@ -6,7 +6,7 @@ from bayesrace.realtime import RealtimeSettings
 from bayesrace.transport import CONTROLLER_ENDPOINT, PLANT_ENDPOINT, Endpoints
 from bayesrace.vehicles import CarSetting, default_car
 from controller.cycle_settings import CompensationSettings, FallbackSettings
-from controller.gate.settings import GateSettings
+from controller.weights.settings import GateSettings
 
 __all__ = ["ControllerSettings"]
 

@@ -1,10 +1,9 @@
 """Weights in two parts: staged by any thread while steps go on, adopted between two of them."""
 
-import ctypes as ct
 import platform
 import shutil
 import subprocess
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +13,7 @@ from numpy.typing import NDArray
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
 from bayesrace.vehicles import CarParameters
-from controller.gate.memory import Memory
-from controller.native_library import Gp
-from controller.native_step import NativeStep
+from controller.native_step import NativeStep, pack_weights, unpack_weights
 from tests.conftest import SETTINGS, Circuit, Problem, fit_weights, mirrored_weights
 from tests.native_programs import OPTIMISED, PROGRAMS, native_program
 
@@ -46,31 +43,14 @@ def test_no_mixture_at_full_speed(kinematic_artefact: Path, tmp_path: Path) -> N
     staging(kinematic_artefact, tmp_path, *OPTIMISED)
 
 
-Lay = Callable[[GpWeights], "ct.Array[Gp]"]
-
-
-@pytest.fixture
-def laid() -> Iterator[Lay]:
-    """Lays weights down as a gatekeeper does, in memory of their own."""
-    memories = []
-
-    def lay(weights: GpWeights) -> "ct.Array[Gp]":
-        memories.append(Memory(1024))
-        memories[-1].lay(weights)
-        return memories[-1].outputs()
-
-    yield lay
-    memories.clear()
-
-
 def drive(
-    native: NativeStep, recorded: list[Problem], takeovers: dict[int, "ct.Array[Gp]"]
+    native: NativeStep, recorded: list[Problem], takeovers: Mapping[int, bytes]
 ) -> NDArray[np.float64]:
     """Inputs over a recorded drive; the sets are taken over before the steps of these numbers."""
     inputs = []
     for k, problem in enumerate(recorded[:100]):
         if k in takeovers:
-            native.stage_weights(takeovers[k])
+            native.stage_weights(unpack_weights(takeovers[k]))
             native.adopt_weights()
         native.prepare()
         native.step(problem.x0, problem.d_previous)
@@ -86,14 +66,13 @@ def fresh(artefact: Path, car: CarParameters, circuit: Circuit, weights: GpWeigh
 
 
 def test_taking_over_the_same_weights_changes_no_bit(
-    laid: Lay,
     kinematic_artefact: Path,
     car: CarParameters,
     circuit: Circuit,
     weights: GpWeights,
     recorded: list[Problem],
 ) -> None:
-    same = laid(weights)
+    same = pack_weights(weights)
     calm, busy = (fresh(kinematic_artefact, car, circuit, weights) for _ in range(2))
     expected = drive(calm, recorded, {})
     assert drive(busy, recorded, dict.fromkeys(range(0, 100, 7), same)).tobytes() == (
@@ -102,27 +81,27 @@ def test_taking_over_the_same_weights_changes_no_bit(
 
 
 def test_adopted_weights_are_those_that_were_staged(
-    laid: Lay,
     kinematic_artefact: Path,
     car: CarParameters,
     circuit: Circuit,
     weights: GpWeights,
     recorded: list[Problem],
 ) -> None:
-    """Through the shared memory's layout: to the same bits as set directly."""
+    """Packed as another process sends them: to the same bits as set directly."""
     other = mirrored_weights(weights)
     staged, direct = (fresh(kinematic_artefact, car, circuit, weights) for _ in range(2))
     direct.set_weights(other)
-    inputs = drive(staged, recorded, {0: laid(other)})
+    inputs = drive(staged, recorded, {0: pack_weights(other)})
     assert inputs.tobytes() == drive(direct, recorded, {}).tobytes()
 
 
 def test_staging_changes_nothing_before_the_adoption(
-    laid: Lay, native: NativeStep, weights: GpWeights, recorded: list[Problem]
+    native: NativeStep, weights: GpWeights, recorded: list[Problem]
 ) -> None:
     x, u = recorded[50].x0, np.array([0.5, 0.1])
     before = native.predict(x, u, 0.02)
-    native.stage_weights(laid(mirrored_weights(weights)))
+    packed = pack_weights(mirrored_weights(weights))
+    native.stage_weights(unpack_weights(packed))
     assert native.predict(x, u, 0.02).tobytes() == before.tobytes()
     native.adopt_weights()
     assert native.predict(x, u, 0.02).tobytes() != before.tobytes()
@@ -130,8 +109,9 @@ def test_staging_changes_nothing_before_the_adoption(
         native.adopt_weights()
 
 
-def test_unusable_weights_are_not_staged(laid: Lay, native: NativeStep, weights: GpWeights) -> None:
-    outputs = laid(weights)
+def test_unusable_weights_are_not_staged(native: NativeStep, weights: GpWeights) -> None:
+    packed = pack_weights(weights)
+    outputs = unpack_weights(packed)
     outputs[1].scale = float("inf")
     with pytest.raises(InputError, match="unusable"):
         native.stage_weights(outputs)
@@ -144,7 +124,6 @@ def test_inputs_jump_only_as_far_as_the_new_model_explains(
     car: CarParameters,
     circuit: Circuit,
     weights: GpWeights,
-    laid: Lay,
     recorded: list[Problem],
 ) -> None:
     """The very next input is what a controller would give that had the new weights all along."""
@@ -155,7 +134,7 @@ def test_inputs_jump_only_as_far_as_the_new_model_explains(
     for step in (old, changed, new):
         step.set_parameters(car, thorough)
     before, after = drive(old, recorded, {}), drive(new, recorded, {})
-    inputs = drive(changed, recorded, {50: laid(other)})
+    inputs = drive(changed, recorded, {50: pack_weights(other)})
     assert inputs[:50].tobytes() == before[:50].tobytes()
     assert np.abs(inputs[50:] - after[50:]).max() < 1e-4
     assert np.abs(before[50:] - after[50:]).max() > 1e-2

@@ -11,7 +11,6 @@ import pytest
 
 from bayesrace.errors import InputError
 from bayesrace.messages import (
-    ACCEPTED,
     EVENT,
     ROLLBACK,
     STATE,
@@ -41,7 +40,6 @@ from bayesrace.transport import (
     ask_all,
     declare_service,
     decode_request,
-    fetch_all,
     free_endpoint,
     open_session,
 )
@@ -184,12 +182,6 @@ def test_a_malformed_answer_does_not_hide_the_valid_ones(pair: tuple[Any, Any]) 
         pytest.raises(InputError, match="Reply: "),
     ):
         ask(pair[1], STOP, "orca", request)
-
-
-def test_answers_of_other_processes_are_fetched_without_the_own(pair: tuple[Any, Any]) -> None:
-    with answering(pair, ACCEPTED, b"theirs", b"another's", b"own"):
-        assert sorted(fetch_all(pair[1], ACCEPTED, "orca")) == [b"another's", b"theirs"]
-        assert fetch_all(pair[1], ACCEPTED, "other") == []
 
 
 def test_several_processes_of_one_name_are_reported(pair: tuple[Any, Any]) -> None:

@@ -7,7 +7,6 @@
 from bayesrace.messages.codec import Decoder, decode, encode, json_schema
 from bayesrace.messages.rules import Scalar
 from bayesrace.messages.table import (
-    ACCEPTED,
     ACTUATION,
     ALIVE,
     COMMAND,
@@ -47,7 +46,7 @@ from bayesrace.messages.types import (
 )
 
 __all__ = [
-    "ACCEPTED", "ACTUATION", "ALIVE", "COMMAND", "EVENT", "HEARTBEAT", "ROLLBACK", "RUN",
+    "ACTUATION", "ALIVE", "COMMAND", "EVENT", "HEARTBEAT", "ROLLBACK", "RUN",
     "SERVICES", "STATE", "STATUS", "STOP", "TELEMETRY", "TOPICS", "TRUTH", "WEIGHTS", "Actuation",
     "CarSample", "Command", "Decoder", "Event", "Message", "Qos",
     "Reply", "RollbackRequest", "RunRequest", "Scalar", "Service", "State", "Status",

@@ -26,7 +26,7 @@ from bayesrace.messages.types import (
 )
 
 __all__ = [
-    "ACCEPTED", "ACTUATION", "ALIVE", "COMMAND", "EVENT", "HEARTBEAT", "ROLLBACK", "RUN",
+    "ACTUATION", "ALIVE", "COMMAND", "EVENT", "HEARTBEAT", "ROLLBACK", "RUN",
     "SERVICES", "STATE", "STATUS", "STOP", "TELEMETRY", "TOPICS", "TRUTH", "WEIGHTS",
     "Qos", "Service", "Topic", "car_key", "is_car_name",
 ]  # fmt: skip
@@ -68,16 +68,12 @@ class Topic(Generic[M]):
 
 @dataclass(frozen=True)
 class Service(Generic[M, A]):
-    """One row of the table of requests.
-
-    ``request`` or ``answer`` None: the payload is no message, but a weights file with or without a
-    header.
-    """
+    """One row of the table of requests. ``request`` None: the payload is a weights file."""
 
     name: str
     key: str
     request: type[M] | None
-    answer: type[A] | None
+    answer: type[A]
     timeout_s: float
     repeatable: bool = True
     """Idempotent: a client repeats a request that was lost with its link."""
@@ -118,15 +114,9 @@ are in use or refused: after a first cycle, earlier requests, and the checks."""
 ROLLBACK: Final = Service(
     "rollback", "bayesrace/{car}/controller/rollback", RollbackRequest, Reply, 20.0, False
 )
-ACCEPTED: Final[Service[Message, Message]] = Service(
-    "accepted", "bayesrace/{car}/controller/accepted", None, None, 2.0
-)
-"""Request without payload, from a controller that starts later. The answer
-(``controller/latecomer.py``) holds the file of the weights in use, its time of acceptance, and the
-digests of withdrawn weights; empty without any."""
 COMMAND: Final = Service("command", "bayesrace/{car}/controller/command", Command, Reply, 5.0)
 SERVICES: Final[tuple[Service[Any, Any], ...]] = (
-    RUN, STOP, STATUS, WEIGHTS, ROLLBACK, ACCEPTED, COMMAND
+    RUN, STOP, STATUS, WEIGHTS, ROLLBACK, COMMAND
 )  # fmt: skip
 
 ALIVE: Final = "bayesrace/{car}/alive/{source}"

@@ -11,7 +11,6 @@ from bayesrace.transport.client import (
     ask_all,
     count_processes,
     decisive,
-    fetch_all,
     send_rollback,
     send_weights,
 )
@@ -32,5 +31,5 @@ __all__ = [
     "CONTROLLER_ENDPOINT", "HEARTBEAT_S", "LOCKSTEP_SPIN_S", "NEWEST", "PLANT_ENDPOINT", "Answers",
     "Director", "Endpoints", "Heartbeat", "Inbox", "Item", "Kind", "Numbering", "Publisher",
     "RefusedError", "Request", "ask", "ask_all", "count_processes", "decisive", "declare_service",
-    "decode_request", "fetch_all", "free_endpoint", "open_session", "send_rollback", "send_weights",
+    "decode_request", "free_endpoint", "open_session", "send_rollback", "send_weights",
 ]  # fmt: skip

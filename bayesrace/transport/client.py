@@ -24,7 +24,7 @@ from bayesrace.messages import (
 from bayesrace.transport.requests import BUSY
 
 __all__ = [
-    "Answers", "ask", "ask_all", "count_processes", "decisive", "fetch_all", "send_rollback",
+    "Answers", "ask", "ask_all", "count_processes", "decisive", "send_rollback",
     "send_weights",
 ]  # fmt: skip
 
@@ -46,17 +46,16 @@ class Answers(Generic[A]):
     fault: str = ""
     """Why there is no valid answer: a process is busy, or what is wrong with the first."""
 
-    def add(self, reply: Any, kind: type[A] | None) -> None:
-        """One reply of Zenoh's; ``kind`` None: answers stay bytes."""
+    def add(self, reply: Any, kind: type[A]) -> None:
+        """One reply of Zenoh's."""
         if reply.ok is None:
             text = reply.err.payload.to_bytes().decode(errors="replace")
             if text.startswith(BUSY):  # not an error of Zenoh's own, such as a timeout
                 self.fault = text[:200]
             return
         self.count += 1
-        data: Any = reply.ok.payload.to_bytes()
         try:
-            self.valid.append(data if kind is None else decode(kind, data))
+            self.valid.append(decode(kind, reply.ok.payload.to_bytes()))
         except InputError as error:
             self.fault = self.fault or str(error)
 
@@ -75,8 +74,6 @@ def ask(
     longer than the lease, and the service is repeatable. If several processes answer under one
     name, :func:`decisive` chooses. Raises InputError if there is no valid answer in time.
     """
-    if service.answer is None:
-        raise TypeError(f"the answer of '{service.name}' is not a message; use fetch_all")
     key = car_key(service.key, car, source)
     limit_s = service.timeout_s if timeout_s is None else timeout_s
     begin = time.monotonic()
@@ -105,7 +102,6 @@ def ask_all(
     keys: Collection[str],
     request: Message | bytes,
     timeout_s: float,
-    where: zenoh.Locality = zenoh.Locality.ANY,
 ) -> dict[str, Answers[A]]:
     """Every answer to one request, by key; sent to all keys of the service at once.
 
@@ -123,7 +119,6 @@ def ask_all(
             consolidation=zenoh.ConsolidationMode.NONE,
             # A dropped request is never answered: on a loaded machine that ended a race.
             congestion_control=zenoh.CongestionControl.BLOCK,
-            allowed_destination=where,
         )
         for key in keys
     }
@@ -150,13 +145,6 @@ def count_processes(
     key = car_key(STATUS.key, car, source)
     request = StatusRequest(0, time.monotonic_ns())
     return ask_all(session, STATUS, (key,), request, timeout_s)[key].count
-
-
-def fetch_all(session: Any, service: Service[Any, Any], car: str) -> list[bytes]:
-    """The answers of all other processes, as bytes: for answers that are no messages."""
-    key, limit_s, remote = car_key(service.key, car), service.timeout_s, zenoh.Locality.REMOTE
-    answers: Answers[Any] = ask_all(session, service, (key,), b"", limit_s, remote)[key]
-    return answers.valid
 
 
 def send_weights(session: Any, car: str, data: bytes, timeout_s: float | None = None) -> Reply:

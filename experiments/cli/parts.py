@@ -112,7 +112,7 @@ def controller(
     ] = "measured",
     gate: Annotated[
         Path | None,
-        typer.Option(help="Thresholds for new weights (JSON), see 'controller/gate/settings.py'."),
+        typer.Option(help="Thresholds for weights (JSON), see 'controller/weights/settings.py'."),
     ] = None,
     hold: Annotated[bool, typer.Option(help="Do not drive before 'bayesrace go'.")] = False,
     cpu: Cpu = None,
@@ -127,8 +127,8 @@ def controller(
     from bayesrace.transport import Endpoints
     from bayesrace.vehicles import get_car
     from controller.assembly import predictive_controller, read_settings
-    from controller.gate.settings import GateSettings
     from controller.process import ControllerSettings, main
+    from controller.weights.settings import GateSettings
 
     parameters = get_car(car)
     process = ControllerSettings(

@@ -1,1 +1,1 @@
-"""New weights for a running controller: gate, gatekeeper, takeover, watch; see ``rig.py``."""
+"""New weights for a running controller: checks, adoption, watch, store; see ``rig.py``."""

@@ -1,4 +1,4 @@
-"""A plant and a controller that takes weights, as processes, and who directs and records them."""
+"""A plant and a controller that takes weights, as processes; and their director and recorder."""
 
 import hashlib
 import struct
@@ -33,7 +33,7 @@ from tests.conftest import fit_weights, offset_line
 from tests.network.cars import Course, Program, start_controller, start_plant
 from tests.programs import until
 
-__all__ = ["DRIVEN_S", "Rig", "digest", "gatekeepers", "make_course", "rigged"]
+__all__ = ["DRIVEN_S", "Rig", "digest", "validators", "make_course", "rigged"]
 
 KINDS = ("rbf", "matern25", "matern15")
 _LATE = 5
@@ -58,7 +58,7 @@ def make_course(folder: Path) -> Course:
 
 @dataclass
 class Rig:
-    """Both processes, and who directs them."""
+    """Both processes, their director and their recorder."""
 
     session: Any
     director: Director
@@ -84,7 +84,7 @@ class Rig:
         return dict(self.director.send_weights(encode_weights(weights)).data)
 
     def drive_and_send(self, run: int, weights: GpWeights, times: int) -> list[int]:
-        """In lockstep, handing over weights so often; the cycles that were told."""
+        """In lockstep, sending weights so often; the cycles that the answers name."""
         self.start(run)
         cycles = [self.send(weights)["cycle"] for _ in range(times)]
         self.director.wait_for_end(run, 60.0)
@@ -103,8 +103,8 @@ class Rig:
         return dict(self.status().counters)
 
     def ready(self) -> None:
-        """Its gatekeeper has started."""
-        until(lambda: self.counters()["gatekeeper"], "the gatekeeper")
+        """Its validator has started."""
+        until(lambda: self.counters()["validator"], "the validator")
 
     def reader(self) -> LogReader:
         self.recorder.settle()
@@ -163,8 +163,8 @@ def digest(states: list[State]) -> str:
     return hashlib.sha256(rows).hexdigest()
 
 
-def gatekeepers(of: int) -> list[int]:
-    """Process numbers of a controller's children that are gatekeepers."""
+def validators(of: int) -> list[int]:
+    """Process numbers of a controller's children that are validators."""
     found = []
     for entry in Path("/proc").iterdir():
         try:
@@ -172,6 +172,6 @@ def gatekeepers(of: int) -> list[int]:
             parent = int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1])
         except (OSError, ValueError, IndexError):
             continue
-        if b"controller.gatekeeper" in words and parent == of:
+        if b"controller.weights.validator" in words and parent == of:
             found.append(int(entry.name))
     return found

@@ -1,6 +1,5 @@
 """What is accepted is kept: it survives its controller, and a disk that is full."""
 
-import json
 import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,13 +10,23 @@ import pytest
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import encode_weights, zero_weights
 from bayesrace.vehicles import CarParameters
-from controller.gate.store import HISTORY, Accepted, Store, digest_of, trimmed
+from controller.weights.store import HISTORY, AcceptedWeights, History, Store, digest_of
+
+START = AcceptedWeights(number=0, version="", digest=digest_of(b""), proven=True)
 
 
-def accepted(car: CarParameters, number: int, proven: bool = True) -> Accepted:
-    version = f"v{number}"
-    data = encode_weights(zero_weights(car.name, "d", version))
-    return Accepted(number, version, data, proven, accepted_utc_ns=number * 10**9)
+def history(car: CarParameters, *proven: bool) -> History:
+    """Weights that have been accepted one after the other, after those at the start."""
+    made = History(discretisation="d", entries=[START])
+    for one in proven:
+        data = encode_weights(zero_weights(car.name, "d", f"v{made.next_number}"))
+        made.accept(f"v{made.next_number}", data, b"", one)
+    return made
+
+
+def numbers(folder: Path) -> list[int]:
+    """Of the weights that a controller started now finds."""
+    return [one.number for one in Store(folder, "d").restore(START).entries]
 
 
 @contextmanager
@@ -32,66 +41,49 @@ def full_disk(free_bytes: int) -> Iterator[None]:
 
 
 def test_what_is_kept_is_found_again(tmp_path: Path, car: CarParameters) -> None:
-    store = Store(tmp_path / "new" / "store", "d")
-    assert (store.load(), store.next_number) == ([], 1)
-    history = [Accepted(0, "", b"", True), accepted(car, 1), accepted(car, 2, proven=False)]
-    given_up = digest_of(b"bad")
-    store.keep(history, 3, [given_up])
-    again = Store(tmp_path / "new" / "store", "d")
-    assert again.load() == history[1:]
-    assert (again.next_number, again.withdrawn) == (3, (given_up,))
-    again.keep(history[:2], 3)  # rolled back
-    assert Store(tmp_path / "new" / "store", "d").load() == history[1:2]
-    assert len(list((tmp_path / "new" / "store").iterdir())) == 2
+    folder = tmp_path / "new" / "store"
+    store = Store(folder, "d")
+    assert store.restore(START).entries == [START]
+    kept = history(car, True, False, False)
+    kept.roll_back(kept.entries[2], withdraw=True)
+    store.keep(kept)
+    found = Store(folder, "d").restore(START)
+    assert [one.model_copy(update={"packed": b""}) for one in found.entries] == kept.entries
+    assert (found.next_number, len(found.withdrawn)) == (4, 1)
+    found.roll_back(found.entries[1], withdraw=False)
+    store.keep(found)
+    assert numbers(folder) == [0, 1]
+    assert len(list(folder.iterdir())) == 2
 
 
 def test_the_store_keeps_the_newest_and_a_proven_one(tmp_path: Path, car: CarParameters) -> None:
-    store = Store(tmp_path, "d")
-    history: list[Accepted] = []
-    for number in range(1, 15):
-        history = trimmed([*history, accepted(car, number, proven=number == 2)])
-        store.keep(history, number + 1)
-    numbers = [one.number for one in Store(tmp_path, "d").load()]
-    assert numbers == [2, *range(15 - HISTORY, 15)]
+    kept = history(car, *(number == 2 for number in range(1, 15)))
+    Store(tmp_path, "d").keep(kept)
+    assert numbers(tmp_path) == [0, 2, *range(15 - HISTORY, 15)]
+    assert kept.reference.number == 2
     assert len(list(tmp_path.glob("*.bin"))) == HISTORY + 1
 
 
 def test_a_store_of_another_model_or_a_damaged_one_is_refused(
     tmp_path: Path, car: CarParameters
 ) -> None:
-    Store(tmp_path, "d").keep([accepted(car, 1)], 2)
-    with pytest.raises(InputError, match="predicts with e; choose another folder"):
+    Store(tmp_path, "d").keep(history(car, True))
+    with pytest.raises(InputError, match="weights for d, not for e; choose another folder"):
         Store(tmp_path, "e")
-    (tmp_path / "index.json").write_text("{")
-    with pytest.raises(InputError, match="is damaged"):
-        Store(tmp_path, "d")
+    for damaged in ("{", '{"entries": [{"number": 1}]}'):
+        (tmp_path / "index.json").write_text(damaged)
+        with pytest.raises(InputError, match="is damaged"):
+            Store(tmp_path, "d")
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="choose another folder"):
         Store(tmp_path / "file", "d")
 
 
-def test_a_file_that_is_not_what_the_index_says_is_passed_over(
-    tmp_path: Path, car: CarParameters
-) -> None:
-    Store(tmp_path, "d").keep([accepted(car, 1), accepted(car, 2)], 3)
+def test_a_damaged_file_is_left_out(tmp_path: Path, car: CarParameters) -> None:
+    Store(tmp_path, "d").keep(history(car, True, True))
     newest = max(tmp_path.glob("*.bin"))
     newest.write_bytes(newest.read_bytes()[:-1])
-    assert [one.number for one in Store(tmp_path, "d").load()] == [1]
-    index = json.loads((tmp_path / "index.json").read_text())
-    index["entries"][0]["file"] = "../elsewhere.bin"
-    (tmp_path / "index.json").write_text(json.dumps(index))
-    with pytest.raises(InputError, match="is damaged"):
-        Store(tmp_path, "d")
-
-
-def test_of_a_store_without_times_all_are_older_than_any_other(
-    tmp_path: Path, car: CarParameters
-) -> None:
-    Store(tmp_path, "d").keep([accepted(car, 1)], 2)
-    index = json.loads((tmp_path / "index.json").read_text())
-    del index["entries"][0]["accepted_utc_ns"]
-    (tmp_path / "index.json").write_text(json.dumps(index))
-    assert [one.accepted_utc_ns for one in Store(tmp_path, "d").load()] == [0]
+    assert numbers(tmp_path) == [0, 1]
 
 
 @pytest.mark.parametrize("free_bytes", [0, 100])
@@ -99,16 +91,14 @@ def test_a_full_disk_leaves_what_was_kept_before(
     tmp_path: Path, car: CarParameters, free_bytes: int
 ) -> None:
     """And nothing else; what could not be kept is kept as soon as it can."""
-    history = [accepted(car, 1), accepted(car, 2)]
+    kept = history(car, True)
     store = Store(tmp_path, "d")
-    store.keep(history[:1], 2)
+    store.keep(kept)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     with full_disk(free_bytes):
-        with pytest.raises(InputError, match="File too large"):
-            store.keep(history, 3)
-        with pytest.raises(InputError, match="File too large"):
-            store.keep([], 3)  # the index alone
+        for one in (history(car, True, True), history(car)):  # the latter: the index alone
+            with pytest.raises(InputError, match="File too large"):
+                store.keep(one)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
-    store.keep(history[1:], 3)
-    assert Store(tmp_path, "d").load() == history[1:]
-    assert len(list(tmp_path.iterdir())) == 2
+    store.keep(history(car, True, True))
+    assert numbers(tmp_path) == [0, 1, 2]

@@ -1,0 +1,163 @@
+"""The tests that new weights have to pass before the controller adopts them."""
+
+import time
+from collections.abc import Sequence
+from functools import lru_cache
+from itertools import product
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from bayesrace.errors import InputError
+from bayesrace.gp.weights import OUTPUTS, UNITS, GpWeights, decode_weights
+from bayesrace.messages import Scalar
+from bayesrace.vehicles.parameters import CarParameters
+from controller.native_step import pack_weights
+from controller.weights.prediction import OneStepModel, Sample, plausible_samples
+from controller.weights.settings import GateSettings
+
+__all__ = ["Checks", "Comparison", "Verdict"]
+
+_Floats = npt.NDArray[np.float64]
+
+_CLOCKS_APART_S: Final = 3600.0
+"""By which the clock of the training host may be ahead."""
+
+
+class Comparison(NamedTuple):
+    """One-step errors (RMSE) of new and old weights over the same samples."""
+
+    worse: str
+    """Outputs for which the new weights are worse, by :class:`GateSettings`; empty: none."""
+    text: str
+    data: dict[str, Scalar]
+    """The number of ``samples``, and errors such as ``error_new_vx``."""
+
+
+class Verdict(NamedTuple):
+    """Whether weights may be adopted."""
+
+    accepted: bool
+    text: str
+    data: dict[str, Scalar]
+    packed: bytes = b""
+    """Arrays of accepted weights, see :func:`controller.native_step.pack_weights`."""
+
+
+class Checks:
+    """The tests for one controller, with the weights that it has in use."""
+
+    def __init__(self, settings: GateSettings, artefact: Path, car: CarParameters) -> None:
+        self.settings, self._artefact, self._car = settings, artefact, car
+        self._model = lru_cache(maxsize=4)(self._make_model)
+        self.nominal = self.in_use = self.reference = self._model(b"")
+        self._in_use_made_ns = 0
+        self.step_s = self.nominal.step_s
+        self._slack = np.array(car.tuning.gate.resolution) * self.step_s
+        self._plausible = plausible_samples(car, self.step_s, settings.plausible_states)
+
+    def use(self, in_use: bytes, accepted_utc_ns: int, reference: bytes) -> None:
+        """Weights files to compare with: in use, and proven; empty: without correction.
+
+        ``accepted_utc_ns``: of those in use, by the calendar; they count as made no later.
+        """
+        self.in_use, self.reference = self._model(in_use), self._model(reference)
+        made_ns = 0 if self.in_use.weights is None else self.in_use.weights.created_utc_ns
+        self._in_use_made_ns = min(made_ns, accepted_utc_ns)
+
+    def judge(self, data: bytes, samples: Sequence[Sample]) -> Verdict:
+        """Whether a weights file may be adopted, by recent ``samples`` among others."""
+        samples = samples[-self.settings.recent_samples :]
+        probation = len(samples) < self.settings.least_samples
+        facts: dict[str, Scalar] = {}
+        try:
+            model = self._model(data)
+            if model.weights is None:
+                raise InputError("GP weights: 0 bytes is not the size of a weights file")
+            facts["version"] = model.weights.version
+            self._check_origin(model.weights)
+            self._check_bounds(model, samples)
+            facts |= {"samples": len(samples), "probation": probation}
+            text = f"on probation: {len(samples)} recent samples are too few to compare"
+            if not probation:
+                text = self._check_errors(model, samples, facts)
+        except InputError as error:
+            return Verdict(False, str(error), facts)
+        return Verdict(True, text, facts, pack_weights(model.weights))
+
+    def _make_model(self, data: bytes) -> OneStepModel:
+        weights = decode_weights(data) if data else None
+        return OneStepModel(self._artefact, self._car, weights)
+
+    def _check_origin(self, weights: GpWeights) -> None:
+        ahead_s = (weights.created_utc_ns - time.time_ns()) * 1e-9
+        older_s = (self._in_use_made_ns - weights.created_utc_ns) * 1e-9
+        in_use, why_not = self.in_use.weights, ""
+        if weights.car != self._car.name:
+            why_not = f"those of the car '{weights.car}', this is '{self._car.name}'"
+        elif ahead_s > _CLOCKS_APART_S:
+            why_not = f"dated {ahead_s:.3g} s ahead: set the clocks, and train again"
+        elif in_use is not None and weights.created_utc_ns and older_s > 0:
+            why_not = (
+                f"stale: made {older_s:.3g} s before those in use, '{in_use.version}'; train "
+                "again, or return to earlier ones with 'bayesrace rollback'"
+            )
+        if why_not:
+            raise InputError(f"weights '{weights.version}' are {why_not}")
+
+    def _check_bounds(self, model: OneStepModel, samples: Sequence[Sample]) -> None:
+        limit = np.array(self._car.tuning.gate.absurd)
+        places = {"over the car's range": self._plausible, "in its recent states": samples}
+        for where, states in places.items():
+            nominal = self.nominal.velocities(states)
+            known = np.isfinite(nominal).all(axis=1)
+            excess = np.abs(model.velocities(states)[known] - nominal[known]) / self.step_s
+            if not (excess <= limit).all():  # NaN: the corrected model leaves all bounds
+                worst = ", ".join(f"{value:.3g}" for value in excess.max(axis=0))
+                most = ", ".join(f"{value:g}" for value in limit)
+                raise InputError(
+                    f"weights are absurd {where}: they correct accelerations (m/s^2, m/s^2, "
+                    f"rad/s^2) by up to {worst}, and {most} is the most; train again"
+                )
+
+    def _check_errors(
+        self, model: OneStepModel, samples: Sequence[Sample], facts: dict[str, Scalar]
+    ) -> str:
+        """The comparison in words, its numbers in ``facts``; InputError if a set is better."""
+        new, nominal = model.errors(samples), self.nominal.errors(samples)
+        found = [
+            self.compare(new, other.errors(samples), nominal)
+            for other in dict.fromkeys((self.in_use, self.reference))
+        ]
+        decisive = next((one for one in found if one.worse), found[0])
+        facts |= decisive.data
+        if decisive.worse:
+            raise InputError(
+                f"weights '{facts['version']}' predict {decisive.worse} worse than those in use: "
+                f"{decisive.text}; train again, on this car's own laps"
+            )
+        return decisive.text
+
+    def compare(self, new: _Floats, old: _Floats, nominal: _Floats) -> Comparison:
+        """Errors (n, 3) over the same samples; those that the nominal model lacks do not count."""
+        usable = np.isfinite(nominal).all(axis=1)
+        rmse = {
+            what: np.sqrt((errors[usable] ** 2).sum(axis=0) / max(usable.sum(), 1))
+            for what, errors in (("new", new), ("old", old), ("nominal", nominal))
+        }
+        settings = self.settings
+        slack = settings.worse_share * rmse["nominal"] + self._slack
+        # Written so that infinity on both sides is worse, too.
+        fine = rmse["new"] <= settings.worse_factor * np.minimum(rmse["old"], 1e12) + slack
+        worse = " and ".join(name for name, good in zip(OUTPUTS, fine, strict=True) if not good)
+        data: dict[str, Scalar] = {"samples": int(usable.sum())}
+        for (what, errors), (j, name) in product(rmse.items(), enumerate(OUTPUTS)):
+            data[f"error_{what}_{name}"] = float(min(errors[j], 1e12))
+        text = ", ".join(
+            f"{name} {old:.4g} to {new:.4g} {UNITS[name]}"
+            for name, old, new in zip(OUTPUTS, rmse["old"], rmse["new"], strict=True)
+        )
+        text = f"one-step errors over {data['samples']} samples go from {text}"
+        return Comparison(worse, text, data)

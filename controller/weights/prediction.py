@@ -1,0 +1,114 @@
+"""What the compiled model predicts, and what the car did: one-step samples of recorded states."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from bayesrace.errors import InputError
+from bayesrace.gp.weights import GpWeights
+from bayesrace.vehicles.parameters import CarParameters
+from controller.native_step import NativeStep
+from controller.settings import MpcSettings
+from controller.weights.states import StateRecord
+
+__all__ = ["OneStepModel", "Sample", "Sampler", "plausible_samples"]
+
+_Floats = npt.NDArray[np.float64]
+
+_LONGEST: Final = 5.0
+"""Sampling times that a sample lasts at most; where states come seldom, each makes one."""
+
+
+class Sample(NamedTuple):
+    """The car went from ``x`` (7,) to ``x_next`` (7,) with the input ``u`` (2,), a mean."""
+
+    recorded_ns: int
+    duration_s: float
+    x: _Floats
+    u: _Floats
+    x_next: _Floats
+
+
+class Sampler:
+    """Joins consecutive states until they are a sampling time apart; a gap begins anew."""
+
+    def __init__(self, step_s: float, moving_mps: float) -> None:
+        """Leaves out samples that begin slower than ``moving_mps``."""
+        self._step_s, self._moving_mps = step_s, moving_mps
+        self._states: list[StateRecord] = []
+        """Those of the sample that is not complete yet."""
+
+    def add(self, state: StateRecord) -> Sample | None:
+        """The sample that this state completes, if any."""
+        if self._states and not _consecutive(self._states[-1], state):
+            self._states = []
+        self._states.append(state)
+        states, first = self._states, self._states[0]
+        duration_s = state.time_s - first.time_s
+        if duration_s < self._step_s * (1 - 1e-6):
+            return None
+        self._states = [state]
+        if first.x[3] < self._moving_mps or duration_s > _LONGEST * self._step_s:
+            return None
+        steps = ((b.time_s - a.time_s) * np.array(b.u_applied) for a, b in pairwise(states))
+        u = sum(steps, np.zeros(2)) / duration_s
+        if abs(duration_s - self._step_s) < 1e-6 * self._step_s:
+            duration_s = self._step_s  # for exactly one step the model takes no remainder
+        return Sample(state.recorded_ns, duration_s, np.array(first.x), u, np.array(state.x))
+
+
+def _consecutive(before: StateRecord, after: StateRecord) -> bool:
+    same_run = (before.epoch, before.run) == (after.epoch, after.run)
+    return same_run and after.seq == before.seq + 1 and after.time_s > before.time_s
+
+
+class OneStepModel:
+    """Predicts with one set of weights; None: without correction."""
+
+    def __init__(self, artefact: Path, car: CarParameters, weights: GpWeights | None) -> None:
+        """InputError if the weights are for another model, too large, or overflow."""
+        self.weights = weights
+        self._step = NativeStep(artefact, car, MpcSettings())
+        self.step_s = self._step.manifest.step_s
+        if weights is not None:
+            self._step.set_weights(weights)
+
+    def velocities(self, samples: Sequence[Sample]) -> _Floats:
+        """Predicted vx, vy, omega (n, 3) at the samples' ends; NaN where the model has no value."""
+        predicted = np.full((len(samples), 3), np.nan)
+        for row, (_, duration_s, x, u, _) in zip(predicted, samples, strict=True):
+            try:
+                row[:] = self._step.predict(x, u, duration_s)[3:6]
+            except InputError:  # a state that is absurd, or that the weights make absurd
+                continue
+        return predicted
+
+    def errors(self, samples: Sequence[Sample]) -> _Floats:
+        """One-step errors (n, 3) as velocities after one Ts; infinite without a prediction."""
+        after = np.array([sample.x_next[3:6] for sample in samples]).reshape(-1, 3)
+        duration_s = np.array([sample.duration_s for sample in samples])[:, None]
+        errors: _Floats = (after - self.velocities(samples)) * (self.step_s / duration_s)
+        return np.where(np.isfinite(errors), errors, np.inf)
+
+
+def plausible_samples(car: CarParameters, step_s: float, count: int) -> list[Sample]:
+    """States and inputs over the whole range of the car, always the same ones."""
+    vx, slip, turn, steer, push, rate = np.random.default_rng(5).uniform(-1, 1, (count, 6)).T
+    vx = 0.5 * (vx + 1) * _top_speed_mps(car)
+    omega = turn * vx * np.tan(car.delta_max_rad) / car.wheelbase_m
+    pose, delta = np.zeros((count, 3)), steer * car.delta_max_rad
+    x = np.column_stack([pose, vx, 0.3 * slip * vx, omega, delta])
+    d = car.d_min + 0.5 * (push + 1) * (car.d_max - car.d_min)
+    u = np.column_stack([d, rate * car.delta_rate_max_radps])
+    return [Sample(0, step_s, x[k], u[k], x[k]) for k in range(count)]
+
+
+def _top_speed_mps(car: CarParameters) -> float:
+    """Where drive and resistance are equal: (cm1 - cm2 v) d_max = cr0 + cr2 v^2."""
+    a, b, c = car.cr2, car.cm2 * car.d_max, car.cr0 - car.cm1 * car.d_max
+    roots = np.roots([a, b, c]) if a else np.array([-c / b])
+    return max((float(v.real) for v in roots if abs(v.imag) < 1e-9 < v.real), default=1.0)
