@@ -1,6 +1,14 @@
 """What crosses a process boundary: message types, their table, and the strict codec."""
 
-from bayesrace.messages.codec import LARGEST_BYTES, Decoder, decode, encode, json_schema
+from bayesrace.messages.codec import (
+    LARGEST_BYTES,
+    Decoder,
+    decode,
+    decode_json,
+    encode,
+    json_schema,
+    to_json,
+)
 from bayesrace.messages.rules import Scalar
 from bayesrace.messages.table import (
     ACCEPTED,
@@ -90,6 +98,8 @@ __all__ = [
     "Truth",
     "car_key",
     "decode",
+    "decode_json",
     "encode",
     "json_schema",
+    "to_json",
 ]

@@ -9,6 +9,7 @@ what is larger is refused before anything is made of it.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import chain
 from types import MappingProxyType
 from typing import Any, Protocol
 
@@ -33,7 +34,7 @@ class Rule(Protocol):
         """The value as the message keeps it; ValueError if it is not acceptable."""
 
     def describe(self) -> dict[str, Any]:
-        """The same rule as JSON schema, for logs that other tools read."""
+        """The same rule as JSON schema: every value has a type, every object its properties."""
 
     @property
     def wire_bytes(self) -> int:
@@ -160,12 +161,15 @@ class Choice:
 class Vector:
     """Finite floats, each within [-limit, limit].
 
-    Exactly ``length`` of them; or, with ``rows``, any whole number of rows up to that many.
+    Exactly ``length`` of them; or, with ``rows``, any whole number of rows up to that many. In JSON
+    they are an object with the numbers by ``names``, of columns if there are rows; without names,
+    an array.
     """
 
     length: int
     limit: float = 1e6
     rows: int | None = None
+    names: tuple[str, ...] = ()
 
     def check(self, value: Any) -> tuple[float, ...]:
         """See :meth:`Rule.check`."""
@@ -185,9 +189,28 @@ class Vector:
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Rule.describe`."""
-        numbers = {"type": "number", "minimum": -self.limit, "maximum": self.limit}
-        least = self.length if self.rows is None else 0
-        return {"type": "array", "items": numbers, "minItems": least, "maxItems": self.most}
+        number = {"type": "number", "minimum": -self.limit, "maximum": self.limit}
+        if not self.names:
+            least = self.length if self.rows is None else 0
+            return {"type": "array", "items": number, "minItems": least, "maxItems": self.most}
+        column = {"type": "array", "items": number, "maxItems": self.rows}
+        return closed_object(dict.fromkeys(self.names, column if self.rows else number))
+
+    def to_json(self, value: Any) -> Any:
+        """The array ``value`` in its JSON form; ValueError or TypeError if it has none."""
+        if not self.names:
+            return value
+        if self.rows is None:
+            return dict(zip(self.names, value, strict=True))
+        return {name: value[i :: self.length] for i, name in enumerate(self.names)}
+
+    def from_json(self, value: Any) -> Any:
+        """The array whose JSON form is ``value``; KeyError, ValueError or TypeError if none is."""
+        if self.names:
+            columns = [value[name] for name in self.names]
+            several = self.rows is not None
+            value = list(chain.from_iterable(zip(*columns, strict=True))) if several else columns
+        return [as_float(number) for number in value] if int in map(type, value) else value
 
     @property
     def most(self) -> int:
@@ -225,7 +248,11 @@ class Scalars:
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Rule.describe`."""
-        return {"type": "object", "maxProperties": self.most}
+        scalar = {"type": ["boolean", "integer", "number", "string"]}
+        return {
+            "type": "object", "properties": {}, "additionalProperties": scalar,
+            "maxProperties": self.most,
+        }  # fmt: skip
 
     @property
     def wire_bytes(self) -> int:
@@ -235,6 +262,19 @@ class Scalars:
             + self.most * (_HEAD_BYTES + _NUMBER_BYTES)
             + _CHARACTER_BYTES * self.characters
         )
+
+
+def as_float(value: Any) -> Any:
+    """An integer as a float, since JSON does not tell them apart; anything else as it is."""
+    return float(value) if type(value) is int else value
+
+
+def closed_object(properties: Mapping[str, Any]) -> dict[str, Any]:
+    """JSON schema of an object that has exactly these properties."""
+    return {
+        "type": "object", "properties": properties, "required": list(properties),
+        "additionalProperties": False,
+    }  # fmt: skip
 
 
 def _check_scalar(name: str, value: Any) -> int:

@@ -63,6 +63,11 @@ Short = Annotated[str, Text(200)]
 Long = Annotated[str, Text(2000)]
 DataMap = Annotated[Mapping[str, Scalar], Scalars()]
 
+_CAR_STATE: Final = ("x", "y", "psi", "vx", "vy", "omega", "delta")
+_INPUT: Final = ("d", "delta_rate")
+CarState = Annotated[tuple[float, ...], Vector(7, names=_CAR_STATE)]
+Input = Annotated[tuple[float, ...], Vector(2, names=_INPUT)]
+
 
 @dataclass(frozen=True, slots=True)
 class Message:
@@ -88,9 +93,9 @@ class CarSample(Message):
     """Number of the run, from its request; it separates one run's messages from the next one's."""
     time_s: Seconds
     """Plant time since the start of the run."""
-    x: Annotated[tuple[float, ...], Vector(7)]
+    x: CarState
     """x, y [m], psi [rad, unwrapped], vx, vy [m/s], omega [rad/s], delta [rad]."""
-    u_applied: Annotated[tuple[float, ...], Vector(2)]
+    u_applied: Input
     """d [-] and delta_rate [rad/s] that acted during the period before; zeros at the start."""
     lap: Signed
     """Start-line crossings so far, forwards minus backwards."""
@@ -103,7 +108,10 @@ class State(CarSample):
 
     lockstep: Annotated[bool, Flag()]
     """True if the plant waits for the actuation that answers this very message."""
-    answers: Annotated[tuple[float, ...], Vector(3, limit=1e15, rows=64)]
+    answers: Annotated[
+        tuple[float, ...],
+        Vector(3, limit=1e15, rows=64, names=("state_seq", "arrival_s", "acting_s")),
+    ]
     """What was received since the state before, row by row: number of the state answered, time
     from that state to the arrival of the answer [s], and from the answer's ``basis_s`` to its
     acting [s] (-1: overtaken, it never acts). Empty in lockstep."""
@@ -129,7 +137,7 @@ class Actuation(Message):
     basis_s: Seconds
     """Plant time up to which the controller took the car's state as known: ``time_s`` of the state,
     plus what had passed since its arrival if it is not a new one."""
-    u: Annotated[tuple[float, ...], Vector(2, limit=1e3)]
+    u: Annotated[tuple[float, ...], Vector(2, limit=1e3, names=_INPUT)]
     """d [-], delta_rate [rad/s]; the range here is sanity, the car's limits are the plant's."""
     weights_version: Short
     """Version of the residual's weights that made it; empty without any."""
@@ -169,9 +177,9 @@ class Telemetry(Message):
     """Making and sending the actuation."""
     delay_s: Annotated[float, Real(0.0, 1e3)]
     """Delay from ``basis_s`` to acting that the prediction of the state covers; 0 without."""
-    plan_x: Annotated[tuple[float, ...], Vector(7, rows=501)]
+    plan_x: Annotated[tuple[float, ...], Vector(7, rows=501, names=_CAR_STATE)]
     """Predicted states row by row, N + 1 rows of 7; empty without a prediction."""
-    plan_u: Annotated[tuple[float, ...], Vector(2, rows=500)]
+    plan_u: Annotated[tuple[float, ...], Vector(2, rows=500, names=_INPUT)]
     """Planned inputs row by row, N rows of 2."""
     residual_dynamics: Annotated[float, Real(-1.0, 1e12)]
     """Largest dynamics defect of the plan; -1 if not known or not finite (the others as well)."""
@@ -210,7 +218,7 @@ class RunRequest(Message):
     run: Count
     lockstep: Annotated[bool, Flag()]
     """True: the plant advances only on the matching actuation; False: by the wall clock."""
-    x0: Annotated[tuple[float, ...], Vector(7)]
+    x0: CarState
     """Start state, as in :class:`State`."""
     line_x_m: Metre
     line_y_m: Metre
