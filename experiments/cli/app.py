@@ -1,9 +1,10 @@
-"""The Typer application: one module per group of subcommands, and errors as one line."""
+"""The Typer application: subcommands grouped by task, and errors as one line."""
 
 import io
 import logging
 import shutil
 import sys
+from collections.abc import Callable
 from tempfile import gettempdir
 from typing import Annotated, Final
 
@@ -20,12 +21,27 @@ __all__ = ["app", "main"]
 _INTERRUPTED: Final = 130
 _OUR_OWN: Final = ("bayesrace", "codegen", "experiments", "plant")
 
+_TASKS: Final[dict[str, tuple[Callable[..., None], ...]]] = {
+    "Race": (evaluation.race, evaluation.report),
+    "Prepare": (
+        preparation.tracks, preparation.cars, preparation.raceline, preparation.collect,
+        preparation.train, learning.validate, preparation.build,
+    ),
+    "Drive": (
+        parts.plant, parts.controller, evaluation.drive, operation.status, operation.stop,
+        operation.go, operation.router,
+    ),
+    "Learn while driving": (learning.learn, learning.publish, learning.rollback),
+    "Measure": (evaluation.bench, latency.latency),
+    "Export to other tools": (preparation.export,),
+}  # fmt: skip
+
 app = typer.Typer(
     name="bayesrace",
     help="Real-time GP-MPC racing: a compiled controller that learns from its own laps.",
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode="markdown",
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
 
 
@@ -38,7 +54,10 @@ def _version(wanted: bool) -> None:
 @app.callback()
 def _options(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print and exit.")
+        bool,
+        typer.Option(
+            "--version", callback=_version, is_eager=True, help="Print the version and exit."
+        ),
     ] = False,
 ) -> None:
     from experiments.printable import PrintableFormatter
@@ -48,8 +67,10 @@ def _options(
     logging.basicConfig(level=logging.INFO, handlers=[handler])
 
 
-for group in (evaluation, latency, preparation, learning, parts, operation, fmu):
-    group.register(app)
+for task, commands in _TASKS.items():
+    for command in commands:
+        app.command(rich_help_panel=task)(command)
+app.add_typer(fmu.fmu, rich_help_panel="Export to other tools")
 
 
 def main() -> None:
@@ -67,15 +88,15 @@ def main() -> None:
     except (typer.Abort, KeyboardInterrupt):
         _fail("interrupted", _INTERRUPTED)
     except Exception as error:
-        told = _in_words(error)
-        if told is None:
+        text = _in_words(error)
+        if text is None:
             raise
         ours = isinstance(error, RuntimeError) and not isinstance(error, RecursionError)
-        _fail(told, 1 if ours else 2)
+        _fail(text, 1 if ours else 2)
 
 
 def _in_words(error: Exception) -> str | None:
-    """What a user is told; None for a fault of the program's own, which gets a traceback."""
+    """The message for the user; None for a bug of the program, which gets a traceback."""
     match error:
         case InputError():
             return str(error)

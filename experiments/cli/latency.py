@@ -1,4 +1,4 @@
-"""``latency``: where a control cycle's time goes, by the wall clock."""
+"""``latency``: the time of each leg of a control cycle, in real time."""
 
 from datetime import UTC, datetime
 from pathlib import Path
@@ -9,49 +9,78 @@ import typer
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from bayesrace.vehicles import DEFAULT_CAR
-from experiments.cli.options import Car, CarName, connect_to, writable
+from experiments.cli.options import Car, CarName, Endpoint, connect_to, writable
+from experiments.cli.parts import LockMemory
 
-__all__ = ["register"]
+__all__ = ["latency"]
 
 
 def latency(
-    rate: Annotated[float, typer.Option(min=1, max=500, help="Of plant and controller [Hz].")] = 50,
-    duration: Annotated[float, typer.Option(min=1, help="Time observed [s].")] = 20.0,
-    load: Annotated[int, typer.Option(min=0, max=1024, help="Busy processes beside.")] = 0,
+    rate: Annotated[
+        float, typer.Option(metavar="HZ", min=1, max=500, help="Rate of plant and controller [Hz].")
+    ] = 50,
+    duration: Annotated[float, typer.Option(metavar="S", min=1, help="Time observed [s].")] = 20.0,
+    load: Annotated[
+        int, typer.Option(metavar="N", min=0, max=1024, help="Busy processes to start as load.")
+    ] = 0,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder [runs/latency-DATE-TIME].")
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            metavar="DIR",
+            show_default="runs/latency-DATE-TIME",
+            help="Folder for results.",
+        ),
     ] = None,
     json_file: Annotated[
         Path | None,
-        typer.Option("--json", callback=writable, help="Write the numbers to this file as well."),
+        typer.Option(
+            "--json",
+            metavar="FILE",
+            callback=writable,
+            help="Write the numbers to this file as well.",
+        ),
     ] = None,
     track: Annotated[
         str | None,
         typer.Option(
-            help="Track: built-in name, random:SEED or CSV file. Attached: the one that is driven."
+            metavar="TRACK",
+            help="Built-in name, random:SEED or CSV file; with --attach, the one that is driven.",
         ),
     ] = None,
     fifo: Annotated[
         int | None,
-        typer.Option(min=1, max=99, help="SCHED_FIFO priority of the loops, the bare one too."),
+        typer.Option(
+            metavar="N",
+            min=1,
+            max=99,
+            help="SCHED_FIFO priority of the loops, the bare loop included.",
+        ),
     ] = None,
-    lock_memory: Annotated[bool, typer.Option(help="Keep their memory from being paged.")] = False,
-    weights: Annotated[Path | None, typer.Option(help="GP weights [trained].")] = None,
-    artefact: Annotated[Path | None, typer.Option(help="Built controller [built].")] = None,
-    raceline: Annotated[Path | None, typer.Option(help="Racing line [computed].")] = None,
-    attach: Annotated[bool, typer.Option(help="Measure a run that is under way.")] = False,
-    endpoint: Annotated[
-        list[str] | None,
-        typer.Option(help="Attach: plant and controller, one each; the defaults of both without."),
+    lock_memory: LockMemory = False,
+    weights: Annotated[
+        Path | None, typer.Option(metavar="FILE", show_default="trained", help="GP weights.")
     ] = None,
+    artefact: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", show_default="built", help="Folder of 'bayesrace build'."),
+    ] = None,
+    raceline: Annotated[
+        Path | None, typer.Option(metavar="FILE", show_default="computed", help="Racing line.")
+    ] = None,
+    attach: Annotated[
+        bool, typer.Option("--attach", help="Measure a run that has been started elsewhere.")
+    ] = False,
+    endpoint: Endpoint = None,
     car: Car = DEFAULT_CAR,
     name: CarName = "",
 ) -> None:
-    """Measure where a control cycle's time goes, from sampling the state to acting.
+    """Measure each leg of a control cycle, from the sampled state to the acting input.
 
-    Starts plant and controller as processes of their own and drives around the track by the wall
-    clock; beside them runs a loop that only sleeps, which tells the machine's stalls from the
-    program's. Leaves latency.json, a picture and HdrHistogram logs. docs/latency.md explains it.
+    Starts plant and controller as processes and drives the track in real time. A loop that only
+    sleeps runs beside them: its delays are those of the machine, not of the program. Leaves
+    latency.json, a picture and HdrHistogram logs; see docs/latency.md.
     """
     if endpoint and not attach:
         raise InputError("--endpoint is of a running system: add --attach, or leave it out")
@@ -88,8 +117,3 @@ def latency(
         write_whole(json_file, measured.result.model_dump_json(indent=1) + "\n")
     console.print(f"{out}", highlight=False, soft_wrap=True)
     measured.raise_if_broken()
-
-
-def register(app: typer.Typer) -> None:
-    """Adds this module's subcommands."""
-    app.command()(latency)

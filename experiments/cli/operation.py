@@ -1,4 +1,4 @@
-"""``status``, ``stop``, ``go``, ``router``: looking after plants and controllers that run."""
+"""``status``, ``stop``, ``go``, ``router``: operation of running plants and controllers."""
 
 import contextlib
 import json
@@ -17,13 +17,21 @@ if TYPE_CHECKING:
     from experiments.operation import Word
     from experiments.picture import Picture
 
-__all__ = ["register"]
+__all__ = ["go", "router", "status", "stop"]
 
-Name = Annotated[str, typer.Option(help="Name of the car.")]
+Name = Annotated[str, typer.Option(metavar="NAME", show_default="", help="Name of the car.")]
 Timeout = Annotated[
-    float, typer.Option(min=0.1, max=60.0, help="Seconds to find the cars, and again to answer.")
+    float,
+    typer.Option(
+        metavar="S",
+        min=0.1,
+        max=60.0,
+        help="Time limit [s], once for finding the cars and once for their answers.",
+    ),
 ]
-Reason = Annotated[str, typer.Option(help="Why; it shows in the controller's status.")]
+Reason = Annotated[
+    str, typer.Option(metavar="TEXT", help="Reason, which the controller's status then shows.")
+]
 
 _PERIOD_S = 0.2
 """Between two pictures of ``status --watch``."""
@@ -39,11 +47,14 @@ def status(
         ),
     ] = False,
     watch: Annotated[
-        bool, typer.Option(help="Go on until Ctrl-C; with --json a line for each heartbeat.")
+        bool,
+        typer.Option(
+            "--watch", help="Update until Ctrl-C; with --json, print a line for each heartbeat."
+        ),
     ] = False,
     timeout: Timeout = 2.0,
 ) -> None:
-    """Show how plants and controllers are: state, rate, misses, fallbacks, counters.
+    """Show plants and controllers: phase, rate, deadline misses, fallbacks, counters.
 
     Without --name: all cars that are found. A process that is there and does not answer is shown
     as such; if none answers, that is an error.
@@ -104,7 +115,7 @@ def _print_json(picture: "Picture", car: str | None = None) -> None:
 
 @contextlib.contextmanager
 def _until_nobody_reads() -> Iterator[None]:
-    """A reader that has had enough (``| head -1``) is no error."""
+    """The end of the reader of a pipe (``| head -1``) is no error."""
     try:
         yield
         sys.stdout.flush()
@@ -117,14 +128,14 @@ def stop(
     name: Name = "",
     endpoint: Endpoint = None,
     reason: Reason = "",
-    everybody: Annotated[bool, typer.Option("--all", help="Stop all cars that are found.")] = False,
+    everybody: Annotated[bool, typer.Option("--all", help="All cars that are found.")] = False,
     run: Annotated[
         bool,
-        typer.Option("--run", help="End the plant's run instead, as when who started it is gone."),
+        typer.Option("--run", help="End the run of the plant instead, such as an abandoned one."),
     ] = False,
     timeout: Timeout = 2.0,
 ) -> None:
-    """Tell a controller to brake to standstill and stay there.
+    """Brake a car to standstill and keep it there.
 
     Without --name: the only car there is. Exit code 2 if it refuses or does not answer.
     """
@@ -137,7 +148,7 @@ def stop(
 def go(
     name: Name = "", endpoint: Endpoint = None, reason: Reason = "", timeout: Timeout = 2.0
 ) -> None:
-    """Tell a controller that has been stopped to drive again.
+    """Let a stopped or held controller drive.
 
     Without --name: the only car there is. Exit code 2 if it refuses or does not answer.
     """
@@ -175,26 +186,21 @@ def _command(
 
 def router(
     listen: Annotated[
-        list[str], typer.Option(help="Zenoh endpoint to listen on; several allowed.")
+        list[str], typer.Option(metavar="ENDPOINT", help="Zenoh endpoint to listen on; repeatable.")
     ],
     connect: Annotated[
-        list[str] | None, typer.Option(help="Endpoint of another router; several allowed.")
+        list[str] | None,
+        typer.Option(metavar="ENDPOINT", help="Endpoint of another router; repeatable."),
     ] = None,
     parent_pid: ParentPid = None,
 ) -> None:
-    """Forward between cars and those who look after them, until Ctrl-C.
+    """Forward messages between all processes that connect to it, until Ctrl-C.
 
-    Plants, controllers and all others then need one endpoint only, this one: many cars on one
-    network, and machines that cannot reach each other directly.
+    Each plant, controller or command then needs this one endpoint only: for several cars in one
+    network, and for machines that cannot reach each other directly.
     """
     die_with_parent(parent_pid)
     from bayesrace.transport import Endpoints
     from experiments.operation import route
 
     route(Endpoints(listen=tuple(listen), connect=tuple(connect or ()), mode="router"))
-
-
-def register(app: typer.Typer) -> None:
-    """Adds this module's subcommands."""
-    for subcommand in (status, stop, go, router):
-        app.command()(subcommand)
