@@ -234,7 +234,7 @@ class _Paddock:
 
     def flushed(self, plan: RunPlan, car: CarParameters, step_s: float) -> Dataset:
         """Samples of a run, from the log."""
-        self.recorder.settle()
+        self.recorder.settle(at_most_s=20.0)  # the next stage reads the log
         return dataset_from_log(self._race.out / FILES.log, car, step_s, runs=(plan.run,))
 
 

@@ -47,10 +47,6 @@ def _excursion(lap: LapResult) -> str:
 
 COLUMNS: Final = (
     Column("controller", "", lambda lap: lap.controller, "name of the controller", number=False),
-    Column(
-        "weights", "", lambda lap: lap.weights_version or "–",
-        "version of the residual's weights", number=False,
-    ),
     Column("lap", "s", _first_lap, "first lap, from standstill; DNF: did not finish one"),
     Column("flying", "s", lambda lap: _decimals(lap.flying_lap_time_s, 3), "best later lap"),
     Column(
@@ -70,6 +66,10 @@ COLUMNS: Final = (
     Column("step p99", "µs", _solve("p99"), "99th percentile of the same"),
     Column("step max", "µs", _solve("max"), "largest of the same"),
     Column("fall-backs", "", lambda lap: str(lap.fallbacks), "cycles that the fallback drove"),
+    Column(
+        "weights", "", lambda lap: lap.weights_version or "–",
+        "version of the residual's weights", number=False,
+    ),
 )  # fmt: skip
 """The result table's columns; the report shows the same cells."""
 

@@ -1,17 +1,21 @@
-"""Figures to SVG that can stand inside a page, and to PNG."""
+"""Figures of one panel; figures to SVG that can stand inside a page, and to PNG."""
 
 import io
 import re
 from pathlib import Path
 from typing import Final
 
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from bayesrace.files import replacing
 
-__all__ = ["inline_svg", "write_png"]
+__all__ = ["PANEL_WIDTH", "inline_svg", "panel", "write_png"]
+
+PANEL_WIDTH: Final = 5.2
+"""Of a panel [inch]: legible on a telephone, and two beside each other on a wide page."""
 
 _PROLOGUE: Final = re.compile(r"^.*?(?=<svg )", re.DOTALL)
 _METADATA: Final = re.compile(r"\s*<metadata>.*?</metadata>", re.DOTALL)
@@ -21,6 +25,12 @@ _GROUP_ID: Final = re.compile(r'<g id="[^"]*"')
 _COMMENT: Final = re.compile(r"\s*<!--.*?-->", re.DOTALL)
 _PATH: Final = re.compile(r' d="[^"]*"')
 _LONG: Final = re.compile(r"(\d+\.\d{2})\d+")
+
+
+def panel(height: float) -> tuple[Figure, Axes]:
+    """A figure with a single panel of this height [inch]."""
+    figure = Figure(figsize=(PANEL_WIDTH, height), layout="constrained")
+    return figure, figure.subplots()
 
 
 def inline_svg(figure: Figure) -> str:

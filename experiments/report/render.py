@@ -10,16 +10,22 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from matplotlib.figure import Figure
 
 from bayesrace.files import write_whole
 from experiments.analysis import RaceAnalysis, read_race
 from experiments.notation import UNCERTAIN
 from experiments.published import LIMIT, SOURCE, compare_gp, compare_laps
 from experiments.report.canvas import inline_svg, write_png
-from experiments.report.learning import gp_figure, solve_figure
-from experiments.report.maps import laps_on_track
+from experiments.report.learning import gp_figures, solve_figure
+from experiments.report.maps import LapMaps
 from experiments.report.style import figure_style, look
-from experiments.report.traces import deviation_figure, inputs_figure, speed_figure
+from experiments.report.traces import (
+    deviation_figures,
+    input_figures,
+    speed_figures,
+    time_figures,
+)
 from experiments.results import LapResult, RaceResult
 from experiments.table import COLUMNS
 
@@ -162,24 +168,24 @@ def _uncertain(analysis: RaceAnalysis) -> list[tuple[str, int, int]]:
     ]
 
 
-def _figures(analysis: RaceAnalysis, picture: Path) -> dict[str, str]:
-    """Name to SVG; a figure that has nothing to show is left out."""
+def _figures(analysis: RaceAnalysis, picture: Path) -> dict[str, list[str]]:
+    """Name to panels as SVG; what has nothing to show is left out."""
     runs, track, line = analysis.runs, analysis.track, analysis.line
     driven = [run for run in runs if len(run.record.truth) > 1]
-    figures: dict[str, str] = {}
+    figures: dict[str, list[Figure]] = {}
     with figure_style():
-        laps = laps_on_track(driven, track, line)
-        figures["laps"] = inline_svg(laps)
-        write_png(laps, picture)
+        maps = LapMaps(driven, track, line)
+        write_png(maps.picture(), picture)
+        figures["laps"] = maps.figures()
         if driven:
-            car = analysis.recording.car
-            figures["speed"] = inline_svg(speed_figure(driven, track, line))
-            figures["inputs"] = inline_svg(inputs_figure(driven, track, car))
-            figures["deviation"] = inline_svg(deviation_figure(driven, track))
+            figures["time"] = time_figures(driven, track)
+            figures["speed"] = speed_figures(driven, track, line)
+            figures["inputs"] = input_figures(driven, track, analysis.recording.car)
+            figures["deviation"] = deviation_figures(driven, track)
         data = analysis.best_case
         if data is not None and analysis.validations:
             progress = track.project_path(data.x[:, :2]).progress_m
-            figures["gp"] = inline_svg(gp_figure(analysis.validations, progress, track.length_m))
+            figures["gp"] = gp_figures(analysis.validations, progress, track.length_m)
         if any(len(run.record.solve_us) for run in driven):
-            figures["solve"] = inline_svg(solve_figure(driven))
-    return figures
+            figures["solve"] = [solve_figure(driven)]
+        return {name: [inline_svg(one) for one in some] for name, some in figures.items() if some}
