@@ -8,9 +8,9 @@ every whole chunk, also where the file ends without its index.
 import json
 import struct
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import IO, Any, Final, Generic, TypeVar, cast
 
@@ -23,7 +23,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import Writer
 
 from bayesrace.errors import InputError
-from bayesrace.messages import TOPICS, Message, Topic, decode, decode_json, json_schema, to_json
+from bayesrace.messages import TOPICS, Message, Topic, decode, from_json, json_schema, to_json
 
 __all__ = ["Entry", "LogReader", "LogWriter", "topic_of"]
 
@@ -142,18 +142,20 @@ class LogReader:
 
     def messages(self, topics: Collection[Topic[Any]] = TOPICS) -> Iterator[Entry[Any]]:
         """The messages of these topics, typed; those that cannot be decoded are counted."""
-        channels: dict[int, tuple[str, Callable[[bytes], Message]]] = {}
+        channels: dict[int, tuple[str, type[Message], bool]] = {}
         self.refused = 0
         for record in self._records():
             if isinstance(record, Channel):
                 topic = topic_of(record.topic)
                 if topic is not None and topic in topics:
-                    read = decode_json if record.message_encoding == "json" else decode
-                    channels[record.id] = record.topic, partial(read, topic.message)
+                    channels[record.id] = (
+                        record.topic, topic.message, record.message_encoding == "json"
+                    )  # fmt: skip
             elif isinstance(record, Record) and record.channel_id in channels:
-                key, decoder = channels[record.channel_id]
+                key, kind, as_json = channels[record.channel_id]
                 try:
-                    message = decoder(record.data)
+                    data = from_json(kind, record.data) if as_json else record.data
+                    message = decode(kind, data)
                 except InputError as error:
                     self.refused += 1
                     self.last_reason = str(error)

@@ -1,14 +1,7 @@
 """What crosses a process boundary: message types, their table, and the strict codec."""
 
-from bayesrace.messages.codec import (
-    LARGEST_BYTES,
-    Decoder,
-    decode,
-    decode_json,
-    encode,
-    json_schema,
-    to_json,
-)
+from bayesrace.messages.codec import LARGEST_BYTES, Decoder, decode, encode
+from bayesrace.messages.json_form import from_json, json_schema, to_json
 from bayesrace.messages.rules import Scalar
 from bayesrace.messages.table import (
     ACCEPTED,
@@ -98,8 +91,8 @@ __all__ = [
     "Truth",
     "car_key",
     "decode",
-    "decode_json",
     "encode",
+    "from_json",
     "json_schema",
     "to_json",
 ]

@@ -15,31 +15,18 @@ from operator import attrgetter
 from typing import Any, Final, Generic, TypeVar, get_args, get_type_hints
 
 import msgpack
-import pydantic_core
 
 from bayesrace.errors import InputError
-from bayesrace.messages.rules import (
-    Integer,
-    Real,
-    Rule,
-    Scalars,
-    Text,
-    Vector,
-    as_float,
-    closed_object,
-)
+from bayesrace.messages.rules import Integer, Rule, Scalars, Text, Vector
 from bayesrace.messages.types import Message
 
 __all__ = [
     "LARGEST_BYTES",
     "Decoder",
     "decode",
-    "decode_json",
     "encode",
-    "json_schema",
     "largest_bytes",
     "peek_seq",
-    "to_json",
 ]
 
 M = TypeVar("M", bound=Message)
@@ -63,8 +50,6 @@ class _Spec:
     values_of: Callable[[Any], tuple[Any, ...]]
     checks: tuple[tuple[str, Callable[[Any], Any]], ...]
     rules: tuple[tuple[str, Rule], ...]
-    vectors: tuple[tuple[str, Vector], ...]
-    reals: tuple[str, ...]
     wire_bytes: int
     """Most bytes of a valid message."""
     unpack: Callable[[bytes], Any]
@@ -81,12 +66,9 @@ def _spec(kind: type[Message]) -> _Spec:
         rules = tuple((name, get_args(hints[name])[1]) for name in names)
         checks = tuple((name, rule.check) for name, rule in rules)
         keys = frozenset(("schema", *names))
-        vectors = tuple((name, rule) for name, rule in rules if isinstance(rule, Vector))
-        reals = tuple(name for name, rule in rules if isinstance(rule, Real))
         spec = _SPECS[kind] = _Spec(
-            names, keys, attrgetter(*names), checks, rules, vectors, reals, _wire_bytes(rules),
-            _unpacker(rules),
-        )  # fmt: skip
+            names, keys, attrgetter(*names), checks, rules, _wire_bytes(rules), _unpacker(rules)
+        )
     return spec
 
 
@@ -151,10 +133,6 @@ def decode(kind: type[M], data: bytes) -> M:
         content = spec.unpack(data)
     except _MALFORMED as error:
         raise InputError(f"{kind.__name__}: not a message ({error or 'malformed'})") from None
-    return _checked(kind, content, spec)
-
-
-def _checked(kind: type[M], content: Any, spec: _Spec) -> M:
     if type(content) is not dict or content.keys() != spec.keys:
         raise InputError(f"{kind.__name__}: not a map of exactly its fields{_odd(content, spec)}")
     version = content["schema"]
@@ -189,47 +167,6 @@ def _explained(kind: type[Message], content: dict[str, Any], spec: _Spec) -> Inp
         except ValueError as error:
             return InputError(f"{kind.__name__}.{name}: {error}")
     raise AssertionError("unreachable: a rule failed once and then did not")
-
-
-def to_json(kind: type[Message], data: bytes) -> bytes | None:
-    """An encoded message as JSON in the form of :func:`json_schema`; None for other bytes.
-
-    The values are not checked. NaN and infinities, which no valid message holds, become the strings
-    "NaN", "Infinity" and "-Infinity".
-    """
-    spec = _spec(kind)
-    try:
-        content = msgpack.unpackb(data)
-        if type(content) is not dict or content.keys() != spec.keys:
-            return None
-        for name, rule in spec.vectors:
-            content[name] = rule.to_json(content[name])
-        return pydantic_core.to_json(content, inf_nan_mode="strings")
-    except _MALFORMED:
-        return None
-
-
-def decode_json(kind: type[M], data: bytes) -> M:
-    """The message of class ``kind`` in JSON; raises InputError as :func:`decode` does."""
-    spec = _spec(kind)
-    try:
-        content = pydantic_core.from_json(data)
-        if type(content) is dict and content.keys() == spec.keys:
-            for name, rule in spec.vectors:
-                content[name] = rule.from_json(content[name])
-            for name in spec.reals:
-                content[name] = as_float(content[name])
-    except (*_MALFORMED, KeyError) as error:
-        raise InputError(f"{kind.__name__}: not a message in JSON ({error!r:.100})") from None
-    return _checked(kind, content, spec)
-
-
-def json_schema(kind: type[Message]) -> dict[str, Any]:
-    """JSON schema of the messages in a log, in the subset that viewers such as Foxglove read."""
-    properties: dict[str, Any] = {"schema": {"type": "integer", "const": kind.SCHEMA}}
-    properties.update((name, rule.describe()) for name, rule in _spec(kind).rules)
-    summary = (kind.__doc__ or "").split("\n")[0]
-    return {"title": kind.__name__, "description": summary, **closed_object(properties)}
 
 
 class Decoder(Generic[M]):

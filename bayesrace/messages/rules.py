@@ -9,7 +9,6 @@ what is larger is refused before anything is made of it.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import chain
 from types import MappingProxyType
 from typing import Any, Protocol
 
@@ -33,9 +32,6 @@ class Rule(Protocol):
     def check(self, value: Any) -> Any:
         """The value as the message keeps it; ValueError if it is not acceptable."""
 
-    def describe(self) -> dict[str, Any]:
-        """The same rule as JSON schema: every value has a type, every object its properties."""
-
     @property
     def wire_bytes(self) -> int:
         """Most bytes that an acceptable value takes."""
@@ -55,10 +51,6 @@ class Integer:
         if not self.low <= value <= self.high:
             raise ValueError(f"{value} is outside [{self.low}, {self.high}]")
         return value
-
-    def describe(self) -> dict[str, Any]:
-        """See :meth:`Rule.describe`."""
-        return {"type": "integer", "minimum": self.low, "maximum": self.high}
 
     @property
     def wire_bytes(self) -> int:
@@ -81,10 +73,6 @@ class Real:
             raise ValueError(f"{value} is outside [{self.low:g}, {self.high:g}]")
         return value
 
-    def describe(self) -> dict[str, Any]:
-        """See :meth:`Rule.describe`."""
-        return {"type": "number", "minimum": self.low, "maximum": self.high}
-
     @property
     def wire_bytes(self) -> int:
         """See :attr:`Rule.wire_bytes`."""
@@ -100,10 +88,6 @@ class Flag:
         if type(value) is not bool:
             raise ValueError(f"expected true or false, got {type(value).__name__}")
         return value
-
-    def describe(self) -> dict[str, Any]:
-        """See :meth:`Rule.describe`."""
-        return {"type": "boolean"}
 
     @property
     def wire_bytes(self) -> int:
@@ -125,10 +109,6 @@ class Text:
             raise ValueError(f"text of {len(value)} characters, at most {self.longest} allowed")
         return value
 
-    def describe(self) -> dict[str, Any]:
-        """See :meth:`Rule.describe`."""
-        return {"type": "string", "maxLength": self.longest}
-
     @property
     def wire_bytes(self) -> int:
         """See :attr:`Rule.wire_bytes`."""
@@ -147,10 +127,6 @@ class Choice:
             raise ValueError(f"expected one of {', '.join(self.words)}")
         return value
 
-    def describe(self) -> dict[str, Any]:
-        """See :meth:`Rule.describe`."""
-        return {"type": "string", "enum": list(self.words)}
-
     @property
     def wire_bytes(self) -> int:
         """See :attr:`Rule.wire_bytes`."""
@@ -161,9 +137,8 @@ class Choice:
 class Vector:
     """Finite floats, each within [-limit, limit].
 
-    Exactly ``length`` of them; or, with ``rows``, any whole number of rows up to that many. In JSON
-    they are an object with the numbers by ``names``, of columns if there are rows; without names,
-    an array.
+    Exactly ``length`` of them; or, with ``rows``, any whole number of rows up to that many.
+    ``names`` of the numbers (of a row) are for JSON, where an array without names stays one.
     """
 
     length: int
@@ -186,31 +161,6 @@ class Vector:
             if type(number) is not float or not -limit <= number <= limit:
                 raise ValueError(f"{number!r:.40} is not a float within ±{limit:g}")
         return tuple(value)
-
-    def describe(self) -> dict[str, Any]:
-        """See :meth:`Rule.describe`."""
-        number = {"type": "number", "minimum": -self.limit, "maximum": self.limit}
-        if not self.names:
-            least = self.length if self.rows is None else 0
-            return {"type": "array", "items": number, "minItems": least, "maxItems": self.most}
-        column = {"type": "array", "items": number, "maxItems": self.rows}
-        return closed_object(dict.fromkeys(self.names, column if self.rows else number))
-
-    def to_json(self, value: Any) -> Any:
-        """The array ``value`` in its JSON form; ValueError or TypeError if it has none."""
-        if not self.names:
-            return value
-        if self.rows is None:
-            return dict(zip(self.names, value, strict=True))
-        return {name: value[i :: self.length] for i, name in enumerate(self.names)}
-
-    def from_json(self, value: Any) -> Any:
-        """The array whose JSON form is ``value``; KeyError, ValueError or TypeError if none is."""
-        if self.names:
-            columns = [value[name] for name in self.names]
-            several = self.rows is not None
-            value = list(chain.from_iterable(zip(*columns, strict=True))) if several else columns
-        return [as_float(number) for number in value] if int in map(type, value) else value
 
     @property
     def most(self) -> int:
@@ -246,14 +196,6 @@ class Scalars:
             raise ValueError(f"{characters} characters, at most {self.characters} allowed")
         return MappingProxyType(value)
 
-    def describe(self) -> dict[str, Any]:
-        """See :meth:`Rule.describe`."""
-        scalar = {"type": ["boolean", "integer", "number", "string"]}
-        return {
-            "type": "object", "properties": {}, "additionalProperties": scalar,
-            "maxProperties": self.most,
-        }  # fmt: skip
-
     @property
     def wire_bytes(self) -> int:
         """See :attr:`Rule.wire_bytes`."""
@@ -262,19 +204,6 @@ class Scalars:
             + self.most * (_HEAD_BYTES + _NUMBER_BYTES)
             + _CHARACTER_BYTES * self.characters
         )
-
-
-def as_float(value: Any) -> Any:
-    """An integer as a float, since JSON does not tell them apart; anything else as it is."""
-    return float(value) if type(value) is int else value
-
-
-def closed_object(properties: Mapping[str, Any]) -> dict[str, Any]:
-    """JSON schema of an object that has exactly these properties."""
-    return {
-        "type": "object", "properties": properties, "required": list(properties),
-        "additionalProperties": False,
-    }  # fmt: skip
 
 
 def _check_scalar(name: str, value: Any) -> int:
