@@ -19,8 +19,7 @@ PANEL_WIDTH: Final = 5.2
 
 _PROLOGUE: Final = re.compile(r"^.*?(?=<svg )", re.DOTALL)
 _METADATA: Final = re.compile(r"\s*<metadata>.*?</metadata>", re.DOTALL)
-_SIZE: Final = re.compile(r'(<svg [^>]*?)\swidth="[^"]*"', re.DOTALL)
-_HEIGHT: Final = re.compile(r'(<svg [^>]*?)\sheight="[^"]*"', re.DOTALL)
+_SIZE: Final = re.compile(r'\s(?:width|height)="[^"]*"')
 _GROUP_ID: Final = re.compile(r'<g id="[^"]*"')
 _COMMENT: Final = re.compile(r"\s*<!--.*?-->", re.DOTALL)
 _PATH: Final = re.compile(r' d="[^"]*"')
@@ -44,8 +43,8 @@ def inline_svg(figure: Figure) -> str:
     text = _PROLOGUE.sub("", buffer.getvalue(), count=1)
     text = _METADATA.sub("", text)
     text = _COMMENT.sub("", text)
-    text = _HEIGHT.sub(r"\1", _SIZE.sub(r"\1", text, count=1), count=1)
-    text = _GROUP_ID.sub("<g", text)
+    tag, rest = text.split(">", 1)
+    text = _GROUP_ID.sub("<g", f"{_SIZE.sub('', tag)}>{rest}")
     # A hundredth of a point is enough for lines; texts keep their digits.
     return _PATH.sub(lambda match: _LONG.sub(r"\1", match.group()), text)
 

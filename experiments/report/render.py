@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
@@ -26,7 +26,7 @@ from experiments.report.traces import (
     speed_figures,
     time_figures,
 )
-from experiments.results import LapResult, RaceResult
+from experiments.results import RaceResult
 from experiments.table import COLUMNS
 
 __all__ = ["PICTURE", "REPORT", "render_report"]
@@ -36,17 +36,6 @@ PICTURE: Final = "lap.png"
 
 _TEMPLATE: Final = "report.html.j2"
 _PACKAGES: Final = ("bayesrace", "casadi", "numpy", "scikit-learn", "eclipse-zenoh")
-
-
-class _Card(NamedTuple):
-    """One controller's headline."""
-
-    name: str
-    colour: str
-    what: str
-    time: str
-    behind: str
-    note: str
 
 
 def render_report(run_dir: Path, result: RaceResult, analysis: RaceAnalysis | None = None) -> Path:
@@ -68,7 +57,7 @@ def render_report(run_dir: Path, result: RaceResult, analysis: RaceAnalysis | No
         result=result,
         columns=COLUMNS,
         look=look,
-        cards=_cards(result),
+        best=result.lap("bestcase"),
         facts=_facts(analysis, result),
         versions=_versions(run_dir),
         figures=_figures(analysis, run_dir / PICTURE),
@@ -79,35 +68,11 @@ def render_report(run_dir: Path, result: RaceResult, analysis: RaceAnalysis | No
         gp_compared=compare_gp(result),
         source=SOURCE,
         limit=LIMIT,
-        title=_title(analysis, result),
+        title=f"{result.settings.track} · {analysis.track.length_m:.2f} m",
     )
     path = run_dir / REPORT
     write_whole(path, page)
     return path
-
-
-def _title(analysis: RaceAnalysis, result: RaceResult) -> str:
-    return f"{result.settings.track} · {analysis.track.length_m:.2f} m"
-
-
-def _cards(result: RaceResult) -> list[_Card]:
-    best = result.lap("bestcase")
-    reference_s = best.lap_time_s if best is not None else None
-    return [_card(lap, reference_s) for lap in result.laps]
-
-
-def _card(lap: LapResult, reference_s: float | None) -> _Card:
-    name, colour, what = look(lap.controller)
-    if lap.lap_time_s is None:
-        return _Card(name, colour, what, "DNF", "", lap.ended)
-    behind = ""
-    if reference_s is not None and lap.controller != "bestcase":
-        behind = f"{lap.lap_time_s - reference_s:+.3f} s to BestCase".replace("-", "−")
-    flying = lap.flying_lap_time_s
-    parts = [f"flying {flying:.3f} s"] if flying is not None else []
-    off = lap.off_track_samples
-    parts.append(f"{off} off track, {lap.off_track_max_m:.3f} m" if off else "none off track")
-    return _Card(name, colour, what, f"{lap.lap_time_s:.3f}", behind, " · ".join(parts))
 
 
 def _facts(analysis: RaceAnalysis, result: RaceResult) -> list[tuple[str, str]]:
@@ -115,7 +80,7 @@ def _facts(analysis: RaceAnalysis, result: RaceResult) -> list[tuple[str, str]]:
     started_ns = analysis.recording.started_ns
     facts = [
         ("driven", "–" if started_ns is None else _calendar(started_ns)),
-        ("car", f"{summary.car}, played by {summary.fmu}" if summary.fmu else summary.car),
+        ("car", f"{summary.car}, simulated by {summary.fmu}" if summary.fmu else summary.car),
         ("trained on", summary.train_track),
         ("mode", summary.mode),
         ("seed", str(summary.seed)),

@@ -67,7 +67,6 @@ def gain_map() -> Colormap:
 
 
 _STYLE: Final[dict[str, Any]] = {
-    "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans", "Arial", "Helvetica"],
     "font.size": 9.0,
     "axes.titlesize": 9.5,
@@ -93,9 +92,6 @@ _STYLE: Final[dict[str, Any]] = {
     "lines.linewidth": 1.2,
     "legend.frameon": False,
     "legend.fontsize": 8.5,
-    "figure.facecolor": "white",
-    "axes.facecolor": "white",
-    "savefig.facecolor": "white",
     # Text stays text: smaller, and it can be searched and read out.
     "svg.fonttype": "none",
     "svg.hashsalt": "bayesrace",

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bayesrace.gp.weights import OUTPUTS, UNITS
 from bayesrace.tracks import Track
 from experiments.notation import SYMBOLS
-from experiments.report.bands import band_patch, draw_band, mark_uncertain, uncertain_handle
+from experiments.report.bands import BAND, draw_band, mark_uncertain
 from experiments.report.maps import draw_edges
 from experiments.report.style import INK, MUTED, PICTURE_WIDTH, WARNING
 from learning.dataset import Dataset
@@ -82,8 +82,10 @@ def _marks(threshold: float) -> list[Line2D | Patch]:
     return [
         Line2D([], [], color=INK, linewidth=1, label="driven minus predicted"),
         Line2D([], [], color=_MEAN, linewidth=1, label="the GP's mean"),
-        band_patch(),
-        uncertain_handle(threshold),
+        Patch(color=BAND, label="95 % band predicted"),
+        Line2D(
+            [], [], color=WARNING, marker="|", linestyle="", label=f"largest sigma > {threshold:g}"
+        ),
     ]
 
 
