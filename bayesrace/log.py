@@ -1,7 +1,8 @@
 """The MCAP file with the messages of a run: writer and reader.
 
-Records are written one by one, not in chunks, so that the reader can take a file that ends
-anywhere.
+Messages are JSON, one channel a key, with a JSON schema for each kind of message, in compressed
+chunks with an index: Foxglove, Lichtblick and PlotJuggler open the file. :class:`LogReader` reads
+every whole chunk, also where the file ends without its index.
 """
 
 import json
@@ -9,6 +10,7 @@ import struct
 import time
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import IO, Any, Final, Generic, TypeVar, cast
 
@@ -18,16 +20,10 @@ from mcap.exceptions import EndOfFile, McapError
 from mcap.records import Channel, Chunk, Metadata
 from mcap.records import Message as Record
 from mcap.stream_reader import StreamReader, breakup_chunk
-from mcap.writer import CompressionType, IndexType, Writer
+from mcap.writer import Writer
 
 from bayesrace.errors import InputError
-from bayesrace.messages import (
-    TOPICS,
-    Decoder,
-    Message,
-    Topic,
-    json_schema,
-)
+from bayesrace.messages import TOPICS, Message, Topic, decode, from_json, json_schema, to_json
 
 __all__ = ["Entry", "LogReader", "LogWriter", "topic_of"]
 
@@ -38,38 +34,35 @@ _MOST_UNPACKED, _RATIO = 1 << 26, 200
 """Bytes that all chunks of a log may unpack to: so many, and this multiple of the file."""
 _DAMAGED: Final = (McapError, struct.error, ValueError, RuntimeError, zstandard.ZstdError)
 """What unpacking raises at a file that is cut off or spoilt."""
-_MESSAGE_ENCODING: Final = "msgpack"
 _MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
 _BY_PREFIX: Final = {topic.key.split("/")[2]: topic for topic in TOPICS}
 
 
+@lru_cache(512)
 def topic_of(key: str) -> Topic[Any] | None:
     """The table's row for a key such as ``bayesrace/orca/state``; None for any other key."""
     parts = key.split("/")
-    if len(parts) < 3 or parts[0] != "bayesrace":
-        return None
-    topic = _BY_PREFIX.get(parts[2])
+    topic = _BY_PREFIX.get(parts[2]) if len(parts) > 2 and parts[0] == "bayesrace" else None
     if topic is None or len(parts) != len(topic.key.split("/")):
         return None
-    return topic
+    return topic if len(parts) == 3 or parts[3] in topic.sources else None
 
 
 class LogWriter:
-    """Appends messages, as they were on the wire, and metadata to an MCAP file. One thread only."""
+    """Appends messages and metadata to an MCAP file. One thread only.
+
+    What is not a message of its key's topic stays as it was received, on a channel with the message
+    encoding ``msgpack`` and no schema.
+    """
 
     def __init__(self, path: Path, metadata: Mapping[str, Mapping[str, str]] | None = None) -> None:
         try:
             self._file = path.open("wb")
         except OSError as error:
             raise InputError(f"cannot write the log {path}: {error.strerror}") from None
-        self._writer = Writer(
-            self._file,
-            compression=CompressionType.NONE,
-            index_types=IndexType.ALL,
-            use_chunking=False,
-        )
-        self._writer.start(profile="", library="bayesrace")
-        self._channels: dict[str, int] = {}
+        self._writer = Writer(self._file)
+        self._writer.start(library="bayesrace")
+        self._channels: dict[tuple[str, bool], int] = {}
         self._schemas: dict[str, int] = {}
         # MCAP tools show calendar time; intervals stay those of the monotonic clock.
         self._epoch_ns = time.time_ns() - time.monotonic_ns()
@@ -83,32 +76,31 @@ class LogWriter:
 
     def write(self, key: str, data: bytes, received_ns: int, seq: int = 0) -> None:
         """One message as received on ``key`` at monotonic time ``received_ns``."""
-        channel = self._channels.get(key)
-        if channel is None:
-            channel = self._register(key)
-        time_ns = self._epoch_ns + received_ns
-        self._writer.add_message(channel, time_ns, data, time_ns, seq)
-
-    def _register(self, key: str) -> int:
         topic = topic_of(key)
-        schema = 0 if topic is None else self._schema(topic)
-        channel: int = self._writer.register_channel(key, _MESSAGE_ENCODING, schema)
-        self._channels[key] = channel
-        return channel
+        text = None if topic is None else to_json(topic.message, data)
+        place = key, text is None
+        if place not in self._channels:
+            encoding = "msgpack" if text is None else "json"
+            schema = 0 if topic is None or text is None else self._schema(topic.message)
+            self._channels[place] = self._writer.register_channel(key, encoding, schema)
+        time_ns = self._epoch_ns + received_ns
+        self._writer.add_message(
+            self._channels[place], time_ns, data if text is None else text, time_ns, seq
+        )
 
-    def _schema(self, topic: Topic[Any]) -> int:
-        name = topic.message.__name__
+    def _schema(self, kind: type[Message]) -> int:
+        name = kind.__name__
         if name not in self._schemas:
-            text = json.dumps(json_schema(topic.message)).encode()
+            text = json.dumps(json_schema(kind)).encode()
             self._schemas[name] = self._writer.register_schema(name, "jsonschema", text)
         return self._schemas[name]
 
     def flush(self) -> None:
-        """Hand everything to the system, where a dying process does not take it along."""
-        self._file.flush()
+        """End the chunk and hand it to the system, which keeps it when this process dies."""
+        self._writer.flush()
 
     def close(self) -> None:
-        """Finish the file with its index; the log is readable without this too."""
+        """Finish the file with its index; :class:`LogReader` reads it without the index too."""
         if not self._file.closed:
             self._writer.finish()
             self._file.close()
@@ -150,24 +142,25 @@ class LogReader:
 
     def messages(self, topics: Collection[Topic[Any]] = TOPICS) -> Iterator[Entry[Any]]:
         """The messages of these topics, typed; those that cannot be decoded are counted."""
-        decoders = {topic.name: Decoder(topic.message) for topic in topics}
-        channels: dict[int, tuple[str, Decoder[Any] | None]] = {}
+        channels: dict[int, tuple[str, type[Message], bool]] = {}
         self.refused = 0
         for record in self._records():
             if isinstance(record, Channel):
                 topic = topic_of(record.topic)
-                decoder = None if topic is None else decoders.get(topic.name)
-                channels[record.id] = (record.topic, decoder)
-            elif isinstance(record, Record):
-                key, decoder = channels.get(record.channel_id, ("", None))
-                if decoder is None:
-                    continue
-                message = decoder(record.data)
-                if message is None:
+                if topic is not None and topic in topics:
+                    channels[record.id] = (
+                        record.topic, topic.message, record.message_encoding == "json"
+                    )  # fmt: skip
+            elif isinstance(record, Record) and record.channel_id in channels:
+                key, kind, as_json = channels[record.channel_id]
+                try:
+                    data = from_json(kind, record.data) if as_json else record.data
+                    message = decode(kind, data)
+                except InputError as error:
                     self.refused += 1
-                    self.last_reason = decoder.last_reason
-                else:
-                    yield Entry(key, record.log_time, message)
+                    self.last_reason = str(error)
+                    continue
+                yield Entry(key, record.log_time, message)
 
     def select(self, topic: Topic[M]) -> list[M]:
         """All messages of one topic."""
@@ -180,10 +173,11 @@ class LogReader:
             file.seek(0)
             if not _MCAP_MAGIC.startswith(head):
                 raise InputError(f"{self.path} is not an MCAP log; give the log of a run")
+            whole = cast(Any, _Whole(file))
             left = _MOST_UNPACKED + _RATIO * self.path.stat().st_size
             try:
                 for record in StreamReader(
-                    cast(Any, _Whole(file)), emit_chunks=True, record_size_limit=_LARGEST_RECORD
+                    whole, emit_chunks=True, record_size_limit=_LARGEST_RECORD
                 ).records:
                     if not isinstance(record, Chunk):
                         yield record
@@ -201,7 +195,7 @@ class LogReader:
 
 
 def _unpacked(chunk: Chunk) -> Chunk:
-    """The chunk of another tool's log, uncompressed; ValueError if it is longer than it says."""
+    """The chunk, uncompressed; ValueError if its length is not the one that it states."""
     size = chunk.uncompressed_size
     if size > _LARGEST_RECORD:
         raise ValueError("a chunk too large")

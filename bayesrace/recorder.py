@@ -1,9 +1,8 @@
-"""Records every message of a car in a log that is readable whatever happens to this process.
+"""Records every message of a car in a log that stays readable if this process dies.
 
-What is written is handed to the system at least every 0.2 s: a killed process loses at most that.
+What is written is handed to the system every 0.2 s: a killed process loses at most that.
 """
 
-import functools
 import logging
 import threading
 import time
@@ -27,36 +26,25 @@ _log = logging.getLogger("bayesrace.recorder")
 FLUSH_PERIOD_S: Final = 0.2
 _BATCH_S: Final = 0.002
 _CHANNEL_CAPACITY: Final = 1 << 16
-_MOST_KEYS: Final = 256
-"""A log's own keys are ten; the format has room for 65,535."""
-
-
-def _in_table(key: str) -> bool:
-    """Whether the table has this very key, of whatever car."""
-    topic, source = topic_of(key), key.rsplit("/", 1)[-1]
-    return topic is not None and ("{source}" not in topic.key or source in topic.sources)
-
-
-@functools.lru_cache(_MOST_KEYS)
-def _is_heartbeat(key: str) -> bool:
-    return topic_of(key) is HEARTBEAT
+_MOST_OTHER_KEYS: Final = 256
+"""Keys that are not in the table of messages; the format has room for 65,535."""
 
 
 @dataclass(slots=True)
 class RecorderCounters:
-    """What a recorder saw."""
+    """Counts of a recorder's messages."""
 
     written: int = 0
     missing: int = 0
-    """Messages that must have been sent, by their numbers, and did not arrive."""
+    """Messages that were sent, by their numbers, and did not arrive."""
     disordered: int = 0
     """Messages with a number not above the one before, restarts from 0 aside."""
     restarts: int = 0
     """Times that a sender began again at 0."""
     unnumbered: int = 0
-    """Messages without a readable number; written all the same."""
+    """Messages without a readable number; they are written all the same."""
     unrecorded: int = 0
-    """Messages on more keys than a log has room for, let go."""
+    """Messages that are not written, since they came on too many keys that are not in the table."""
 
 
 class Recorder:
@@ -77,11 +65,11 @@ class Recorder:
     ) -> None:
         self.counters = RecorderCounters()
         self.failed = ""
-        """Why the log cannot be written; empty while it can. Messages are then let go."""
+        """Why the log cannot be written; empty while it can. Later messages are not written."""
         self.gaps: list[str] = []
-        """The first few gaps in the numbering, in words."""
+        """The first 20 gaps in the numbering, as text."""
         self._last: dict[str, int] = {}
-        self._keys: set[str] = set()
+        self._other_keys: set[str] = set()
         self._path, self._session = path, session
         self._event_key = car_key(EVENT.key, car, "recorder")
         self._writer = LogWriter(path, metadata)
@@ -126,7 +114,7 @@ class Recorder:
             if self.counters.unrecorded:
                 _log.warning(
                     "%s: %d messages on more than %d keys of other programs were not recorded",
-                    self._path, self.counters.unrecorded, _MOST_KEYS,
+                    self._path, self.counters.unrecorded, _MOST_OTHER_KEYS,
                 )  # fmt: skip
             with suppress(OSError, ValueError):
                 counted = {name: str(count) for name, count in asdict(self.counters).items()}
@@ -140,28 +128,29 @@ class Recorder:
         self.close()
 
     def _write_all(self) -> None:
-        handler = self._subscriber.handler
-        while True:
-            try:
+        handler = self._subscriber.handler  # undeclare() fails while the subscriber is borrowed
+        with suppress(zenoh.ZError):  # undeclared and drained
+            while True:
                 sample = handler.recv()
                 while sample is not None:
                     self._write(sample)
                     sample = handler.try_recv()
-            except zenoh.ZError:  # undeclared and drained
-                return
-            # Waking for a batch instead of each message leaves the CPU to who is recorded.
-            time.sleep(_BATCH_S)
+                # Waking once a batch, not once a message, leaves the CPU to what is recorded.
+                time.sleep(_BATCH_S)
 
     def _write(self, sample: Any) -> None:
         now_ns = time.monotonic_ns()
         key, data = str(sample.key_expr), sample.payload.to_bytes()
-        if not _is_heartbeat(key):  # those never end
+        topic = topic_of(key)
+        if topic is not HEARTBEAT:  # those never end
             self._quiet_since_ns = now_ns
-        if not self._known(key):
-            self.counters.unrecorded += 1
-            return
+        if topic is None and key not in self._other_keys:
+            if len(self._other_keys) == _MOST_OTHER_KEYS:
+                self.counters.unrecorded += 1
+                return
+            self._other_keys.add(key)
         seq = peek_seq(data)
-        self._account(key, seq)
+        self._count(key, seq)
         if self.failed:
             return
         try:
@@ -169,12 +158,6 @@ class Recorder:
                 self._writer.write(key, data, now_ns, 0 if seq is None else seq & 0xFFFFFFFF)
         except Exception as error:
             self._fail(error)
-
-    def _known(self, key: str) -> bool:
-        """Whether messages on this key are written: the table's, and a bounded number of others."""
-        if key not in self._keys and (len(self._keys) < _MOST_KEYS or _in_table(key)):
-            self._keys.add(key)
-        return key in self._keys
 
     def _fail(self, error: Exception) -> None:
         """Notes the failure in :attr:`failed`, and publishes one event about it."""
@@ -187,8 +170,8 @@ class Recorder:
         self.failed = f"cannot write the log {self._path}: {why}"
         now_ns = time.monotonic_ns()
         event = Event(0, now_ns, 0, "recorder", "recorder_failed", self.failed[:2000], {})
+        # Not to this recorder's own channel, which may be full: put would block.
         with suppress(zenoh.ZError):
-            # Not to itself, who takes nothing from its channel at this moment.
             self._session.put(
                 self._event_key, encode(event), allowed_destination=zenoh.Locality.REMOTE
             )
@@ -206,21 +189,18 @@ class Recorder:
         while not self._stop.wait(FLUSH_PERIOD_S):
             self._flush()
 
-    def _account(self, key: str, seq: int | None) -> None:
+    def _count(self, key: str, seq: int | None) -> None:
         counters = self.counters
         counters.written += 1
         if seq is None:
             counters.unnumbered += 1
             return
-        last = self._last.get(key)
+        due = self._last.get(key, seq - 1) + 1
         self._last[key] = seq
-        if last is None or seq == last + 1:
-            return
-        if seq == 0:
-            counters.restarts += 1
-        elif seq <= last:
-            counters.disordered += 1
-        else:
-            counters.missing += seq - last - 1
+        if seq > due:
+            counters.missing += seq - due
             if len(self.gaps) < 20:
-                self.gaps.append(f"{key}: {last + 1} to {seq - 1} missing")
+                self.gaps.append(f"{key}: {due} to {seq - 1} missing")
+        elif seq < due:
+            counters.restarts += seq == 0
+            counters.disordered += seq > 0

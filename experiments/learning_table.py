@@ -1,15 +1,14 @@
-"""What training and validation have to say, on the terminal."""
+"""Results of training and validation on the terminal."""
 
 from collections.abc import Sequence
 
-from rich import box
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from bayesrace.gp.weights import OUTPUTS, UNITS
 from experiments.notation import SMOOTHNESS
 from experiments.results import GpMetrics
+from experiments.terminal import plain_table
 from experiments.validation import Drift, HorizonResult, Spread, ValidationResult
 from learning.assessment import ChoiceScore, KernelScore
 from learning.dataset import left_out
@@ -17,17 +16,10 @@ from learning.dataset import left_out
 __all__ = ["print_choices", "print_kernels", "print_validation"]
 
 
-def _table(*titles: str, left: int = 1, padding: int = 1) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, padding), pad_edge=False)
-    for number, title in enumerate(titles):
-        table.add_column(title, justify="left" if number < left else "right", no_wrap=True)
-    return table
-
-
 def print_kernels(scores: Sequence[KernelScore], console: Console) -> None:
     """The paper's appendix: held-out error against the kernel's smoothness, per output."""
-    titles = [f"{output}\nRMSE {UNITS[output]}\nlog dens." for output in OUTPUTS]
-    table = _table("kernel", "ν", *titles, padding=0)
+    titles = [f"{output}\nRMSE {UNITS[output]}\nlog density" for output in OUTPUTS]
+    table = plain_table("kernel", "ν", *titles, padding=0)
     found = {(score.output, score.kernel): score for score in scores}
     for kernel, nu in SMOOTHNESS.items():
         row = [found.get((output, kernel)) for output in OUTPUTS]
@@ -48,10 +40,10 @@ def _kernel_cell(score: KernelScore | None) -> Text:
 
 
 def print_choices(scores: Sequence[ChoiceScore], console: Console) -> None:
-    """What is lost by learning from chosen samples; nothing to print if all fit."""
+    """Held-out errors of chosen samples beside all; prints nothing if all of them fit."""
     if not scores:
         return
-    table = _table("output", "samples", "points", "RMSE", "log density", left=2)
+    table = plain_table("output", "samples", "points", "RMSE", "log density", left=2)
     for score in scores:
         table.add_row(
             f"{score.output} {UNITS[score.output]}" if score.choice == "all" else "",
@@ -70,9 +62,9 @@ def print_validation(result: ValidationResult, console: Console) -> None:
         style="bold",
     )
     if result.learned_from:
-        text = "these are the samples that the weights were learned from: an error this small is "
-        console.print(Text(text + "no promise for others", style="yellow"))
-    table = _table("output", "RMSE", "without GP", "R²", "coverage", "log density")
+        text = "the weights were learned from these very samples: expect larger errors on others"
+        console.print(Text(text, style="yellow"))
+    table = plain_table("output", "RMSE", "without GP", "R²", "coverage", "log density")
     metrics: dict[str, GpMetrics] = {o: getattr(result, o) for o in OUTPUTS}
     for output, one in metrics.items():
         table.add_row(
@@ -96,7 +88,7 @@ def print_validation(result: ValidationResult, console: Console) -> None:
 def _print_drift(drift: HorizonResult, console: Console) -> None:
     steps = "1 step" if drift.steps == 1 else f"{drift.steps} steps, open loop"
     titles = ("nominal\nmean", "\np95", "\nmax", "corrected\nmean", "\np95", "\nmax")
-    table = _table("error", *titles)
+    table = plain_table("error", *titles)
     for label, name in (
         ("position m", "position_m"), ("heading rad", "heading_rad"), ("vx m/s", "vx_mps"),
         ("vy m/s", "vy_mps"), ("omega rad/s", "omega_radps"),

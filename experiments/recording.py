@@ -1,9 +1,10 @@
-"""A run directory as arrays: what the log says about each run, and what was driven on."""
+"""A run directory in memory: settings, track, racing line, and the messages of each run."""
 
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,12 +17,10 @@ from bayesrace.files import read_text
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.log import LogReader
 from bayesrace.messages import (
-    ACTUATION,
-    EVENT,
-    STATE,
-    TELEMETRY,
-    TRUTH,
+    HEARTBEAT,
+    TOPICS,
     Actuation,
+    CarSample,
     Event,
     State,
     Telemetry,
@@ -37,12 +36,12 @@ __all__ = ["RUN_EVENT", "PlannedRun", "Recording", "RunRecord", "read_recording"
 Floats = NDArray[np.float64]
 
 RUN_EVENT: Final = "run"
-"""Kind of the event with which the race announces a run, before it starts."""
+"""Kind of the event that announces a run of a race before it starts."""
 
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """Who drives which run: the data of a ``kind="run"`` event from the race."""
+    """The controller of a run: the data of a ``kind="run"`` event from the race."""
 
     run: int
     controller: str
@@ -70,9 +69,19 @@ class RunRecord(Trajectory):
     telemetry: list[Telemetry] = field(default_factory=list)
     events: list[Event] = field(default_factory=list)
 
+    def add(self, message: Any) -> None:
+        """Appends a message, unless it repeats the last sample, as after a fault of the plant."""
+        lists: dict[type, list[Any]] = {
+            State: self.states, Truth: self.truth, Actuation: self.actuations,
+            Telemetry: self.telemetry, Event: self.events,
+        }  # fmt: skip
+        found = lists[type(message)]
+        if not (isinstance(message, CarSample) and found and found[-1].time_s == message.time_s):
+            found.append(message)
+
     @cached_property
     def solve_us(self) -> Floats:
-        """Execution times of the controller's steps."""
+        """Execution times of the controller's steps [us]."""
         return np.array([message.solve_us for message in self.telemetry], dtype=np.float64)
 
     @property
@@ -93,8 +102,8 @@ class RunRecord(Trajectory):
 
     @property
     def gaps(self) -> int:
-        """Messages missing by their numbers, states missing at the beginning, and states whose
-        truth is missing."""
+        """Number of messages missing in the numbering, of states missing at the beginning, and of
+        states without their truth."""
         streams: tuple[Sequence[Any], ...] = (self.states, self.actuations, self.telemetry)
         missing = sum(_missing(message.seq for message in stream) for stream in streams)
         missing += len({one.seq for one in self.states} - {one.seq for one in self.truth})
@@ -105,26 +114,21 @@ class RunRecord(Trajectory):
 
     @property
     def ended(self) -> str:
-        """Why the run ended, in the plant's words, or what the log tells without them."""
+        """Why the run ended: the text of the plant's event, or where the log ends without one."""
         for event in reversed(self.events):
             if event.source == "plant" and event.kind == "run_ended":
                 return event.text
         if not self.states:
             return "the run never started"
         return (
-            f"the log ends {self.states[-1].time_s:.2f} s into the run without a word from the "
-            "plant: it was killed, or the race was"
+            f"the log ends {self.states[-1].time_s:.2f} s into the run, before the plant reported "
+            "its end: the plant or the race was killed"
         )
 
 
 def _missing(numbers: Iterable[int]) -> int:
-    gaps, last = 0, None
-    for number in numbers:
-        # A number that falls is a process that began again, not a loss.
-        if last is not None and number > last:
-            gaps += number - last - 1
-        last = number
-    return gaps
+    # A number that falls is a process that began again, not a loss.
+    return sum(max(after - before - 1, 0) for before, after in pairwise(numbers))
 
 
 @dataclass(eq=False)
@@ -137,7 +141,7 @@ class Recording:
     line: RaceLine
     runs: list[RunRecord]
     truth: bool
-    """The log tells what was true; without, as of a real car, what was measured is taken for it."""
+    """The log holds the truth; without it, as of a real car, measurements take its place."""
     truncated: bool
     """The log ends without its end mark."""
     refused: int
@@ -155,7 +159,7 @@ class Recording:
 
     @property
     def discretisation(self) -> Discretisation:
-        """With which the controller predicted and the residual was made."""
+        """The discretisation of the controller's prediction and of the residual."""
         given = self.settings.get("discretisation")
         try:
             return PREDICTION if given is None else Discretisation.model_validate(given)
@@ -177,41 +181,24 @@ def read_recording(run_dir: Path) -> Recording:
     reader = LogReader(run_dir / "run.mcap")
     runs: dict[int, RunRecord] = {}
     started_ns: int | None = None
-    for entry in reader.messages((STATE, TRUTH, ACTUATION, TELEMETRY, EVENT)):
+    for entry in reader.messages([topic for topic in TOPICS if topic is not HEARTBEAT]):
         started_ns = entry.log_time_ns if started_ns is None else started_ns
-        _sort_in(runs, entry.message)
+        message = entry.message
+        plan = PlannedRun.from_event(message) if isinstance(message, Event) else None
+        run = message.run if plan is None else plan.run
+        record = runs.setdefault(run, RunRecord(PlannedRun(run, "", "")))
+        if plan is None:
+            record.add(message)
+        else:  # a state can overtake it, since it comes from another process
+            record.plan = plan
     planned = [record for _, record in sorted(runs.items()) if record.plan.controller]
     truth = any(record.truth for record in planned)
-    if not truth:
-        for record in planned:
-            record.truth = [_taken_for_true(state) for state in record.states]
+    for record in planned if not truth else ():
+        names = [one.name for one in fields(Truth)]
+        record.truth = [Truth(*(getattr(state, n) for n in names)) for state in record.states]
     return Recording(
         run_dir, settings, track, line, planned, truth, reader.truncated, reader.refused, started_ns
     )
-
-
-def _taken_for_true(state: State) -> Truth:
-    return Truth(*(getattr(state, one.name) for one in fields(Truth)))
-
-
-def _sort_in(runs: dict[int, RunRecord], message: Any) -> None:
-    plan = PlannedRun.from_event(message) if isinstance(message, Event) else None
-    if plan is not None:
-        # A state can overtake the announcement, which comes from another process.
-        runs.setdefault(plan.run, RunRecord(plan)).plan = plan
-        return
-    record = runs.setdefault(message.run, RunRecord(PlannedRun(message.run, "", "")))
-    if isinstance(message, State | Truth):
-        samples: list[Any] = record.states if isinstance(message, State) else record.truth
-        # A fault of the plant repeats the last sample: no time has passed.
-        if not (samples and message.time_s == samples[-1].time_s):
-            samples.append(message)
-    elif isinstance(message, Actuation):
-        record.actuations.append(message)
-    elif isinstance(message, Telemetry):
-        record.telemetry.append(message)
-    else:
-        record.events.append(message)
 
 
 def _read_settings(path: Path) -> dict[str, Any]:

@@ -1,15 +1,17 @@
-"""A race's outcome on the terminal."""
+"""The result of a race on the terminal, legible from 80 columns on."""
 
+import re
 from collections.abc import Callable
-from typing import Final, Literal, NamedTuple
+from typing import Final, NamedTuple
 
-from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from bayesrace.gp.weights import UNITS
 from experiments.published import SOURCE, compare_gp, compare_laps
-from experiments.results import GpMetrics, LapResult, RaceResult
+from experiments.results import LapResult, RaceResult
+from experiments.terminal import plain_table
 
 __all__ = ["COLUMNS", "Column", "print_table"]
 
@@ -44,60 +46,47 @@ def _excursion(lap: LapResult) -> str:
 
 
 COLUMNS: Final = (
-    Column("controller", "", lambda lap: lap.controller, "who drove", number=False),
+    Column("controller", "", lambda lap: lap.controller, "name of the controller", number=False),
+    Column("lap", "s", _first_lap, "first lap, from standstill; DNF: did not finish one"),
+    Column("flying", "s", lambda lap: _decimals(lap.flying_lap_time_s, 3), "best later lap"),
     Column(
-        "weights",
-        "",
-        lambda lap: lap.weights_version or "–",
-        "version of the residual's weights",
-        number=False,
+        "off track", "", lambda lap: str(lap.off_track_samples),
+        "samples with the centre of gravity off the track",
     ),
-    Column("lap", "s", _first_lap, "first lap, from standstill; DNF: none finished"),
+    Column("deepest", "m", _excursion, "largest distance off the track"),
     Column(
-        "flying",
-        "s",
-        lambda lap: _decimals(lap.flying_lap_time_s, 3),
-        "best of the laps after the first",
-    ),
-    Column(
-        "off", "", lambda lap: str(lap.off_track_samples), "samples with the centre of gravity off"
-    ),
-    Column("deepest", "m", _excursion, "deepest excursion"),
-    Column(
-        "dev ø",
-        "m",
-        lambda lap: _decimals(lap.deviation_mean_m, 3),
+        "dev mean", "m", lambda lap: _decimals(lap.deviation_mean_m, 3),
         "mean distance from the racing line",
     ),
     Column(
-        "dev max",
-        "m",
-        lambda lap: _decimals(lap.deviation_max_m, 3),
+        "dev max", "m", lambda lap: _decimals(lap.deviation_max_m, 3),
         "largest distance from the racing line",
     ),
-    Column("p50", "µs", _solve("p50"), "median execution time of the controller's step"),
-    Column("p99", "µs", _solve("p99"), "99th percentile of the same"),
-    Column("max", "µs", _solve("max"), "largest of the same"),
-    Column("fb", "", lambda lap: str(lap.fallbacks), "cycles that the fallback drove"),
-)
+    Column("step p50", "µs", _solve("p50"), "median execution time of the control step"),
+    Column("step p99", "µs", _solve("p99"), "99th percentile of the same"),
+    Column("step max", "µs", _solve("max"), "largest of the same"),
+    Column("fall-backs", "", lambda lap: str(lap.fallbacks), "cycles that the fallback drove"),
+    Column(
+        "weights", "", lambda lap: lap.weights_version or "–",
+        "version of the residual's weights", number=False,
+    ),
+)  # fmt: skip
 """The result table's columns; the report shows the same cells."""
 
 
 def _gp_table(result: RaceResult) -> Table:
-    """One row the GPs, one column an output: RMSE with and without the GP, R², coverage."""
-    table = Table(box=box.SIMPLE_HEAD, padding=0, pad_edge=False)
-    table.add_column("GP")
+    """One row an output and weights: RMSE with and without the GP, R², coverage."""
+    table = plain_table("output", "GP of", "RMSE", "without GP", "R²", "95 % coverage", left=2)
     for output in result.gp or result.gp_updated:
-        table.add_column(f"{output} RMSE (raw) R² cover", justify="right", overflow="fold")
-    for name, metrics in (("bayesrace", result.gp), ("updated", result.gp_updated)):
-        if metrics:
-            table.add_row(name, *(_gp_cell(item) for item in metrics.values()))
+        name = f"{output} {UNITS[output]}"
+        for weights, metrics in (("bayesrace", result.gp), ("updated", result.gp_updated)):
+            if one := metrics.get(output):
+                table.add_row(
+                    name, weights, f"{one.rmse:.3g}", f"{one.uncorrected_rmse:.3g}",
+                    f"{one.r2:.4f}", f"{one.coverage:.3f}",
+                )  # fmt: skip
+                name = ""
     return table
-
-
-def _gp_cell(metrics: GpMetrics) -> str:
-    errors = f"{metrics.rmse:.3g} ({metrics.uncorrected_rmse:.3g})"
-    return f"{errors} {metrics.r2:.3f} {metrics.coverage:.2f}"
 
 
 def print_table(result: RaceResult, console: Console) -> None:
@@ -112,20 +101,23 @@ def print_table(result: RaceResult, console: Console) -> None:
             style="bold",
         )
     )
-    table = Table(box=box.SIMPLE_HEAD, padding=0, pad_edge=False)
-    for column in COLUMNS:
-        # Where the terminal is narrow, names wrap: numbers are never cut.
-        justify: Literal["left", "right"] = "right" if column.number else "left"
-        table.add_column(
-            f"{column.title}\n{column.unit}",
-            justify=justify,
-            no_wrap=column.number,
-            overflow="fold",
-        )
+    columns = [column for column in COLUMNS if column.title != "weights"]
+    heads = ("\n".join([*re.split("(?<=-)| ", c.title), c.unit]).rstrip() for c in columns)
+    table = plain_table(*heads, padding=0)
     for lap in result.laps:
         style = "" if lap.finished else "red"
-        table.add_row(*(Text(column.cell(lap)) for column in COLUMNS), style=style)
+        table.add_row(*(Text(column.cell(lap)) for column in columns), style=style)
     console.print(table)
+    console.print(
+        Text(
+            "lap: first, from standstill; off track: samples, and the deepest; dev: distance from "
+            "the racing line; step: time of a control step; fall-backs: cycles",
+            style="dim",
+        )
+    )
+    for lap in result.laps:
+        if lap.weights_version:
+            console.print(Text(f"{lap.controller}: weights {lap.weights_version}"))
     _print_notes(result, console)
 
 
@@ -134,21 +126,17 @@ def _print_published(result: RaceResult, console: Console) -> None:
     laps, outputs = compare_laps(result), compare_gp(result)
     if not laps:
         return
-    console.print(Text(f"Beside the paper ({SOURCE})"))
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False)
-    table.add_column("controller")
-    for title in ("paper\nlap s", "here\nlap s", "paper\noff / m", "here\noff / m"):
-        table.add_column(title, justify="right", no_wrap=True)
+    console.print(Text(f"\nBeside the paper ({SOURCE})"))
+    table = plain_table(
+        "controller", "paper\nlap s", "here\nlap s", "paper\noff track / m", "here\noff track / m"
+    )
     for lap in laps:
         table.add_row(lap.controller, lap.paper_lap, lap.our_lap, lap.paper_off, lap.our_off)
     console.print(table)
     if not outputs:
         return
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False)
-    table.add_column("GP")
-    table.add_column("weights")
-    for title in ("paper\nRMSE (raw) · R²", "here\nRMSE (raw) · R²"):
-        table.add_column(title, justify="right", no_wrap=True)
+    rmse = "RMSE (without GP) · R²"
+    table = plain_table("output", "GP of", f"paper\n{rmse}", f"here\n{rmse}", left=2)
     for row in outputs:
         table.add_row(row.output, "bayesrace", row.paper, row.ours)
         table.add_row("", "updated", row.paper_updated, row.ours_updated)
@@ -157,7 +145,7 @@ def _print_published(result: RaceResult, console: Console) -> None:
 
 def _print_notes(result: RaceResult, console: Console) -> None:
     if result.gp or result.gp_updated:
-        console.print(_gp_table(result))
+        console.print(_gp_table(result), new_line_start=True)
     _print_published(result, console)
     if result.real_time_factor is not None:
         console.print(Text(f"lockstep at {result.real_time_factor:.1f} × real time"))
@@ -168,7 +156,7 @@ def _print_notes(result: RaceResult, console: Console) -> None:
             text = f"{lap.controller} finished {count} of {result.settings.laps} laps: {lap.ended}"
             console.print(Text(text, style="yellow"))
     if result.judged_by == "measurement":
-        text = "the log holds no truth: laps and GPs are judged by what was measured"
+        text = "the log holds no truth: laps and GPs are judged by the measurements"
         console.print(Text(text, style="yellow"))
     if not result.complete:
         lost = (

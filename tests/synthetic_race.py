@@ -113,6 +113,8 @@ class _Log:
             self.put("state", State(*sample, tuple(seen), u, 0, drive.lockstep, (), final))
             if self._truth:
                 self.put("truth", Truth(*sample, tuple(x), u, 0))
+            if k % 10 == 0:
+                self._writer.flush()  # as a recorder does
             if final:
                 break
             actuation = self.seq("actuation")

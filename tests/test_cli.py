@@ -49,9 +49,13 @@ def course(circuit: Circuit, tmp_path: Path) -> tuple[str | Path, ...]:
 
 
 @pytest.mark.parametrize("name", ["", *SUBCOMMANDS])
-def test_help_reads_well(cli: Cli, name: str) -> None:
-    outcome = cli(*name.split(), "--help")
+def test_help_reads_well(cli: Cli, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a terminal of 80 columns nothing is cut, neither texts nor defaults."""
+    monkeypatch.setenv("COLUMNS", "80")
+    outcome = cli(*name.split(), "-h")
     assert outcome.code == 0
+    assert "…" not in outcome.out
+    assert max(map(len, outcome.out.splitlines())) <= 80
     assert "Usage: bayesrace" in outcome.out
     # what only our own processes say to each other, and Python's own words
     for internal in ("parent-pid", "parent_pid", "None", "typer", "Traceback", "TODO"):
@@ -59,6 +63,9 @@ def test_help_reads_well(cli: Cli, name: str) -> None:
     assert "--help" in outcome.out
     if not name:
         assert all(command.split()[0] in outcome.out for command in SUBCOMMANDS)
+        tasks = ("Race", "Prepare", "Drive", "Learn while driving", "Measure", "Export to other")
+        assert all(f"─ {task}" in outcome.out for task in tasks)
+        assert "--install-completion" in outcome.out
 
 
 def test_every_option_says_what_it_is(cli: Cli) -> None:

@@ -65,6 +65,16 @@ def _valid(value: Any, schema: dict[str, Any]) -> bool:
                 and schema["minItems"] <= len(value) <= schema["maxItems"]
                 and all(_valid(number, schema["items"]) for number in value)
             )
+        case "object" if schema["properties"]:  # a vector whose numbers have names in JSON
+            columns = list(schema["properties"].values())
+            number = columns[0].get("items", columns[0])
+            rows = columns[0].get("maxItems", 1)
+            whole = type(value) is tuple and len(value) % len(columns) == 0
+            return (
+                whole
+                and len(value) <= rows * len(columns)
+                and all(_valid(one, number) for one in value)
+            )
         case "object":
             return len(value) <= schema["maxProperties"] and all(
                 type(name) is str

@@ -22,7 +22,7 @@ from bayesrace.log import LogReader
 from bayesrace.messages import STATE, TELEMETRY, State, Truth
 from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
 from bayesrace.vehicles import get_car
-from experiments.recording import PlannedRun, RunRecord, _sort_in
+from experiments.recording import PlannedRun, RunRecord
 from learning.logs import dataset_from_messages
 from tests import programs
 from tests.car_fmu import Version, packed_car
@@ -238,12 +238,9 @@ def test_a_repeated_last_state_is_no_gap_and_no_sample() -> None:
 
     states = [state(0, 0.0), state(1, 0.02), state(2, 0.04), state(3, 0.04, final=True)]
     record = RunRecord(PlannedRun(1, "a controller", ""))
-    runs = {1: record}
     for message in states:
-        _sort_in(runs, message)
-        _sort_in(
-            runs, Truth(message.seq, message.seq, 1, 1, message.time_s, message.x, (0.1, 0.0), 0)
-        )
+        record.add(message)
+        record.add(Truth(message.seq, message.seq, 1, 1, message.time_s, message.x, (0.1, 0.0), 0))
     assert [one.seq for one in record.states] == [one.seq for one in record.truth] == [0, 1, 2]
     assert record.gaps == 0
     data = dataset_from_messages(states, [], get_car("orca"), 0.02)

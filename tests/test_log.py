@@ -1,6 +1,7 @@
 """The log's promise: complete, typed, and readable up to the last second whatever happened."""
 
 import errno
+import json
 import subprocess
 import sys
 import threading
@@ -19,8 +20,9 @@ from bayesrace.messages import EVENT, HEARTBEAT, STATE, Event, State, Status, en
 from bayesrace.recorder import Recorder
 from bayesrace.transport import Endpoints, Inbox, Publisher, free_endpoint, open_session
 from tests.programs import ROOT, until
+from tests.test_messages import conforms
 
-KEY = "bayesrace/orca/state"
+KEY, EVENT_KEY = "bayesrace/orca/state", "bayesrace/orca/event/plant"
 
 
 def state(seq: int) -> State:
@@ -32,7 +34,7 @@ def write(path: Path, count: int = 50) -> None:
     for seq in range(count):
         writer.write(KEY, encode(state(seq)), time.monotonic_ns(), seq)
     event = Event(0, 0, 1, "plant", "run_ended", "done", {"laps": 1})
-    writer.write("bayesrace/orca/event/plant", encode(event), time.monotonic_ns())
+    writer.write(EVENT_KEY, encode(event), time.monotonic_ns())
     writer.write(KEY, b"junk", time.monotonic_ns())
     writer.write("bayesrace/orca/unknown", b"junk", time.monotonic_ns())
     writer.add_metadata("manifest", {"scheme": "rk4"})
@@ -44,7 +46,7 @@ def test_a_log_gives_back_typed_messages_and_metadata(tmp_path: Path) -> None:
     log = LogReader(tmp_path / "log.mcap")
     entries = list(log.messages())
     assert [entry.message for entry in entries[:50]] == [state(seq) for seq in range(50)]
-    assert entries[50].key == "bayesrace/orca/event/plant"
+    assert entries[50].key == EVENT_KEY
     assert log.select(EVENT)[0].data == {"laps": 1}
     assert log.metadata() == {"settings": {"track": "ethz"}, "manifest": {"scheme": "rk4"}}
     assert not log.truncated
@@ -54,34 +56,53 @@ def test_a_log_gives_back_typed_messages_and_metadata(tmp_path: Path) -> None:
     assert abs(entries[0].log_time_ns - time.time_ns()) < 60e9
 
 
-def test_other_mcap_tools_can_read_it(tmp_path: Path) -> None:
+def test_other_mcap_tools_read_json_with_schemas_and_an_index(tmp_path: Path) -> None:
+    """With the mcap package alone: what viewers such as Foxglove need, they find."""
     write(tmp_path / "log.mcap")
     with (tmp_path / "log.mcap").open("rb") as file:
-        summary = make_reader(file).get_summary()
+        reader = make_reader(file)
+        summary = reader.get_summary()
+        first = {c.topic: (s, c, m) for s, c, m in reversed(list(reader.iter_messages()))}
+        late = [m.sequence for _, _, m in reader.iter_messages([KEY], reverse=True)]
     assert summary is not None
     assert summary.statistics is not None
     assert summary.statistics.message_count == 53
-    assert {s.name: s.encoding for s in summary.schemas.values()} == {
-        "State": "jsonschema",
-        "Event": "jsonschema",
-    }
-    assert {c.message_encoding for c in summary.channels.values()} == {"msgpack"}
+    assert summary.chunk_indexes
+    assert {index.compression for index in summary.chunk_indexes} == {"zstd"}
+    assert late[1:4] == [49, 48, 47]
+    encodings = {(c.topic, c.message_encoding) for c in summary.channels.values()}
+    unknown = "bayesrace/orca/unknown"
+    assert encodings == {(KEY, "json"), (EVENT_KEY, "json"), (KEY, "msgpack"), (unknown, "msgpack")}
+    for key, title in ((KEY, "State"), (EVENT_KEY, "Event")):
+        schema, channel, message = first[key]
+        assert channel.message_encoding == "json"
+        assert schema is not None
+        assert (schema.name, schema.encoding) == (title, "jsonschema")
+        assert conforms(json.loads(message.data), json.loads(schema.data))
+    assert json.loads(first[KEY][2].data)["x"] == dict.fromkeys(
+        ("x", "y", "psi", "vx", "vy", "omega", "delta"), 0.0
+    )
 
 
-def test_a_log_cut_anywhere_gives_all_whole_messages(tmp_path: Path) -> None:
-    write(tmp_path / "log.mcap", 20)
-    whole = (tmp_path / "log.mcap").read_bytes()
+def test_a_log_cut_anywhere_gives_all_that_was_flushed(tmp_path: Path) -> None:
+    log = tmp_path / "log.mcap"
+    writer, flushed = LogWriter(log, {"settings": {"track": "ethz"}}), [log.stat().st_size]
+    for seq in range(20):
+        writer.write(KEY, encode(state(seq)), time.monotonic_ns(), seq)
+        writer.flush()
+        flushed.append(log.stat().st_size)
+    writer.close()
+    whole = log.read_bytes()
     cut = tmp_path / "cut.mcap"
-    seen = 0
-    for size in [*range(8, len(whole), 97), len(whole) - 1]:
+    for size in [*range(8, len(whole), 97), *flushed, len(whole) - 1]:
         cut.write_bytes(whole[:size])
-        log = LogReader(cut)
-        states = log.select(STATE)
+        reader = LogReader(cut)
+        count = sum(size >= end for end in flushed[1:])
+        # A chunk is followed by its index, which the reader does not need.
+        assert len(states := reader.select(STATE)) in (count, count + 1)
         assert states == [state(seq) for seq in range(len(states))]
-        assert len(states) >= seen
-        assert log.truncated
-        seen = len(states)
-    assert seen == 20
+        assert reader.truncated
+        assert reader.metadata() == ({"settings": {"track": "ethz"}} if size >= flushed[0] else {})
 
 
 def test_what_is_no_log_is_named(tmp_path: Path) -> None:

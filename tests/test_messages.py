@@ -1,7 +1,9 @@
 """The codec's promise: a message survives the wire unchanged, and nothing else gets through."""
 
+import json
 import logging
 import math
+from dataclasses import replace
 from typing import Any, get_type_hints
 
 import msgpack
@@ -25,7 +27,9 @@ from bayesrace.messages import (
     car_key,
     decode,
     encode,
+    from_json,
     json_schema,
+    to_json,
 )
 from bayesrace.messages.codec import largest_bytes, peek_seq
 from bayesrace.messages.rules import (
@@ -242,6 +246,78 @@ def test_keys_of_the_table_are_distinct() -> None:
     keys = [topic.key for topic in TOPICS] + [service.key for service in SERVICES]
     assert len(set(keys)) == len(keys)
     assert STOP.request is not None
+
+
+def conforms(value: Any, schema: dict[str, Any]) -> bool:
+    """Whether a value read by json has the type, properties and lengths that the schema states."""
+    match schema["type"]:
+        case "object" if schema["properties"]:
+            names = schema["properties"]
+            return value.keys() == names.keys() == set(schema["required"]) and all(
+                conforms(value[name], names[name]) for name in names
+            )
+        case "object":
+            return all(type(one) in (bool, int, float, str) for one in value.values())
+        case "array":
+            least, most = schema.get("minItems", 0), schema["maxItems"]
+            return least <= len(value) <= most and all(conforms(v, schema["items"]) for v in value)
+        case "integer" if "const" in schema:
+            return bool(value == schema["const"])
+        case "integer" | "number":
+            return type(value) in (int, float) and schema["minimum"] <= value <= schema["maximum"]
+        case "boolean":
+            return type(value) is bool
+        case "string":
+            return type(value) is str and value in schema.get("enum", [value])
+    raise AssertionError(f"viewers such as Foxglove know no type {schema['type']}")
+
+
+@settings(deadline=None)
+@given(messages())
+def test_every_message_survives_json_to_the_bit_and_is_as_its_schema_says(message: Message) -> None:
+    kind, text = type(message), to_json(type(message), encode(message))
+    assert text is not None
+    read = decode(kind, from_json(kind, text))
+    assert read == message
+    assert encode(read) == encode(message)  # -0.0 is not 0.0
+    assert conforms(json.loads(text), json_schema(kind))
+
+
+def test_json_names_the_numbers_of_states_and_inputs() -> None:
+    text = to_json(State, encode(STATE))
+    assert text is not None
+    content = json.loads(text)
+    assert content["x"] == dict(
+        zip(("x", "y", "psi", "vx", "vy", "omega", "delta"), X0, strict=True)
+    )
+    assert content["u_applied"] == {"d": 0.1, "delta_rate": 0.2}
+    assert content["answers"] == {"state_seq": [2.0], "arrival_s": [4e-4], "acting_s": [1e-3]}
+    whole = text.replace(b'"time_s":0.5', b'"time_s":2').replace(b'"psi":3.0', b'"psi":3')
+    assert decode(State, from_json(State, whole)) == replace(STATE, time_s=2.0)
+
+
+def test_what_is_not_finite_is_recorded_and_refused() -> None:
+    text = to_json(State, _changed(time_s=math.nan, u_applied=[0.0, -math.inf]))
+    assert text is not None
+    assert b'"time_s":"NaN"' in text
+    assert b'"delta_rate":"-Infinity"' in text
+    with pytest.raises(InputError, match=r"State\.time_s: expected a float, got str"):
+        decode(State, from_json(State, text))
+
+
+@pytest.mark.parametrize("changes", [{"x": [0.0] * 6}, {"x": 7}, {"extra": 1}, {"lap": ...}])
+def test_what_has_no_form_in_json_is_no_message(changes: dict[str, Any]) -> None:
+    assert to_json(State, _changed(**changes)) is None
+
+
+@settings(deadline=None)
+@given(st.sampled_from(KINDS), st.binary(max_size=100) | st.text(max_size=100).map(str.encode))
+@example(Telemetry, b"[" * 5000)
+@example(Telemetry, b'{"schema":2')
+def test_any_bytes_become_json_or_are_refused(kind: type[Message], data: bytes) -> None:
+    to_json(kind, data)
+    with pytest.raises(InputError):
+        decode(kind, from_json(kind, data))
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -1,4 +1,4 @@
-"""The report: one file, the numbers of the result, and whatever the race left, something to see."""
+"""The report: one file with the numbers of the result, from whatever a race has left."""
 
 import re
 from html.parser import HTMLParser
@@ -12,7 +12,7 @@ from experiments.published import compare_gp, compare_laps
 from experiments.report import render_report
 from experiments.results import RaceResult
 from experiments.table import COLUMNS
-from tests.synthetic_race import Drive, circle, write_race
+from tests.synthetic_race import LAP_S, Drive, circle, write_race
 from tests.test_analysis import TWO_LAPS, race
 
 
@@ -65,7 +65,8 @@ def test_the_page_needs_nothing_but_itself(rendered: tuple[Path, RaceResult]) ->
     assert not re.search(r"""(src|href)\s*=\s*["'](?!#|data:)""", text)
     assert not re.search(r"@import|url\(\s*[\"']?(?!#|data:)", text)
     assert "script" not in parse(rendered[0]).tags
-    assert text.count("<svg ") == 6
+    # Maps, time, speed, inputs, deviation, GPs, execution times.
+    assert text.count("<svg ") == 4 + 2 + 2 + 3 + 2 + 6 + 1
     assert str(rendered[0].parent) not in text
 
 
@@ -131,14 +132,40 @@ def test_names_from_files_are_text_not_markup(tmp_path: Path) -> None:
     assert "script" not in tags
 
 
+def test_time_lost_along_the_track_is_known(tmp_path: Path) -> None:
+    """A car that is 1 % slower everywhere loses evenly."""
+    from experiments.report.laps import first_laps, reference_of
+
+    drives = [
+        Drive("bayesrace", circle(TWO_LAPS / 1.01, 1.0)),
+        Drive("bestcase", circle(TWO_LAPS, 1.0)),
+    ]
+    analysis = read_race(write_race(tmp_path, drives))
+    slower, best = first_laps(analysis.runs, analysis.track)
+    assert reference_of([slower, best]) is best
+    s, behind_s = slower.behind(best)
+    expected_s = 0.01 * LAP_S * s / analysis.track.length_m
+    np.testing.assert_allclose(behind_s, expected_s, atol=2e-4)
+
+
+def test_nothing_but_tables_is_wider_than_a_telephone(rendered: tuple[Path, RaceResult]) -> None:
+    text = rendered[0].read_text(encoding="utf-8")
+    assert 'name="viewport" content="width=device-width' in text
+    assert not re.search(r"<svg [^>]*(width|height)=", text)
+    for table in re.finditer("<table", text):
+        assert text[: table.start()].endswith('<div class="scroll">')
+    widths = [float(box.split()[2]) for box in re.findall(r'viewBox="([^"]*)"', text)]
+    assert max(widths) < 400  # points: at 400 pixels, a text of 9 points keeps 8 pixels or more
+
+
 def test_a_car_that_wanders_off_does_not_shrink_the_track(tmp_path: Path) -> None:
-    from experiments.report.maps import laps_on_track
+    from experiments.report.maps import LapMaps
     from experiments.report.style import figure_style
 
     far = circle(TWO_LAPS[:100], np.linspace(1.0, 50.0, 100))
     analysis = read_race(write_race(tmp_path, [Drive("worstcase", far)]))
     with figure_style():
-        figure = laps_on_track(analysis.runs, analysis.track, analysis.line)
+        figure = LapMaps(analysis.runs, analysis.track, analysis.line).picture()
     left, right = figure.axes[0].get_xlim()
     assert -1.5 < left < -1.2 < 1.2 < right < 1.5
     assert figure.axes[0].get_aspect() == 1.0

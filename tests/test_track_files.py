@@ -21,6 +21,22 @@ def rows(count: int = 12) -> list[str]:
     return [f"{np.cos(a):.6f},{np.sin(a):.6f},0.2,0.3" for a in angle]
 
 
+def swapped(lines: list[str]) -> list[str]:
+    """The same rows with left before right."""
+    cells = [line.split(",") for line in lines]
+    return [",".join([x, y, left, right]) for x, y, right, left in cells]
+
+
+def scaled(factor: float, widths: float | None = None, count: int = 80) -> list[str]:
+    """A circle of radius 3, .2 right and .3 left, in another unit; the widths in theirs."""
+    factors = np.array([factor, factor, *[factor if widths is None else widths] * 2])
+    angle = np.arange(count) * (2 * np.pi / count)
+    return [
+        ",".join(f"{value:.6f}" for value in factors * (3 * np.cos(a), 3 * np.sin(a), 0.2, 0.3))
+        for a in angle
+    ]
+
+
 def written(folder: Path, lines: list[str]) -> Path:
     path = folder / "loop.csv"
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -44,10 +60,26 @@ def refusal(path: Path, **options: float) -> str:
         ["x_m,y_m,w_tr_right_m,w_tr_left_m", *rows()],
         ["# one", "", "  # two", *[row.replace(",", " , ") for row in rows()], ""],
         [HEADER, *[row.replace(",", "; ") for row in rows()]],
+        [HEADER, *[row.replace(",", "\t") for row in rows()]],
+        [HEADER, *[row.replace(",", "   ") for row in rows()]],
+        ["# x_m,y_m,w_tr_left_m,w_tr_right_m", *swapped(rows())],
+        ["x;y;width_left;width_right", *swapped(rows())],
         [*[row + "  # note" for row in rows()], rows()[0]],
         ["\ufeff" + HEADER, *rows()],
     ],
-    ids=["hash", "bare", "names", "spaces", "semicolon", "repeated", "bom"],
+    ids=[
+        "hash",
+        "bare",
+        "names",
+        "spaces",
+        "semicolon",
+        "tab",
+        "blanks",
+        "left first",
+        "other names",
+        "repeated",
+        "bom",
+    ],
 )
 def test_every_variant_gives_the_same_track(tmp_path: Path, lines: list[str]) -> None:
     track = read_track(written(tmp_path, lines))
@@ -71,7 +103,8 @@ def test_windows_line_ends_count_rows_the_same(tmp_path: Path) -> None:
     [
         ("1,2,3", "row 6: 3 columns instead of 4"),
         ("1,2,3,4,5", "row 6: 5 columns instead of 4"),
-        ("1 2 3 4", "row 6: 1 columns instead of 4"),
+        ("1", "row 6: 1 column instead of 4"),
+        ("1;2", "separated by commas, semicolons, tabs or spaces"),
         ("1,2,abc,4", "row 6: 'abc' is not a number"),
         ("1,2,,4", "row 6: '' is not a number"),
         ("1,nan,.2,.3", "row 6: a value is not finite"),
@@ -92,6 +125,47 @@ def test_the_car_decides_how_wide_a_track_must_be(tmp_path: Path) -> None:
     path = written(tmp_path, [HEADER, *rows()])
     assert "0.5 m wide, the car 0.6 m" in refusal(path, car_width_m=0.6)
     read_track(path, car_width_m=0.4)
+
+
+@pytest.mark.parametrize(
+    ("factors", "car_width_m", "size", "unit"),
+    [
+        ((1000, None), 0.05, "500 m wide, 10000 times the car", "in millimetres; divide them by"),
+        ((100, None), 0.05, "50 m wide, 1000 times the car", "in centimetres; divide them by"),
+        ((1000, None), None, "m long and 500 m wide", "in millimetres or centimetres; give"),
+        ((100, None), None, "1861 m long and 50 m wide", "in centimetres; give them in metres"),
+        ((20000, 1), 0.05, "0.5 m wide", "x, y and the widths probably have different units"),
+    ],
+)
+def test_a_track_in_another_unit_is_refused_with_its_likely_unit(
+    tmp_path: Path,
+    factors: tuple[float, float | None],
+    car_width_m: float | None,
+    size: str,
+    unit: str,
+) -> None:
+    path = written(tmp_path, [HEADER, *scaled(*factors)])
+    with pytest.raises(InputError, match=f"{size}; .*{unit}"):
+        read_track(path, car_width_m)
+    read_track(path, car_width_m=0.0)
+
+
+def test_tracks_of_all_scales_are_plausible(tmp_path: Path) -> None:
+    for factor, car_width_m in ((1, 0.05), (4, 0.2), (24, 1.9), (24, None), (0.5, None)):
+        read_track(written(tmp_path, scaled(factor)), car_width_m)
+
+
+def test_a_header_in_other_units_is_refused(tmp_path: Path) -> None:
+    path = written(tmp_path, ["# x_mm,y_mm,w_tr_right_mm,w_tr_left_mm", *rows()])
+    assert "row 1: the header names 'x_mm' where 'x_m' is expected" in refusal(path)
+
+
+@pytest.mark.parametrize("share", [0.5, 0.8])
+def test_a_part_of_a_track_is_not_closed(tmp_path: Path, share: float) -> None:
+    lines = scaled(1.0, count=100)
+    message = refusal(written(tmp_path, lines[: round(share * 100)]))
+    assert "the centreline is not closed: the last point is" in message
+    assert "other neighbours at most 0.188 m" in message
 
 
 def test_duplicates_name_both_rows_but_the_closing_point_is_none(tmp_path: Path) -> None:

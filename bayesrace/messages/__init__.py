@@ -1,10 +1,11 @@
 """Messages between processes.
 
 ``rules`` checks one field, ``types`` has the message classes, ``table`` the topics and services,
-``codec`` turns messages into bytes and refuses everything else.
+``codec`` turns messages into bytes and refuses everything else, ``json_form`` into JSON for logs.
 """
 
-from bayesrace.messages.codec import Decoder, decode, encode, json_schema
+from bayesrace.messages.codec import Decoder, decode, encode
+from bayesrace.messages.json_form import from_json, json_schema, to_json
 from bayesrace.messages.rules import Scalar
 from bayesrace.messages.table import (
     ACTUATION,
@@ -51,5 +52,5 @@ __all__ = [
     "CarSample", "Command", "Decoder", "Event", "Message", "Qos",
     "Reply", "RollbackRequest", "RunRequest", "Scalar", "Service", "State", "Status",
     "StatusRequest", "StopRequest", "Telemetry", "Topic", "Truth", "car_key", "decode", "encode",
-    "is_car_name", "json_schema",
+    "from_json", "is_car_name", "json_schema", "to_json",
 ]  # fmt: skip

@@ -16,10 +16,10 @@ from typing import Any, Final, Generic, TypeVar, get_args, get_type_hints
 import msgpack
 
 from bayesrace.errors import InputError
-from bayesrace.messages.rules import Integer, Rule, Scalars, Text, Vector, rule_schema, wire_bytes
+from bayesrace.messages.rules import Integer, Rule, Scalars, Text, Vector, wire_bytes
 from bayesrace.messages.types import Message
 
-__all__ = ["Decoder", "decode", "encode", "json_schema", "largest_bytes", "peek_seq"]
+__all__ = ["Decoder", "decode", "encode", "largest_bytes", "peek_seq"]
 
 M = TypeVar("M", bound=Message)
 
@@ -139,20 +139,6 @@ def decode(kind: type[M], data: bytes) -> M:
 def largest_bytes(kind: type[Message]) -> int:
     """Most bytes of a valid message of class ``kind``; longer input is refused unread."""
     return _SPECS[kind].wire_bytes
-
-
-def json_schema(kind: type[Message]) -> dict[str, Any]:
-    """JSON schema of the map on the wire, for logs that other tools read."""
-    properties: dict[str, Any] = {"schema": {"const": kind.SCHEMA}}
-    properties |= {name: rule_schema(rule) for name, rule in _SPECS[kind].rules.items()}
-    return {
-        "title": kind.__name__,
-        "description": (kind.__doc__ or "").split("\n")[0],
-        "type": "object",
-        "properties": properties,
-        "required": list(properties),
-        "additionalProperties": False,
-    }
 
 
 class Decoder(Generic[M]):

@@ -13,7 +13,7 @@ from typing import Any
 
 __all__ = [
     "Choice", "Flag", "Integer", "Real", "Rule", "Scalar", "Scalars", "Text", "Vector",
-    "rule_schema", "wire_bytes",
+    "wire_bytes",
 ]  # fmt: skip
 
 Scalar = bool | int | float | str
@@ -99,11 +99,13 @@ class Vector:
     """Finite floats, each within [-limit, limit].
 
     Exactly ``length`` of them; or, with ``rows``, any whole number of rows up to that many.
+    ``names`` of the numbers (of a row) are for JSON, where an array without names stays one.
     """
 
     length: int
     limit: float = 1e6
     rows: int | None = None
+    names: tuple[str, ...] = ()
 
     def check(self, value: Any) -> tuple[float, ...]:
         """The numbers; ValueError if one is no float in range, or their count is wrong."""
@@ -180,24 +182,3 @@ def wire_bytes(rule: Rule) -> int:
         case Scalars(most, characters):
             entries = most * (_HEAD_BYTES + _NUMBER_BYTES)
             return _HEAD_BYTES + entries + _CHARACTER_BYTES * characters
-
-
-def rule_schema(rule: Rule) -> dict[str, Any]:
-    """The rule as JSON schema, for logs that other tools read."""
-    match rule:
-        case Integer(low, high):
-            return {"type": "integer", "minimum": low, "maximum": high}
-        case Real(least, largest):
-            return {"type": "number", "minimum": least, "maximum": largest}
-        case Flag():
-            return {"type": "boolean"}
-        case Text(longest):
-            return {"type": "string", "maxLength": longest}
-        case Choice(words):
-            return {"type": "string", "enum": list(words)}
-        case Vector(length, limit, rows):
-            numbers = {"type": "number", "minimum": -limit, "maximum": limit}
-            fewest = length if rows is None else 0
-            return {"type": "array", "items": numbers, "minItems": fewest, "maxItems": rule.most}
-        case Scalars(most):
-            return {"type": "object", "maxProperties": most}

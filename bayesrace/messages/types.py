@@ -39,6 +39,11 @@ Short = Annotated[str, Text(200)]
 Long = Annotated[str, Text(2000)]
 DataMap = Annotated[Mapping[str, Scalar], Scalars()]
 
+_CAR_STATE: Final = ("x", "y", "psi", "vx", "vy", "omega", "delta")
+_INPUT: Final = ("d", "delta_rate")
+CarState = Annotated[tuple[float, ...], Vector(7, names=_CAR_STATE)]
+Input = Annotated[tuple[float, ...], Vector(2, names=_INPUT)]
+
 
 @dataclass(frozen=True, slots=True)
 class Message:
@@ -63,9 +68,9 @@ class CarSample(Message):
     """Number of the run, from its request; it separates the messages of consecutive runs."""
     time_s: Seconds
     """Plant time since the start of the run."""
-    x: Annotated[tuple[float, ...], Vector(7)]
+    x: CarState
     """x, y [m], psi [rad, unwrapped], vx, vy [m/s], omega [rad/s], delta [rad]."""
-    u_applied: Annotated[tuple[float, ...], Vector(2)]
+    u_applied: Input
     """d [-] and delta_rate [rad/s] applied during the previous period; zeros at the start."""
     lap: Signed
     """Start-line crossings so far, forwards minus backwards."""
@@ -80,7 +85,10 @@ class State(CarSample):
 
     lockstep: Annotated[bool, Flag()]
     """True if the plant waits for the actuation that answers this very message."""
-    answers: Annotated[tuple[float, ...], Vector(3, limit=1e15, rows=64)]
+    answers: Annotated[
+        tuple[float, ...],
+        Vector(3, limit=1e15, rows=64, names=("state_seq", "arrival_s", "acting_s")),
+    ]
     """Actuations received since the previous state, row by row: ``seq`` of the state that each
     answers, time from that state to the actuation's arrival [s], and from its ``basis_s`` to its
     application [s] (-1: superseded, never applied). Empty in lockstep."""
@@ -108,7 +116,7 @@ class Actuation(Message):
     basis_s: Seconds
     """Plant time for which the controller took the state as known: ``time_s`` of the state, plus
     the time since its arrival if the state is not new."""
-    u: Annotated[tuple[float, ...], Vector(2, limit=1e3)]
+    u: Annotated[tuple[float, ...], Vector(2, limit=1e3, names=_INPUT)]
     """d [-], delta_rate [rad/s]; the plant applies the car's own, narrower limits."""
     weights_version: Short
     """Version of the GP weights in use; empty without any."""
@@ -147,9 +155,9 @@ class Telemetry(Message):
     """Encoding and sending the actuation."""
     delay_s: Annotated[float, Real(0.0, 1e3)]
     """Delay from ``basis_s`` to application that the state is predicted over; 0 without."""
-    plan_x: Annotated[tuple[float, ...], Vector(7, rows=501)]
+    plan_x: Annotated[tuple[float, ...], Vector(7, rows=501, names=_CAR_STATE)]
     """Predicted states row by row, N + 1 rows of 7; empty without a prediction."""
-    plan_u: Annotated[tuple[float, ...], Vector(2, rows=500)]
+    plan_u: Annotated[tuple[float, ...], Vector(2, rows=500, names=_INPUT)]
     """Planned inputs row by row, N rows of 2."""
     residual_dynamics: Annotated[float, Real(-1.0, 1e12)]
     """Largest dynamics defect of the plan; -1: unknown or not finite (as below)."""
@@ -189,7 +197,7 @@ class RunRequest(Message):
     run: Count
     lockstep: Annotated[bool, Flag()]
     """True: the plant advances only on the matching actuation; False: in real time."""
-    x0: Annotated[tuple[float, ...], Vector(7)]
+    x0: CarState
     """Start state, as in :class:`State`."""
     line_x_m: Metre
     line_y_m: Metre

@@ -1,4 +1,4 @@
-"""What makes a list of points a track, and which point breaks it."""
+"""Checks that a list of points is a track in metres; each names the point at fault."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,12 +8,21 @@ import numpy.typing as npt
 
 from bayesrace.tracks.spline import FloatArray
 
-__all__ = ["MIN_POINTS", "Fault", "clearance_m", "find_crossing", "find_fault"]
+__all__ = ["MIN_POINTS", "Fault", "clearance_m", "find_crossing", "find_fault", "find_scale_fault"]
 
 MIN_POINTS = 8
 """Fewer points don't describe a circuit: the spline through them would be a guess."""
 
 _DUPLICATE_M = 1e-6
+_OPEN = 4.0
+"""A gap between the last and the first point of more than this many times the longest other one."""
+_MOST_CARS, _USUAL_CARS = 100.0, 7.0
+"""Cars side by side on the widest plausible track, and on a usual one of any scale."""
+_WIDEST_M, _NARROWEST_M = 25.0, 0.15
+"""Plausible widths of tracks, from 1:43 to full scale."""
+_MOST_WIDTHS = 10_000.0
+"""Length of the longest plausible track over its width; the Nordschleife has 2,300."""
+_UNITS = {"millimetres": 1e3, "centimetres": 1e2}
 _CHUNK = 512
 
 
@@ -79,6 +88,13 @@ def _find_width_fault(right: FloatArray, left: FloatArray, min_width_m: float) -
 def _find_shape_fault(points: FloatArray) -> Fault | None:
     edge = np.roll(points, -1, axis=0) - points
     length = np.linalg.norm(edge, axis=1)
+    if length[-1] > _OPEN * length[:-1].max():
+        return Fault(
+            None,
+            f"the centreline is not closed: the last point is {length[-1]:.3g} m from the first, "
+            f"other neighbours at most {length[:-1].max():.3g} m",
+            "give the whole lap, up to the point before the first one",
+        )
     if (length < _DUPLICATE_M).any():
         first = int(np.argmax(length < _DUPLICATE_M))
         second = (first + 1) % len(points)
@@ -100,6 +116,37 @@ def _find_shape_fault(points: FloatArray) -> Fault | None:
             other=crossing[0],
         )
     return None
+
+
+def find_scale_fault(
+    points: FloatArray, right: FloatArray, left: FloatArray, car_width_m: float | None
+) -> Fault | None:
+    """Sizes of a track (n, 2), (n,) that fit no track in metres; None if they are plausible.
+
+    Compares the median width with the car's; ``car_width_m`` None: with tracks of any scale.
+    """
+    width_m = float(np.median(right + left))
+    length_m = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+    size = f"the track is {length_m:.0f} m long and {width_m:.3g} m wide"
+    if length_m > _MOST_WIDTHS * width_m:
+        remedy = "x, y and the widths probably have different units; give all of them in metres"
+        return Fault(None, size, remedy)
+    if width_m <= (_WIDEST_M if car_width_m is None else _MOST_CARS * car_width_m):
+        return None
+    if car_width_m is None:
+        units = [name for name, by in _UNITS.items() if _NARROWEST_M < width_m / by < _WIDEST_M]
+        return Fault(
+            None, size, f"the values are probably in {' or '.join(units) or 'another unit'}; "
+            "give them in metres",
+        )  # fmt: skip
+    cars = width_m / car_width_m
+    unit = min(_UNITS, key=lambda name: abs(np.log(cars / _UNITS[name] / _USUAL_CARS)))
+    return Fault(
+        None,
+        f"{size}, {cars:.0f} times the car",
+        f"the values are probably in {unit}; divide them by {_UNITS[unit]:.0f}, or choose a car "
+        "of the track's scale",
+    )
 
 
 def find_crossing(points: FloatArray) -> tuple[int, int] | None:

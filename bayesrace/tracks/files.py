@@ -1,8 +1,8 @@
 """Tracks as CSV files: ``x_m, y_m, w_tr_right_m, w_tr_left_m``, one row per centreline point.
 
-The form the TUM and F1TENTH communities use. Lines starting with # are comments; a first line of
-column names without # is accepted; comma or semicolon; spaces anywhere; the first point may be
-repeated at the end.
+The form the TUM and F1TENTH communities use. Columns are separated by commas, semicolons, tabs or
+spaces; what follows a # is a comment. A first line of column names, with or without #, gives the
+order of the columns. The first point may be repeated at the end.
 """
 
 from pathlib import Path
@@ -12,7 +12,7 @@ import numpy as np
 
 from bayesrace.errors import InputError
 from bayesrace.files import read_text, write_whole
-from bayesrace.tracks.checks import find_fault
+from bayesrace.tracks.checks import find_fault, find_scale_fault
 from bayesrace.tracks.spline import FloatArray
 from bayesrace.tracks.track import Track, drop_repeated
 
@@ -29,13 +29,16 @@ COLUMNS = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")
 def read_track(path: Path | str, car_width_m: float | None = None) -> Track:
     """The track in a CSV file, named after the file.
 
-    ``car_width_m``: the track must be at least as wide; default: the default car's. Raises
+    ``car_width_m``: the track must be at least as wide and of the car's scale; 0: of any scale;
+    default: at least as wide as the default car, of any scale that is usual in metres. Raises
     InputError naming file, row (line number in the file) and remedy.
     """
     path = Path(path)
     table, rows = read_table(path, COLUMNS)
     points, right, left = drop_repeated(table[:, :2], table[:, 2], table[:, 3])
     fault = find_fault(points, right, left, default_car_width_m(car_width_m))
+    if fault is None and car_width_m != 0:
+        fault = find_scale_fault(points, right, left, car_width_m)
     if fault is not None:
         raise InputError(fault.text(str(path), "row", rows))
     return Track._from_checked(path.stem, points, right, left)
@@ -61,41 +64,77 @@ def default_car_width_m(car_width_m: float | None) -> float:
 def read_table(path: Path, columns: tuple[str, ...]) -> tuple[FloatArray, list[int]]:
     """Numbers (n, len(columns)) of a CSV file and the line number of each row.
 
-    Raises InputError for a file that can't be read, a wrong column count or a cell that is no
-    number; what the numbers mean is checked by the caller.
+    A header with these names in another order is honoured. Raises InputError for a file that can't
+    be read, a header with other units, a wrong column count or a cell that is no number; what the
+    numbers mean is checked by the caller.
     """
     text = read_text(path, "the CSV file", "give an existing one, of at most 20,000 points")
     values: list[list[float]] = []
     rows: list[int] = []
+    order = list(range(len(columns)))
     for row, line in enumerate(text.splitlines(), start=1):
+        if not rows and (header := _header(path, row, line, columns)):
+            order = header
+            continue
         content = line.split("#", 1)[0].strip()
         if not content:
-            continue
-        cells = [cell.strip() for cell in content.split(";" if ";" in content else ",")]
-        if not rows and tuple(cells) == columns:
             continue
         if len(rows) == _MOST_POINTS:
             raise InputError(
                 f"{path}, row {row}: more than {_MOST_POINTS} points; "
                 "give fewer, some centimetres apart"
             )
-        values.append(_numbers(path, row, cells, columns))
+        numbers = _numbers(path, row, _cells(content), columns)
+        values.append([numbers[i] for i in order])
         rows.append(row)
     return np.array(values, dtype=float).reshape(-1, len(columns)), rows
+
+
+def _cells(line: str) -> list[str]:
+    separator = next((mark for mark in ";,\t" if mark in line), None)
+    return [cell.strip() for cell in line.split(separator)]
+
+
+def _header(path: Path, row: int, line: str, columns: tuple[str, ...]) -> list[int] | None:
+    """The place of each of ``columns`` in the file, if this line names all of them."""
+    names = _cells(line.strip().removeprefix("#").strip().lower())
+    found, wanted = [_quantity(name) for name in names], [_quantity(name) for name in columns]
+    if sorted(found) != sorted(wanted):
+        return None
+    order = [found.index(quantity) for quantity in wanted]
+    for column, name in zip(columns, (names[i] for i in order), strict=True):
+        if _unit(name) not in ("", _unit(column)):
+            raise InputError(
+                f"{path}, row {row}: the header names '{name[:40]}' where '{column}' is expected; "
+                f"give the values in the unit of '{column}' and name them so"
+            )
+    return order
+
+
+def _quantity(name: str) -> str:
+    """What a column holds, by its name: 'x' of 'x_m', 'left' of 'w_tr_left_m'."""
+    return next((side for side in ("right", "left") if side in name), name.split("_")[0])
+
+
+def _unit(name: str) -> str:
+    """The unit at the end of a column's name; empty without one."""
+    unit = name.rpartition("_")[2] if "_" in name else ""
+    return "" if unit in ("right", "left") else unit
 
 
 def _numbers(path: Path, row: int, cells: list[str], columns: tuple[str, ...]) -> list[float]:
     if len(cells) != len(columns):
         raise InputError(
-            f"{path}, row {row}: {len(cells)} columns instead of {len(columns)}; "
-            f"each row needs {', '.join(columns)}, separated by commas or semicolons"
+            f"{path}, row {row}: {len(cells)} column{'s' * (len(cells) != 1)} instead of "
+            f"{len(columns)}; each row needs {', '.join(columns)}, separated by commas, "
+            "semicolons, tabs or spaces"
         )
     try:
         numbers = [_number(cell) for cell in cells]
     except ValueError as error:
-        bad = next((cell for cell in cells if not _is_number(cell)), str(error))
         raise InputError(
-            f"{path}, row {row}: '{bad[:40]}' is not a number; write numbers with a decimal point"
+            f"{path}, row {row}: '{str(error)[:40]}' is not a number; "
+            "write numbers with a decimal point"
         ) from None
     if not all(abs(number) <= _LARGEST for number in numbers):
         raise InputError(
@@ -106,15 +145,10 @@ def _numbers(path: Path, row: int, cells: list[str], columns: tuple[str, ...]) -
 
 
 def _number(cell: str) -> float:
-    """ValueError for what is no number to other programs, such as '1_0', either."""
-    if "_" in cell:
-        raise ValueError(cell)
-    return float(cell)
-
-
-def _is_number(cell: str) -> bool:
+    """The number; ValueError with the cell if it is none to other programs either, as '1_0'."""
     try:
-        _number(cell)
+        if "_" not in cell:
+            return float(cell)
     except ValueError:
-        return False
-    return True
+        pass
+    raise ValueError(cell)

@@ -1,9 +1,10 @@
-"""The Typer application: one module per group of subcommands, and errors as one line."""
+"""The Typer application: subcommands grouped by task, and errors as one line."""
 
 import io
 import logging
 import shutil
 import sys
+from collections.abc import Callable
 from tempfile import gettempdir
 from typing import Annotated, Final
 
@@ -27,12 +28,27 @@ _RACE_PACKAGES: Final = (
 )  # fmt: skip
 """Modules that the extras ``fmu`` and ``race`` of pyproject.toml install."""
 
+_TASKS: Final[dict[str, tuple[Callable[..., None], ...]]] = {
+    "Race": (evaluation.race, evaluation.report),
+    "Prepare": (
+        preparation.tracks, preparation.cars, preparation.raceline, preparation.collect,
+        preparation.train, learning.validate, preparation.build,
+    ),
+    "Drive": (
+        parts.plant, parts.controller, evaluation.drive, operation.status, operation.stop,
+        operation.go, operation.router,
+    ),
+    "Learn while driving": (learning.learn, learning.publish, learning.rollback),
+    "Measure": (evaluation.bench, latency.latency),
+    "Export to other tools": (preparation.export,),
+}  # fmt: skip
+
 app = typer.Typer(
     name="bayesrace",
     help="Real-time GP-MPC racing: a compiled controller that learns from its own laps.",
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode="markdown",
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
 
 
@@ -45,7 +61,10 @@ def _version(wanted: bool) -> None:
 @app.callback()
 def _options(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print and exit.")
+        bool,
+        typer.Option(
+            "--version", callback=_version, is_eager=True, help="Print the version and exit."
+        ),
     ] = False,
 ) -> None:
     from experiments.printable import PrintableFormatter
@@ -55,8 +74,10 @@ def _options(
     logging.basicConfig(level=logging.INFO, handlers=[handler])
 
 
-for group in (evaluation, latency, preparation, learning, parts, operation, fmu):
-    group.register(app)
+for task, commands in _TASKS.items():
+    for command in commands:
+        app.command(rich_help_panel=task)(command)
+app.add_typer(fmu.fmu, rich_help_panel="Export to other tools")
 
 
 def main() -> None:

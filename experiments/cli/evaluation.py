@@ -1,4 +1,4 @@
-"""``race``, ``drive``, ``report``, ``bench``: what runs parts together."""
+"""``race``, ``drive``, ``report``, ``bench``: commands that run several parts together."""
 
 from datetime import UTC, datetime
 from enum import StrEnum
@@ -13,6 +13,7 @@ from bayesrace.vehicles import DEFAULT_CAR
 from experiments.cli.options import (
     Car,
     CarName,
+    Endpoint,
     FmuFile,
     FmuMap,
     Seed,
@@ -21,29 +22,41 @@ from experiments.cli.options import (
     writable,
 )
 
-__all__ = ["register"]
+__all__ = ["bench", "drive", "race", "report"]
 
 
 class Mode(StrEnum):
-    """Time mode."""
+    """How time passes in a run."""
 
     lockstep = "lockstep"
     realtime = "realtime"
+
+
+TimeMode = Annotated[
+    Mode,
+    typer.Option(metavar="MODE", help="lockstep: as fast as possible; realtime: by the clock."),
+]
 
 
 def race(
     car: Car = DEFAULT_CAR,
     track: TrackName = DEFAULT_RACE_TRACK,
     train_track: Annotated[
-        str, typer.Option(help="Track of the training drive: the same forms.")
+        str, typer.Option(metavar="TRACK", help="Track of the training drive.")
     ] = DEFAULT_TRAINING_TRACK,
     laps: Annotated[
-        int, typer.Option(min=1, max=100, help="Laps per controller, first from rest.")
+        int,
+        typer.Option(metavar="N", min=1, max=100, help="Laps per controller, the first from rest."),
     ] = 2,
-    mode: Annotated[Mode, typer.Option(help="Simulated or wall-clock time.")] = Mode.lockstep,
-    constraints: Annotated[bool, typer.Option(help="Track constraints of the OCP.")] = True,
+    mode: TimeMode = Mode.lockstep,
+    no_constraints: Annotated[
+        bool, typer.Option("--no-constraints", help="OCP without track constraints.")
+    ] = False,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Run directory [runs/DATE-TIME].")
+        Path | None,
+        typer.Option(
+            "--out", "-o", metavar="DIR", show_default="runs/DATE-TIME", help="Run directory."
+        ),
     ] = None,
     seed: Seed = 0,
     fmu: FmuFile = None,
@@ -70,7 +83,7 @@ def race(
         car=get_car(car), track=track, train_track=train_track, laps=laps, mode=mode.value,
         seed=seed, fmu=fmu, fmu_map=fmu_map,
     )  # fmt: skip
-    mpc = settings.mpc.model_copy(update={"constraints": constraints})
+    mpc = settings.mpc.model_copy(update={"constraints": not no_constraints})
     settings = settings.model_copy(update={"mpc": mpc})
     out = out or Path("runs") / datetime.now(UTC).astimezone().strftime("%Y%m%d-%H%M%S")
     console = Terminal()
@@ -85,9 +98,12 @@ def race(
 
 
 def report(
-    run: Annotated[Path, typer.Argument(help="Run directory; a broken-off run will do.")],
+    run: Annotated[
+        Path,
+        typer.Argument(metavar="DIR", help="Run directory, also of a race that was interrupted."),
+    ],
 ) -> None:
-    """Make result.json, the table and report.html again from a run's log."""
+    """Compute result.json, the table and report.html again from a run's log."""
 
     from experiments.analysis import read_race, write_result
     from experiments.race import FILES
@@ -103,20 +119,21 @@ def report(
 
 def drive(
     track: TrackName = DEFAULT_RACE_TRACK,
-    laps: Annotated[int, typer.Option(min=1, help="Laps to drive, first from rest.")] = 2,
-    mode: Annotated[Mode, typer.Option(help="Simulated or wall-clock time.")] = Mode.lockstep,
-    endpoint: Annotated[
-        list[str] | None,
-        typer.Option(help="Plant and controller, one each; the defaults of both without."),
-    ] = None,
-    max_time: Annotated[float, typer.Option(min=1, max=1e6, help="Time limit [s].")] = 60.0,
-    log: Annotated[Path, typer.Option(callback=writable, help="Log to write (MCAP).")] = Path(
-        "run.mcap"
-    ),
+    laps: Annotated[
+        int, typer.Option(metavar="N", min=1, help="Laps to drive, the first from rest.")
+    ] = 2,
+    mode: TimeMode = Mode.lockstep,
+    endpoint: Endpoint = None,
+    max_time: Annotated[
+        float, typer.Option(metavar="S", min=1, max=1e6, help="Time limit [s].")
+    ] = 60.0,
+    log: Annotated[
+        Path, typer.Option(metavar="FILE", callback=writable, help="Log to write (MCAP).")
+    ] = Path("run.mcap"),
     car: Car = DEFAULT_CAR,
     name: CarName = "",
 ) -> None:
-    """Start a run on a plant and a controller that are waiting elsewhere, and record it."""
+    """Start a run on a plant and a controller that are already running, and record it."""
     from bayesrace.messages import EVENT, Event
     from bayesrace.recorder import Recorder
     from bayesrace.tracks import load_track
@@ -144,23 +161,32 @@ def drive(
 def bench(
     json_file: Annotated[
         Path | None,
-        typer.Option("--json", callback=writable, help="Write the numbers to this file."),
+        typer.Option(
+            "--json", metavar="FILE", callback=writable, help="Write the numbers to this file."
+        ),
     ] = None,
     track: Annotated[
         list[str] | None,
         typer.Option(
-            help="Track to record on, as everywhere; may be repeated [three, with hairpins]."
+            metavar="TRACK",
+            show_default="three with hairpins",
+            help="Track to record problems on; repeatable.",
         ),
     ] = None,
     problems: Annotated[
-        int, typer.Option(min=10, help="Problems to record, all solved by the compiled step.")
+        int,
+        typer.Option(metavar="N", min=10, help="Problems for the compiled step."),
     ] = 900,
-    peers: Annotated[int, typer.Option(min=1, help="How many of them IPOPT solves too.")] = 25,
-    points: Annotated[int, typer.Option(min=20, max=1024, help="Training points per GP.")] = 400,
+    peers: Annotated[
+        int, typer.Option(metavar="N", min=1, help="Number of them that IPOPT solves, too.")
+    ] = 25,
+    points: Annotated[
+        int, typer.Option(metavar="N", min=20, max=1024, help="Training points per GP.")
+    ] = 400,
     seed: Seed = 0,
     car: Car = DEFAULT_CAR,
 ) -> None:
-    """Time the compiled step beside the paper's formulation in CasADi + IPOPT, same problems."""
+    """Time the compiled step and the paper's formulation (CasADi, IPOPT) on the same problems."""
 
     from bayesrace.vehicles import get_car
     from experiments.bench import BenchSettings, run_bench
@@ -177,9 +203,3 @@ def bench(
     result.print(console)
     if json_file:
         write_whole(json_file, result.model_dump_json(indent=1) + "\n")
-
-
-def register(app: typer.Typer) -> None:
-    """Adds this module's subcommands."""
-    for command in (race, drive, report, bench):
-        app.command()(command)

@@ -1,4 +1,4 @@
-"""``fmu export``, ``weights``, ``inspect``: our FMUs for other tools, and theirs for us."""
+"""``fmu export``, ``weights``, ``inspect``: FMUs for other tools, and of other tools."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from bayesrace.vehicles import CarParameters
     from codegen.fmu import FmuDefinition
 
-__all__ = ["register"]
+__all__ = ["fmu"]
 
 
 class Version(StrEnum):
@@ -35,7 +35,7 @@ class Kind(StrEnum):
 
 fmu = typer.Typer(
     name="fmu",
-    help="The car or its controller as an FMU; what an FMU of another tool needs to be the car.",
+    help="Export the car or its controller as an FMU; inspect an FMU of another tool.",
     no_args_is_help=True,
 )
 
@@ -44,36 +44,58 @@ fmu = typer.Typer(
 def export(
     out: OutFile,
     car: Car = DEFAULT_CAR,
-    version: Annotated[Version, typer.Option(help="Of the FMI standard: 2 or 3.")] = Version.three,
+    version: Annotated[
+        Version, typer.Option(metavar="FMI", help="Version of the FMI standard: 2 or 3.")
+    ] = Version.three,
     kind: Annotated[
-        Kind, typer.Option(help="Co-Simulation, or Model Exchange (the car, FMI 3.0).")
+        Kind,
+        typer.Option(
+            metavar="KIND", help="cs: Co-Simulation; me: Model Exchange (the car, FMI 3.0)."
+        ),
     ] = Kind.cs,
     platform: Annotated[
         list[str] | None,
         typer.Option(
-            help="Platform to build for, may be repeated [this one]: x86_64-linux, aarch64-linux, "
-            "x86_64-windows. Others than this one need ziglang."
+            metavar="PLATFORM",
+            show_default="this one",
+            help="x86_64-linux, aarch64-linux or x86_64-windows; repeatable. Others than this one "
+            "need ziglang.",
         ),
     ] = None,
-    controller: Annotated[bool, typer.Option(help="The controller instead of the car.")] = False,
+    controller: Annotated[
+        bool, typer.Option("--controller", help="Export the controller instead of the car.")
+    ] = False,
     track: Annotated[
-        str | None, typer.Option(help=f"Controller: track, as everywhere [{DEFAULT_RACE_TRACK}].")
+        str | None,
+        typer.Option(
+            metavar="TRACK", show_default=DEFAULT_RACE_TRACK, help="Controller: its track."
+        ),
     ] = None,
     raceline: Annotated[
-        Path | None, typer.Option(help="Controller: racing line file [computed].")
+        Path | None,
+        typer.Option(metavar="FILE", show_default="computed", help="Controller: racing line."),
     ] = None,
     weights: Annotated[
-        Path | None, typer.Option(help="Controller: GP weights; none is the uncorrected model.")
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Controller: GP weights; without them, the uncorrected model."
+        ),
     ] = None,
-    settings: Annotated[Path | None, typer.Option(help="Controller: OCP settings (JSON).")] = None,
+    settings: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Controller: OCP settings (JSON).")
+    ] = None,
     artefact: Annotated[
-        Path | None, typer.Option(help="Controller: folder of 'bayesrace build' [built].")
+        Path | None,
+        typer.Option(
+            metavar="DIR", show_default="built", help="Controller: folder of 'bayesrace build'."
+        ),
     ] = None,
     cpu: Annotated[
         str,
         typer.Option(
-            help="Controller: CPU to build for. 'portable' runs on any of this kind, 'native' is "
-            "faster and runs on this one's like only; or a value for the compiler's -march."
+            metavar="CPU",
+            help="Controller: CPU to build for. portable: any of this architecture; native: this "
+            "one, faster; or a value for the compiler's -march.",
         ),
     ] = "portable",
 ) -> None:
@@ -148,11 +170,11 @@ def _controller(
 
 @fmu.command(name="weights")
 def other_weights(
-    controller: Annotated[Path, typer.Argument(help="A controller's FMU.")],
-    weights: Annotated[Path, typer.Argument(help="GP weights that it is to drive with.")],
+    controller: Annotated[Path, typer.Argument(metavar="FMU", help="FMU of a controller.")],
+    weights: Annotated[Path, typer.Argument(metavar="WEIGHTS", help="New GP weights.")],
     out: OutFile,
 ) -> None:
-    """Copy a controller's FMU with other weights: nothing is compiled."""
+    """Copy a controller's FMU with other weights, without compiling."""
     from bayesrace.gp.weights import read_weights
     from codegen.fmu.resources import exchange_weights
 
@@ -163,14 +185,16 @@ def other_weights(
 
 @fmu.command()
 def inspect(
-    file: Annotated[Path, typer.Argument(help="FMU file.")],
+    file: Annotated[Path, typer.Argument(metavar="FMU", help="FMU file.")],
     map_file: Annotated[
         Path | None,
-        typer.Option("--map", callback=writable, help="Write a map to start from (TOML)."),
+        typer.Option(
+            "--map", metavar="FILE", callback=writable, help="Write a map to edit (TOML)."
+        ),
     ] = None,
-    every: Annotated[bool, typer.Option("--all", help="Local variables, too.")] = False,
+    every: Annotated[bool, typer.Option("--all", help="Print local variables, too.")] = False,
 ) -> None:
-    """Print an FMU's variables; write a map for 'bayesrace plant --fmu' to start from."""
+    """Print an FMU's variables; write a map for 'bayesrace plant --fmu' to edit."""
 
     from experiments.fmu_table import FmuTable
     from experiments.terminal import Terminal
@@ -184,8 +208,3 @@ def inspect(
             raise InputError(f"{map_file} exists already; choose another name or remove it")
         write_whole(map_file, starting_map(description))
         typer.echo(f"map to start from: {map_file}")
-
-
-def register(app: typer.Typer) -> None:
-    """Adds the group."""
-    app.add_typer(fmu)

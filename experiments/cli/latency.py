@@ -1,4 +1,4 @@
-"""``latency``: where a control cycle's time goes, in real time."""
+"""``latency``: the time of each leg of a control cycle, in real time."""
 
 from datetime import UTC, datetime
 from pathlib import Path
@@ -9,56 +9,91 @@ import typer
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from bayesrace.vehicles import DEFAULT_CAR
-from experiments.cli.options import Car, CarName, connect_to, writable
+from experiments.cli.options import Car, CarName, Endpoint, connect_to, writable
+from experiments.cli.parts import LockMemory
 
-__all__ = ["register"]
+__all__ = ["latency"]
 
 
 def latency(
-    rate: Annotated[float, typer.Option(min=1, max=500, help="Of plant and controller [Hz].")] = 50,
+    rate: Annotated[
+        float, typer.Option(metavar="HZ", min=1, max=500, help="Rate of plant and controller [Hz].")
+    ] = 50,
     duration: Annotated[
         float | None,
-        typer.Option(min=1, max=20_000, help="Time that counts [s] [20; of a log all of it]."),
+        typer.Option(
+            metavar="S",
+            min=1,
+            max=20_000,
+            show_default="20; all of a log",
+            help="Time that counts [s].",
+        ),
     ] = None,
-    load: Annotated[int, typer.Option(min=0, max=1024, help="Busy processes beside.")] = 0,
+    load: Annotated[
+        int, typer.Option(metavar="N", min=0, max=1024, help="Busy processes to start as load.")
+    ] = 0,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder [runs/latency-DATE-TIME].")
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            metavar="DIR",
+            show_default="runs/latency-DATE-TIME",
+            help="Folder for results.",
+        ),
     ] = None,
     json_file: Annotated[
         Path | None,
-        typer.Option("--json", callback=writable, help="Write the numbers to this file as well."),
+        typer.Option(
+            "--json",
+            metavar="FILE",
+            callback=writable,
+            help="Write the numbers to this file as well.",
+        ),
     ] = None,
     track: Annotated[
         str | None,
         typer.Option(
-            help="Track: built-in name, random:SEED or CSV file. "
-            "With --attach or --log: the one that was driven."
+            metavar="TRACK",
+            help="Built-in name, random:SEED or CSV file; with --attach or --log, that run's.",
         ),
     ] = None,
     fifo: Annotated[
         int | None,
-        typer.Option(min=1, max=99, help="SCHED_FIFO priority of the loops, the bare one too."),
+        typer.Option(
+            metavar="N",
+            min=1,
+            max=99,
+            help="SCHED_FIFO priority of the loops, the bare loop included.",
+        ),
     ] = None,
-    lock_memory: Annotated[bool, typer.Option(help="Keep their memory from being paged.")] = False,
-    weights: Annotated[Path | None, typer.Option(help="GP weights [trained].")] = None,
-    artefact: Annotated[Path | None, typer.Option(help="Built controller [built].")] = None,
-    raceline: Annotated[Path | None, typer.Option(help="Racing line [computed].")] = None,
-    attach: Annotated[bool, typer.Option(help="Measure a run that is driven elsewhere.")] = False,
-    endpoint: Annotated[
-        list[str] | None,
-        typer.Option(help="Attach: plant and controller, one each; the defaults of both without."),
+    lock_memory: LockMemory = False,
+    weights: Annotated[
+        Path | None, typer.Option(metavar="FILE", show_default="trained", help="GP weights.")
     ] = None,
+    artefact: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", show_default="built", help="Folder of 'bayesrace build'."),
+    ] = None,
+    raceline: Annotated[
+        Path | None, typer.Option(metavar="FILE", show_default="computed", help="Racing line.")
+    ] = None,
+    attach: Annotated[
+        bool, typer.Option("--attach", help="Measure a run that has been started elsewhere.")
+    ] = False,
+    endpoint: Endpoint = None,
     log: Annotated[
-        Path | None, typer.Option(help="Log of a run (MCAP), in place of a new run.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Log of a run (MCAP), in place of a new run."),
     ] = None,
     car: Car = DEFAULT_CAR,
     name: CarName = "",
 ) -> None:
-    """Measure where a control cycle's time goes, from sampling the state to acting.
+    """Measure each leg of a control cycle, from the sampled state to the acting input.
 
-    Starts plant and controller as processes of their own, drives around the track in real time and
-    records the run; a loop beside them that only sleeps tells the machine's stalls from the
-    program's. Leaves latency.json, a picture and HdrHistogram logs: docs/latency.md.
+    Starts plant and controller as processes and drives the track in real time. A loop that only
+    sleeps runs beside them: its delays are those of the machine, not of the program. Leaves
+    latency.json, a picture and HdrHistogram logs; see docs/latency.md.
     """
     if endpoint and not attach:
         raise InputError("--endpoint is of a running system: add --attach, or leave it out")
@@ -96,8 +131,3 @@ def latency(
     console.print(f"{out}", highlight=False, soft_wrap=True)
     if run.error is not None:
         raise run.error
-
-
-def register(app: typer.Typer) -> None:
-    """Adds this module's subcommands."""
-    app.command()(latency)

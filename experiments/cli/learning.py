@@ -1,4 +1,4 @@
-"""``validate``, ``publish``, ``rollback``, ``learn``: weights judged, sent, made lap by lap."""
+"""``validate``, ``publish``, ``rollback``, ``learn``: validation and update of weights."""
 
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,53 +14,79 @@ from experiments.notation import UNCERTAIN
 if TYPE_CHECKING:
     from bayesrace.transport import Endpoints
 
-__all__ = ["register"]
+__all__ = ["learn", "publish", "rollback", "validate"]
 
 Name = Annotated[
-    str, typer.Option("--name", "--car", help="Name of the car; the only one there is without.")
+    str,
+    typer.Option(
+        "--name",
+        "--car",
+        metavar="NAME",
+        show_default="the only one that is found",
+        help="Name of the car.",
+    ),
 ]
 Timeout = Annotated[
     float,
-    typer.Option(min=0.1, max=600.0, help="Seconds to find the controller, and again to answer."),
+    typer.Option(
+        metavar="S",
+        min=0.1,
+        max=600.0,
+        help="Time limit [s], once for finding the controller and once for its answer.",
+    ),
+]
+WeightsFile = Annotated[
+    Path,
+    typer.Argument(metavar="WEIGHTS", help="Weights file, as 'bayesrace train' writes it."),
 ]
 _TIMEOUT_S = 20.0
 
 
 def validate(
-    weights: Annotated[Path, typer.Argument(help="Weights file, as 'bayesrace train' writes it.")],
+    weights: WeightsFile,
     on: Annotated[
-        list[Path], typer.Option("--on", help="Run log (MCAP) or arrays (.npz); repeatable.")
+        list[Path],
+        typer.Option("--on", metavar="FILE", help="Run log (MCAP) or arrays (.npz); repeatable."),
     ],
     json_file: Annotated[
         Path | None,
-        typer.Option("--json", callback=writable, help="Write the numbers to this file."),
+        typer.Option(
+            "--json", metavar="FILE", callback=writable, help="Write the numbers to this file."
+        ),
     ] = None,
     plot: Annotated[
         Path | None,
-        typer.Option(callback=writable, help="Error with its 95 % band, as a picture (PNG)."),
+        typer.Option(
+            metavar="FILE", callback=writable, help="Draw the error with its 95 % band (PNG)."
+        ),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Folder for all: numbers, error.png, track.png."),
+        typer.Option(
+            "--out", "-o", metavar="DIR", help="Folder for numbers, error.png and track.png."
+        ),
     ] = None,
     track: Annotated[
-        str | None, typer.Option(help="Track to draw the drive on: name, random:SEED or CSV file.")
+        str | None,
+        typer.Option(metavar="TRACK", help="Track for track.png: name, random:SEED or CSV file."),
     ] = None,
     threshold: Annotated[
-        float, typer.Option(min=0, help="Mark where the largest sigma is above this.")
+        float,
+        typer.Option(metavar="SIGMA", min=0, help="Mark samples whose largest sigma is above."),
     ] = UNCERTAIN,
     run: Annotated[
-        list[int] | None, typer.Option(help="Only this run of the log; repeatable.")
+        list[int] | None,
+        typer.Option(metavar="N", help="Only this run of the log; repeatable."),
     ] = None,
     car: Annotated[
-        str, typer.Option(help="Car of the weights, where it is not built in: TOML file.")
+        str,
+        typer.Option(metavar="CAR", help="TOML file of the weights' car if it is not built in."),
     ] = "",
     name: CarName = "",
 ) -> None:
-    """Judge weights on a drive: error, coverage, and drift over one step and over the horizon.
+    """Validate weights on a drive: error, coverage, and drift over one step and the horizon.
 
-    Compare drives that the weights have not seen. Samples that training would leave out are left
-    out here too.
+    Use drives that the weights were not trained on. The filters of the training apply here, too.
     """
 
     from bayesrace.gp.weights import read_weights
@@ -97,15 +123,15 @@ def validate(
 
 
 def publish(
-    weights: Annotated[Path, typer.Argument(help="Weights file, as 'bayesrace train' writes it.")],
+    weights: WeightsFile,
     name: Name = "",
     endpoint: Endpoint = None,
     timeout: Timeout = _TIMEOUT_S,
 ) -> None:
-    """Hand new weights to a running controller, and wait for its answer.
+    """Send new weights to a running controller, and wait for its answer.
 
-    Exit code 0 once it drives with them, 1 if it refuses (and says so if only for now), 2 if it
-    cannot be asked.
+    Exit code 0 once it drives with them, 1 if it refuses them (the message says if a later attempt
+    can succeed), 2 if it cannot be reached.
     """
     from bayesrace.files import read_whole
     from bayesrace.gp.weights import MAX_BYTES
@@ -125,12 +151,14 @@ def publish(
 def rollback(
     name: Name = "",
     endpoint: Endpoint = None,
-    reason: Annotated[str, typer.Option(help="Why; it shows in the controller's event.")] = "",
+    reason: Annotated[
+        str, typer.Option(metavar="TEXT", help="Reason, for the controller's event.")
+    ] = "",
     timeout: Timeout = _TIMEOUT_S,
 ) -> None:
-    """Have a controller return to the weights before those that it drives with.
+    """Let a controller return to the weights before those in use.
 
-    Exit code 0 once it drives with them, 1 if there are none, 2 if it cannot be asked.
+    Exit code 0 once it drives with them, 1 if there are none, 2 if it cannot be reached.
     """
     from bayesrace.transport import open_session, send_rollback
     from experiments.learn.publishing import NotTakenOverError, in_words
@@ -148,51 +176,66 @@ def rollback(
 
 def learn(
     watch: Annotated[
-        bool, typer.Option("--watch", help="Go on, lap by lap, until Ctrl-C; else one lap.")
+        bool, typer.Option("--watch", help="Learn after each lap until Ctrl-C, not after one lap.")
     ] = False,
-    laps: Annotated[int | None, typer.Option(min=1, help="End after so many laps.")] = None,
+    laps: Annotated[
+        int | None, typer.Option(metavar="N", min=1, help="End after so many laps.")
+    ] = None,
     data: Annotated[
         list[Path] | None,
-        typer.Option(help="Samples to begin with: log (MCAP) or arrays (.npz); repeatable."),
+        typer.Option(
+            metavar="FILE", help="First samples: log (MCAP) or arrays (.npz); repeatable."
+        ),
     ] = None,
     weights: Annotated[
-        Path | None, typer.Option(help="Weights to begin with; the controller is given them.")
+        Path | None,
+        typer.Option(metavar="FILE", help="First weights, which are sent to the controller."),
     ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
             "--out",
             "-o",
-            help="Folder to leave, or to go on in, then without reading --data and --weights "
-            "[runs/learn-DATE-TIME].",
+            metavar="DIR",
+            show_default="runs/learn-DATE-TIME",
+            help="Folder for results, or of a job to resume (--data and --weights do not count "
+            "then).",
         ),
     ] = None,
-    points: Annotated[int, typer.Option(min=20, max=20000, help="Points per output.")] = 400,
+    points: Annotated[
+        int, typer.Option(metavar="N", min=20, max=20000, help="Points per output.")
+    ] = 400,
     keep: Annotated[
-        int, typer.Option(min=100, max=20000, help="Samples kept from lap to lap.")
+        int,
+        typer.Option(metavar="N", min=100, max=20000, help="Samples kept from lap to lap."),
     ] = 1200,
     track: Annotated[
         str | None,
         typer.Option(
-            help="Track that is driven: times laps to less than a period, sees excursions."
+            metavar="TRACK",
+            help="Track that is driven: for exact lap times and excursions.",
         ),
     ] = None,
     compare: Annotated[
-        Path | None, typer.Option(help="Run directory of a race: its lap times are drawn beside.")
+        Path | None,
+        typer.Option(metavar="DIR", help="Run directory of a race, to draw its lap times, too."),
     ] = None,
     artefact: Annotated[
-        Path | None, typer.Option(help="Built controller to learn for; the default one without.")
+        Path | None,
+        typer.Option(
+            metavar="DIR", show_default="the default one", help="Built controller to learn for."
+        ),
     ] = None,
     endpoint: Endpoint = None,
     seed: Seed = 0,
     car: Car = DEFAULT_CAR,
     name: CarName = "",
 ) -> None:
-    """Learn from the laps of a car that drives, and hand the weights to its controller.
+    """Learn from the laps of a driving car, and send the weights to its controller.
 
-    After each lap a process in the background trains on what was kept and on what is new, and the
-    weights are published. Plant and controller may be started before or after this, and again;
-    given the same --out, this too goes on where it was. Start a run with 'bayesrace drive'.
+    After each lap a background process trains on the samples that were kept and on the new ones,
+    and publishes the weights. Plant and controller may start before or after this command, and
+    restart; with the same --out, this command resumes. Start a run with 'bayesrace drive'.
     """
     from bayesrace.vehicles import get_car
     from experiments.learn.job import learn as follow
@@ -221,14 +264,8 @@ def learn(
 
 
 def _controller(session: object, endpoints: "Endpoints", name: str, timeout_s: float) -> str:
-    """The car whose controller is asked; InputError if there is none, or a choice."""
+    """The car of the controller to send to; InputError if none or several are found."""
     from experiments.operation import find, pick
 
     found = find(session, endpoints, timeout_s, name, ("controller",))
     return pick(found, name, False)[0]
-
-
-def register(app: typer.Typer) -> None:
-    """Adds this module's subcommands."""
-    for command in (validate, publish, rollback, learn):
-        app.command()(command)

@@ -1,4 +1,4 @@
-"""``status``, ``stop``, ``go``, ``router``: operating plants and controllers that run."""
+"""``status``, ``stop``, ``go``, ``router``: operation of running plants and controllers."""
 
 import contextlib
 import json
@@ -17,13 +17,21 @@ if TYPE_CHECKING:
     from experiments.operation import Action
     from experiments.picture import Picture
 
-__all__ = ["register"]
+__all__ = ["go", "router", "status", "stop"]
 
-Name = Annotated[str, typer.Option(help="Name of the car.")]
+Name = Annotated[str, typer.Option(metavar="NAME", show_default="", help="Name of the car.")]
 Timeout = Annotated[
-    float, typer.Option(min=0.1, max=60.0, help="Seconds to find cars, and for their answers.")
+    float,
+    typer.Option(
+        metavar="S",
+        min=0.1,
+        max=60.0,
+        help="Time limit [s], once for finding the cars and once for their answers.",
+    ),
 ]
-Reason = Annotated[str, typer.Option(help="The reason, shown in the controller's status.")]
+Reason = Annotated[
+    str, typer.Option(metavar="TEXT", help="Reason, which the controller's status then shows.")
+]
 
 _PERIOD_S = 0.2
 """Period of the display of ``status --watch``."""
@@ -39,11 +47,14 @@ def status(
         ),
     ] = False,
     watch: Annotated[
-        bool, typer.Option(help="Go on until Ctrl-C; with --json a line for each heartbeat.")
+        bool,
+        typer.Option(
+            "--watch", help="Update until Ctrl-C; with --json, print a line for each heartbeat."
+        ),
     ] = False,
     timeout: Timeout = 2.0,
 ) -> None:
-    """Show the state of plants and controllers: phase, rate, misses, fallbacks, counters.
+    """Show plants and controllers: phase, rate, deadline misses, fallbacks, counters.
 
     Without --name: all cars found. A process that is present and does not answer is shown as such;
     if none answers, that is an error.
@@ -97,13 +108,14 @@ def stop(
     name: Name = "",
     endpoint: Endpoint = None,
     reason: Reason = "",
-    everybody: Annotated[bool, typer.Option("--all", help="Stop all cars found.")] = False,
+    everybody: Annotated[bool, typer.Option("--all", help="All cars that are found.")] = False,
     run: Annotated[
-        bool, typer.Option("--run", help="End the plant's run instead, after its client has died.")
+        bool,
+        typer.Option("--run", help="End the run of the plant instead, such as an abandoned one."),
     ] = False,
     timeout: Timeout = 2.0,
 ) -> None:
-    """Stop a car: its controller brakes to standstill and stays there.
+    """Brake a car to standstill and keep it there.
 
     Without --name: the only car found. Exit code 2 if it refuses or does not answer.
     """
@@ -116,7 +128,7 @@ def stop(
 def go(
     name: Name = "", endpoint: Endpoint = None, reason: Reason = "", timeout: Timeout = 2.0
 ) -> None:
-    """Let a stopped car drive again.
+    """Let a stopped or held controller drive.
 
     Without --name: the only car found. Exit code 2 if it refuses or does not answer.
     """
@@ -154,26 +166,21 @@ def _command(
 
 def router(
     listen: Annotated[
-        list[str], typer.Option(help="Zenoh endpoint to listen on; several allowed.")
+        list[str], typer.Option(metavar="ENDPOINT", help="Zenoh endpoint to listen on; repeatable.")
     ],
     connect: Annotated[
-        list[str] | None, typer.Option(help="Endpoint of another router; several allowed.")
+        list[str] | None,
+        typer.Option(metavar="ENDPOINT", help="Endpoint of another router; repeatable."),
     ] = None,
     parent_pid: ParentPid = None,
 ) -> None:
-    """Forward between plants, controllers and other processes, until Ctrl-C.
+    """Forward messages between all processes that connect to it, until Ctrl-C.
 
-    All of them then need one endpoint only, this one: for many cars on one network, and for
-    machines that cannot reach each other directly.
+    Each plant, controller or command then needs this one endpoint only: for several cars in one
+    network, and for machines that cannot reach each other directly.
     """
     die_with_parent(parent_pid)
     from bayesrace.transport import Endpoints
     from experiments.operation import route
 
     route(Endpoints(listen=tuple(listen), connect=tuple(connect or ()), mode="router"))
-
-
-def register(app: typer.Typer) -> None:
-    """Adds this module's subcommands."""
-    for subcommand in (status, stop, go, router):
-        app.command()(subcommand)

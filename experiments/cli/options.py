@@ -29,23 +29,37 @@ __all__ = [
     "writable",
 ]
 
-Car = Annotated[str, typer.Option(help="Car: built-in name or TOML file.")]
+Car = Annotated[str, typer.Option(metavar="CAR", help="Car: built-in name or TOML file.")]
 CarName = Annotated[
-    str, typer.Option("--name", help="Name of the car in the network; the car's own without.")
+    str,
+    typer.Option(
+        "--name",
+        metavar="NAME",
+        show_default="the car's own",
+        help="Name of the car in the network.",
+    ),
 ]
 Seed = Annotated[
-    int, typer.Option(min=0, max=2**32 - 1, help="Of training drive and training alike.")
+    int,
+    typer.Option(
+        min=0, max=2**32 - 1, metavar="N", help="Seed of the training drive and of the training."
+    ),
 ]
-TrackName = Annotated[str, typer.Option(help="Track: built-in name, random:SEED or CSV file.")]
+TrackName = Annotated[
+    str, typer.Option(metavar="TRACK", help="Built-in name, random:SEED or CSV file.")
+]
 RaceLineFile = Annotated[
-    Path, typer.Option("--raceline", help="Racing line file, as 'bayesrace raceline' writes it.")
+    Path,
+    typer.Option(
+        "--raceline", metavar="FILE", help="Racing line, as 'bayesrace raceline' writes it."
+    ),
 ]
 Endpoint = Annotated[
     list[str] | None,
     typer.Option(
-        help="Zenoh endpoint of a plant, a controller or a router; can be given several times "
-        "[tcp/127.0.0.1:7447 and :7448, the plant's and the controller's own].",
-        show_default=False,
+        metavar="ENDPOINT",
+        help="Zenoh endpoint of a plant, a controller or a router; repeatable.",
+        show_default="tcp/127.0.0.1:7447 and :7448",
     ),
 ]
 
@@ -72,7 +86,7 @@ def path_on(track: str, raceline: Path | None, car: "CarParameters") -> "PathTab
 
 
 def writable(path: Path | None) -> Path | None:
-    """Callback of options that name a file to write: complains before the work, not after it."""
+    """Callback of options that name a file to write: InputError before the work, not after it."""
     if path is not None and not path.parent.is_dir():
         raise InputError(f"cannot write {path}: no folder {path.parent}; make it first")
     if path is not None and path.is_dir():
@@ -80,20 +94,27 @@ def writable(path: Path | None) -> Path | None:
     return path
 
 
-OutFile = Annotated[Path, typer.Option("--out", "-o", callback=writable, help="File to write.")]
+OutFile = Annotated[
+    Path,
+    typer.Option("--out", "-o", metavar="FILE", callback=writable, help="File to write."),
+]
 FmuFile = Annotated[
-    Path | None, typer.Option(help="Co-Simulation FMU (2.0, 3.0) that plays the car.")
+    Path | None,
+    typer.Option(metavar="FILE", help="Co-Simulation FMU (2.0, 3.0) that simulates the car."),
 ]
 FmuMap = Annotated[
     Path | None,
     typer.Option(
-        "--map", help="What the FMU's variables mean (TOML); 'bayesrace fmu inspect' writes one."
+        "--map",
+        metavar="FILE",
+        help="Meaning of the FMU's variables (TOML); 'bayesrace fmu inspect' writes one to edit.",
     ),
 ]
 LowLatency = Annotated[
     bool,
     typer.Option(
-        help="Send in the calling thread. For lockstep, on plant and controller alike.",
+        "--low-latency",
+        help="Send in the calling thread: in lockstep only, on both plant and controller.",
     ),
 ]
 ParentPid = Annotated[int | None, typer.Option(hidden=True, help="End when this parent ends.")]

@@ -19,26 +19,35 @@ from experiments.cli.options import (
     TrackName,
 )
 
-__all__ = ["register"]
+__all__ = ["controller", "plant"]
 
 _PLANT = "tcp/127.0.0.1:7447"
 _CONTROLLER = "tcp/127.0.0.1:7448"
 
-Rate = Annotated[float, typer.Option(min=1, max=500, help="Rate by the wall clock [Hz].")]
-Cpu = Annotated[int | None, typer.Option(min=0, help="CPU to bind the control thread to.")]
+Rate = Annotated[float, typer.Option(metavar="HZ", min=1, max=500, help="Rate in real time [Hz].")]
+Cpu = Annotated[
+    int | None, typer.Option(metavar="N", min=0, help="CPU to bind the control thread to.")
+]
 Fifo = Annotated[
     int | None,
-    typer.Option(min=1, max=99, help="SCHED_FIFO priority of the control thread alone."),
+    typer.Option(metavar="N", min=1, max=99, help="SCHED_FIFO priority of the control thread."),
 ]
-LockMemory = Annotated[bool, typer.Option(help="Keep the process's memory from being paged.")]
+LockMemory = Annotated[
+    bool, typer.Option("--lock-memory", help="Lock the memory of the process against paging.")
+]
 
 
 def plant(
     car: Car = DEFAULT_CAR,
     name: CarName = "",
-    endpoint: Annotated[str, typer.Option(help="Zenoh endpoint to listen on.")] = _PLANT,
+    endpoint: Annotated[
+        str, typer.Option(metavar="ENDPOINT", help="Zenoh endpoint to listen on.")
+    ] = _PLANT,
     connect: Annotated[
-        list[str] | None, typer.Option(help="Further endpoints to connect to.")
+        list[str] | None,
+        typer.Option(
+            metavar="ENDPOINT", help="Endpoint to connect to, as of a router; repeatable."
+        ),
     ] = None,
     rate: Rate = 50.0,
     fmu: FmuFile = None,
@@ -46,7 +55,10 @@ def plant(
     delay: Annotated[
         float,
         typer.Option(
-            min=0, max=1000, help="Delay of states and of actuations each, by the wall clock [ms]."
+            metavar="MS",
+            min=0,
+            max=1000,
+            help="Delay of states and of actuations each, in real time [ms].",
         ),
     ] = 0.0,
     cpu: Cpu = None,
@@ -55,7 +67,7 @@ def plant(
     low_latency: LowLatency = False,
     parent_pid: ParentPid = None,
 ) -> None:
-    """Play the car: waits for a run to be asked for ('bayesrace drive'), until Ctrl-C."""
+    """Simulate the car: waits for runs, as of 'bayesrace drive', until Ctrl-C."""
     die_with_parent(parent_pid)
     from bayesrace.realtime import RealtimeSettings
     from bayesrace.transport import Endpoints
@@ -79,42 +91,60 @@ def plant(
 
 
 def controller(
-    artefact: Annotated[Path, typer.Option(help="Folder that 'bayesrace build' printed.")],
+    artefact: Annotated[
+        Path, typer.Option(metavar="DIR", help="Folder that 'bayesrace build' printed.")
+    ],
     track: TrackName,
     raceline: RaceLineFile,
     weights: Annotated[
-        Path | None, typer.Option(help="GP weights; none is the uncorrected model.")
+        Path | None,
+        typer.Option(metavar="FILE", help="GP weights; without them, the uncorrected model."),
     ] = None,
     settings: Annotated[
-        Path | None, typer.Option(help="OCP settings (JSON), see 'controller/settings.py'.")
+        Path | None,
+        typer.Option(metavar="FILE", help="OCP settings (JSON), see 'controller/settings.py'."),
     ] = None,
     store: Annotated[
         Path | None,
-        typer.Option(help="Folder that keeps accepted weights for the next start."),
+        typer.Option(metavar="DIR", help="Folder that keeps accepted weights for the next start."),
     ] = None,
     car: Car = DEFAULT_CAR,
     name: CarName = "",
     endpoint: Annotated[
-        list[str] | None, typer.Option(help=f"Zenoh endpoint of the plant [{_PLANT}].")
+        list[str] | None,
+        typer.Option(metavar="ENDPOINT", show_default=_PLANT, help="Zenoh endpoint of the plant."),
     ] = None,
     listen: Annotated[
-        str, typer.Option(help="Zenoh endpoint to listen on, for who records or sends weights.")
+        str,
+        typer.Option(
+            metavar="ENDPOINT",
+            help="Zenoh endpoint to listen on, for recorders and senders of weights.",
+        ),
     ] = _CONTROLLER,
     rate: Rate = 50.0,
     budget: Annotated[
-        float, typer.Option(min=0.05, max=1, help="Fraction of the period a cycle may take.")
+        float,
+        typer.Option(
+            metavar="SHARE", min=0.05, max=1, help="Share of the period that a cycle may take."
+        ),
     ] = 0.8,
     delay: Annotated[
         str,
         typer.Option(
-            help="Delay over which the state is predicted: measured, off, or milliseconds."
+            metavar="DELAY",
+            help="Delay over which the state is predicted: measured, off, or milliseconds.",
         ),
     ] = "measured",
     gate: Annotated[
         Path | None,
-        typer.Option(help="Thresholds for weights (JSON), see 'controller/weights/settings.py'."),
+        typer.Option(
+            metavar="FILE",
+            help="Thresholds for new weights (JSON), see 'controller/weights/settings.py'.",
+        ),
     ] = None,
-    hold: Annotated[bool, typer.Option(help="Do not drive before 'bayesrace go'.")] = False,
+    hold: Annotated[
+        bool, typer.Option("--hold", help="Do not drive before 'bayesrace go'.")
+    ] = False,
     cpu: Cpu = None,
     fifo: Fifo = None,
     lock_memory: LockMemory = False,
@@ -159,9 +189,3 @@ def _compensation(delay: str) -> dict[str, str | float]:
         raise InputError(
             f"--delay {delay}: give 'measured', 'off', or a number of milliseconds"
         ) from None
-
-
-def register(app: typer.Typer) -> None:
-    """Adds this module's subcommands."""
-    for command in (plant, controller):
-        app.command()(command)

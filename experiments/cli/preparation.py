@@ -1,4 +1,4 @@
-"""``tracks`` to ``export``: what is done before driving, each with files in and out."""
+"""``tracks`` to ``export``: preparation of a drive, each command with files in and out."""
 
 import shutil
 from enum import StrEnum
@@ -23,11 +23,11 @@ from experiments.cli.options import (
     writable,
 )
 
-__all__ = ["register"]
+__all__ = ["build", "cars", "collect", "export", "raceline", "tracks", "train"]
 
 
 class PredictionModel(StrEnum):
-    """What the OCP predicts with."""
+    """Prediction model of the OCP."""
 
     e_kinematic = "e_kinematic"
     dynamic = "dynamic"
@@ -45,10 +45,18 @@ class KernelChoice(StrEnum):
 
 def tracks(
     name: Annotated[
-        str | None, typer.Argument(help="Built-in name, random:SEED or CSV file; all without.")
+        str | None,
+        typer.Argument(
+            metavar="TRACK",
+            show_default="all built in",
+            help="Built-in name, random:SEED or CSV file.",
+        ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", callback=writable, help="Write it as CSV.")
+        Path | None,
+        typer.Option(
+            "--out", "-o", metavar="FILE", callback=writable, help="Write the track as CSV."
+        ),
     ] = None,
 ) -> None:
     """List the built-in tracks, check a track file, or write a track to a file."""
@@ -76,11 +84,20 @@ def tracks(
 
 def cars(
     car: Annotated[
-        str | None, typer.Argument(help="Built-in name or TOML file; all built in without.")
+        str | None,
+        typer.Argument(
+            metavar="CAR", show_default="all built in", help="Built-in name or TOML file."
+        ),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", callback=writable, help="Write it as TOML, tuning included."),
+        typer.Option(
+            "--out",
+            "-o",
+            metavar="FILE",
+            callback=writable,
+            help="Write the car as TOML, tuning included.",
+        ),
     ] = None,
 ) -> None:
     """List the built-in cars, check a car's file, or write a car to a file with all its values."""
@@ -103,15 +120,22 @@ def cars(
 
 
 def raceline(
-    track: Annotated[str, typer.Argument(help="Built-in name, random:SEED or CSV file.")],
+    track: Annotated[
+        str, typer.Argument(metavar="TRACK", help="Built-in name, random:SEED or CSV file.")
+    ],
     out: OutFile = Path("raceline.csv"),
     car: Car = DEFAULT_CAR,
     friction: Annotated[
         float | None,
-        typer.Option(help="Usable acceleration over g of who drives the line [the car's]."),
+        typer.Option(metavar="MU", show_default="the car's", help="Usable acceleration over g."),
     ] = None,
     margin: Annotated[
-        float | None, typer.Option(help="Centre of gravity to track edge [m].")
+        float | None,
+        typer.Option(
+            metavar="M",
+            show_default="by the car's width",
+            help="Least distance of the centre of gravity from the track's edge [m].",
+        ),
     ] = None,
 ) -> None:
     """Compute the minimum-time racing line of a track."""
@@ -133,14 +157,20 @@ def collect(
     out: OutFile = Path("collect.mcap"),
     duration: Annotated[
         float | None,
-        typer.Option(min=1, max=3600, help="Length of the drive [s] [by the car's tuning]."),
+        typer.Option(
+            metavar="S",
+            min=1,
+            max=3600,
+            show_default="by the car's tuning",
+            help="Length of the drive [s].",
+        ),
     ] = None,
     seed: Seed = 0,
     fmu: FmuFile = None,
     fmu_map: FmuMap = None,
     car: Car = DEFAULT_CAR,
 ) -> None:
-    """Drive a track by pure pursuit and log it: training data."""
+    """Drive a track by pure pursuit and log the drive as training data."""
     from bayesrace.raceline import read_raceline_for
     from bayesrace.tracks import load_track
     from bayesrace.vehicles import get_car
@@ -164,33 +194,56 @@ def collect(
 
 
 def train(
-    logs: Annotated[list[Path] | None, typer.Argument(help="Run logs (MCAP).")] = None,
+    logs: Annotated[
+        list[Path] | None, typer.Argument(metavar="LOG", help="Run logs (MCAP).")
+    ] = None,
     data: Annotated[
-        list[Path] | None, typer.Option(help="Samples in plain arrays (.npz); repeatable.")
+        list[Path] | None,
+        typer.Option(metavar="FILE", help="Samples in plain arrays (.npz); repeatable."),
     ] = None,
     kernel: Annotated[
-        KernelChoice, typer.Option(help="Kernel; auto: the best one per output.")
+        KernelChoice,
+        typer.Option(
+            metavar="KERNEL", help="rbf, matern05, matern15, matern25; auto: the best per output."
+        ),
     ] = KernelChoice.auto,
     out: OutFile = Path("weights.bin"),
-    points: Annotated[int, typer.Option(min=20, max=20000, help="Points per output.")] = 400,
+    points: Annotated[
+        int, typer.Option(metavar="N", min=20, max=20000, help="Points per output.")
+    ] = 400,
     restarts: Annotated[
-        int, typer.Option(min=0, max=100, help="Further starts of the optimiser per kernel.")
+        int,
+        typer.Option(
+            metavar="N", min=0, max=100, help="Further starts of the optimiser per kernel."
+        ),
     ] = 2,
     plot: Annotated[
         Path | None,
-        typer.Option(callback=writable, help="Draw error against the kernel's smoothness (PNG)."),
+        typer.Option(
+            metavar="FILE",
+            callback=writable,
+            help="Draw the error against the kernel's smoothness (PNG).",
+        ),
     ] = None,
     artefact: Annotated[
-        Path | None, typer.Option(help="Built controller to learn for; the default one without.")
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            show_default="the default one",
+            help="Built controller to learn for.",
+        ),
     ] = None,
     seed: Seed = 0,
-    car: Annotated[str, typer.Option(help="Car, where the files do not name it.")] = "",
+    car: Annotated[
+        str,
+        typer.Option(metavar="CAR", show_default="named by the files", help="Car that drove."),
+    ] = "",
     name: CarName = "",
 ) -> None:
-    """Train the three GPs on the residual that run logs or plain arrays show.
+    """Train the three GPs on the residual in run logs or plain arrays.
 
-    Beyond --points, samples are chosen one by one where the GP knows least; what that costs is
-    printed beside a choice by chance.
+    Of more samples than --points, those with the largest predictive variance are chosen one by one;
+    the output compares their error with that of a random choice.
     """
 
     from bayesrace.gp.weights import write_weights
@@ -244,15 +297,22 @@ def train(
 
 
 def build(
-    model: Annotated[PredictionModel, typer.Option(help="Prediction model.")] = (
-        PredictionModel.e_kinematic
-    ),
-    horizon: Annotated[int, typer.Option(min=2, max=100, help="Stages N.")] = 20,
-    gp_capacity: Annotated[int, typer.Option(min=8, max=16384, help="Points per output.")] = 1024,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Copy the artefact here.")] = None,
+    model: Annotated[
+        PredictionModel,
+        typer.Option(metavar="MODEL", help="Prediction model: e_kinematic or dynamic."),
+    ] = PredictionModel.e_kinematic,
+    horizon: Annotated[
+        int, typer.Option(metavar="N", min=2, max=100, help="Stages of the horizon.")
+    ] = 20,
+    gp_capacity: Annotated[
+        int, typer.Option(metavar="N", min=8, max=16384, help="Most points per output.")
+    ] = 1024,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", metavar="DIR", help="Copy the artefact here.")
+    ] = None,
     car: Car = DEFAULT_CAR,
 ) -> None:
-    """Generate and compile a controller, or find it in the cache; prints its folder."""
+    """Generate and compile a controller, or take it from the cache; prints its folder."""
     from bayesrace.integrators import PERFECT, PREDICTION
     from bayesrace.vehicles import get_car
     from codegen.build import build as make
@@ -273,21 +333,25 @@ def build(
 
 
 def export(
-    out: Annotated[Path, typer.Argument(help="Folder to write into.")],
+    out: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write into.")],
     track: TrackName = DEFAULT_RACE_TRACK,
     raceline: Annotated[
-        Path | None, typer.Option(help="Racing line file [computed].", show_default=False)
+        Path | None, typer.Option(metavar="FILE", show_default="computed", help="Racing line.")
     ] = None,
     weights: Annotated[
-        Path | None, typer.Option(help="GP weights; none is the uncorrected model.")
+        Path | None,
+        typer.Option(metavar="FILE", help="GP weights; without them, the uncorrected model."),
     ] = None,
-    settings: Annotated[Path | None, typer.Option(help="OCP settings (JSON).")] = None,
+    settings: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="OCP settings (JSON).")
+    ] = None,
     artefact: Annotated[
-        Path | None, typer.Option(help="Folder of 'bayesrace build' [built].", show_default=False)
+        Path | None,
+        typer.Option(metavar="DIR", show_default="built", help="Folder of 'bayesrace build'."),
     ] = None,
     car: Car = DEFAULT_CAR,
 ) -> None:
-    """Write what a C program drives with: racing line, weights, settings (examples/c_host)."""
+    """Write racing line, weights and settings for a C program (examples/c_host)."""
     from bayesrace.gp.weights import read_weights
     from bayesrace.manifest import read_manifest
     from bayesrace.vehicles import get_car
@@ -317,9 +381,3 @@ def _replace(source: str, target: str) -> None:
     beside = f"{target}.new"
     shutil.copy2(source, beside)
     Path(beside).replace(target)
-
-
-def register(app: typer.Typer) -> None:
-    """Adds this module's subcommands."""
-    for command in (tracks, cars, raceline, collect, train, build, export):
-        app.command()(command)

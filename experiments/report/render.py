@@ -7,20 +7,26 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from matplotlib.figure import Figure
 
 from bayesrace.files import write_whole
 from experiments.analysis import RaceAnalysis, read_race
 from experiments.notation import UNCERTAIN
 from experiments.published import LIMIT, SOURCE, compare_gp, compare_laps
 from experiments.report.canvas import inline_svg, write_png
-from experiments.report.learning import gp_figure, solve_figure
-from experiments.report.maps import laps_on_track
+from experiments.report.learning import gp_figures, solve_figure
+from experiments.report.maps import LapMaps
 from experiments.report.style import figure_style, look
-from experiments.report.traces import deviation_figure, inputs_figure, speed_figure
-from experiments.results import LapResult, RaceResult
+from experiments.report.traces import (
+    deviation_figures,
+    input_figures,
+    speed_figures,
+    time_figures,
+)
+from experiments.results import RaceResult
 from experiments.table import COLUMNS
 
 __all__ = ["PICTURE", "REPORT", "render_report"]
@@ -30,17 +36,6 @@ PICTURE: Final = "lap.png"
 
 _TEMPLATE: Final = "report.html.j2"
 _PACKAGES: Final = ("bayesrace", "casadi", "numpy", "scikit-learn", "eclipse-zenoh")
-
-
-class _Card(NamedTuple):
-    """One controller's headline."""
-
-    name: str
-    colour: str
-    what: str
-    time: str
-    behind: str
-    note: str
 
 
 def render_report(run_dir: Path, result: RaceResult, analysis: RaceAnalysis | None = None) -> Path:
@@ -62,7 +57,7 @@ def render_report(run_dir: Path, result: RaceResult, analysis: RaceAnalysis | No
         result=result,
         columns=COLUMNS,
         look=look,
-        cards=_cards(result),
+        best=result.lap("bestcase"),
         facts=_facts(analysis, result),
         versions=_versions(run_dir),
         figures=_figures(analysis, run_dir / PICTURE),
@@ -73,35 +68,11 @@ def render_report(run_dir: Path, result: RaceResult, analysis: RaceAnalysis | No
         gp_compared=compare_gp(result),
         source=SOURCE,
         limit=LIMIT,
-        title=_title(analysis, result),
+        title=f"{result.settings.track} · {analysis.track.length_m:.2f} m",
     )
     path = run_dir / REPORT
     write_whole(path, page)
     return path
-
-
-def _title(analysis: RaceAnalysis, result: RaceResult) -> str:
-    return f"{result.settings.track} · {analysis.track.length_m:.2f} m"
-
-
-def _cards(result: RaceResult) -> list[_Card]:
-    best = result.lap("bestcase")
-    reference_s = best.lap_time_s if best is not None else None
-    return [_card(lap, reference_s) for lap in result.laps]
-
-
-def _card(lap: LapResult, reference_s: float | None) -> _Card:
-    name, colour, what = look(lap.controller)
-    if lap.lap_time_s is None:
-        return _Card(name, colour, what, "DNF", "", lap.ended)
-    behind = ""
-    if reference_s is not None and lap.controller != "bestcase":
-        behind = f"{lap.lap_time_s - reference_s:+.3f} s to BestCase".replace("-", "−")
-    flying = lap.flying_lap_time_s
-    parts = [f"flying {flying:.3f} s"] if flying is not None else []
-    off = lap.off_track_samples
-    parts.append(f"{off} off track, {lap.off_track_max_m:.3f} m" if off else "none off track")
-    return _Card(name, colour, what, f"{lap.lap_time_s:.3f}", behind, " · ".join(parts))
 
 
 def _facts(analysis: RaceAnalysis, result: RaceResult) -> list[tuple[str, str]]:
@@ -109,7 +80,7 @@ def _facts(analysis: RaceAnalysis, result: RaceResult) -> list[tuple[str, str]]:
     started_ns = analysis.recording.started_ns
     facts = [
         ("driven", "–" if started_ns is None else _calendar(started_ns)),
-        ("car", f"{summary.car}, played by {summary.fmu}" if summary.fmu else summary.car),
+        ("car", f"{summary.car}, simulated by {summary.fmu}" if summary.fmu else summary.car),
         ("trained on", summary.train_track),
         ("mode", summary.mode),
         ("seed", str(summary.seed)),
@@ -162,24 +133,24 @@ def _uncertain(analysis: RaceAnalysis) -> list[tuple[str, int, int]]:
     ]
 
 
-def _figures(analysis: RaceAnalysis, picture: Path) -> dict[str, str]:
-    """Name to SVG; a figure that has nothing to show is left out."""
+def _figures(analysis: RaceAnalysis, picture: Path) -> dict[str, list[str]]:
+    """Name to panels as SVG; what has nothing to show is left out."""
     runs, track, line = analysis.runs, analysis.track, analysis.line
     driven = [run for run in runs if len(run.record.truth) > 1]
-    figures: dict[str, str] = {}
+    figures: dict[str, list[Figure]] = {}
     with figure_style():
-        laps = laps_on_track(driven, track, line)
-        figures["laps"] = inline_svg(laps)
-        write_png(laps, picture)
+        maps = LapMaps(driven, track, line)
+        write_png(maps.picture(), picture)
+        figures["laps"] = maps.figures()
         if driven:
-            car = analysis.recording.car
-            figures["speed"] = inline_svg(speed_figure(driven, track, line))
-            figures["inputs"] = inline_svg(inputs_figure(driven, track, car))
-            figures["deviation"] = inline_svg(deviation_figure(driven, track))
+            figures["time"] = time_figures(driven, track)
+            figures["speed"] = speed_figures(driven, track, line)
+            figures["inputs"] = input_figures(driven, track, analysis.recording.car)
+            figures["deviation"] = deviation_figures(driven, track)
         data = analysis.best_case
         if data is not None and analysis.validations:
             progress = track.project_path(data.x[:, :2]).progress_m
-            figures["gp"] = inline_svg(gp_figure(analysis.validations, progress, track.length_m))
+            figures["gp"] = gp_figures(analysis.validations, progress, track.length_m)
         if any(len(run.record.solve_us) for run in driven):
-            figures["solve"] = inline_svg(solve_figure(driven))
-    return figures
+            figures["solve"] = [solve_figure(driven)]
+        return {name: [inline_svg(one) for one in some] for name, some in figures.items() if some}

@@ -10,11 +10,12 @@ from matplotlib.colors import Colormap, LinearSegmentedColormap
 __all__ = [
     "INK",
     "MUTED",
-    "PAGE_WIDTH",
+    "PICTURE_WIDTH",
     "SURFACE",
     "WARNING",
     "Look",
     "figure_style",
+    "gain_map",
     "look",
     "speed_map",
 ]
@@ -24,8 +25,8 @@ MUTED: Final = "#75756f"
 SURFACE: Final = "#e7e7e2"
 WARNING: Final = "#c8102e"
 
-PAGE_WIDTH: Final = 11.2
-"""Of a figure over the whole page [inch]."""
+PICTURE_WIDTH: Final = 11.2
+"""Of a picture with several panels [inch]."""
 
 
 class Look(NamedTuple):
@@ -36,15 +37,15 @@ class Look(NamedTuple):
     what: str
 
 
-# Okabe and Ito's colours: told apart by any eyes.
+# Okabe and Ito's colours, which colour-blind readers can distinguish.
 _LOOKS: Final[Mapping[str, Look]] = {
     "worstcase": Look("WorstCase", "#D55E00", "e-kinematic model, no correction"),
     "bayesrace": Look("BayesRace", "#0072B2", "corrected by GPs learned from pure pursuit"),
     "bayesrace-updated": Look(
         "BayesRace updated", "#009E73", "GPs updated with BayesRace's own laps"
     ),
-    "bestcase": Look("BestCase", "#3d3d3a", "the perfect model, for comparison"),
-    "purepursuit": Look("Pure pursuit", "#CC79A7", "the driver of the training laps"),
+    "bestcase": Look("BestCase", "#3d3d3a", "the true model, for comparison"),
+    "purepursuit": Look("Pure pursuit", "#CC79A7", "controller of the training laps"),
 }
 
 
@@ -60,14 +61,18 @@ def speed_map() -> Colormap:
     return LinearSegmentedColormap.from_list("speed", shades)
 
 
+def gain_map() -> Colormap:
+    """Gains in blue, losses in red, and what is neither dark enough for a light background."""
+    return LinearSegmentedColormap.from_list("gain", ["#0072B2", "#8d8d86", "#C8321E"])
+
+
 _STYLE: Final[dict[str, Any]] = {
-    "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans", "Arial", "Helvetica"],
-    "font.size": 8.0,
-    "axes.titlesize": 9.0,
+    "font.size": 9.0,
+    "axes.titlesize": 9.5,
     "axes.titlelocation": "left",
     "axes.titlepad": 6.0,
-    "axes.labelsize": 8.0,
+    "axes.labelsize": 9.0,
     "axes.labelcolor": INK,
     "axes.edgecolor": "#b5b5ae",
     "axes.linewidth": 0.6,
@@ -79,17 +84,14 @@ _STYLE: Final[dict[str, Any]] = {
     "grid.linewidth": 0.6,
     "xtick.color": MUTED,
     "ytick.color": MUTED,
-    "xtick.labelsize": 7.5,
-    "ytick.labelsize": 7.5,
+    "xtick.labelsize": 8.5,
+    "ytick.labelsize": 8.5,
     "xtick.major.size": 0,
     "ytick.major.size": 0,
     "text.color": INK,
     "lines.linewidth": 1.2,
     "legend.frameon": False,
-    "legend.fontsize": 8.0,
-    "figure.facecolor": "white",
-    "axes.facecolor": "white",
-    "savefig.facecolor": "white",
+    "legend.fontsize": 8.5,
     # Text stays text: smaller, and it can be searched and read out.
     "svg.fonttype": "none",
     "svg.hashsalt": "bayesrace",

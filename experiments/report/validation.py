@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from bayesrace.gp.weights import OUTPUTS, UNITS
 from bayesrace.tracks import Track
 from experiments.notation import SYMBOLS
-from experiments.report.bands import band_patch, draw_band, mark_uncertain, uncertain_handle
+from experiments.report.bands import BAND, draw_band, mark_uncertain
 from experiments.report.maps import draw_edges
-from experiments.report.style import INK, MUTED, PAGE_WIDTH, WARNING
+from experiments.report.style import INK, MUTED, PICTURE_WIDTH, WARNING
 from learning.dataset import Dataset
 from learning.validation import Validation, unbroken
 
@@ -32,7 +32,7 @@ def band_figure(validation: Validation, step_s: float, threshold: float) -> Figu
 
     Right, what the correction leaves, at its own scale. Marks below: largest sigma > ``threshold``.
     """
-    figure = Figure(figsize=(PAGE_WIDTH, 6.4))
+    figure = Figure(figsize=(PICTURE_WIDTH, 6.4))
     grid = figure.subplots(len(OUTPUTS), 2, sharex=True, squeeze=False)
     time_s: Floats = np.arange(len(validation.sigma), dtype=np.float64) * step_s
     marked = validation.uncertain(threshold)
@@ -81,8 +81,10 @@ def _marks(threshold: float) -> list[Line2D | Patch]:
     return [
         Line2D([], [], color=INK, linewidth=1, label="driven minus predicted"),
         Line2D([], [], color=_MEAN, linewidth=1, label="the GP's mean"),
-        band_patch(),
-        uncertain_handle(threshold),
+        Patch(color=BAND, label="95 % band predicted"),
+        Line2D(
+            [], [], color=WARNING, marker="|", linestyle="", label=f"largest sigma > {threshold:g}"
+        ),
     ]
 
 
@@ -92,7 +94,7 @@ def track_figure(
     """Where the car was, in red where the largest sigma is above ``threshold`` (paper's figure)."""
     xy = dataset.x[:, :2]
     corners = xy
-    figure = Figure(figsize=(PAGE_WIDTH * 0.72, 6.4))
+    figure = Figure(figsize=(PICTURE_WIDTH * 0.72, 6.4))
     axes = figure.subplots()
     if track is not None:
         right, left = track.boundaries(0.04)
