@@ -79,7 +79,7 @@ def export(
 ) -> None:
     """Write the car, or the controller of a track, as an FMU, C sources inside."""
     from bayesrace.vehicles import get_car
-    from codegen.fmu import pack
+    from codegen.fmu import car_fmu, pack
 
     parameters = get_car(car)
     number: Literal[2, 3] = 2 if version is Version.two else 3
@@ -88,8 +88,6 @@ def export(
             track=track, raceline=raceline, weights=weights, settings=settings, artefact=artefact,
             cpu=None if cpu == "portable" else cpu,
         )  # fmt: skip
-        from plant.fmu.export import car_fmu
-
         definition = car_fmu(parameters, number, kind.value)
     elif kind is Kind.me:
         raise InputError("a controller is sampled, not continuous: export it with --kind cs")
@@ -126,7 +124,7 @@ def _controller(
 ) -> "FmuDefinition":
     from bayesrace.gp.weights import read_weights
     from codegen.build import build
-    from codegen.fmu.controller import controller_fmu
+    from codegen.fmu import controller_fmu
     from codegen.settings import BuildSettings
     from controller.assembly import read_settings
     from controller.cycle_settings import FallbackSettings
@@ -136,13 +134,13 @@ def _controller(
     return controller_fmu(
         artefact or build(BuildSettings(car=car))[0],
         car,
-        table.rows,
-        table.spacing_m,
-        read_settings(settings, MpcSettings).parameters(car),
-        FallbackSettings().model_dump() | {"brake_fade_mps": car.brake_fade_mps},
-        None if weights is None else read_weights(weights),
-        version,
-        cpu,
+        rows=table.rows,
+        spacing_m=table.spacing_m,
+        settings=read_settings(settings, MpcSettings).parameters(car),
+        fallback=FallbackSettings().model_dump() | {"brake_fade_mps": car.brake_fade_mps},
+        weights=None if weights is None else read_weights(weights),
+        version=version,
+        cpu=cpu,
     )
 
 
@@ -154,7 +152,7 @@ def other_weights(
 ) -> None:
     """Copy a controller's FMU with other weights: nothing is compiled."""
     from bayesrace.gp.weights import read_weights
-    from codegen.fmu.resources import exchange_weights
+    from codegen.fmu.weights import exchange_weights
 
     loaded = read_weights(weights)
     exchange_weights(controller, loaded, out)

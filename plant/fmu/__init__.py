@@ -1,1 +1,1 @@
-"""The car as an FMU: exported from our equations, or any Co-Simulation FMU as the plant."""
+"""Any Co-Simulation FMU as the plant's car. The export of FMUs is in :mod:`codegen.fmu`."""
