@@ -33,7 +33,7 @@ def _page(definition: FmuDefinition, parts: Sequence[Part]) -> str:
     kind = "Model Exchange" if definition.states else "Co-Simulation"
     linux = PLATFORMS["x86_64-linux"]
     binary = f"{definition.identifier}.so"
-    line = arguments(linux, linked_files(definition), binary, definition.flags)
+    line = arguments(linux, linked_files(definition, ".c", ".a"), binary, definition.flags)
     return f"""<!DOCTYPE html><html lang="en"><meta charset="utf-8"><style>{_STYLE}</style>
 <title>{escape(definition.name)}</title><h1>{escape(definition.name)}</h1>
 <p>{escape(definition.description)}. FMI {definition.version}.0 for {kind}.</p>
@@ -56,7 +56,7 @@ def write_sources(definition: FmuDefinition, folder: Path) -> list[str]:
     for name, content in all_sources(definition).items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(content)
-    return linked_files(definition)
+    return linked_files(definition, ".c", ".a")
 
 
 def pack(definition: FmuDefinition, out: Path, platforms: Sequence[str] | None = None) -> Path:

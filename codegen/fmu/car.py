@@ -14,13 +14,8 @@ import casadi as ca
 
 from bayesrace.errors import InputError
 from bayesrace.integrators import PLANT_SCHEME, PLANT_SUBSTEP_HZ, SCHEMES
-from bayesrace.vehicles.models import (
-    DYNAMIC_PARAMETERS,
-    INPUTS,
-    STATES,
-    car_value,
-    dynamic_with_parameters,
-)
+from bayesrace.vehicles import models
+from bayesrace.vehicles.models import DYNAMIC_PARAMETERS, INPUTS, STATES
 from bayesrace.vehicles.parameters import CarParameters, Pacejka
 from codegen.fmu.definition import FmuDefinition, Variable
 from codegen.fmu.sources import NATIVE
@@ -58,27 +53,22 @@ F_x  = (cm1 - cm2 vx) d - cr0 - cr2 vx^2
 F_fy = front_d sin(front_c atan(front_b alpha_f))    alpha_f = delta - atan((omega lf_m + vy) / vx)
 F_ry = rear_d sin(rear_c atan(rear_b alpha_r))       alpha_r = atan((omega lr_m - vy) / vx)
 </pre>
-<p>Below 0.1 m/s, slip angles and rolling resistance fade smoothly to none at standstill.</p>
+<p>Below 0.1 m/s, slip angles and rolling resistance fade smoothly to none at standstill. {kind}</p>
 """
 
-_KIND_PAGE: Final = {
-    "cs": """
-<p>A communication step may have any length and is divided into equal Runge-Kutta steps of at most
-1 ms. During it, the inputs are held. Whatever they are, the car does what its actuators can: duty
-cycle within d_min to d_max, steering rate within &plusmn;delta_rate_max_radps and such that the
-steering angle stays within &plusmn;delta_max_rad; an input that is not finite brakes the car, with
-the steering held. d_applied and delta_rate_applied say what acted. The state can be saved, set and
-serialised at any time.</p>""",
-    "me": """
-<p>The derivatives are those of the equations as they stand: no limit is applied to an input or to
-the steering angle. Directional and adjoint derivatives are exact, with respect to states, inputs
-and parameters.</p>""",
+_KIND: Final = {
+    "cs": "A communication step has any length and is divided into equal Runge-Kutta steps of at "
+    "most 1 ms, with the inputs held. Duty cycle, steering rate and steering angle stay within the "
+    "limits; an input that is not finite brakes the car with the steering held. d_applied and "
+    "delta_rate_applied say what acted.",
+    "me": "No limit is applied to an input or to the steering angle. Directional and adjoint "
+    "derivatives are exact, with respect to states, inputs and parameters.",
 }
 
 
 def car_values(car: CarParameters) -> dict[str, float]:
     """Every FMU parameter of a car by name; ``front_b`` is ``car.front.b``."""
-    return {name: car_value(car, name) for name in (*DYNAMIC_PARAMETERS, *LIMITS)}
+    return {name: models.car_value(car, name) for name in (*DYNAMIC_PARAMETERS, *LIMITS)}
 
 
 def _parameter(name: str, value: float) -> Variable:
@@ -102,7 +92,6 @@ def _parameter(name: str, value: float) -> Variable:
 
 def _variables(car: CarParameters, kind: str) -> list[Variable]:
     """In the order that car.c relies on: states, inputs, parameters, the rest."""
-    values = car_values(car)
     sampled = kind == "cs"
     held = " (held during a step)" if sampled else ""
     nominal = {"vx": 1.0, "vy": 0.1, "delta": 0.1}
@@ -118,8 +107,11 @@ def _variables(car: CarParameters, kind: str) -> list[Variable]:
         Variable("d", "input", duty, unit="1", start=0.0, min=-1, max=1),
         Variable("delta_rate", "input", f"steering rate{held}", unit="rad/s", start=0.0),
     ]
-    names = (*DYNAMIC_PARAMETERS, *(LIMITS if sampled else ()))
-    variables += [_parameter(name, values[name]) for name in names]
+    variables += [
+        _parameter(name, value)
+        for name, value in car_values(car).items()
+        if sampled or name not in LIMITS
+    ]
     if not sampled:
         return variables + _derivatives()
     acted = "that acted in the last step"
@@ -133,11 +125,7 @@ def _variables(car: CarParameters, kind: str) -> list[Variable]:
 def _derivatives() -> list[Variable]:
     """Their direct dependencies on states and inputs are those of the equations."""
     sparsity = _rates().sparsity_jac(0, 0)
-    names = (*STATES, *INPUTS, *DYNAMIC_PARAMETERS)
-
-    def dependencies(row: int, count: int) -> tuple[str, ...]:
-        return tuple(names[column] for column in range(count) if sparsity.has_nz(row, column))
-
+    names = (*STATES, *INPUTS)
     return [
         Variable(
             f"der_{name}",
@@ -145,8 +133,7 @@ def _derivatives() -> list[Variable]:
             f"time derivative of {name}",
             unit=f"{unit}2" if unit.endswith("/s") else f"{unit}/s",
             derivative_of=name,
-            dependencies=dependencies(row, len(STATES) + len(INPUTS)),
-            initial_dependencies=dependencies(row, len(names)),
+            dependencies=tuple(n for column, n in enumerate(names) if sparsity.has_nz(row, column)),
         )
         for row, (name, (unit, _)) in enumerate(STATE.items())
     ]
@@ -154,7 +141,7 @@ def _derivatives() -> list[Variable]:
 
 def _rates() -> Any:
     """The equations as a function of states, inputs and parameters in one vector."""
-    ode = dynamic_with_parameters()
+    ode = models.dynamic_with_parameters()
     n, m, k = (ode.size1_in(i) for i in range(3))
     known = ca.SX.sym("known", n + m + k)
     return ca.Function("car_rates", [known], [ode(*ca.vertsplit(known, [0, n, n + m, n + m + k]))])
@@ -162,7 +149,7 @@ def _rates() -> Any:
 
 def _substep() -> Any:
     """One integration step of Co-Simulation: (x, u, p, h) -> x_next."""
-    ode = dynamic_with_parameters()
+    ode = models.dynamic_with_parameters()
     x, u, p = (ca.SX.sym(name, ode.size1_in(i)) for i, name in enumerate("xup"))
     h: Any = ca.SX.sym("h")  # the schemes take a symbol as well
     _, advance = SCHEMES[PLANT_SCHEME]
@@ -213,5 +200,5 @@ def car_fmu(
         variables=tuple(_variables(car, kind)),
         sources=_sources(kind),
         constants=constants if kind == "cs" else {},
-        documentation=_PAGE.format(car=car.name) + _KIND_PAGE[kind],
+        documentation=_PAGE.format(car=car.name, kind=_KIND[kind]),
     )

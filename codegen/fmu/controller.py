@@ -47,8 +47,6 @@ _STATUSES: Final = ", ".join(
     )
 )
 
-_LEVELS: Final = "0 the solution, 1 the plan before, 2 braking, 3 standing"
-
 _RANGES: Final[dict[str, dict[str, Any]]] = {
     "> 0": {"unit": "1", "min": 0.0, "exclusive": True},
     ">= 0": {"unit": "1", "min": 0.0},
@@ -127,25 +125,19 @@ def _variables(
     manifest: Manifest, settings: Mapping[str, float], fallback: Mapping[str, float]
 ) -> list[Variable]:
     """In the order that controller.c relies on: the state together, the outputs last."""
+    acts = "duty cycle that acts now, read if d_applied_connected; else taken to be the last output"
+    limit = f"the reference moves along the racing line no faster; {_NO_LIMIT_MPS:g}: no limit"
+    rate = "by how much the limit falls along the horizon, for a stop on the line"
     return [
         *(
             Variable(name, "input", f"measured: {text}", unit=unit, start=0.0)
             for name, (unit, text) in STATE.items()
         ),
-        *_inputs(),
-        *_parameters(manifest, settings, fallback),
-        *_outputs(),
-    ]
-
-
-def _inputs() -> list[Variable]:
-    acts = "duty cycle that acts now, read if d_applied_connected; else taken to be the last output"
-    limit = f"the reference moves along the racing line no faster; {_NO_LIMIT_MPS:g}: no limit"
-    rate = "by how much the limit falls along the horizon, for a stop on the line"
-    return [
         Variable("d_applied", "input", acts, unit="1", start=0.0),
         Variable("speed_limit", "input", limit, unit="m/s", start=_NO_LIMIT_MPS),
         Variable("speed_limit_rate", "input", rate, unit="m/s2", start=0.0),
+        *_parameters(manifest, settings, fallback),
+        *_outputs(),
     ]
 
 
@@ -157,9 +149,7 @@ def _parameters(
     def tunable(name: str, text: str, start: float, **others: Any) -> Variable:
         return Variable(name, "parameter", text, start=start, tunable=True, **others)
 
-    recover = (
-        "fallback: usable solutions in a row that end braking; a standing car drives the first"
-    )
+    recover = "fallback: usable solutions that end braking; a standing car drives the first"
     period = "time between two control steps, outputs held in between; 0: one in every doStep"
     delay = (
         "time from the state to the new input acting, over which it is predicted: the "
@@ -167,13 +157,9 @@ def _parameters(
     )
     connected = "d_applied is connected"
     return [
-        *(
-            tunable(
-                one.name, one.text, _value(settings, one.name), unit=one.unit,
-                min=0.0 if one.positive else one.low, max=one.high, exclusive=one.positive,
-            )
-            for one in manifest.problem.parameters
-        ),
+        *(tunable(one.name, one.text, _value(settings, one.name), unit=one.unit, max=one.high,
+                  min=0.0 if one.positive else one.low, exclusive=one.positive)
+          for one in manifest.problem.parameters),
         *(tunable(name, text, _value(settings, name), **_RANGES[rule])
           for name, _, text, rule in SOLVER),
         *(tunable(name, f"fallback: {text}", _value(fallback, key), unit=unit, min=0.0,
@@ -196,7 +182,9 @@ def _outputs() -> list[Variable]:
         output("delta_rate", "steering rate", unit="rad/s"),
         output("status", f"of the step: {_STATUSES}", kind="integer"),
         output("usable", "the step's solution may be driven", kind="boolean"),
-        output("fallback_level", _LEVELS, kind="integer"),
+        output(
+            "fallback_level", "0 solution, 1 plan before, 2 braking, 3 standing", kind="integer"
+        ),
         output("iterations_used", "SQP iterations of the step", kind="integer"),
         output("stationarity", "residual at the plan; -1: not known", unit="1"),
         output("defect", "dynamics residual at the plan; -1: not known", unit="1"),
@@ -208,17 +196,15 @@ def _outputs() -> list[Variable]:
 
 def _documentation(manifest: Manifest, weights: GpWeights | None, cpu: str) -> str:
     correction = "no correction" if weights is None else f"weights '{escape(weights.version)}'"
-    return (
-        f"<p>Nonlinear model predictive controller, {manifest.horizon} stages of "
-        f"{manifest.step_s:g} s, model {escape(manifest.discretisation)}, {correction}.</p>"
-        "<p>Every doStep in which a control step is due makes one for the inputs set before it. "
-        "Its outputs are meant for the plant's step over the same time. So step the controller "
-        "first, hand its outputs to the plant, and step that. If your tool steps all FMUs side by "
-        "side, set <code>delay</code> to the communication step.</p>"
-        "<p>If a step gives no usable solution, the outputs are those of the plan before it, then "
-        "of braking along it; see <code>fallback_level</code>. Outputs are always finite.</p>"
-        f"<p>Racing line and weights are in <code>resources/{PATH_FILE}</code> and "
-        f"<code>resources/{WEIGHTS_FILE}</code> (format: sources/br_files.h), loaded "
-        "and checked at instantiation: exchange them without compiling.</p>"
-        f"<p>The binary is compiled for the CPU '{escape(cpu)}'.</p>"
-    )
+    return f"""<p>Nonlinear model predictive controller, {manifest.horizon} stages of
+{manifest.step_s:g} s, model {escape(manifest.discretisation)}, {correction}; the binary is for the
+CPU '{escape(cpu)}'.</p>
+<p>Every doStep in which a control step is due makes one for the inputs set before it. Its outputs
+are meant for the plant's step over the same time. So step the controller first, hand its outputs to
+the plant, and step that. If your tool steps all FMUs side by side, set <code>delay</code> to the
+communication step.</p>
+<p>If a step gives no usable solution, the outputs are those of the plan before it, then of braking
+along it; see <code>fallback_level</code>. Outputs are always finite.</p>
+<p>Racing line and weights are in <code>resources/{PATH_FILE}</code> and
+<code>resources/{WEIGHTS_FILE}</code> (format: sources/br_files.h), loaded and checked at
+instantiation: exchange them without compiling.</p>"""

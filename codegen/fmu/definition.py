@@ -15,8 +15,7 @@ class Variable:
     """One scalar variable; its value reference is its place in the definition.
 
     An input, a parameter, a state and an output that may be set before the run have a ``start``;
-    an output without one is calculated. Booleans are 0 or 1. In C the variable is
-    ``instance->value[FMU_V_<name>]``.
+    an output without one is calculated. In C the variable is ``instance->value[FMU_V_<name>]``.
     """
 
     name: str
@@ -38,8 +37,6 @@ class Variable:
     """Model Exchange: the state that this variable is the derivative of."""
     dependencies: tuple[str, ...] | None = ()
     """Outputs and derivatives: variables that it depends on directly (None: on all)."""
-    initial_dependencies: tuple[str, ...] | None = ()
-    """The same at initialisation, where parameters and start values count as well."""
 
     def __post_init__(self) -> None:
         if self.start is None and self.causality in ("input", "parameter"):
@@ -83,14 +80,14 @@ class FmuDefinition:
     resources: Mapping[str, bytes] = field(default_factory=dict)
     """Files of the ``resources/`` folder: relative path to content."""
     documentation: str = ""
-    """Body of the documentation page, HTML; the table of variables is added."""
+    """Body of the documentation page, HTML."""
     default_step_s: float = 0.02
     serialises: bool = True
     """A saved state can become bytes for another instance: model memory holds no pointers."""
 
     @property
     def states(self) -> tuple[str, ...]:
-        """Continuous states; there are some if and only if the FMU is for Model Exchange."""
+        """Continuous states: some if the FMU is for Model Exchange, else none."""
         return tuple(v.derivative_of for v in self.variables if v.derivative_of is not None)
 
     @property
@@ -99,6 +96,6 @@ class FmuDefinition:
         return (*self.variables, TIME)
 
     @property
-    def libraries(self) -> list[str]:
-        """Names of the static libraries among the sources."""
-        return sorted(name for name in self.sources if name.endswith(".a"))
+    def libraries(self) -> bool:
+        """Whether static libraries are among the sources."""
+        return any(name.endswith(".a") for name in self.sources)

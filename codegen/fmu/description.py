@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 from functools import cache
 from math import isfinite
-from typing import Final
+from typing import Any, Final
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import pint
@@ -19,8 +19,9 @@ _TYPES: Final = {
     2: {"real": "Real", "integer": "Integer", "boolean": "Boolean"},
     3: {"real": "Float64", "integer": "Int32", "boolean": "Boolean"},
 }
-
 _BASE: Final = {"kilogram": "kg", "meter": "m", "second": "s", "radian": "rad"}
+
+_registry: Final[Any] = cache(pint.UnitRegistry)
 
 
 def _base_units(unit: str) -> dict[str, str]:
@@ -32,19 +33,15 @@ def _base_units(unit: str) -> dict[str, str]:
     return {_BASE[name]: str(int(power)) for name, power in base.unit_items()}
 
 
-@cache
-def _registry() -> pint.UnitRegistry:
-    return pint.UnitRegistry()
-
-
 def _text(root: Element) -> bytes:
     indent(root)
     text: bytes = tostring(root, encoding="utf-8", xml_declaration=True)
     return text + b"\n"
 
 
-def _flag(value: bool) -> str:
-    return "true" if value else "false"
+def _add_files(parent: Element, tag: str, names: Sequence[str]) -> None:
+    for name in names:
+        SubElement(parent, tag, name=name)
 
 
 def model_description(definition: FmuDefinition, token: str) -> bytes:
@@ -62,33 +59,21 @@ def model_description(definition: FmuDefinition, token: str) -> bytes:
     }
     root = Element("fmiModelDescription", head)
     state = "FMUstate" if two else "FMUState"
-    interface = SubElement(
-        root,
-        "ModelExchange" if definition.states else "CoSimulation",
-        {
-            "modelIdentifier": definition.identifier,
-            "canBeInstantiatedOnlyOncePerProcess": "false",
-            f"canGetAndSet{state}": "true",
-            f"canSerialize{state}": _flag(definition.serialises),
-        },
-    )
+    interface = {
+        "modelIdentifier": definition.identifier,
+        "canBeInstantiatedOnlyOncePerProcess": "false",
+        f"canGetAndSet{state}": "true",
+        f"canSerialize{state}": _number(definition.serialises, "boolean"),
+    }
     if definition.states:
-        interface.set("providesDirectionalDerivatives", "true")
-        interface.set("providesAdjointDerivatives", "true")
+        abilities = ("providesDirectionalDerivatives", "providesAdjointDerivatives")
+        SubElement(root, "ModelExchange", interface | dict.fromkeys(abilities, "true"))
     else:
-        interface.set("canHandleVariableCommunicationStepSize", "true")
-    if two:
-        interface.set("canNotUseMemoryManagementFunctions", "true")
-        files = SubElement(interface, "SourceFiles")
-        compiled = [name for name in linked_files(definition) if name.endswith(".c")]
-        _named_files(files, "File", compiled)
-    _units_and_experiment(root, definition)
-    _variables(root, definition)
-    _structure(root, definition)
-    return _text(root)
-
-
-def _units_and_experiment(root: Element, definition: FmuDefinition) -> None:
+        interface["canHandleVariableCommunicationStepSize"] = "true"
+        parent = SubElement(root, "CoSimulation", interface)
+        if two:
+            parent.set("canNotUseMemoryManagementFunctions", "true")
+            _add_files(SubElement(parent, "SourceFiles"), "File", linked_files(definition, ".c"))
     units = SubElement(root, "UnitDefinitions")
     for unit in sorted({v.unit for v in definition.all_variables if v.unit is not None}):
         SubElement(SubElement(units, "Unit", name=unit), "BaseUnit", _base_units(unit))
@@ -97,11 +82,14 @@ def _units_and_experiment(root: Element, definition: FmuDefinition) -> None:
     SubElement(categories, "Category", name="logStatusError", description=why)
     step = repr(definition.default_step_s)
     SubElement(root, "DefaultExperiment", startTime="0", stopTime="10", stepSize=step)
+    _variables(root, definition)
+    _structure(root, definition)
+    return _text(root)
 
 
 def _number(value: float, kind: str) -> str:
     if kind == "boolean":
-        return _flag(bool(value))
+        return "true" if value else "false"
     return str(int(value)) if kind == "integer" else repr(float(value))
 
 
@@ -144,12 +132,13 @@ def _structure(root: Element, definition: FmuDefinition) -> None:
     place = {v.name: str(i) for i, v in enumerate(definition.variables, start=int(two))}
     outputs = [v for v in definition.variables if v.causality == "output"]
     derivatives = [v for v in definition.variables if v.derivative_of is not None]
-    calculated = [v for v in (*outputs, *derivatives) if v.start is None]
+    # before the run, calculated outputs are constants, derivatives may depend on everything
+    initial = [(v, ()) for v in outputs if v.start is None] + [(v, None) for v in derivatives]
     structure = SubElement(root, "ModelStructure")
     for tag, unknowns in (
         ("Output", [(v, v.dependencies) for v in outputs]),
         ("ContinuousStateDerivative", [(v, v.dependencies) for v in derivatives]),
-        ("InitialUnknown", [(v, v.initial_dependencies) for v in calculated]),
+        ("InitialUnknown", initial),
     ):
         if not unknowns:
             continue
@@ -161,18 +150,12 @@ def _structure(root: Element, definition: FmuDefinition) -> None:
                 element.set("dependencies", " ".join(place[name] for name in known))
 
 
-def _named_files(parent: Element, tag: str, names: Sequence[str]) -> None:
-    for name in names:
-        SubElement(parent, tag, name=name)
-
-
 def build_description(definition: FmuDefinition, options: Sequence[str]) -> bytes:
     """``sources/buildDescription.xml`` of FMI 3.0; ``options``: of the compiler."""
     root = Element("fmiBuildDescription", fmiVersion="3.0")
     parent = SubElement(root, "BuildConfiguration", modelIdentifier=definition.identifier)
     files = SubElement(parent, "SourceFileSet", language="C11", compilerOptions=" ".join(options))
-    compiled = [name for name in linked_files(definition) if name.endswith(".c")]
-    _named_files(files, "SourceFile", compiled)
-    _named_files(parent, "Library", definition.libraries)
+    _add_files(files, "SourceFile", linked_files(definition, ".c"))
+    _add_files(parent, "Library", linked_files(definition, ".a"))
     SubElement(parent, "Library", name="m", external="true")
     return _text(root)

@@ -19,16 +19,17 @@ __all__ = ["Part", "licence_files", "third_parties"]
 
 
 class Part(NamedTuple):
-    """Something that an FMU holds and that another project owns."""
+    """Something in an FMU that another project owns.
+
+    ``package``: the installed one that it comes from; ``where``: in the FMU; ``text``: the licence
+    with its copyright lines.
+    """
 
     name: str
     package: str
-    """The installed package that it comes from."""
     licence: str
     where: str
-    """In the FMU."""
     text: str
-    """The licence, with the copyright lines."""
 
     @property
     def file(self) -> str:
@@ -41,16 +42,16 @@ class Part(NamedTuple):
         return f"{self.name} ({self.package} {version}), {self.licence}: {self.where}"
 
 
+def _folder(package: str) -> Path:
+    return Path(str(distribution(package).locate_file(package)))
+
+
 def _comment(path: Path, beginning: str) -> str:
     """The comment of a C file from the line with ``beginning`` on."""
     found = re.search(rf"[^\n]*{beginning}.*?(?=\*/|\n\n\n)", path.read_text("utf-8"), re.DOTALL)
     if found is None:
         raise InputError(f"{path} names no licence: install its package again")
     return re.sub(r"(?m)^[ */]+", "", found[0])
-
-
-def _folder(package: str) -> Path:
-    return Path(str(distribution(package).locate_file(package)))
 
 
 def third_parties(definition: FmuDefinition, targets: Sequence[Platform]) -> list[Part]:
@@ -67,25 +68,24 @@ def third_parties(definition: FmuDefinition, targets: Sequence[Platform]) -> lis
         text = (casadi / "licenses/daqp-external/LICENSE").read_text("utf-8")
         where = "sources/libdaqpstat.a, sources/daqp, the binary"
         parts.append(Part("DAQP", "casadi", "MIT", where, text))
-    for zig in (target.name for target in targets if "ziglang" in target.command()):
-        parts += [part for part in _linked_by_zig(zig) if part not in parts]
+    if zig := [target.name for target in targets if "ziglang" in target.command()]:
+        parts += _linked_by_zig(" ".join(zig))
     return parts
 
 
-def _linked_by_zig(platform: str) -> list[Part]:
-    """What ziglang links into every binary for a platform."""
-    folder = _folder("ziglang")
-    libraries = [("Zig compiler runtime", "MIT", "every platform", "LICENSE")]
-    if platform.endswith("windows"):
-        licence = "ZPL-2.1 and public domain"
-        libraries.append(("MinGW-w64 runtime", licence, platform, "lib/libc/mingw/COPYING"))
-    if platform.endswith("linux"):
-        licence = "LGPL-2.1-or-later with an exception for linking"
-        libraries.append(("glibc start-up code", licence, "Linux", "lib/libc/glibc/LICENSES"))
+def _linked_by_zig(platforms: str) -> list[Part]:
+    """What ziglang links into binaries."""
+    lgpl = "LGPL-2.1-or-later with an exception for linking"
+    libraries = (
+        ("Zig compiler runtime", "MIT", "", "LICENSE"),
+        ("MinGW-w64 runtime", "ZPL-2.1, public domain", "windows", "lib/libc/mingw/COPYING"),
+        ("glibc start-up code", lgpl, "linux", "lib/libc/glibc/LICENSES"),
+    )
     return [
-        Part(name, "ziglang", licence, f"binaries for {of}", (folder / file).read_text("utf-8"))
-        for name, licence, of, file in libraries
-    ]
+        Part(name, "ziglang", licence, f"cross-compiled binaries {system}".strip(),
+             (_folder("ziglang") / file).read_text("utf-8"))
+        for name, licence, system, file in libraries if system in platforms
+    ]  # fmt: skip
 
 
 def licence_files(parts: Sequence[Part]) -> dict[str, bytes]:

@@ -21,15 +21,16 @@ FLAGS: Final = ("-std=gnu11", "-O2", "-ffp-contract=off", "-fvisibility=hidden")
 
 @dataclass(frozen=True)
 class Platform:
-    """An operating system and processor that FMI has a folder for."""
+    """An operating system and processor that FMI has a folder for.
+
+    ``name``: FMI 3.0's folder, and on the command line; ``fmi2``: FMI 2.0's folder; ``suffix``: of
+    binaries; ``zig``: ziglang's target, None if only the host's own compiler can build for it.
+    """
 
     name: str
-    """FMI 3.0's folder, and the name on the command line."""
     fmi2: str
-    """FMI 2.0's folder."""
     suffix: str
     zig: str | None
-    """ziglang's target; None: only the host's own compiler can build for it."""
 
     def folder(self, version: int) -> str:
         """Below ``binaries/``."""
@@ -50,8 +51,7 @@ class Platform:
         return [*RUN_MODULE, "ziglang", "cc", "-target", self.zig, "-s", "-g0"]
 
 
-# the old glibc is for the binary to load on old systems too
-_KNOWN: Final = (
+_KNOWN: Final = (  # the old glibc is for the binary to load on old systems too
     Platform("x86_64-linux", "linux64", ".so", "x86_64-linux-gnu.2.17"),
     Platform("aarch64-linux", "aarch64-linux", ".so", "aarch64-linux-gnu.2.17"),
     Platform("x86_64-windows", "win64", ".dll", "x86_64-windows-gnu"),

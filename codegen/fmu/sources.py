@@ -43,9 +43,10 @@ def all_sources(definition: FmuDefinition) -> dict[str, bytes]:
     return {**_fixed(definition), "fmu_config.h": header}
 
 
-def linked_files(definition: FmuDefinition) -> list[str]:
-    """Those that the compiler is given: C files, then libraries."""
-    return [*sorted(n for n in _fixed(definition) if n.endswith(".c")), *definition.libraries]
+def linked_files(definition: FmuDefinition, *endings: str) -> list[str]:
+    """Those that the compiler is given, of these endings in this order."""
+    names = sorted(_fixed(definition))
+    return [name for ending in endings for name in names if name.endswith(ending)]
 
 
 def _row(v: Variable) -> str:

@@ -58,15 +58,15 @@ def read_description(path: str | os.PathLike[str]) -> Any:
             )
         with archive.open("modelDescription.xml") as xml:
             head = xml.read(1 << 16)
-    version = re.search(rb"fmiVersion\s*=\s*[\"']([^\"']*)[\"']", head)
-    told = version.group(1).decode(errors="replace") if version else "none"
-    if not (told == "2.0" or told.startswith("3.")):
+    stated = re.search(rb"fmiVersion\s*=\s*[\"']([^\"']*)[\"']", head)
+    version = stated.group(1).decode(errors="replace") if stated else "none"
+    if version != "2.0" and not version.startswith("3."):
         raise InputError(
-            f"{path} is for FMI version {told}; versions 2.0 and 3.0 are understood: export it so"
+            f"{path} is for FMI version {version}; versions 2.0 and 3.0 are read: export it so"
         )
     try:
         return read_model_description(str(path), validate=False)
-    except Exception as error:  # it fails with whatever the first wrong line leads to
+    except Exception as error:  # fmpy fails with whatever the first wrong line leads to
         raise InputError(f"{path}: its modelDescription.xml cannot be read: {error}") from None
 
 

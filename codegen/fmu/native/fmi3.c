@@ -102,9 +102,7 @@ fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 time, fmi3Float64 h, fmi3Boole
                       fmi3Float64 *reached) {
     REQUIRE(FMU_STEPPING);
     const bool fine = fmu_step(instance, time, h);
-    no(event);
-    no(terminate);
-    no(early);
+    no(event), no(terminate), no(early);
     if (reached) *reached = instance->value[FMU_V_time];
     return fine ? fmi3OK : fmi3Error;
 }
@@ -113,27 +111,21 @@ fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 time, fmi3Float64 h, fmi3Boole
 
 #define INITIALISED (FMU_INITIALISATION | FMU_EVENT | FMU_CONTINUOUS | FMU_TERMINATED)
 
-fmi3Status fmi3EnterEventMode(fmi3Instance c) {
-    REQUIRE(FMU_CONTINUOUS);
-    instance->phase = FMU_EVENT;
-    return fmi3OK;
-}
+#define ENTER(mode, before, after)                                                                 \
+    fmi3Status fmi3Enter##mode(fmi3Instance c) {                                                   \
+        REQUIRE(before);                                                                           \
+        instance->phase = after;                                                                   \
+        return fmi3OK;                                                                             \
+    }
 
-fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance c) {
-    REQUIRE(FMU_EVENT);
-    instance->phase = FMU_CONTINUOUS;
-    return fmi3OK;
-}
+ENTER(EventMode, FMU_CONTINUOUS, FMU_EVENT)
+ENTER(ContinuousTimeMode, FMU_EVENT, FMU_CONTINUOUS)
 
 fmi3Status fmi3UpdateDiscreteStates(fmi3Instance c, fmi3Boolean *again, fmi3Boolean *terminate,
                                     fmi3Boolean *nominals, fmi3Boolean *values, fmi3Boolean *timed,
                                     fmi3Float64 *next) {
     REQUIRE(FMU_EVENT);
-    no(again);
-    no(terminate);
-    no(nominals);
-    no(values);
-    no(timed);
+    no(again), no(terminate), no(nominals), no(values), no(timed);
     if (next) *next = INFINITY;
     return fmi3OK;
 }
@@ -141,8 +133,7 @@ fmi3Status fmi3UpdateDiscreteStates(fmi3Instance c, fmi3Boolean *again, fmi3Bool
 fmi3Status fmi3CompletedIntegratorStep(fmi3Instance c, fmi3Boolean no_rollback, fmi3Boolean *event,
                                        fmi3Boolean *terminate) {
     REQUIRE(FMU_CONTINUOUS);
-    no(event);
-    no(terminate);
+    no(event), no(terminate);
     return fmi3OK;
 }
 
@@ -189,7 +180,6 @@ COUNT(fmi3GetNumberOfEventIndicators, 0)
 /* Whether all are states or derivatives (unknowns), or none is a derivative (knowns). */
 static bool differentiable(const fmu_instance *instance, const fmi3ValueReference *reference,
                            size_t n, bool unknown) {
-    if (n && !reference) return fmu_refuse(instance, "partial derivatives: a pointer is NULL");
     for (size_t i = 0; i < n; i++) {
         const uint32_t r = reference[i];
         if (r >= FMU_VALUES || fmu_variables[r].kind != FMU_REAL)
@@ -208,7 +198,7 @@ static fmi3Status partial_derivatives(fmu_instance *c, const fmi3ValueReference 
                                       bool adjoint) {
     double in[FMU_VALUES] = {0}, all[FMU_VALUES] = {0};
     REQUIRE(FMU_STATES ? INITIALISED : 0);
-    if (!seed || !out || !sizes_fit) {
+    if (!seed || !out || !sizes_fit || (n_from && !from) || (n_to && !to)) {
         fmu_refuse(instance, "partial derivatives: a pointer is NULL or a size does not fit");
         return fmi3Error;
     }

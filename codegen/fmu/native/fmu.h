@@ -31,9 +31,8 @@
 
 #if defined(__GNUC__)
 #pragma GCC diagnostic ignored "-Wunused-parameter" /* FMI passes more than these FMUs need */
-#define FMU_PRINTF __attribute__((format(printf, 2, 3)))
 #else
-#define FMU_PRINTF
+#define __attribute__(x)
 #endif
 
 typedef enum {
@@ -65,7 +64,8 @@ typedef struct {
 } fmu_instance;
 
 /* Sends an error message (printf format) to the importer's log. Returns false. */
-bool fmu_refuse(const fmu_instance *instance, const char *format, ...) FMU_PRINTF;
+__attribute__((format(printf, 2, 3)))
+bool fmu_refuse(const fmu_instance *instance, const char *format, ...);
 
 /* ---- the model; what is bool is false after fmu_refuse, else true ---- */
 
@@ -86,10 +86,8 @@ bool fmu_model_step(fmu_instance *instance, double h);
 /* Model Exchange: derivatives [FMU_STATES] of the states at the instance's values. */
 void fmu_model_derivatives(const fmu_instance *instance, double *dx);
 
-/* Model Exchange, with the Jacobian J of all values by all values at the instance's values:
- * directional: out = J in, adjoint: out = J' in, both [FMU_VALUES]. Only derivatives of states and
- * states count among the rows (of a state: one for itself), and not derivatives or time among the
- * columns. */
+/* Model Exchange, with the Jacobian J of all values by all values: out = J in, or out = J' in, both
+ * [FMU_VALUES]. Only the rows of states (one for itself) and of their derivatives count. */
 void fmu_model_directional(const fmu_instance *instance, const double *in, double *out);
 void fmu_model_adjoint(const fmu_instance *instance, const double *in, double *out);
 

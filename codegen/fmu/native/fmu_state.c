@@ -16,9 +16,7 @@ struct fmu_saved {
     unsigned char bytes[];
 };
 
-static size_t state_size(void) {
-    return OF_INSTANCE + fmu_model_size();
-}
+static size_t state_size(void) { return OF_INSTANCE + fmu_model_size(); }
 
 /* By address: a state that has been freed or belongs elsewhere is never read. */
 static fmu_saved *own(const fmu_instance *instance, const void *state) {

@@ -27,10 +27,10 @@ static bool accessible(const fmu_instance *instance, fmu_kind kind, const uint32
 static bool settable(const fmu_instance *instance, uint32_t reference, double number) {
     const fmu_variable *v = &fmu_variables[reference];
     const bool before_run = instance->phase & (FMU_INSTANTIATED | FMU_INITIALISATION);
-    const bool over = instance->phase & (FMU_TERMINATED | FMU_FAILED);
-    const bool integrated = FMU_IS_STATE(reference) && !before_run && !over;
-    const bool now = v->role == FMU_FIXED ? before_run || integrated : v->role && !over;
-    if (!now)
+    const bool running = instance->phase & (FMU_EVENT | FMU_CONTINUOUS | FMU_STEPPING);
+    const bool integrated = running && FMU_IS_STATE(reference);
+    const bool now = before_run || integrated || (running && v->role != FMU_FIXED);
+    if (!now || v->role == FMU_CALCULATED)
         return fmu_refuse(instance, "variable '%s' cannot be set in phase '%s'", v->name,
                           fmu_phase_name(instance));
     const bool inside = v->open ? number > v->min && number < v->max
