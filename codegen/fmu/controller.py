@@ -38,13 +38,9 @@ _FALLBACK: Final = (
 _NAMED: Final = {"UNPREDICTABLE": "not predictable", "HALTED": "none yet", "STEP_FAILED": "refused"}
 """Of :data:`bayesrace.native_interface.NO_STEP`, those of an FMU, and what they mean here."""
 
-_STATUSES: Final = ", ".join(
-    f"{number} {text}"
-    for number, text in (
-        # a step without a budget is never out of time, which is the last
-        *enumerate(text for _, text, _ in STATUSES[:-1]),
-        *((number, _NAMED[name]) for name, number, _ in NO_STEP if name in _NAMED),
-    )
+_STATUSES: Final = (  # a step without a budget is never out of time, which is the last
+    *(f"{number} {text}" for number, (_, text, _) in enumerate(STATUSES[:-1])),
+    *(f"{number} {_NAMED[name]}" for name, number, _ in NO_STEP if name in _NAMED),
 )
 
 _RANGES: Final[dict[str, dict[str, Any]]] = {
@@ -180,7 +176,7 @@ def _outputs() -> list[Variable]:
     return [
         output("d", "duty cycle", unit="1"),
         output("delta_rate", "steering rate", unit="rad/s"),
-        output("status", f"of the step: {_STATUSES}", kind="integer"),
+        output("status", f"of the step: {', '.join(_STATUSES)}", kind="integer"),
         output("usable", "the step's solution may be driven", kind="boolean"),
         output(
             "fallback_level", "0 solution, 1 plan before, 2 braking, 3 standing", kind="integer"

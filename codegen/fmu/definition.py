@@ -1,11 +1,9 @@
 """What an FMU is before it is packed: everything that XML, C and archive are made from."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, field
+from math import inf
 from typing import Final, Literal
-
-from bayesrace.errors import InputError
 
 __all__ = ["TIME", "FmuDefinition", "Variable"]
 
@@ -26,8 +24,8 @@ class Variable:
     unit: str | None = None
     """Modelica style, such as ``m/s`` or ``kg.m2``; ``1`` for a pure number; real ones only."""
     start: float | None = None
-    min: float = -math.inf
-    max: float = math.inf
+    min: float = -inf
+    max: float = inf
     exclusive: bool = False
     """The value must not be equal to ``min`` or ``max`` either (FMI cannot say that)."""
     tunable: bool = False
@@ -37,12 +35,6 @@ class Variable:
     """Model Exchange: the state that this variable is the derivative of."""
     dependencies: tuple[str, ...] | None = ()
     """Outputs and derivatives: variables that it depends on directly (None: on all)."""
-
-    def __post_init__(self) -> None:
-        if self.start is None and self.causality in ("input", "parameter"):
-            raise InputError(f"variable '{self.name}': an {self.causality} needs a start value")
-        if self.start is not None and not math.isfinite(self.start):
-            raise InputError(f"variable '{self.name}': the start value {self.start} is not finite")
 
     @property
     def variability(self) -> Literal["continuous", "discrete", "fixed", "tunable"]:

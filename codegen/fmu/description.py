@@ -132,8 +132,9 @@ def _structure(root: Element, definition: FmuDefinition) -> None:
     place = {v.name: str(i) for i, v in enumerate(definition.variables, start=int(two))}
     outputs = [v for v in definition.variables if v.causality == "output"]
     derivatives = [v for v in definition.variables if v.derivative_of is not None]
-    # before the run, calculated outputs are constants, derivatives may depend on everything
-    initial = [(v, ()) for v in outputs if v.start is None] + [(v, None) for v in derivatives]
+    # before the run, calculated outputs are constants, derivatives may depend on all that is set
+    given = tuple(v.name for v in definition.variables if v.start is not None)
+    initial = [(v, ()) for v in outputs if v.start is None] + [(v, given) for v in derivatives]
     structure = SubElement(root, "ModelStructure")
     for tag, unknowns in (
         ("Output", [(v, v.dependencies) for v in outputs]),

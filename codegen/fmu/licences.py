@@ -68,24 +68,15 @@ def third_parties(definition: FmuDefinition, targets: Sequence[Platform]) -> lis
         text = (casadi / "licenses/daqp-external/LICENSE").read_text("utf-8")
         where = "sources/libdaqpstat.a, sources/daqp, the binary"
         parts.append(Part("DAQP", "casadi", "MIT", where, text))
-    if zig := [target.name for target in targets if "ziglang" in target.command()]:
-        parts += _linked_by_zig(" ".join(zig))
+    zig = [target.name for target in targets if "ziglang" in target.command()]
+    if zig:
+        text = (_folder("ziglang") / "LICENSE").read_text("utf-8")
+        parts.append(Part("Zig compiler runtime", "ziglang", "MIT", ", ".join(zig), text))
+    if windows := [name for name in zig if name.endswith("windows")]:
+        text = (_folder("ziglang") / "lib/libc/mingw/COPYING").read_text("utf-8")
+        licence = "ZPL-2.1 and public domain"
+        parts.append(Part("MinGW-w64 runtime", "ziglang", licence, ", ".join(windows), text))
     return parts
-
-
-def _linked_by_zig(platforms: str) -> list[Part]:
-    """What ziglang links into binaries."""
-    lgpl = "LGPL-2.1-or-later with an exception for linking"
-    libraries = (
-        ("Zig compiler runtime", "MIT", "", "LICENSE"),
-        ("MinGW-w64 runtime", "ZPL-2.1, public domain", "windows", "lib/libc/mingw/COPYING"),
-        ("glibc start-up code", lgpl, "linux", "lib/libc/glibc/LICENSES"),
-    )
-    return [
-        Part(name, "ziglang", licence, f"cross-compiled binaries {system}".strip(),
-             (_folder("ziglang") / file).read_text("utf-8"))
-        for name, licence, system, file in libraries if system in platforms
-    ]  # fmt: skip
 
 
 def licence_files(parts: Sequence[Part]) -> dict[str, bytes]:

@@ -94,12 +94,10 @@ def library(path: Path, folder: Path, description: Any) -> Path:
     name: str = description.coSimulation.modelIdentifier + sharedLibraryExtension
     if "/" in name or "\\" in name:
         raise InputError(f"{path} names '{name[:200]}' as its library, which is no file name")
-    # FMI 2.0 names Intel's platforms alone; where else, the names of 3.0 are in use.
-    fits = (platform_tuple,) if description.fmiVersion.startswith("3.") else (
-        (platform, platform_tuple) if platform_tuple.startswith("x86") else (
-            platform_tuple, platform,
-        )
-    )  # fmt: skip
+    # FMI 2.0 names Intel's platforms alone; for others the names of 3.0 are in use.
+    fits = [platform_tuple]
+    if description.fmiVersion == "2.0":
+        fits.insert(0 if platform_tuple.startswith("x86") else 1, platform)
     for one in fits:
         path_here: Path = folder / "binaries" / one / name
         if path_here.is_file():

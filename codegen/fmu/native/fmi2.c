@@ -29,16 +29,12 @@ void fmu_report(const fmu_instance *instance, const char *text) {
 
 /* ---- instances ---- */
 
-static bool has_scheme(const char *location) {
-    size_t n = 0;
-    while (isalnum((unsigned char)location[n])) n++;
-    return n > 1 && location[n] == ':'; /* a single letter is a drive */
-}
-
 /* Turns the URI file:///a%20b, file:/a%20b or file://host/a of FMI into a plain path, in place;
  * a plain path, which many importers pass, stays. NULL for nothing or another scheme. */
 char *fmu_folder(char *location) {
-    if (location[0] && !has_scheme(location)) return location;
+    const size_t n = strcspn(location, ":/\\");
+    const bool has_scheme = location[n] == ':' && n > 1; /* a single letter is a drive */
+    if (location[0] && !has_scheme) return location;
     if (strncmp(location, "file:", 5) != 0) return NULL;
     const char *uri = location + 5;
     if (strncmp(uri, "//", 2) == 0) uri = strchr(uri + 2, '/');
