@@ -6,7 +6,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, Final
 
 from fmpy import platform, platform_tuple, read_model_description, sharedLibraryExtension
@@ -21,21 +21,16 @@ _MOST_BYTES: Final = 2 << 30
 _LARGEST_XML: Final = 16_000_000
 """Bytes of a model description; a hundred thousand variables."""
 
-_UNREADABLE: Final = (
-    OSError, RuntimeError, NotImplementedError, EOFError, zipfile.BadZipFile, zlib.error,
-)  # fmt: skip
-"""What :mod:`zipfile` raises at a file that is no archive, damaged, or encrypted."""
-
 
 @contextmanager
 def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
-    """The archive; whatever it lacks becomes an InputError."""
+    """The archive; InputError if the file is none, damaged, or encrypted."""
     if not path.is_file():
         raise InputError(f"no FMU at {path}; give the path of an .fmu file")
     try:
         with zipfile.ZipFile(path) as archive:
             yield archive
-    except _UNREADABLE as error:
+    except (OSError, RuntimeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(
             f"{path} is no FMU, or a damaged one ({error}); export or copy it again"
         ) from None
@@ -73,10 +68,8 @@ def read_description(path: str | os.PathLike[str]) -> Any:
 def extract(path: Path, folder: Path) -> None:
     """Unpacks the FMU into an existing folder, and nowhere else; InputError if it cannot be."""
     with _opened(path) as archive:
-        for entry in archive.infolist():
-            name = entry.filename
-            parts = PurePosixPath(name).parts
-            if name.startswith("/") or ".." in parts or "\\" in name or ":" in name:
+        for name in archive.namelist():
+            if name.startswith("/") or ".." in name.split("/") or "\\" in name or ":" in name:
                 raise InputError(
                     f"{path} holds '{name[:200]}', a path that leads out of its folder: not "
                     "unpacked; do not use this file"

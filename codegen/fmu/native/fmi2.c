@@ -9,10 +9,6 @@ const char *fmi2GetTypesPlatform(void) {
     return fmi2TypesPlatform;
 }
 
-const char *fmi2GetVersion(void) {
-    return fmi2Version;
-}
-
 /* Some importers take the text for a printf format, others print it as it is. */
 void fmu_report(const fmu_instance *instance, const char *text) {
     char escaped[1024];

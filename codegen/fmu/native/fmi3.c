@@ -4,10 +4,6 @@
 
 #include "fmu.h"
 
-const char *fmi3GetVersion(void) {
-    return fmi3Version;
-}
-
 void fmu_report(const fmu_instance *instance, const char *text) {
     if (instance->logger)
         ((fmi3LogMessageCallback)instance->logger)(instance->environment, fmi3Error,

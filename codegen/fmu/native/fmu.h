@@ -69,8 +69,7 @@ bool fmu_refuse(const fmu_instance *instance, const char *format, ...);
 
 /* ---- the model; what is bool is false after fmu_refuse, else true ---- */
 
-/* Bytes of memory that one instance of the model needs beside the values. */
-size_t fmu_model_size(void);
+size_t fmu_model_size(void); /* bytes of memory that an instance needs beside the values */
 
 /* At instantiation and at reset; values are at their start values. If it fails, there is no
  * instance. It must not allocate anything: no function of the model releases it. */

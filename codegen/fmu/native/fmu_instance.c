@@ -10,6 +10,8 @@
 #define ALIGNED(size) (((size) + 63) / 64 * 64)
 #define LONGEST_STEP_S 1000.0 /* internal steps are counted by int */
 
+const char *FMI(GetVersion)(void) { return FMI(Version); }
+
 /* ---- messages ---- */
 
 bool fmu_refuse(const fmu_instance *instance, const char *format, ...) {

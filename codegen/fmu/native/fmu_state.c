@@ -72,8 +72,7 @@ FMI(Status) FMI(FreeFMUState)(void *c, void **state) {
 
 /* ---- as bytes ---- */
 
-/* Ends a function that needs such a pointer with an error. */
-#define REQUIRE_BYTES(pointer)                                                                     \
+#define REQUIRE_BYTES(pointer) /* and that the FMU can serialise at all */                         \
     REQUIRE(ANY_PHASE);                                                                            \
     if (!FMU_SERIALISES || !(pointer)) {                                                           \
         fmu_refuse(instance, FMU_SERIALISES ? "saved state: a pointer is NULL"                     \
