@@ -1,4 +1,4 @@
-"""``fmu export``, ``weights``, ``inspect``: our FMUs for other tools, and theirs for us."""
+"""``bayesrace fmu``: exports FMUs, exchanges their weights, lists the variables of any FMU."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -93,15 +93,9 @@ def export(
         raise InputError("a controller is sampled, not continuous: export it with --kind cs")
     else:
         definition = _controller(
-            parameters,
-            number,
-            track or DEFAULT_RACE_TRACK,
-            raceline,
-            weights,
-            settings,
-            artefact,
-            cpu,
-        )
+            parameters, track or DEFAULT_RACE_TRACK, raceline=raceline, weights=weights,
+            settings=settings, artefact=artefact, version=number, cpu=cpu,
+        )  # fmt: skip
     pack(definition, out, platform)
     typer.echo(f"{definition.name}, FMI {number}.0 {kind.value}: {out}")
 
@@ -114,12 +108,13 @@ def _only_for_controllers(**options: object) -> None:
 
 def _controller(
     car: "CarParameters",
-    version: Literal[2, 3],
     track: str,
+    *,
     raceline: Path | None,
     weights: Path | None,
     settings: Path | None,
     artefact: Path | None,
+    version: Literal[2, 3],
     cpu: str,
 ) -> "FmuDefinition":
     from bayesrace.gp.weights import read_weights
@@ -147,7 +142,7 @@ def _controller(
 @fmu.command(name="weights")
 def other_weights(
     controller: Annotated[Path, typer.Argument(help="A controller's FMU.")],
-    weights: Annotated[Path, typer.Argument(help="GP weights that it is to drive with.")],
+    weights: Annotated[Path, typer.Argument(help="GP weights to put into it.")],
     out: OutFile,
 ) -> None:
     """Copy a controller's FMU with other weights: nothing is compiled."""
