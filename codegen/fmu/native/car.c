@@ -76,11 +76,11 @@ bool fmu_model_step(fmu_instance *car, double h) {
         memcpy(x, next, sizeof x);
     }
     const double angle = v[FMU_V_delta_max_rad];
-    x[6] = clipped(v[FMU_V_delta] + h * u[1], -angle, angle); /* without the integrator's rounding */
+    x[6] = clipped(v[FMU_V_delta] + h * u[1], -angle, angle); /* without rounding of steps */
     for (int i = 0; i < NX; i++)
         if (!isfinite(x[i]))
-            return fmu_refuse(car, "the state is not finite after the step from %.9g s; the step is "
-                                   "undone", v[FMU_V_time]);
+            return fmu_refuse(car, "the state after the step from %.9g s is not finite; the step "
+                                   "is undone", v[FMU_V_time]);
     memcpy(&v[FMU_V_x], x, sizeof x);
     v[FMU_V_d_applied] = u[0];
     v[FMU_V_delta_rate_applied] = u[1];

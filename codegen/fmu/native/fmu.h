@@ -13,7 +13,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
-#include "fmu_config.h" /* generated: FMU_VALUES, FMU_STATES, the place FMU_V_<name> of each value */
+#include "fmu_config.h" /* generated: FMU_VALUES, FMU_STATES, FMU_V_<name> of each value */
 
 #if FMU_FMI == 2
 #include "fmi2Functions.h"
@@ -121,7 +121,7 @@ extern const fmu_variable fmu_variables[FMU_VALUES];
 /* Passes a message to the importer, in the version's own way. */
 void fmu_report(const fmu_instance *instance, const char *text);
 
-/* The path of the resources folder from what the importer passes, in place; NULL if there is none. */
+/* The path of the resources folder from what the importer passes, in place; NULL for none. */
 char *fmu_folder(char *location);
 
 /* NULL after a message if the token is another FMU's, or the model refuses. */

@@ -132,8 +132,8 @@ bool fmu_step(fmu_instance *instance, double time, double h) {
     double *now = &instance->value[FMU_V_time];
     const double tolerance = 1e-6 * (1 + fabs(*now));
     if (!(h > 0 && h <= LONGEST_STEP_S))
-        return fmu_refuse(instance, "the communication step is %g s, must be positive and at most %g",
-                          h, LONGEST_STEP_S);
+        return fmu_refuse(instance, "the communication step is %g s, must be positive and at most "
+                                    "%g", h, LONGEST_STEP_S);
     if (!(fabs(time - *now) <= tolerance))
         return fmu_refuse(instance, "asked to continue at %.9g s, but time is %.9g s", time, *now);
     if (time + h > instance->stop_time + tolerance)

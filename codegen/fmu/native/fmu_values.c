@@ -80,7 +80,7 @@ static FMI(Status) refresh(fmu_instance *instance, const uint32_t *reference, si
         for (size_t i = 0; i < n; i++)                                                             \
             if (!settable(instance, reference[i], (double)value[i])) return FMI(Error);            \
         for (size_t i = 0; i < n; i++)                                                             \
-            instance->value[reference[i]] = kind == FMU_BOOLEAN ? value[i] != 0 : (double)value[i]; \
+            instance->value[reference[i]] = kind == FMU_BOOLEAN ? !!value[i] : (double)value[i];   \
         return FMI(OK);                                                                            \
     }
 
