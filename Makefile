@@ -31,7 +31,7 @@ help:
 	@echo "make race    set up, and drive the whole comparison; leaves runs/DATE-TIME"
 	@echo "make test    set up for testing, and run most tests, in a few minutes"
 	@echo "make check   everything: lint, all tests, coverage; names the tools that it needs"
-	@echo "make lint    ruff, mypy, import contracts"
+	@echo "make lint    ruff, clang-format, mypy, import contracts"
 	@echo "make bench   time the compiled step beside CasADi + IPOPT"
 	@echo "make clean   remove the virtual environment and all caches in this folder"
 
@@ -87,6 +87,7 @@ coverage: $(VENV)/.ready-dev
 lint: $(VENV)/.ready-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/clang-format --dry-run -Werror $$(git ls-files '*.c' '*.h')
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
@@ -114,7 +115,7 @@ NO_COMPILER = $(if $(ZIG:,%=%),@echo "no C compiler here: installing ziglang")
 
 $(VENV)/.ready: $(SHAPED_BY)
 	$(NO_COMPILER)
-	$(INSTALL) ".$(ZIG:,%=[%])"
+	$(INSTALL) ".[race$(ZIG)]"
 	@touch $@
 
 $(VENV)/.ready-test: $(SHAPED_BY)

@@ -72,7 +72,7 @@ def write_whole(path: Path, data: str | bytes) -> None:
 
 
 def clear_partials(folder: Path) -> None:
-    """Deletes what killed processes have begun; only while nobody writes there."""
+    """Deletes what killed processes have begun; only while no process writes there."""
     for partial in folder.glob(".*.part*"):
         partial.unlink(missing_ok=True)
 

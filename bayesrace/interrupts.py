@@ -20,7 +20,7 @@ _pending = threading.Event()
 
 @contextmanager
 def catching_signals(arrived: Callable[[int], None]) -> Iterator[None]:
-    """For the block, SIGINT and SIGTERM are only told, by number. Nothing off the main thread.
+    """SIGINT and SIGTERM only call ``arrived`` with their number; off the main thread, nothing.
 
     ``arrived`` runs in the signal handler, between any two instructions of the main thread: let it
     put the signal into a :class:`queue.SimpleQueue`, whose ``put`` may interrupt itself.

@@ -1,4 +1,4 @@
-"""What a built controller is: written by codegen, read by whoever loads it.
+"""What a built controller is: codegen writes it, every program that loads the library reads it.
 
 The manifest names everything that shaped the artefact. Weights learned for another model, step
 or scheme are refused by comparing :attr:`Manifest.discretisation`.
@@ -152,4 +152,4 @@ def _check_owner(path: Path) -> None:
             "build your own, or set BAYESRACE_CACHE to a folder of yours"
         )
     if status.st_mode & stat.S_IWOTH:
-        raise InputError(f"{path} may be written by anybody: remove it, or 'chmod o-w' it")
+        raise InputError(f"{path} is writable for every user: remove it, or 'chmod o-w' it")

@@ -34,7 +34,7 @@ SOLVER: Final = (
     ("tolerance", "double", "KKT residual (scaled) of a converged step", "> 0"),
     ("defect_max", "double", "largest dynamics defect of a usable plan", "> 0"),
     (
-        "settle",
+        "early_stop_tol",
         "double",
         "a step ends at this stationarity and tenth of it as defect, or earlier: see br_step.c",
         ">= 0",
@@ -226,7 +226,7 @@ COUNTERS: Final = (
     ("failed", "int64", "steps that were broken"),
     ("second_starts", "int64", "steps that looked for another plan"),
     ("cost_jumps", "int64", "steps whose plan costs much more than to go on with the one before"),
-    ("stale", "int64", "states of the run under way that were not newer than one before"),
+    ("stale", "int64", "states of the current run that were not newer than one before"),
     ("foreign", "int64", "states of another plant or run, or far ahead, that were not driven on"),
     ("phase", "int", "life cycle of the controller, at this moment"),
     ("delay_s", "double", "delay that is compensated, at this moment"),

@@ -1,4 +1,4 @@
-"""Getting a thread ready to keep time; what the system refuses is told and the work goes on.
+"""Real-time priority, CPU affinity and memory locking; refusals are reported, and the work goes on.
 
 Only the calling thread is scheduled and bound, so call it from the control thread once the
 transport has started its own: with the whole process at real-time priority, message latency

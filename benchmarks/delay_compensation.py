@@ -2,13 +2,12 @@
 
     python -m benchmarks.delay_compensation [--track NAME|FILE.csv] [--train-track …] [--laps 3]
 
-Plant and controller are processes of their own and run by the wall clock; the plant holds back each
+Plant and controller are processes of their own and run in real time; the plant holds back each
 state and each actuation for the delay (``bayesrace plant --delay``), so the input acts twice the
 delay later, plus what messages and the step take. Prints a table in Markdown; some four minutes.
 """
 
 import argparse
-import os
 import tempfile
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -18,17 +17,16 @@ import numpy as np
 from rich.console import Console
 
 from bayesrace.log import LogReader
-from bayesrace.messages import EVENT, TELEMETRY, TRUTH, Event
+from bayesrace.messages import TELEMETRY, TRUTH
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK, Track
-from bayesrace.transport import Director, Endpoints, Publisher, free_endpoint, open_session
 from bayesrace.vehicles import DEFAULT_CAR
-from experiments.drive import RunPlan, execute, wait_for_both
+from experiments.drive import RunPlan
 from experiments.laps import time_laps
 from experiments.preparation import Prepared, prepare
-from experiments.processes import child
 from experiments.progress import stages_on
 from experiments.settings import PreparationSettings
+from experiments.system import started_system
 
 DELAYS_MS = (0, 10, 20, 40)
 CAR = DEFAULT_CAR
@@ -57,27 +55,14 @@ class Outcome:
 
 def drive(files: Prepared, delay_ms: float, mode: str, laps: int) -> Outcome:
     """Starts both processes, drives, analyses the log."""
-    plant_at, controller_at = free_endpoint(), free_endpoint()
-    parent = ["--parent-pid", str(os.getpid())]
-    plant = ["plant", "--endpoint", plant_at, "--delay", f"{delay_ms:g}", *parent]
-    controller = [
-        "controller", *files.arguments,
-        "--endpoint", plant_at, "--listen", controller_at, "--delay", mode, *parent,
-    ]  # fmt: skip
     track = files.course.track
-    limit_s = 3.0 * files.course.line.lap_time_s * laps
+    plan = RunPlan(1, mode, laps, 3.0 * files.course.line.lap_time_s * laps, lockstep=False)
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        children = [
-            stack.enter_context(child(plant, folder / "plant.log")),
-            stack.enter_context(child(controller, folder / "controller.log")),
-        ]
-        session = stack.enter_context(open_session(Endpoints(connect=(plant_at, controller_at))))
-        director = Director(session, CAR)
-        events: Publisher[Event] = Publisher(session, EVENT, CAR, "race")
-        with Recorder(session, CAR, folder / "run.mcap"):
-            wait_for_both(director, children, 20.0)
-            execute(director, events, track, RunPlan(1, mode, laps, limit_s, lockstep=False))
+        system = stack.enter_context(started_system(CAR, folder, ["--delay", f"{delay_ms:g}"]))
+        stack.enter_context(system.controller([*files.arguments, "--delay", mode]))
+        with Recorder(system.session, CAR, folder / "run.mcap"):
+            system.drive(track, plan)
         return analyse(folder / "run.mcap", track, laps)
 
 

@@ -10,11 +10,11 @@ any two runs differ in a bit.
 """
 
 import argparse
-import os
+import itertools
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -22,52 +22,28 @@ from rich.console import Console
 
 from bayesrace.gp.weights import read_weights
 from bayesrace.log import LogReader, LogWriter
-from bayesrace.messages import EVENT, TRUTH, Event
+from bayesrace.messages import TRUTH
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import DEFAULT_RACE_TRACK
-from bayesrace.transport import Director, Endpoints, Publisher, free_endpoint, open_session
 from bayesrace.vehicles import DEFAULT_CAR, get_car
 from controller.assembly import compiled_controller
 from experiments.closed_loop import ClosedLoop
-from experiments.drive import RunPlan, execute, wait_for_both
+from experiments.drive import RunPlan
 from experiments.preparation import Prepared, prepare
-from experiments.processes import child
 from experiments.progress import stages_on
 from experiments.settings import PreparationSettings
+from experiments.system import System, started_system
 
 CAR = DEFAULT_CAR
 LIMIT_S = 1000.0
 
 
-@contextmanager
-def over_zenoh(prepared: Prepared, folder: Path) -> Iterator[Callable[[int, Path | None], float]]:
-    """Plant and controller as processes; the function drives laps, records them if it gets a file,
-    and returns the plant time of the run."""
-    at_plant, at_controller = free_endpoint(), free_endpoint()
-    both = ["--parent-pid", str(os.getpid()), "--low-latency"]
-    plant = ["plant", "--endpoint", at_plant, *both]
-    listen = ["--endpoint", at_plant, "--listen", at_controller]
-    controller = ["controller", *prepared.arguments, *listen, *both]
-    with ExitStack() as stack:
-        children = [
-            stack.enter_context(child(plant, folder / "plant.log")),
-            stack.enter_context(child(controller, folder / "controller.log")),
-        ]
-        session = stack.enter_context(open_session(Endpoints(connect=(at_plant, at_controller))))
-        director = Director(session, CAR)
-        events: Publisher[Event] = Publisher(session, EVENT, CAR, "race")
-        wait_for_both(director, children, 60.0)
-        runs = 0
-
-        def drive(laps: int, log: Path | None) -> float:
-            nonlocal runs
-            runs += 1
-            plan = RunPlan(runs, "bayesrace", laps, LIMIT_S, lockstep=True)
-            with Recorder(session, CAR, log) if log else ExitStack():
-                end = execute(director, events, prepared.course.track, plan)
-            return float(end.data["time_s"])
-
-        yield drive
+def over_zenoh(system: System, prepared: Prepared, laps: int, run: int, log: Path | None) -> float:
+    """Drives a run by two processes, records it if there is a log; its plant time [s]."""
+    plan = RunPlan(run, "bayesrace", laps, LIMIT_S, lockstep=True)
+    with Recorder(system.session, CAR, log) if log else ExitStack():
+        end = system.drive(prepared.course.track, plan)
+    return float(end.data["time_s"])
 
 
 def states_of(log: Path) -> np.ndarray:
@@ -91,7 +67,9 @@ def main() -> None:
     factors: dict[str, list[float]] = {}
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        networked = stack.enter_context(over_zenoh(prepared, folder))
+        system = stack.enter_context(started_system(CAR, folder, both=["--low-latency"]))
+        stack.enter_context(system.controller(prepared.arguments))
+        runs = itertools.count(1)
         zenoh_log, own_log = folder / "zenoh.mcap", folder / "own.mcap"
 
         def in_one_process(log: LogWriter | None) -> float:
@@ -106,8 +84,10 @@ def main() -> None:
                 log.close()
 
         ways: dict[str, Callable[[], float]] = {
-            "over Zenoh, recorded": lambda: networked(options.laps, zenoh_log),
-            "over Zenoh": lambda: networked(options.laps, None),
+            "over Zenoh, recorded": lambda: over_zenoh(
+                system, prepared, options.laps, next(runs), zenoh_log
+            ),
+            "over Zenoh": lambda: over_zenoh(system, prepared, options.laps, next(runs), None),
             "in one process, logged": logged,
             "in one process": lambda: in_one_process(None),
         }

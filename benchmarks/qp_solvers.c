@@ -71,7 +71,8 @@ static void make_solver(solver *s, ocp *o, enum hpipm_mode mode) {
     d_ocp_qp_ipm_arg_set_tol_eq(&tolerance, &s->arg);
     d_ocp_qp_ipm_arg_set_tol_ineq(&tolerance, &s->arg);
     d_ocp_qp_ipm_arg_set_tol_comp(&tolerance, &s->arg);
-    d_ocp_qp_ipm_ws_create(&o->dim, &s->arg, &s->ws, block(d_ocp_qp_ipm_ws_memsize(&o->dim, &s->arg)));
+    d_ocp_qp_ipm_ws_create(&o->dim, &s->arg, &s->ws,
+                           block(d_ocp_qp_ipm_ws_memsize(&o->dim, &s->arg)));
 }
 
 static void make_dimensions(struct d_ocp_qp_dim *dim) {
@@ -184,8 +185,9 @@ static void set_up_hpipm(void) {
     make_ocp(&part);
     d_part_cond_qp_arg_create(BLOCKS, &cond_arg, block(d_part_cond_qp_arg_memsize(BLOCKS)));
     d_part_cond_qp_arg_set_default(&cond_arg);
-    d_part_cond_qp_ws_create(&full.dim, sizes, &part.dim, &cond_arg, &cond_ws,
-                             block(d_part_cond_qp_ws_memsize(&full.dim, sizes, &part.dim, &cond_arg)));
+    d_part_cond_qp_ws_create(
+        &full.dim, sizes, &part.dim, &cond_arg, &cond_ws,
+        block(d_part_cond_qp_ws_memsize(&full.dim, sizes, &part.dim, &cond_arg)));
     for (int m = 0; m < 2; ++m) {
         make_solver(&plain[m], &full, modes[m]);
         make_solver(&condensed[m], &part, modes[m]);
@@ -293,8 +295,10 @@ int main(int argc, char **argv) {
         memcpy(mpc->reference, at + 8, sizeof mpc->reference);
         memset(&mpc->info, 0, sizeof mpc->info);
         const int warm = mpc->warm;
-        if (warm) br_sqp_shift(mpc);
-        else br_sqp_cold_start(mpc);
+        if (warm)
+            br_sqp_shift(mpc);
+        else
+            br_sqp_cold_start(mpc);
         double results[ROUTES][4];
         compare(mpc, warm, results);
         mpc->qp.factorised = 0; /* compare left that of the Gauss-Newton Hessian */

@@ -1,12 +1,12 @@
 """The promises of free-running mode, each measured by ``bayesrace latency`` and judged.
 
     python -m benchmarks.soak            about a quarter of an hour
-    python -m benchmarks.soak --share .1 a tenth of each run's length: whether it works at all
+    python -m benchmarks.soak --share 0.1   a tenth of each run's length, to try it
 
-1. 50 Hz for ten minutes: state to actuation median at most .6 ms; misses at most those of the bare
+1. 50 Hz for ten minutes: state to actuation median at most 0.6 ms; misses at most those of the bare
    loop in the same run + 2; resident memory grows by less than 1 MB after the first minute; every
    message sent was received or counted as lost.
-2. 500 Hz for one minute: mean period within .1 % (of the bare loop's, where that skipped too).
+2. 500 Hz for one minute: mean period within 0.1 % (of the bare loop's, where that skipped too).
 3. 50 Hz for one minute with all cores busy: a lap, and no sample off the track.
 
 Nothing else should be running. A stall of the machine longer than a period is seen by the bare
@@ -56,7 +56,7 @@ def bare(result: Result) -> float:
 
 
 def keeps_rate(result: Result) -> bool:
-    """Mean period within .1 %; where the machine's stalls made the bare loop skip, of its own."""
+    """Mean period within 0.1 %; where the machine's stalls made the bare loop skip, of its own."""
     error = result["rate_error"]
     return bool(abs(error) <= 1e-3 or abs(error - bare(result)) <= 1e-3)
 
@@ -82,7 +82,7 @@ CASES = (
     Case(
         "500hz", 60.0, ("--rate", "500"),
         (
-            Promise("mean period within .1 %, of the bare loop's if the machine did not give more",
+            Promise("mean period within 0.1 %, of the bare loop's if the machine did not give more",
                     keeps_rate, lambda r: f"{r['rate_error']:+.3%}, bare loop {bare(r):+.3%}"),
         ),
     ),

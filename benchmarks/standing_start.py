@@ -1,4 +1,4 @@
-"""Does a car get under way again wherever it stands, and after braking blind?
+"""Does a car drive off again wherever it stands, and after braking without states?
 
     python -m benchmarks.standing_start                           built-in track, 200 of each
     python -m benchmarks.standing_start --track ethz.csv --train-track ethzmobil.csv
@@ -35,7 +35,7 @@ from plant.simulator import Simulator
 
 ASIDE_M: Final = 0.6
 LATER: Final = 750
-"""Cycles after which a car has to be under way."""
+"""Cycles after which a car has to be driving."""
 BLIND: Final = 80
 """Longest loss of states, in cycles."""
 AFTER_LOSS: Final = 200
@@ -122,8 +122,8 @@ def main() -> None:
         rig.cycles(LATER)
         if not rig.under_way():
             stood += 1
-            console.print(f"not under way from {x.round(3).tolist()}")
-    console.print(f"{track.name}: {stood} of {given.count} poses not under way after 15 s")
+            console.print(f"not driving from {x.round(3).tolist()}")
+    console.print(f"{track.name}: {stood} of {given.count} poses not driving after 15 s")
     rig.place(np.array([line.x_m[0], line.y_m[0], line.psi_rad[0], 0.0, 0, 0, 0]))
     stood = 0
     for _ in range(given.count):

@@ -43,7 +43,7 @@ from controller.native_step import NativeStep
 from controller.settings import MpcSettings
 data = np.load(sys.argv[2])
 car = get_car(str(data["car"]))
-exact = MpcSettings(iterations=100, iterations_cold=100, tolerance=1e-10, settle=0)
+exact = MpcSettings(iterations=100, iterations_cold=100, tolerance=1e-10, early_stop_tol=0)
 def make(settings):
     step = NativeStep(build(BuildSettings(car=car.name))[0], car, settings)
     step.set_weights(decode_weights(data["weights"].tobytes()))

@@ -16,21 +16,19 @@ import time
 import warnings
 
 import numpy as np
-from numpy.typing import NDArray
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
 
+from bayesrace.arrays import Floats
 from bayesrace.gp.weights import OUTPUTS
 from bayesrace.integrators import PREDICTION
 from experiments.preparation import training_samples
 from experiments.settings import PreparationSettings
 from learning.hyperparameters import BOUNDS, starts
-from learning.regression import scaling_of
 from learning.residual import residual
+from learning.target import Target
 from learning.training import TrainingSettings, fit
-
-Floats = NDArray[np.float64]
 
 NU = {"matern05": 0.5, "matern15": 1.5, "matern25": 2.5}
 SLACK = 1e-3
@@ -87,12 +85,11 @@ def main() -> None:
     z, y = samples.features, residual(samples, PREDICTION)
     theirs_s, same = 0.0, True
     for i, output in enumerate(OUTPUTS):
-        scaling = scaling_of(z, y[:, i])
-        scaled, target = scaling.features(z), scaling.targets(y[:, i])
+        target = Target.of(output, z, y[:, i], np.zeros(points, dtype=np.int64))
         found = -math.inf
         began = time.perf_counter()
         for guess in guesses:
-            found = max(found, theirs(kind, guess, scaled, target))
+            found = max(found, theirs(kind, guess, target.z, target.y))
         theirs_s += time.perf_counter() - began
         same &= abs(ours[i] - found) <= SLACK
         print(f"{output:6} ours {ours[i]:.5f}, scikit-learn {found:.5f}: {ours[i] - found:+.1e}")

@@ -170,7 +170,7 @@ def build(
     target = cache_folder() / f"{problem.name if problem else settings.model}-{identity}"
 
     def built() -> tuple[Path, Manifest] | None:
-        """What the cache has; None if it is absent, damaged, or somebody else's."""
+        """What the cache has; None if it is absent, damaged, or another user's."""
         try:
             manifest = read_manifest(target)
             check_library(target, manifest)

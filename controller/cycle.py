@@ -1,4 +1,4 @@
-"""The control cycle with its execution times, for whoever carries the messages.
+"""The control cycle with its execution times, for the loops that carry the messages.
 
 :mod:`controller.process` receives states and sends actuations over the network;
 ``experiments.closed_loop`` does so by function calls. Both answer a lockstep state by

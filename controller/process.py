@@ -1,6 +1,6 @@
-"""The controller process: a fixed-rate loop by the wall clock, an answer to each state in lockstep.
+"""The controller process: a fixed-rate loop in real time, an answer to each state in lockstep.
 
-By the wall clock the loop keeps its rate whatever arrives: it wakes shortly before a release,
+In real time the loop keeps its rate whatever arrives: it wakes shortly before a release,
 looks for the state that is due, steps, sends, and does everything else (telemetry, requests,
 heartbeat, preparation of the next step) in the time that is left. It writes nothing to disk, waits
 for no one and logs nothing while it drives.
@@ -65,8 +65,8 @@ _GRACE: Final = 0.25
 period)."""
 
 _SERVE_NS: Final = 40_000_000
-"""Between two requests that are served while driving: each takes as long as a cycle, and whoever
-asks without end must not hold up the loop."""
+"""Between two requests that are served while driving: each takes as long as a cycle, and a
+flood of requests must not hold up the loop."""
 
 _SWITCH_S: Final = 1e-4
 
@@ -101,7 +101,6 @@ class ControllerProcess:
             )  # fmt: skip
             self._takeover = self._courier.takeover
             self._courier.start()
-        inbox.tell_time("controller")
         inbox.watch("plant")
         inbox.announce("controller")
 
@@ -243,7 +242,7 @@ class ControllerProcess:
         if self._takeover is not None:
             self._takeover.between_cycles(self._next_cycle)
         if min(end_ns, time.monotonic_ns()) >= self._serve_ns:
-            item = self.inbox.other()
+            item = self.inbox.poll_queue()
             if item is not None:
                 self._serve_ns = time.monotonic_ns() + _SERVE_NS
                 self._service.react(item)
@@ -334,7 +333,7 @@ class ControllerProcess:
             "states_foreign": driver.count("foreign"),
             "refused": self._decoder.refused,
             "overflowed": self.inbox.overflowed,
-            "turned_away": self.inbox.turned_away,
+            "requests_rejected": self.inbox.requests_rejected,
             **({} if self._courier is None else self._courier.status()),
             "actuations_sent": self._actuations.next_seq,
         }
@@ -348,7 +347,7 @@ def main(settings: ControllerSettings, controller: Controller) -> int:
     die_with_parent(settings.parent_pid)
     with open_session(settings.endpoints, "controller") as session:
         process = ControllerProcess(session, settings, controller)
-        # A control thread that wants the interpreter's lock back has it this soon, whoever has it.
+        # The control thread gets the interpreter's lock back from another thread this soon.
         sys.setswitchinterval(_SWITCH_S)
         try:
             for refusal in prepare_thread(settings.realtime):
@@ -358,7 +357,7 @@ def main(settings: ControllerSettings, controller: Controller) -> int:
                 process.name,
                 ", ".join(settings.endpoints.connect) or "(connects to us)",
             )
-            with process.inbox.catching_signals():
+            with process.inbox.receive_signals():
                 process.serve()
         finally:
             process.close()

@@ -19,7 +19,7 @@ class ControllerSettings(BaseModel):
     car: CarSetting = Field(default_factory=default_car)
     name: str = Field(default="", description="name in message keys; the car's own if empty")
     endpoints: Endpoints = Endpoints(listen=(CONTROLLER_ENDPOINT,), connect=(PLANT_ENDPOINT,))
-    rate_hz: float = Field(50.0, ge=1, le=500, description="of the loop by the wall clock")
+    rate_hz: float = Field(50.0, ge=1, le=500, description="of the loop in real time")
     budget: float = Field(
         0.8, gt=0, le=1, description="fraction of the period that a cycle may take, step included"
     )

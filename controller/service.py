@@ -53,7 +53,7 @@ class Service:
         self._weights_refused = 0
         self._takes_weights = takes_weights
         self.stopping = False
-        """The process has been told to end."""
+        """The process was asked to end."""
         self.plant_there = True
         """Its liveliness token has not gone; where there never was one, its states tell."""
         self.arrived_ns: int | None = None

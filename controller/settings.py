@@ -30,7 +30,7 @@ class MpcSettings(BaseModel):
     defect_max: float = Field(
         0.03, gt=0, description="largest dynamics defect (m, rad, m/s, 10 rad/s) of a usable plan"
     )
-    settle: float = Field(
+    early_stop_tol: float = Field(
         1e-4,
         ge=0,
         description="a step stops iterating at this stationarity and tenth of the defect, or, "

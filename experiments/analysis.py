@@ -239,7 +239,7 @@ def _real_time_factor(runs: Sequence[RunRecord]) -> float | None:
 def read_race(run_dir: Path) -> RaceAnalysis:
     """The analysis of a run directory; InputError if it is none.
 
-    A race that was cut short can be analysed too: what did not finish is told so.
+    A race that was cut short can be analysed, too; what did not finish is marked so.
     """
     return RaceAnalysis(read_recording(run_dir))
 

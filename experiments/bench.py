@@ -43,7 +43,9 @@ __all__ = ["BenchResult", "BenchSettings", "run_bench"]
 
 Floats = NDArray[np.float64]
 
-_CONVERGED: Final = MpcSettings(iterations=100, iterations_cold=100, tolerance=1e-9, settle=0)
+_CONVERGED: Final = MpcSettings(
+    iterations=100, iterations_cold=100, tolerance=1e-9, early_stop_tol=0
+)
 _PUBLISHED: Final = Discretisation(scheme="euler", step_s=PREDICTION.step_s)
 """The published controller predicts with forward Euler; the mean changes the velocities alone."""
 

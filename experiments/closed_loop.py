@@ -1,8 +1,8 @@
 """Plant and controller in one process: a lockstep run without network, clock or other processes.
 
 The car is driven by the plant's own lockstep loop and the controller's own cycle, so a run is
-equal to the bit to the same run of two processes over Zenoh (tests/test_closed_loop.py). What that
-run has besides, it has not: new weights are the caller's, no gate judges them, nobody can stop it.
+equal to the bit to the same run of two processes over Zenoh (tests/test_closed_loop.py). New
+weights are the caller's: nothing validates them, and no command can stop the run.
 """
 
 import time

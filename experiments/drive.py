@@ -1,7 +1,7 @@
 """Directs one run of a waiting plant and controller, from the start line to the last lap."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -10,12 +10,11 @@ from bayesrace.messages import Event, RunRequest, Scalar
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import StartLine, Track
 from bayesrace.transport import Director, Publisher, RefusedError
-from experiments.processes import Child, endings
 
-__all__ = ["RunPlan", "announcement", "execute", "run_request", "wait_for_both"]
+__all__ = ["RunPlan", "announcement", "execute", "run_request"]
 
 _ABSENCE_S = 10.0
-"""By the wall clock a process may be away for so long: a link comes back, a controller is started
+"""In real time a process may be away for so long: a link comes back, a controller is started
 again, and the car waits at standstill."""
 
 _UNDRIVEN = 0.5
@@ -58,20 +57,6 @@ def run_request(track: Track, plan: RunPlan) -> RunRequest:
     )
 
 
-def wait_for_both(director: Director, children: Sequence[Child], timeout_s: float) -> None:
-    """Waits for plant and controller, as long as the processes that are to be them live.
-
-    InputError if they are not there in time.
-    """
-    deadline = time.monotonic() + timeout_s
-    while True:
-        try:
-            return director.wait_for(("plant", "controller"), 0.5)
-        except InputError:
-            if endings(children) or time.monotonic() > deadline:
-                raise
-
-
 def announcement(plan: RunPlan, seq: int, weights_version: str) -> Event:
     """What stands in the log before a run: who is going to drive it."""
     text = f"run {plan.run}: {plan.controller}"
@@ -102,7 +87,7 @@ def execute(
     before = director.status("plant").counters
     try:
         director.start(run_request(track, plan))
-        # In lockstep simulated time passes faster than the clock's, but nobody promises it.
+        # In lockstep simulated time passes faster than real time, but that is no promise.
         absence_s = 1.0 if plan.lockstep else _ABSENCE_S
         end = director.wait_for_end(
             plan.run,
@@ -110,10 +95,10 @@ def execute(
             absence_s,
             lambda: recorder.failed if recorder else "",
         )
-    except RefusedError:  # the plant may be driving for somebody else
+    except RefusedError:  # the plant may be driving for another director
         raise
     except (InputError, KeyboardInterrupt):
-        with suppress(InputError):  # a car must not drive on when nobody watches it
+        with suppress(InputError):  # a car must not drive on unwatched
             director.stop("who started the run has left")
         raise
     if end.data.get("reason") not in _REGULAR:

@@ -1,12 +1,10 @@
-"""Looking after cars that drive: who is there, how they are, stop and go, and the router."""
+"""Operating running cars: finding them, their status, stop and go, and the router."""
 
 import logging
 import queue
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any, Final, Literal, NamedTuple
-
-import zenoh
 
 from bayesrace.errors import InputError
 from bayesrace.interrupts import catching_signals
@@ -17,29 +15,27 @@ from bayesrace.messages import (
     STATUS,
     STOP,
     Command,
-    Decoder,
     Message,
     Reply,
-    Status,
     StatusRequest,
     StopRequest,
     car_key,
-    decode,
+    is_car_name,
 )
-from bayesrace.transport import Endpoints, ask_all, decisive, open_session
+from bayesrace.transport import Endpoints, Inbox, Kind, ask_all, decisive, open_session
 from experiments.picture import SOURCES, Picture, Process
 
-__all__ = ["Found", "Word", "ask_statuses", "command", "find", "follow", "pick", "route"]
+__all__ = ["Action", "Found", "ask_statuses", "command", "find", "follow", "pick", "route"]
 
 _log = logging.getLogger("bayesrace.router")
 
 Found = Mapping[str, Collection[str]]
-"""Name of a car to those of its processes whose liveliness token is there."""
+"""Name of a car to its processes whose liveliness token is present."""
 
-Word = Literal["stop", "go", "end"]
+Action = Literal["stop", "go", "end"]
 
-_SETTLING_S: Final = 0.1
-"""After the last link is up, a moment for what is declared behind it."""
+_DECLARATIONS_S: Final = 0.1
+"""Time that declarations take to arrive after the last link is up."""
 
 
 def find(
@@ -49,29 +45,29 @@ def find(
     name: str = "",
     sources: Collection[str] = SOURCES,
 ) -> Found:
-    """Cars in the network with those of their processes that are there.
+    """Cars in the network with their present processes.
 
-    Returns as soon as the named car's ``sources`` are seen, or all endpoints are connected and
-    have told of theirs; with what there is when the time is over. Raises InputError if that is
-    nothing, or nothing of the named car.
+    Returns when the named car's ``sources`` are found, or all endpoints are connected and their
+    processes known, or with what there is after the timeout. Raises InputError if that is nothing,
+    or nothing of the named car.
     """
     key = ALIVE.format(car="*", source="*") if not name else car_key(ALIVE, name, "*")
     deadline = time.monotonic() + timeout_s
-    settled_s: float | None = None
+    complete_s: float | None = None
     while True:
         found = _tokens(session, key, timeout_s)
         now_s = time.monotonic()
         if name and set(sources) <= set(found.get(name, ())):
             return found
         if _connected(session) < len(endpoints.connect):
-            settled_s = None
-        elif settled_s is None:
-            settled_s = now_s + _SETTLING_S
-        if now_s >= deadline or (settled_s is not None and found and now_s >= settled_s):
+            complete_s = None
+        elif complete_s is None:
+            complete_s = now_s + _DECLARATIONS_S
+        if now_s >= deadline or (complete_s is not None and found and now_s >= complete_s):
             break
         time.sleep(0.02)
     if not found:
-        raise _nobody(session, endpoints, timeout_s, name)
+        raise _not_found(session, endpoints, timeout_s, name)
     return found
 
 
@@ -82,7 +78,7 @@ def _connected(session: Any) -> int:
 def _tokens(session: Any, key: str, timeout_s: float) -> dict[str, set[str]]:
     found: dict[str, set[str]] = {}
     for reply in session.liveliness().get(key, timeout=timeout_s):
-        if reply.ok is not None and (place := _place(str(reply.ok.key_expr), ALIVE)):
+        if reply.ok is not None and (place := _place(str(reply.ok.key_expr))):
             found.setdefault(place.car, set()).add(place.source)
     return found
 
@@ -92,53 +88,40 @@ class _Place(NamedTuple):
     source: str
 
 
-def _place(key: str, template: str) -> _Place | None:
-    """Car and source of a key; None for one that is not of this form."""
-    parts, form = key.split("/"), template.split("/")
-    if len(parts) != len(form):
-        return None
-    place = _Place(parts[form.index("{car}")], parts[form.index("{source}")])
-    try:
-        ours = place.source in SOURCES and car_key(template, *place) == key
-    except InputError:
-        ours = False
-    return place if ours else None
+def _place(key: str) -> _Place | None:
+    """Car and source of the key of a token or heartbeat; None if the table has no such process."""
+    parts = key.split("/")
+    known = len(parts) == 4 and is_car_name(parts[1]) and parts[3] in SOURCES
+    return _Place(parts[1], parts[3]) if known else None
 
 
-def _nobody(session: Any, endpoints: Endpoints, timeout_s: float, name: str) -> InputError:
+def _not_found(session: Any, endpoints: Endpoints, timeout_s: float, name: str) -> InputError:
     where = ", ".join(endpoints.connect)
-    start = "start 'bayesrace plant' and 'bayesrace controller', or name their endpoints"
+    remedy = (
+        "start 'bayesrace plant' and 'bayesrace controller', or give their endpoints (--endpoint)"
+    )
     if not _connected(session):
-        return InputError(f"nobody answers at {where} within {timeout_s:g} s; {start}: --endpoint")
+        return InputError(f"no connection to {where} within {timeout_s:g} s; {remedy}")
     others = sorted(_tokens(session, ALIVE.format(car="*", source="*"), timeout_s)) if name else []
     if others:
-        return InputError(f"no car '{name}' at {where}; there are: {', '.join(others)}")
-    return InputError(f"no car at {where}, though somebody listens there; {start}: --endpoint")
+        return InputError(f"no car '{name}' at {where}; cars found: {', '.join(others)}")
+    return InputError(f"no car at {where}, though another process listens there; {remedy}")
 
 
 def ask_statuses(session: Any, found: Found, timeout_s: float) -> Picture:
-    """What the processes say of themselves, those included that do not answer in time."""
-    keys = {
+    """The status of each process, those included that do not answer in time."""
+    places = {
         car_key(STATUS.key, car, source): _Place(car, source)
         for car, sources in found.items()
         for source in sources
     }
     request = StatusRequest(0, time.monotonic_ns())
-    answers = ask_all(session, keys, request, timeout_s)
     picture = Picture({})
-    for key, place in keys.items():
-        picture.put(*place, _process(answers[key], f"no answer within {timeout_s:g} s"))
+    for key, answers in ask_all(session, STATUS, places, request, timeout_s).items():
+        status = answers.valid[0] if answers.valid else None
+        fault = "" if status else answers.fault or f"no answer within {timeout_s:g} s"
+        picture.put(*places[key], Process(status, fault, answers.count))
     return Picture(picture.cars)
-
-
-def _process(answers: list[bytes], fault: str) -> Process:
-    status = None
-    for data in answers:
-        try:
-            status = status or decode(Status, data)
-        except InputError as error:
-            fault = str(error)
-    return Process(status, "" if status else fault, len(answers))
 
 
 def pick(found: Found, name: str, everybody: bool, source: str = "controller") -> list[str]:
@@ -147,112 +130,69 @@ def pick(found: Found, name: str, everybody: bool, source: str = "controller") -
     if not cars:
         other = "plant" if source == "controller" else "controller"
         raise InputError(
-            f"no {source} can be reached, only the {other} of {', '.join(sorted(found))}; "
-            f"start 'bayesrace {source}', or name its endpoint: --endpoint"
+            f"no {source} found, only the {other} of {', '.join(sorted(found))}; "
+            f"start 'bayesrace {source}', or give its endpoint (--endpoint)"
         )
     if name or everybody or len(cars) == 1:
         return cars
-    raise InputError(f"several cars are there: {', '.join(cars)}; choose one with --name")
+    raise InputError(f"several cars found: {', '.join(cars)}; choose one with --name")
 
 
 def command(
-    session: Any, cars: Collection[str], word: Word, text: str, timeout_s: float
+    session: Any, cars: Collection[str], action: Action, text: str, timeout_s: float
 ) -> dict[str, Reply | str]:
-    """Tell the controllers of these cars, all at once; each one's answer, or why there is none.
+    """Command the controllers of these cars, all at once: each one's reply, or why there is none.
 
-    "end" is for their plants: it ends the run under way.
+    "end" ends the current runs of their plants. ``text``: the reason.
     """
-    service = STOP if word == "end" else COMMAND
-    keys = {car: car_key(service.key, car) for car in cars}
     now_ns = time.monotonic_ns()
     request: Message = (
-        StopRequest(0, now_ns, text) if word == "end" else Command(0, now_ns, word, text)
+        StopRequest(0, now_ns, text) if action == "end" else Command(0, now_ns, action, text)
     )
-    answers = ask_all(session, keys.values(), request, timeout_s)
-    return {car: _reply(answers[key], timeout_s) for car, key in keys.items()}
+    service: Any = STOP if action == "end" else COMMAND
+    keys = {car_key(service.key, car): car for car in cars}
+    return {
+        keys[key]: decisive(answers.valid) or answers.fault or f"no answer within {timeout_s:g} s"
+        for key, answers in ask_all(session, service, keys, request, timeout_s).items()
+    }
 
 
-def _reply(answers: list[bytes], timeout_s: float) -> Reply | str:
-    """What the controllers under one name say together, or why that is unknown."""
-    try:
-        reply = decisive([decode(Reply, data) for data in answers])
-    except InputError as error:
-        return str(error)
-    return reply or f"no answer within {timeout_s:g} s"
+def follow(session: Any, picture: Picture, name: str, period_s: float) -> Iterator[str | None]:
+    """Updates the picture from heartbeats and tokens, of one car or all (""), until a signal.
 
-
-class _News:
-    """Heartbeats, comings and goings of one car or all (name ""), as they arrive."""
-
-    def __init__(self, session: Any, name: str) -> None:
-        self._arrived: queue.SimpleQueue[tuple[_Place, bytes | bool] | None] = queue.SimpleQueue()
-        car = name or "*"
-        alive, beat = (key.format(car=car, source="*") for key in (ALIVE, HEARTBEAT.key))
-        self._declared = (
-            session.liveliness().declare_subscriber(alive, self._on_token, history=True),
-            session.declare_subscriber(beat, self._on_heartbeat),
-        )
-
-    def end(self) -> None:
-        """Makes :meth:`next` return None; may be called from a signal handler."""
-        self._arrived.put(None)
-
-    def next(self, timeout_s: float) -> tuple[_Place, bytes | bool] | None:
-        """A heartbeat's bytes, or whether a process is there now; queue.Empty if nothing comes."""
-        return self._arrived.get(timeout=timeout_s)
-
-    def _on_heartbeat(self, sample: Any) -> None:
-        if place := _place(str(sample.key_expr), HEARTBEAT.key):
-            self._arrived.put((place, sample.payload.to_bytes()))
-
-    def _on_token(self, sample: Any) -> None:
-        if place := _place(str(sample.key_expr), ALIVE):
-            self._arrived.put((place, sample.kind == zenoh.SampleKind.PUT))
-
-
-def follow(
-    session: Any, picture: Picture, name: str, show: Callable[[str | None], None], period_s: float
-) -> None:
-    """Keeps the picture up to date from heartbeats and tokens, until SIGINT or SIGTERM.
-
-    Calls ``show`` with the car's name after each heartbeat, and with None each ``period_s``. For
-    the main thread.
+    Yields the car's name after each heartbeat, and None each ``period_s``. For the main thread.
     """
-    news, decoder = _News(session, name), Decoder(Status)
-    due_s = 0.0
-    with catching_signals(lambda _number: news.end()):
+    inbox, due_s = Inbox(session, name or None), 0.0
+    decoder = inbox.subscribe(HEARTBEAT)
+    inbox.watch()
+    with inbox.receive_signals():
         while True:
             if (now_s := time.monotonic()) >= due_s:
-                picture.silence(now_s)
-                show(None)
-                # From the end of the showing: however long that takes, there is time to listen.
+                picture.expire(now_s)
+                yield None
+                # After a slow display there is still time to receive.
                 due_s = time.monotonic() + period_s
-            try:
-                item = news.next(max(due_s - time.monotonic(), 0.001))
-            except queue.Empty:
-                continue
+            item = inbox.get(max(due_s - time.monotonic(), 0.001))
             if item is None:
-                return
-            place, what = item
-            if isinstance(what, bool):
-                _note_token(picture, place, what)
                 continue
-            status = decoder(what)
-            picture.put(*place, Process(status, "" if status else decoder.last_reason, 1))
-            show(place.car)
-
-
-def _note_token(picture: Picture, place: _Place, there: bool) -> None:
-    known = picture.cars.get(place.car, {}).get(place.source)
-    if not there:
-        picture.put(*place, None)
-    elif known is None:
-        picture.put(*place, Process(None, "no heartbeat yet"))
+            if item.kind is Kind.SIGNAL:
+                return
+            place = _place(item.key)
+            if place is None:
+                continue
+            if item.kind is Kind.MESSAGE:
+                fault = "" if item.value else decoder.last_reason
+                picture.put(*place, Process(item.value, fault, 1))
+                yield place.car
+            elif item.kind is Kind.GONE:
+                picture.put(*place, None)
+            elif place.source not in picture.cars.get(place.car, {}):
+                picture.put(*place, Process(None, "no heartbeat yet"))
 
 
 def route(endpoints: Endpoints) -> None:
     """Forward between all that connect to this process, until SIGINT or SIGTERM."""
-    told: queue.SimpleQueue[None] = queue.SimpleQueue()
-    with catching_signals(lambda _number: told.put(None)), open_session(endpoints):
+    signals: queue.SimpleQueue[int] = queue.SimpleQueue()
+    with catching_signals(signals.put), open_session(endpoints):
         _log.info("router on %s", ", ".join(endpoints.listen))
-        told.get()
+        signals.get()

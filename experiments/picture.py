@@ -1,20 +1,20 @@
-"""What is known of the cars in a network at one moment, and its form as JSON.
+"""The known state of the cars in a network, and its form as JSON.
 
 What ``bayesrace status --json`` prints is one object, ``{"cars": {NAME: {"plant": P, "controller":
 P}}}``, where P is null if no such process is there, and otherwise holds, always:
 
-- ``answering``: it has told its status; all from ``phase`` on is null if not;
-- ``fault``: why not, or null;
-- ``processes``: how many answered under this name; more than one is a mistake;
+- ``answering``: its status is known; all from ``phase`` on is null if not;
+- ``fault``: why it is not, or null;
+- ``processes``: how many answer under this name; more than one is a mistake;
 - ``status_age_s``: since the status arrived here [s];
 - ``phase``, ``epoch``, ``run``, ``text``, ``weights_version``, ``delay_s``: as in the message
   :class:`~bayesrace.messages.Status`;
 - ``rate_hz``: of the loop, null in lockstep;
 - ``state_age_s``: since the process received (controller) or sent (plant) its newest state [s],
   null before the first;
-- ``counters``: name to number, everything counted since the process started.
+- ``counters``: name to number, all counters since the process started.
 
-With ``--watch`` there is a line for each heartbeat, about the car whose process it came from.
+With ``--watch`` there is a line for each heartbeat, about the car that it came from.
 """
 
 import time
@@ -30,12 +30,12 @@ SOURCES: Final = ("plant", "controller")
 """Processes that a car consists of."""
 
 _SILENT_S: Final = 1.0
-"""A process without a heartbeat for this long, ten of them, counts as not answering."""
+"""A process without a heartbeat for this long, ten periods, counts as not answering."""
 
 
 @dataclass(frozen=True)
 class Process:
-    """What is known of a process that is there."""
+    """What is known of a present process."""
 
     status: Status | None = None
     fault: str = ""
@@ -46,7 +46,7 @@ class Process:
     """Monotonic clock when the status arrived, or was missed."""
 
     def as_json(self, now_s: float) -> dict[str, Any]:
-        """See the text of this module."""
+        """JSON as in the docstring of this module."""
         status = self.status
         known: dict[str, Any] = dict.fromkeys(
             ("phase", "epoch", "run", "text", "weights_version", "rate_hz", "state_age_s")
@@ -67,18 +67,18 @@ class Process:
 
 
 class Picture:
-    """All cars as known at the moment."""
+    """All cars as known now."""
 
     def __init__(self, cars: Mapping[str, Mapping[str, Process]]) -> None:
         self.cars: dict[str, dict[str, Process]] = {car: dict(cars[car]) for car in sorted(cars)}
 
     @property
     def answering(self) -> bool:
-        """Whether any process has told its status."""
+        """Whether the status of any process is known."""
         return any(one.status for processes in self.cars.values() for one in processes.values())
 
     def put(self, car: str, source: str, process: Process | None) -> None:
-        """What is new of a process; None: it is gone."""
+        """Update a process; None: it is gone."""
         processes = self.cars.setdefault(car, {})
         if process is None:
             processes.pop(source, None)
@@ -87,15 +87,16 @@ class Picture:
         if not processes:
             del self.cars[car]
 
-    def silence(self, now_s: float) -> None:
-        """Takes the status from those that have not told it for a while."""
+    def expire(self, now_s: float) -> None:
+        """Drop each status whose process sends no heartbeats any more."""
         for processes in self.cars.values():
             for source, one in processes.items():
                 if one.status is not None and now_s - one.arrived_s > _SILENT_S:
-                    processes[source] = Process(None, "silent", 0, one.arrived_s)
+                    fault = f"no heartbeat for {_SILENT_S:g} s"
+                    processes[source] = Process(None, fault, 0, one.arrived_s)
 
     def as_json(self, only: str | None = None) -> dict[str, Any]:
-        """See the text of this module; ``only``: one car."""
+        """JSON as in the docstring of this module; ``only``: one car."""
         now_s = time.monotonic()
         names = sorted(self.cars) if only is None else [only]
         return {

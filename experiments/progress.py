@@ -19,7 +19,7 @@ _CACHED: Final = "from the cache"
 
 
 class Stage(Protocol):
-    """One stage under way."""
+    """One stage of the work."""
 
     def update(self, share: float, text: str = "") -> None:
         """``share`` of it is done (0 to 1); ``text`` says what is going on."""

@@ -4,26 +4,22 @@ Plant and controller are processes of their own, started as a person would start
 directs, records everything that is said on the network, and hands over weights.
 """
 
-import os
 import shutil
-import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from bayesrace.gp.weights import read_weights
 from bayesrace.manifest import MANIFEST
-from bayesrace.messages import EVENT, Event
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import load_track
-from bayesrace.transport import Director, Endpoints, Publisher, free_endpoint, open_session
-from bayesrace.vehicles import CarParameters, write_car
+from bayesrace.vehicles import write_car
 from codegen.compiler import find_compiler
-from experiments.drive import RunPlan, execute, wait_for_both
+from experiments.drive import RunPlan
 from experiments.preparation import (
     Course,
     PredictionModel,
@@ -32,9 +28,9 @@ from experiments.preparation import (
     trained_weights,
     training_settings,
 )
-from experiments.processes import Child, child, endings
 from experiments.progress import Stage, Stages
 from experiments.settings import RaceSettings
+from experiments.system import System, started_system
 from learning.dataset import Dataset, concatenate
 from learning.logs import dataset_from_log
 from plant.fmu.faults import FmuFault
@@ -42,8 +38,6 @@ from plant.simulator import PLANT
 from plant.vehicle import open_vehicle
 
 __all__ = ["FILES", "RaceError", "race"]
-
-_START_S: Final = 20.0
 
 _MODELS: Final[tuple[PredictionModel, ...]] = ("e_kinematic", "dynamic")
 """Of BayesRace and of BestCase."""
@@ -125,6 +119,17 @@ class _Race:
             None if settings.fmu_map is None else self.out / FILES.fmu_map,
         )
 
+    @property
+    def plant_options(self) -> list[str]:
+        """Of ``bayesrace plant``."""
+        files = zip(("--fmu", "--map"), self.fmu_files, strict=True)
+        return ["--car", self.car_file, *(str(one) for pair in files if pair[1] for one in pair)]
+
+    @property
+    def both_options(self) -> list[str]:
+        """Of plant and controller: a link in lockstep needs no priorities."""
+        return ["--low-latency"] if self.settings.mode == "lockstep" else []
+
     def update(self, prepared: Prepared, lap: Dataset, stage: Stage) -> Path:
         """Weights learned from training drive and lap, beginning with those of the lap."""
         settings = self.settings
@@ -152,90 +157,45 @@ class _Race:
 
 
 @contextmanager
-def _faults_named() -> Iterator[None]:
-    """Turns a fault of the FMU into the reason why there is no race."""
+def _faults_named(fault: type[Exception] = FmuFault) -> Iterator[None]:
+    """Turns a fault, of the FMU or of a run, into the reason why there is no race."""
     try:
         yield
-    except FmuFault as fault:
-        raise RaceError(str(fault)) from fault
+    except fault as error:
+        raise RaceError(str(error)) from error
 
 
-@contextmanager
-def _explained(children: list[Child]) -> Iterator[None]:
-    """Turns the end of a child into the reason of what went wrong because of it."""
-    try:
-        yield
-    except InputError as error:
-        time.sleep(0.2)  # the system tells of a death a moment after the network does
-        raise RaceError("; ".join([str(error), *endings(children)])) from error
+class _Drives:
+    """The runs of a race, driven and recorded one after the other."""
 
+    def __init__(self, race: _Race, course: Course, system: System, recorder: Recorder) -> None:
+        self._race, self._course = race, course
+        self._system, self._recorder = system, recorder
 
-class _Paddock:
-    """The processes of a race and the session that directs and records them."""
-
-    def __init__(self, race: _Race, course: Course, stack: ExitStack) -> None:
-        self._race, self._course, self._stack = race, course, stack
-        self._plant_endpoint = free_endpoint()
-        self._controller_endpoint = free_endpoint()
-        # Per link, and links that carry weights cannot have it: large messages need fragments.
-        self._low_latency = race.settings.mode == "lockstep"
-        self.children: list[Child] = []
-        self.children.append(stack.enter_context(self._plant()))
-        endpoints = Endpoints(connect=(self._plant_endpoint, self._controller_endpoint))
-        session = stack.enter_context(open_session(endpoints))
-        stack.callback(self._stop_children)
-        self.recorder = stack.enter_context(
-            Recorder(session, race.car.name, race.out / FILES.log, self._metadata())
-        )
-        self.director = Director(session, race.car.name)
-        self._events: Publisher[Event] = Publisher(session, EVENT, race.car.name, "race")
-
-    def _metadata(self) -> dict[str, dict[str, str]]:
-        return {"race": {"settings": self._race.settings.model_dump_json()}}
-
-    def _flags(self) -> list[str]:
-        return ["--parent-pid", str(os.getpid()), *(["--low-latency"] if self._low_latency else [])]
-
-    def _plant(self) -> Any:
-        arguments = ["plant", "--car", self._race.car_file, "--endpoint", self._plant_endpoint]
-        for option, file in zip(("--fmu", "--map"), self._race.fmu_files, strict=True):
-            arguments += [option, str(file)] if file is not None else []
-        return child([*arguments, *self._flags()], self._race.out / "plant.log")
-
-    def _stop_children(self) -> None:
-        for process in self.children:
-            process.stop()
-
-    @contextmanager
-    def controller(self, artefact: Path, name: str) -> Iterator[None]:
+    def controller(self, artefact: Path, name: str) -> AbstractContextManager[None]:
         """A controller process for the block; ready for its first run."""
         race, course = self._race, self._course
         settings_file = race.out / FILES.mpc
         write_whole(settings_file, race.settings.mpc.model_dump_json(indent=1) + "\n")
-        arguments = [
-            "controller", "--car", race.car_file, "--artefact", str(artefact),
-            "--track", str(course.track_file), "--raceline", str(course.line_file),
-            "--settings", str(settings_file), "--endpoint", self._plant_endpoint,
-            "--listen", self._controller_endpoint, *self._flags(),
+        options = [
+            "--car", race.car_file, "--artefact", str(artefact), "--track", str(course.track_file),
+            "--raceline", str(course.line_file), "--settings", str(settings_file),
         ]  # fmt: skip
-        with child(arguments, race.out / f"controller-{name}.log") as process:
-            self.children.append(process)
-            with _explained(self.children):
-                wait_for_both(self.director, self.children, _START_S)
-                yield
-            self.children.remove(process)
-        self.director.wait_until_gone("controller", _START_S)
+        return self._system.controller(options, f"controller-{name}.log")
 
-    def drive(self, controller: str) -> RunPlan:
-        """One run; InputError if it broke off."""
+    def drive(self, controller: str, weights: Path | None = None) -> RunPlan:
+        """One run, with new weights first if there are any; InputError if it broke off."""
+        if weights is not None:
+            self._system.director.send_weights(weights.read_bytes())
         plan = self._race.plan(controller, self._course)
-        execute(self.director, self._events, self._course.track, plan, self.recorder)
+        self._system.drive(self._course.track, plan, self._recorder)
         return plan
 
-    def flushed(self, plan: RunPlan, car: CarParameters, step_s: float) -> Dataset:
-        """Samples of a run, from the log."""
-        self.recorder.settle()
-        return dataset_from_log(self._race.out / FILES.log, car, step_s, runs=(plan.run,))
+    def samples(self, plan: RunPlan) -> Dataset:
+        """What can be learned from a run, from the log."""
+        self._recorder.settle()
+        step_s = self._race.settings.discretisation.step_s
+        return dataset_from_log(self._race.out / FILES.log, self._race.car, step_s, (plan.run,))
 
 
 def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
@@ -256,19 +216,21 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
     write_whole(out / FILES.settings, settings.model_dump_json(indent=1) + "\n")
     prepared = this.prepare()
     artefact, perfect = prepared.artefacts
-    with ExitStack() as stack:
-        paddock = _Paddock(this, prepared.course, stack)
-        with paddock.controller(artefact, "bayesrace"):
+    about = {"race": {"settings": settings.model_dump_json()}}
+    with (
+        _faults_named(InputError),
+        started_system(this.car.name, out, this.plant_options, this.both_options) as system,
+        Recorder(system.session, this.car.name, out / FILES.log, about) as recorder,
+    ):
+        drives = _Drives(this, prepared.course, system, recorder)
+        with drives.controller(artefact, "bayesrace"):
             with stages.stage("drive WorstCase"):
-                paddock.drive("worstcase")
+                drives.drive("worstcase")
             with stages.stage("drive BayesRace"):
-                paddock.director.send_weights(prepared.weights.read_bytes())
-                driven = paddock.drive("bayesrace")
+                driven = drives.drive("bayesrace", prepared.weights)
             with stages.stage("update the residual") as stage:
-                lap = paddock.flushed(driven, this.car, settings.discretisation.step_s)
-                updated = this.update(prepared, lap, stage)
+                updated = this.update(prepared, drives.samples(driven), stage)
             with stages.stage("drive BayesRace-updated"):
-                paddock.director.send_weights(updated.read_bytes())
-                paddock.drive("bayesrace-updated")
-        with paddock.controller(perfect, "bestcase"), stages.stage("drive BestCase"):
-            paddock.drive("bestcase")
+                drives.drive("bayesrace-updated", updated)
+        with drives.controller(perfect, "bestcase"), stages.stage("drive BestCase"):
+            drives.drive("bestcase")

@@ -1,4 +1,4 @@
-"""Everything a race can be told, as one resolved object that goes into the run directory."""
+"""Settings of a race, as one resolved object that goes into the run directory."""
 
 from pathlib import Path
 from typing import Literal, Self
@@ -39,7 +39,7 @@ class PreparationSettings(BaseModel):
 
     @property
     def driven_car(self) -> CarParameters:
-        """With the friction that the line is asked for: whoever drives it must know the same."""
+        """With the friction that the line is asked for: the controller must assume the same."""
         grip = self.raceline.friction
         return self.car if grip is None else self.car.model_copy(update={"friction": grip})
 

@@ -1,4 +1,4 @@
-"""The state of all cars on the terminal: numbers in a table, and below it what each said last."""
+"""The state of all cars on the terminal: a table of numbers, and below it each latest message."""
 
 from collections.abc import Iterator
 from typing import Final, Literal
@@ -14,7 +14,7 @@ from experiments.printable import printable
 
 __all__ = ["COUNTERS_SHOWN", "StatusTable"]
 
-_ROWS: Final[tuple[tuple[str, Literal["left", "right"]], ...]] = (
+_VALUES: Final[tuple[tuple[str, Literal["left", "right"]], ...]] = (
     ("state", "left"),
     ("rate\nHz", "right"),
     ("last state\nms ago", "right"),
@@ -24,10 +24,10 @@ _ROWS: Final[tuple[tuple[str, Literal["left", "right"]], ...]] = (
     ("delay\nms", "right"),
     ("messages\nrefused/lost/stale", "right"),
 )
-"""What is told of each process: a column of the wide table, a row of the narrow one."""
+"""Shown of each process: columns of the wide table, rows of the narrow ones."""
 
 _WIDE: Final = 115
-"""Columns of a terminal that the wide table fits into, names being short."""
+"""Columns of a terminal that the wide table fits into, if names are short."""
 
 _COLOURS: Final = {
     "driving": "green", "running": "green", "fallback": "red", "stopped": "yellow",
@@ -42,24 +42,27 @@ COUNTERS_SHOWN: Final = {
     ),
     "plant": (("overruns",), ("", "braked", ""), ("refused", "actuations_lost", "stale")),
 }
-"""Of each process, what is shown under misses, fallbacks, and messages."""
+"""Counters of each process that are shown as misses, fallbacks, and messages."""
 
 
 class StatusTable:
-    """All that is known, for rich to print: a row per process, or a column where that is too wide.
+    """The picture for rich to print: a row per process, or a table per car where that is too wide.
 
-    ``brief`` cuts what processes said to a line each.
+    ``brief`` cuts each message to a line.
     """
 
     def __init__(self, picture: Picture, *, brief: bool = False) -> None:
-        self._cars = picture.cars
+        self._cars: dict[str, list[tuple[str, Process]]] = {
+            car: [(source, processes[source]) for source in SOURCES if source in processes]
+            for car, processes in picture.cars.items()
+        }
         self._brief = brief
 
     def __rich_console__(
         self, console: Console, options: ConsoleOptions
     ) -> Iterator[RenderableType]:
         if not self._cars:
-            yield "nobody is there any more"
+            yield "no process is present any more"
         elif options.max_width >= _WIDE:
             yield self._wide()
             yield ""
@@ -68,49 +71,44 @@ class StatusTable:
                 yield _narrow(car, processes)
                 yield ""
         for car, processes in self._cars.items():
-            for source, process in _in_order(processes):
-                said = _said(f"{car} {source}", process)
-                said.no_wrap, said.overflow = self._brief, "ellipsis" if self._brief else "fold"
-                yield said
+            for source, process in processes:
+                text = _message(f"{car} {source}", process)
+                text.no_wrap, text.overflow = self._brief, "ellipsis" if self._brief else "fold"
+                yield text
 
     def _wide(self) -> Table:
-        table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, show_edge=False)
-        table.add_column("car", overflow="fold")
-        table.add_column("process")
-        for title, justify in _ROWS:
+        table = _table("car", "process")
+        for title, justify in _VALUES:
             table.add_column(title, justify=justify)
         for car, processes in self._cars.items():
-            for source, process in _in_order(processes):
-                table.add_row(printable(car), source, *_cells(source, process))
+            for source, process in processes:
+                table.add_row(printable(car), source, *_values(source, process))
         return table
 
 
-def _narrow(car: str, processes: dict[str, Process]) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, show_edge=False)
-    table.add_column(printable(car))
-    columns = [_cells(source, process) for source, process in _in_order(processes)]
-    for source, _ in _in_order(processes):
-        table.add_column(source)
-    for i, (title, _) in enumerate(_ROWS):
-        cells = (column[i] if i < len(column) else "" for column in columns)
-        table.add_row(title.replace("\n", " "), *cells)
+def _narrow(car: str, processes: list[tuple[str, Process]]) -> Table:
+    table = _table(printable(car), *(source for source, _ in processes))
+    columns = [_values(source, process) for source, process in processes]
+    for (title, _), *values in zip(_VALUES, *columns, strict=True):
+        table.add_row(title.replace("\n", " "), *values)
     return table
 
 
-def _in_order(processes: dict[str, Process]) -> list[tuple[str, Process]]:
-    return [(source, processes[source]) for source in SOURCES if source in processes]
+def _table(*titles: str) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, show_edge=False)
+    for title in titles:
+        table.add_column(title, overflow="fold")
+    return table
 
 
-def _cells(source: str, process: Process) -> list[Text | str]:
+def _values(source: str, process: Process) -> list[Text | str]:
     status = process.status
     if status is None:
-        return [Text("no answer", style="red")]
+        return [Text("no answer", style="red"), *[""] * (len(_VALUES) - 1)]
     phase = Text(status.phase, style=_COLOURS.get(status.phase, ""))
     if process.processes > 1:
         phase.append(f" ×{process.processes}", style="red")
-    misses, fallbacks, messages = (
-        "/".join(_count(status, name) for name in names) for names in COUNTERS_SHOWN[source]
-    )
+    misses, fallbacks, messages = (_counts(status, names) for names in COUNTERS_SHOWN[source])
     return [
         phase,
         f"{status.rate_hz:g}" if status.rate_hz else "lockstep",
@@ -123,13 +121,12 @@ def _cells(source: str, process: Process) -> list[Text | str]:
     ]
 
 
-def _count(status: Status, name: str) -> str:
-    return str(status.counters.get(name, "–"))
+def _counts(status: Status, names: tuple[str, ...]) -> str:
+    return "/".join(str(status.counters.get(name, "–")) for name in names)
 
 
-def _said(who: str, process: Process) -> Text:
-    """A line about the process."""
-    words = process.fault if process.status is None else process.status.text
+def _message(who: str, process: Process) -> Text:
+    text = process.fault if process.status is None else process.status.text
     if process.processes > 1:
-        words = f"{process.processes} processes answer to this name; end all but one. {words}"
-    return Text.assemble((f"{printable(who)}: ", "bold"), printable(words) or "nothing to say")
+        text = f"{process.processes} processes answer under this name; end all but one. {text}"
+    return Text.assemble((f"{printable(who)}: ", "bold"), printable(text) or "no message")

@@ -14,10 +14,9 @@ from bayesrace.vehicles import CarParameters, get_car
 from experiments.notation import UNCERTAIN
 from experiments.results import GpMetrics
 from learning.dataset import Dataset, left_out
-from learning.horizon import HORIZON, Mismatch, mismatch
 from learning.residual import discretisation_of
 from learning.sources import read_samples
-from learning.validation import Validation, validate
+from learning.validation import HORIZON, Validation, mismatch, validate
 
 __all__ = [
     "Drift",
@@ -61,12 +60,12 @@ class Drift(_Frozen):
     omega_radps: Spread
 
     @classmethod
-    def of(cls, errors: Mismatch) -> "Drift":
-        """From at least one prediction."""
-        vx, vy, omega = errors.velocities.T
+    def of(cls, errors: Floats) -> "Drift":
+        """From states driven minus predicted, (m, 7), m at least 1."""
+        x, y, psi, vx, vy, omega, _ = errors.T
         return cls(
-            position_m=Spread.of(errors.position_m),
-            heading_rad=Spread.of(errors.heading_rad),
+            position_m=Spread.of(np.hypot(x, y)),
+            heading_rad=Spread.of(psi),
             vx_mps=Spread.of(vx),
             vy_mps=Spread.of(vy),
             omega_radps=Spread.of(omega),

@@ -1,29 +1,22 @@
-"""What training tells beside the weights: kernels by smoothness, the cost of choosing samples.
+"""What training reports beside the weights: kernels by smoothness, the cost of choosing samples.
 
-Every number is held out: a sample is predicted by a GP that has not seen its part of the drive
-(kernels) or its stretch of the track (choices); see :mod:`learning.folds`.
+Every number is held out: a GP predicts a sample without its part of the drive (kernels) or its
+stretch of the track (choices); see :mod:`learning.folds`.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from learning.crossvalidation import calibrated
+from bayesrace.arrays import Rows
 from learning.hyperparameters import Fit
-from learning.regression import judged
-from learning.scores import PredictionErrors
-from learning.subset import at_random, evenly
+from learning.posterior import Covariance, Posterior
+from learning.target import Target
 
-__all__ = ["TESTS", "ChoiceScore", "KernelScore", "choice_scores"]
-
-Floats = NDArray[np.float64]
-Rows = NDArray[np.int64]
-
-TESTS: Final = 2000
-"""Samples that a GP is judged by at most, evenly spread over all."""
+__all__ = ["ChoiceScore", "KernelScore", "choice_scores", "choose_kernel"]
 
 _DRAWS: Final = 5
 """Random choices that the baseline is the mean of."""
@@ -35,33 +28,16 @@ class KernelScore:
 
     output: str
     kernel: str
-    log_likelihood: float
     rmse: float
     log_density: float
-    coverage: float
     chosen: bool
-
-    @classmethod
-    def of(
-        cls, output: str, fit: Fit, held: PredictionErrors, scale: float, chosen: bool
-    ) -> "KernelScore":
-        """From errors in units of ``scale``."""
-        return cls(
-            output,
-            fit.kind,
-            fit.log_likelihood,
-            held.rmse * scale,
-            held.log_density - math.log(scale),
-            held.coverage,
-            chosen,
-        )
 
 
 @dataclass(frozen=True)
 class ChoiceScore:
-    """What is left of one output's prediction with some of the samples (SI units).
+    """How well some of the samples predict one output (SI units).
 
-    ``choice``: "all" (at most :data:`TESTS`, evenly spread), "greedy" (what the weights hold) or
+    ``choice``: "all" (a limited number, evenly spread), "greedy" (those in the weights) or
     "random" (mean of several draws of the same number).
     """
 
@@ -72,28 +48,43 @@ class ChoiceScore:
     log_density: float
 
 
+def choose_kernel(target: Target, fits: Sequence[Fit]) -> tuple[Fit, list[KernelScore]]:
+    """Best start per kernel by likelihood, then best kernel by held-out log density."""
+    best: dict[str, Fit] = {}
+    for fit in fits:
+        best[fit.kind] = max(best.get(fit.kind, fit), fit, key=lambda one: one.log_likelihood)
+    held = {
+        kind: Posterior(fit.covariance, target.z, target.y).held_out(target.folds)
+        for kind, fit in best.items()
+    }
+    chosen = max(held, key=lambda kind: held[kind].log_density)
+    scale = target.y_scale
+    return best[chosen], [
+        KernelScore(
+            output=target.name,
+            kernel=kind,
+            rmse=errors.rmse * scale,
+            log_density=errors.log_density - math.log(scale),
+            chosen=kind == chosen,
+        )
+        for kind, errors in held.items()
+    ]
+
+
 def choice_scores(
-    output: str, fit: Fit, z: Floats, y: Floats, rows: Rows, folds: Rows, seed: int, scale: float
+    target: Target, covariance: Covariance, rows: Rows, seed: int
 ) -> list[ChoiceScore]:
-    """All samples, the chosen ``rows``, and as many at random; scaled ``z`` (n, 6), ``y`` (n,).
+    """Predictions from all samples, from the chosen ``rows``, and from as many at random.
 
     Variances are calibrated as those of weights are.
     """
-    tests = evenly(len(y), TESTS)
 
-    def judge(some: Rows) -> PredictionErrors:
-        return calibrated(judged(fit.kind, fit.theta, z, y, some, tests, folds), folds[tests])
+    def score(choice: str, *choices: Rows) -> ChoiceScore:
+        held = [target.calibrated(target.errors_from(some, covariance)) for some in choices]
+        rmse = math.sqrt(np.mean([one.rmse**2 for one in held])) * target.y_scale
+        density = float(np.mean([one.log_density for one in held])) - math.log(target.y_scale)
+        return ChoiceScore(target.name, choice, len(choices[0]), rmse, density)
 
-    def score(choice: str, count: int, errors: list[PredictionErrors]) -> ChoiceScore:
-        square = float(np.mean([one.rmse**2 for one in errors]))
-        density = float(np.mean([one.log_density for one in errors]))
-        return ChoiceScore(
-            output, choice, count, math.sqrt(square) * scale, density - math.log(scale)
-        )
-
-    draws = [at_random(len(y), len(rows), seed + draw) for draw in range(_DRAWS)]
-    return [
-        score("all", len(tests), [judge(tests)]),
-        score("greedy", len(rows), [judge(rows)]),
-        score("random", len(rows), [judge(draw) for draw in draws]),
-    ]
+    generators = [np.random.default_rng(seed + draw) for draw in range(_DRAWS)]
+    draws = [one.choice(len(target.y), len(rows), replace=False) for one in generators]
+    return [score("all", target.tests), score("greedy", rows), score("random", *draws)]

@@ -1,15 +1,15 @@
-"""What cross-validation leaves out together: parts of the drive, or stretches of the track.
+"""The parts that cross-validation leaves out together: spans of time, or stretches of the track.
 
-Neighbouring samples of a drive are 20 ms apart and nearly alike, so single samples are no folds:
-they would ask for interpolation only.
+Neighbouring samples of a drive are 20 ms apart and nearly alike, so folds of single samples would
+ask for interpolation only.
 
-*Spans* are consecutive in time. They rank kernels well, but a log holds several laps, and a corner
-driven before and after a span teaches nearly all of it: errors held out by time are about those of
-the next lap, far below those on another track.
+*Spans* are consecutive in time. They rank kernels well, but a log holds several laps, and the laps
+before and after a span pass the same corner: errors held out by time are about those of the next
+lap, far below those on another track.
 
-*Stretches* are all passages of a place. What is held out by stretch tells what to expect on a track
-that was not driven (docs/learning.md has how well, and why kernels are not chosen by it). No track
-is needed: in driving order, the first sample of new ground becomes a *leader*, and all samples near
+*Stretches* are all passages of a place. Errors held out by stretch estimate those on a track that
+was not driven (docs/learning.md has how well, and why kernels are not chosen by it). No track is
+needed: in driving order, the first sample of new ground becomes a *leader*, and all samples near
 it, driven in the same direction, are at its place (the leader algorithm: Hartigan, "Clustering
 algorithms", 1975, chapter 3). Leaders follow one another along the path.
 """
@@ -17,14 +17,12 @@ algorithms", 1975, chapter 3). Leaders follow one another along the path.
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from bayesrace.arrays import Rows
 from learning.dataset import Dataset
 
 __all__ = ["spans", "stretches"]
-
-Rows = NDArray[np.int64]
 
 _NEAR: Final = 5.0
 """Wheelbases within which two samples are at the same place; the lanes of 1:43 tracks are six
@@ -46,9 +44,8 @@ def stretches(dataset: Dataset, count: int) -> Rows:
     """
     leader = _leaders(dataset)
     total = len(leader)
-    order = np.argsort(leader, kind="stable")
     rank = np.empty(total, dtype=np.int64)
-    rank[order] = np.arange(total)
+    rank[np.argsort(leader, kind="stable")] = np.arange(total)
     size = np.bincount(leader)
     first = np.cumsum(size) - size
     whole = size[leader] * count <= total
@@ -57,7 +54,7 @@ def stretches(dataset: Dataset, count: int) -> Rows:
 
 
 def _leaders(dataset: Dataset) -> Rows:
-    """Which leader each sample follows, numbered in the order in which they were driven."""
+    """Number of the leader that each sample follows, in driving order."""
     xy, psi = dataset.x[:, :2], dataset.x[:, 2]
     near_m = _NEAR * dataset.car.wheelbase_m
     tree = cKDTree(xy)

@@ -13,25 +13,20 @@ condition number of 1000 points below 2.5e10, well within float64.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from bayesrace.arrays import Floats
 from bayesrace.gp.weights import FEATURES
 from learning.likelihood import MarginalLikelihood, PairDistances
+from learning.posterior import Covariance
 
-__all__ = ["BOUNDS", "NOISE_FLOOR", "TOLERANCE", "Fit", "best", "maximise", "starts"]
+__all__ = ["BOUNDS", "TOLERANCE", "Fit", "maximise", "starts"]
 
-Floats = NDArray[np.float64]
-
-NOISE_FLOOR: Final = 1e-6
-"""Smallest noise variance, in units of the targets' variance."""
-
-BOUNDS: Final = np.log([(1e-2, 25.0)] + [(1e-1, 1e2)] * len(FEATURES) + [(NOISE_FLOOR, 1.0)])
+BOUNDS: Final = np.log([(1e-2, 25.0)] + [(1e-1, 1e2)] * len(FEATURES) + [(1e-6, 1.0)])
 """Lower and upper bound of theta, (8, 2)."""
 
 TOLERANCE: Final = 1e-7
@@ -39,21 +34,25 @@ TOLERANCE: Final = 1e-7
 
 _FIRST: Final = np.log([10.0] + [3.0] * len(FEATURES) + [1e-3])
 _WORST: Final = 1e25
-"""What L-BFGS sees where the covariance is singular; it then shortens its step."""
+"""Objective where the covariance is singular; L-BFGS then shortens its step."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fit:
-    """A local optimum: ``theta`` (8,), log marginal likelihood there, evaluations it took."""
+    """A local optimum: ``theta`` (8,) and the log marginal likelihood there."""
 
     kind: str
     theta: Floats
     log_likelihood: float
-    evaluations: int
+
+    @property
+    def covariance(self) -> Covariance:
+        """The covariance with these hyperparameters."""
+        return Covariance.of(self.kind, self.theta)
 
 
 def starts(restarts: int, seed: int) -> list[Floats]:
-    """First guess and ``restarts`` seeded others, in the part of the bounds where optima lie."""
+    """First guess and ``restarts`` seeded others, in the part of the bounds where optima are."""
     random = np.random.default_rng(seed)
     low = np.log([1.0] + [1.0] * len(FEATURES) + [1e-5])
     high = np.log([30.0] + [10.0] * len(FEATURES) + [1e-2])
@@ -62,14 +61,14 @@ def starts(restarts: int, seed: int) -> list[Floats]:
 
 def maximise(
     kind: str,
-    z: Floats | PairDistances,
+    pairs: PairDistances,
     y: Floats,
     start: Floats,
     iterations: int,
     tolerance: float = TOLERANCE,
 ) -> Fit:
     """L-BFGS-B from ``start`` within :data:`BOUNDS`, at most ``iterations`` iterations."""
-    likelihood = MarginalLikelihood(kind, z, y)
+    likelihood = MarginalLikelihood(kind, pairs, y)
     # Per sample, so that the optimiser's tolerances do not depend on how many there are.
     scale = 1.0 / len(y)
 
@@ -81,15 +80,10 @@ def maximise(
 
     result = minimize(
         objective,
-        np.clip(start, BOUNDS[:, 0], BOUNDS[:, 1]),
+        np.clip(start, *BOUNDS.T),
         jac=True,
         bounds=BOUNDS,
         method="L-BFGS-B",
         options={"maxiter": iterations, "ftol": tolerance, "gtol": 1e-5},
     )
-    return Fit(kind, np.asarray(result.x), float(-result.fun / scale), int(result.nfev))
-
-
-def best(fits: Sequence[Fit]) -> Fit:
-    """The fit of largest likelihood; the first of equals."""
-    return max(fits, key=lambda fit: fit.log_likelihood)
+    return Fit(kind, np.asarray(result.x), float(-result.fun / scale))

@@ -12,17 +12,16 @@ once (:class:`PairDistances`).
 """
 
 import math
+from typing import Any, cast
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
 
-from bayesrace.gp.expression import bind, kernel
+from bayesrace.arrays import Floats
+from bayesrace.gp.expression import kernel
 
 __all__ = ["MarginalLikelihood", "PairDistances"]
-
-Floats = NDArray[np.float64]
 
 
 class PairDistances:
@@ -33,28 +32,31 @@ class PairDistances:
         rows, columns = np.tril_indices(self.count, -1)
         self.rows, self.columns = rows, columns
         self.flat = columns * self.count + rows
-        """Where a pair below the diagonal is in a matrix by columns."""
+        """Index of a pair below the diagonal in a matrix stored by columns."""
         self.squares = np.ascontiguousarray(((z[rows] - z[columns]) ** 2).T)
         """(p, n (n - 1) / 2)."""
 
 
 class MarginalLikelihood:
-    """log p(y | z, theta) for scaled features ``z`` (n, p) and scaled targets ``y`` (n,).
+    """log p(y | z, theta) for the pairs of scaled features and scaled targets ``y`` (n,).
 
-    ``z`` may be given as its :class:`PairDistances`. One thread only: it works in its own memory.
+    One thread only: it works in its own memory.
     """
 
-    def __init__(self, kind: str, z: Floats | PairDistances, y: Floats) -> None:
-        self._pairs = z if isinstance(z, PairDistances) else PairDistances(z)
-        self._y = np.ascontiguousarray(y, dtype=np.float64)
-        n, pairs = self._pairs.count, len(self._pairs.rows)
-        self._r2, self._k, self._slope, self._weight = (np.zeros(pairs) for _ in range(4))
-        self._matrix = np.zeros((n, n), order="F")
-        r2 = ca.MX.sym("r2", pairs)
+    def __init__(self, kind: str, pairs: PairDistances, y: Floats) -> None:
+        self._pairs, self._y = pairs, np.ascontiguousarray(y, dtype=np.float64)
+        self._r2, self._k, self._slope, self._weight = np.zeros((4, len(pairs.rows)))
+        self._matrix = np.zeros((pairs.count, pairs.count), order="F")
+        r2 = ca.MX.sym("r2", len(pairs.rows))
         k = kernel(kind, r2)
-        slope = ca.gradient(ca.sum1(k), r2)
-        function = ca.Function("kernel_and_slope", [r2], [k, slope])
-        self._evaluate = bind(function, [self._r2], [self._k, self._slope])
+        function = ca.Function("k", [r2], [k, ca.gradient(ca.sum1(k), r2)])
+        # An ordinary call would convert every number to and from CasADi's own matrices, which
+        # takes longer than the kernel itself.
+        buffer, self._evaluate = cast(Any, function).buffer()
+        buffer.set_arg(0, memoryview(cast(Any, self._r2)))
+        buffer.set_res(0, memoryview(cast(Any, self._k)))
+        buffer.set_res(1, memoryview(cast(Any, self._slope)))
+        self._alive = function, buffer
 
     def __call__(self, theta: Floats) -> tuple[float, Floats]:
         """Value and gradient (p + 2,); -inf and zeros where K is numerically singular."""
@@ -67,8 +69,7 @@ class MarginalLikelihood:
         if inverse is None:
             return -math.inf, np.zeros_like(theta)
         alpha = blas.dsymv(1.0, inverse, self._y, lower=1)
-        n = len(alpha)
-        value = -0.5 * (self._y @ alpha + log_det + n * math.log(2 * math.pi))
+        value = -0.5 * (self._y @ alpha + log_det + pairs.count * math.log(2 * math.pi))
         # d log p / d theta = 1/2 tr((alpha alpha' - K^-1) dK/dtheta); pairs count twice.
         np.multiply(alpha[pairs.rows], alpha[pairs.columns], out=weight)
         weight -= inverse.ravel(order="F")[pairs.flat]

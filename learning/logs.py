@@ -23,33 +23,34 @@ __all__ = ["LogFacts", "dataset_from_log", "dataset_from_messages", "fallback_cy
 
 @dataclass(frozen=True)
 class LogFacts:
-    """What a log says about itself."""
+    """Keys and metadata of a log, as far as they concern the car."""
 
     names: tuple[str, ...]
-    """Cars in the network whose states it holds, by the keys."""
+    """Names in the network of the cars whose states it holds."""
     truth: bool
-    """It holds what was true besides what was measured."""
+    """It holds the true states besides the measured ones."""
     car: CarParameters | None
-    """The car that drove, by who recorded it; None if that is not told."""
+    """The recorded car; None if the log does not name it."""
     discretisation: Discretisation | None
-    """With which its controller predicted; None if that is not told."""
+    """The one that its controller predicted with; None if the log does not name it."""
 
 
 def log_facts(path: str | os.PathLike[str]) -> LogFacts:
-    """Reads what there is about the car; InputError if it is no log or its metadata are damaged."""
+    """Reads keys and metadata; InputError if it is no log or its metadata are damaged."""
     reader = LogReader(Path(path))
     keys = [(topic_of(key), key.split("/")[1]) for key in reader.channels()]
-    names = sorted(name for topic, name in keys if topic is STATE)
-    truth = any(topic is TRUTH for topic, _ in keys)
     metadata = reader.metadata()
-    told: dict[str, Any] = dict(metadata.get("collect") or metadata.get("drive") or {})
+    settings: dict[str, Any] = dict(metadata.get("collect") or metadata.get("drive") or {})
     try:
         if "race" in metadata:
-            told = json.loads(metadata["race"].get("settings", "{}"))
-        given = told.get("discretisation")
-        discretisation = None if given is None else Discretisation.model_validate(given)
-        car = described_car(told["car"]) if told.get("car") else None
-        return LogFacts(tuple(names), truth, car, discretisation)
+            settings = json.loads(metadata["race"].get("settings", "{}"))
+        given = settings.get("discretisation")
+        return LogFacts(
+            names=tuple(sorted(name for topic, name in keys if topic is STATE)),
+            truth=any(topic is TRUTH for topic, _ in keys),
+            car=described_car(settings["car"]) if settings.get("car") else None,
+            discretisation=None if given is None else Discretisation.model_validate(given),
+        )
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except (ValueError, AttributeError, ValidationError) as error:
@@ -57,7 +58,7 @@ def log_facts(path: str | os.PathLike[str]) -> LogFacts:
 
 
 def fallback_cycles(telemetry: Iterable[Telemetry]) -> set[tuple[int, int]]:
-    """Run and number of the states that the fallback has answered."""
+    """Run and number of the states in whose cycles the fallback acted."""
     return {(message.run, message.state_seq) for message in telemetry if message.fallback > 0}
 
 
@@ -70,36 +71,46 @@ def dataset_from_messages(
 ) -> Dataset:
     """Filtered samples from consecutive states of the same run (all runs, or those named).
 
-    ``states``: as measured, to learn from; the truth, to judge what was learned. ``fallback``: run
-    and number of the states whose cycles are left out, :func:`fallback_cycles`. The input of sample
-    k is ``u_applied`` of the state after it: what acted, not what was asked. A missing state ends
-    the stretch ("gap").
+    ``states``: the measured ones to learn from, the true ones to judge by. ``fallback``: run and
+    number of the states whose cycles are left out, :func:`fallback_cycles`. The input of sample k
+    is ``u_applied`` of the state after it, which acted, not the requested one. A missing state is
+    counted as "gap".
     """
-    slack_s = tolerances(car)["time"].value
+    slack_s = tolerances(car)["time"]
     wanted = [state for state in states if runs is None or state.run in runs]
-    x, u, x_next, driven = [], [], [], []
-    gaps = 0
-    for now, after in itertools.pairwise(wanted):
-        if now.run != after.run or after.time_s == now.time_s:
-            continue  # a fault of the plant repeats the last state: no time has passed
-        if after.seq != now.seq + 1 or abs(after.time_s - now.time_s - step_s) > slack_s:
-            gaps += 1
-            continue
-        x.append(now.x)
-        u.append(after.u_applied)
-        x_next.append(after.x)
-        driven.append((now.run, now.seq) not in fallback)
-    if not x:
-        steps = [b.time_s - a.time_s for a, b in itertools.pairwise(wanted) if a.run == b.run]
+    # A fault of the plant repeats the last state: no time has passed.
+    pairs = [
+        (now, after)
+        for now, after in itertools.pairwise(wanted)
+        if now.run == after.run and after.time_s != now.time_s
+    ]
+    found = [
+        (now, after)
+        for now, after in pairs
+        if after.seq == now.seq + 1 and abs(after.time_s - now.time_s - step_s) <= slack_s
+    ]
+    if not found:
+        steps = [b.time_s - a.time_s for a, b in pairs if b.seq == a.seq + 1]
         if not steps:
-            raise InputError("the log has no two consecutive states; was the car driven?")
+            raise InputError(
+                "no two states follow one another; was the car driven, or does the network or the "
+                "machine lose messages? Give them less to do"
+            )
         raise InputError(
-            f"no two states are {step_s:g} s apart, but {float(np.median(steps)):g} s; learn with "
-            "the step that was driven with"
+            f"states are {float(np.median(steps)):.3g} s apart, the model's step is {step_s:g} s; "
+            f"drive with --rate {1 / step_s:g}, or learn for the controller that drove: --artefact"
         )
-    dropped = {"gap": gaps} if gaps else {}
-    samples = Dataset(car, step_s, np.array(x), np.array(u), np.array(x_next), dropped)
-    return filter_dataset(samples.select(np.array(driven), "fallback"))
+    gaps = {"gap": len(pairs) - len(found)} if len(pairs) > len(found) else {}
+    samples = Dataset(
+        car,
+        step_s,
+        x=np.array([now.x for now, _ in found]),
+        u=np.array([after.u_applied for _, after in found]),
+        x_next=np.array([after.x for _, after in found]),
+        dropped=gaps,
+    )
+    driven = [(now.run, now.seq) not in fallback for now, _ in found]
+    return filter_dataset(samples.select(driven, "fallback"))
 
 
 def dataset_from_log(
@@ -112,15 +123,14 @@ def dataset_from_log(
 ) -> Dataset:
     """Filtered samples of ``car`` from a run's MCAP log; see :func:`dataset_from_messages`.
 
-    ``name``: its name in the network, if that is another one than its own. ``truth``: what was true
-    in place of what was measured. InputError if it is no log or holds no driving of this car.
+    ``name``: the car's name in the network, if it differs from its own. ``truth``: the true states
+    in place of the measured ones. InputError if it is no log or holds no driving of this car.
     """
-    reader = LogReader(Path(path))
     topics = TRUTH if truth else STATE, TELEMETRY
     keys = {car_key(topic.key, name or car.name) for topic in topics}
     states: list[CarSample] = []
     fallback: set[tuple[int, int]] = set()
-    for entry in reader.messages(topics):
+    for entry in LogReader(Path(path)).messages(topics):
         if entry.key not in keys:
             continue
         if isinstance(entry.message, CarSample):

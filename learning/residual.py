@@ -4,9 +4,9 @@ import re
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import OUTPUTS
 from bayesrace.integrators import Discretisation
@@ -19,17 +19,15 @@ __all__ = ["NOMINAL", "discretisation_of", "identity", "residual"]
 NOMINAL = e_kinematic
 """The model that is corrected."""
 
-_ROWS = [STATES.index(name) for name in OUTPUTS]
+_ROWS: Final = [STATES.index(name) for name in OUTPUTS]
+_IDENTITY: Final = re.compile(
+    r"[^/]+/(?P<scheme>\w+)x(?P<substeps>\d{1,4})-(?P<pose>\w+)/(?P<step_s>[\d.e-]{1,16})s/[^/]+"
+)
 
 
 def identity(dataset: Dataset, discretisation: Discretisation) -> str:
     """Identity of the discretised nominal model of the dataset's car."""
     return discretisation.identity(NOMINAL(dataset.car).name, dataset.car)
-
-
-_IDENTITY: Final = re.compile(
-    r"[^/]+/(?P<scheme>\w+)x(?P<substeps>\d{1,4})-(?P<pose>\w+)/(?P<step_s>[\d.e-]{1,16})s/[^/]+"
-)
 
 
 def discretisation_of(name: str, car: CarParameters) -> Discretisation:
@@ -50,7 +48,7 @@ def discretisation_of(name: str, car: CarParameters) -> Discretisation:
     return discretisation
 
 
-def residual(dataset: Dataset, discretisation: Discretisation) -> NDArray[np.float64]:
+def residual(dataset: Dataset, discretisation: Discretisation) -> Floats:
     """x_{k+1} - F(x_k, u_k) for vx [m/s], vy [m/s], omega [rad/s]; shape (n, 3).
 
     F is the nominal model under ``discretisation``, the same object that predicts in the

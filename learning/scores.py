@@ -1,4 +1,4 @@
-"""How good predictions with an uncertainty are: the numbers that training and validation tell.
+"""Scores of predictions with an uncertainty, as training and validation report them.
 
 A prediction of one output is a mean and a standard deviation sigma, with the learned noise in it.
 With error = truth - mean, over n samples
@@ -10,15 +10,14 @@ With error = truth - mean, over n samples
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+
+from bayesrace.arrays import Floats, Rows
 
 __all__ = ["NORMAL_95", "PredictionErrors"]
-
-Floats = NDArray[np.float64]
 
 NORMAL_95: Final = 1.959963984540054
 """Half the width of the 95 % interval, in standard deviations."""
@@ -51,10 +50,24 @@ class PredictionErrors:
     def variance_scale(self) -> float:
         """Factor on all variances that makes the 95 % interval hold 95 % of the errors; at least 1.
 
-        An interval that holds more is left alone: 20 errors say little about the one outside.
+        An interval that holds more is kept: 20 errors say little about the one outside.
         """
         ratio = np.quantile(np.abs(self.error) / self.sigma, 0.95) / NORMAL_95
         return max(1.0, float(ratio**2))
+
+    def calibrated(self, folds: Rows) -> "PredictionErrors":
+        """The same errors, each fold's variances scaled as those of all other ``folds`` (n,) need.
+
+        An interval fitted to the very errors that it is judged by would hold 95 % of them however
+        poor the GP is.
+        """
+        sigma = self.sigma.copy()
+        for fold in np.unique(folds):
+            inside = folds == fold
+            if not inside.all():
+                others = PredictionErrors(self.error[~inside], self.sigma[~inside])
+                sigma[inside] *= math.sqrt(others.variance_scale)
+        return replace(self, sigma=sigma)
 
     def r2(self, truth: Floats) -> float:
         """Share of the variance of ``truth`` (n,) that is predicted; 0 where it has none."""
@@ -64,8 +77,8 @@ class PredictionErrors:
     def metrics(self, truth: Floats, offset: float = 0.0, scale: float = 1.0) -> dict[str, float]:
         """All scores, and the RMSE that predicting zero would have (``uncorrected_rmse``).
 
-        ``truth`` (n,), like errors and sigmas, may be in scaled units: what was measured is
-        ``offset + scale * truth``, and the scores are in its unit.
+        ``truth`` (n,), errors and sigmas may be in scaled units: ``offset + scale * truth`` is the
+        measured quantity, and the scores are in its unit.
         """
         return {
             "rmse": self.rmse * scale,

@@ -1,8 +1,9 @@
 """One dataset from any number of logs and array files, all of the same car and discretisation."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from bayesrace.errors import InputError
 from bayesrace.integrators import PREDICTION, Discretisation
@@ -13,6 +14,8 @@ from learning.logs import LogFacts, dataset_from_log, log_facts
 
 __all__ = ["Samples", "read_samples"]
 
+T = TypeVar("T")
+
 
 @dataclass(frozen=True, eq=False)
 class Samples:
@@ -20,61 +23,6 @@ class Samples:
 
     dataset: Dataset
     discretisation: Discretisation
-
-
-@dataclass(frozen=True)
-class _Source:
-    path: Path
-    facts: LogFacts | None
-    """None for arrays."""
-
-
-def _car(sources: Sequence[_Source], wanted: CarParameters | None, name: str) -> CarParameters:
-    """The one car of all sources; InputError if they tell of several, or of none."""
-    told: dict[str, tuple[CarParameters, Path]] = {}
-    for source in sources:
-        if source.facts is None:
-            car = car_of_npz(source.path)
-        else:
-            driver = _driver(source.path, source.facts, name)
-            car = source.facts.car or builtin_cars().get(driver)
-        if car is not None:
-            told.setdefault(car.identity, (car, source.path))
-    if wanted is not None:
-        told.setdefault(wanted.identity, (wanted, Path("--car")))
-    if len(told) > 1:
-        cars = ", ".join(f"'{name}' ({path})" for name, (_, path) in told.items())
-        raise InputError(f"different cars cannot be mixed: {cars}; give logs of one car")
-    if told:
-        return next(iter(told.values()))[0]
-    raise InputError("no file names its car; name it with --car")
-
-
-def _driver(path: Path, facts: LogFacts, name: str) -> str:
-    """Whose messages are read from a log: a name in the network."""
-    names = [one for one in facts.names if not name or one == name]
-    if len(names) > 1:
-        raise InputError(f"{path} holds several cars ({', '.join(names)}); choose one with --name")
-    if not names:
-        whom = f"car '{name}'" if name else "any car"
-        raise InputError(f"{path} holds no states of {whom}; give the log of a drive")
-    return names[0]
-
-
-def _discretisation(sources: Sequence[_Source], given: Discretisation | None) -> Discretisation:
-    told = {} if given is None else {given: "the one asked for"}
-    for source in sources:
-        if source.facts is not None and source.facts.discretisation is not None:
-            told.setdefault(source.facts.discretisation, str(source.path))
-    if len(told) > 1:
-        raise InputError(
-            "different discretisations cannot be mixed: "
-            + "; ".join(
-                f"{d.scheme}x{d.substeps}, {d.pose} pose, {d.step_s:g} s ({where})"
-                for d, where in told.items()
-            )
-        )
-    return next(iter(told), PREDICTION)
 
 
 def read_samples(
@@ -87,34 +35,63 @@ def read_samples(
 ) -> Samples:
     """All samples of logs (MCAP) and arrays (``.npz``), filtered, in the order given.
 
-    ``car``: what drove, where the files do not tell; ``name``: its name in the network, where a log
-    holds several; ``discretisation``: what the residual is to be made with, else what the logs
-    name, else the default; ``runs``: those of the logs, all without; ``truth``: what was true in
-    place of what was measured, of the logs that hold it. InputError if cars, discretisations or
-    steps differ, or if two files hold the same samples.
+    ``car``: the driven one, where the files do not name it; ``name``: its name in the network,
+    where a log holds several; ``discretisation``: for the residual, by default the one that the
+    logs name, or ``PREDICTION``; ``runs``: the wanted runs of the logs, by default all; ``truth``:
+    the true states in place of the measured ones, of the logs that hold them. InputError if cars,
+    discretisations or steps differ, or if two files hold the same samples.
     """
     if not paths:
         raise InputError("no samples given; name at least one log, or --data FILE.npz")
-    sources = [
-        _Source(path, None if path.suffix.lower() == ".npz" else log_facts(path)) for path in paths
-    ]
-    parameters = _car(sources, car, name)
-    used = _discretisation(sources, discretisation)
-    datasets: dict[str, Path] = {}
-    found = []
-    for source in sources:
-        if source.facts is None:
-            raw = dataset_from_npz(source.path, parameters, used.step_s)
-            samples = filter_dataset(raw)
+    logs = {path: log_facts(path) for path in paths if path.suffix.lower() != ".npz"}
+    drivers = {path: _driver(path, facts, name) for path, facts in logs.items()}
+    cars = {
+        path: logs[path].car or builtin_cars().get(drivers[path])
+        if path in logs
+        else car_of_npz(path)
+        for path in paths
+    }
+    driven = _common("cars", cars | {Path("--car"): car}, lambda one: f"'{one.identity}'")
+    if driven is None:
+        raise InputError("no file names its car; name it with --car")
+    named = {path: facts.discretisation for path, facts in logs.items()}
+    used = _common("discretisations", named | {Path("as asked for"): discretisation}, _described)
+    used = used or PREDICTION
+    datasets: list[Dataset] = []
+    seen: dict[str, Path] = {}
+    for path in paths:
+        if path in logs:
+            true = truth and logs[path].truth
+            samples = dataset_from_log(path, driven, used.step_s, runs, drivers[path], true)
         else:
-            driver = _driver(source.path, source.facts, name)
-            true = truth and source.facts.truth
-            samples = dataset_from_log(source.path, parameters, used.step_s, runs, driver, true)
+            samples = filter_dataset(dataset_from_npz(path, driven, used.step_s))
         digest = samples.digest()
-        if digest in datasets and len(samples):
-            raise InputError(
-                f"{source.path} holds the same samples as {datasets[digest]}; give them once"
-            )
-        datasets[digest] = source.path
-        found.append(samples)
-    return Samples(concatenate(found), used)
+        if digest in seen and len(samples):
+            raise InputError(f"{path} holds the same samples as {seen[digest]}; give them once")
+        seen[digest] = path
+        datasets.append(samples)
+    return Samples(concatenate(datasets), used)
+
+
+def _driver(path: Path, facts: LogFacts, name: str) -> str:
+    """The name in the network of the car whose messages are read from a log."""
+    names = [one for one in facts.names if not name or one == name]
+    if len(names) > 1:
+        raise InputError(f"{path} holds several cars ({', '.join(names)}); choose one with --name")
+    if not names:
+        which = f"car '{name}'" if name else "any car"
+        raise InputError(f"{path} holds no states of {which}; give the log of a drive")
+    return names[0]
+
+
+def _common(what: str, named: Mapping[Path, T | None], text: Callable[[T], str]) -> T | None:
+    """The first named value, None if there is none; InputError if others differ by ``text``."""
+    sources = {path: value for path, value in named.items() if value is not None}
+    if len({text(value) for value in sources.values()}) > 1:
+        listed = "; ".join(f"{text(value)} ({path})" for path, value in sources.items())
+        raise InputError(f"different {what} cannot be mixed: {listed}; give logs of one kind")
+    return next(iter(sources.values()), None)
+
+
+def _described(one: Discretisation) -> str:
+    return f"{one.scheme}x{one.substeps}, {one.pose} pose, {one.step_s!r} s"

@@ -1,37 +1,29 @@
-"""Which samples to keep when there are more than the controller has room for."""
+"""Choice of samples where there are more than the controller has room for."""
 
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats, Rows
 from bayesrace.errors import InputError
 from bayesrace.gp.expression import kernel_matrix
 
-__all__ = ["MAX_BYTES", "at_random", "evenly", "most_informative"]
-
-Floats = NDArray[np.float64]
+__all__ = ["MAX_BYTES", "evenly", "most_informative"]
 
 MAX_BYTES: Final = 1 << 32
-"""Of memory for a choice."""
+"""Upper limit of the memory for a choice."""
 
 
-def evenly(count: int, wanted: int) -> NDArray[np.int64]:
+def evenly(count: int, wanted: int) -> Rows:
     """``wanted`` of ``count`` indices, evenly spaced; all if there are not more."""
     if count <= wanted:
         return np.arange(count)
     return np.floor((np.arange(wanted) + 0.5) * count / wanted).astype(np.int64)
 
 
-def at_random(count: int, wanted: int, seed: int) -> NDArray[np.int64]:
-    """``wanted`` of ``count`` indices by chance, sorted: what a choice has to beat."""
-    random = np.random.default_rng(seed)
-    return np.sort(random.choice(count, min(count, wanted), replace=False)).astype(np.int64)
-
-
 def most_informative(
     kind: str, z: Floats, length_scales: Floats, noise_ratio: float, wanted: int
-) -> NDArray[np.int64]:
+) -> Rows:
     """Indices of ``wanted`` samples, each of largest posterior variance given those before it.
 
     A pivoted Cholesky factorisation: O(n wanted^2) time, O(n wanted) memory. ``noise_ratio`` is

@@ -1,4 +1,10 @@
-"""How well weights predict the residual of a drive that they were not trained on."""
+"""Comparison of weights with a drive that they were not trained on.
+
+Over one step, the prediction is compared with the residual (:func:`validate`). Over a controller's
+horizon, the model is stepped from a driven state on with the inputs that acted, without any
+correction on the way (:func:`mismatch`); the difference at the end is the error of the controller's
+plan. The paper draws the same (its figures of model mismatch with and without GPs).
+"""
 
 import math
 from collections.abc import Mapping
@@ -6,23 +12,25 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.linalg import cho_factor, solve_triangular
 
+from bayesrace.arrays import Flags, Floats, Rows
 from bayesrace.errors import InputError
-from bayesrace.gp.expression import evaluate_mean, kernel_matrix
-from bayesrace.gp.weights import OUTPUTS, GpOutput, GpWeights
+from bayesrace.gp.corrected import corrected_function
+from bayesrace.gp.expression import evaluate_mean
+from bayesrace.gp.weights import OUTPUTS, GpWeights
 from bayesrace.integrators import Discretisation
 from learning.dataset import Dataset
-from learning.residual import identity, residual
+from learning.posterior import Covariance, Posterior
+from learning.residual import NOMINAL, identity, residual
 from learning.scores import NORMAL_95, PredictionErrors
 
-__all__ = ["Validation", "predictive_sigma", "validate"]
+__all__ = ["HORIZON", "Validation", "mismatch", "predictive_sigma", "unbroken", "validate"]
 
-Floats = NDArray[np.float64]
+HORIZON: Final = 20
+"""Stages of the controller's default horizon."""
 
-_AT_ONCE: Final = 4096
-"""Samples whose covariances with all training points are in memory together."""
+_MAX_STARTS: Final = 2000
+"""Predictions per horizon at most, evenly spread over the samples."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +56,7 @@ class Validation:
         """Half the width of the 95 % interval about the mean."""
         return NORMAL_95 * self.sigma
 
-    def uncertain(self, threshold: float) -> NDArray[np.bool_]:
+    def uncertain(self, threshold: float) -> Flags:
         """Samples (n,) whose largest standard deviation, over the outputs, is above this.
 
         The paper's mark, which compares m/s and rad/s with one number.
@@ -56,34 +64,17 @@ class Validation:
         return np.asarray(self.sigma.max(axis=1) > threshold)
 
 
-def _output_sigma(output: GpOutput, z: Floats) -> Floats:
-    prior = output.signal_variance + output.noise_variance
-    if output.count == 0:
-        return np.full(len(z), output.y_scale * np.sqrt(prior))
-    signal = output.signal_variance
-    own = signal * kernel_matrix(output.kernel, output.inputs, output.inputs, output.length_scales)
-    own[np.diag_indices_from(own)] += output.noise_variance
-    try:
-        factor, _ = cho_factor(own, lower=True)
-    except np.linalg.LinAlgError as error:
-        raise InputError("GP weights: covariance of the inputs is singular; train again") from error
-    explained = np.empty(len(z))
-    for begin in range(0, len(z), _AT_ONCE):
-        rows = slice(begin, begin + _AT_ONCE)
-        cross = signal * kernel_matrix(output.kernel, output.inputs, z[rows], output.length_scales)
-        whitened = solve_triangular(factor, cross, lower=True, check_finite=False)
-        explained[rows] = np.einsum("ij,ij->j", whitened, whitened)
-    variance = np.maximum(prior - explained, output.noise_variance)
-    sigma: Floats = output.y_scale * np.sqrt(variance)
-    return sigma
-
-
 def predictive_sigma(weights: GpWeights, z: Floats) -> Floats:
-    """Predictive standard deviation (m, 3) at features ``z`` (m, 6), noise included, SI units.
-
-    sigma^2 = y_scale^2 (s^2 + noise - s^4 k' (s^2 K + noise I)^-1 k).
-    """
-    return np.column_stack([_output_sigma(output, z) for output in weights.outputs])
+    """Predictive standard deviation (m, 3) at features ``z`` (m, 6), noise included, SI units."""
+    columns = []
+    for output in weights.outputs:
+        covariance = Covariance(
+            output.kernel, output.signal_variance, output.length_scales, output.noise_variance
+        )
+        # The uncertainty does not depend on the targets.
+        _, sigma = Posterior(covariance, output.inputs, np.zeros(output.count)).predict(z)
+        columns.append(output.y_scale * sigma)
+    return np.column_stack(columns)
 
 
 def validate(weights: GpWeights, dataset: Dataset, discretisation: Discretisation) -> Validation:
@@ -110,3 +101,35 @@ def validate(weights: GpWeights, dataset: Dataset, discretisation: Discretisatio
             "uncertainty; train again"
         )
     return Validation(truth, mean, sigma, metrics)
+
+
+def unbroken(dataset: Dataset, steps: int) -> Rows:
+    """Rows at which ``steps`` consecutive samples of one drive begin."""
+    if len(dataset) < steps:
+        return np.zeros(0, dtype=np.int64)
+    joined = (dataset.x_next[:-1] == dataset.x[1:]).all(axis=1)
+    before = np.concatenate(([0], np.cumsum(joined)))
+    return np.flatnonzero(before[steps - 1 :] - before[: len(before) - steps + 1] == steps - 1)
+
+
+def mismatch(
+    dataset: Dataset,
+    discretisation: Discretisation,
+    weights: GpWeights | None,
+    steps: int = HORIZON,
+) -> Floats:
+    """Driven minus predicted states after ``steps`` steps, open loop, (m, 7), SI units.
+
+    One row for each sample that ``steps`` consecutive ones begin with, or for evenly chosen ones.
+    ``weights`` None: the nominal model. InputError for weights of another discretised model.
+    """
+    step = corrected_function(NOMINAL(dataset.car), discretisation, weights)
+    first = unbroken(dataset, steps)
+    if len(first) > _MAX_STARTS:
+        first = first[np.linspace(0, len(first) - 1, _MAX_STARTS).astype(np.int64)]
+    if len(first) == 0:
+        return np.zeros((0, 7))
+    x = dataset.x[first].T
+    for k in range(steps):
+        x = np.asarray(step(x, dataset.u[first + k].T), dtype=np.float64)
+    return dataset.x_next[first + steps - 1] - x.T

@@ -1,124 +1,161 @@
-"""Training as a process of its own.
+"""Training in a process of its own, which leaves the CPU to everything else.
 
-    python -m learning.worker [PARENT]
-
-reads tasks from standard input, one line of JSON each (:class:`Task`), and answers each with a
-line (:class:`Outcome`) when it is done. Samples and weights travel as files. It ends with its
-input, or with the process of number PARENT.
+:class:`Trainer` starts ``python -m learning.worker PARENT FOLDER`` and gives it one :class:`Task`
+after another; each ends with an :class:`Outcome`. Both travel as pickled files of the folder; a
+line on standard input starts a task. The process ends with its input, or with its parent.
 """
 
+import os
+import pickle
+import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
-
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from typing import Final
 
 from bayesrace.clock import die_with_parent
 from bayesrace.errors import InputError
-from bayesrace.files import replacing
-from bayesrace.gp.weights import OUTPUTS, GpWeights, read_weights, write_weights
+from bayesrace.files import write_whole
+from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.integrators import Discretisation
-from bayesrace.vehicles import CarSetting
-from learning.arrays import dataset_from_npz, write_npz
+from bayesrace.interpreter import RUN_MODULE
 from learning.dataset import Dataset, concatenate
-from learning.pool import bounded, recalled
+from learning.pool import bounded
 from learning.training import TrainingSettings, train
 
-__all__ = ["Outcome", "Task", "main", "perform"]
+__all__ = ["NICE", "Outcome", "Task", "Trainer", "main", "perform"]
+
+NICE: Final = 10
+"""A tenth of what others get of a CPU. At 19 a busy machine would hardly ever run the training."""
+
+_LOG, _TASK, _OUTCOME = "worker.log", ".task.part", ".outcome.part"
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
+@dataclass(frozen=True, eq=False)
+class Task:
+    """Learn from samples, and keep a bounded part of them."""
 
-
-class Task(_Frozen):
-    """Learn from old and new samples; keep a bounded part of them."""
-
-    number: int = Field(description="comes back in the outcome")
-    car: CarSetting
     discretisation: Discretisation
-    old: Path | None = Field(None, description="samples kept so far (.npz)")
-    new: tuple[Path, ...] = Field((), description="samples driven since (.npz)")
-    recall: Path | None = Field(None, description="weights whose knowledge counts as old samples")
-    initial: Path | None = Field(None, description="weights to start the optimiser from")
-    training: TrainingSettings = TrainingSettings()
-    keep: int = Field(ge=1, description="samples to keep at most")
-    weights: Path = Field(description="file for the weights")
-    kept: Path = Field(description="file for the samples kept")
+    samples: Sequence[Dataset]
+    """In the order in which they were driven."""
+    initial: Path | None
+    """Weights to start the optimiser from."""
+    training: TrainingSettings
+    keep: int
+    """Samples to keep at most."""
 
 
-class Outcome(_Frozen):
-    """What became of a task; the samples kept are written in any case."""
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What became of a task."""
 
-    number: int
-    error: str = Field("", description="why there are no weights; empty if there are")
-    version: str = ""
-    samples: int = Field(0, description="learned from")
-    kept: int = Field(0, description="samples kept")
-    points: int = Field(0, description="training points per output, the most")
-    training_s: float = Field(0.0, description="reading and writing included")
-    metrics: Mapping[str, Mapping[str, float]] = Field(
-        default_factory=dict, description="held out, per output"
-    )
-
-
-def _samples(task: Task) -> Dataset:
-    car, step_s = task.car, task.discretisation.step_s
-    found = [recalled(read_weights(task.recall), car)] if task.recall is not None else []
-    old = [task.old] if task.old is not None else []
-    found += [dataset_from_npz(path, car, step_s) for path in (*old, *task.new)]
-    return concatenate(found)
+    error: str = ""
+    """Why there are no weights; empty if there are."""
+    weights: GpWeights | None = None
+    samples: int = 0
+    """Learned from."""
+    kept: Dataset | None = None
+    """Kept of the samples, also where nothing can be learned from them; None if that failed."""
+    training_s: float = 0.0
 
 
 def perform(task: Task) -> Outcome:
-    """Does it. InputError if the samples cannot be read; what cannot be learned is in the outcome.
+    """Trains; what cannot be learned is in the outcome.
 
-    Weights that cannot be started from, of another model or damaged, are an error too.
+    InputError for weights that cannot be started from, of another model or damaged.
     """
     begin_s = time.monotonic()
-    samples = _samples(task)
+    samples = concatenate(task.samples)
     initial = None if task.initial is None else read_weights(task.initial)
-    weights: GpWeights | None = None
-    error = ""
+    weights, error = None, ""
     try:
         weights = train(samples, task.discretisation, task.training, initial)
     except (InputError, ArithmeticError, ValueError) as reason:  # LinAlgError is a ValueError
         error = str(reason) or type(reason).__name__
-    if weights is not None:
-        write_weights(task.weights, weights)
     kept = bounded(samples, task.keep, weights or initial)
-    with replacing(task.kept) as partial:
-        write_npz(partial, kept)
-    outcome = Outcome(
-        number=task.number,
-        error=error,
-        samples=len(samples),
-        kept=len(kept),
-        training_s=time.monotonic() - begin_s,
-    )
-    if weights is None:
+    return Outcome(error, weights, len(samples), kept, time.monotonic() - begin_s)
+
+
+class Trainer:
+    """Runs one task at a time in a process that is started again if it has died."""
+
+    def __init__(self, folder: Path) -> None:
+        """``folder``: for the task under way and for ``worker.log``, the process's messages."""
+        self._folder, self._log = folder, folder / _LOG
+        self._log.write_bytes(b"")
+        self._process: subprocess.Popen[bytes] | None = None
+        self.busy = False
+        """A task runs."""
+
+    def prepare(self) -> "subprocess.Popen[bytes]":
+        """Starts the process unless it runs: it takes seconds. For the main thread."""
+        if self._process is not None and self._process.poll() is None:
+            return self._process
+        # One thread for linear algebra: idle ones of a pool would still spin against a controller.
+        threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        command = [*RUN_MODULE, "learning.worker", str(os.getpid()), str(self._folder)]
+        with self._log.open("ab") as log:
+            # A session of its own: Ctrl-C at the terminal is for the job, which ends its worker.
+            self._process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=log, stderr=log,
+                env={**os.environ, **threads}, start_new_session=True, bufsize=0,
+            )  # fmt: skip
+        with suppress(ProcessLookupError):  # at once: its imports take a while, too
+            os.setpriority(os.PRIO_PROCESS, self._process.pid, NICE)
+        return self._process
+
+    def start(self, task: Task) -> None:
+        """Runs the task; only if not :attr:`busy`. For the main thread."""
+        process = self.prepare()
+        os.truncate(self._log, 0)  # the process appends: it goes on at the beginning
+        (self._folder / _OUTCOME).unlink(missing_ok=True)
+        write_whole(self._folder / _TASK, pickle.dumps(task))
+        self.busy = True
+        if process.stdin is not None:
+            with suppress(BrokenPipeError):  # it has died, which poll() reports
+                process.stdin.write(b"\n")
+
+    def poll(self) -> Outcome | None:
+        """The outcome, once; None while the task runs, or without one. An error if it died."""
+        if not self.busy or self._process is None:
+            return None
+        code, path = self._process.poll(), self._folder / _OUTCOME
+        if path.exists():
+            outcome: Outcome = pickle.loads(path.read_bytes())  # noqa: S301 - of our own process
+        elif code is None:
+            return None
+        else:
+            words = self._log.read_text(errors="replace").strip().splitlines()
+            how = f"was killed by signal {-code}" if code < 0 else f"ended with code {code}"
+            outcome = Outcome(f"the training {how}{f': {words[-1]}' if code > 0 and words else ''}")
+        self.busy = False
         return outcome
-    held_out = {name: dict(weights.metrics[name]) for name in OUTPUTS}
-    return outcome.model_copy(
-        update={
-            "version": weights.version, "points": max(weights.counts), "metrics": held_out,
-        }
-    )  # fmt: skip
+
+    def stop(self) -> None:
+        """Kills the process, and the task with it."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+        for name in (_TASK, _OUTCOME):
+            (self._folder / name).unlink(missing_ok=True)
 
 
-def main(parent: int | None = None) -> None:
-    """Tasks until the input ends."""
+def main(parent: int, folder: Path) -> None:
+    """Performs tasks until the input ends."""
     die_with_parent(parent)
-    for line in sys.stdin:
-        task = Task.model_validate_json(line)
+    for _ in sys.stdin:
+        task: Task = pickle.loads((folder / _TASK).read_bytes())  # noqa: S301 - of our own parent
         try:
             outcome = perform(task)
-        except (InputError, ValidationError, OSError, MemoryError) as error:
-            outcome = Outcome(number=task.number, error=str(error) or type(error).__name__)
-        sys.stdout.write(outcome.model_dump_json() + "\n")
-        sys.stdout.flush()
+        except (InputError, OSError, MemoryError) as error:
+            outcome = Outcome(str(error) or type(error).__name__)
+        write_whole(folder / _OUTCOME, pickle.dumps(outcome))
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else None)
+    from learning.worker import main as run  # the parent unpickles outcomes by this module's name
+
+    run(int(sys.argv[1]), Path(sys.argv[2]))

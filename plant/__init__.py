@@ -1,1 +1,1 @@
-"""The process that plays the car: what it does when driven, and what it lets itself be told."""
+"""The process that plays the car: simulator, sensors, runs, and the requests it serves."""

@@ -54,7 +54,7 @@ __all__ = ["PlantProcess", "PlantSettings", "main"]
 _log = logging.getLogger("bayesrace.plant")
 
 _ABANDONED_S = 10.0
-"""Nobody watches or records a run whose director is gone for so long; a link may come back."""
+"""A run ends when its director has been gone for so long; a link may come back before."""
 
 
 _STATUS_S = 1.0
@@ -76,7 +76,7 @@ class PlantSettings(BaseModel):
         default=0.0,
         ge=0,
         le=1,
-        description="delay put on states and actuations each, when running by the wall clock",
+        description="delay put on states and actuations each, in real time",
     )
     fmu: Path | None = Field(
         None, description="Co-Simulation FMU that plays the car, instead of the built-in equations"
@@ -115,13 +115,12 @@ class PlantProcess:
         self._text = f"no run so far with {_played_by(settings)}"
         self._stopping = False
         self._director_gone_ns: int | None = None
-        """Since when whoever directs is gone; None: is there, or never was."""
+        """Since when the director is gone; None: it is there, or never was."""
         inbox = self.inbox = Inbox(session, self.name)
         self._decoder = inbox.subscribe(ACTUATION, newest=NEWEST, logger=_log)
         for service in (RUN, STOP):
             inbox.serve(service)
         inbox.serve(STATUS, "plant")
-        inbox.tell_time("plant")
         inbox.watch("controller")
         inbox.watch("director")
         inbox.announce("plant")
@@ -133,7 +132,7 @@ class PlantProcess:
             item = self.inbox.get(HEARTBEAT_S)
             if item is None:
                 continue
-            if item.kind is Kind.MESSAGE:  # for nobody, but received
+            if item.kind is Kind.MESSAGE:  # not used, but received
                 self._overheard(item)
                 continue
             if item.kind is Kind.REQUEST and item.name == RUN.name:
@@ -164,7 +163,7 @@ class PlantProcess:
             # Without priorities a message that Zenoh drops may be the last of its kind on a link.
             return (
                 "this plant was started for lockstep (--low-latency): "
-                "start it without to drive by the wall clock"
+                "start it without to drive in real time"
             )
         if message.lockstep and not self._controller_there():
             return (
@@ -172,7 +171,7 @@ class PlantProcess:
                 "(bayesrace controller)"
             )
         if (count := count_processes(self._session, self.name, "controller", _STATUS_S)) > 1:
-            # Their actuations could not be told apart.
+            # Their actuations could not be distinguished.
             return f"{count} controllers drive car '{self.name}'; end all but one"
         try:
             self._run = Run(
@@ -236,10 +235,10 @@ class PlantProcess:
         self._publish_event("run_ended", self._text, data)
 
     def _react(self, item: Item) -> End | None:
-        """Everything that may happen at any time; what it returns ends a run under way."""
+        """Everything that may happen at any time; what it returns ends the current run."""
         if item.kind is Kind.SIGNAL:
             self._stopping = True
-            return End("interrupted", "the plant process was told to end")
+            return End("interrupted", "the plant process was asked to end")
         if item.name == "director":
             self._director_gone_ns = item.received_ns if item.kind is Kind.GONE else None
         elif item.kind is Kind.GONE:
@@ -275,7 +274,7 @@ class PlantProcess:
             "runs": self._runs,
             "refused": self._decoder.refused,
             "overflowed": self.inbox.overflowed,
-            "turned_away": self.inbox.turned_away,
+            "requests_rejected": self.inbox.requests_rejected,
             "states_sent": self._states.next_seq,
             "actuations_received": self._numbering.received,
             "actuations_lost": self._numbering.lost,
@@ -287,7 +286,7 @@ class PlantProcess:
         return Reply(0, time.monotonic_ns(), accepted, text[:2000], {})
 
     def _beat(self) -> End | None:
-        """Publishes the status, if it is time to; what ends a run under way."""
+        """Publishes the status, if it is time to; what ends the current run."""
         self._heartbeat.beat(self._status)
         gone_ns = self._director_gone_ns
         if gone_ns is None or time.monotonic_ns() - gone_ns < _ABANDONED_S * 1e9:
@@ -330,6 +329,6 @@ def main(settings: PlantSettings) -> int:
             _log.warning("%s", refusal)
         where = ", ".join(settings.endpoints.listen)
         _log.info("plant of car '%s', %s, on %s", process.name, _played_by(settings), where)
-        with process.inbox.catching_signals():
+        with process.inbox.receive_signals():
             process.serve()
     return 0

@@ -1,4 +1,4 @@
-"""One run of the plant, in lockstep or by the wall clock; the same car below both."""
+"""One run of the plant, in lockstep or in real time; the same car below both."""
 
 import heapq
 import time
@@ -30,7 +30,7 @@ class RunCounters:
     late: int = 0
     """Periods that ended without the answer to the state at their beginning."""
     stale: int = 0
-    """Actuations for another plant, run or state than the one under way, or overtaken ones."""
+    """Actuations for another plant, run or state than the current one, or overtaken ones."""
     overruns: int = 0
     """Periods that the plant itself finished more than a period too late."""
 
@@ -70,7 +70,7 @@ class Run:
         epoch: int,
         delay_s: float = 0.0,
     ) -> None:
-        """``delay_s``: added to states and actuations alike when running by the wall clock."""
+        """``delay_s``: added to states and actuations alike in real time."""
         self.request = request
         self._car = CarRun(request, simulator, epoch)
         self._epoch = epoch
@@ -83,7 +83,7 @@ class Run:
         self._react = react
         self._beat = beat
         self._numbering = numbering
-        # Running by the wall clock:
+        # In real time:
         self._outbox: deque[tuple[int, State, Truth]] = deque()
         self._sampled_ns: dict[int, int] = {}
         self._waiting: list[_Waiting] = []

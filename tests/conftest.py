@@ -48,7 +48,7 @@ SETTINGS = MpcSettings(
     margin_m=0.0,
     tolerance=1e-6,
     defect_max=0.1,
-    settle=0.0,
+    early_stop_tol=0.0,
     iterations=1,
     iterations_cold=30,
 )
@@ -115,7 +115,16 @@ def fit_output(kind: str, z: Floats, y: Floats) -> GpOutput:
     mean, scale = float(y.mean()), float(y.std())
     gram = kernel_matrix(kind, z, z, LENGTH_SCALES) + NOISE * np.eye(len(z))
     alpha = np.asarray(np.linalg.solve(gram, (y - mean) / scale), dtype=np.float64)
-    return GpOutput(kind, LENGTH_SCALES, 1.0, NOISE, z, alpha, mean, scale)
+    return GpOutput(
+        kernel=kind,
+        signal_variance=1.0,
+        noise_variance=NOISE,
+        y_mean=mean,
+        y_scale=scale,
+        length_scales=LENGTH_SCALES,
+        inputs=z,
+        alpha=alpha,
+    )
 
 
 def fit_weights(
@@ -129,7 +138,12 @@ def fit_weights(
     z = np.column_stack([states[:-1, 3:7], inputs[:-1]])
     vx, vy, omega = (fit_output(kinds[j], z, residual[:, j]) for j in range(3))
     identity = PREDICTION.identity("e_kinematic", car)
-    return GpWeights("-".join(kinds), car.name, identity, (vx, vy, omega))
+    return GpWeights(
+        version="-".join(kinds),
+        car=car.name,
+        discretisation=identity,
+        outputs=(vx, vy, omega),
+    )
 
 
 def mirrored_weights(weights: GpWeights) -> GpWeights:

@@ -51,12 +51,12 @@ def telemetry(run: int, state_seq: int, fallback: int) -> Telemetry:
     nothing: dict[str, Any] = {
         one.name: get_args(kinds[one.name])[0]() for one in fields(Telemetry)
     }
-    told = {"seq": state_seq, "run": run, "state_seq": state_seq, "fallback": fallback}
-    return Telemetry(**(nothing | told))
+    known = {"seq": state_seq, "run": run, "state_seq": state_seq, "fallback": fallback}
+    return Telemetry(**(nothing | known))
 
 
 def logged(data: Dataset, run: int) -> list[State]:
-    """The states a plant would publish: each tells the input of the period before."""
+    """The states a plant would publish: each names the input of the period before."""
     x = np.vstack((data.x, data.x_next[-1:]))
     u = np.vstack((np.zeros(2), data.u))
     return [state(run, k, x[k], u[k]) for k in range(len(x))]

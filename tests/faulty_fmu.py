@@ -17,9 +17,13 @@ from bayesrace.cache import software
 from bayesrace.vehicles.models import STATES
 from codegen.compiler import find_compiler
 from plant.fmu.host import FmuHost
+from plant.fmu.package import read_description
+from plant.fmu.process import FmuProcess
 from tests.shared import shared_folder
 
-__all__ = ["PATIENCE_S", "STATES", "Mode", "faulty_fmu", "faulty_library", "worker_of"]
+__all__ = [
+    "PATIENCE_S", "STATES", "Mode", "faulty_fmu", "faulty_host", "faulty_library", "process_of",
+]  # fmt: skip
 
 SOURCE: Final = Path(__file__).parent / "native" / "faulty_fmu.c"
 HEADERS: Final = Path(fmpy.__file__).parent / "c-code"
@@ -29,7 +33,7 @@ PATIENCE_S: Final = 20.0
 Mode = IntEnum(
     "Mode",
     "GOOD ABORT SEGFAULT EXIT HANG NOT_A_NUMBER FAIL REFUSE FLOOD_LOG FLOOD_STDOUT SLOW TERMINATE "
-    "INIT_FAILS INIT_HANGS INIT_ABORTS HUGE_VALUE CLOSE_ALL EARLY STUCK SAY WORST SCRIBBLE ORPHAN",
+    "INIT_FAILS INIT_HANGS INIT_ABORTS HUGE_VALUE CLOSE_ALL EARLY SAY WORST SCRIBBLE ORPHAN",
     start=0,
 )
 """As in the C file."""
@@ -80,10 +84,22 @@ def faulty_fmu(
     return out
 
 
-def worker_of(host: FmuHost) -> "subprocess.Popen[bytes]":
+def faulty_host(path: Path, outputs: tuple[str, ...] = STATES) -> FmuHost:
+    """The FMU in a process of its own."""
+    return FmuHost(
+        path,
+        read_description(path),
+        ("d", "delta_rate"),
+        outputs,
+        timeout_s=PATIENCE_S,
+        startup_s=PATIENCE_S,
+    )
+
+
+def process_of(host: FmuHost) -> FmuProcess:
     """The process that the FMU runs in."""
     assert host._process is not None
-    return host._process._popen
+    return host._process
 
 
 def _description_2(guid: str, attributes: str) -> str:
@@ -97,11 +113,11 @@ def _description_2(guid: str, attributes: str) -> str:
         ("mode", fixed, '<Real start="0"/>'),
         ("gear", f'causality="input" {discrete}', '<Integer start="0"/>'),
         ("light", f'causality="input" {discrete}', '<Boolean start="false"/>'),
-        ("gear_told", f'causality="output" {discrete}', "<Integer/>"),
-        ("light_told", f'causality="output" {discrete}', "<Boolean/>"),
+        ("gear_told", 'causality="output"', "<Real/>"),
+        ("light_told", 'causality="output"', "<Real/>"),
         ("label", fixed, '<String start=""/>'),
-        ("label_length", f'causality="output" {discrete}', "<Integer/>"),
-        ("instances", f'causality="output" {discrete}', "<Integer/>"),
+        ("label_length", 'causality="output"', "<Real/>"),
+        ("instances", 'causality="output"', "<Real/>"),
     ]
     lines = "\n".join(
         f'<ScalarVariable name="{name}" valueReference="{reference}" {how}>{kind}</ScalarVariable>'
@@ -127,11 +143,11 @@ def _description_3(guid: str, attributes: str) -> str:
         ("Float64", "mode", 'causality="parameter" start="0"'),
         ("UInt8", "gear", 'causality="input" start="0"'),
         ("Boolean", "light", 'causality="input" start="false"'),
-        ("UInt8", "gear_told", 'causality="output"'),
-        ("Boolean", "light_told", 'causality="output"'),
+        ("Float64", "gear_told", 'causality="output"'),
+        ("Float32", "light_told", 'causality="output"'),
         ("String", "label", 'causality="parameter"'),
-        ("UInt64", "label_length", 'causality="output"'),
-        ("Int32", "instances", 'causality="output"'),
+        ("Float64", "label_length", 'causality="output"'),
+        ("Float64", "instances", 'causality="output"'),
         ("Float32", "soft", 'causality="parameter" start="1"'),
         ("UInt8", "small", 'causality="parameter" start="1"'),
         ("UInt64", "rows", 'causality="structuralParameter" start="1"'),

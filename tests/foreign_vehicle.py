@@ -1,4 +1,4 @@
-"""A vehicle model as somebody else would write it, for `pythonfmu` to make an FMU of.
+"""A vehicle model as another author would write it, for `pythonfmu` to make an FMU of.
 
 Its names, units and signs are not ours, and `tests/foreign_fmu.py` has the map for it. The physics
 are the dynamic bicycle's, so that a lap of it can be compared with one of the built-in plant.
@@ -40,7 +40,7 @@ OUTPUTS = {
 class ForeignCar(Fmi2Slave):  # type: ignore[misc]
     """ORCA car 1:43; east, north and a compass in place of x, y and a mathematical heading."""
 
-    author = "somebody else"
+    author = "another author"
     description = "Rear-driven 1:43 car"
 
     def __init__(self, **kwargs: Any) -> None:
@@ -73,7 +73,7 @@ class ForeignCar(Fmi2Slave):  # type: ignore[misc]
         self.register_variable(Real(name, causality=causality, description=text, **options))
 
     def exit_initialization_mode(self) -> None:
-        """Puts the car where the parameters say, its wheels where they are told to be."""
+        """Puts the car where the parameters say, its wheels at the commanded angle."""
         east, north = self.startEast, self.startNorth
         self._state[:] = 0.0
         self._state[:2] = east / 100.0, north / 100.0
@@ -82,7 +82,7 @@ class ForeignCar(Fmi2Slave):  # type: ignore[misc]
         self._state[6] = -math.radians(self.SteerAngleCmd)
 
     def do_step(self, current_time: float, step_size: float) -> bool:
-        """Turns the wheels evenly to where they are told to be within the step."""
+        """Turns the wheels evenly to the commanded angle within the step."""
         angle = -math.radians(self.SteerAngleCmd)
         self._input[:] = self.PedalPercent / 100.0, (angle - self._state[6]) / step_size
         for _ in range(round(step_size / SUBSTEP_S)):

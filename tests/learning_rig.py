@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bayesrace.messages import Event
+from bayesrace.messages import Event, Status
 from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
 from experiments.drive import RunPlan, run_request
-from experiments.learn.journal import LapRecord
+from experiments.learn.records import LapRecord
 from tests.network.cars import Course, Program, start_controller, start_plant
 from tests.programs import PATIENCE_S
 
-__all__ = ["Rig", "lap", "learn_arguments", "record", "rigged"]
+__all__ = ["Rig", "controller_status", "lap", "learn_arguments", "record", "rigged"]
 
 
 @dataclass
@@ -109,3 +109,8 @@ def lap(number: int, time_s: float | None, *, flying: bool = True, off_m: float 
         lap=number, run=1, time_s=time_s, flying=flying, versions=["a"], samples=100, left_out={},
         fallbacks=0, off_track_m=off_m,
     )  # fmt: skip
+
+
+def controller_status(version: str) -> Status:
+    """A heartbeat of a controller that drives with these weights."""
+    return Status(0, 1, "controller", "driving", 0, 0, "", version, 50.0, 0.0, 0.0, {})

@@ -1,23 +1,19 @@
-"""What is left out together, how intervals are calibrated, and what the metrics told then mean."""
+"""Folds of cross-validation, calibrated intervals, and the meaning of the reported metrics."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from bayesrace.gp.weights import OUTPUTS
 from bayesrace.integrators import PREDICTION
 from bayesrace.vehicles.models import dynamic
-from learning.crossvalidation import calibrated
 from learning.dataset import Dataset, concatenate
 from learning.folds import stretches
 from learning.scores import PredictionErrors
 from learning.training import train
 from learning.validation import validate
 from tests.driven import CAR, QUICK, STEP_S, drive
-
-Floats = NDArray[np.float64]
 
 
 def circling(laps: float, count: int, radius_m: float, shift_m: float = 0.0) -> Dataset:
@@ -79,24 +75,24 @@ def test_an_interval_is_not_judged_by_the_errors_that_it_was_fitted_to() -> None
     error = random.normal(size=1000)
     error[900:] *= 50
     folds = np.arange(1000) // 100
-    told = PredictionErrors(error, np.ones(1000))
-    whole = replace(told, sigma=told.sigma * np.sqrt(told.variance_scale))
+    raw = PredictionErrors(error, np.ones(1000))
+    whole = replace(raw, sigma=raw.sigma * np.sqrt(raw.variance_scale))
     assert whole.coverage == pytest.approx(0.95, abs=0.001)
-    honest = calibrated(told, folds)
-    assert np.mean(np.abs(honest.error[900:]) < 1.96 * honest.sigma[900:]) < 0.15
-    assert honest.sigma[900:] == pytest.approx(
-        np.sqrt(PredictionErrors(error[:900], told.sigma[:900]).variance_scale)
+    scaled = raw.calibrated(folds)
+    assert np.mean(np.abs(scaled.error[900:]) < 1.96 * scaled.sigma[900:]) < 0.15
+    assert scaled.sigma[900:] == pytest.approx(
+        np.sqrt(PredictionErrors(error[:900], raw.sigma[:900]).variance_scale)
     )
-    assert honest.log_density < whole.log_density
+    assert scaled.log_density < whole.log_density
 
 
 def test_calibration_widens_and_never_narrows() -> None:
     error, folds = np.random.default_rng(1).normal(size=200), np.arange(200) // 20
     wide = PredictionErrors(error, np.full(200, 5.0))
-    assert calibrated(wide, folds).sigma == pytest.approx(wide.sigma)
-    narrow = calibrated(PredictionErrors(error, np.full(200, 0.1)), folds)
-    assert 0.9 < narrow.coverage < 1
-    alone = calibrated(PredictionErrors(error, np.full(200, 0.1)), np.zeros(200, dtype=np.int64))
+    assert wide.calibrated(folds).sigma == pytest.approx(wide.sigma)
+    narrow = PredictionErrors(error, np.full(200, 0.1))
+    assert 0.9 < narrow.calibrated(folds).coverage < 1
+    alone = narrow.calibrated(np.zeros(200, dtype=np.int64))
     assert alone.sigma == pytest.approx(0.1), "no other fold to learn the scale from"
 
 
@@ -109,16 +105,16 @@ def test_scores_do_not_depend_on_the_unit() -> None:
     assert scaled == pytest.approx(plain)
 
 
-# What is told ----------------------------------------------------------------------------------
+# What is reported ------------------------------------------------------------------------------
 
 
-def test_laps_driven_again_do_not_improve_what_is_told() -> None:
+def test_laps_driven_again_do_not_improve_the_reported_metrics() -> None:
     """The same place driven thrice teaches the next lap, not another track."""
     laps = [drive(dynamic(CAR), 160, seed=1, vx=vx) for vx in (1.5, 1.501, 1.499)]
     one, three = (train(data, PREDICTION, QUICK) for data in (laps[0], concatenate(laps)))
     again = validate(three, drive(dynamic(CAR), 160, seed=1, vx=1.5005), PREDICTION).metrics
     for output in OUTPUTS:
-        told = three.metrics[output]
-        assert told["rmse"] > 0.4 * one.metrics[output]["rmse"]
-        assert told["rmse"] > 3 * again[output]["rmse"]
-        assert told["log_density"] < again[output]["log_density"]
+        reported = three.metrics[output]
+        assert reported["rmse"] > 0.4 * one.metrics[output]["rmse"]
+        assert reported["rmse"] > 3 * again[output]["rmse"]
+        assert reported["log_density"] < again[output]["log_density"]

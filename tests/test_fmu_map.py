@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 
 import pytest
+from fmpy.model_description import BaseUnit
 from hypothesis import given as those
 from hypothesis import strategies as st
 from rich.console import Console
@@ -13,8 +14,9 @@ from rich.console import Console
 from bayesrace.errors import InputError
 from experiments.fmu_table import FmuTable
 from plant.fmu.inspection import FmuDescription, inspect
-from plant.fmu.map import parse_map, read_map, wire
-from plant.fmu.units import UnitDefinition, parse_quantity, to_si, unit_of
+from plant.fmu.map import wire
+from plant.fmu.map_file import parse_map, read_map
+from plant.fmu.units import parse_quantity, to_si, unit_of
 from tests.fmu_variables import OWN, description, given, own_fmu, taken, variable, write_fmu
 
 # -- the file -------------------------------------------------------------------------------------
@@ -112,16 +114,16 @@ def test_no_text_breaks_the_reading_of_units(text: str) -> None:
 
 
 def test_the_fmus_own_definition_stands_for_unknown_names_and_fills_no_gaps() -> None:
-    ticks = unit_of("ticks", UnitDefinition((0, 1, 0, 0, 0, 0, 0, 0), 0.005))
+    ticks = unit_of("ticks", BaseUnit(m=1, factor=0.005))
     assert ticks is not None
     assert to_si(ticks, "m") == 0.005
-    nothing = unit_of("km/h", UnitDefinition((0,) * 8))
-    no_angle = unit_of("deg", UnitDefinition((0,) * 8, 0.0174533))
+    nothing = unit_of("km/h", BaseUnit())
+    no_angle = unit_of("deg", BaseUnit(factor=0.0174533))
     assert nothing is not None
     assert no_angle is not None
     assert to_si(nothing, "m/s") == pytest.approx(1 / 3.6, rel=1e-15)
     assert to_si(no_angle, "rad") == math.pi / 180
-    assert unit_of("degC", UnitDefinition((0, 0, 0, 0, 1, 0, 0, 0), 1.0, 273.15)) is None
+    assert unit_of("degC", BaseUnit(K=1, offset=273.15)) is None
 
 
 # -- maps that do not fit -------------------------------------------------------------------------
@@ -190,17 +192,17 @@ def test_what_does_not_fit_is_named_with_what_to_write(text: str, said: str) -> 
         wire(MIXED, parse_map(text))
 
 
-def test_all_problems_are_told_at_once() -> None:
+def test_all_problems_are_reported_at_once() -> None:
     fmu = description(given("speed", "km/h"), taken("pedal"), taken("wheel", start=None))
     with pytest.raises(InputError) as caught:
         wire(fmu)
-    said = str(caught.value)
+    text = str(caught.value)
     for quantity in ("x", "y", "psi", "vx", "vy", "omega", "delta"):
-        assert f"nothing gives our {quantity} [" in said
-    assert "the duty cycle" in said
-    assert "the steering rate" in said
-    assert "'wheel' has neither a start value nor a place in the map" in said
-    assert "fmu inspect" in said
+        assert f"nothing gives our {quantity} [" in text
+    assert "the duty cycle" in text
+    assert "the steering rate" in text
+    assert "'wheel' has neither a start value nor a place in the map" in text
+    assert "fmu inspect" in text
 
 
 def test_an_open_frequency_is_what_the_map_says_it_is() -> None:

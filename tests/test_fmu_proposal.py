@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from bayesrace.errors import InputError
 from plant.fmu.inspection import Variable
-from plant.fmu.map import parse_map, wire
+from plant.fmu.map import wire
+from plant.fmu.map_file import parse_map
 from plant.fmu.proposal import starting_map
 from tests.fmu_variables import description, given, own_fmu, taken, variable
 from tests.foreign_fmu import FOREIGN_MAP
@@ -28,13 +29,13 @@ def test_the_map_of_our_own_fmu_works_unchanged() -> None:
     assert "# mass_kg = 0.041  # [kg] mass" in text
 
 
-def told(*variables: Variable) -> dict[str, Any]:
+def proposal_for(*variables: Variable) -> dict[str, Any]:
     """The map proposed for these variables."""
     return tomllib.loads(starting_map(description(*variables)))
 
 
 def test_common_names_are_guessed() -> None:
-    proposed = told(
+    proposed = proposal_for(
         *(taken("throttle_pct"), taken("brakePedal"), taken("steeringAngleCmd", "deg")),
         *(given("pos_x_cm"), given("pos_y_cm"), given("vehicle.yaw", "deg")),
         *(
@@ -62,7 +63,7 @@ def test_common_names_are_guessed() -> None:
 
 
 def test_what_can_be_derived_is() -> None:
-    proposed = told(
+    proposed = proposal_for(
         *(given("x"), given("y"), given("v"), given("beta", "deg"), given("rate", "deg/s")),
         *(given(f"q{i}") for i in range(4)),
         *(taken("steer"), taken("gas")),
@@ -76,7 +77,7 @@ def test_what_can_be_derived_is() -> None:
 
 
 def test_a_unit_forbids_a_guess() -> None:
-    assert "x" not in told(given("x", "km/h"))["outputs"]
+    assert "x" not in proposal_for(given("x", "km/h"))["outputs"]
 
 
 def test_the_map_of_the_foreign_model_follows_from_its_descriptions() -> None:

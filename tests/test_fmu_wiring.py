@@ -11,7 +11,8 @@ from hypothesis import given as those
 from hypothesis import strategies as st
 
 from bayesrace.errors import InputError
-from plant.fmu.map import parse_map, wire
+from plant.fmu.map import wire
+from plant.fmu.map_file import parse_map
 from plant.fmu.package import read_description
 from tests.fmu_variables import (
     STATE,
@@ -35,7 +36,7 @@ def test_our_own_names_pass_to_the_bit_without_a_map() -> None:
     state = STATE + np.array([0, 0, 700.1, 0, 0, 0, 0])  # turns are the FMU's to count
     assert (read(wiring, our_names, state) == state).all()
     assert wiring.inputs == ("d", "delta_rate")
-    assert wiring.to_inputs(U, 0.2, 0.02) == list(U)
+    assert wiring.to_inputs(U, 0.2, (0.02,)) == list(U)
 
 
 def test_outputs_that_can_be_started_are() -> None:
@@ -177,25 +178,6 @@ def test_velocity_of_a_model_without_side_slip() -> None:
     state = STATE.copy()
     state[4] = 0.0
     assert_same(read(wiring, replacing("vx", "vy", v=lambda s: s["vx"]), state), state)
-
-
-def test_lengths_speeds_and_rates_in_declared_units() -> None:
-    fmu = own_fmu(
-        given("px", "cm"),
-        given("py", "mm"),
-        given("u", "km/h"),
-        given("r", "rpm"),
-        without=("x", "y", "vx", "omega"),
-    )
-    wiring = wire(fmu, parse_map('[outputs]\nx = "px"\ny = "py"\nvx = "u"\nomega = "r"'))
-    say = replacing(
-        *("x", "y", "vx", "omega"),
-        px=lambda s: 100 * s["x"],
-        py=lambda s: 1000 * s["y"],
-        u=lambda s: 3.6 * s["vx"],
-        r=lambda s: s["omega"] * 30 / math.pi,
-    )
-    assert_same(read(wiring, say, STATE), STATE)
 
 
 def test_yaw_rate_from_the_heading_across_the_wrap() -> None:

@@ -9,14 +9,14 @@ from hypothesis import given as those
 from hypothesis import strategies as st
 
 from bayesrace.errors import InputError
-from plant.fmu.map import parse_map, wire
+from plant.fmu.map import wire
+from plant.fmu.map_file import parse_map
 from plant.fmu.wiring import Wiring
 from tests.fmu_variables import (
     STATE,
     Array,
     U,
     assert_same,
-    description,
     given,
     our_names,
     own_fmu,
@@ -26,7 +26,6 @@ from tests.fmu_variables import (
     values,
     variable,
 )
-from tests.foreign_fmu import FOREIGN_MAP
 
 # -- inputs ---------------------------------------------------------------------------------------
 
@@ -41,13 +40,13 @@ def test_throttle_in_percent_and_a_separate_brake_pedal() -> None:
         *(taken("gas", highest=100.0), taken("brk")),
         without=("d",),
     )
-    assert wiring.to_inputs((0.4, 0), 0, 0.02) == pytest.approx([40.0, 0.0, 0.0])
-    assert wiring.to_inputs((-0.1, 0), 0, 0.02) == pytest.approx([0.0, 1.0, 0.0])
+    assert wiring.to_inputs((0.4, 0), 0, (0.02,)) == pytest.approx([40.0, 0.0, 0.0])
+    assert wiring.to_inputs((-0.1, 0), 0, (0.02,)) == pytest.approx([0.0, 1.0, 0.0])
 
 
 def test_an_input_stays_within_its_declared_range() -> None:
     wiring = inputs('[inputs]\ngas = "d"', taken("gas", lowest=0.0, highest=0.8), without=("d",))
-    sent = [wiring.to_inputs((d, 0), 0, 0.02)[0] for d in (-0.1, 0.5, 1)]
+    sent = [wiring.to_inputs((d, 0), 0, (0.02,))[0] for d in (-0.1, 0.5, 1)]
     assert sent == [0.0, 0.5, 0.8]
 
 
@@ -57,7 +56,9 @@ def test_steering_angle_at_the_end_of_the_hold_in_degrees_to_the_right() -> None
         *(taken("steer", "deg"), taken("d")),
         without=("d", "delta_rate"),
     )
-    assert wiring.to_inputs(U, 0.2, 0.02)[0] == pytest.approx(-math.degrees(0.2 - 0.04), rel=1e-14)
+    assert wiring.to_inputs(U, 0.2, (0.02,))[0] == pytest.approx(
+        -math.degrees(0.2 - 0.04), rel=1e-14
+    )
     assert wiring.start_values(STATE)["steer"] == pytest.approx(-math.degrees(0.2), rel=1e-14)
 
 
@@ -68,7 +69,7 @@ def test_steering_wheel_with_a_ratio() -> None:
     text += f"[outputs]\ndelta = {{ variable = 'wheel', scale = {1 / ratio!r} }}"
     fmu = own_fmu(taken("swa", "deg"), given("wheel", "deg"), without=("delta_rate", "delta"))
     wiring = wire(fmu, parse_map(text))
-    sent = dict(zip(wiring.inputs, wiring.to_inputs((0, 1.0), 0.1, 0.02), strict=True))
+    sent = dict(zip(wiring.inputs, wiring.to_inputs((0, 1.0), 0.1, (0.02,)), strict=True))
     assert sent["swa"] == pytest.approx(16 * math.degrees(0.12) + 0.5, rel=1e-14)
     say = replacing("delta", wheel=lambda s: 16 * math.degrees(s["delta"]))
     assert_same(read(wiring, say, STATE), STATE)
@@ -190,32 +191,3 @@ def test_a_quaternion_of_zeros_is_no_heading() -> None:
     wiring = wire(fmu, parse_map(rule))
     state = wiring.begin([0.0] * len(wiring.outputs), STATE)
     assert math.isnan(state[2])
-
-
-def test_a_foreign_vehicle_altogether() -> None:
-    """The names, units and signs of a model that nobody made for us."""
-    fmu = description(
-        *(taken("PedalPercent", "%"), taken("SteerAngleCmd", "deg")),
-        *(given("posEast", "cm"), given("posNorth", "cm"), given("compass", "deg")),
-        *(given("velEast", "km/h"), given("velNorth", "km/h"), given("turnRate", "deg/s")),
-    )
-    text = FOREIGN_MAP[: FOREIGN_MAP.index("[start]")]
-    wiring = wire(fmu, parse_map(text))
-
-    def say(state: Array) -> dict[str, float]:
-        x, y, psi, vx, vy, omega, _ = state
-        return {
-            "posEast": 100 * x,
-            "posNorth": 100 * y,
-            "compass": (90 - math.degrees(psi)) % 360,
-            "velEast": 3.6 * (math.cos(psi) * vx - math.sin(psi) * vy),
-            "velNorth": 3.6 * (math.sin(psi) * vx + math.cos(psi) * vy),
-            "turnRate": -math.degrees(omega),
-        }
-
-    start = STATE.copy()
-    start[6] -= 0.02 * U[1]
-    assert_same(wiring.begin(values(wiring, say(start)), start), start)
-    sent = dict(zip(wiring.inputs, wiring.to_inputs(U, start[6], 0.02), strict=True))
-    assert sent == pytest.approx({"PedalPercent": 40.0, "SteerAngleCmd": -math.degrees(STATE[6])})
-    assert_same(wiring.state(values(wiring, say(STATE)), U, 0.02), STATE)

@@ -5,20 +5,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
 
 from bayesrace.errors import InputError
-from bayesrace.gp.expression import (
-    evaluate_mean,
-    kernel,
-    kernel_matrix,
-    mean_function,
-    mean_parameters,
-    numeric_mean,
-)
+from bayesrace.gp.expression import evaluate_mean, kernel, kernel_matrix, mean_function
 from bayesrace.gp.weights import KERNELS, GpOutput, GpWeights, zero_weights
+from tests.scikit import correlation, scikit_gp
 
-NU = {"matern05": 0.5, "matern15": 1.5, "matern25": 2.5}
 LENGTHS = np.array([1.0, 0.7, 3.0, 0.4, 1.5, 5.0])
 CENTRE = np.array([2.0, 0.0, 1.0, 0.0, 0.4, 0.0])
 Y_MEAN, Y_SCALE = 0.3, 0.5
@@ -29,15 +21,22 @@ def fitted(kind: str, count: int = 40, seed: int = 0) -> tuple[GaussianProcessRe
     random = np.random.default_rng(seed)
     z = CENTRE + random.normal(size=(count, 6))
     y = np.sin(z[:, 0]) + z[:, 3] * z[:, 4] + 0.1 * random.normal(size=count)
-    base = RBF(LENGTHS) if kind == "rbf" else Matern(LENGTHS, nu=NU[kind])
-    covariance = ConstantKernel(2.0) * base + WhiteKernel(0.05)
-    gp = GaussianProcessRegressor(covariance, alpha=0.0, optimizer=None).fit(z, y)
-    return gp, GpOutput(kind, LENGTHS, 2.0, 0.05, z, gp.alpha_, Y_MEAN, Y_SCALE)
+    gp = scikit_gp(kind, np.log([2.0, *LENGTHS, 0.05]), z, y)
+    return gp, GpOutput(
+        kernel=kind,
+        signal_variance=2.0,
+        noise_variance=0.05,
+        y_mean=Y_MEAN,
+        y_scale=Y_SCALE,
+        length_scales=LENGTHS,
+        inputs=z,
+        alpha=gp.alpha_,
+    )
 
 
 def weights_of(kinds: tuple[str, ...], count: int = 40) -> GpWeights:
     vx, vy, omega = (fitted(kind, count + i, i)[1] for i, kind in enumerate(kinds))
-    return GpWeights("v", "orca", "d", (vx, vy, omega))
+    return GpWeights(version="v", car="orca", discretisation="d", outputs=(vx, vy, omega))
 
 
 def points(count: int = 20, seed: int = 9) -> NDArray[np.float64]:
@@ -47,7 +46,8 @@ def points(count: int = 20, seed: int = 9) -> NDArray[np.float64]:
 @pytest.mark.parametrize("kind", KERNELS)
 def test_mean_equals_scikit_learn(kind: str) -> None:
     gp, output = fitted(kind)
-    weights = GpWeights("v", "orca", "d", (output, output, output))
+    outputs = (output, output, output)
+    weights = GpWeights(version="v", car="orca", discretisation="d", outputs=outputs)
     z = np.vstack((points(), output.inputs))
     expected = Y_MEAN + Y_SCALE * gp.predict(z)
     assert np.abs(evaluate_mean(weights, z) - expected[:, None]).max() < 1e-10
@@ -55,7 +55,7 @@ def test_mean_equals_scikit_learn(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", KERNELS)
 def test_kernel_matrix_equals_scikit_learn(kind: str) -> None:
-    base = RBF(LENGTHS) if kind == "rbf" else Matern(LENGTHS, nu=NU[kind])
+    base = correlation(kind, LENGTHS)
     a, b = points(7), points(5, seed=3)
     assert np.abs(kernel_matrix(kind, a, b, LENGTHS) - base(a, b)).max() < 1e-12
     assert kernel_matrix(kind, a[:0], b, LENGTHS).shape == (0, 5)
@@ -63,7 +63,7 @@ def test_kernel_matrix_equals_scikit_learn(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", KERNELS)
 def test_jacobian_equals_finite_differences(kind: str) -> None:
-    mean = numeric_mean(weights_of((kind, kind, kind)))
+    mean = mean_function(weights_of((kind, kind, kind)))
     jacobian = mean.factory("jacobian", ["z"], ["jac:mean:z"])
     step = 1e-5
     for z in points(5):
@@ -77,7 +77,7 @@ def test_jacobian_equals_finite_differences(kind: str) -> None:
 def test_derivatives_are_finite_on_a_training_point(kind: str) -> None:
     """sqrt(r^2) has an infinite slope at 0; the Matérn derivatives must not inherit it."""
     weights = weights_of((kind, kind, kind))
-    mean = numeric_mean(weights)
+    mean = mean_function(weights)
     jacobian = mean.factory("jacobian", ["z"], ["jac:mean:z"])
     z = weights.outputs[0].inputs[3]
     at_point = np.array(jacobian(z))
@@ -102,26 +102,6 @@ def test_slope_of_the_kernels_at_zero_distance() -> None:
         assert float(slope(1e-14)) == pytest.approx(expected, rel=1e-5)
 
 
-def test_capacity_beyond_the_points_changes_nothing() -> None:
-    weights = weights_of(("rbf", "matern25", "matern05"))
-    function = mean_function(weights.kernels, 64)
-    z = points()
-    padded = np.array(function(z.T, *mean_parameters(weights, 64))).T
-    assert np.abs(padded - evaluate_mean(weights, z)).max() < 1e-12
-    assert function.name_in()[:3] == ["z", "inputs_vx", "alpha_vx"]
-    with pytest.raises(InputError, match="capacity"):
-        mean_parameters(weights, 10)
-
-
-def test_weights_are_parameters_not_constants() -> None:
-    first, second = weights_of(("rbf",) * 3), weights_of(("rbf",) * 3, count=30)
-    function = mean_function(("rbf",) * 3, 64)
-    z = points(1)[0]
-    for weights in (first, second):
-        got = np.array(function(z, *mean_parameters(weights, 64)))[:, 0]
-        assert got == pytest.approx(evaluate_mean(weights, z[None])[0], abs=1e-12)
-
-
 def test_zero_weights_give_zero() -> None:
     assert not evaluate_mean(zero_weights("orca", "d"), points()).any()
 
@@ -130,8 +110,6 @@ def test_bad_arguments_are_refused() -> None:
     weights = zero_weights("orca", "d")
     with pytest.raises(InputError):
         evaluate_mean(weights, np.zeros((3, 5)))
-    with pytest.raises(InputError):
-        mean_function(("rbf", "rbf", "cubic"), 4)
-    with pytest.raises(InputError):
-        mean_function(("rbf", "rbf", "rbf"), 0)
+    with pytest.raises(InputError, match="cubic"):
+        kernel("cubic", np.zeros(3))
     assert evaluate_mean(weights, np.zeros((0, 6))).shape == (0, 3)

@@ -2,6 +2,7 @@
 
 import hashlib
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -46,8 +47,16 @@ def make_output(seed: int = 0, count: int = 5, kernel: str = "rbf", **changes: A
 def make_weights(count: int = 5, kernels: tuple[str, ...] = KERNELS[:3]) -> GpWeights:
     vx, vy, omega = (make_output(i, count + i, kernel) for i, kernel in enumerate(kernels))
     metrics = {"vx": {"rmse": 0.1}, "training vx": {"points": 5.0}}
-    about = ("digest", 17, metrics, "bayesrace 1.2.3")
-    return GpWeights("v1", "orca", "model/rk4", (vx, vy, omega), *about)
+    return GpWeights(
+        version="v1",
+        car="orca",
+        discretisation="model/rk4",
+        dataset_digest="digest",
+        created_utc_ns=17,
+        metrics=metrics,
+        program="bayesrace 1.2.3",
+        outputs=(vx, vy, omega),
+    )
 
 
 def reseal(data: bytes) -> bytes:
@@ -85,7 +94,7 @@ def gp_outputs(draw: st.DrawFn) -> GpOutput:
 @given(vx=gp_outputs(), vy=gp_outputs(), omega=gp_outputs(), created=st.integers(0, 2**62))
 @settings(max_examples=40, deadline=None)
 def test_encoding_round_trips(vx: GpOutput, vy: GpOutput, omega: GpOutput, created: int) -> None:
-    weights = GpWeights("v", "orca", "d", (vx, vy, omega), "abc", created, {"vx": {"r2": 0.5}})
+    weights = replace(make_weights(), created_utc_ns=created, outputs=(vx, vy, omega))
     again = decode_weights(encode_weights(weights))
     assert again == weights
     for ours, theirs in zip(weights.outputs, again.outputs, strict=True):
@@ -155,6 +164,8 @@ def test_any_bytes_decode_or_are_refused(noise: bytes) -> None:
         lambda body: body["outputs"][0]["alpha"].update(shape=[-1]),
         lambda body: body["outputs"][0]["alpha"].update(shape=[True]),
         lambda body: body["outputs"][0]["alpha"].update(shape=[4]),
+        lambda body: body["outputs"][0]["alpha"].update(shape=None),
+        lambda body: body["outputs"][0].update(signal_variance=2),  # encoded as an integer
         lambda body: body["outputs"][0]["alpha"].update(shape=[2**40]),
         lambda body: body["outputs"][0]["alpha"].update(f64le="text"),
         lambda body: body["outputs"][0]["inputs"].update(shape=[6, 5]),

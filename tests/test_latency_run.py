@@ -15,11 +15,13 @@ from typing import Any
 import pytest
 from hdrh.log import HistogramLogReader
 
+from bayesrace.log import LogReader
+from bayesrace.messages import STATE
 from bayesrace.tracks import Track
 from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
 from experiments.drive import RunPlan, run_request
-from experiments.latency.histograms import new_histogram
 from experiments.latency.legs import LEGS
+from experiments.latency.series import new_histogram
 from experiments.preparation import Prepared, prepare
 from experiments.progress import stages_on
 from experiments.settings import PreparationSettings
@@ -76,12 +78,11 @@ def loaded(files: Prepared, tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 def test_every_leg_is_measured(loaded: Run) -> None:
     result = loaded.result
-    assert set(result["legs_us"]) == {leg.name for leg in LEGS}
+    assert set(result["legs_us"]) == set(LEGS)
     for name, leg in result["legs_us"].items():
         assert leg["count"] > 50, name
         assert leg["p50"] <= leg["p90"] <= leg["p99"] <= leg["p999"] <= leg["max"], name
         assert leg["below_zero"] == 0, name
-    assert set(result["state_to_actuation_us"]) == {"p50", "p90", "p99", "p999", "max"}
     assert result["bare_loop_us"]["count"] > 0
     assert result["bare_loop_misses"] == result["bare_loop_us"]["misses"]
 
@@ -94,7 +95,7 @@ def test_messages_sent_are_received_or_lost(loaded: Run) -> None:
     assert result["sent"] > 100
 
 
-def test_memory_laps_and_clocks_are_told(loaded: Run) -> None:
+def test_memory_laps_and_clocks_are_reported(loaded: Run) -> None:
     result = loaded.result
     assert set(result["rss"]) == {"plant", "controller"}
     assert result["rss_growth_bytes"] >= 0
@@ -108,8 +109,8 @@ def test_memory_laps_and_clocks_are_told(loaded: Run) -> None:
 
 def test_files_are_those_of_the_documentation(loaded: Run) -> None:
     names = {path.name for path in loaded.out.iterdir()}
-    logs = {f"{leg.name}.hlog" for leg in LEGS} | {"bare_loop.hlog"}
-    assert logs | {"latency.json", "latency.png", "settings.json"} <= names
+    logs = {f"{name}.hlog" for name in LEGS} | {"bare_loop.hlog"}
+    assert logs | {"latency.json", "latency.png", "settings.json", "run.mcap"} <= names
     for name in logs:
         reader = HistogramLogReader(str(loaded.out / name), new_histogram())
         total = 0
@@ -118,6 +119,18 @@ def test_files_are_those_of_the_documentation(loaded: Run) -> None:
         leg = loaded.result["legs_us"].get(name.removesuffix(".hlog"))
         expected = loaded.result["bare_loop_us"] if leg is None else leg
         assert total == expected["count"], name
+
+
+def test_the_log_of_a_run_gives_the_same_legs_again(loaded: Run, cli: Cli, tmp_path: Path) -> None:
+    log = loaded.out / "run.mcap"
+    done = cli("latency", "--log", log, "--duration", "3", "--out", tmp_path / "again")
+    assert done.code == 0, done.err
+    result = json.loads((tmp_path / "again" / "latency.json").read_text())
+    for name in ("legs_us", "ticks", "traffic", "clocks", "laps", "rate_hz", "overruns"):
+        assert result[name] == loaded.result[name], name
+    assert result["recorded"] is True
+    assert result["bare_loop_us"] is None
+    assert "recorded" in done.out
 
 
 def _with_parent(pid: int) -> list[str]:
@@ -144,8 +157,11 @@ def _child_pid(parent: int, word: str) -> int | None:
 
 
 def _observing(out: Path) -> bool:
-    log = out / "state_age.hlog"
-    return log.is_file()
+    """Whether the log goes on beyond the warm-up."""
+    time.sleep(0.5)
+    log = out / "run.mcap"
+    states = LogReader(log).select(STATE) if log.is_file() else []
+    return bool(states) and states[-1].time_s > 4.0
 
 
 @pytest.mark.check
@@ -171,7 +187,6 @@ def test_interrupt_leaves_a_report_and_no_process(files: Prepared, tmp_path: Pat
     out = tmp_path / "run"
     process = start("latency", *files.arguments, "--duration", "60", "--load", "1", "--out", out)
     until(lambda: _observing(out), "time observed")
-    time.sleep(1.0)
     process.send_signal(signal.SIGINT)
     done = finish(process)
     assert done.returncode == 130, done.stderr
@@ -181,7 +196,7 @@ def test_interrupt_leaves_a_report_and_no_process(files: Prepared, tmp_path: Pat
 
 @pytest.mark.check
 def test_killed_measurement_takes_its_children_along(files: Prepared, tmp_path: Path) -> None:
-    """The busy processes above all: nobody would look for them."""
+    """The busy processes above all."""
     out = tmp_path / "run"
     process = start("latency", *files.arguments, "--duration", "60", "--load", "2", "--out", out)
     until(lambda: _observing(out), "time observed")
@@ -196,6 +211,8 @@ def test_killed_measurement_takes_its_children_along(files: Prepared, tmp_path: 
     [
         (["--endpoint", "tcp/127.0.0.1:7447"], "--attach"),
         (["--attach", "--weights", "w.bin"], "started here"),
+        (["--attach", "--log", "run.mcap"], "leave out --attach"),
+        (["--log", "run.mcap"], "no log at run.mcap"),
         (["--rate", "0"], "--rate"),
         (["--json", "/no/such/folder/x.json"], "no folder"),
         (["--track", "nowhere"], "nowhere"),
@@ -203,6 +220,12 @@ def test_killed_measurement_takes_its_children_along(files: Prepared, tmp_path: 
 )
 def test_bad_options_get_one_line(cli: Cli, arguments: list[str], words: str) -> None:
     refused(cli("latency", "--out", "run", *arguments), words)
+
+
+@pytest.mark.parametrize("name", ["latency.json", "run.mcap"])
+def test_a_measurement_is_never_overwritten(cli: Cli, tmp_path: Path, name: str) -> None:
+    (tmp_path / name).touch()
+    refused(cli("latency", "--out", tmp_path), "holds a measurement already")
 
 
 # Attached --------------------------------------------------------------------------------------
@@ -264,7 +287,7 @@ def test_a_running_system_is_measured_and_left_running(files: Prepared, tmp_path
         assert director.status("controller").phase == "driving"
     assert result["attached"] is True
     assert result["clocks"]["shared"] is True
-    assert set(result["legs_us"]) == {leg.name for leg in LEGS}
+    assert set(result["legs_us"]) == set(LEGS)
     assert result["rss_growth_bytes"] is None
     assert result["off_track_samples"] is None
     assert result["ticks"] > 50
@@ -291,7 +314,7 @@ def _time_namespaces() -> str:
 
 @pytest.mark.check
 def test_clock_of_another_host_is_found_and_corrected(files: Prepared, tmp_path: Path) -> None:
-    """The plant in a time namespace: its monotonic clock is 1000 s ahead of everybody else's."""
+    """The plant in a time namespace: its monotonic clock is 1000 s ahead of all others."""
     if why_not := _time_namespaces():
         pytest.skip(f"time namespaces are not allowed here: {why_not}")
     prefix = ["unshare", "--time", "--monotonic=1000", "--fork", "--kill-child"]
@@ -299,10 +322,8 @@ def test_clock_of_another_host_is_found_and_corrected(files: Prepared, tmp_path:
         result = _attached(endpoints, tmp_path / "run")
     clocks = result["clocks"]
     assert clocks["shared"] is False
-    for name, offset_us in (("plant", 1e9), ("controller", 0.0)):
-        found = clocks[name]
-        assert abs(found["offset_us"] - offset_us) <= found["uncertainty_us"], name
-        assert found["exchanges"] > 20
+    assert abs(clocks["offset_us"] + 1e9) <= clocks["uncertainty_us"]
+    assert clocks["exchanges"] > 50
     margin_us = clocks["uncertainty_us"]
     assert 0 < margin_us < 1e5
     for name in ("state_transport", "state_age", "actuation_transport"):

@@ -49,7 +49,7 @@ def settled(out: Path, count: int) -> list[dict[str, Any]]:
 
     def enough() -> bool:
         updates = record(out)["updates"]
-        return len(updates) >= count and updates[-1]["verdict"] != "waiting"
+        return len(updates) >= count and updates[-1]["verdict"] != "pending"
 
     until(enough, f"{count} updates")
     updates: list[dict[str, Any]] = record(out)["updates"]

@@ -1,8 +1,9 @@
-"""Parts of the learning job, each alone: worker, dealings with the controller, picture."""
+"""Parts of the learning job, each alone: trainer, publisher, figure and table."""
 
 import os
-import queue
 import signal
+from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -10,108 +11,87 @@ import pytest
 from rich.console import Console
 
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import write_weights, zero_weights
+from bayesrace.gp.weights import decode_weights, zero_weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.messages import Event, Reply, Scalar
 from bayesrace.vehicles.models import dynamic
-from experiments.learn import desk as desk_module
-from experiments.learn import trainer as trainer_module
-from experiments.learn.desk import Desk
-from experiments.learn.feed import What
-from experiments.learn.figure import draw, references
-from experiments.learn.journal import Journal, LapRecord, Record, UpdateRecord
-from experiments.learn.settings import LearnSettings
-from experiments.learn.table import print_laps
-from experiments.learn.trainer import NICE, Trainer
-from learning.arrays import write_npz
-from learning.worker import Outcome, Task
+from experiments.learn import publishing
+from experiments.learn.journal import Journal
+from experiments.learn.publishing import Publisher
+from experiments.learn.records import LapRecord, LearnSettings, Record, UpdateRecord
+from experiments.learn.report import draw, print_laps, references
+from learning.training import TrainingSettings
+from learning.worker import NICE, Outcome, Task, Trainer
 from tests.driven import CAR, QUICK, drive
-from tests.learning_rig import lap
-from tests.programs import PATIENCE_S
+from tests.learning_rig import controller_status, lap
+from tests.programs import until
 
-SETTINGS = LearnSettings(car=CAR.name)
+SETTINGS = LearnSettings(car=CAR)
 NAME = PREDICTION.identity("e_kinematic", CAR)
+NOT_NOW = Reply(0, 0, False, "the controller ends", {"again": True})
 
 
-class Heard:
-    """In place of the feed: keeps what is put, and what is said."""
+class Desk:
+    """A publisher whose controller answers as prepared; without an answer, none comes."""
 
-    def __init__(self) -> None:
-        self.items: queue.Queue[tuple[What, Any]] = queue.Queue()
-        self.said: list[str] = []
-
-    def put(self, what: What, value: Any = None) -> None:
-        self.items.put((what, value))
-
-
-class Office:
-    """A desk whose controller answers as it is told to."""
-
-    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.journal = Journal(folder, SETTINGS)
-        self.heard = Heard()
+    def __init__(self, journal: Journal, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.journal = journal
         self.answers: dict[str, Reply] = {}
         self.sent: list[str] = []
-        self.drives_with: str | None = ""
-        monkeypatch.setattr(desk_module, "send_weights", self._send)
-        monkeypatch.setattr(desk_module, "ask", self._ask)
-        feed: Any = self.heard
-        self.desk = Desk(None, "orca", self.journal, feed, self.heard.said.append)
+        self.said: list[str] = []
+        monkeypatch.setattr(publishing, "send_weights", self._send)
+        self.publisher = Publisher(None, journal, self.said.append)
 
     def _send(self, _session: Any, _car: str, data: bytes) -> Reply:
-        version = next(one.version for one in self.journal.record.updates
-                       if self.journal.path(one.file).read_bytes() == data)  # fmt: skip
+        version = decode_weights(data).version
         self.sent.append(version)
         if version not in self.answers:
             raise InputError("nobody answers")
         return self.answers[version]
 
-    def _ask(self, *_: Any) -> Any:
-        if self.drives_with is None:
-            raise InputError("nobody answers")
-
-        class Told:
-            weights_version = self.drives_with
-
-        return Told
-
-    def learn(self, version: str, answer: Reply | None = None) -> UpdateRecord:
-        path = self.journal.path(f"{version}.bin")
-        write_weights(path, zero_weights(CAR.name, NAME, version))
-        update = UpdateRecord(after_lap=1, version=version, file=path.name)
-        self.journal.add_update(update)
+    def learn(self, version: str, answer: Reply | None = None) -> None:
+        """New weights are published, and answered."""
         if answer is not None:
             self.answers[version] = answer
-        return update
+        self.offer(version)
+        self.work()
+
+    def offer(self, version: str) -> None:
+        update = UpdateRecord(after_lap=1)
+        self.journal.add_update(update, zero_weights(CAR.name, NAME, version))
+        self.publisher.offer(update)
 
     def work(self) -> None:
         """Until no answer is missing."""
-        while self.desk.busy:
-            what, value = self.heard.items.get(timeout=5)
-            assert what is What.ANSWER
-            self.desk.answer(value)
+        self.publisher._thread.submit(int).result()
+        self.publisher.poll()
+        assert not self.publisher.unanswered
 
-    def come(self, drives_with: str | None = "") -> None:
-        self.drives_with = drives_with
-        self.desk.presence(there=True)
+    def heartbeat(self, drives_with: str) -> None:
+        self.publisher.heartbeat(controller_status(drives_with))
         self.work()
 
-    def offer(self, version: str, answer: Reply | None = None) -> None:
-        self.desk.offer(self.learn(version, answer))
-        self.work()
+    def start_controller(self, drives_with: str = "") -> None:
+        self.publisher.present = False
+        self.heartbeat(drives_with)
 
-    def verdict(self, version: str) -> str:
+    def roll_back(self, version: str) -> None:
+        data: dict[str, Scalar] = {"from_version": version}
+        self.publisher.event(Event(0, 0, 1, "controller", "weights_rolled_back", "because", data))
+
+    def update(self, version: str) -> UpdateRecord:
         update = self.journal.update_of(version)
         assert update is not None
-        return update.verdict
+        return update
 
-    def event(self, kind: str, **data: Scalar) -> None:
-        self.desk.event(Event(0, 0, 1, "controller", kind, "because", data))
+    def verdict(self, version: str) -> str:
+        return self.update(version).verdict
 
 
 @pytest.fixture
-def office(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Office:
-    return Office(tmp_path / "job", monkeypatch)
+def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Desk]:
+    with closing(Journal(tmp_path / "job", SETTINGS)) as journal:
+        yield Desk(journal, monkeypatch)
 
 
 def yes(version: str, number: int = 1) -> Reply:
@@ -119,214 +99,149 @@ def yes(version: str, number: int = 1) -> Reply:
     return Reply(0, 0, True, "taken", data)
 
 
-def test_what_is_accepted_is_noted_with_its_cycle(office: Office) -> None:
-    office.come()
-    office.offer("a", yes("a"))
-    update = office.journal.update_of("a")
-    assert update is not None
+def test_accepted_weights_are_noted_with_their_cycle(desk: Desk) -> None:
+    desk.start_controller()
+    desk.learn("a", yes("a"))
+    update = desk.update("a")
     assert (update.verdict, update.cycle, update.acceptance) == ("accepted", 41, 1)
-    assert office.journal.last_accepted() == update
+    assert desk.said == ["a: taken over at cycle 41 (acceptance 1)"]
 
 
-def test_what_is_refused_is_said_and_not_sent_again(office: Office) -> None:
-    office.come()
-    office.offer("bad", Reply(0, 0, False, "worse than those in use", {}))
-    assert office.verdict("bad") == "refused"
-    assert any("worse than those in use" in line for line in office.heard.said)
-    office.offer("bad")
-    assert office.sent == ["bad"]
-    assert office.verdict("bad") == "not sent"
+def test_declined_weights_are_reported_and_not_sent_again(desk: Desk) -> None:
+    desk.start_controller()
+    desk.learn("bad", Reply(0, 0, False, "worse than those in use", {}))
+    desk.learn("back", yes("back"))
+    desk.roll_back("back")
+    assert (desk.verdict("bad"), desk.verdict("back")) == ("refused", "rolled back")
+    assert "bad: refused: worse than those in use" in desk.said
+    assert "rolled back: back (learned after lap 1): because" in desk.said
+    for version in ("bad", "back"):
+        desk.learn(version, yes(version))
+        assert desk.verdict(version) == "not sent"
+    assert desk.sent == ["bad", "back"]
+    assert desk.journal.last_accepted is None
 
 
-def test_what_is_rolled_back_is_said_and_not_sent_again(office: Office) -> None:
-    office.come()
-    office.offer("a", yes("a"))
-    office.offer("b", yes("b", 2))
-    office.event("weights_rolled_back", version="a", from_version="b", by="watch")
-    assert (office.verdict("a"), office.verdict("b")) == ("accepted", "rolled back")
-    assert any(line.startswith("rolled back: b") for line in office.heard.said)
-    office.offer("b", yes("b", 3))
-    assert office.sent == ["a", "b"]
-    accepted = office.journal.last_accepted()
-    assert accepted is not None
-    assert accepted.version == "a"
+def test_an_answer_after_the_rollback_changes_nothing(desk: Desk) -> None:
+    desk.start_controller()
+    desk.answers["a"] = yes("a")
+    desk.offer("a")
+    desk.roll_back("a")
+    desk.work()
+    assert desk.verdict("a") == "rolled back"
 
 
-def test_what_nobody_answers_for_waits_for_a_controller(office: Office) -> None:
-    office.offer("a", yes("a"))
-    assert (office.sent, office.verdict("a")) == ([], "waiting")
-    office.come()
-    assert (office.sent, office.verdict("a")) == (["a"], "accepted")
-    office.offer("b")
-    assert office.verdict("b") == "waiting"
-    office.answers["b"] = yes("b", 2)
-    office.desk.presence(there=False)
-    office.come("a")
-    assert office.verdict("b") == "accepted"
-
-
-def test_a_controller_that_lost_its_weights_gets_them_again(office: Office) -> None:
-    office.come("old")
-    office.offer("a", yes("a"))
-    office.desk.presence(there=False)
-    office.come("a")  # it has kept them
-    assert office.sent == ["a"]
-    office.desk.presence(there=False)
-    office.come("old")
-    assert office.sent == ["a", "a"]
-
-
-def test_weights_of_somebody_else_are_left_alone(office: Office) -> None:
-    office.come("old")
-    office.offer("a", yes("a"))
-    office.event("weights_accepted", version="theirs")
-    office.desk.presence(there=False)
-    office.come("old")
-    assert office.sent == ["a"]
-
-
-def test_not_now_is_no_refusal(office: Office) -> None:
-    """It waits for a controller that takes it, which learning goes on from meanwhile."""
-    office.come()
-    office.offer("a", Reply(0, 0, False, "the controller ends", {"again": True}))
-    update = office.journal.update_of("a")
-    assert update is not None
-    assert update.verdict == "waiting"
-    assert update.answer == "refused for now, try again: the controller ends"
-    assert any("the controller ends" in line for line in office.heard.said)
-    office.desk.presence(there=False)
-    office.answers["a"] = yes("a")
-    office.come()
-    assert (office.sent, office.verdict("a")) == (["a", "a"], "accepted")
-
-
-def test_not_now_to_what_was_in_use_before_is_no_refusal_either(office: Office) -> None:
-    """The newest weights are given to the next controller, too."""
-    office.come("old")
-    office.offer("a", yes("a"))
-    for answer in (Reply(0, 0, False, "the controller ends", {"again": True}), yes("a")):
-        office.answers["a"] = answer
-        office.desk.presence(there=False)
-        office.come("old")
-    assert (office.sent, office.verdict("a")) == (["a"] * 3, "accepted")
-
-
-def test_an_acceptance_without_an_answer_is_noted(office: Office) -> None:
-    """The answer was lost, came too late, or newer weights were quicker than it: they drive."""
-    office.come()
-    office.offer("a")
-    assert office.verdict("a") == "waiting"
-    office.event("weights_accepted", version="a", cycle=7, number=3)
-    update = office.journal.update_of("a")
-    assert update is not None
-    assert (update.verdict, update.cycle, update.acceptance) == ("accepted", 7, 3)
-    office.offer("b")
-    office.offer("c")
-    assert office.verdict("b") == "no answer"
-    office.event("weights_accepted", version="b", cycle=8, number=4)
-    assert office.verdict("b") == "accepted"
-    assert office.desk.in_use == "b"
-
-
-def test_an_acceptance_that_is_known_already_is_said_once(office: Office) -> None:
-    """The event may come before the answer; what is in use waits for nobody."""
-    office.come()
-    office.desk.offer(office.learn("a", yes("a")))
-    office.event("weights_accepted", version="a", cycle=41, number=1)
-    office.work()
-    office.desk.offer(office.learn("b"))
-    office.event("weights_accepted", version="b", cycle=42, number=2)
-    office.work()
-    assert [office.verdict(version) for version in "ab"] == ["accepted"] * 2
-    for version, cycle in (("a", 41), ("b", 42)):
-        words = f"{version}: taken over at cycle {cycle}"
-        assert len([line for line in office.heard.said if line.startswith(words)]) == 1
-
-
-def test_what_nobody_answered_for_waits_no_longer_than_for_newer_weights(office: Office) -> None:
-    office.come()
-    office.offer("a")
-    assert office.verdict("a") == "waiting"
-    office.offer("b", yes("b"))
-    assert (office.verdict("a"), office.verdict("b")) == ("no answer", "accepted")
-    update = office.journal.update_of("a")
-    assert update is not None
-    assert update.answer == "nobody answers"
-
-
-def test_what_the_training_processes_say_does_not_grow(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("answer", [None, NOT_NOW], ids=["no answer", "refused for now"])
+def test_weights_without_an_answer_are_sent_to_the_next_controller(
+    desk: Desk, answer: Reply | None
 ) -> None:
-    """Neither from job to job nor from task to task."""
-    output = tmp_path / "worker.log"
-    output.write_text("of the job before")
-    trainer = Trainer(output, lambda _: None)
-    monkeypatch.setattr(Trainer, "prepare", lambda _: None)
-    assert output.read_text() == ""
-    monkeypatch.setattr(trainer_module, "_MOST_OUTPUT", 10)
-    task = Task(
-        number=1, car=CAR.name, discretisation=PREDICTION, keep=60, weights=output, kept=output
-    )
-    for words, left in (("few words", "few words"), (", and more", "")):
-        with output.open("a") as file:
-            file.write(words)
-        trainer.start(task)
-        assert output.read_text() == left
+    desk.learn("a", yes("a"))
+    assert (desk.sent, desk.verdict("a")) == ([], "pending")
+    desk.start_controller()
+    assert (desk.sent, desk.verdict("a")) == (["a"], "accepted")
+    desk.learn("b", answer)
+    assert desk.verdict("b") == "pending"
+    assert desk.update("b").answer == desk.said[-1].removeprefix("b: ") != ""
+    desk.answers["b"] = yes("b", 2)
+    desk.start_controller("a")
+    assert (desk.sent, desk.verdict("b")) == (["a", "b", "b"], "accepted")
 
 
-class Workshop:
-    """A trainer and what it tells."""
+def test_newer_weights_supersede_pending_ones(desk: Desk) -> None:
+    desk.start_controller()
+    desk.learn("a")
+    desk.learn("b", yes("b"))
+    assert (desk.verdict("a"), desk.verdict("b")) == ("superseded", "accepted")
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.told: queue.Queue[Outcome] = queue.Queue()
-        self.trainer = Trainer(folder / "worker.log", self.told.put)
-        write_npz(folder / "new.npz", drive(dynamic(CAR), 120, seed=1))
 
-    def start(self, number: int, **changes: Any) -> None:
-        task = Task(
-            number=number, car=CAR.name, discretisation=PREDICTION,
-            new=(self.folder / "new.npz",), training=QUICK, keep=60,
-            weights=self.folder / "w.bin", kept=self.folder / "kept.npz",
-        )  # fmt: skip
-        self.trainer.start(task.model_copy(update=changes))
+def test_weights_in_use_without_an_answer_are_accepted(desk: Desk) -> None:
+    """The answer was lost, or they were given to the controller at its start."""
+    desk.start_controller("old")
+    desk.learn("a")
+    desk.heartbeat("a")
+    assert desk.verdict("a") == "accepted"
+    desk.learn("a")
+    assert (desk.sent, desk.update("a").answer) == (["a"], "in use already")
 
-    def outcome(self) -> Outcome:
-        return self.told.get(timeout=PATIENCE_S)
 
-    def pid(self) -> int:
-        process = self.trainer._process
-        assert process is not None
-        return process.pid
+def test_a_controller_without_the_last_accepted_weights_gets_them(desk: Desk) -> None:
+    """As often as it takes; those refused on the way are not the last accepted."""
+    desk.start_controller("old")
+    desk.learn("a", yes("a"))
+    desk.learn("bad", Reply(0, 0, False, "worse", {}))
+    desk.start_controller("a")  # it has kept them
+    assert desk.sent == ["a", "bad"]
+    desk.answers["a"] = NOT_NOW
+    desk.start_controller("old")
+    desk.answers["a"] = yes("a", 2)
+    desk.start_controller("")
+    assert desk.sent == ["a", "bad", "a", "a"]
+    assert (desk.verdict("a"), desk.update("a").acceptance) == ("accepted", 2)
+    assert "the controller drives with no weights; sending a" in desk.said
+    desk.answers["a"] = Reply(0, 0, False, "older than those in use", {})
+    desk.start_controller("theirs")
+    assert desk.verdict("a") == "refused"
+
+
+# Training ------------------------------------------------------------------------------------
+
+
+def outcome_of(trainer: Trainer) -> Outcome:
+    found: list[Outcome] = []
+
+    def poll() -> bool:
+        found.extend(filter(None, [trainer.poll()]))
+        return bool(found)
+
+    until(poll, "an outcome")
+    assert not trainer.busy
+    return found[0]
 
 
 @pytest.mark.check
 def test_training_is_a_niced_process_that_may_die(tmp_path: Path) -> None:
-    workshop = Workshop(tmp_path)
+    log = tmp_path / "worker.log"
+    log.write_text("of the job before")
+    trainer = Trainer(tmp_path)
+    assert log.read_text() == ""
+
+    def start(initial: Path | None = None, training: TrainingSettings = QUICK) -> int:
+        task = Task(PREDICTION, [drive(dynamic(CAR), 120, seed=1)], initial, training, 60)
+        trainer.start(task)
+        return trainer.prepare().pid
+
     try:
-        workshop.start(1)
-        first = workshop.outcome()
-        assert (first.number, first.error, first.kept) == (1, "", 60)
-        assert not workshop.trainer.busy
-        assert os.getpriority(os.PRIO_PROCESS, workshop.pid()) == NICE
-        workshop.start(2, new=(tmp_path / "gone.npz",))
-        assert "gone.npz" in workshop.outcome().error
-        os.kill(workshop.pid(), signal.SIGSTOP)  # else it might be done before it is killed
-        workshop.start(3)
-        os.kill(workshop.pid(), signal.SIGKILL)
-        assert workshop.outcome() == Outcome(number=3, error="the training was killed by signal 9")
-        workshop.start(4)
-        assert workshop.outcome().version == first.version, "the same samples, the same weights"
+        pid = start()
+        first = outcome_of(trainer)
+        assert first.kept is not None
+        assert (first.error, first.samples, len(first.kept)) == ("", 120, 60)
+        assert os.getpriority(os.PRIO_PROCESS, pid) == NICE
+        assert start(initial=tmp_path / "gone.bin") == pid
+        assert "gone.bin" in outcome_of(trainer).error
+        os.kill(pid, signal.SIGSTOP)  # else it might be done before it is killed
+        start()
+        os.kill(pid, signal.SIGKILL)
+        died = outcome_of(trainer)
+        assert (died.error, died.kept) == ("the training was killed by signal 9", None)
+        start()
+        again = outcome_of(trainer)
+        assert first.weights is not None
+        assert again.weights is not None
+        assert again.weights.version == first.weights.version, "the same samples and weights"
     finally:
-        workshop.trainer.stop()
+        trainer.stop()
+    assert [path.name for path in tmp_path.iterdir()] == ["worker.log"]
 
 
-def test_picture_and_table_show_every_kind_of_lap(tmp_path: Path) -> None:
+# Figure and table ----------------------------------------------------------------------------
+
+
+def test_figure_and_table_show_every_kind_of_lap(tmp_path: Path) -> None:
     laps = [lap(1, 8.0, flying=False), lap(2, 7.5), lap(3, None), lap(4, 7.4, off_m=0.01)]
     laps.append(lap(5, 160.0))
     updates = [
         UpdateRecord(after_lap=k, version=f"v{k}", verdict=verdict, samples=10)
-        for k, verdict in enumerate(("accepted", "refused", "rolled back", "failed", "waiting"))
+        for k, verdict in enumerate(("accepted", "refused", "rolled back", "failed", "pending"))
     ]
     record = Record(laps=laps, updates=updates, remarks=["the car stood"])
     draw(record, {"bestcase": 7.39}, tmp_path / "laps.png")
@@ -341,13 +256,10 @@ def test_picture_and_table_show_every_kind_of_lap(tmp_path: Path) -> None:
     for words in ("8.000*", "7.400!", "refused", "rolled back", "v3"):
         assert words in text
     assert "nothing to learn from: the car stood" in text
-    assert "waiting: no controller has answered" in text
-    print_laps(Record(laps=[replace_number(laps[1], k) for k in range(1, 100)]), console)
+    assert "pending: no controller has" in text
+    many: list[LapRecord] = [laps[1].model_copy(update={"lap": k}) for k in range(1, 100)]
+    print_laps(Record(laps=many), console)
     assert "the last 40 of 99 laps" in console.export_text()
-
-
-def replace_number(one: LapRecord, number: int) -> LapRecord:
-    return one.model_copy(update={"lap": number})
 
 
 def test_what_to_compare_with_must_be_a_race(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Laps and samples as the learning job makes them of messages: the same as from the log."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -9,10 +10,15 @@ from bayesrace.messages import Actuation, State
 from bayesrace.tracks import Track
 from bayesrace.vehicles.models import dynamic
 from experiments.learn import collector
-from experiments.learn.collector import Collector, Driven
+from experiments.learn.collector import Collector, Stretch
 from learning.dataset import Dataset
 from learning.logs import dataset_from_messages
 from tests.driven import CAR, STEP_S, drive, logged, telemetry
+
+
+@pytest.fixture(autouse=True)
+def _at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(collector, "_DELAY_S", 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +30,7 @@ def states() -> list[State]:
 
 def fed(
     states: list[State], fallbacks: tuple[int, ...] = (), track: Track | None = None
-) -> tuple[list[Driven], list[Driven]]:
+) -> tuple[list[Stretch], list[Stretch]]:
     """What is given out as it arrives, and at the end."""
     made, taken = Collector(CAR, STEP_S, track), []
     for one in states:
@@ -34,10 +40,10 @@ def fed(
         )
         made.telemetry(telemetry(one.run, one.seq, int(one.seq in fallbacks)))
         taken += made.take()
-    return taken, made.end()
+    return taken, made.take(at_once=True)
 
 
-def samples(driven: list[Driven]) -> Dataset:
+def samples(driven: list[Stretch]) -> Dataset:
     sets = [one.samples for one in driven if one.samples is not None]
     rows = [np.hstack((one.x, one.u, one.x_next)) for one in sets]
     every = np.vstack(rows)
@@ -66,8 +72,8 @@ def test_laps_are_timed_from_crossing_to_crossing(states: list[State]) -> None:
     assert laps[0].time_s == pytest.approx(61 * STEP_S)
     assert laps[1].time_s == pytest.approx(100 * STEP_S)
     assert (laps[0].fallbacks, laps[1].fallbacks) == (2, 2)
-    assert laps[0].versions == ("v0",)
-    assert laps[1].versions == ("v0", "v1")
+    assert laps[0].versions == ["v0"]
+    assert laps[1].versions == ["v0", "v1"]
 
 
 def test_with_the_track_crossings_are_interpolated() -> None:
@@ -110,23 +116,40 @@ def test_another_plant_with_the_same_run_is_another_run(states: list[State]) -> 
     assert len(samples(taken + rest)) == 99 + 49
 
 
-def test_a_lap_waits_for_its_telemetry_but_not_for_ever(
+def test_a_lap_is_given_out_after_the_telemetry_of_its_last_cycle(
     states: list[State], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(collector, "_PATIENCE_S", 1e9)
+    monkeypatch.setattr(collector, "_DELAY_S", 1e9)
     made = Collector(CAR, STEP_S)
     for one in states[:70]:
         made.state(one)
-    assert made.take() == []
-    made.telemetry(telemetry(7, 59, 1))
     assert made.take() == []
     made.telemetry(telemetry(7, 60, 1))
-    assert len(made.take()) == 1
-    made = Collector(CAR, STEP_S)
-    for one in states[:70]:
-        made.state(one)
-    monkeypatch.setattr(collector, "_PATIENCE_S", 0.0)
-    assert len(made.take()) == 1
+    monkeypatch.setattr(collector, "_DELAY_S", 0.0)
+    (stretch,) = made.take()
+    assert stretch.lap is not None
+    assert stretch.lap.fallbacks == 1
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda one: replace(one, x=(*one.x[:3], 0.0, *one.x[4:])), "bayesrace status"),
+        (lambda one: replace(one, x=(*one.x[:6], 0.5)), "--car"),
+        (lambda one: replace(one, u_applied=(0.1, 0.0)), "the FMU's map"),
+        (lambda one: replace(one, seq=2 * one.seq), "lose messages"),
+        (lambda one: one, ""),
+    ],
+    ids=["standstill", "another car", "steering", "gaps", "good"],
+)
+def test_each_cause_of_nothing_to_learn_from_has_its_remedy(
+    states: list[State], spoil: Callable[[State], State], words: str
+) -> None:
+    _, (stretch,) = fed([spoil(one) for one in states[:60]])
+    assert words in stretch.why_not
+    assert bool(words) == bool(stretch.why_not)
+    _, (stretch,) = fed(states[:60], tuple(range(60)))
+    assert "the fallback drove" in stretch.why_not
 
 
 def test_memory_does_not_follow_a_car_that_stands(

@@ -27,7 +27,7 @@ from bayesrace.messages import (
     encode,
     json_schema,
 )
-from bayesrace.messages.codec import LARGEST_BYTES, largest_bytes, peek_seq
+from bayesrace.messages.codec import largest_bytes, peek_seq
 from bayesrace.messages.rules import (
     Choice,
     Flag,
@@ -143,7 +143,7 @@ def test_the_largest_message_passes_and_what_is_larger_is_not_read(kind: type[Me
     message = kind(*map(largest, rules_of(kind).values()))
     data = encode(message)
     assert decode(kind, data) == message
-    assert len(data) <= largest_bytes(kind) <= LARGEST_BYTES
+    assert len(data) <= largest_bytes(kind) <= 1 << 17
     junk = bytes(largest_bytes(kind) + 1)
     with pytest.raises(InputError, match=f"{len(junk)} bytes, at most {len(junk) - 1} allowed"):
         decode(kind, junk)
@@ -161,19 +161,19 @@ def _changed(**changes: Any) -> bytes:
     [
         ({"x": [math.nan] * 7}, "State.x"),
         ({"x": [math.inf] + [0.0] * 6}, "State.x"),
-        ({"x": [0.0] * 6}, "State.x: expected 7 numbers, got 6"),
+        ({"x": [0.0] * 6}, "State.x: 6 numbers are not 7"),
         ({"x": [0] * 7}, "State.x"),
-        ({"x": "1234567"}, "State.x: expected an array"),
+        ({"x": "1234567"}, "State.x: '1234567' is not an array"),
         ({"seq": -1}, "State.seq"),
-        ({"seq": True}, "State.seq: expected an integer, got bool"),
+        ({"seq": True}, "State.seq: True is not an integer"),
         ({"seq": 2**63}, "State.seq"),
-        ({"time_s": 1}, "State.time_s: expected a float"),
+        ({"time_s": 1}, "State.time_s: 1 is not a float"),
         ({"time_s": math.nan}, "State.time_s"),
         ({"lockstep": 1}, "State.lockstep"),
         ({"schema": 2}, "schema version 2, this program reads 1"),
         ({"schema": 1.0}, "schema version"),
-        ({"extra": 1}, "missing or unknown: 'extra'"),
-        ({"lap": ...}, "missing or unknown: 'lap'"),
+        ({"extra": 1}, "missing or unknown fields: 'extra'"),
+        ({"lap": ...}, "missing or unknown fields: 'lap'"),
     ],
 )
 def test_a_refusal_names_the_field_and_the_fault(changes: dict[str, Any], names: str) -> None:
@@ -207,15 +207,15 @@ def test_the_decoder_counts_drops_and_logs_at_a_limited_rate(
 @pytest.mark.parametrize(
     ("entries", "fault"),
     [
-        ({"a": math.nan}, "'a' is not a finite number"),
-        ({"a\x1b[2J": -math.inf}, r"'a\\x1b\[2J' is not a finite"),
-        ({"a": 2**64 - 1}, "'a' is an integer beyond"),
-        ({"a": {"b": 1}}, "'a' is neither"),
+        ({"a": math.nan}, "'a' is not a flag, .* a float within"),
+        ({"a\x1b[2J": -math.inf}, r"'a\\x1b\[2J' is not a flag"),
+        ({"a": 2**64 - 1}, "'a' is not a flag, an integer of 64 bits"),
+        ({"a": {"b": 1}}, "'a' is not a flag, .* text"),
         ({"a": [1]}, "max_array_len"),
-        ({"a": "x" * 2001}, "'a' is neither"),
+        ({"a": "x" * 2001}, "'a' is not a flag, .* text"),
         ({"x" * 101: 1}, "at most 100 characters"),
         ({f"n{i}": "x" * 2000 for i in range(11)}, "22023 characters, at most 20000"),
-        ({f"n{i}": 1 for i in range(201)}, "201 entries|max_map_len"),
+        ({f"n{i}": 1 for i in range(201)}, "at most 200 entries|max_map_len"),
     ],
 )
 def test_a_map_holds_few_finite_scalars(entries: dict[str, Any], fault: str) -> None:

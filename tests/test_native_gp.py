@@ -8,12 +8,10 @@ import casadi as ca
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
 
 from bayesrace.errors import InputError
 from bayesrace.gp.corrected import corrected_function
-from bayesrace.gp.weights import KERNELS, GpOutput, GpWeights, zero_weights
+from bayesrace.gp.weights import KERNELS, GpWeights, zero_weights
 from bayesrace.integrators import PERFECT, PREDICTION
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic, e_kinematic
@@ -21,10 +19,10 @@ from controller.native_library import Gp
 from controller.native_step import NativeStep
 from controller.settings import MpcSettings
 from tests.conftest import LENGTH_SCALES, fit_weights, smooth_drive
+from tests.scikit import scikit_gp
 
 Floats = NDArray[np.float64]
 
-NU = {"matern05": 0.5, "matern15": 1.5, "matern25": 2.5}
 NOMINAL = np.array([0.3, -0.2, 0.5, 1.8, 0.05, 0.8, 0.08, 0.5, 0.5])
 
 
@@ -135,11 +133,12 @@ def test_the_compiled_mean_equals_scikit_learn(
     kinematic_artefact: Path, car: CarParameters, weights: GpWeights, kind: str
 ) -> None:
     source = weights.outputs[2]
-    base = RBF(LENGTH_SCALES) if kind == "rbf" else Matern(LENGTH_SCALES, nu=NU[kind])
-    covariance = ConstantKernel(1.5) * base + WhiteKernel(0.05)
+    theta = np.log([1.5, *LENGTH_SCALES, 0.05])
     y = np.sin(source.inputs[:, 0]) + source.inputs[:, 3] * source.inputs[:, 4]
-    gp = GaussianProcessRegressor(covariance, alpha=0.0, optimizer=None).fit(source.inputs, y)
-    learned = GpOutput(kind, LENGTH_SCALES, 1.5, 0.05, source.inputs, gp.alpha_, 0.1, 0.7)
+    gp = scikit_gp(kind, theta, source.inputs, y)
+    learned = replace(
+        source, kernel=kind, signal_variance=1.5, alpha=gp.alpha_, y_mean=0.1, y_scale=0.7
+    )
     step = loaded(kinematic_artefact, car, replace(weights, outputs=(learned, learned, learned)))
     plain = loaded(kinematic_artefact, car)
     for v in points(car, 20):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from bayesrace.errors import InputError
-from bayesrace.gp.expression import numeric_mean
+from bayesrace.gp.expression import mean_function
 from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import PERFECT, PREDICTION, Discretisation
 from bayesrace.vehicles import CarParameters
@@ -133,7 +133,7 @@ def test_part_of_a_stage_takes_its_share_of_the_residual(
     corrected: NativeStep, car: CarParameters, weights: GpWeights
 ) -> None:
     """Against the CasADi expressions of the model and of the posterior mean."""
-    over, mean = PREDICTION.over(e_kinematic(car)), numeric_mean(weights)
+    over, mean = PREDICTION.over(e_kinematic(car)), mean_function(weights)
     for x, u in drives(car)[::3]:
         e = np.asarray(mean(np.r_[x[3:], u])).ravel()
         for theta in (1e-6, 0.1, 0.5, 0.99):

@@ -15,7 +15,7 @@ from tests.test_native_time import TS, Clock, Make, make, residual, solve
 
 __all__ = ["make"]  # the fixture
 
-DEFAULTS = {name: getattr(MpcSettings(), name) for name in ("settle", "iterations")}
+DEFAULTS = {name: getattr(MpcSettings(), name) for name in ("early_stop_tol", "iterations")}
 
 
 def result(step: NativeStep) -> bytes:

@@ -126,13 +126,13 @@ def test_settle_ends_the_iterations_early(
     kinematic_artefact: Path, car: CarParameters, weights: GpWeights, recorded: list[Problem]
 ) -> None:
     used = []
-    for settle in (0.0, 1e-5, 1e6):
-        changes = {"settle": settle, "iterations_cold": 12, "tolerance": 1e-14}
+    for early_stop_tol in (0.0, 1e-5, 1e6):
+        changes = {"early_stop_tol": early_stop_tol, "iterations_cold": 12, "tolerance": 1e-14}
         step = NativeStep(kinematic_artefact, car, SETTINGS.model_copy(update=changes))
         step.set_weights(weights)
         p = recorded[100]
         assert step.solve(p.x0, p.d_previous, p.reference).usable
         used.append(step.info.iterations)
-        if 0 < settle < 1:
-            assert max(step.info.stationarity, 0.1 * step.info.defect) <= settle
+        if 0 < early_stop_tol < 1:
+            assert max(step.info.stationarity, 0.1 * step.info.defect) <= early_stop_tol
     assert used[2] == 1 < used[1] <= used[0]

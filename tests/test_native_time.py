@@ -160,7 +160,7 @@ def test_a_car_that_was_out_of_sight_is_found_on_the_line(
 def test_with_a_budget_the_step_iterates_until_it_settles(
     make: Make, recorded: list[Problem]
 ) -> None:
-    step, settled = make(settle=1e-7, tolerance=1e-12), 0
+    step, settled = make(early_stop_tol=1e-7, tolerance=1e-12), 0
     Clock(step, 1e-6)
     for p in recorded[:60]:
         assert solve(step, p, budget_s=1.0).usable
@@ -176,7 +176,7 @@ def test_the_step_ends_within_its_budget(make: Make, recorded: list[Problem], wa
     after the last check: here they alone take time."""
     iterations, limited = set(), 0
     for readings in (2, 6, 8, 10, 13, 20, 30):
-        step = make(settle=1e-12, tolerance=1e-12)
+        step = make(early_stop_tol=1e-12, tolerance=1e-12)
         clock = Clock(step, 1e-3)
         for p in recorded[100:200:3]:
             if not warm:
@@ -222,7 +222,7 @@ def test_the_first_iteration_is_always_done(make: Make, recorded: list[Problem])
 def test_no_budget_means_the_iteration_limits(
     make: Make, recorded: list[Problem], budget_s: float
 ) -> None:
-    step, plain = make(iterations=3, settle=1e-4), make(iterations=3, settle=1e-4)
+    step, plain = make(iterations=3, early_stop_tol=1e-4), make(iterations=3, early_stop_tol=1e-4)
     Clock(step, 1e3)
     for p in recorded[:30]:
         assert solve(step, p, budget_s=budget_s) is solve(plain, p)
@@ -299,7 +299,7 @@ def test_more_iterations_do_not_take_back_a_usable_plan(
 
 def test_the_systems_clock_runs(make: Make, recorded: list[Problem]) -> None:
     """NativeStep sets it: an hour limits nothing, a nanosecond everything."""
-    step = make(settle=1e-9)
+    step = make(early_stop_tol=1e-9)
     solve(step, recorded[0])
     assert solve(step, recorded[1], budget_s=3600.0).usable
     assert step.info.time_limited == 0

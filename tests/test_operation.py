@@ -1,4 +1,4 @@
-"""Looking after running cars: who is found, what is shown, who obeys, and who forwards."""
+"""Operating running cars: finding them, their status, stop and go, and the router."""
 
 import json
 import os
@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -36,17 +35,19 @@ from bayesrace.transport import (
     Item,
     Kind,
     Publisher,
+    decode_request,
     free_endpoint,
     open_session,
 )
 from bayesrace.transport.session import Role
 from experiments.drive import RunPlan, run_request
-from experiments.operation import ask_statuses, command, find, pick
+from experiments.operation import ask_statuses, command, find, follow, pick
 from experiments.picture import Picture, Process
 from experiments.status_table import COUNTERS_SHOWN, StatusTable
 from tests.command_line import Cli, refused
 from tests.conftest import Circuit
 from tests.programs import ROOT, environment, finish, run, start, until
+from tests.test_transport import take
 
 pytestmark = pytest.mark.wall_clock
 
@@ -67,7 +68,7 @@ class Fake:
     source: str
     endpoints: Endpoints
     mute: bool = False
-    """It is there and does not answer."""
+    """It is present and does not answer."""
     refuses: str = ""
     beats: bool = True
     text: str = "all is well"
@@ -101,7 +102,7 @@ class Fake:
         if item.value.service is STATUS:
             item.value.answer(self.status(0))
             return
-        self.heard.append(item.value.message())
+        self.heard.append(decode_request(item.value)[0])
         text = self.refuses or f"{self.heard[-1].command}: as you say"
         item.value.answer(Reply(0, 0, not self.refuses, text, {}))
 
@@ -111,7 +112,7 @@ Fakes = Callable[..., Fake]
 
 @pytest.fixture
 def fakes() -> Iterator[Fakes]:
-    """Starts fakes, each listening on an endpoint of its own unless told otherwise."""
+    """Starts fakes, each listening on an endpoint of its own by default."""
     over = threading.Event()
     threads = []
 
@@ -171,13 +172,13 @@ def test_every_car_is_found_and_json_has_the_documented_form(fakes: Fakes) -> No
 
 
 def test_a_named_car_is_found_without_waiting_for_the_absent(fakes: Fakes) -> None:
-    """An endpoint where nobody listens costs no time if what was asked for is there."""
+    """An endpoint without a listener costs no time if the named car is found."""
     one, two = fakes("a", "plant"), fakes("a", "controller")
     endpoints = Endpoints(connect=(free_endpoint(), *where(one, two).connect))
     assert set(picture_of(endpoints, "a", patience_s=600.0).cars) == {"a"}
 
 
-def test_who_is_there_but_hangs_is_shown_as_such(fakes: Fakes) -> None:
+def test_a_present_process_that_hangs_is_shown_as_such(fakes: Fakes) -> None:
     one, two = fakes("a", "plant", mute=True), fakes("a", "controller")
     picture = picture_of(where(one, two))
     content = picture.as_json()["cars"]["a"]
@@ -193,19 +194,19 @@ def test_two_processes_under_one_name_are_noticed(fakes: Fakes) -> None:
     ones = fakes("a", "controller"), fakes("a", "controller")
     picture = picture_of(where(*ones))
     assert picture.as_json()["cars"]["a"]["controller"]["processes"] == 2
-    assert "2 processes answer to this name" in rendered(picture)
+    assert "2 processes answer under this name" in rendered(picture)
 
 
 def test_absence_is_an_error_that_says_what_to_do(fakes: Fakes) -> None:
     nowhere = Endpoints(connect=(free_endpoint(),))
-    with pytest.raises(InputError, match=f"nobody answers at {nowhere.connect[0]} .*--endpoint"):
+    with pytest.raises(InputError, match=f"no connection to {nowhere.connect[0]} .*--endpoint"):
         picture_of(nowhere, patience_s=0.3)
     one, two = fakes("a", "plant"), fakes("b", "plant")
-    with pytest.raises(InputError, match=r"no car 'c' at .*; there are: a, b"):
+    with pytest.raises(InputError, match=r"no car 'c' at .*; cars found: a, b"):
         picture_of(where(one, two), "c", patience_s=1.0)
 
 
-def test_the_table_shows_what_an_operator_looks_for(fakes: Fakes) -> None:
+def test_the_table_shows_phase_rate_misses_and_counters(fakes: Fakes) -> None:
     one, two = fakes("a", "plant"), fakes("a", "controller", text="\x1b[2Jgone \x07")
     text = rendered(picture_of(where(one, two)))
     row = next(line for line in text.splitlines() if "controller" in line).split()
@@ -229,10 +230,10 @@ def test_a_heartbeat_that_stops_is_no_answer_any_more() -> None:
     picture = Picture({"a": {"plant": Process(status, "", 1, arrived_s=100.0)}})
     answering = []
     for now_s in (100.5, 102.0):
-        picture.silence(now_s)
+        picture.expire(now_s)
         answering.append(picture.answering)
     assert answering == [True, False]
-    assert picture.as_json()["cars"]["a"]["plant"]["fault"] == "silent"
+    assert picture.as_json()["cars"]["a"]["plant"]["fault"] == "no heartbeat for 1 s"
 
 
 def test_status_on_the_command_line(fakes: Fakes, cli: Cli) -> None:
@@ -244,10 +245,10 @@ def test_status_on_the_command_line(fakes: Fakes, cli: Cli) -> None:
     assert set(content["cars"]["a"]["plant"]) == FIELDS
     one.mute = two.mute = True
     done = cli("status", "--json", "--timeout", "0.5", *options(one, two))
-    refused(done, "none of the processes found answers within 0.5 s")
+    refused(done, "no answer within 0.5 s from the processes found")
     assert json.loads(done.out)["cars"]["a"]["plant"]["answering"] is False
     done = cli("status", "--timeout", "0.3", "--endpoint", free_endpoint())
-    refused(done, "nobody answers at")
+    refused(done, "no connection to")
 
 
 def test_watching_prints_a_line_for_each_heartbeat_until_interrupted(fakes: Fakes) -> None:
@@ -262,7 +263,16 @@ def test_watching_prints_a_line_for_each_heartbeat_until_interrupted(fakes: Fake
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_a_reader_that_leaves_ends_the_watch_without_complaint(fakes: Fakes) -> None:
+def test_messages_on_keys_of_no_car_do_not_end_the_watch(fakes: Fakes) -> None:
+    with open_session(where(fakes("a", "plant"))) as session:
+        updates = follow(session, Picture({}), "", 60.0)
+        assert next(updates) is None
+        for key in ("bayesrace/**", "bayesrace/*/status/*", "bayesrace/a b/status/plant"):
+            session.put(key, b"junk")
+        assert next(updates) == "a"
+
+
+def test_a_closed_pipe_ends_the_watch_without_an_error(fakes: Fakes) -> None:
     one = fakes("a", "plant")
     watching = start("status", "--watch", "--json", *options(one))
     assert watching.stdout is not None
@@ -325,7 +335,7 @@ def test_stop_and_go_reach_the_controller_with_a_reason(fakes: Fakes, cli: Cli) 
     two.mute = True
     refused(
         cli("stop", "--timeout", "0.5", *options(one, two)),
-        "stop of car 'a' no answer within 0.5 s",
+        "stop of car 'a' failed: no answer within 0.5 s",
     )
 
 
@@ -334,7 +344,7 @@ def test_of_several_cars_one_must_be_named(fakes: Fakes) -> None:
     endpoints = where(*ones)
     with open_session(endpoints) as session:
         found = find(session, endpoints, PATIENCE_S)
-        with pytest.raises(InputError, match="several cars are there: a, b; choose one with"):
+        with pytest.raises(InputError, match="several cars found: a, b; choose one with"):
             pick(found, "", everybody=False)
         assert pick(found, "", everybody=True) == ["a", "b"]
         assert pick(find(session, endpoints, PATIENCE_S, "b"), "b", everybody=False) == ["b"]
@@ -358,21 +368,12 @@ def test_all_are_stopped_though_one_hangs_and_one_refuses(fakes: Fakes, cli: Cli
     assert isinstance(answers["c"], Reply)
     assert answers["c"].accepted
     done = cli("stop", "--all", "--timeout", "0.5", *options(*ones))
-    refused(done, "'a' no answer", "'b' refused: no")
+    refused(done, "'a' failed: no answer", "'b' refused: no")
     assert "c: stop: as you say" in done.out
     assert len(ones[2].heard) == 2
 
 
 # router ------------------------------------------------------------------------------------------
-
-
-def take(inbox: Inbox, kind: Kind) -> Item:
-    deadline = time.monotonic() + PATIENCE_S
-    while (left := deadline - time.monotonic()) > 0:
-        item = inbox.get(left)
-        if item is not None and item.kind is kind:
-            return item
-    raise AssertionError(f"no {kind} within {PATIENCE_S} s")
 
 
 @pytest.mark.parametrize("mode", ["peer", "router"])
@@ -433,7 +434,7 @@ def test_the_router_command_forwards_and_ends_on_sigterm(fakes: Fakes) -> None:
 
 
 def test_a_router_that_cannot_listen_says_so(cli: Cli) -> None:
-    refused(cli("router", "--listen", "tcp/localhost"), "lacks a port")
+    refused(cli("router", "--listen", "tcp/localhost"), "is not of the form protocol/address:port")
 
 
 # With the real processes -------------------------------------------------------------------------
@@ -491,7 +492,7 @@ def test_real_processes_that_know_only_the_router_are_watched_stopped_and_restar
             until(lambda: phase("controller") is None, "the controller gone")
             done = run("stop", "--timeout", "0.5", "--endpoint", endpoint)
             assert done.returncode == 2
-            assert "no controller can be reached, only the plant of one" in done.stderr
+            assert "no controller found, only the plant of one" in done.stderr
             started.append(start(*controller, *here))
             until(lambda: phase("controller") == "driving", "another controller driving")
     finally:

@@ -11,7 +11,6 @@ from bayesrace.gp.expression import evaluate_mean
 from bayesrace.gp.weights import GpWeights, write_weights, zero_weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.vehicles.models import dynamic
-from learning.arrays import dataset_from_npz, write_npz
 from learning.dataset import Dataset, concatenate
 from learning.pool import MOST_NEW, bounded, recalled
 from learning.residual import residual
@@ -93,35 +92,22 @@ def test_weights_that_know_nothing_recall_nothing() -> None:
     assert len(recalled(zero_weights(CAR.name, name), CAR)) == 0
 
 
-def _task(folder: Path, **changes: object) -> Task:
-    values: dict[str, object] = {
-        "number": 4, "car": CAR.name, "discretisation": PREDICTION, "training": SMALL,
-        "keep": 150, "weights": folder / "w.bin", "kept": folder / "kept.npz",
-    }  # fmt: skip
-    return Task.model_validate(values | changes)
-
-
 def test_a_task_learns_from_old_and_new(
     tmp_path: Path, driven: Dataset, learned: GpWeights
 ) -> None:
-    write_npz(tmp_path / "old.npz", driven.select(slice(0, 150)))
-    write_npz(tmp_path / "new.npz", driven.select(slice(150, None)))
     write_weights(tmp_path / "first.bin", learned)
-    outcome = perform(
-        _task(
-            tmp_path, old=tmp_path / "old.npz", new=(tmp_path / "new.npz",),
-            initial=tmp_path / "first.bin",
-        )
-    )  # fmt: skip
-    assert (outcome.number, outcome.error) == (4, "")
-    assert (outcome.samples, outcome.kept, outcome.points) == (300, 150, 60)
-    assert set(outcome.metrics) == {"vx", "vy", "omega"}
-    assert len(dataset_from_npz(tmp_path / "kept.npz")) == 150
+    samples = [driven.select(slice(0, 150)), driven.select(slice(150, None))]
+    outcome = perform(Task(PREDICTION, samples, tmp_path / "first.bin", SMALL, keep=150))
+    assert (outcome.error, outcome.samples) == ("", 300)
+    assert outcome.weights is not None
+    assert outcome.weights.counts == (60, 60, 60)
+    assert outcome.kept is not None
+    assert len(outcome.kept) == 150
 
 
-def test_what_cannot_be_learned_from_is_kept_all_the_same(tmp_path: Path, driven: Dataset) -> None:
-    write_npz(tmp_path / "new.npz", driven.select(slice(0, 5)))
-    outcome = perform(_task(tmp_path, new=(tmp_path / "new.npz",)))
+def test_what_cannot_be_learned_from_is_kept_all_the_same(driven: Dataset) -> None:
+    outcome = perform(Task(PREDICTION, [driven.select(slice(0, 5))], None, SMALL, keep=150))
     assert "5 samples" in outcome.error
-    assert not (tmp_path / "w.bin").exists()
-    assert len(dataset_from_npz(tmp_path / "kept.npz")) == 5
+    assert outcome.weights is None
+    assert outcome.kept is not None
+    assert len(outcome.kept) == 5

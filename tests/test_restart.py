@@ -281,7 +281,7 @@ def test_whoever_asks_without_end_does_not_hold_up_the_loop(rig: Rig) -> None:
     rig.drive_on()
     counters = rig.observer.status("controller")["counters"]
     assert 10 <= accepted <= 100
-    assert counters["turned_away"] > 200
+    assert counters["requests_rejected"] > 200
     rig.observer.stop()
     controller.end()
     plant.end()

@@ -10,25 +10,24 @@ from typing import Any
 import numpy as np
 import pytest
 from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+from sklearn.gaussian_process.kernels import ConstantKernel, WhiteKernel
 
 from bayesrace import __version__
 from bayesrace.errors import InputError
 from bayesrace.gp.expression import evaluate_mean
-from bayesrace.gp.weights import OUTPUTS, decode_weights, encode_weights
+from bayesrace.gp.weights import KERNELS, OUTPUTS, decode_weights, encode_weights
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from learning.dataset import Dataset
-from learning.hyperparameters import BOUNDS, Fit, best, maximise, starts
+from learning.hyperparameters import BOUNDS, Fit, maximise, starts
 from learning.likelihood import MarginalLikelihood, PairDistances
-from learning.regression import held_out_errors, judged, regressor, scaling_of
+from learning.posterior import Covariance, Posterior
 from learning.residual import discretisation_of, identity, residual
-from learning.subset import at_random
+from learning.target import Target
 from learning.training import MAX_SAMPLES, Training, TrainingSettings, fit, train
 from learning.validation import predictive_sigma
 from tests.driven import CAR, QUICK, drive
-
-ALL = ("rbf", "matern05", "matern15", "matern25")
+from tests.scikit import correlation
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +38,7 @@ def driven() -> Dataset:
 @pytest.fixture(scope="module")
 def chosen(driven: Dataset) -> Training:
     """Every kernel, a third of the samples."""
-    settings = QUICK.model_copy(update={"kernels": ALL, "capacity": 50})
+    settings = QUICK.model_copy(update={"kernels": KERNELS, "capacity": 50})
     return fit(driven, PREDICTION, settings, compare=True)
 
 
@@ -49,38 +48,32 @@ def chosen(driven: Dataset) -> Training:
 def test_the_optimum_is_scikit_learns() -> None:
     """Same starts, same bounds: the best log marginal likelihoods agree within 1e-3."""
     data = drive(dynamic(CAR), 70, seed=3)
-    z, y = data.features, residual(data, PREDICTION)
-    low, high = np.exp(BOUNDS).T
-    for column in y.T[1:]:
-        scaling = scaling_of(z, column)
-        scaled, target = scaling.features(z), scaling.targets(column)
-        pairs, found = PairDistances(scaled), []
+    bounds, folds = np.exp(BOUNDS), np.zeros(len(data), dtype=np.int64)
+    for column in residual(data, PREDICTION).T[1:]:
+        target = Target.of("vy", data.features, column, folds)
+        pairs, found = PairDistances(target.z), []
         guesses = starts(1, seed=0)
         for guess in guesses:
             theta = np.exp(guess)
-            kernel = ConstantKernel(theta[0], (low[0], high[0])) * RBF(
-                theta[1:-1], np.exp(BOUNDS[1:-1])
-            ) + WhiteKernel(theta[-1], (low[-1], high[-1]))
+            base = correlation("rbf", theta[1:-1], length_scale_bounds=bounds[1:-1])
+            noise = WhiteKernel(theta[-1], tuple(bounds[-1]))
+            kernel = ConstantKernel(theta[0], tuple(bounds[0])) * base + noise
             gp = GaussianProcessRegressor(kernel, alpha=0.0)
             with pytest.warns():  # that noise and some length scales end at their bounds
-                found.append(gp.fit(scaled, target).log_marginal_likelihood_value_)
-        ours = best([maximise("rbf", pairs, target, guess, 300, 1e-9) for guess in guesses])
-        assert ours.log_likelihood == pytest.approx(max(found), abs=1e-3)
+                found.append(gp.fit(target.z, target.y).log_marginal_likelihood_value_)
+        ours = [maximise("rbf", pairs, target.y, guess, 300, 1e-9) for guess in guesses]
+        assert max(fit.log_likelihood for fit in ours) == pytest.approx(max(found), abs=1e-3)
 
 
-def test_shared_distances_change_nothing() -> None:
+def test_shared_distances_and_reused_memory_change_nothing() -> None:
     random = np.random.default_rng(0)
-    z, y = random.normal(size=(30, 6)), random.normal(size=(2, 30))
-    pairs, theta = PairDistances(z), starts(1, 0)[1]
-    for target in y:
-        alone, shared = MarginalLikelihood("rbf", z, target), MarginalLikelihood(
-            "rbf", pairs, target
-        )  # fmt: skip
-        for _ in range(2):  # the second call finds the memory as the first one left it
-            value, gradient = alone(theta)
-            other, other_gradient = shared(theta)
-            assert value == other
-            assert np.array_equal(gradient, other_gradient)
+    pairs, theta = PairDistances(random.normal(size=(30, 6))), starts(1, 0)[1]
+    first, second = (MarginalLikelihood("rbf", pairs, y) for y in random.normal(size=(2, 30)))
+    value, gradient = first(theta)
+    second(theta)
+    again, gradient_again = first(theta)
+    assert value == again
+    assert np.array_equal(gradient, gradient_again)
 
 
 # Choice of kernel and samples --------------------------------------------------------------------
@@ -89,7 +82,7 @@ def test_shared_distances_change_nothing() -> None:
 def test_every_kernel_is_scored_and_the_best_density_is_chosen(chosen: Training) -> None:
     for i, output in enumerate(OUTPUTS):
         own = [score for score in chosen.kernels if score.output == output]
-        assert [score.kernel for score in own] == list(ALL)
+        assert [score.kernel for score in own] == list(KERNELS)
         winner = max(own, key=lambda score: score.log_density)
         assert [score.kernel for score in own if score.chosen] == [winner.kernel]
         assert chosen.weights.kernels[i] == winner.kernel
@@ -97,7 +90,7 @@ def test_every_kernel_is_scored_and_the_best_density_is_chosen(chosen: Training)
         assert winner.rmse < rough.rmse  # smooth dynamics
 
 
-def test_the_cost_of_choosing_is_told(chosen: Training, driven: Dataset) -> None:
+def test_the_cost_of_choosing_is_reported(chosen: Training, driven: Dataset) -> None:
     assert chosen.weights.counts == (50, 50, 50)
     for output in OUTPUTS:
         everything, greedy, random = (s for s in chosen.choices if s.output == output)
@@ -113,45 +106,34 @@ def test_nothing_is_chosen_where_all_fit(driven: Dataset) -> None:
 
 
 def test_prediction_by_stretches_leaves_the_stretch_out(driven: Dataset) -> None:
-    z, y = driven.features, residual(driven, PREDICTION)[:, 1]
-    scaling = scaling_of(z, y)
-    scaled, target = scaling.features(z), scaling.targets(y)
-    theta = np.log([2.0] + [1.5] * 6 + [0.02])
-    rows = np.arange(len(y))
-    folds = 4 * rows // len(y)
-    found = judged("matern25", theta, scaled, target, rows, rows, folds)
-    closed = held_out_errors(regressor("matern25", theta, scaled, target), target, folds)
+    rows = np.arange(len(driven))
+    y = residual(driven, PREDICTION)[:, 1]
+    target = Target.of("vy", driven.features, y, 4 * rows // len(driven))
+    covariance = Covariance("matern25", 2.0, np.full(6, 1.5), 0.02)
+    found = target.errors_from(rows, covariance)
+    closed = Posterior(covariance, target.z, target.y).held_out(target.folds)
     assert found.error == pytest.approx(closed.error, abs=1e-8)
     assert found.sigma == pytest.approx(closed.sigma, abs=1e-8)
-    few, tests = rows[:30], np.array([5, 100])
-    without = judged("matern25", theta, scaled, target, few, tests, folds)
+    without = target.errors_from(rows[:30], covariance)
     # The first stretch, rows 0 to 39, holds all that is known: there is nothing but the prior.
-    assert without.error[0] == target[5]
-    assert without.sigma[0] == pytest.approx(np.sqrt(2.02))
-    assert without.sigma[1] < without.sigma[0]
-
-
-def test_choice_by_chance_is_seeded_and_without_repetition() -> None:
-    rows = at_random(100, 30, seed=4)
-    assert len(set(rows.tolist())) == 30
-    assert list(rows) == sorted(rows)
-    assert np.array_equal(rows, at_random(100, 30, seed=4))
-    assert len(at_random(10, 30, seed=0)) == 10
+    assert without.error[5] == target.y[5]
+    assert without.sigma[5] == pytest.approx(np.sqrt(2.02))
+    assert without.sigma[100] < without.sigma[5]
 
 
 def test_training_that_is_interrupted_begins_nothing_more(
     driven: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    begun, told = [], threading.Event()
+    begun, interruption = [], threading.Event()
 
     def counted(*arguments: Any) -> Fit:
         begun.append(arguments[0])
         if len(begun) > 1:
-            told.wait(60)
+            interruption.wait(60)
         return maximise(*arguments)
 
     def interrupted(share: float, text: str) -> None:
-        told.set()
+        interruption.set()
         raise KeyboardInterrupt
 
     monkeypatch.setattr("learning.training.maximise", counted)
@@ -182,7 +164,7 @@ def test_weights_carry_what_they_were_made_from_and_how_good_they_are(
 
 
 def test_the_metrics_carried_are_those_of_samples_not_learned_from(driven: Dataset) -> None:
-    """The error on the samples themselves is far smaller: nobody may be told that one."""
+    """The error on the samples themselves is far smaller and says little about a drive."""
     weights = train(driven, PREDICTION, QUICK)
     y = residual(driven, PREDICTION)
     own = np.sqrt(np.mean((y - evaluate_mean(weights, driven.features)) ** 2, axis=0))
@@ -191,7 +173,7 @@ def test_the_metrics_carried_are_those_of_samples_not_learned_from(driven: Datas
     assert np.all(predictive_sigma(weights, driven.features) > 0)
 
 
-def test_the_name_does_not_depend_on_who_trained_when(
+def test_the_name_does_not_depend_on_time_and_program(
     driven: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = train(driven, PREDICTION, QUICK)

@@ -75,6 +75,7 @@ def test_the_published_form_needs_car_and_step(tmp_path: Path, driven: Dataset) 
     ("changes", "words"),
     [
         ({"car": None}, "need 'car'"),
+        ({"x": None, "u": None, "x_next": None, "states": np.zeros((6, 4))}, "need 'car'"),
         ({"step_s": None}, "need 'car'"),
         ({"x_next": None}, "need 'car'"),
         ({"inputs": np.zeros((3, 2))}, "need 'car'"),
@@ -159,7 +160,7 @@ def test_damaged_files_are_read_or_refused(
 # Logs --------------------------------------------------------------------------------------------
 
 
-def test_a_log_tells_its_car_and_discretisation(tmp_path: Path, driven: Dataset) -> None:
+def test_a_log_names_its_car_and_discretisation(tmp_path: Path, driven: Dataset) -> None:
     facts = log_facts(write_log(tmp_path / "bare.mcap", driven))
     assert (facts.names, facts.car, facts.discretisation) == (("orca",), None, None)
     given = {"car": "orca", "discretisation": PREDICTION.model_dump()}
@@ -195,7 +196,7 @@ def test_a_step_in_single_precision_is_the_step_that_is_meant(
     assert len(read_samples(paths).dataset) == len(driven) + len(other)
 
 
-def test_a_damaged_file_is_told_as_such(tmp_path: Path) -> None:
+def test_a_damaged_file_is_reported_as_such(tmp_path: Path) -> None:
     """It does not name its car either, but that is not what is wrong with it."""
     (tmp_path / "x.npz").write_bytes(b"PK, and no more")
     with pytest.raises(InputError, match=r"x\.npz: not arrays"):
@@ -224,14 +225,14 @@ def test_the_plans_in_a_log_are_not_kept(tmp_path: Path, driven: Dataset) -> Non
 def test_a_car_under_another_name_is_known_by_its_log(
     tmp_path: Path, driven: Dataset, other: Dataset
 ) -> None:
-    told = write_log(tmp_path / "a.mcap", driven, "red", {"drive": {"car": "orca"}})
-    assert same(read_samples([told]).dataset, driven)
-    silent = write_log(tmp_path / "b.mcap", other, "red")
+    named = write_log(tmp_path / "a.mcap", driven, "red", {"drive": {"car": "orca"}})
+    assert same(read_samples([named]).dataset, driven)
+    unnamed = write_log(tmp_path / "b.mcap", other, "red")
     with pytest.raises(InputError, match="--car"):
-        read_samples([silent])
-    assert same(read_samples([silent], car=CAR).dataset, other)
+        read_samples([unnamed])
+    assert same(read_samples([unnamed], car=CAR).dataset, other)
     with pytest.raises(InputError, match="no states of car 'blue'"):
-        read_samples([told], name="blue")
+        read_samples([named], name="blue")
 
 
 def test_mixed_cars_are_refused(tmp_path: Path, driven: Dataset, other: Dataset) -> None:
@@ -266,7 +267,7 @@ def test_mixed_discretisations_and_steps_are_refused(
     slow = save(tmp_path / "slow.npz", other, step_s=0.05)
     with pytest.raises(InputError, match=r"slow\.npz.*0\.05 s apart"):
         read_samples([logs[0], slow])
-    with pytest.raises(InputError, match=r"0\.01 s apart, but 0\.02 s"):
+    with pytest.raises(InputError, match=r"0\.02 s apart, the model.s step is 0\.01 s"):
         dataset_from_log(logs[0], CAR, 0.01)
 
 

@@ -1,29 +1,5 @@
-"""The GP residual as data (:mod:`.weights`) and as an expression (:mod:`.expression`, CasADi)."""
+"""The Gaussian-process (GP) residual, from the file to the corrected model.
 
-from bayesrace.gp.weights import (
-    FEATURES,
-    KERNELS,
-    OUTPUTS,
-    UNITS,
-    GpOutput,
-    GpWeights,
-    decode_weights,
-    encode_weights,
-    read_weights,
-    write_weights,
-    zero_weights,
-)
-
-__all__ = [
-    "FEATURES",
-    "KERNELS",
-    "OUTPUTS",
-    "UNITS",
-    "GpOutput",
-    "GpWeights",
-    "decode_weights",
-    "encode_weights",
-    "read_weights",
-    "write_weights",
-    "zero_weights",
-]
+:mod:`.weights` holds what training found, as data and as a file; :mod:`.expression` evaluates the
+posterior mean of these data (CasADi, NumPy); :mod:`.corrected` adds it to the nominal model.
+"""

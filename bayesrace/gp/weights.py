@@ -1,11 +1,11 @@
-"""Mean-function weights of the GP residual as data: what learning publishes, a controller loads.
+"""Weights of the GP residual as data: learning publishes them, a controller loads them.
 
 For each output the corrected model adds, to the discretised nominal model,
 
     mean(z) = y_mean + y_scale * signal_variance * sum_i alpha_i k(|(z - inputs_i) / length_scales|)
 
 with the features z = [vx, vy, omega, delta, d, delta_rate] of the state and input *at the start* of
-the step. The formula is evaluated by :mod:`bayesrace.gp.expression`; here it is only stored.
+the step. :mod:`bayesrace.gp.expression` evaluates this formula.
 
 The encoded form is ``magic | schema (u32 LE) | sha256 | msgpack body``; the checksum covers all but
 itself. Arrays are raw little-endian float64. Decoding checks every type, shape and number and never
@@ -17,14 +17,16 @@ import os
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final, get_type_hints
 
 import msgpack
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from pydantic import AfterValidator, Field, InstanceOf, PlainValidator, TypeAdapter, ValidationError
 
-from bayesrace.errors import InputError
+from bayesrace.arrays import Floats
+from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_whole, write_whole
 
 __all__ = [
@@ -44,8 +46,6 @@ __all__ = [
     "zero_weights",
 ]
 
-Floats = NDArray[np.float64]
-
 OUTPUTS: Final = ("vx", "vy", "omega")
 """State components that get a correction, in this order."""
 
@@ -53,72 +53,72 @@ UNITS: Final = {"vx": "m/s", "vy": "m/s", "omega": "rad/s"}
 """Of the correction per output, added once a step."""
 
 FEATURES: Final = ("vx", "vy", "omega", "delta", "d", "delta_rate")
-"""What the correction depends on, in this order."""
-
-FEATURE_COUNT: Final = len(FEATURES)
+"""Arguments of the correction, in this order."""
 
 KERNELS: Final = ("rbf", "matern05", "matern15", "matern25")
-"""Kernel kinds by smoothness: squared exponential, Matern with nu = 0.5, 1.5, 2.5."""
+"""Kernel kinds: squared exponential, Matérn with nu = 0.5, 1.5, 2.5."""
 
 MAX_POINTS: Final = 20_000
-"""More training points per output than this are refused (a controller's capacity is far lower)."""
+"""Upper limit of training points per output (a controller's capacity is far lower)."""
 
 MAX_BYTES: Final = 16 * 1024 * 1024
-"""Encoded weights longer than this are refused before anything is parsed."""
+"""Upper limit of the encoded size; longer data are refused before anything is parsed."""
 
 _MAX_PARTS: Final = 1000
 """Maps and arrays in the encoded form at most; a file has some forty. Without a limit, 16 MB of
 empty arrays would take a second for every 2 MB, and 80 times their size in memory."""
 
 SCHEMA: Final = 2
-"""Version of the encoded form; any other one is refused, also an older one: train again."""
+"""Version of the encoded form; any other version is refused, older ones included: train again."""
 
 _MAGIC: Final = b"BRACEGP\n"
 _HEAD: Final = struct.Struct("<8sI")
-_DIGEST_BYTES: Final = 32
-_MAX_TEXT: Final = 200
-"""A version fits into every actuation message, whose texts have this limit."""
+_BODY_START: Final = _HEAD.size + hashlib.sha256().digest_size
 
 
-def _array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
-    """Read-only float64 copy of ``value``, which must be finite and of the given shape."""
+def _read_only(value: Any) -> Floats:
+    """Read-only copy of finite numbers."""
     try:
         array = np.array(value, dtype=np.float64, order="C")
     except (TypeError, ValueError) as error:
-        raise InputError(f"GP weights: {name} is not an array of numbers") from error
-    if array.shape != shape:
-        raise InputError(f"GP weights: {name} has shape {array.shape}, expected {shape}")
+        raise ValueError("not an array of numbers") from error
     if not np.isfinite(array).all():
-        raise InputError(f"GP weights: {name} holds a number that is not finite; train again")
+        raise ValueError("holds a number that is not finite")
     array.setflags(write=False)
     return array
 
 
-def _number(name: str, value: Any, minimum: float | None = None, strict: bool = False) -> float:
-    """``value`` as finite float, at least (strict: above) ``minimum``."""
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.floating, np.integer)):
-        raise InputError(f"GP weights: {name} must be a number, not {type(value).__name__}")
-    try:
-        number = float(value)
-    except OverflowError:
-        number = float("inf")
-    if not np.isfinite(number):
-        raise InputError(f"GP weights: {name} is not finite; train again")
-    if minimum is not None and (number < minimum or (strict and number == minimum)):
-        bound = "above" if strict else "at least"
-        raise InputError(f"GP weights: {name} is {number:g}, must be {bound} {minimum:g}")
-    return number
+def _printable(text: str) -> str:
+    if not text.isprintable():
+        raise ValueError("holds characters that cannot be printed")
+    return text
 
 
-def _text(name: str, value: Any, empty: bool = False) -> str:
-    if not isinstance(value, str) or len(value) > _MAX_TEXT or not (value or empty):
-        raise InputError(f"GP weights: {name} must be a text of 1 to {_MAX_TEXT} characters")
-    if not value.isprintable():
-        raise InputError(f"GP weights: {name} holds characters that cannot be printed")
-    return value
+_Array = Annotated[Floats, PlainValidator(_read_only)]
+_Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+_Positive = Annotated[_Number, Field(gt=0)]
+# A version must fit into an actuation message, whose texts have this limit.
+_Text = Annotated[str, Field(strict=True, max_length=200), AfterValidator(_printable)]
+_Name = Annotated[_Text, Field(min_length=1)]
 
 
-@dataclass(frozen=True, eq=False)
+@cache
+def _adapters(kind: type) -> dict[str, TypeAdapter[Any]]:
+    return {name: TypeAdapter(of) for name, of in get_type_hints(kind, include_extras=True).items()}
+
+
+def _validate(item: "GpOutput | GpWeights") -> None:
+    """Replaces each field by its validated value; InputError names the field and its fault."""
+    kind: Any = type(item)
+    for name, adapter in _adapters(kind).items():
+        try:
+            object.__setattr__(item, name, adapter.validate_python(getattr(item, name)))
+        except ValidationError as error:
+            fault = f"{name}: {faults_in(error, 'value')}"
+            raise InputError(f"GP weights: {fault}; train again") from None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class GpOutput:
     """One output of the residual GP; see the module text for the formula.
 
@@ -129,76 +129,61 @@ class GpOutput:
     """
 
     kernel: str
-    length_scales: Floats
-    signal_variance: float
-    noise_variance: float
-    inputs: Floats
-    alpha: Floats
-    y_mean: float = 0.0
-    y_scale: float = 1.0
+    signal_variance: _Positive
+    noise_variance: Annotated[_Number, Field(ge=0)]
+    y_mean: _Number = 0.0
+    y_scale: _Positive = 1.0
+    length_scales: _Array
+    inputs: _Array
+    alpha: _Array
 
     def __post_init__(self) -> None:
         if self.kernel not in KERNELS:
             known = ", ".join(KERNELS)
-            raise InputError(f"GP weights: unknown kernel {self.kernel!r}; known: {known}")
-        count = np.shape(self.alpha)[0] if np.ndim(self.alpha) == 1 else -1
-        if not 0 <= count <= MAX_POINTS:
-            raise InputError(f"GP weights: alpha must be one column of at most {MAX_POINTS} points")
-        length_scales = _array("length_scales", self.length_scales, (FEATURE_COUNT,))
-        if length_scales.min() <= 0:
-            raise InputError("GP weights: every length scale must be above 0")
-        checked: dict[str, Any] = {
-            "length_scales": length_scales,
-            "inputs": _array("inputs", self.inputs, (count, FEATURE_COUNT)),
-            "alpha": _array("alpha", self.alpha, (count,)),
-            "signal_variance": _number("signal_variance", self.signal_variance, 0.0, True),
-            "noise_variance": _number("noise_variance", self.noise_variance, 0.0),
-            "y_mean": _number("y_mean", self.y_mean),
-            "y_scale": _number("y_scale", self.y_scale, 0.0, True),
-        }
-        for name, value in checked.items():
-            object.__setattr__(self, name, value)
+            raise InputError(f"GP weights: unknown kernel {self.kernel!r:.40}; known: {known}")
+        _validate(self)
+        width, shapes = len(FEATURES), [self.length_scales.shape, self.inputs.shape]
+        if self.alpha.ndim != 1 or shapes != [(width,), (self.count, width)]:
+            raise InputError(
+                f"GP weights: length_scales, inputs and alpha have the shapes {shapes[0]}, "
+                f"{shapes[1]} and {self.alpha.shape}, expected ({width},), (n, {width}) and (n,)"
+            )
+        if self.count > MAX_POINTS:
+            raise InputError(f"GP weights: {self.count} points are more than {MAX_POINTS}")
+        if self.length_scales.min() <= 0:
+            raise InputError("GP weights: every length scale must be above 0; train again")
 
     @property
     def count(self) -> int:
         """Number of training points, n."""
-        return int(self.alpha.shape[0])
+        return len(self.alpha)
 
 
-@dataclass(frozen=True, eq=False)
+_Outputs = tuple[InstanceOf[GpOutput], InstanceOf[GpOutput], InstanceOf[GpOutput]]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class GpWeights:
     """The residual GP of one car for one discretised nominal model.
 
     ``discretisation`` is :meth:`bayesrace.integrators.Discretisation.identity` of the model that
     the residual was made with: a controller that predicts otherwise must refuse these weights.
-    ``metrics`` maps a group to named numbers: an output's name to what was measured on samples that
-    were not learned from (rmse, r2, coverage, log_density, …), "training vx" and so on to how it
-    was learned. ``program`` is the version of what made them. Two objects are equal if they encode
-    to the same bytes.
+    ``metrics`` maps a group to named numbers: an output's name to the scores on held-out samples
+    (rmse, r2, coverage, log_density, …), "training vx" and so on to how it was learned. ``program``
+    is the program and version that trained. Two objects are equal if they encode to the same bytes.
     """
 
-    version: str
-    car: str
-    discretisation: str
-    outputs: tuple[GpOutput, GpOutput, GpOutput]
-    dataset_digest: str = ""
-    created_utc_ns: int = 0
-    metrics: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    program: str = ""
+    version: _Name
+    car: _Name
+    discretisation: _Name
+    dataset_digest: _Text = ""
+    created_utc_ns: Annotated[int, Field(strict=True, ge=0, lt=2**63)] = 0
+    metrics: Mapping[_Name, Mapping[_Name, _Number]] = field(default_factory=dict)
+    program: _Text = ""
+    outputs: _Outputs
 
     def __post_init__(self) -> None:
-        for name in ("version", "car", "discretisation"):
-            _text(name, getattr(self, name))
-        for name in ("dataset_digest", "program"):
-            _text(name, getattr(self, name), empty=True)
-        created = self.created_utc_ns
-        if isinstance(created, bool) or not isinstance(created, int) or not 0 <= created < 2**63:
-            raise InputError("GP weights: created_utc_ns must be nanoseconds since 1970")
-        outputs = tuple(self.outputs)
-        if len(outputs) != len(OUTPUTS) or not all(isinstance(o, GpOutput) for o in outputs):
-            raise InputError(f"GP weights: need one output for each of {', '.join(OUTPUTS)}")
-        object.__setattr__(self, "outputs", outputs)
-        object.__setattr__(self, "metrics", _metrics(self.metrics))
+        _validate(self)
 
     @property
     def kernels(self) -> tuple[str, ...]:
@@ -207,7 +192,7 @@ class GpWeights:
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Number of training points per output; what must fit a controller's capacity."""
+        """Number of training points per output; each must fit a controller's capacity."""
         return tuple(output.count for output in self.outputs)
 
     def __eq__(self, other: object) -> bool:
@@ -219,98 +204,58 @@ class GpWeights:
         return hash(encode_weights(self))
 
 
-def _metrics(metrics: Any) -> dict[str, dict[str, float]]:
-    """Checked deep copy of the metrics."""
-    groups = metrics.values() if isinstance(metrics, Mapping) else [None]
-    if not all(isinstance(group, Mapping) for group in groups):
-        raise InputError("GP weights: metrics must map a group to named numbers")
-    return {
-        _text("a metrics group", group): {
-            _text("a metric's name", name): _number(f"metric {group}.{name}", value)
-            for name, value in values.items()
-        }
-        for group, values in metrics.items()
-    }
-
-
 def zero_weights(car: str, discretisation: str, version: str = "worstcase") -> GpWeights:
     """Weights without a training point: the correction is exactly zero (WorstCase)."""
+    width = len(FEATURES)
+    zero = GpOutput(
+        kernel="rbf",
+        signal_variance=1.0,
+        noise_variance=0.0,
+        length_scales=np.ones(width),
+        inputs=np.zeros((0, width)),
+        alpha=np.zeros(0),
+    )
+    return GpWeights(
+        version=version, car=car, discretisation=discretisation, outputs=(zero, zero, zero)
+    )
 
-    def nothing() -> GpOutput:
-        return GpOutput(
-            "rbf", np.ones(FEATURE_COUNT), 1.0, 0.0, np.zeros((0, FEATURE_COUNT)), np.zeros(0)
-        )
 
-    return GpWeights(version, car, discretisation, (nothing(), nothing(), nothing()))
-
-
-def _pack_array(array: Floats) -> dict[str, Any]:
-    return {"shape": list(array.shape), "f64le": array.astype("<f8", order="C").tobytes()}
-
-
-_ARRAYS: Final = ("length_scales", "inputs", "alpha")
-_SCALARS: Final = ("kernel", "signal_variance", "noise_variance", "y_mean", "y_scale")
-_HEADERS: Final = (
-    "version",
-    "car",
-    "discretisation",
-    "dataset_digest",
-    "created_utc_ns",
-    "metrics",
-    "program",
-)
+def _packed(value: Any) -> Any:
+    """The plain form of what msgpack does not know: objects as maps, arrays as shape and bytes."""
+    if isinstance(value, np.ndarray):
+        return {"shape": list(value.shape), "f64le": value.astype("<f8", order="C").tobytes()}
+    return vars(value)
 
 
 def encode_weights(weights: GpWeights) -> bytes:
     """The one byte string for these weights; :func:`decode_weights` is its inverse."""
-    body: dict[str, Any] = {name: getattr(weights, name) for name in _HEADERS}
-    body["features"], body["output_names"] = list(FEATURES), list(OUTPUTS)
-    body["outputs"] = [
-        {name: getattr(output, name) for name in _SCALARS}
-        | {name: _pack_array(getattr(output, name)) for name in _ARRAYS}
-        for output in weights.outputs
-    ]
-    packed: bytes = msgpack.packb(body, use_bin_type=True)
+    body = vars(weights) | {"features": FEATURES, "output_names": OUTPUTS}
+    body["outputs"] = body.pop("outputs")  # the last of the map
+    packed: bytes = msgpack.packb(body, default=_packed)
     head = _HEAD.pack(_MAGIC, SCHEMA)
     return head + hashlib.sha256(head + packed).digest() + packed
 
 
-def _unpack_map(name: str, value: Any, keys: tuple[str, ...]) -> dict[str, Any]:
-    if not isinstance(value, dict) or set(value) != set(keys):
-        raise InputError(f"GP weights: {name} does not hold exactly {', '.join(keys)}")
-    return value
+def _array(form: Any) -> Floats:
+    return np.frombuffer(form["f64le"], dtype="<f8").reshape(form["shape"])
 
 
-def _unpack_array(name: str, value: Any) -> Floats:
-    fields = _unpack_map(name, value, ("shape", "f64le"))
-    shape, data = fields["shape"], fields["f64le"]
-    sizes_ok = isinstance(shape, list) and len(shape) in (1, 2)
-    if not sizes_ok or not all(type(n) is int and 0 <= n <= MAX_POINTS for n in shape):
-        raise InputError(f"GP weights: {name} has an impossible shape")
-    if not isinstance(data, bytes) or len(data) != 8 * int(np.prod(shape)):
-        raise InputError(f"GP weights: {name} has not as many numbers as its shape says")
-    return np.frombuffer(data, dtype="<f8").reshape(shape).astype(np.float64)
+def _output(fields: Any) -> GpOutput:
+    arrays = {name: _array(fields[name]) for name in ("length_scales", "inputs", "alpha")}
+    return GpOutput(**fields | arrays)
 
 
-def _unpack_output(value: Any) -> GpOutput:
-    fields = _unpack_map("an output", value, _SCALARS + _ARRAYS)
-    for name in _ARRAYS:
-        fields[name] = _unpack_array(name, fields[name])
-    return GpOutput(**fields)
-
-
-def _unpack_body(data: bytes) -> Any:
-    """Checks size, magic, schema and checksum; the msgpack body as plain Python values."""
-    start = _HEAD.size + _DIGEST_BYTES
-    if len(data) < start or len(data) > MAX_BYTES:
+def _body(data: bytes) -> Any:
+    """The msgpack body as plain values, after size, magic, schema and checksum are checked."""
+    if not _BODY_START <= len(data) <= MAX_BYTES:
         raise InputError(f"GP weights: {len(data)} bytes is not the size of a weights file")
     magic, schema = _HEAD.unpack_from(data)
     if magic != _MAGIC:
         raise InputError("GP weights: not a weights file; make one with 'bayesrace train'")
     if schema != SCHEMA:
         raise InputError(f"GP weights: schema {schema} is not {SCHEMA}; train again")
-    digest = hashlib.sha256(data[: _HEAD.size] + data[start:]).digest()
-    if digest != data[_HEAD.size : start]:
+    digest = hashlib.sha256(data[: _HEAD.size] + data[_BODY_START:]).digest()
+    if digest != data[_HEAD.size : _BODY_START]:
         raise InputError("GP weights: checksum mismatch, the data are damaged; copy them again")
     parts = iter(range(_MAX_PARTS))
 
@@ -321,7 +266,7 @@ def _unpack_body(data: bytes) -> Any:
 
     try:
         return msgpack.unpackb(
-            data[start:],
+            data[_BODY_START:],
             object_hook=counted,
             list_hook=counted,
             max_array_len=_MAX_PARTS,
@@ -333,16 +278,21 @@ def _unpack_body(data: bytes) -> Any:
 
 
 def decode_weights(data: bytes) -> GpWeights:
-    """Weights from :func:`encode_weights`; InputError for anything damaged, foreign or invalid."""
-    keys = (*_HEADERS, "features", "output_names", "outputs")
-    body = _unpack_map("the file", _unpack_body(bytes(data)), keys)
-    if body["features"] != list(FEATURES) or body["output_names"] != list(OUTPUTS):
+    """Weights from :func:`encode_weights`; InputError for any other bytes."""
+    body = _body(bytes(data))
+    try:
+        made_for = body.pop("features"), body.pop("output_names")
+        outputs: Any = tuple(map(_output, body.pop("outputs")))
+        weights = GpWeights(**body, outputs=outputs)
+    except InputError:
+        raise
+    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
+        raise InputError("GP weights: the body does not describe weights; train again") from error
+    if made_for != (list(FEATURES), list(OUTPUTS)):
         raise InputError(f"GP weights: made for other features or outputs than {FEATURES}")
-    outputs = body["outputs"]
-    if not isinstance(outputs, list) or len(outputs) != len(OUTPUTS):
-        raise InputError(f"GP weights: need one output for each of {', '.join(OUTPUTS)}")
-    vx, vy, omega = (_unpack_output(output) for output in outputs)
-    return GpWeights(outputs=(vx, vy, omega), **{name: body[name] for name in _HEADERS})
+    if encode_weights(weights) != data:  # something is missing, or has another type or shape
+        raise InputError("GP weights: the body is not encoded as weights are; train again")
+    return weights
 
 
 def write_weights(path: str | os.PathLike[str], weights: GpWeights) -> None:

@@ -1,12 +1,15 @@
-"""What crosses a process boundary: message types, their table, and the strict codec."""
+"""Messages between processes.
 
-from bayesrace.messages.codec import LARGEST_BYTES, Decoder, decode, encode, json_schema
+``rules`` checks one field, ``types`` has the message classes, ``table`` the topics and services,
+``codec`` turns messages into bytes and refuses everything else.
+"""
+
+from bayesrace.messages.codec import Decoder, decode, encode, json_schema
 from bayesrace.messages.rules import Scalar
 from bayesrace.messages.table import (
     ACCEPTED,
     ACTUATION,
     ALIVE,
-    CLOCK,
     COMMAND,
     EVENT,
     HEARTBEAT,
@@ -24,14 +27,11 @@ from bayesrace.messages.table import (
     Service,
     Topic,
     car_key,
+    is_car_name,
 )
 from bayesrace.messages.types import (
-    END_REASONS,
-    PHASES,
     Actuation,
     CarSample,
-    ClockReading,
-    ClockRequest,
     Command,
     Event,
     Message,
@@ -47,49 +47,10 @@ from bayesrace.messages.types import (
 )
 
 __all__ = [
-    "ACCEPTED",
-    "ACTUATION",
-    "ALIVE",
-    "CLOCK",
-    "COMMAND",
-    "END_REASONS",
-    "EVENT",
-    "HEARTBEAT",
-    "LARGEST_BYTES",
-    "PHASES",
-    "ROLLBACK",
-    "RUN",
-    "SERVICES",
-    "STATE",
-    "STATUS",
-    "STOP",
-    "TELEMETRY",
-    "TOPICS",
-    "TRUTH",
-    "WEIGHTS",
-    "Actuation",
-    "CarSample",
-    "ClockReading",
-    "ClockRequest",
-    "Command",
-    "Decoder",
-    "Event",
-    "Message",
-    "Qos",
-    "Reply",
-    "RollbackRequest",
-    "RunRequest",
-    "Scalar",
-    "Service",
-    "State",
-    "Status",
-    "StatusRequest",
-    "StopRequest",
-    "Telemetry",
-    "Topic",
-    "Truth",
-    "car_key",
-    "decode",
-    "encode",
-    "json_schema",
-]
+    "ACCEPTED", "ACTUATION", "ALIVE", "COMMAND", "EVENT", "HEARTBEAT", "ROLLBACK", "RUN",
+    "SERVICES", "STATE", "STATUS", "STOP", "TELEMETRY", "TOPICS", "TRUTH", "WEIGHTS", "Actuation",
+    "CarSample", "Command", "Decoder", "Event", "Message", "Qos",
+    "Reply", "RollbackRequest", "RunRequest", "Scalar", "Service", "State", "Status",
+    "StatusRequest", "StopRequest", "Telemetry", "Topic", "Truth", "car_key", "decode", "encode",
+    "is_car_name", "json_schema",
+]  # fmt: skip

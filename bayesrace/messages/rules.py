@@ -1,43 +1,32 @@
-"""What a field of a message may hold: one small rule per kind of value.
+"""Rules for the fields of messages: one small class for each kind of value.
 
-A rule's ``check`` returns the value as the dataclass keeps it or raises ``ValueError`` saying what
-is wrong; the codec adds message and field name. Comparisons are written so that NaN fails them.
-
-A rule also says how large its values get on the wire, in the widest form that msgpack has for them:
-what is larger is refused before anything is made of it.
+A rule's ``check`` returns the value as the message keeps it, or raises ``ValueError`` with what is
+wrong; the codec adds the names of message and field. Comparisons are written so that NaN fails
+them. :func:`wire_bytes` is the size of a rule's largest value in msgpack's widest form: the codec
+refuses longer input unread. :func:`rule_schema` is the rule as JSON schema.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any
 
-__all__ = ["Choice", "Flag", "Integer", "Real", "Rule", "Scalar", "Scalars", "Text", "Vector"]
+__all__ = [
+    "Choice", "Flag", "Integer", "Real", "Rule", "Scalar", "Scalars", "Text", "Vector",
+    "rule_schema", "wire_bytes",
+]  # fmt: skip
 
 Scalar = bool | int | float | str
-"""What an event's or a reply's data map may hold."""
+"""Value in the data map of an event or a reply."""
 
 _INT64_MAX = 2**63 - 1
 _REAL_MAX = 1e12
+_TEXT_MAX = 2000
 
 _NUMBER_BYTES = 9
 _HEAD_BYTES = 5
 """Before the content of a text, array or map."""
 _CHARACTER_BYTES = 4
-
-
-class Rule(Protocol):
-    """Checks one decoded value."""
-
-    def check(self, value: Any) -> Any:
-        """The value as the message keeps it; ValueError if it is not acceptable."""
-
-    def describe(self) -> dict[str, Any]:
-        """The same rule as JSON schema, for logs that other tools read."""
-
-    @property
-    def wire_bytes(self) -> int:
-        """Most bytes that an acceptable value takes."""
 
 
 @dataclass(frozen=True)
@@ -48,21 +37,10 @@ class Integer:
     high: int = _INT64_MAX
 
     def check(self, value: Any) -> int:
-        """See :meth:`Rule.check`."""
-        if type(value) is not int:
-            raise ValueError(f"expected an integer, got {type(value).__name__}")
-        if not self.low <= value <= self.high:
-            raise ValueError(f"{value} is outside [{self.low}, {self.high}]")
-        return value
-
-    def describe(self) -> dict[str, Any]:
-        """See :meth:`Rule.describe`."""
-        return {"type": "integer", "minimum": self.low, "maximum": self.high}
-
-    @property
-    def wire_bytes(self) -> int:
-        """See :attr:`Rule.wire_bytes`."""
-        return _NUMBER_BYTES
+        """The number; ValueError if it is of another type or outside the range."""
+        if type(value) is int and self.low <= value <= self.high:
+            return value
+        raise ValueError(f"{value!r:.40} is not an integer within [{self.low}, {self.high}]")
 
 
 @dataclass(frozen=True)
@@ -73,21 +51,10 @@ class Real:
     high: float = _REAL_MAX
 
     def check(self, value: Any) -> float:
-        """See :meth:`Rule.check`."""
-        if type(value) is not float:
-            raise ValueError(f"expected a float, got {type(value).__name__}")
-        if not self.low <= value <= self.high:
-            raise ValueError(f"{value} is outside [{self.low:g}, {self.high:g}]")
-        return value
-
-    def describe(self) -> dict[str, Any]:
-        """See :meth:`Rule.describe`."""
-        return {"type": "number", "minimum": self.low, "maximum": self.high}
-
-    @property
-    def wire_bytes(self) -> int:
-        """See :attr:`Rule.wire_bytes`."""
-        return _NUMBER_BYTES
+        """The number; ValueError if it is of another type or outside the range."""
+        if type(value) is float and self.low <= value <= self.high:
+            return value
+        raise ValueError(f"{value!r:.40} is not a float within [{self.low:g}, {self.high:g}]")
 
 
 @dataclass(frozen=True)
@@ -95,43 +62,23 @@ class Flag:
     """True or false."""
 
     def check(self, value: Any) -> bool:
-        """See :meth:`Rule.check`."""
-        if type(value) is not bool:
-            raise ValueError(f"expected true or false, got {type(value).__name__}")
-        return value
-
-    def describe(self) -> dict[str, Any]:
-        """See :meth:`Rule.describe`."""
-        return {"type": "boolean"}
-
-    @property
-    def wire_bytes(self) -> int:
-        """See :attr:`Rule.wire_bytes`."""
-        return 1
+        """The flag; ValueError if it is of another type."""
+        if type(value) is bool:
+            return value
+        raise ValueError(f"{value!r:.40} is not true or false")
 
 
 @dataclass(frozen=True)
 class Text:
-    """Text of at most ``longest`` characters that UTF-8 can carry."""
+    """UTF-8 text of at most ``longest`` characters."""
 
-    longest: int = 2000
+    longest: int = _TEXT_MAX
 
     def check(self, value: Any) -> str:
-        """See :meth:`Rule.check`."""
-        if type(value) is not str:
-            raise ValueError(f"expected text, got {type(value).__name__}")
-        if len(value) > self.longest:
-            raise ValueError(f"text of {len(value)} characters, at most {self.longest} allowed")
-        return value
-
-    def describe(self) -> dict[str, Any]:
-        """See :meth:`Rule.describe`."""
-        return {"type": "string", "maxLength": self.longest}
-
-    @property
-    def wire_bytes(self) -> int:
-        """See :attr:`Rule.wire_bytes`."""
-        return _HEAD_BYTES + _CHARACTER_BYTES * self.longest
+        """The text; ValueError if it is of another type or too long."""
+        if type(value) is str and len(value) <= self.longest:
+            return value
+        raise ValueError(f"{value!r:.40} is not text of at most {self.longest} characters")
 
 
 @dataclass(frozen=True)
@@ -141,19 +88,10 @@ class Choice:
     words: tuple[str, ...]
 
     def check(self, value: Any) -> str:
-        """See :meth:`Rule.check`."""
-        if type(value) is not str or value not in self.words:
-            raise ValueError(f"expected one of {', '.join(self.words)}")
-        return value
-
-    def describe(self) -> dict[str, Any]:
-        """See :meth:`Rule.describe`."""
-        return {"type": "string", "enum": list(self.words)}
-
-    @property
-    def wire_bytes(self) -> int:
-        """See :attr:`Rule.wire_bytes`."""
-        return _HEAD_BYTES + _CHARACTER_BYTES * max(map(len, self.words))
+        """The word; ValueError if it is none of them."""
+        if type(value) is str and value in self.words:
+            return value
+        raise ValueError(f"{value!r:.40} is not one of {', '.join(self.words)}")
 
 
 @dataclass(frozen=True)
@@ -168,36 +106,23 @@ class Vector:
     rows: int | None = None
 
     def check(self, value: Any) -> tuple[float, ...]:
-        """See :meth:`Rule.check`."""
+        """The numbers; ValueError if one is no float in range, or their count is wrong."""
         if type(value) is not list:
-            raise ValueError(f"expected an array, got {type(value).__name__}")
-        count = len(value)
-        if self.rows is None:
-            if count != self.length:
-                raise ValueError(f"expected {self.length} numbers, got {count}")
-        elif count % self.length or count > self.rows * self.length:
-            raise ValueError(f"{count} numbers are not up to {self.rows} rows of {self.length}")
+            raise ValueError(f"{value!r:.40} is not an array")
+        count, length = len(value), self.length
+        if count != length and (self.rows is None or count % length or count > self.most):
+            shape = "" if self.rows is None else f"up to {self.rows} rows of "
+            raise ValueError(f"{count} numbers are not {shape}{length}")
         limit = self.limit
         for number in value:
             if type(number) is not float or not -limit <= number <= limit:
                 raise ValueError(f"{number!r:.40} is not a float within ±{limit:g}")
         return tuple(value)
 
-    def describe(self) -> dict[str, Any]:
-        """See :meth:`Rule.describe`."""
-        numbers = {"type": "number", "minimum": -self.limit, "maximum": self.limit}
-        least = self.length if self.rows is None else 0
-        return {"type": "array", "items": numbers, "minItems": least, "maxItems": self.most}
-
     @property
     def most(self) -> int:
         """Most numbers."""
         return self.length if self.rows is None else self.length * self.rows
-
-    @property
-    def wire_bytes(self) -> int:
-        """See :attr:`Rule.wire_bytes`."""
-        return _HEAD_BYTES + _NUMBER_BYTES * self.most
 
 
 @dataclass(frozen=True)
@@ -209,47 +134,70 @@ class Scalars:
     """Most characters of all names and texts together."""
 
     def check(self, value: Any) -> Mapping[str, Scalar]:
-        """See :meth:`Rule.check`."""
-        if type(value) is not dict:
-            raise ValueError(f"expected a map, got {type(value).__name__}")
-        if len(value) > self.most:
-            raise ValueError(f"{len(value)} entries, at most {self.most} allowed")
+        """The map, read-only; ValueError if it is too large or holds something else."""
+        if type(value) is not dict or len(value) > self.most:
+            raise ValueError(f"{value!r:.40} is not a map of at most {self.most} entries")
         characters = 0
         for name, scalar in value.items():
             if type(name) is not str or len(name) > 100:
                 raise ValueError("a name in the map is not text of at most 100 characters")
-            characters += len(name) + _check_scalar(name, scalar)
+            if not _is_scalar(scalar):
+                raise ValueError(
+                    f"{name!r:.40} is not a flag, an integer of 64 bits, a float within "
+                    f"±{_REAL_MAX:g} or a text of at most {_TEXT_MAX} characters"
+                )
+            characters += len(name) + (len(scalar) if type(scalar) is str else 0)
         if characters > self.characters:
             raise ValueError(f"{characters} characters, at most {self.characters} allowed")
         return MappingProxyType(value)
 
-    def describe(self) -> dict[str, Any]:
-        """See :meth:`Rule.describe`."""
-        return {"type": "object", "maxProperties": self.most}
 
-    @property
-    def wire_bytes(self) -> int:
-        """See :attr:`Rule.wire_bytes`."""
-        return (
-            _HEAD_BYTES
-            + self.most * (_HEAD_BYTES + _NUMBER_BYTES)
-            + _CHARACTER_BYTES * self.characters
-        )
-
-
-def _check_scalar(name: str, value: Any) -> int:
-    """Refuses what is no scalar; the number of characters, 0 unless it is a text."""
+def _is_scalar(value: Any) -> bool:
     kind = type(value)
-    if kind is bool:
-        return 0
-    if kind is int:
-        if not -_INT64_MAX <= value <= _INT64_MAX:
-            raise ValueError(f"{name!r:.40} is an integer beyond 64 bits")
-        return 0
-    if kind is float:
-        if not -_REAL_MAX <= value <= _REAL_MAX:
-            raise ValueError(f"{name!r:.40} is not a finite number of sensible size")
-        return 0
-    if kind is not str or len(value) > 2000:
-        raise ValueError(f"{name!r:.40} is neither a number nor a short text")
-    return len(value)
+    if kind is str:
+        return len(value) <= _TEXT_MAX
+    if kind is int or kind is float:
+        return bool(abs(value) <= (_INT64_MAX if kind is int else _REAL_MAX))
+    return kind is bool
+
+
+Rule = Integer | Real | Flag | Text | Choice | Vector | Scalars
+
+
+def wire_bytes(rule: Rule) -> int:
+    """Most bytes that an acceptable value takes."""
+    match rule:
+        case Integer() | Real():
+            return _NUMBER_BYTES
+        case Flag():
+            return 1
+        case Text(longest):
+            return _HEAD_BYTES + _CHARACTER_BYTES * longest
+        case Choice(words):
+            return _HEAD_BYTES + _CHARACTER_BYTES * max(map(len, words))
+        case Vector():
+            return _HEAD_BYTES + _NUMBER_BYTES * rule.most
+        case Scalars(most, characters):
+            entries = most * (_HEAD_BYTES + _NUMBER_BYTES)
+            return _HEAD_BYTES + entries + _CHARACTER_BYTES * characters
+
+
+def rule_schema(rule: Rule) -> dict[str, Any]:
+    """The rule as JSON schema, for logs that other tools read."""
+    match rule:
+        case Integer(low, high):
+            return {"type": "integer", "minimum": low, "maximum": high}
+        case Real(least, largest):
+            return {"type": "number", "minimum": least, "maximum": largest}
+        case Flag():
+            return {"type": "boolean"}
+        case Text(longest):
+            return {"type": "string", "maxLength": longest}
+        case Choice(words):
+            return {"type": "string", "enum": list(words)}
+        case Vector(length, limit, rows):
+            numbers = {"type": "number", "minimum": -limit, "maximum": limit}
+            fewest = length if rows is None else 0
+            return {"type": "array", "items": numbers, "minItems": fewest, "maxItems": rule.most}
+        case Scalars(most):
+            return {"type": "object", "maxProperties": most}

@@ -1,4 +1,8 @@
-"""The process boundary in one table: key expression, message, rate, quality of service."""
+"""The table of everything that crosses a process boundary: key, message, rate, quality of service.
+
+A topic is published; a service is a request with an answer. ``{car}`` and ``{source}`` in a key
+stand for the car's name and the process.
+"""
 
 import re
 from dataclasses import dataclass
@@ -7,8 +11,6 @@ from typing import Any, Final, Generic, Literal, TypeVar
 from bayesrace.errors import InputError
 from bayesrace.messages.types import (
     Actuation,
-    ClockReading,
-    ClockRequest,
     Command,
     Event,
     Message,
@@ -24,28 +26,10 @@ from bayesrace.messages.types import (
 )
 
 __all__ = [
-    "ACCEPTED",
-    "ACTUATION",
-    "ALIVE",
-    "CLOCK",
-    "COMMAND",
-    "EVENT",
-    "HEARTBEAT",
-    "ROLLBACK",
-    "RUN",
-    "SERVICES",
-    "STATE",
-    "STATUS",
-    "STOP",
-    "TELEMETRY",
-    "TOPICS",
-    "TRUTH",
-    "WEIGHTS",
-    "Qos",
-    "Service",
-    "Topic",
-    "car_key",
-]
+    "ACCEPTED", "ACTUATION", "ALIVE", "COMMAND", "EVENT", "HEARTBEAT", "ROLLBACK", "RUN",
+    "SERVICES", "STATE", "STATUS", "STOP", "TELEMETRY", "TOPICS", "TRUTH", "WEIGHTS",
+    "Qos", "Service", "Topic", "car_key", "is_car_name",
+]  # fmt: skip
 
 M = TypeVar("M", bound=Message)
 A = TypeVar("A", bound=Message)
@@ -57,17 +41,16 @@ _CAR_NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")
 
 @dataclass(frozen=True)
 class Qos:
-    """How a topic travels.
+    """Quality of service of a topic; delivery is reliable and in order on each link.
 
-    In lockstep every topic blocks the sender rather than lose a message; ``wall_clock_blocks``
-    says whether it does so in free-running mode too, where late is late.
+    In lockstep every topic blocks its sender rather than lose a message. ``realtime_blocks``: it
+    does so in free-running mode, too, where the others drop what the link cannot take.
     """
 
-    priority: Literal["real_time", "interactive_high", "data", "data_low"]
+    priority: Literal["real_time", "data", "data_low"]
     express: bool
     """Sent at once, never batched."""
-    reliable: bool
-    wall_clock_blocks: bool
+    realtime_blocks: bool = False
 
 
 @dataclass(frozen=True)
@@ -76,7 +59,7 @@ class Topic(Generic[M]):
 
     name: str
     key: str
-    """Key expression; ``{car}`` and, for events, ``{source}`` are filled in."""
+    """Key expression with its placeholders."""
     message: type[M]
     sources: tuple[Source, ...]
     rate: str
@@ -85,8 +68,11 @@ class Topic(Generic[M]):
 
 @dataclass(frozen=True)
 class Service(Generic[M, A]):
-    """One row of the table of requests. ``request`` or ``answer`` None: the payload is no message,
-    but a weights file, or one in a frame."""
+    """One row of the table of requests.
+
+    ``request`` or ``answer`` None: the payload is no message, but a weights file with or without a
+    header.
+    """
 
     name: str
     key: str
@@ -94,12 +80,12 @@ class Service(Generic[M, A]):
     answer: type[A] | None
     timeout_s: float
     repeatable: bool = True
-    """Asked twice, it does what it does once: a question that a link has lost is asked again."""
+    """Idempotent: a client repeats a request that was lost with its link."""
 
 
-_CONTROL: Final = Qos("real_time", express=True, reliable=True, wall_clock_blocks=False)
-_REPORT: Final = Qos("data_low", express=False, reliable=True, wall_clock_blocks=False)
-_NEWS: Final = Qos("data", express=True, reliable=True, wall_clock_blocks=True)
+_CONTROL: Final = Qos("real_time", express=True)
+_REPORT: Final = Qos("data_low", express=False)
+_NEWS: Final = Qos("data", express=True, realtime_blocks=True)
 
 STATE: Final = Topic(
     "state", "bayesrace/{car}/state", State, ("plant",), "each period (50 Hz by default)", _CONTROL
@@ -112,21 +98,13 @@ TELEMETRY: Final = Topic(
     "telemetry", "bayesrace/{car}/telemetry", Telemetry, ("controller",), "each cycle", _REPORT
 )
 EVENT: Final = Topic(
-    "event",
-    "bayesrace/{car}/event/{source}",
-    Event,
-    ("plant", "controller", "race", "recorder"),
-    "when something happens",
-    _NEWS,
-)
+    "event", "bayesrace/{car}/event/{source}", Event, ("plant", "controller", "race", "recorder"),
+    "when something happens", _NEWS,
+)  # fmt: skip
 HEARTBEAT: Final = Topic(
-    "heartbeat",
-    "bayesrace/{car}/status/{source}",
-    Status,
-    ("plant", "controller"),
-    "10 Hz",
+    "heartbeat", "bayesrace/{car}/status/{source}", Status, ("plant", "controller"), "10 Hz",
     _REPORT,
-)
+)  # fmt: skip
 TOPICS: Final[tuple[Topic[Any], ...]] = (STATE, TRUTH, ACTUATION, TELEMETRY, EVENT, HEARTBEAT)
 
 RUN: Final = Service("run", "bayesrace/{car}/plant/run", RunRequest, Reply, 20.0, False)
@@ -135,30 +113,34 @@ STATUS: Final = Service("status", "bayesrace/{car}/{source}/status", StatusReque
 WEIGHTS: Final[Service[Message, Reply]] = Service(
     "weights", "bayesrace/{car}/controller/weights", None, Reply, 20.0
 )
-"""The payload is a weights file (:mod:`bayesrace.gp.weights`). Answered once it is in use, or
-refused; waits for a first cycle, for others that sent theirs before, and for the checks."""
+"""The payload is a weights file (:mod:`bayesrace.gp.weights`). The answer comes when the weights
+are in use or refused: after a first cycle, earlier requests, and the checks."""
 ROLLBACK: Final = Service(
     "rollback", "bayesrace/{car}/controller/rollback", RollbackRequest, Reply, 20.0, False
 )
 ACCEPTED: Final[Service[Message, Message]] = Service(
     "accepted", "bayesrace/{car}/controller/accepted", None, None, 2.0
 )
-"""Asked without payload, for who joins late. The answer (``controller/latecomer.py``) frames the
-file of the weights in use with its time of acceptance and the digests of those given up; empty if
-there is nothing to tell."""
+"""Request without payload, from a controller that starts later. The answer
+(``controller/latecomer.py``) holds the file of the weights in use, its time of acceptance, and the
+digests of withdrawn weights; empty without any."""
 COMMAND: Final = Service("command", "bayesrace/{car}/controller/command", Command, Reply, 5.0)
-CLOCK: Final = Service("clock", "bayesrace/{car}/{source}/clock", ClockRequest, ClockReading, 2.0)
 SERVICES: Final[tuple[Service[Any, Any], ...]] = (
-    RUN, STOP, STATUS, WEIGHTS, ROLLBACK, ACCEPTED, COMMAND, CLOCK
+    RUN, STOP, STATUS, WEIGHTS, ROLLBACK, ACCEPTED, COMMAND
 )  # fmt: skip
 
 ALIVE: Final = "bayesrace/{car}/alive/{source}"
 """Liveliness token of a process."""
 
 
+def is_car_name(name: str) -> bool:
+    """Whether a car of this name can have keys: up to 40 letters, digits, '-' or '_'."""
+    return _CAR_NAME.fullmatch(name) is not None
+
+
 def car_key(template: str, car: str, source: str = "") -> str:
-    """A key expression of the table for one car (and one source, where the key has it)."""
-    if not _CAR_NAME.fullmatch(car):
+    """A key of the table for one car and, where it has one, source; InputError at a bad name."""
+    if not is_car_name(car):
         raise InputError(
             f"car name '{car[:60]}' cannot be part of a key; "
             "use up to 40 letters, digits, '-' or '_'"

@@ -1,71 +1,44 @@
-"""One place where a thread waits for everything that can happen to it, with a time limit.
+"""One place where a thread waits, with a time limit, for everything that can happen to it.
 
-Each topic has a channel of Zenoh's own, which the waiting thread reads itself: one hand-over
-between threads less than a callback that fills a queue, which halves the round trip (docs/
-decisions/). Requests, the coming and going of other processes and signals are put into a queue by
-callbacks. No call waits for several channels and a queue, so the thread looks at all of them and
-sleeps between two looks: 0.05 ms at first, longer the longer it has waited.
+Messages of the control path wait in channels of Zenoh's own, one for each topic, which the waiting
+thread polls: that saves a hand-over between threads and halves the round trip (docs/decisions/).
+All else arrives in one queue: other messages, requests, liveliness tokens, signals. No call waits
+for channels and a queue at once, so the thread looks at all of them and sleeps between two looks:
+0.05 ms at first, longer the longer it has waited. An inbox without channels sleeps in its queue.
 """
 
 import logging
 import os
 import queue
-import socket
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from enum import Enum
 from typing import Any, Final, NamedTuple, TypeVar
 
 import zenoh
 
-from bayesrace.errors import InputError
 from bayesrace.interrupts import catching_signals
-from bayesrace.messages import (
-    ALIVE,
-    CLOCK,
-    ClockReading,
-    Decoder,
-    Message,
-    Service,
-    Topic,
-    car_key,
-    decode,
-    encode,
-)
+from bayesrace.messages import ALIVE, Decoder, Message, Service, Topic, car_key
+from bayesrace.transport.requests import Request, declare_service, in_transport_thread
 
-__all__ = [
-    "BUSY",
-    "LOCKSTEP_SPIN_S",
-    "NEWEST",
-    "Inbox",
-    "Item",
-    "Kind",
-    "Request",
-    "declare_service",
-    "decode_request",
-]
+__all__ = ["LOCKSTEP_SPIN_S", "NEWEST", "Inbox", "Item", "Kind"]
 
 M = TypeVar("M", bound=Message)
 
 _CAPACITY: Final = 10_000
-"""Items, and messages of a topic, waiting at most; a thread this far behind is broken, and memory
-must not follow it. A full channel holds back the senders: those of the wall clock drop, by the
-table."""
+"""Items that wait at most; a thread this far behind is broken, and memory must not follow it."""
 
 _REQUESTS: Final = 16
-"""At most so many requests wait; more are turned away, so that no backlog builds up."""
-
-BUSY: Final = "busy: "
-"""How the error begins that ends a request which is turned away."""
+"""Requests that wait at most; more are rejected, so that no backlog builds up."""
 
 NEWEST: Final = 1024
-"""Messages of the control path that wait at most: a thread this far behind wants the newest."""
+"""Messages of the control path that wait at most; a thread this far behind needs the newest."""
 
 LOCKSTEP_SPIN_S: Final = 0.002
-"""How long a lockstep peer looks for the answer before it sleeps. Waking an idle CPU takes longer
+"""How long a lockstep peer polls for the answer before it sleeps. Waking an idle CPU takes longer
 than the answer: measured, the round trip falls from 270 to 90 us."""
 
 _POLL_S: Final = 5e-5
@@ -85,49 +58,7 @@ class Kind(Enum):
     ALIVE = "alive"
     GONE = "gone"
     SIGNAL = "signal"
-
-
-class Request:
-    """A request under way; answer it once."""
-
-    def __init__(
-        self, service: Service[Any, Any], query: Any, most_bytes: int | None = None
-    ) -> None:
-        """``most_bytes``: a longer payload is not copied, which would hold up other threads."""
-        self.service = service
-        self._query = query
-        payload = query.payload
-        self.size = 0 if payload is None else len(payload)
-        """Bytes that were sent."""
-        fits = most_bytes is None or self.size <= most_bytes
-        self.payload: bytes = payload.to_bytes() if payload is not None and fits else b""
-
-    def message(self) -> Any:
-        """The decoded request; InputError if it is not a valid one."""
-        if self.service.request is None:
-            raise TypeError(f"the payload of '{self.service.name}' is not a message")
-        return decode(self.service.request, self.payload)
-
-    def answer(self, message: Message) -> None:
-        """Send the answer; one that nobody waits for any more is dropped."""
-        self.answer_raw(encode(message))
-
-    def answer_raw(self, data: bytes) -> None:
-        """The same where the answer is not a message."""
-        self._end(lambda query: query.reply(query.key_expr, data))
-
-    def turn_away(self, why: str) -> None:
-        """Ends the request with an error in place of an answer: busy, and ``why``."""
-        self._end(lambda query: query.reply_err(BUSY + why))
-
-    def _end(self, reply: Callable[[Any], None]) -> None:
-        query, self._query = self._query, None
-        try:
-            reply(query)
-        except zenoh.ZError:
-            pass
-        finally:
-            query.drop()
+    RESULT = "result"
 
 
 class Item(NamedTuple):
@@ -138,41 +69,46 @@ class Item(NamedTuple):
     """Topic, service or source; empty for signals."""
     value: Any
     """MESSAGE: the message, None if the topic's decoder has refused it; REQUEST: :class:`Request`;
-    SIGNAL: its number; else None."""
+    SIGNAL: its number; RESULT: what another thread of this process has :meth:`put`; else None."""
     received_ns: int
     """Own monotonic clock on arrival."""
+    key: str = ""
+    """Key of a token, or of a message from the queue."""
 
 
-class _Stream(NamedTuple):
-    """One topic as it arrives."""
+class _Channel(NamedTuple):
+    """A topic that the thread polls."""
 
     name: str
     key: str
-    channel: Any
+    try_recv: Callable[[], Any]
     decoder: Decoder[Any]
 
 
 class Inbox:
-    """Items for one thread. Declare what may arrive, then :meth:`get`.
+    """Items for one thread: declare what may arrive, then :meth:`get` it.
 
-    What is declared lives as long as the inbox, so keep it.
+    Declarations live as long as the inbox, so keep it.
     """
 
-    def __init__(self, session: Any, car: str) -> None:
+    def __init__(self, session: Any, car: str | None, capacity: int = _CAPACITY) -> None:
+        """``car``: None for all cars, to receive only. ``capacity``: of the queue."""
         self._session = session
         self._car = car
-        self._items: queue.SimpleQueue[Item] = queue.SimpleQueue()
+        self._capacity = capacity
+        self._queue: queue.SimpleQueue[Item] = queue.SimpleQueue()
         self._declared: list[Any] = []
-        self._streams: deque[_Stream] = deque()
+        self._decoders: dict[str, Decoder[Any]] = {}
+        self._channels: deque[_Channel] = deque()
         """In the order in which they are looked at next."""
         self._stamping = False
         self.alive: set[str] = set()
         """Sources whose liveliness token is there, as of the items taken so far."""
         self._room = threading.Semaphore(_REQUESTS)
         self.overflowed = 0
-        """Items lost because nobody took them."""
-        self.turned_away = 0
-        """Requests that were not answered because too many waited."""
+        """Items lost because the queue was full."""
+        self.requests_rejected = 0
+        """Requests rejected because too many waited."""
         self.spin_s = 0.0
         """How long :meth:`get` polls before it sleeps; 0 wherever others need the CPU."""
 
@@ -183,84 +119,73 @@ class Inbox:
         newest: int | None = None,
         logger: logging.Logger | None = None,
     ) -> Decoder[M]:
-        """Let the topic's messages arrive, decoded, under the topic's name; any number of topics.
+        """Receive the topic's messages, decoded, under its name; any number of topics.
 
-        ``newest``: of those waiting, only so many are kept, the newest; the others are let go.
-        Returns the topic's decoder, which counts what it refuses; ``logger`` as in
-        :class:`Decoder`.
+        ``newest``: they wait in a channel that the thread polls, of which the newest so many are
+        kept; otherwise in the queue. Returns the topic's decoder, which counts what it refuses;
+        ``logger`` as in :class:`Decoder`.
         """
-        key = car_key(topic.key, self._car, source)
-        channel: Any = zenoh.handlers.FifoChannel(_CAPACITY)
-        if newest is not None:
-            channel = zenoh.handlers.RingChannel(newest)
-        subscriber = self._session.declare_subscriber(key, channel)
-        decoder = Decoder(topic.message, logger)
-        self._declared.append(subscriber)
-        self._streams.append(_Stream(topic.name, key, subscriber.handler, decoder))
+        decoder = self._decoders[topic.name] = Decoder(topic.message, logger)
+        key = self._key(topic.key, source)
+        if newest is None:
+            self._declared.append(self._into_queue(topic.name, key))
+        else:
+            channel: Any = zenoh.handlers.RingChannel(newest)
+            subscriber = self._session.declare_subscriber(key, channel)
+            self._declared.append(subscriber)
+            take = subscriber.handler.try_recv
+            self._channels.append(_Channel(topic.name, key, take, decoder))
         return decoder
 
     def serve(self, service: Service[Any, Any], source: str = "") -> None:
-        """Let the service's requests arrive; what comes when many wait is turned away, counted."""
+        """Receive the service's requests; those beyond the limit are rejected and counted."""
 
-        def arrived(request: Request) -> None:
-            if not self._room.acquire(blocking=False):
-                self.turned_away += 1
-                request.turn_away(f"{_REQUESTS} requests wait already")
-                return
-            self._enqueue(Item(Kind.REQUEST, service.name, request, time.monotonic_ns()))
+        def on_request(request: Request) -> None:
+            if self._room.acquire(blocking=False):
+                self.put(Item(Kind.REQUEST, service.name, request, time.monotonic_ns()))
+            else:
+                self.requests_rejected += 1
+                request.reject(f"{_REQUESTS} requests are waiting; try again")
 
-        self._declared.append(
-            declare_service(self._session, service, self._car, arrived, source=source)
-        )
-
-    def tell_time(self, source: str) -> None:
-        """Answer requests for this process's clock, at once in the transport's own thread."""
-        host = socket.gethostname()[:200]
-
-        def on_query(query: Any) -> None:
-            query.reply(query.key_expr, encode(ClockReading(0, time.monotonic_ns(), host)))
-            query.drop()
-
-        key = car_key(CLOCK.key, self._car, source)
-        self._declared.append(self._session.declare_queryable(key, _direct(on_query)))
+        self._serve(service, on_request, source)
 
     def announce(self, source: str) -> None:
-        """Declare own liveliness token: last, when everything else is in place."""
-        token = self._session.liveliness().declare_token(car_key(ALIVE, self._car, source))
+        """Declare this process's liveliness token: last, when everything else is in place."""
+        token = self._session.liveliness().declare_token(self._key(ALIVE, source))
         self._declared.append(token)
 
-    def watch(self, source: str) -> None:
-        """Let the coming and going of another process arrive, its presence now included."""
+    def watch(self, source: str = "*") -> None:
+        """Receive the appearance and disappearance of processes, those present now included."""
 
         def on_token(sample: Any) -> None:
-            there = sample.kind == zenoh.SampleKind.PUT
-            kind = Kind.ALIVE if there else Kind.GONE
-            self._enqueue(Item(kind, source, None, time.monotonic_ns()))
+            kind = Kind.ALIVE if sample.kind == zenoh.SampleKind.PUT else Kind.GONE
+            key = str(sample.key_expr)
+            self._offer(kind, key.split("/")[-1] if source == "*" else source, None, key)
 
-        key = car_key(ALIVE, self._car, source)
+        tokens, handler = self._session.liveliness(), in_transport_thread(on_token)
         self._declared.append(
-            self._session.liveliness().declare_subscriber(key, _direct(on_token), history=True)
+            tokens.declare_subscriber(self._key(ALIVE, source), handler, history=True)
         )
 
-    @contextmanager
-    def catching_signals(self) -> Iterator[None]:
-        """For the block, let SIGINT and SIGTERM arrive as items; nothing off the main thread."""
+    def receive_signals(self) -> AbstractContextManager[None]:
+        """For the block, SIGINT and SIGTERM arrive as items; no effect off the main thread."""
+        return catching_signals(
+            lambda number: self.put(Item(Kind.SIGNAL, "", number, time.monotonic_ns()))
+        )
 
-        def arrived(number: int) -> None:
-            self._items.put(Item(Kind.SIGNAL, "", number, time.monotonic_ns()))
-
-        with catching_signals(arrived):
-            yield
+    def put(self, item: Item) -> None:
+        """Add an item of this process itself, whatever waits; from any thread or signal handler."""
+        self._queue.put(item)
 
     def get(self, timeout_s: float = 0.0) -> Item | None:
-        """The next item, the topics in turn; None if nothing arrives in time."""
+        """The next item, of the queue or else of the channels in turn; None after the timeout."""
         if self._stamping:
             self._empty_channels()
-        if self._stamping or not self._streams:
+        if self._stamping or not self._channels:
             return self._from_queue(timeout_s)
         begin = time.monotonic()
         while True:
-            item = self._from_channels() if self._items.empty() else self.other()
+            item = self._from_channels() if self._queue.empty() else self.poll_queue()
             if item is not None:
                 return item
             waited_s = time.monotonic() - begin
@@ -273,10 +198,11 @@ class Inbox:
             time.sleep(min(sleep_s, timeout_s - waited_s))
 
     def poll(self, until_ns: int) -> Item | None:
-        """The next message, looked for until the monotonic clock says ``until_ns``.
+        """The next message of the channels, looked for until the monotonic clock is ``until_ns``.
 
-        For fixed-rate loops: wakes to the tenth of a millisecond without another thread's help, and
-        leaves the CPU to the thread that brings the message (docs/decisions/). Looks at least once.
+        For fixed-rate loops: notices a message within a tenth of a millisecond without another
+        thread's help, and leaves the CPU to the thread that receives it (docs/decisions/). Looks at
+        least once.
         """
         while (item := self._from_channels()) is None:
             if time.monotonic_ns() >= until_ns:
@@ -284,60 +210,79 @@ class Inbox:
             time.sleep(_POLL_S)
         return item
 
-    def other(self) -> Item | None:
-        """The next item that is no message, of those that are there; does not wait."""
+    def poll_queue(self) -> Item | None:
+        """The next item of the queue; does not wait."""
         return self._from_queue(0.0)
 
     @contextmanager
     def stamped(self) -> Iterator[None]:
-        """For the block, the transport's own thread takes the messages as they arrive, so that
-        ``received_ns`` is right even if the owner sleeps meanwhile."""
+        """For the block, the messages of channels go through the queue, too.
 
-        def stamping(name: str) -> Any:
-            def on_sample(sample: Any) -> None:
-                data: bytes = sample.payload.to_bytes()
-                self._enqueue(Item(Kind.MESSAGE, name, data, time.monotonic_ns()))
-
-            return _direct(on_sample)
-
+        The transport's thread takes them as they arrive, so that ``received_ns`` is right even
+        while the owner sleeps.
+        """
         self._stamping = True
         try:
             with ExitStack() as stack:
-                for stream in self._streams:
-                    subscriber = self._session.declare_subscriber(stream.key, stamping(stream.name))
-                    stack.callback(subscriber.undeclare)
+                for channel in self._channels:
+                    stack.callback(self._into_queue(channel.name, channel.key).undeclare)
                 yield
         finally:
             self._empty_channels()
             self._stamping = False
 
+    def _key(self, template: str, source: str) -> str:
+        if self._car is None:
+            return template.format(car="*", source=source)
+        return car_key(template, self._car, source)
+
+    def _serve(
+        self, service: Service[Any, Any], on_request: Callable[[Request], None], source: str
+    ) -> None:
+        self._declared.append(
+            declare_service(self._session, service, self._car or "", on_request, source=source)
+        )
+
+    def _into_queue(self, name: str, key: str) -> Any:
+        def on_sample(sample: Any) -> None:
+            data: bytes = sample.payload.to_bytes()
+            self._offer(Kind.MESSAGE, name, data, str(sample.key_expr))
+
+        return self._session.declare_subscriber(key, in_transport_thread(on_sample))
+
+    def _offer(self, kind: Kind, name: str, value: Any, key: str) -> None:
+        """In the transport's thread: another process must not fill the memory."""
+        if self._queue.qsize() < self._capacity:
+            self._queue.put(Item(kind, name, value, time.monotonic_ns(), key))
+        else:
+            self.overflowed += 1
+
     def _empty_channels(self) -> None:
-        """Lets go of what was stamped: each message there keeps a buffer of the transport's."""
-        for stream in self._streams:
-            while stream.channel.try_recv() is not None:
+        """Drops what the queue has as well: each message there keeps a buffer of the transport."""
+        for channel in self._channels:
+            while channel.try_recv() is not None:
                 pass
 
     def _from_channels(self) -> Item | None:
         """The next message of those that are there, beginning with the topic after the last one."""
-        streams = self._streams
-        for _ in range(len(streams)):
-            stream = streams[0]
-            streams.rotate(-1)
-            sample = stream.channel.try_recv()
+        channels = self._channels
+        for _ in range(len(channels)):
+            channel = channels[0]
+            channels.rotate(-1)
+            sample = channel.try_recv()
             if sample is not None:
                 now_ns = time.monotonic_ns()
-                message = stream.decoder(sample.payload.to_bytes())
-                return Item(Kind.MESSAGE, stream.name, message, now_ns)
+                message = channel.decoder(sample.payload.to_bytes())
+                return Item(Kind.MESSAGE, channel.name, message, now_ns)
         return None
 
     def _from_queue(self, timeout_s: float) -> Item | None:
         try:
-            item = self._items.get(timeout_s > 0, max(timeout_s, 0.0))
+            item = self._queue.get(timeout_s > 0, max(timeout_s, 0.0))
         except queue.Empty:
             return None
         if item.kind is Kind.MESSAGE:
-            decoder = next(one.decoder for one in self._streams if one.name == item.name)
-            return item._replace(value=decoder(item.value))
+            return item._replace(value=self._decoders[item.name](item.value))
         if item.kind is Kind.ALIVE:
             self.alive.add(item.name)
         elif item.kind is Kind.GONE:
@@ -345,42 +290,3 @@ class Inbox:
         elif item.kind is Kind.REQUEST:
             self._room.release()
         return item
-
-    def _enqueue(self, item: Item) -> None:
-        """From another thread."""
-        if self._items.qsize() >= _CAPACITY:
-            self.overflowed += 1
-            return
-        self._items.put(item)
-
-
-def _direct(callback: Callable[[Any], None]) -> Any:
-    """Run on the receiving thread: a second hand-over would cost as much as the network."""
-    return zenoh.handlers.Callback(callback, indirect=False)
-
-
-def declare_service(
-    session: Any,
-    service: Service[Any, Any],
-    car: str,
-    on_request: Callable[[Request], None],
-    most_bytes: int | None = None,
-    source: str = "",
-) -> Any:
-    """Calls ``on_request`` with each request in the transport's own thread, so it must be quick.
-
-    For a thread that has no inbox. Keep what is returned; ``most_bytes`` as in :class:`Request`.
-    """
-
-    def on_query(query: Any) -> None:
-        on_request(Request(service, query, most_bytes))
-
-    return session.declare_queryable(car_key(service.key, car, source), _direct(on_query))
-
-
-def decode_request(request: Request) -> tuple[Any, str]:
-    """The request's message and "", or None and why it is refused."""
-    try:
-        return request.message(), ""
-    except InputError as error:
-        return None, str(error)

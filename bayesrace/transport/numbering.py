@@ -1,19 +1,19 @@
-"""Counting what a numbered stream of messages has lost on its way."""
+"""Counting lost messages by their sequence numbers."""
 
 from typing import Final
 
 __all__ = ["Numbering"]
 
 _FAR: Final = 1024
-"""No message is overtaken by more, and few losses are longer: a number farther from the one that is
-due, either way, or 0, counts once the next one confirms it."""
+"""Reordering is shorter, and so are most losses: a number farther from the expected one, or 0,
+counts once the next one confirms it."""
 
 
 class Numbering:
-    """Received and lost messages of one sender, by their numbers.
+    """Received and lost messages of one sender.
 
-    A message that was overtaken counts as lost until it arrives after all. A sender that begins
-    again starts afresh. A single number far off does not change the losses.
+    A late message counts as lost until it arrives. A restarted sender begins a new count. A single
+    number far off does not change the losses.
     """
 
     def __init__(self) -> None:
@@ -21,14 +21,14 @@ class Numbering:
         self.lost = 0
         self._next: int | None = None
         self._far: int | None = None
-        """Number of the message before, if it waits to be confirmed."""
+        """Number of the previous message, if it waits to be confirmed."""
 
     def restart(self) -> None:
-        """Whatever number comes next is the first of another sender."""
+        """Take the next number, whatever it is, as the first of another sender."""
         self._next = self._far = None
 
     def note(self, seq: int) -> None:
-        """The next message, in the order of arrival."""
+        """Count the next message, in the order of arrival."""
         self.received += 1
         far, self._far = self._far, None
         due = self._next

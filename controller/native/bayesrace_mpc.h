@@ -32,10 +32,10 @@ extern "C" {
 #endif
 
 #define BR_SECOND_START_ITERATIONS 12 /* at most; most often it needs eight */
-#define BR_NV (BR_NX + BR_NU)      /* stage variables v = [x; u] */
-#define BR_PATH_COLUMNS 7          /* see br_mpc_set_path */
-#define BR_PATH_CAPACITY 8192      /* points of the path table */
-#define BR_PREDICT_MAX_S 1.0       /* longest br_mpc_predict */
+#define BR_NV (BR_NX + BR_NU)         /* stage variables v = [x; u] */
+#define BR_PATH_COLUMNS 7             /* see br_mpc_set_path */
+#define BR_PATH_CAPACITY 8192         /* points of the path table */
+#define BR_PREDICT_MAX_S 1.0          /* longest br_mpc_predict */
 
 #if defined(_WIN32)
 #define BR_API __declspec(dllexport)
@@ -58,15 +58,15 @@ typedef double (*br_mpc_clock)(void *context);
 /* Posterior mean of one output: mean(z) = offset + scale * sum_i alpha_i k(r_i),
  * r_i = || (z - inputs_i) / length_scales ||. n = 0 gives offset alone. */
 typedef struct {
-    int kernel;                    /* br_mpc_kernel */
-    int n;                         /* training points, at most BR_GP_CAPACITY */
+    int kernel; /* br_mpc_kernel */
+    int n;      /* training points, at most BR_GP_CAPACITY */
     double offset, scale;
-    const double *length_scales;   /* BR_NZ */
-    const double *inputs;          /* n x BR_NZ, row major */
-    const double *alpha;           /* n */
+    const double *length_scales; /* BR_NZ */
+    const double *inputs;        /* n x BR_NZ, row major */
+    const double *alpha;         /* n */
 } br_mpc_gp;
 
-/* --- set-up; none is for the control loop but where it says so ------------------------------ */
+/* --- set-up; none is for the control loop but where it says so --- */
 
 BR_API size_t br_mpc_memory_size(void);
 BR_API br_mpc_error br_mpc_init(void *memory, size_t size, br_mpc **out);
@@ -76,15 +76,15 @@ BR_API br_mpc_error br_mpc_set_parameters(br_mpc *mpc, const br_mpc_parameters *
  * x, y, speed, left unit normal of the centreline (2), lower and upper bound of normal . p. */
 BR_API br_mpc_error br_mpc_set_path(br_mpc *mpc, const double *table, int n, double spacing_m);
 
-/* Copies the weights; the next step uses them. About 10 us per 400 points and output. What is staged
- * is forgotten. BR_ERROR_BUSY while another thread stages. */
+/* Copies the weights; the next step uses them. About 10 us per 400 points and output. What is
+ * staged is forgotten. BR_ERROR_BUSY while another thread stages. */
 BR_API br_mpc_error br_mpc_set_weights(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]);
 
 /* The same in two parts, for a control loop that has no time to copy. br_mpc_stage_weights copies
  * into a second buffer, while steps go on with the weights in use: the one function that another
  * thread may call beside the one that calls all others. Staged again before they are adopted, the
- * newer ones count. BR_ERROR_BUSY: two threads stage, or the other adopts, at this very moment; call
- * again. After an error nothing is staged.
+ * newer ones count. BR_ERROR_BUSY: two threads stage, or the other adopts, at this very moment;
+ * call again. After an error nothing is staged.
  *
  * br_mpc_adopt_weights, between two steps, puts what is staged into use: an exchange of buffers,
  * about a microsecond. Then as after br_mpc_set_weights: plan and multipliers stay, and a
@@ -101,7 +101,7 @@ BR_API br_mpc_error br_mpc_set_clock(br_mpc *mpc, br_mpc_clock clock, void *cont
  * Alone in br_clock.c, which a system without it leaves out. */
 BR_API double br_mpc_monotonic(void *context);
 
-/* --- the control loop ------------------------------------------------------------------------ */
+/* --- the control loop --- */
 
 /* Forgets the previous plan, working set and position on the line. */
 BR_API void br_mpc_reset(br_mpc *mpc);
@@ -109,14 +109,14 @@ BR_API void br_mpc_reset(br_mpc *mpc);
 /* One control step: projects the car on the racing line, makes the reference, solves, checks.
  * A problem without a path has none of that (BR_ERROR_NOT_READY): br_mpc_solve serves it.
  * Where the car stands and points away from the line, the reference (br_mpc_get_reference) leads it
- * round at a walking pace instead, with the track's edges farther out: see br_turn.c.
+ * round at a walking pace instead, with the track's edges farther out: see br_turnaround.c.
  *
  * x: measured state. u_before: the input that acts now. u: first input of the plan; written
  * only for BR_CONVERGED and BR_ACCEPTABLE. info may be NULL.
  *
  * environment: what limits the car besides. The reference moves along the line at most at the speed
- * limit, and at every stage by its rate times BR_TS less, down to standstill: for a stop on the line.
- * NULL: nothing does. BR_ERROR_PARAMETERS if a number is negative or none.
+ * limit, and at every stage by its rate times BR_TS less, down to standstill: for a stop on the
+ * line. NULL: nothing does. BR_ERROR_PARAMETERS if a number is negative or none.
  *
  * elapsed_s: time from the state of the call before to this one, whether that was solved or not.
  * The plan is shifted by whole stages as soon as it lags behind by half a stage, so that it is
@@ -125,11 +125,11 @@ BR_API void br_mpc_reset(br_mpc *mpc);
  * not finite.
  *
  * budget_s: time from the call within which it should return; needs a clock. The step then
- * iterates until settled (settle 0: converged) or as long as another iteration, at the longest
- * duration seen, fits, and returns the best usable plan. The first iteration is always done.
- * Without a clock or with budget_s <= 0 the iteration limits alone count. Either way an iteration
- * that fails does not take back a usable plan found before it. After BR_TIME_LIMIT the next step
- * goes on from where this one stopped. */
+ * iterates until an early stop (early_stop_tol 0: until converged) or as long as another iteration,
+ * at the longest duration seen, fits, and returns the best usable plan. The first iteration is
+ * always done. Without a clock or with budget_s <= 0 the iteration limits alone count. Either way
+ * an iteration that fails does not take back a usable plan found before it. After BR_TIME_LIMIT the
+ * next step goes on from where this one stopped. */
 BR_API br_mpc_error br_mpc_step(br_mpc *mpc, const double x[BR_NX], const double u_before[BR_NU],
                                 const br_environment *environment, double elapsed_s,
                                 double budget_s, double u[BR_NU], br_mpc_status *status,
@@ -156,9 +156,9 @@ BR_API br_mpc_error br_mpc_prepare(br_mpc *mpc, double elapsed_s, double budget_
 BR_API br_mpc_error br_mpc_predict(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
                                    double duration_s, double x_next[BR_NX]);
 
-/* Does over what br_mpc_prepare has done, to the same bits, so that caches and branch predictors are
- * warm when the state arrives: after 20 ms of other work a step takes half as long again. Nothing
- * if nothing is prepared. */
+/* Does over what br_mpc_prepare has done, to the same bits, so that caches and branch predictors
+ * are warm when the state arrives: after 20 ms of other work a step takes half as long again.
+ * Nothing if nothing is prepared. */
 BR_API br_mpc_error br_mpc_rehearse(br_mpc *mpc);
 
 /* Plan of the last step, row major: x (BR_N + 1) x BR_NX, u BR_N x BR_NU; NULL for what is not
@@ -166,7 +166,7 @@ BR_API br_mpc_error br_mpc_rehearse(br_mpc *mpc);
 BR_API br_mpc_error br_mpc_get_plan(const br_mpc *mpc, double *x, double *u);
 BR_API br_mpc_error br_mpc_get_reference(const br_mpc *mpc, br_mpc_reference reference[BR_N]);
 
-/* --- for tests and tools ----------------------------------------------------------------------- */
+/* --- for tests and tools --- */
 
 /* Corrected model at v = [x; u]: x_next, J = d x_next / d v (row major) and
  * H = sum_i lambda_i d^2 x_next_i / d v^2. */

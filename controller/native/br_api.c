@@ -17,7 +17,7 @@ br_mpc_error br_mpc_init(void *memory, size_t size, br_mpc **out) {
 }
 
 static int valid(const br_mpc_parameters *p) {
-    const double numbers[] = {p->tolerance, p->defect_max, p->settle};
+    const double numbers[] = {p->tolerance, p->defect_max, p->early_stop_tol};
     return br_all_finite(numbers, sizeof numbers / sizeof numbers[0]) && BR_SOLVER_VALID(p) &&
            br_valid_parameters(p);
 }

@@ -7,9 +7,9 @@
 
 #if BR_HAS_PATH
 
-#define JUMP 2.0          /* a plan that costs more than so many times the one before, shifted, */
-#define JUMP_BY 0.01      /* and so much more */
-#define LEAST_BUDGET 0.1  /* what a step gets however late its cycle began: share of the budget */
+#define JUMP 2.0         /* a plan that costs more than so many times the one before, shifted, */
+#define JUMP_BY 0.01     /* and so much more */
+#define LEAST_BUDGET 0.1 /* what a step gets however late its cycle began: share of the budget */
 
 struct br_cycle {
     br_controller controller;
@@ -26,12 +26,12 @@ struct br_cycle {
     br_solution solution;
     br_decision decision; /* of the newest cycle */
     int halted;           /* the phase of a car that is not to be driven; 0: drive */
-    int stopping;         /* a stop is under way: since, from which speed */
+    int stopping;         /* a stop has begun: since, from which speed */
     double stopping_s, stopping_mps;
     int stepped; /* a step has been made, for that moment */
     double stepped_s;
     double vx_mps; /* the newest that is known */
-    int reckoned;  /* where the car may be, and when, if no state tells */
+    int reckoned;  /* where the car may be, and when, without a state */
     double reckoned_s, reckoned_x[BR_NX];
 };
 
@@ -54,7 +54,7 @@ br_mpc_error br_cycle_init(void *memory, size_t size, const br_controller *contr
     return BR_OK;
 }
 
-/* --- the compiled controller ------------------------------------------------------------------ */
+/* --- the compiled controller --- */
 
 static int mpc_step(void *self, const double x[BR_NX], const double u_before[BR_NU],
                     const br_environment *environment, double elapsed_s, double budget_s,
@@ -101,7 +101,7 @@ br_mpc_error br_cycle_drive_mpc(void *memory, size_t size, br_mpc *mpc, int hold
     return error;
 }
 
-/* --- settings and counters -------------------------------------------------------------------- */
+/* --- settings and counters --- */
 
 const br_mpc_info *br_cycle_info(const br_cycle *cycle) { return cycle ? &cycle->info : NULL; }
 
@@ -134,7 +134,7 @@ br_mpc_error br_cycle_set_clock(br_cycle *cycle, br_mpc_clock clock, void *conte
     return cycle->mpc ? br_mpc_set_clock(cycle->mpc, clock, context) : BR_OK;
 }
 
-/* --- states, runs, commands ------------------------------------------------------------------- */
+/* --- states, runs, commands --- */
 
 br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state) {
     if (!cycle || !state) return BR_STATE_FOREIGN;
@@ -143,13 +143,13 @@ br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state) {
         return BR_STATE_FOREIGN;
     }
     const br_measured *newest = &cycle->stream.newest;
-    const int begins = !cycle->stream.has_newest || newest->epoch != state->epoch ||
-                       newest->run != state->run;
+    const int begins =
+        !cycle->stream.has_newest || newest->epoch != state->epoch || newest->run != state->run;
     const br_reception reception = br_stream_accept(&cycle->stream, state, &cycle->counters);
     if (reception != BR_STATE_NEW) return reception;
     if (begins) {
         memset(&cycle->fallback, 0, sizeof cycle->fallback); /* the plan is of another run */
-        cycle->delay.count = 0; /* no input is under way; the delay is still the best guess */
+        cycle->delay.count = 0; /* no input is on its way; the delay is still the best guess */
         cycle->controller.reset(cycle->controller.self);
         cycle->stepped = cycle->stopping = cycle->reckoned = 0;
     }
@@ -178,27 +178,26 @@ void br_cycle_go(br_cycle *cycle) {
     if (cycle) cycle->halted = cycle->stopping = 0;
 }
 
-/* --- one cycle -------------------------------------------------------------------------------- */
+/* --- one cycle --- */
 
-static double now(const br_cycle *cycle) {
-    return cycle->clock ? cycle->clock(cycle->context) : 0;
-}
+static double now(const br_cycle *cycle) { return cycle->clock ? cycle->clock(cycle->context) : 0; }
 
-/* Whether a stop on command is still under way; limits the speed to what it has got to. Driven to
+/* Whether a stop on command is not over yet; limits the speed to what it has got to. Driven to
  * standstill, the car stays on the line and points along it, fit to go on. */
 static int slowing(br_cycle *cycle, double basis_s, br_environment *environment) {
     const br_driving *s = &cycle->settings;
     const double vx_mps = cycle->stream.newest.x[BR_INDEX_VX];
     const int rolling = fabs(vx_mps) > s->standing_mps;
     if (!cycle->stopping && !rolling) return 0;
-    if (!cycle->stopping) { /* just told, or a rolling car taken over on hold */
+    if (!cycle->stopping) { /* just commanded, or a rolling car taken over on hold */
         cycle->stopping = 1;
         cycle->stopping_s = basis_s;
         cycle->stopping_mps = fmax(vx_mps, 0);
     }
     const double since_s = basis_s - cycle->stopping_s;
     const double limit_mps = fmax(cycle->stopping_mps - s->stop_mps2 * since_s, 0);
-    /* Both limits are kept by the lower one falling at the higher rate; NaN is left to be refused. */
+    /* Both limits are kept by the lower one falling at the higher rate; NaN is left to be refused.
+     */
     if (limit_mps < environment->speed_limit_mps) environment->speed_limit_mps = limit_mps;
     if (s->stop_mps2 > environment->speed_limit_rate_mps2)
         environment->speed_limit_rate_mps2 = s->stop_mps2;
@@ -266,8 +265,8 @@ static int step(br_cycle *cycle, const br_environment *environment, double actin
     solution->rows = solution->second_start = 0;
     solution->cost = solution->shifted_cost = -1;
     const double begin_s = now(cycle);
-    const int status = controller->step(controller->self, x, u, environment, elapsed_s, budget_s,
-                                        solution);
+    const int status =
+        controller->step(controller->self, x, u, environment, elapsed_s, budget_s, solution);
     cycle->decision.step_us = (now(cycle) - begin_s) * 1e6;
     cycle->decision.stepped = status != BR_STEP_FAILED;
     count(cycle, status);
@@ -292,9 +291,9 @@ static void drive(br_cycle *cycle, const br_environment *environment, double act
         decision->status = step(cycle, environment, acting_s, budget_s > 0 ? left_s : 0);
     }
     if (budget_s > 0) decision->late_s = spent_s + now(cycle) - begin_s - budget_s;
-    decision->level = br_fallback_decide(
-        &cycle->fallback, &cycle->settings, decision->status ? NULL : &cycle->solution,
-        cycle->vx_mps, acting_s, fmax(decision->late_s, 0), decision->u);
+    decision->level = br_fallback_decide(&cycle->fallback, &cycle->settings,
+                                         decision->status ? NULL : &cycle->solution, cycle->vx_mps,
+                                         acting_s, fmax(decision->late_s, 0), decision->u);
     cycle->counters.levels[decision->level] += 1;
     const int driving = decision->level == BR_SOLUTION ? BR_PHASE_DRIVING : BR_PHASE_FALLBACK;
     cycle->counters.phase = cycle->halted ? cycle->halted : driving;
@@ -317,8 +316,10 @@ br_mpc_error br_cycle_decide(br_cycle *cycle, const br_environment *environment,
     const double acting_s = basis_s + decision->delay_s;
     br_environment around = {.speed_limit_mps = INFINITY};
     if (environment) around = *environment;
-    if (cycle->halted && !slowing(cycle, basis_s, &around)) halt(cycle, acting_s);
-    else drive(cycle, &around, acting_s, budget_s, spent_s);
+    if (cycle->halted && !slowing(cycle, basis_s, &around))
+        halt(cycle, acting_s);
+    else
+        drive(cycle, &around, acting_s, budget_s, spent_s);
     br_delay_sent(&cycle->delay, basis_s, decision->u);
     *out = *decision;
     return BR_OK;
@@ -334,7 +335,8 @@ br_mpc_error br_cycle_answer(br_cycle *cycle, const br_measured *state,
 
 /* A car is being driven: a step has been made, and no halt since. */
 void br_cycle_prepare(br_cycle *cycle, double period_s, double budget_s) {
-    if (cycle && cycle->stepped) cycle->controller.prepare(cycle->controller.self, period_s, budget_s);
+    if (cycle && cycle->stepped)
+        cycle->controller.prepare(cycle->controller.self, period_s, budget_s);
 }
 
 void br_cycle_rehearse(br_cycle *cycle) {

@@ -4,23 +4,23 @@
 
 #include "bayesrace_cycle.h"
 
-/* --- br_stream.c: which states count ---------------------------------------------------------- */
+/* --- br_stream.c: which states count --- */
 
 typedef struct {
     br_measured newest, other; /* other: the last one that did not continue the stream */
     int has_newest, has_other;
-    int others;                /* states in a row that belong to the other */
-    int ended, silent;         /* the run is over; nothing has come for long */
+    int others;        /* states in a row that belong to the other */
+    int ended, silent; /* the run is over; nothing has come for long */
 } br_stream;
 
 void br_stream_init(br_stream *stream);
 br_reception br_stream_accept(br_stream *stream, const br_measured *state, br_counters *counters);
 int br_stream_forget(br_stream *stream, br_counters *counters);
 
-/* --- br_delay.c: the state at the moment from which the new input will act -------------------- */
+/* --- br_delay.c: the state at the moment from which the new input will act --- */
 
-#define BR_SENT 1024     /* inputs remembered: two seconds at 500 Hz */
-#define BR_MEDIAN_OF 15  /* delays */
+#define BR_SENT 1024    /* inputs remembered: two seconds at 500 Hz */
+#define BR_MEDIAN_OF 15 /* delays */
 
 typedef struct {
     double basis_s, u[BR_NU];
@@ -40,7 +40,7 @@ int br_delay_at_acting(br_delay *delay, const br_driving *settings, const br_con
                        const br_measured *state, double basis_s, double delay_s, double x[BR_NX],
                        double u[BR_NU]);
 
-/* --- br_fallback.c: what is sent where there is no solution to send ---------------------------- */
+/* --- br_fallback.c: what is sent where there is no solution to send --- */
 
 typedef struct {
     int rows; /* of the plan; 0: none */

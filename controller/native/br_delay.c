@@ -1,9 +1,9 @@
 /* Delay compensation: the state at the moment from which the new input will act.
  *
- * The plant tells, in its own time, how long after its basis each input began to act; the median of
- * the newest ones is the delay. The input made now on the basis of plant time t acts from t + delay
- * on. Until then act the inputs that were sent before, each from its own basis plus the delay on;
- * the corrected model carries the state through them. No clocks have to agree. */
+ * The plant reports, in its own time, how long after its basis each input began to act; the median
+ * of the newest ones is the delay. The input made now on the basis of plant time t acts from t +
+ * delay on. Until then act the inputs that were sent before, each from its own basis plus the delay
+ * on; the corrected model carries the state through them. No clocks have to agree. */
 #include <math.h>
 #include <string.h>
 

@@ -69,9 +69,8 @@ static br_level step_down(const br_fallback *fallback, const br_driving *s, doub
 
 /* The input u that acts late_s after time_s, always finite and within the limits. solution: for one
  * that acts at time_s; NULL: there is none. */
-br_level br_fallback_decide(br_fallback *fallback, const br_driving *s,
-                            const br_solution *solution, double vx_mps, double time_s,
-                            double late_s, double u[BR_NU]) {
+br_level br_fallback_decide(br_fallback *fallback, const br_driving *s, const br_solution *solution,
+                            double vx_mps, double time_s, double late_s, double u[BR_NU]) {
     const double acting_s = time_s + late_s;
     if (!solution || !usable(s, solution->u)) {
         const br_level level = step_down(fallback, s, vx_mps, acting_s, u);

@@ -48,7 +48,8 @@ static inline __attribute__((always_inline)) kernel_value kernel(const int kind,
 }
 
 /* Points are taken in blocks that stay in the first-level cache: what needs the exponential is
- * computed once and stored, then the sums run over it with few enough accumulators for registers. */
+ * computed once and stored, then the sums run over it with few enough accumulators for registers.
+ */
 #define BLOCK 64
 
 typedef struct {
@@ -56,9 +57,10 @@ typedef struct {
     BR_ALIGNED double w1[BLOCK], w2[BLOCK]; /* alpha g1, alpha g2 */
 } block;
 
-static inline __attribute__((always_inline)) br_vec
-fill_block(const int kind, const br_gp_output *gp, const br_vec query[BR_NZ], int first, int count,
-           block *out) {
+static inline __attribute__((always_inline)) br_vec fill_block(const int kind,
+                                                               const br_gp_output *gp,
+                                                               const br_vec query[BR_NZ], int first,
+                                                               int count, block *out) {
     br_vec sum = {0};
 #pragma GCC unroll 2
     for (int i = 0; i < count; i += BR_LANES) {
@@ -95,8 +97,8 @@ INLINE void add_first_moments(const block *in, int count, br_vec sums[1 + BR_NZ]
     UNROLL for (int a = 0; a < BR_NZ; ++a) sums[1 + a] = s[a];
 }
 
-/* Second moments sum w2 t_a t_b for b <= a, packed by rows; of the rows first <= a < end, whose sums
- * have room in the registers. */
+/* Second moments sum w2 t_a t_b for b <= a, packed by rows; of the rows first <= a < end, whose
+ * sums have room in the registers. */
 INLINE void add_rows(const block *in, int count, const int first, const int end,
                      br_vec sums[SECOND_MOMENTS]) {
     br_vec s[SECOND_MOMENTS];
@@ -106,8 +108,8 @@ INLINE void add_rows(const block *in, int count, const int first, const int end,
         br_vec t[BR_NZ], wt[BR_NZ];
         UNROLL for (int a = 0; a < end; ++a) t[a] = br_load(&in->t[a][i]);
         UNROLL for (int a = first; a < end; ++a) wt[a] = w * t[a];
-        UNROLL for (int a = first; a < end; ++a)
-            UNROLL for (int b = 0; b <= a; ++b) s[a * (a + 1) / 2 + b] += wt[a] * t[b];
+        UNROLL for (int a = first; a < end; ++a) UNROLL for (int b = 0; b <= a; ++b)
+            s[a * (a + 1) / 2 + b] += wt[a] * t[b];
     }
     UNROLL for (int e = first * (first + 1) / 2; e < end * (end + 1) / 2; ++e) sums[e] = s[e];
 }
@@ -118,9 +120,10 @@ static inline void add_second_moments(const block *in, int count, br_vec sums[SE
 #undef GROUP
 }
 
-static inline __attribute__((always_inline)) void
-evaluate(const int kind, const br_gp_output *gp, const double z[BR_NZ], double *mean,
-         double gradient[BR_NZ], double hessian[BR_NZ][BR_NZ]) {
+static inline __attribute__((always_inline)) void evaluate(const int kind, const br_gp_output *gp,
+                                                           const double z[BR_NZ], double *mean,
+                                                           double gradient[BR_NZ],
+                                                           double hessian[BR_NZ][BR_NZ]) {
     br_vec query[BR_NZ], sum = {0}, first[1 + BR_NZ] = {{0}}, second[SECOND_MOMENTS] = {{0}};
     block points;
     for (int a = 0; a < BR_NZ; ++a) query[a] = br_splat(z[a] * gp->inverse_scale[a]);
@@ -186,12 +189,16 @@ br_mpc_error br_gp_load(br_gp *gp, const br_mpc_gp outputs[BR_NE]) {
         for (int a = 0; a < BR_NZ; ++a) {
             out->inverse_scale[a] = in->n ? 1.0 / in->length_scales[a] : 0.0;
             for (int i = 0; i < out->n_padded; ++i)
-                out->inputs[a][i] = i < in->n ? in->inputs[i * BR_NZ + a] * out->inverse_scale[a] : 0;
+                out->inputs[a][i] =
+                    i < in->n ? in->inputs[i * BR_NZ + a] * out->inverse_scale[a] : 0;
         }
-        for (int i = 0; i < out->n_padded; ++i) out->alpha[i] = i < in->n ? in->scale * in->alpha[i] : 0;
+        for (int i = 0; i < out->n_padded; ++i)
+            out->alpha[i] = i < in->n ? in->scale * in->alpha[i] : 0;
         /* finite numbers may overflow once scaled: refused here, not found out while driving */
-        int finite = br_all_finite(out->alpha, out->n_padded) && br_all_finite(out->inverse_scale, BR_NZ);
-        for (int a = 0; a < BR_NZ; ++a) finite = finite && br_all_finite(out->inputs[a], out->n_padded);
+        int finite =
+            br_all_finite(out->alpha, out->n_padded) && br_all_finite(out->inverse_scale, BR_NZ);
+        for (int a = 0; a < BR_NZ; ++a)
+            finite = finite && br_all_finite(out->inputs[a], out->n_padded);
         if (!finite) return BR_ERROR_WEIGHTS;
         if (in->n || in->offset != 0.0) gp->any = 1;
     }

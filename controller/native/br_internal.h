@@ -9,13 +9,21 @@
 #include "bayesrace_mpc.h"
 #include "br_vector.h"
 
+/* Before loops over states, inputs, rows and their nonzeros, which have constant bounds: unrolled,
+ * the problem's sparsity is in the code, and no table is read. */
+#ifdef __clang__
+#define BR_UNROLL _Pragma("unroll")
+#else
+#define BR_UNROLL _Pragma("GCC unroll 16")
+#endif
+
 #define BR_M (BR_NU * BR_N)                      /* condensed variables */
 #define BR_MP (((BR_M + 7) / 8) * 8)             /* padded to whole vectors */
 #define BR_ROWS (BR_M + BR_NR * BR_N)            /* input bounds, then the problem's, row by row */
 #define BR_ROW(r, k) (BR_M + BR_N * (r) + (k))   /* row r of stage k + 1 */
 #define BR_ACTIVE (BR_M + BR_NR_SOFT * BR_N + 2) /* most rows that DAQP holds active at a time */
-#define BR_ROW_LATE BR_ROW(BR_NR_EARLY, 0)       /* from here on gradients are known at a step only */
-#define BR_COLS ((((BR_ROWS + 1) + 7) / 8) * 8)  /* right-hand sides of one substitution */
+#define BR_ROW_LATE BR_ROW(BR_NR_EARLY, 0) /* from here on gradients are known at a step only */
+#define BR_COLS ((((BR_ROWS + 1) + 7) / 8) * 8) /* right-hand sides of one substitution */
 #define BR_HORIZON_S (BR_N * BR_TS)
 #define BR_LINE_SEARCH_TRIALS 5
 #define BR_FUTILE 8 /* second starts in vain from which they are made only each so many steps */
@@ -61,24 +69,24 @@ typedef struct {
     int n, ready;
     double spacing, length;
     double table[BR_PATH_CAPACITY][BR_PATH_COLUMNS];
-    int known;     /* the projection of the step before is valid */
-    double s;      /* arc length of the last projection */
+    int known;                            /* the projection of the step before is valid */
+    double s;                             /* arc length of the last projection */
     double speed_limit, speed_limit_rate; /* of the environment */
-    double age;    /* time since then */
+    double age;                           /* time since then */
 } br_path;
 
 typedef struct {
-    int factorised;     /* g, h, and y, scale, m of the rows before BR_ROW_LATE fit the linearisation */
-    int regularised;    /* the exact Hessian was not positive definite */
-    double curvature;   /* share of the second-order part that is in h */
-    int evaluated;      /* terms belong to the plan, the reference and the parameters */
+    int factorised; /* g, h, and y, scale, m of the rows before BR_ROW_LATE fit the linearisation */
+    int regularised;  /* the exact Hessian was not positive definite */
+    double curvature; /* share of the second-order part that is in h */
+    int evaluated;    /* terms belong to the plan, the reference and the parameters */
     br_stage_terms terms[BR_N];
     br_stage_curvature second[BR_N];
-    double penalty[BR_NR]; /* of the soft rows */
+    double penalty[BR_NR];                       /* of the soft rows */
     BR_ALIGNED double g[BR_N + 1][BR_NX][BR_MP]; /* sensitivity of stage k to all inputs */
     BR_ALIGNED double costate[2][BR_NX][BR_MP];
-    BR_ALIGNED double h[BR_M][BR_MP];            /* condensed Hessian, then its Cholesky factor */
-    BR_ALIGNED double y[BR_M][BR_COLS];          /* L^{-1} [A' | gradient] */
+    BR_ALIGNED double h[BR_M][BR_MP];   /* condensed Hessian, then its Cholesky factor */
+    BR_ALIGNED double y[BR_M][BR_COLS]; /* L^{-1} [A' | gradient] */
     double diagonal[BR_M];
     double xbar[BR_N + 1][BR_NX];
     double gradient[BR_M];
@@ -113,20 +121,20 @@ typedef struct {
     br_mpc_info info;
     br_mpc_status status;
     double residual, worth;
-} br_best;
+} br_incumbent;
 
 /* Time within a call, by the host's clock. */
 typedef struct {
     br_mpc_clock clock; /* NULL: none */
     void *context;
-    int limited;        /* there is a deadline */
+    int limited; /* there is a deadline */
     double deadline;
     double iteration, trial; /* longest seen, of the line search's trials too; 0: none yet */
 } br_timer;
 
 /* The spare one of the two weight buffers, and whose it is. */
 enum {
-    BR_SPARE_FREE = 0, /* nobody's */
+    BR_SPARE_FREE = 0, /* not in use */
     BR_SPARE_TAKEN,    /* one thread writes it, or exchanges the two */
     BR_SPARE_STAGED    /* complete, to be adopted */
 };
@@ -136,39 +144,39 @@ struct br_mpc {
     int has_parameters;
     br_path path;
     br_gp gp[2];
-    int gp_in_use;       /* written by who has taken the spare buffer, in the control thread */
+    int gp_in_use; /* written by who has taken the spare buffer, in the control thread */
     atomic_int spare;
     /* the problem */
     double u_before[BR_NU];
     double u_lower[BR_NU], u_upper[BR_NU];
     double x0[BR_NX];
     br_mpc_reference reference[BR_N];
-    double turn;         /* the side that the car turns round to, 1 left, -1 right; 0: it does not */
+    double turn; /* the side that the car turns round to, 1 left, -1 right; 0: it does not */
     double turn_u[BR_N][BR_NU]; /* inputs that the reference of a turn has been made with */
     /* the plan, primal and dual */
-    int warm;            /* a plan from the step before is there */
-    int linearised;      /* stage[] belongs to the plan and the weights in use */
-    unsigned attempts;   /* steps without a usable plan since the last warm start that gave one */
-    int unfinished;      /* iterations that BR_TIME_LIMIT has left without a usable plan */
-    double lag;          /* of the plan, without what br_mpc_prepare shifted, behind the last state */
-    int ahead;           /* shifts that br_mpc_prepare did */
+    int warm;          /* a plan from the step before is there */
+    int linearised;    /* stage[] belongs to the plan and the weights in use */
+    unsigned attempts; /* steps without a usable plan since the last warm start that gave one */
+    int unfinished;    /* iterations that BR_TIME_LIMIT has left without a usable plan */
+    double lag;        /* of the plan, without what br_mpc_prepare shifted, behind the last state */
+    int ahead;         /* shifts that br_mpc_prepare did */
     int prepared, prepared_iterations;
     br_plan plan;
-    br_plan before;      /* the plan that the iteration at hand started from */
-    br_best best;
-    br_best first;       /* the plan that a second start has to beat */
-    unsigned starts;     /* second ones in a row */
-    unsigned futile;     /* tries in a row since one was better */
-    unsigned looks;      /* second starts of br_mpc_prepare */
-    br_plan kept;        /* the plan, and the QP's working set, before those shifts */
+    br_plan before; /* the plan that the iteration at hand started from */
+    br_incumbent incumbent;
+    br_incumbent first; /* the plan that a second start has to beat */
+    unsigned starts;    /* second ones in a row */
+    unsigned futile;    /* tries in a row since one was better */
+    unsigned looks;     /* second starts of br_mpc_prepare */
+    br_plan kept;       /* the plan, and the QP's working set, before those shifts */
     int kept_sense[BR_ROWS];
     double answer_x[BR_N + 1][BR_NX], answer_u[BR_N][BR_NU]; /* plan of the last step */
     br_timer timer;
     br_stage stage[BR_N];
     br_qp qp;
-    double penalty;      /* on the sum of the plan's defects ... */
-    double merit;        /* ... beside its cost */
-    double worth;        /* cost, to first order, once the defects are gone: costates price them */
+    double penalty; /* on the sum of the plan's defects ... */
+    double merit;   /* ... beside its cost */
+    double worth;   /* cost, to first order, once the defects are gone: costates price them */
     br_mpc_info info;
 };
 
@@ -186,8 +194,8 @@ void br_path_plan(br_path *path, const double x[BR_NX], br_mpc_reference referen
                   double *lateral);
 void br_path_ahead(const br_path *path, double distance, double point[2]);
 
-/* br_turn.c */
-void br_turn(br_mpc *mpc);
+/* br_turnaround.c */
+void br_turnaround(br_mpc *mpc);
 
 /* br_stage.c */
 void br_stage_linearise(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
@@ -200,7 +208,8 @@ void br_evaluate_terms(br_mpc *mpc);
 /* out += (cost_xx + share * rows_xx) dx */
 static inline void br_add_curvature(const br_stage_curvature *second, double share,
                                     const double dx[BR_NX], double out[BR_NX]) {
-    for (int n = 0; n < BR_CXX_NNZ; ++n) out[BR_CXX_ROW[n]] += second->cost_xx[n] * dx[BR_CXX_COLUMN[n]];
+    for (int n = 0; n < BR_CXX_NNZ; ++n)
+        out[BR_CXX_ROW[n]] += second->cost_xx[n] * dx[BR_CXX_COLUMN[n]];
     for (int n = 0; n < BR_RXX_NNZ; ++n)
         out[BR_RXX_ROW[n]] += share * second->rows_xx[n] * dx[BR_RXX_COLUMN[n]];
 }
@@ -244,12 +253,12 @@ void br_undo_preparation(br_mpc *mpc);
 br_mpc_status br_start_again(br_mpc *mpc, br_mpc_status status, unsigned turn);
 int br_iteration_limit(const br_mpc *mpc);
 
-/* br_best.c */
-void br_best_begin(br_mpc *mpc);
-void br_best_keep(br_mpc *mpc, br_mpc_status status, int lowest);
-br_mpc_status br_best_restore(br_mpc *mpc, br_mpc_status status);
-void br_first_keep(br_mpc *mpc, br_mpc_status status);
-br_mpc_status br_first_compare(br_mpc *mpc, br_mpc_status status, int *second);
+/* br_incumbent.c */
+void br_incumbent_reset(br_mpc *mpc);
+void br_incumbent_keep(br_mpc *mpc, br_mpc_status status, int lowest);
+br_mpc_status br_incumbent_restore(br_mpc *mpc, br_mpc_status status);
+void br_first_plan_keep(br_mpc *mpc, br_mpc_status status);
+br_mpc_status br_first_plan_compare(br_mpc *mpc, br_mpc_status status, int *second);
 
 /* br_residuals.c */
 int br_all_finite(const double *values, int n);

@@ -14,10 +14,10 @@
 
 enum { X = 0, Y = 1, SPEED = 2, NORMAL_X = 3, NORMAL_Y = 4, LOWER = 5, UPPER = 6 };
 
-
 br_mpc_error br_path_load(br_path *path, const double *table, int n, double spacing) {
     if (n < 8 || n > BR_PATH_CAPACITY) return BR_ERROR_PATH;
-    if (!(spacing >= BR_PATH_SPACING_MIN_M && spacing <= BR_PATH_SPACING_MAX_M)) return BR_ERROR_PATH;
+    if (!(spacing >= BR_PATH_SPACING_MIN_M && spacing <= BR_PATH_SPACING_MAX_M))
+        return BR_ERROR_PATH;
     if (!br_all_finite(table, n * BR_PATH_COLUMNS)) return BR_ERROR_PATH;
     for (int i = 0; i < n; ++i) {
         const double *row = &table[i * BR_PATH_COLUMNS];
@@ -86,7 +86,8 @@ static int nearest_anywhere(const br_path *path, const double x[BR_NX]) {
 
 static int nearest_in_window(const br_path *path, const double x[BR_NX]) {
     const int start = (int)((path->s - BR_PATH_WINDOW_BACK_M) / path->spacing);
-    int count = (int)((BR_PATH_WINDOW_BACK_M + BR_PATH_WINDOW_AHEAD_M) / path->spacing) + 1, best = start;
+    int count = (int)((BR_PATH_WINDOW_BACK_M + BR_PATH_WINDOW_AHEAD_M) / path->spacing) + 1,
+        best = start;
     if (count > path->n) count = path->n;
     double best_d2 = INFINITY;
     for (int i = start; i < start + count; ++i) {
@@ -132,7 +133,8 @@ void br_path_plan(br_path *path, const double x[BR_NX], br_mpc_reference referen
     const double moved = path->age * hypot(x[BR_INDEX_VX], x[BR_INDEX_VY]);
     if (moved > 0.8 * BR_PATH_WINDOW_AHEAD_M) path->known = 0; /* may have left the window */
     path->age = 0;
-    project(path, path->known ? nearest_in_window(path, x) : nearest_anywhere(path, x), x, &s, lateral);
+    project(path, path->known ? nearest_in_window(path, x) : nearest_anywhere(path, x), x, &s,
+            lateral);
     path_at(path, s, row);
     if (path->known && fabs(*lateral) > row[UPPER] - row[LOWER]) /* lost: off by a track's width */
         project(path, nearest_anywhere(path, x), x, &s, lateral);
@@ -145,9 +147,12 @@ void br_path_plan(br_path *path, const double x[BR_NX], br_mpc_reference referen
         path_at(path, s, row);
         const double norm = hypot(row[NORMAL_X], row[NORMAL_Y]);
         reference[k] = (br_mpc_reference){
-            .x = row[X], .y = row[Y],
-            .normal_x = row[NORMAL_X] / norm, .normal_y = row[NORMAL_Y] / norm,
-            .lower = row[LOWER] / norm, .upper = row[UPPER] / norm,
+            .x = row[X],
+            .y = row[Y],
+            .normal_x = row[NORMAL_X] / norm,
+            .normal_y = row[NORMAL_Y] / norm,
+            .lower = row[LOWER] / norm,
+            .upper = row[UPPER] / norm,
         };
     }
 }

@@ -45,18 +45,18 @@ static int improve(br_mpc *mpc) {
     mpc->penalty = 0;
     br_residuals(mpc);
     br_mpc_status status = br_judge(mpc);
-    br_best_begin(mpc);
-    br_best_keep(mpc, status, 1);
+    br_incumbent_reset(mpc);
+    br_incumbent_keep(mpc, status, 1);
     const int limit = br_iteration_limit(mpc);
     int time = 1;
     while (mpc->info.iterations < limit && (status == BR_ACCEPTABLE || status == BR_DEFECT)) {
         time = br_timer_allows(timer, br_timer_now(timer), 2 * timer->iteration);
         if (!time) break;
         status = br_sqp_iterate(mpc, 1, 0);
-        br_best_keep(mpc, status, 1);
+        br_incumbent_keep(mpc, status, 1);
     }
     mpc->prepared_iterations += mpc->info.iterations;
-    br_best_restore(mpc, status);
+    br_incumbent_restore(mpc, status);
     return time;
 }
 
@@ -66,7 +66,8 @@ static void look_elsewhere(br_mpc *mpc) {
     br_timer *timer = &mpc->timer;
     if (mpc->turn) return; /* there is one way to turn */
     timer->deadline -= 2 * timer->iteration;
-    if (!br_timer_allows(timer, br_timer_now(timer), BR_SECOND_START_ITERATIONS * timer->iteration)) return;
+    if (!br_timer_allows(timer, br_timer_now(timer), BR_SECOND_START_ITERATIONS * timer->iteration))
+        return;
     if (!mpc->linearised) br_sqp_linearise(mpc);
     memset(&mpc->info, 0, sizeof mpc->info);
     br_residuals(mpc);

@@ -13,8 +13,8 @@ static const double *input_before(const br_mpc *mpc, int k) {
     return k ? mpc->plan.u[k - 1] : mpc->u_before;
 }
 
-/* Of all stages at the plan, unless they are known: whoever changes the plan, the reference, the
- * input before or the parameters clears qp.evaluated. */
+/* Of all stages at the plan, unless they are known: code that changes the plan, the reference,
+ * the input before or the parameters clears qp.evaluated. */
 void br_evaluate_terms(br_mpc *mpc) {
     if (mpc->qp.evaluated) return;
     mpc->qp.evaluated = 1;
@@ -23,9 +23,12 @@ void br_evaluate_terms(br_mpc *mpc) {
     casadi_real w[br_terms_SZ_W + 1];
     for (int k = 0; k < BR_N; ++k) {
         const double last = k == BR_N - 1;
-        const casadi_real *arg[br_terms_SZ_ARG] = {
-            mpc->plan.x[k + 1], mpc->plan.u[k], input_before(mpc, k), &last,
-            (const double *)&mpc->reference[k], theta};
+        const casadi_real *arg[br_terms_SZ_ARG] = {mpc->plan.x[k + 1],
+                                                   mpc->plan.u[k],
+                                                   input_before(mpc, k),
+                                                   &last,
+                                                   (const double *)&mpc->reference[k],
+                                                   theta};
         casadi_real *res[br_terms_SZ_RES] = {(double *)&mpc->qp.terms[k]};
         br_terms(arg, res, iw, w, 0);
     }
@@ -40,9 +43,13 @@ void br_evaluate_curvature(br_mpc *mpc) {
         double multiplier[BR_NR + 1];
         for (int r = 0; r < BR_NR; ++r) multiplier[r] = mpc->plan.multiplier[BR_ROW(r, k)];
         br_stage_curvature *out = &mpc->qp.second[k];
-        const casadi_real *arg[br_curvature_SZ_ARG] = {
-            mpc->plan.x[k + 1], mpc->plan.u[k], input_before(mpc, k), &last,
-            (const double *)&mpc->reference[k], theta, multiplier};
+        const casadi_real *arg[br_curvature_SZ_ARG] = {mpc->plan.x[k + 1],
+                                                       mpc->plan.u[k],
+                                                       input_before(mpc, k),
+                                                       &last,
+                                                       (const double *)&mpc->reference[k],
+                                                       theta,
+                                                       multiplier};
         casadi_real *res[br_curvature_SZ_RES] = {out->cost_xx, out->rows_xx, out->uu[0]};
         br_curvature(arg, res, iw, w, 0);
     }
@@ -72,8 +79,10 @@ void br_evaluate_penalties(br_mpc *mpc) {
 }
 
 /* The problem's first guess of the input at the measured state; share: see Symbols. */
-void br_first_guess(const br_mpc *mpc, const double u_before[BR_NU], double share, double u[BR_NU]) {
-    const casadi_real *arg[br_guess_SZ_ARG] = {mpc->x0, u_before, &share, br_theta(&mpc->parameters)};
+void br_first_guess(const br_mpc *mpc, const double u_before[BR_NU], double share,
+                    double u[BR_NU]) {
+    const casadi_real *arg[br_guess_SZ_ARG] = {mpc->x0, u_before, &share,
+                                               br_theta(&mpc->parameters)};
     casadi_real *res[br_guess_SZ_RES] = {u};
     casadi_int iw[br_guess_SZ_IW + 1];
     casadi_real w[br_guess_SZ_W + 1];

@@ -3,9 +3,9 @@
  *
  *   min 1/2 dU' H dU + g' dU   s.t.  lower <= A dU <= upper
  *
- * rows: BR_M input bounds, then BR_N for each row of the problem (stages 1..N), two-sided, those with
- * constant gradients first. Soft ones have the penalty w eps^2, eps >= 0 per side; only one side can
- * be violated, and with a purely quadratic penalty eps >= 0 never binds, so DAQP's dual
+ * rows: BR_M input bounds, then BR_N for each row of the problem (stages 1..N), two-sided, those
+ * with constant gradients first. Soft ones have the penalty w eps^2, eps >= 0 per side; only one
+ * side can be violated, and with a purely quadratic penalty eps >= 0 never binds, so DAQP's dual
  * regularisation (1 / 2w on a soft row's diagonal) is exact.
  *
  * DAQP gets M = A L^{-T} (H = L L') in caller-owned memory; only its core daqp_ldp is called,
@@ -67,9 +67,10 @@ void br_qp_shift_rows(void *rows, size_t size) {
 static inline int padded(int n) { return (n + 7) & ~7; }
 
 /* out[c] (+)= sum_n weight_n rows[n][c] for whole vectors of columns. */
-static inline __attribute__((always_inline)) void
-combine(double *restrict out, const int columns, const int add, const int count,
-        const double *restrict weight, const double *const *restrict rows) {
+static inline __attribute__((always_inline)) void combine(double *restrict out, const int columns,
+                                                          const int add, const int count,
+                                                          const double *restrict weight,
+                                                          const double *const *restrict rows) {
     for (int c = 0; c < columns; c += BR_LANES) {
         br_vec sum = add ? br_load(&out[c]) : br_splat(0.0);
         for (int n = 0; n < count; ++n) sum += weight[n] * br_load(&rows[n][c]);
@@ -81,15 +82,18 @@ combine(double *restrict out, const int columns, const int add, const int count,
 static void propagate_sensitivity(double (*restrict next)[BR_MP], double (*restrict g)[BR_MP],
                                   const br_stage *stage, int k) {
     const int columns = padded(BR_NU * k);
+    BR_UNROLL
     for (int i = 0; i < BR_NX; ++i) {
         double weight[BR_NX];
         const double *rows[BR_NX];
         int count = 0;
+        BR_UNROLL
         for (int n = BR_A_START[i]; n < BR_A_START[i + 1]; ++n, ++count) {
             weight[count] = stage->jacobian[i][BR_A_INDEX[n]];
             rows[count] = g[BR_A_INDEX[n]];
         }
         combine(next[i], columns, 0, count, weight, rows);
+        BR_UNROLL
         for (int c = 0; c < BR_NU; ++c) next[i][BR_NU * k + c] = stage->jacobian[i][BR_NX + c];
     }
 }
@@ -116,33 +120,40 @@ static void hessian_rows(br_mpc *mpc, int k, double tau, double (*restrict p)[BR
     br_qp *qp = &mpc->qp;
     const br_stage *stage = &mpc->stage[k];
     const int columns = padded(BR_NU * (k + 1)), before = padded(BR_NU * k);
-    double(*restrict g)[BR_MP] = qp->g[k];
+    double (*restrict g)[BR_MP] = qp->g[k];
     double weight[2 * BR_NX];
     const double *rows[2 * BR_NX];
+    BR_UNROLL
     for (int r = 0; r < BR_NU; ++r) {
         double *restrict row = qp->h[BR_NU * k + r];
         int count = 0;
+        BR_UNROLL
         for (int n = BR_BT_START[r]; n < BR_BT_START[r + 1]; ++n, ++count) {
             weight[count] = stage->jacobian[BR_BT_INDEX[n]][BR_NX + r];
             rows[count] = p[BR_BT_INDEX[n]];
         }
         combine(row, columns, 0, count, weight, rows);
         count = 0;
+        BR_UNROLL
         for (int n = BR_WUX_START[r]; n < BR_WUX_START[r + 1]; ++n, ++count) {
             weight[count] = tau * stage->hessian[BR_NX + r][BR_WUX_INDEX[n]];
             rows[count] = g[BR_WUX_INDEX[n]];
         }
         combine(row, before, 1, count, weight, rows);
+        BR_UNROLL
         for (int c = 0; c < BR_NU; ++c)
             row[BR_NU * k + c] += tau * stage->hessian[BR_NX + r][BR_NX + c];
     }
     if (k == 0) return;
+    BR_UNROLL
     for (int i = 0; i < BR_NX; ++i) {
         int count = 0;
+        BR_UNROLL
         for (int n = BR_AT_START[i]; n < BR_AT_START[i + 1]; ++n, ++count) {
             weight[count] = stage->jacobian[BR_AT_INDEX[n]][i];
             rows[count] = p[BR_AT_INDEX[n]];
         }
+        BR_UNROLL
         for (int n = BR_WXX_START[i]; n < BR_WXX_START[i + 1]; ++n, ++count) {
             weight[count] = tau * stage->hessian[i][BR_WXX_INDEX[n]];
             rows[count] = g[BR_WXX_INDEX[n]];
@@ -150,10 +161,12 @@ static void hessian_rows(br_mpc *mpc, int k, double tau, double (*restrict p)[BR
         combine(p_next[i], before, 0, count, weight, rows);
     }
     br_stage_curvature *second = &qp->second[k - 1];
+    BR_UNROLL
     for (int n = 0; n < BR_CXX_NNZ; ++n) {
         rows[0] = g[BR_CXX_COLUMN[n]];
         combine(p_next[BR_CXX_ROW[n]], before, 1, 1, &second->cost_xx[n], rows);
     }
+    BR_UNROLL
     for (int n = 0; n < BR_RXX_NNZ; ++n) {
         weight[0] = tau * second->rows_xx[n];
         rows[0] = g[BR_RXX_COLUMN[n]];
@@ -167,7 +180,8 @@ static void condense_hessian(br_mpc *mpc, double tau) {
     memset(qp->costate[0], 0, sizeof qp->costate[0]);
     for (int n = 0; n < BR_CXX_NNZ; ++n)
         for (int c = 0; c < BR_MP; ++c)
-            qp->costate[0][BR_CXX_ROW[n]][c] += final->cost_xx[n] * qp->g[BR_N][BR_CXX_COLUMN[n]][c];
+            qp->costate[0][BR_CXX_ROW[n]][c] +=
+                final->cost_xx[n] * qp->g[BR_N][BR_CXX_COLUMN[n]][c];
     for (int n = 0; n < BR_RXX_NNZ; ++n)
         for (int c = 0; c < BR_MP; ++c)
             qp->costate[0][BR_RXX_ROW[n]][c] +=
@@ -178,7 +192,8 @@ static void condense_hessian(br_mpc *mpc, double tau) {
         const int i = BR_NU * k;
         for (int a = 0; a < BR_NU; ++a)
             for (int b = 0; b < BR_NU; ++b) {
-                const double later = k + 1 < BR_N ? qp->second[k + 1].uu[BR_NU + a][BR_NU + b] : 0.0;
+                const double later =
+                    k + 1 < BR_N ? qp->second[k + 1].uu[BR_NU + a][BR_NU + b] : 0.0;
                 qp->h[i + a][i + b] += qp->second[k].uu[a][b] + later;
                 if (k) qp->h[i + a][i - BR_NU + b] += qp->second[k].uu[a][BR_NU + b];
             }
@@ -194,21 +209,28 @@ static void condense_gradient(br_mpc *mpc, double tau) {
         if (k < BR_N) {
             const br_stage *stage = &mpc->stage[k];
             const double *dx = qp->xbar[k];
+            BR_UNROLL
             for (int c = 0; c < BR_NU; ++c) {
-                double sum = qp->terms[k].in_u[c] + (k + 1 < BR_N ? qp->terms[k + 1].in_u_before[c] : 0.0);
+                double sum =
+                    qp->terms[k].in_u[c] + (k + 1 < BR_N ? qp->terms[k + 1].in_u_before[c] : 0.0);
                 for (int j = 0; j < BR_NX; ++j) sum += stage->jacobian[j][BR_NX + c] * p[j];
+                BR_UNROLL
                 for (int n = BR_WUX_START[c]; n < BR_WUX_START[c + 1]; ++n)
                     sum += tau * stage->hessian[BR_NX + c][BR_WUX_INDEX[n]] * dx[BR_WUX_INDEX[n]];
                 qp->gradient[BR_NU * k + c] = sum;
             }
+            BR_UNROLL
             for (int i = 0; i < BR_NX; ++i) {
+                BR_UNROLL
                 for (int n = BR_AT_START[i]; n < BR_AT_START[i + 1]; ++n)
                     next[i] += stage->jacobian[BR_AT_INDEX[n]][i] * p[BR_AT_INDEX[n]];
+                BR_UNROLL
                 for (int n = BR_WXX_START[i]; n < BR_WXX_START[i + 1]; ++n)
                     next[i] += tau * stage->hessian[i][BR_WXX_INDEX[n]] * dx[BR_WXX_INDEX[n]];
             }
         }
         if (k) {
+            BR_UNROLL
             for (int i = 0; i < BR_NX; ++i) next[i] += qp->terms[k - 1].in_x[i];
             br_add_curvature(&qp->second[k - 1], tau, qp->xbar[k], next);
         }
@@ -251,8 +273,8 @@ static inline __attribute__((always_inline)) void substitute(br_qp *qp, const in
     }
 }
 
-/* Rows of DAQP's matrix. Hard ones are scaled to unit length, soft ones by the root of their penalty,
- * because DAQP has one weight for all soft rows: see set_scales. */
+/* Rows of DAQP's matrix. Hard ones are scaled to unit length, soft ones by the root of their
+ * penalty, because DAQP has one weight for all soft rows: see set_scales. */
 static inline __attribute__((always_inline)) void fill_rows(br_qp *qp, const int first,
                                                             const int last) {
     for (int i = first; i < last; ++i)
@@ -261,15 +283,18 @@ static inline __attribute__((always_inline)) void fill_rows(br_qp *qp, const int
 
 /* Columns of y for these rows of the problem: their sensitivities h_x G to all inputs. */
 static void fill_sensitivities(br_qp *qp, const int first, const int last) {
+    BR_UNROLL
     for (int r = first; r < last; ++r)
         for (int k = 0; k < BR_N; ++k) {
             BR_ALIGNED double row[BR_MP];
             double weight[BR_NX];
             const double *sensitivity[BR_NX];
             int count = 0;
+            BR_UNROLL
             for (int n = BR_ROW_START[r]; n < BR_ROW_START[r + 1]; ++n, ++count) {
                 const int i = BR_ROW_INDEX[n];
-                weight[count] = r < BR_NR_EARLY ? BR_ROW_CONSTANT[BR_NX * r + i] : qp->terms[k].gradient[n];
+                weight[count] =
+                    r < BR_NR_EARLY ? BR_ROW_CONSTANT[BR_NX * r + i] : qp->terms[k].gradient[n];
                 sensitivity[count] = qp->g[k + 1][i];
             }
             combine(row, padded(BR_NU * (k + 1)), 0, count, weight, sensitivity);
@@ -277,7 +302,8 @@ static void fill_sensitivities(br_qp *qp, const int first, const int last) {
         }
 }
 
-/* Of soft rows with several penalties, each is scaled so that the first one's penalty serves all. */
+/* Of soft rows with several penalties, each is scaled so that the first one's penalty serves all.
+ */
 static double slack_weight(const br_qp *qp) {
     for (int r = 0; r < BR_NR; ++r)
         if (BR_ROW_SOFT[r] && qp->penalty[r] > 0) return qp->penalty[r];
@@ -312,8 +338,8 @@ static void transform(br_qp *qp) {
 }
 
 /* All that needs neither the measured state nor the reference. With the exact Hessian if that is
- * positive definite in the inputs; else with less and less of the dynamics' and the rows' part, down
- * to that of the cost alone, which always is. */
+ * positive definite in the inputs; else with less and less of the dynamics' and the rows' part,
+ * down to that of the cost alone, which always is. */
 void br_qp_factorise(br_mpc *mpc) {
     static const double curvature[] = {1.0, 0.5, 0.25, 0.0};
     br_qp *qp = &mpc->qp;
@@ -416,7 +442,8 @@ br_mpc_status br_qp_solve(br_mpc *mpc, int warm) {
     br_qp *qp = &mpc->qp;
     bounds(mpc);
     fill_least_distance(mpc);
-    if (!br_all_finite(qp->dupper, BR_ROWS) || !br_all_finite(qp->dlower, BR_ROWS)) return BR_NOT_FINITE;
+    if (!br_all_finite(qp->dupper, BR_ROWS) || !br_all_finite(qp->dlower, BR_ROWS))
+        return BR_NOT_FINITE;
     if (!warm) br_qp_forget_working_set(qp);
     int flag = run_daqp(qp);
     mpc->info.qp_iterations += qp->daqp.iterations;

@@ -44,22 +44,26 @@ static double stationarity(const br_mpc *mpc) {
     for (int k = BR_N; k >= 1; --k) {
         const br_stage_terms *terms = &mpc->qp.terms[k - 1];
         const br_stage *stage = &mpc->stage[k - 1];
+        BR_UNROLL
         for (int i = 0; i < BR_NX; ++i) p[i] += terms->in_x[i];
-        for (int r = 0; r < BR_NR; ++r)
-            for (int n = BR_ROW_START[r]; n < BR_ROW_START[r + 1]; ++n)
-                p[BR_ROW_INDEX[n]] += multiplier[BR_ROW(r, k - 1)] * terms->gradient[n];
+        BR_UNROLL
+        for (int r = 0; r < BR_NR; ++r) BR_UNROLL
+        for (int n = BR_ROW_START[r]; n < BR_ROW_START[r + 1]; ++n)
+            p[BR_ROW_INDEX[n]] += multiplier[BR_ROW(r, k - 1)] * terms->gradient[n];
+        BR_UNROLL
         for (int c = 0; c < BR_NU; ++c) {
             const double later = k < BR_N ? mpc->qp.terms[k].in_u_before[c] : 0.0;
             double through = 0;
             for (int j = 0; j < BR_NX; ++j) through += stage->jacobian[j][BR_NX + c] * p[j];
-            worst = br_worse(worst, fabs(terms->in_u[c] + later + through +
-                                         multiplier[BR_NU * (k - 1) + c]));
+            worst = br_worse(
+                worst, fabs(terms->in_u[c] + later + through + multiplier[BR_NU * (k - 1) + c]));
             size = br_worse(size, fabs(through));
         }
         double next[BR_NX] = {0};
-        for (int i = 0; i < BR_NX; ++i)
-            for (int n = BR_AT_START[i]; n < BR_AT_START[i + 1]; ++n)
-                next[i] += stage->jacobian[BR_AT_INDEX[n]][i] * p[BR_AT_INDEX[n]];
+        BR_UNROLL
+        for (int i = 0; i < BR_NX; ++i) BR_UNROLL
+        for (int n = BR_AT_START[i]; n < BR_AT_START[i + 1]; ++n)
+            next[i] += stage->jacobian[BR_AT_INDEX[n]][i] * p[BR_AT_INDEX[n]];
         memcpy(p, next, sizeof p);
     }
     return worst / size;
@@ -74,6 +78,7 @@ void br_residuals(br_mpc *mpc) {
     info->defect = info->cost = info->slack_max_m = 0;
     for (int k = 0; k <= BR_N; ++k) {
         const double *model = k ? mpc->stage[k - 1].f : mpc->x0;
+        BR_UNROLL
         for (int i = 0; i < BR_NX; ++i) {
             const double gap = fabs(model[i] - mpc->plan.x[k][i]);
             info->defect = br_worse(info->defect, gap / BR_STATE_SCALE[i]);
@@ -99,9 +104,12 @@ br_mpc_status br_judge(const br_mpc *mpc) {
     const br_mpc_info *info = &mpc->info;
     const double tolerance = mpc->parameters.tolerance;
     if (!br_all_finite(&mpc->plan.x[0][0], (BR_N + 1) * BR_NX) ||
-        !br_all_finite(&mpc->plan.u[0][0], BR_M) || !isfinite(info->stationarity + mpc->merit + info->bound))
+        !br_all_finite(&mpc->plan.u[0][0], BR_M) ||
+        !isfinite(info->stationarity + mpc->merit + info->bound))
         return BR_NOT_FINITE;
-    /* linear in the QP, as inputs and early rows are, they are violated by no more than round-off */
+    /* linear in the QP, as inputs and early rows are, they are violated by no more than round-off
+     */
     if (info->defect > mpc->parameters.defect_max || info->bound > 1e-6) return BR_DEFECT;
-    return info->stationarity <= tolerance && info->defect <= tolerance ? BR_CONVERGED : BR_ACCEPTABLE;
+    return info->stationarity <= tolerance && info->defect <= tolerance ? BR_CONVERGED
+                                                                        : BR_ACCEPTABLE;
 }

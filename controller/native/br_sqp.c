@@ -19,9 +19,9 @@ static void linearise(br_mpc *mpc, int first) {
 
 void br_sqp_linearise(br_mpc *mpc) { linearise(mpc, 0); }
 
-/* Without a plan from before: the problem's guess, see where that leads; or turn. Where that has led
- * to no plan time and again, Newton's steps may go round in circles: then, but for a turn, other
- * guesses are tried. */
+/* Without a plan from before: the problem's guess, see where that leads; or turn. Where that has
+ * led to no plan time and again, Newton's steps may go round in circles: then, but for a turn,
+ * other guesses are tried. */
 void br_sqp_cold_start(br_mpc *mpc) {
     static const double shares[] = {0.5, 0.5, 1.0, 0.25};
     double u[BR_NU];
@@ -67,10 +67,12 @@ static void direction(br_mpc *mpc) {
     memcpy(qp->delta_x[0], qp->xbar[0], sizeof qp->xbar[0]);
     for (int k = 0; k < BR_N; ++k) {
         const double *dx = qp->delta_x[k], *du = &qp->delta_u[BR_NU * k];
+        BR_UNROLL
         for (int i = 0; i < BR_NX; ++i) {
             const double *row = mpc->stage[k].jacobian[i];
             double sum = mpc->stage[k].f[i] - mpc->plan.x[k + 1][i];
             for (int j = 0; j < BR_NX; ++j) sum += row[j] * dx[j];
+            BR_UNROLL
             for (int c = 0; c < BR_NU; ++c) sum += row[BR_NX + c] * du[c];
             qp->delta_x[k + 1][i] = sum;
         }
@@ -81,21 +83,26 @@ static void direction(br_mpc *mpc) {
         double *lambda = qp->costate_next[k];
         memcpy(lambda, terms->in_x, sizeof qp->costate_next[k]);
         br_add_curvature(&qp->second[k - 1], 1.0, dx, lambda);
-        for (int r = 0; r < BR_NR; ++r)
-            for (int n = BR_ROW_START[r]; n < BR_ROW_START[r + 1]; ++n)
-                lambda[BR_ROW_INDEX[n]] += qp->multiplier[BR_ROW(r, k - 1)] * terms->gradient[n];
+        BR_UNROLL
+        for (int r = 0; r < BR_NR; ++r) BR_UNROLL
+        for (int n = BR_ROW_START[r]; n < BR_ROW_START[r + 1]; ++n)
+            lambda[BR_ROW_INDEX[n]] += qp->multiplier[BR_ROW(r, k - 1)] * terms->gradient[n];
         if (k == BR_N) continue;
         const br_stage *stage = &mpc->stage[k];
         const double *after = qp->costate_next[k + 1], *du = &qp->delta_u[BR_NU * k];
+        BR_UNROLL
         for (int i = 0; i < BR_NX; ++i) {
+            BR_UNROLL
             for (int n = BR_AT_START[i]; n < BR_AT_START[i + 1]; ++n)
                 lambda[i] += stage->jacobian[BR_AT_INDEX[n]][i] * after[BR_AT_INDEX[n]];
+            BR_UNROLL
             for (int n = BR_WXX_START[i]; n < BR_WXX_START[i + 1]; ++n)
                 lambda[i] += stage->hessian[i][BR_WXX_INDEX[n]] * dx[BR_WXX_INDEX[n]];
         }
-        for (int c = 0; c < BR_NU; ++c)
-            for (int n = BR_WUX_START[c]; n < BR_WUX_START[c + 1]; ++n)
-                lambda[BR_WUX_INDEX[n]] += stage->hessian[BR_WUX_INDEX[n]][BR_NX + c] * du[c];
+        BR_UNROLL
+        for (int c = 0; c < BR_NU; ++c) BR_UNROLL
+        for (int n = BR_WUX_START[c]; n < BR_WUX_START[c + 1]; ++n)
+            lambda[BR_WUX_INDEX[n]] += stage->hessian[BR_WUX_INDEX[n]][BR_NX + c] * du[c];
     }
 }
 
@@ -144,7 +151,9 @@ static void line_search(br_mpc *mpc, int first_of_warm) {
         br_residuals(mpc);
         br_timer_note(timer, begin, &timer->trial);
         if (first_of_warm && br_judge(mpc) <= BR_ACCEPTABLE) return;
-        if (mpc->merit <= merit || br_worse(mpc->info.stationarity, mpc->info.defect) <= 0.9 * residual) return;
+        if (mpc->merit <= merit ||
+            br_worse(mpc->info.stationarity, mpc->info.defect) <= 0.9 * residual)
+            return;
         mpc->info.shortened += 1;
     }
 }

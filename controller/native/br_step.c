@@ -27,12 +27,12 @@ static void begin_plan(br_mpc *mpc) {
 
 /* Another iteration would change little that matters until the next step, or, where the Hessian is
  * indefinite and convergence slow, cost more than it gives, which only a budget can tell: with one
- * it goes on. settle = 0 means to go on regardless. */
-static int settled(const br_mpc *mpc, double *residual) {
-    const double before = *residual, settle = mpc->parameters.settle;
+ * it goes on. early_stop_tol = 0 means to go on regardless. */
+static int stops_early(const br_mpc *mpc, double *residual) {
+    const double before = *residual, early_stop_tol = mpc->parameters.early_stop_tol;
     *residual = br_residual(mpc);
-    if (settle == 0) return 0;
-    if (*residual <= settle) return 1;
+    if (early_stop_tol == 0) return 0;
+    if (*residual <= early_stop_tol) return 1;
     if (mpc->timer.limited || !mpc->warm || mpc->info.defect > BR_DEFECT_FINE) return 0;
     return *residual > 0.5 * before;
 }
@@ -42,32 +42,32 @@ static int rough(const br_mpc *mpc, br_mpc_status status) {
     return status == BR_DEFECT || mpc->info.defect > BR_DEFECT_FINE;
 }
 
-/* Iterates until settled or out of time. What is rough yet may take as many iterations as a cold
- * start. */
+/* Iterates until an early stop or out of time. What is rough yet may take as many iterations as a
+ * cold start. */
 static br_mpc_status iterate(br_mpc *mpc, int warm, int most) {
     br_timer *timer = &mpc->timer;
     const int limit = timer->limited || !warm ? most : mpc->parameters.iterations;
     br_mpc_status status = BR_DEFECT;
     double residual = INFINITY;
-    br_best_begin(mpc);
+    br_incumbent_reset(mpc);
     for (int i = 0; i < (rough(mpc, status) ? most : limit); ++i) {
         if (i && !br_timer_allows(timer, br_timer_now(timer), timer->iteration)) {
             mpc->info.time_limited = 1;
             break;
         }
         status = br_sqp_iterate(mpc, i > 0 || warm, i == 0 && warm);
-        br_best_keep(mpc, status, timer->limited);
+        br_incumbent_keep(mpc, status, timer->limited);
         if (status != BR_ACCEPTABLE && status != BR_DEFECT) break;
-        if (status == BR_ACCEPTABLE && settled(mpc, &residual)) break;
+        if (status == BR_ACCEPTABLE && stops_early(mpc, &residual)) break;
     }
-    status = br_best_restore(mpc, status);
+    status = br_incumbent_restore(mpc, status);
     return status == BR_DEFECT && mpc->info.time_limited ? BR_TIME_LIMIT : status;
 }
 
-/* Signs that the plan from before is on its way to another local minimum, often a bad one: the exact
- * Hessian is indefinite, or Newton's steps had to be shortened. Typically the horizon has reached a
- * bend for which the plan is too fast: the tyres slide, and neither more nor less steering helps.
- * Such a plan satisfies every residual and costs more with each step. */
+/* Signs that the plan from before is on its way to another local minimum, often a bad one: the
+ * exact Hessian is indefinite, or Newton's steps had to be shortened. Typically the horizon has
+ * reached a bend for which the plan is too fast: the tyres slide, and neither more nor less
+ * steering helps. Such a plan satisfies every residual and costs more with each step. */
 static int doubtful(const br_mpc *mpc, br_mpc_status status) {
     return mpc->qp.regularised || mpc->info.shortened || !br_usable(status);
 }
@@ -80,20 +80,22 @@ static int worth_a_try(br_mpc *mpc) {
 }
 
 /* Iterates from another start, with another guess each time in a row; leaves the better plan of
- * that and the one at hand. To coast from the measured state most often leads to the good minimum in
- * a few iterations (docs/decisions/2026-11-22-second-start.md). */
+ * that and the one at hand. To coast from the measured state most often leads to the good minimum
+ * in a few iterations (docs/decisions/2026-11-22-second-start.md). */
 br_mpc_status br_start_again(br_mpc *mpc, br_mpc_status status, unsigned turn) {
     static const double shares[] = {0, 0.5, 1, 0.25}, nothing[BR_NU] = {0};
     const int time_limited = mpc->info.time_limited;
     double u[BR_NU];
     int better;
-    br_first_keep(mpc, status);
+    br_first_plan_keep(mpc, status);
     br_first_guess(mpc, nothing, shares[turn % 4], u);
     br_sqp_roll_out(mpc, u);
-    status = br_first_compare(mpc, iterate(mpc, 0, BR_SECOND_START_ITERATIONS), &better);
+    status = br_first_plan_compare(mpc, iterate(mpc, 0, BR_SECOND_START_ITERATIONS), &better);
     mpc->info.second_start = better ? 2 : 1;
-    if (better) mpc->futile = mpc->starts = 0;
-    else mpc->info.time_limited = time_limited;
+    if (better)
+        mpc->futile = mpc->starts = 0;
+    else
+        mpc->info.time_limited = time_limited;
     return status;
 }
 
@@ -106,7 +108,8 @@ static br_mpc_status optimise(br_mpc *mpc) {
     br_residuals(mpc);
     const double shifted_cost = mpc->info.cost;
     br_mpc_status status = iterate(mpc, 1, most);
-    if (!doubtful(mpc, status)) mpc->futile = mpc->starts = 0;
+    if (!doubtful(mpc, status))
+        mpc->futile = mpc->starts = 0;
     else if (!mpc->info.time_limited &&
              br_timer_allows(timer, br_timer_now(timer), 3 * timer->iteration) && worth_a_try(mpc))
         status = br_start_again(mpc, status, mpc->starts++);
@@ -118,8 +121,10 @@ static void solve(br_mpc *mpc, double u[BR_NU], br_mpc_status *status, br_mpc_in
     *status = optimise(mpc);
     const int good = br_usable(*status), unfinished = *status == BR_TIME_LIMIT;
     if (good) memcpy(u, mpc->plan.u[0], sizeof mpc->plan.u[0]);
-    if (!good) mpc->attempts += 1;
-    else if (mpc->warm) mpc->attempts = 0;
+    if (!good)
+        mpc->attempts += 1;
+    else if (mpc->warm)
+        mpc->attempts = 0;
     mpc->warm = good || unfinished; /* another bad plan is no start for the next step */
     mpc->unfinished = unfinished ? mpc->unfinished + mpc->info.iterations : 0;
     memcpy(mpc->answer_x, mpc->plan.x, sizeof mpc->answer_x);
@@ -187,7 +192,7 @@ br_mpc_error br_mpc_step(br_mpc *mpc, const double x[BR_NX], const double u_befo
     if (!plausible) return BR_OK;
 #if BR_HAS_PATH
     br_path_plan(&mpc->path, x, mpc->reference, &mpc->info.lateral_m);
-    br_turn(mpc);
+    br_turnaround(mpc);
     mpc->info.s_ref_m = mpc->path.s;
 #endif
     solve(mpc, u, status, info);
@@ -195,8 +200,8 @@ br_mpc_error br_mpc_step(br_mpc *mpc, const double x[BR_NX], const double u_befo
 }
 
 br_mpc_error br_mpc_solve(br_mpc *mpc, const double x[BR_NX], const double u_before[BR_NU],
-                          double elapsed_s, double budget_s, const br_mpc_reference reference[BR_N], double u[BR_NU],
-                          br_mpc_status *status, br_mpc_info *info) {
+                          double elapsed_s, double budget_s, const br_mpc_reference reference[BR_N],
+                          double u[BR_NU], br_mpc_status *status, br_mpc_info *info) {
     if (!reference) return BR_ERROR_NULL;
     int plausible;
     const request r = {x, u_before, elapsed_s, budget_s, u, status, info};

@@ -1,12 +1,14 @@
-/* Which states count: those of the plant and the run under way, each newer than the one before. */
+/* Which states count: those of the current plant and run, each newer than the one before. */
 #include <math.h>
 
 #include "br_cycle.h"
 
-#define AHEAD 16     /* a number farther ahead is not taken for the next one of the run at once */
-#define AHEAD_S 0.3  /* the same as a time, where the interval of the states allows more of them, */
-#define FARTHEST 256 /* and at most these */
-#define CONFIRMED 4  /* states in a row that belong together are a stream of their own */
+/* A number that is farther ahead than this is not taken for the next one of the run at once: as
+ * many states, or, where their interval allows more, as much time, and at most so many states. */
+#define AHEAD 16
+#define AHEAD_S 0.3
+#define FARTHEST 256
+#define CONFIRMED 4 /* states in a row that belong together are a stream of their own */
 
 void br_stream_init(br_stream *stream) { *stream = (br_stream){.ended = 1, .silent = 1}; }
 
@@ -44,8 +46,10 @@ br_reception br_stream_accept(br_stream *stream, const br_measured *state, br_co
     const double interval_s = counters->interval_s;
     if (!continues(stream, state, interval_s) && !confirmed(stream, state, interval_s)) {
         const int stale = same && state->seq <= newest->seq;
-        if (stale) counters->stale += 1;
-        else counters->foreign += 1;
+        if (stale)
+            counters->stale += 1;
+        else
+            counters->foreign += 1;
         return stale ? BR_STATE_STALE : BR_STATE_FOREIGN;
     }
     if (same && (uint64_t)state->seq == (uint64_t)newest->seq + 1)

@@ -5,7 +5,9 @@
 
 /* 0 without a clock; its time is measured with and without a budget, so that br_mpc_prepare knows
  * what an iteration takes. */
-double br_timer_now(const br_timer *timer) { return timer->clock ? timer->clock(timer->context) : 0; }
+double br_timer_now(const br_timer *timer) {
+    return timer->clock ? timer->clock(timer->context) : 0;
+}
 
 void br_timer_start(br_timer *timer, double budget) {
     timer->limited = timer->clock && budget > 0;

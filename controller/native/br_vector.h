@@ -35,7 +35,8 @@ static inline br_vec br_sqrt(br_vec v) {
     return root;
 }
 
-/* a where the mask (a comparison's result) is set, else b; C has no ternary on vectors before gcc 14 */
+/* a where the mask (a comparison's result) is set, else b; C has no ternary on vectors before gcc
+ * 14 */
 static inline br_vec br_select(br_ivec mask, br_vec a, br_vec b) {
     br_ivec ia, ib;
     memcpy(&ia, &a, sizeof ia);

@@ -164,7 +164,7 @@ static int serve_udp(host *h, int port) {
     if (in < 0) return failed("UDP", strerror(errno));
     fprintf(stderr, "c_host: listening on port %d\n", port);
     struct sockaddr_in plant = {0}; /* whose state counts */
-    double due_s = 0;         /* of the next input if no state comes */
+    double due_s = 0;               /* of the next input if no state comes */
     for (;;) {
         char line[LINE], out[LINE];
         const int ready = wait_until(in, due_s);
@@ -176,7 +176,8 @@ static int serve_udp(host *h, int port) {
             const ssize_t got =
                 recvfrom(in, line, sizeof line - 1, 0, (struct sockaddr *)&from, &size);
             line[got > 0 ? got : 0] = 0;
-            length = answer(h, line, out, sizeof out); /* anyone may send anything: not all counts */
+            length =
+                answer(h, line, out, sizeof out); /* anyone may send anything: not all counts */
             if (length > 0) plant = from;
         }
         const int bridged = length <= 0 && br_mpc_monotonic(NULL) >= due_s;
@@ -192,9 +193,12 @@ int main(int argc, char **argv) {
     host h = {.period_s = 0.02};
     int port = 0;
     for (int i = 2; i + 1 < argc; i += 2) {
-        if (!strcmp(argv[i], "--udp")) port = atoi(argv[i + 1]);
-        else if (!strcmp(argv[i], "--rate")) h.period_s = 1 / atof(argv[i + 1]);
-        else argc = 0;
+        if (!strcmp(argv[i], "--udp"))
+            port = atoi(argv[i + 1]);
+        else if (!strcmp(argv[i], "--rate"))
+            h.period_s = 1 / atof(argv[i + 1]);
+        else
+            argc = 0;
     }
     if (argc < 2 || argc % 2 || !(h.period_s > 1e-4 && h.period_s < 1)) {
         fprintf(stderr, "usage: c_host DATA [--udp PORT] [--rate HZ]\n");

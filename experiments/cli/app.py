@@ -20,6 +20,13 @@ __all__ = ["app", "main"]
 _INTERRUPTED: Final = 130
 _OUR_OWN: Final = ("bayesrace", "codegen", "experiments", "plant")
 
+_FMU_PACKAGES: Final = ("fmpy", "pint")
+_RACE_PACKAGES: Final = (
+    "casadi", "hdrh", "jinja2", "lz4", "matplotlib", "mcap", "rich", "scipy", "sklearn",
+    "threadpoolctl", "zstandard",
+)  # fmt: skip
+"""Modules that the extras ``fmu`` and ``race`` of pyproject.toml install."""
+
 app = typer.Typer(
     name="bayesrace",
     help="Real-time GP-MPC racing: a compiled controller that learns from its own laps.",
@@ -67,20 +74,22 @@ def main() -> None:
     except (typer.Abort, KeyboardInterrupt):
         _fail("interrupted", _INTERRUPTED)
     except Exception as error:
-        told = _in_words(error)
-        if told is None:
+        text = _in_words(error)
+        if text is None:
             raise
         ours = isinstance(error, RuntimeError) and not isinstance(error, RecursionError)
-        _fail(told, 1 if ours else 2)
+        _fail(text, 1 if ours else 2)
 
 
 def _in_words(error: Exception) -> str | None:
-    """What a user is told; None for a fault of the program's own, which gets a traceback."""
+    """The message for the user; None for a fault of the program's own, which gets a traceback."""
     match error:
         case InputError():
             return str(error)
         case ValidationError():
             return faults_in(error, "settings")
+        case ModuleNotFoundError(name=str(name)):
+            return _missing(name.partition(".")[0])
         case shutil.Error():  # of several files: source, target, why
             _, target, why = error.args[0][0]
             return f"{target}: {why}; choose a path that can be written, or make room"
@@ -93,6 +102,14 @@ def _in_words(error: Exception) -> str | None:
             return str(error) if type(error).__module__.split(".")[0] in _OUR_OWN else None
     explain = getattr(error, "format_message", None)  # Click's
     return None if explain is None else str(explain())
+
+
+def _missing(package: str) -> str | None:
+    """What to install for a package; None if no extra brings it."""
+    if package not in (*_FMU_PACKAGES, *_RACE_PACKAGES):
+        return None
+    extra = "fmu" if package in _FMU_PACKAGES else "race"
+    return f"this command needs {package}, which is not installed: pip install 'bayesrace[{extra}]'"
 
 
 def _fail(text: str, code: int = 2) -> None:

@@ -1,4 +1,4 @@
-"""``latency``: where a control cycle's time goes, by the wall clock."""
+"""``latency``: where a control cycle's time goes, in real time."""
 
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,7 +16,10 @@ __all__ = ["register"]
 
 def latency(
     rate: Annotated[float, typer.Option(min=1, max=500, help="Of plant and controller [Hz].")] = 50,
-    duration: Annotated[float, typer.Option(min=1, help="Time observed [s].")] = 20.0,
+    duration: Annotated[
+        float | None,
+        typer.Option(min=1, max=20_000, help="Time that counts [s] [20; of a log all of it]."),
+    ] = None,
     load: Annotated[int, typer.Option(min=0, max=1024, help="Busy processes beside.")] = 0,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder [runs/latency-DATE-TIME].")
@@ -28,7 +31,8 @@ def latency(
     track: Annotated[
         str | None,
         typer.Option(
-            help="Track: built-in name, random:SEED or CSV file. Attached: the one that is driven."
+            help="Track: built-in name, random:SEED or CSV file. "
+            "With --attach or --log: the one that was driven."
         ),
     ] = None,
     fifo: Annotated[
@@ -39,55 +43,59 @@ def latency(
     weights: Annotated[Path | None, typer.Option(help="GP weights [trained].")] = None,
     artefact: Annotated[Path | None, typer.Option(help="Built controller [built].")] = None,
     raceline: Annotated[Path | None, typer.Option(help="Racing line [computed].")] = None,
-    attach: Annotated[bool, typer.Option(help="Measure a run that is under way.")] = False,
+    attach: Annotated[bool, typer.Option(help="Measure a run that is driven elsewhere.")] = False,
     endpoint: Annotated[
         list[str] | None,
         typer.Option(help="Attach: plant and controller, one each; the defaults of both without."),
+    ] = None,
+    log: Annotated[
+        Path | None, typer.Option(help="Log of a run (MCAP), in place of a new run.")
     ] = None,
     car: Car = DEFAULT_CAR,
     name: CarName = "",
 ) -> None:
     """Measure where a control cycle's time goes, from sampling the state to acting.
 
-    Starts plant and controller as processes of their own and drives around the track by the wall
-    clock; beside them runs a loop that only sleeps, which tells the machine's stalls from the
-    program's. Leaves latency.json, a picture and HdrHistogram logs. docs/latency.md explains it.
+    Starts plant and controller as processes of their own, drives around the track in real time and
+    records the run; a loop beside them that only sleeps tells the machine's stalls from the
+    program's. Leaves latency.json, a picture and HdrHistogram logs: docs/latency.md.
     """
     if endpoint and not attach:
         raise InputError("--endpoint is of a running system: add --attach, or leave it out")
-    if attach and (weights or artefact or raceline):
+    if (attach or log) and (weights or artefact or raceline):
         raise InputError("--weights, --artefact and --raceline are for what is started here")
+    if log and (attach or load):
+        raise InputError("--log is of a run that is over: leave out --attach and --load")
 
     from bayesrace.realtime import RealtimeSettings
     from bayesrace.tracks import DEFAULT_RACE_TRACK
     from bayesrace.vehicles import get_car
+    from experiments.latency.measure import measure
     from experiments.latency.report import print_report
     from experiments.latency.settings import LatencySettings
     from experiments.progress import stages_on
     from experiments.terminal import Terminal
 
-    ends = connect_to(endpoint).connect if attach else ()
+    here = not (attach or log)
     settings = LatencySettings(
-        car=get_car(car), name=name, rate_hz=rate, duration_s=duration, load=load,
-        settle_s=1.0 if attach else 3.0,
-        track=track if track is not None else "" if attach else DEFAULT_RACE_TRACK,
+        car=get_car(car), name=name, rate_hz=rate, load=load,
+        duration_s=duration or (1e9 if log else 20.0), warm_up_s=0.0 if attach else 3.0,
+        track=track if track is not None else DEFAULT_RACE_TRACK if here else "",
         realtime=RealtimeSettings(fifo=fifo, lock_memory=lock_memory),
-        weights=weights, artefact=artefact, raceline=raceline, attach=ends,
+        weights=weights, artefact=artefact, raceline=raceline, log=log,
+        attach=connect_to(endpoint).connect if attach else (),
     )  # fmt: skip
     time = datetime.now(UTC).astimezone().strftime("%Y%m%d-%H%M%S")
     out = out or Path("runs") / f"latency-{time}"
-    if attach:
-        from experiments.latency.attach import measure_attached as measure
-    else:
-        from experiments.latency.run import measure_latency as measure
     console = Terminal()
     with stages_on(console) as stages:
-        measured = measure(settings, out, stages)
-    print_report(measured.result, console)
+        result, run = measure(settings, out, stages)
+    print_report(result, console)
     if json_file:
-        write_whole(json_file, measured.result.model_dump_json(indent=1) + "\n")
+        write_whole(json_file, result.model_dump_json(indent=1) + "\n")
     console.print(f"{out}", highlight=False, soft_wrap=True)
-    measured.raise_if_broken()
+    if run.error is not None:
+        raise run.error
 
 
 def register(app: typer.Typer) -> None:

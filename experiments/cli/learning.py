@@ -110,16 +110,16 @@ def publish(
     from bayesrace.files import read_whole
     from bayesrace.gp.weights import MAX_BYTES
     from bayesrace.transport import open_session, send_weights
-    from experiments.learn.publishing import Answer, NotTakenOverError
+    from experiments.learn.publishing import NotTakenOverError, in_words
 
     data = read_whole(weights, "weights file", MAX_BYTES)
     endpoints = connect_to(endpoint)
     with open_session(endpoints) as session:
         car = _controller(session, endpoints, name, timeout)
-        answer = Answer.of(send_weights(session, car, data, timeout))
-    if not answer.accepted:
-        raise NotTakenOverError(f"{car}: {answer.words}")
-    typer.echo(f"{car}: {answer.version} {answer.words}")
+        reply = send_weights(session, car, data, timeout)
+    if not reply.accepted:
+        raise NotTakenOverError(f"{car}: {in_words(reply)}")
+    typer.echo(f"{car}: {reply.data.get('version', '')} {in_words(reply)}")
 
 
 def rollback(
@@ -133,16 +133,17 @@ def rollback(
     Exit code 0 once it drives with them, 1 if there are none, 2 if it cannot be asked.
     """
     from bayesrace.transport import open_session, send_rollback
-    from experiments.learn.publishing import Answer, NotTakenOverError
+    from experiments.learn.publishing import NotTakenOverError, in_words
 
     endpoints = connect_to(endpoint)
     with open_session(endpoints) as session:
         car = _controller(session, endpoints, name, timeout)
-        answer = Answer.of(send_rollback(session, car, reason or "bayesrace rollback", timeout))
-    if not answer.accepted:
-        raise NotTakenOverError(f"{car}: {answer.words}")
-    instead = f", instead of {answer.before}" if answer.before else ""
-    typer.echo(f"{car}: {answer.version} {answer.words}{instead}")
+        reply = send_rollback(session, car, reason or "bayesrace rollback", timeout)
+    if not reply.accepted:
+        raise NotTakenOverError(f"{car}: {in_words(reply)}")
+    before = reply.data.get("from_version")
+    instead = f", instead of {before}" if before else ""
+    typer.echo(f"{car}: {reply.data.get('version', '')} {in_words(reply)}{instead}")
 
 
 def learn(
@@ -194,10 +195,9 @@ def learn(
     given the same --out, this too goes on where it was. Start a run with 'bayesrace drive'.
     """
     from bayesrace.vehicles import get_car
-    from experiments.learn.job import discretisation_from
     from experiments.learn.job import learn as follow
-    from experiments.learn.settings import LearnSettings
-    from experiments.learn.table import print_laps
+    from experiments.learn.records import LearnSettings
+    from experiments.learn.report import print_laps
 
     stamp = datetime.now(UTC).astimezone().strftime("%Y%m%d-%H%M%S")
     folder = out or Path("runs") / f"learn-{stamp}"
@@ -205,7 +205,6 @@ def learn(
     settings = LearnSettings(
         car=parameters,
         name=name or parameters.name,
-        discretisation=discretisation_from(parameters, weights, artefact, points, folder),
         points=points,
         keep=keep,
         laps=laps or (None if watch else 1),
@@ -213,7 +212,10 @@ def learn(
         compare=compare,
         seed=seed,
     )
-    record = follow(settings, connect_to(endpoint), folder, data or [], weights, typer.echo)
+    record = follow(
+        settings, connect_to(endpoint), folder, typer.echo,
+        data=data or (), weights=weights, artefact=artefact,
+    )  # fmt: skip
     print_laps(record)
     typer.echo(str(folder))
 

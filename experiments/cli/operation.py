@@ -1,4 +1,4 @@
-"""``status``, ``stop``, ``go``, ``router``: looking after plants and controllers that run."""
+"""``status``, ``stop``, ``go``, ``router``: operating plants and controllers that run."""
 
 import contextlib
 import json
@@ -14,19 +14,19 @@ from bayesrace.errors import InputError
 from experiments.cli.options import Endpoint, ParentPid, connect_to
 
 if TYPE_CHECKING:
-    from experiments.operation import Word
+    from experiments.operation import Action
     from experiments.picture import Picture
 
 __all__ = ["register"]
 
 Name = Annotated[str, typer.Option(help="Name of the car.")]
 Timeout = Annotated[
-    float, typer.Option(min=0.1, max=60.0, help="Seconds to find the cars, and again to answer.")
+    float, typer.Option(min=0.1, max=60.0, help="Seconds to find cars, and for their answers.")
 ]
-Reason = Annotated[str, typer.Option(help="Why; it shows in the controller's status.")]
+Reason = Annotated[str, typer.Option(help="The reason, shown in the controller's status.")]
 
 _PERIOD_S = 0.2
-"""Between two pictures of ``status --watch``."""
+"""Period of the display of ``status --watch``."""
 
 
 def status(
@@ -43,59 +43,39 @@ def status(
     ] = False,
     timeout: Timeout = 2.0,
 ) -> None:
-    """Show how plants and controllers are: state, rate, misses, fallbacks, counters.
+    """Show the state of plants and controllers: phase, rate, misses, fallbacks, counters.
 
-    Without --name: all cars that are found. A process that is there and does not answer is shown
-    as such; if none answers, that is an error.
+    Without --name: all cars found. A process that is present and does not answer is shown as such;
+    if none answers, that is an error.
     """
+    from rich.live import Live
 
     from bayesrace.transport import open_session
-    from experiments.operation import ask_statuses, find
+    from experiments.operation import ask_statuses, find, follow
     from experiments.status_table import StatusTable
     from experiments.terminal import Terminal
 
     endpoints = connect_to(endpoint)
-    with open_session(endpoints) as session, _until_nobody_reads():
+    with open_session(endpoints) as session, _closed_pipe_allowed():
         picture = ask_statuses(session, find(session, endpoints, timeout, name), timeout)
         if watch and as_json:
-            _watch_json(session, picture, name)
+            for car in follow(session, picture, name, 1.0):
+                if car is not None:
+                    _print_json(picture, car)
         elif watch:
-            _watch(session, picture, name)
+            with Live(console=Terminal(), auto_refresh=False) as live:
+                for car in follow(session, picture, name, _PERIOD_S):
+                    if car is None:  # once a period, not for each heartbeat
+                        live.update(StatusTable(picture, brief=True), refresh=True)
         elif as_json:
             _print_json(picture)
         else:
             Terminal().print(StatusTable(picture))
     if not watch and not picture.answering:
         raise InputError(
-            f"none of the processes found answers within {timeout:g} s; they hang, are of another "
-            "release, or the network is slow: --timeout"
+            f"no answer within {timeout:g} s from the processes found; they hang or are of another "
+            "release, or the network is slow (--timeout)"
         )
-
-
-def _watch(session: object, picture: "Picture", name: str) -> None:
-    from rich.live import Live
-
-    from experiments.operation import follow
-    from experiments.status_table import StatusTable
-    from experiments.terminal import Terminal
-
-    with Live(console=Terminal(), auto_refresh=False) as live:
-
-        def show(car: str | None) -> None:
-            if car is None:
-                live.update(StatusTable(picture, brief=True), refresh=True)
-
-        follow(session, picture, name, show, _PERIOD_S)
-
-
-def _watch_json(session: object, picture: "Picture", name: str) -> None:
-    from experiments.operation import follow
-
-    def show(car: str | None) -> None:
-        if car is not None:
-            _print_json(picture, car)
-
-    follow(session, picture, name, show, 1.0)
 
 
 def _print_json(picture: "Picture", car: str | None = None) -> None:
@@ -103,13 +83,13 @@ def _print_json(picture: "Picture", car: str | None = None) -> None:
 
 
 @contextlib.contextmanager
-def _until_nobody_reads() -> Iterator[None]:
-    """A reader that has had enough (``| head -1``) is no error."""
+def _closed_pipe_allowed() -> Iterator[None]:
+    """A reader that closes the pipe (``| head -1``) is no error."""
     try:
         yield
         sys.stdout.flush()
     except BrokenPipeError:
-        # What is left in the buffer must not fail once more at exit.
+        # The rest of the buffer must not fail once more at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
@@ -117,35 +97,34 @@ def stop(
     name: Name = "",
     endpoint: Endpoint = None,
     reason: Reason = "",
-    everybody: Annotated[bool, typer.Option("--all", help="Stop all cars that are found.")] = False,
+    everybody: Annotated[bool, typer.Option("--all", help="Stop all cars found.")] = False,
     run: Annotated[
-        bool,
-        typer.Option("--run", help="End the plant's run instead, as when who started it is gone."),
+        bool, typer.Option("--run", help="End the plant's run instead, after its client has died.")
     ] = False,
     timeout: Timeout = 2.0,
 ) -> None:
-    """Tell a controller to brake to standstill and stay there.
+    """Stop a car: its controller brakes to standstill and stays there.
 
-    Without --name: the only car there is. Exit code 2 if it refuses or does not answer.
+    Without --name: the only car found. Exit code 2 if it refuses or does not answer.
     """
     if name and everybody:
         raise InputError("--name and --all contradict each other; give one of them")
-    word: Literal["stop", "end"] = "end" if run else "stop"
-    _command(word, name, endpoint, reason or "bayesrace stop", everybody, timeout)
+    action: Literal["stop", "end"] = "end" if run else "stop"
+    _command(action, name, endpoint, reason or "bayesrace stop", everybody, timeout)
 
 
 def go(
     name: Name = "", endpoint: Endpoint = None, reason: Reason = "", timeout: Timeout = 2.0
 ) -> None:
-    """Tell a controller that has been stopped to drive again.
+    """Let a stopped car drive again.
 
-    Without --name: the only car there is. Exit code 2 if it refuses or does not answer.
+    Without --name: the only car found. Exit code 2 if it refuses or does not answer.
     """
     _command("go", name, endpoint, reason or "bayesrace go", False, timeout)
 
 
 def _command(
-    word: "Word",
+    action: "Action",
     name: str,
     endpoint: list[str] | None,
     reason: str,
@@ -159,16 +138,16 @@ def _command(
 
     endpoints = connect_to(endpoint)
     with open_session(endpoints) as session:
-        source = "plant" if word == "end" else "controller"
+        source = "plant" if action == "end" else "controller"
         cars = pick(find(session, endpoints, timeout, name, (source,)), name, everybody, source)
-        answers = command(session, cars, word, reason, timeout)
+        answers = command(session, cars, action, reason, timeout)
     failures = []
     for car, answer in answers.items():
         if isinstance(answer, Reply) and answer.accepted:
             typer.echo(f"{car}: {printable(answer.text)}")
         else:
-            why = f"refused: {answer.text}" if isinstance(answer, Reply) else answer
-            failures.append(f"{word} of car '{car}' {printable(why)}")
+            why = f"refused: {answer.text}" if isinstance(answer, Reply) else f"failed: {answer}"
+            failures.append(f"{action} of car '{car}' {printable(why)}")
     if failures:
         raise InputError("; ".join(failures))
 
@@ -182,10 +161,10 @@ def router(
     ] = None,
     parent_pid: ParentPid = None,
 ) -> None:
-    """Forward between cars and those who look after them, until Ctrl-C.
+    """Forward between plants, controllers and other processes, until Ctrl-C.
 
-    Plants, controllers and all others then need one endpoint only, this one: many cars on one
-    network, and machines that cannot reach each other directly.
+    All of them then need one endpoint only, this one: for many cars on one network, and for
+    machines that cannot reach each other directly.
     """
     die_with_parent(parent_pid)
     from bayesrace.transport import Endpoints

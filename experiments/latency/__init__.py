@@ -1,1 +1,10 @@
-"""``bayesrace latency``: where a control cycle's time goes, measured from the messages."""
+"""``bayesrace latency``: the legs of a control cycle, computed from the log of a run.
+
+All times are in the messages. A measurement records a run and computes the legs afterwards, by the
+same code whether the run was started here, was driven elsewhere, or was recorded earlier.
+
+In the order of use: ``settings``; ``measure`` records the run, with the processes of ``beside``.
+``columns`` reads the log into tables, ``legs`` joins the messages of a cycle, ``clocks`` relates
+the clocks of plant and controller, and ``traffic`` counts messages. ``analysis`` makes the
+``results`` of these and of each leg's ``series``; ``report`` and ``plot`` show them.
+"""

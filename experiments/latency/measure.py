@@ -1,158 +1,200 @@
-"""The time observed: takes in messages, clocks, counters and memory, and disturbs no one."""
+"""Records a run, started here or running elsewhere, and analyses its log."""
 
+import os
+import socket
 import time
-from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from bayesrace.errors import InputError
-from bayesrace.messages import Event, Status
-from bayesrace.tracks import Track
-from bayesrace.transport import Director, Kind
-from experiments.latency.memory import MemoryWatch
-from experiments.latency.observer import ClockProbe, Observer
-from experiments.latency.traffic import numbers
+from bayesrace.files import write_whole
+from bayesrace.messages import Event
+from bayesrace.recorder import Recorder
+from bayesrace.tracks import Track, load_track
+from bayesrace.transport import Director, Endpoints, Item, Kind, open_session
+from bayesrace.vehicles import write_car
+from experiments.drive import RunPlan, run_request
+from experiments.latency.analysis import Beside, analyse
+from experiments.latency.beside import read_bare_loop, running_beside
+from experiments.latency.report import RESULT, write_files
+from experiments.latency.results import LatencyResult, Memory
+from experiments.latency.settings import LatencySettings
+from experiments.preparation import Prepared, prepare
+from experiments.processes import Child, endings
+from experiments.progress import Stages
+from experiments.settings import PreparationSettings
+from experiments.system import started_system
 
-__all__ = ["Measurement", "Snapshot"]
+__all__ = ["LatencyError", "Run", "measure"]
 
-_LOOK_S: Final = 0.2
-"""Between two looks at what has arrived; as often, timestamps are exchanged with other hosts."""
+_LOG: Final = "run.mcap"
 
-_FIRST_ATTEMPTS: Final = 5
-_ATTEMPTS: Final = 25
+_ATTACH_S: Final = 10.0
+_AFTERWARDS_S: Final = 60.0
+"""The run's own time limit is this much later than its end by request."""
+_SAMPLE_S: Final = 0.5
+"""Between two samples of the memory of the processes."""
+_MEMORY_S: Final = 60.0
+"""Memory that a process takes in its first minute, or third of a shorter run, is no growth."""
 
 
-@dataclass(frozen=True)
-class Snapshot:
-    """What both processes had counted at about the same time."""
-
-    plant: Status
-    controller: Status
-    apart_s: float
-    """At most so long after the one the other answered."""
-
-    @property
-    def in_flight(self) -> tuple[int, int]:
-        """States, actuations sent and neither received nor counted as lost."""
-        plant, controller = numbers(self.plant), numbers(self.controller)
-
-        def missing(name: str, sender: dict[str, int], receiver: dict[str, int]) -> int:
-            arrived = receiver.get(f"{name}_received", 0) + receiver.get(f"{name}_lost", 0)
-            return sender.get(f"{name}_sent", 0) - arrived
-
-        return missing("states", plant, controller), missing("actuations", controller, plant)
+class LatencyError(RuntimeError):
+    """The measurement broke off."""
 
 
 @dataclass
-class Measurement:
-    """One car, from outside. Call the methods in their order."""
+class Run(Beside):
+    """A run while it is recorded, and what is known of it besides the log."""
 
-    session: Any
-    director: Director
-    car: str
-    rate_hz: float
-    duration_s: float
-    track: Track | None
-    out: Path
-    pids: dict[str, int]
-    """Processes on this machine whose memory is watched."""
-    notes: list[str] = field(default_factory=list)
+    car: str = ""
+    children: dict[str, Child] = field(default_factory=dict)
+    """Plant and controller, if they were started here."""
     ended_early: str = ""
-    """Why the time observed was cut short."""
-    interrupted: bool = False
-    elapsed_s: float = 0.0
+    error: BaseException | None = None
+    """LatencyError or KeyboardInterrupt, if the recording ended early though it should not have."""
 
-    def __post_init__(self) -> None:
-        self.clocks = ClockProbe(self.session, self.car)
-        self.clocks.begin()
-        self.observer = Observer(
-            self.session, self.car, self.rate_hz, self.clocks.pair, self.duration_s, self.track,
-            self.out,
-        )  # fmt: skip
-        self.memory = MemoryWatch(self.pids, self.duration_s)
-
-    def settle(self, until_ns: int) -> None:
-        """Follows the run without counting."""
-        with self.director.inbox.catching_signals():
-            while not self.ended_early and (left_ns := until_ns - time.monotonic_ns()) > 0:
-                self._wait(min(_LOOK_S, left_ns * 1e-9))
-                self.observer.drain()
-                if not self.clocks.pair.shared:
-                    self.clocks.exchange()
-
-    def observe(self) -> None:
-        """Counts for ``duration_s``, or until the run ends, a process started here, or Ctrl-C."""
-        self.begin = self._snapshot()
-        self.observer.begin()
-        began_ns = time.monotonic_ns()
-        end_ns = began_ns + round(self.duration_s * 1e9)
-        with self.director.inbox.catching_signals():
+    def watch(self, director: Director, recorder: Recorder, begin_ns: int, end_ns: int) -> None:
+        """Lets the time pass, until the run ends, a process started here ends, or a signal."""
+        warm_ns = begin_ns + min(round(_MEMORY_S * 1e9), (end_ns - begin_ns) // 3)
+        with director.inbox.receive_signals():
             while not self.ended_early and (left_ns := end_ns - time.monotonic_ns()) > 0:
-                self._wait(min(_LOOK_S, left_ns * 1e-9))
-                self._look((time.monotonic_ns() - began_ns) * 1e-9)
-            self.elapsed_s = (time.monotonic_ns() - began_ns) * 1e-9
-            self.memory.look(self.elapsed_s)  # at least once: the looks before may have come late
-            self.observer.drain()
-            self._conclude()
+                item = director.inbox.get(min(left_ns * 1e-9, _SAMPLE_S))
+                if item is not None:
+                    self._react(item)
+                self.ended_early = self.ended_early or recorder.failed
+                if time.monotonic_ns() >= warm_ns:
+                    self.sample_memory()
+            self.sample_memory()  # at least once: those before may have come late
+        if self.ended_early and self.children and self.error is None:
+            ended = [self.ended_early, *_endings(self.children)]
+            self.error = LatencyError("; ".join(ended))
+        self.notes += [f"ended early: {self.ended_early}"] if self.ended_early else []
 
-    def _conclude(self) -> None:
-        """The end's counters and clocks; without those of the processes that have gone."""
+    def _react(self, item: Item) -> None:
+        if item.kind is Kind.SIGNAL:
+            self.error, self.ended_early = KeyboardInterrupt(), "interrupted"
+        elif isinstance(item.value, Event) and item.value.kind == "run_ended":
+            self.ended_early = item.value.text
+        elif item.kind is Kind.GONE:
+            text = f"the {item.name} of car '{self.car}' vanished"
+            self.ended_early = text if item.name in self.children else ""
+            self.notes += [] if self.ended_early else [text]
+
+    def sample_memory(self) -> None:
+        """Samples the resident memory of the processes that were started here."""
+        for name, process in self.children.items():
+            with suppress(OSError, IndexError, ValueError):  # it is gone, or there is no /proc
+                pages = int(Path(f"/proc/{process.pid}/statm").read_text().split()[1])
+                now = pages * os.sysconf("SC_PAGE_SIZE")
+                before = self.rss.get(name, Memory(begin_bytes=now, most_bytes=now))
+                most = max(now, before.most_bytes)
+                self.rss[name] = before.model_copy(update={"most_bytes": most})
+
+
+def measure(settings: LatencySettings, out: Path, stages: Stages) -> tuple[LatencyResult, Run]:
+    """Records a run, or takes the log in the settings, and leaves the report's files in ``out``.
+
+    Raises InputError for unusable settings, LatencyError if a process is lost before anything is
+    measured; no process outlives the call.
+    """
+    if any((out / name).exists() for name in (RESULT, *(() if settings.log else (_LOG,)))):
+        raise InputError(f"{out} holds a measurement already; choose another folder or remove it")
+    track = load_track(settings.track, settings.car.width_m) if settings.track else None
+    run = Run(car=settings.car_name)
+    if settings.log is None:
+        _record(run, settings, track, out, stages)
+    with stages.stage("analyse the log"):
         try:
-            self.end = self._snapshot(self.begin)
+            analysis = analyse(settings.log or out / _LOG, settings, track, run)
         except InputError as error:
-            self.end = self.begin
-            self.notes.append(f"no counters at the end: {error}")
-        else:
-            self.clocks.exchange(10)
-        self.clocks.settle()
-        if self.clocks.pair.shared and not self.clocks.pair.agree():
-            self.notes.append(
-                "the clocks of plant and controller were one at the beginning and are not any more"
-            )
-        self.observer.finish()
+            raise run.error or error from None
+        out.mkdir(parents=True, exist_ok=True)
+        write_whole(out / "settings.json", settings.model_dump_json(indent=1) + "\n")
+        write_files(out, analysis)
+    return analysis.result, run
 
-    def _look(self, elapsed_s: float) -> None:
-        self.observer.drain()
-        self.memory.look(elapsed_s)
-        if not self.clocks.pair.shared:
-            self.clocks.exchange()
 
-    def _wait(self, timeout_s: float) -> None:
-        """Lets time pass; notices what ends the measurement."""
-        until = time.monotonic() + timeout_s
-        while (left_s := until - time.monotonic()) > 0 and not self.ended_early:
-            item = self.director.inbox.get(left_s)
-            if item is None:
-                return
-            if item.kind is Kind.SIGNAL:
-                self.interrupted, self.ended_early = True, "interrupted"
-            elif item.kind is Kind.GONE:
-                self._gone(item.name)
-            elif isinstance(item.value, Event) and item.value.kind == "run_ended":
-                self.ended_early = item.value.text
+def _record(
+    run: Run, settings: LatencySettings, track: Track | None, out: Path, stages: Stages
+) -> None:
+    """Records the run, and the machine beside it."""
+    start = not settings.attach
+    files = _files(settings, stages) if start else None
+    out.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as stack:
+        with stages.stage("start plant and controller" if start else "attach"):
+            stack.enter_context(_explained(run))
+            if files is not None:
+                plant, both = _options(settings, out)
+                system = stack.enter_context(started_system(run.car, out, plant, both))
+                stack.enter_context(system.controller([*files.arguments, *plant]))
+                session, director, run.children = system.session, system.director, system.children
+            else:
+                session = stack.enter_context(open_session(Endpoints(connect=settings.attach)))
+                director = Director(session, run.car)
+                director.wait_for(("plant", "controller"), _ATTACH_S)
+            rate_hz, phase = director.status("controller").rate_hz, director.status("plant").phase
+            if not start and (phase != "running" or not rate_hz):
+                raise InputError(
+                    f"car '{run.car}' is not driving in real time (plant: {phase}); "
+                    "start a run with 'bayesrace drive --mode realtime'"
+                )
+            about = {"latency": {"settings": settings.model_dump_json()}}
+            recorder = stack.enter_context(Recorder(session, run.car, out / _LOG, about))
+            if track is not None and start:
+                limit_s = settings.warm_up_s + settings.duration_s + _AFTERWARDS_S
+                plan = RunPlan(1, "bayesrace", 0, limit_s, lockstep=False)
+                director.start(run_request(track, plan))
+                stack.callback(_stop, director)
+        begin_ns = time.monotonic_ns() + round(settings.warm_up_s * 1e9)
+        end_ns = begin_ns + round(settings.duration_s * 1e9)
+        count = round(settings.duration_s * rate_hz)
+        with (
+            running_beside(out, settings.load, settings.realtime, rate_hz, begin_ns, count),
+            stages.stage(f"record {settings.duration_s:g} s"),
+        ):
+            run.watch(director, recorder, begin_ns, end_ns)
+    run.host, run.bare = socket.gethostname(), read_bare_loop(out, rate_hz)
+    run.notes += [] if run.bare else ["no bare loop to compare the misses with: it was lost"]
 
-    def _gone(self, source: str) -> None:
-        text = f"the {source} of car '{self.car}' vanished"
-        if source in self.pids:
-            self.ended_early = text
-        else:
-            self.notes.append(text)
 
-    def _snapshot(self, like: Snapshot | None = None) -> Snapshot:
-        """Counters of both; if it can be, of a moment without a message between them.
+def _files(settings: LatencySettings, stages: Stages) -> Prepared:
+    """What plant and controller are started with."""
+    return prepare(
+        PreparationSettings(car=settings.car), (settings.track,), stages,
+        raceline=settings.raceline, weights=settings.weights, artefact=settings.artefact,
+    )  # fmt: skip
 
-        Asked first, the controller answers right after its actuation has gone, and the plant when
-        it has taken that in, before the next state: nothing is under way, and what differs was
-        counted before this process looked. A period may begin in between, so it is tried a few
-        times: until the difference is that of ``like``, else the commonest difference counts.
-        """
-        found: list[Snapshot] = []
-        for _ in range(_FIRST_ATTEMPTS if like is None else _ATTEMPTS):
-            begin = time.monotonic()
-            controller, plant = (self.director.status(name) for name in ("controller", "plant"))
-            found.append(Snapshot(plant, controller, time.monotonic() - begin))
-            if like is not None and found[-1].in_flight == like.in_flight:
-                return found[-1]
-        commonest = Counter(one.in_flight for one in found).most_common(1)[0][0]
-        return next(one for one in found if one.in_flight == commonest)
+
+def _options(settings: LatencySettings, out: Path) -> tuple[list[str], list[str]]:
+    """Options that name the car, and further ones, all of them of plant and controller."""
+    realtime, car_file = settings.realtime, out / "car.toml"
+    write_car(car_file, settings.car)
+    both = ["--name", settings.car_name, "--rate", repr(settings.rate_hz)]
+    both += ["--lock-memory"] if realtime.lock_memory else []
+    both += ["--fifo", str(realtime.fifo)] if realtime.fifo else []
+    return ["--car", str(car_file)], both
+
+
+def _stop(director: Director) -> None:
+    with suppress(InputError):  # the plant may be what was lost
+        director.stop("measured")
+
+
+@contextmanager
+def _explained(run: Run) -> Iterator[None]:
+    """Adds the end of a child to what went wrong because of it."""
+    try:
+        yield
+    except InputError as error:
+        if _endings(run.children):
+            raise LatencyError(str(error)) from error  # which says how they ended
+        raise
+
+
+def _endings(children: dict[str, Child]) -> list[str]:
+    time.sleep(0.2)  # the system reports a death a moment after the network does
+    return endings(children.values())

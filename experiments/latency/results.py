@@ -1,18 +1,8 @@
-"""The outcome of ``bayesrace latency``: what ``latency.json`` holds, and nothing beside it."""
+"""The content of ``latency.json``."""
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = [
-    "BareLoop",
-    "ClockResult",
-    "Clocks",
-    "Distribution",
-    "LatencyResult",
-    "LegResult",
-    "Memory",
-    "Percentiles",
-    "Traffic",
-]
+__all__ = ["BareLoop", "Clocks", "Distribution", "LatencyResult", "LegResult", "Memory", "Traffic"]
 
 
 class _Frozen(BaseModel):
@@ -20,29 +10,22 @@ class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-class Percentiles(_Frozen):
-    """Of one leg [us]."""
+class Distribution(_Frozen):
+    """Percentiles [us], each the smallest value that so many do not exceed."""
 
     p50: float
     p90: float
     p99: float
     p999: float
     max: float
-
-
-class Distribution(Percentiles):
-    """The same with the number of values."""
-
     count: int
 
 
 class LegResult(Distribution):
     """One leg."""
 
-    clock: str = Field(description="whose clock it is measured on; both: it crosses")
-    uncertainty_us: float = Field(
-        description="of each value, largest over the run; 0 where one clock measured it"
-    )
+    clock: str = Field(description="on which it is measured; both: it crosses")
+    uncertainty_us: float = Field(description="of each value, largest; 0 where one clock measured")
     min: float = Field(description="smallest value; below 0 only within the uncertainty")
     below_zero: int = Field(description="values below 0, which count as 0 in the percentiles")
 
@@ -58,27 +41,13 @@ class BareLoop(Distribution):
 
 
 class Traffic(_Frozen):
-    """Messages of one direction, counted by its sender and its receiver."""
+    """Messages of one direction, by the sender's numbers and the receiver's counters."""
 
     sent: int
     received: int
     lost: int
-    in_flight: int = Field(
-        description="sent - received - lost: 0, or what lay between two processes' counting"
-    )
-    complete: bool = Field(description="sent = received + lost, but for what was in flight")
-
-
-class ClockResult(_Frozen):
-    """A process's clock against that of the measuring one."""
-
-    host: str
-    offset_us: float
-    uncertainty_us: float = Field(description="half the round trip of the exchange used, largest")
-    drift_ppm: float
-    drift_uncertainty_ppm: float | None = Field(description="null: one reading only")
-    exchanges: int
-    failed: int
+    in_flight: int = Field(description="sent - received - lost")
+    complete: bool = Field(description="in_flight is at most what can be on its way")
 
 
 class Clocks(_Frozen):
@@ -86,9 +55,9 @@ class Clocks(_Frozen):
 
     shared: bool = Field(description="one clock: legs that cross from one to the other are exact")
     text: str
+    offset_us: float = Field(description="controller minus plant at the end; 0 if shared")
     uncertainty_us: float = Field(description="of a leg that crosses, largest over the run")
-    plant: ClockResult
-    controller: ClockResult
+    exchanges: int = Field(description="states and answers that bound the offset")
 
 
 class Memory(_Frozen):
@@ -99,44 +68,45 @@ class Memory(_Frozen):
 
     @property
     def growth_bytes(self) -> int:
-        """What came in between."""
+        """Largest value less the one at the beginning."""
         return self.most_bytes - self.begin_bytes
 
 
 class LatencyResult(_Frozen):
-    """One measurement. Counts are over the time observed, but for messages (see ``traffic``)."""
+    """One measurement; null: not known from the log or the measurement."""
 
     car: str
     track: str = Field(description="empty if not known")
     rate_hz: float
-    duration_s: float = Field(description="observed")
+    duration_s: float = Field(description="from the first state that counts to the last one")
     load: int = Field(description="busy processes beside")
     attached: bool
+    recorded: bool = Field(description="made from a log of an earlier run")
     started: str = Field(description="calendar time")
-    host: str = Field(description="of the measuring process, and of the bare loop")
-    state_to_actuation_us: Percentiles | None
+    host: str = Field(description="of the measuring process and of the bare loop")
+    state_to_actuation_us: Distribution | None
     legs_us: dict[str, LegResult]
     ticks: int = Field(description="releases, those passed over included")
     skipped: int = Field(description="releases passed over")
     deadline_misses: int = Field(description="actuations sent after the next release")
-    overruns: int = Field(description="cycles that took more than their budget")
+    overruns: int | None = Field(description="cycles that took more than their budget")
     fallbacks: int = Field(description="cycles that the fallback drove")
-    bare_loop_misses: int | None = Field(description="null if there was no bare loop")
+    bare_loop_misses: int | None
     bare_loop_us: BareLoop | None
     mean_period_us: float | None
     rate_error: float | None = Field(description="mean period over the nominal one, less 1")
-    sent: int = Field(description="states and actuations, by their senders")
-    received: int
-    lost: int
+    sent: int | None = Field(description="states and actuations")
+    received: int | None
+    lost: int | None
     traffic: dict[str, Traffic] = Field(description="of states and of actuations, each by itself")
-    rss_growth_bytes: int | None = Field(description="the larger one of the two; null: not known")
+    rss_growth_bytes: int | None = Field(description="the larger one of the two")
     rss: dict[str, Memory]
     repeated_answers: int = Field(description="further answers to a state, predicted forward")
     overtaken_answers: int = Field(description="answers that never acted")
-    unobserved: int = Field(description="messages that only the measuring process did not get")
+    unobserved: int = Field(description="messages missing in the log alone")
     restarts: int
     laps: int | None
-    states: int = Field(description="since the run's start, where it was started here")
-    off_track_samples: int | None = Field(description="of these states; null: track not known")
-    clocks: Clocks
+    states: int = Field(description="true states in the log, those of the warm-up included")
+    off_track_samples: int | None = Field(description="of these states")
+    clocks: Clocks | None = Field(description="null: no state reports when an answer arrived")
     notes: list[str] = Field(description="what a reader must know, such as an early end")

@@ -1,64 +1,55 @@
-"""Messages sent, received and lost, by the counters of both processes."""
+"""Messages sent, received and lost: the sender's numbers against the receiver's counters.
 
-import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+A heartbeat of the receiver carries what it had received and counted as lost until then; what had
+been sent until then follows from the numbers and times in the log. Messages are counted between two
+heartbeats, of the first and of the last second, at which the fewest were in flight.
+"""
+
 from typing import Final
 
-from bayesrace.messages import Status
-from experiments.latency.results import Traffic
+import numpy as np
+from numpy.typing import NDArray
 
-__all__ = ["STREAMS", "Counted", "counted", "numbers", "traffic"]
+from experiments.latency.clocks import ClockMap
+from experiments.latency.columns import Columns, Tables, begins_anew
 
-STREAMS: Final = {"states": ("plant", "controller"), "actuations": ("controller", "plant")}
-"""Direction to sender and receiver; the counters are named after the direction."""
+__all__ = ["heartbeats", "traffic"]
 
+Floats = NDArray[np.float64]
 
-@dataclass(frozen=True)
-class Counted:
-    """How far counters went between two answers of a process."""
-
-    counters: Mapping[str, int]
-    restarted: bool
-    """The process began anew: what it counted before that is not known."""
-
-    def __getitem__(self, name: str) -> int:
-        return self.counters.get(name, 0)
+_SECOND: Final = 10
+"""Heartbeats in a second."""
 
 
-def counted(begin: Status, end: Status) -> Counted:
-    """The difference of two answers of one process."""
-    before, after = numbers(begin), numbers(end)
-    restarted = any(after.get(name, 0) < value for name, value in before.items())
-    if restarted:
-        before = {}
-    return Counted({name: after[name] - before.get(name, 0) for name in after}, restarted)
+def traffic(tables: Tables, clock: ClockMap) -> dict[str, float]:
+    """``states_sent``, ``…_received``, ``…_lost``, ``actuations_sent`` and so on; of a direction
+    without heartbeats nothing."""
+    states, actuations = tables["states"], tables["actuations"]
+    actuations = actuations[actuations["state"] >= states["seq"][0]]  # none of the warm-up
+    plant, controller = (heartbeats(tables, one) for one in (False, True))
+    at = clock.to_plant(controller["sent"])
+    found = _counted("states", states["seq"], states["sampled"], controller, at)
+    at = clock.to_plant(actuations["sent"])
+    return found | _counted("actuations", actuations["seq"], at, plant, plant["sent"])
 
 
-def numbers(status: Status) -> dict[str, int]:
-    """The counters of a process."""
-    return {name: value for name, value in status.counters.items() if type(value) is int}
+def heartbeats(tables: Tables, controller: bool) -> Columns:
+    """Those of one process, up to a restart of it: its counters begin anew there."""
+    beats = tables["heartbeats"]
+    beats = beats[beats["controller"] == controller]
+    return np.split(beats, np.flatnonzero(begins_anew(beats)) + 1)[0]
 
 
-def traffic(
-    by: Mapping[str, Counted], rate_hz: float = 0.0, apart_s: float = 0.0
-) -> dict[str, Traffic]:
-    """Each direction by itself.
-
-    ``apart_s``: for counters read while messages are under way, time between reading the one
-    process's and the other's, both ends added up; what could be sent meanwhile may differ.
-    """
-    most = math.ceil(rate_hz * apart_s)
-    found = {}
-    for name, (sender, receiver) in STREAMS.items():
-        sent = by[sender][f"{name}_sent"]
-        received, lost = by[receiver][f"{name}_received"], by[receiver][f"{name}_lost"]
-        in_flight = sent - received - lost
-        found[name] = Traffic(
-            sent=sent,
-            received=received,
-            lost=lost,
-            in_flight=in_flight,
-            complete=abs(in_flight) <= most,
-        )
-    return found
+def _counted(
+    stream: str, numbers: Floats, sent_at: Floats, beats: Columns, at: Floats
+) -> dict[str, float]:
+    """``sent_at`` of the messages and ``at`` of the receiver's heartbeats are on one clock."""
+    before = np.searchsorted(sent_at, at, side="right")
+    inside = (before > 0) & (before < len(sent_at))
+    if not inside.any():
+        return {}
+    sent, beats = numbers[before[inside] - 1], beats[inside]
+    left = sent - beats["received"] - beats["lost"]
+    begin, end = left[:_SECOND].argmin(), len(left) - 1 - left[::-1][:_SECOND].argmin()
+    columns = {"sent": sent, "received": beats["received"], "lost": beats["lost"]}
+    return {f"{stream}_{name}": one[end] - one[begin] for name, one in columns.items()}

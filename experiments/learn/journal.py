@@ -1,290 +1,190 @@
-"""The folder of a learning job: what was driven and learned, and enough to go on after an end.
+"""The folder of a learning job: ``learn.db``, and the files made beside it.
 
-================  ===============================================================================
-file              what
-================  ===============================================================================
-settings.json     of the job (:class:`.settings.LearnSettings`)
-laps.json         :class:`Record`: every lap, every update with the controller's answer
-weights-NNNN.bin  weights learned after that lap (0000: from the data given); the newest ones
-weights-given.bin weights that the job was given to begin with
-kept-N.npz        samples kept so far, bounded (:mod:`.store`; form: :mod:`learning.arrays`)
-new-N.npz         samples that no update has learned from yet
-laps.png          lap time against lap number
-worker.log        what the training processes of the last job have said besides
-lock              held by the job that runs
-================  ===============================================================================
-
-Every file but the last two is replaced whole: whenever the job is killed, the folder can be gone on
-with.
+``learn.db`` (SQLite, one table of named contents) holds all that a job needs to resume: its
+:class:`~.records.Record`, and its samples in three stages: ``new`` (driven since the last training
+began), ``learning`` (taken by a training) and ``kept`` (by the last training that ended). Each
+change is one transaction that is on the disk when it ends: after a kill or a power failure at any
+moment every sample is in one stage.
 """
 
-import fcntl
-from collections.abc import Mapping
-from itertools import count
+import sqlite3
 from pathlib import Path
-from typing import IO, Final, Literal, Self
+from typing import Any, Final
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+import numpy as np
 
-from bayesrace.errors import InputError, faults_in
-from bayesrace.files import clear_partials, read_whole, write_whole
-from experiments.learn.settings import LearnSettings
+from bayesrace.errors import InputError
+from bayesrace.files import clear_partials, write_whole
+from bayesrace.gp.weights import OUTPUTS, GpWeights, write_weights
+from experiments.learn.records import LapRecord, LearnSettings, Record, UpdateRecord
+from learning.dataset import Dataset, concatenate
+from learning.pool import MOST_NEW
+from learning.subset import evenly
 
-__all__ = ["MOST_WEIGHTS", "Journal", "LapRecord", "Record", "UpdateRecord"]
+__all__ = ["MOST_WEIGHTS", "Journal", "resumable_settings"]
 
 MOST_WEIGHTS: Final = 20
-"""Weights files that stay, the newest; besides, those that are in use or were last accepted."""
+"""Weights files kept, the newest; besides, those that are in use or were last accepted."""
 
-_MOST_REMARKS: Final = 50
-"""Each is there once, but some name a number."""
-
-Verdict = Literal[
-    "waiting", "accepted", "refused", "rolled back", "not sent", "no answer", "failed"
-]
-"""Of weights: ``waiting`` for a controller's answer; ``no answer``: newer weights came first; ``not
-sent``: declined before; ``failed``: the training."""
-
-
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class LapRecord(_Frozen):
-    """One lap that was driven."""
-
-    lap: int = Field(description="number in this folder, from 1")
-    run: int = Field(description="number of the run in all messages")
-    time_s: float | None = Field(description="lap time; null if an end of it was not seen")
-    flying: bool = Field(description="begun at speed, not from standstill")
-    versions: list[str] = Field(description="of the weights that drove it, in order")
-    samples: int = Field(description="fit to learn from")
-    left_out: dict[str, int] = Field(description="samples left out, by reason")
-    fallbacks: int = Field(description="cycles that the fallback drove")
-    off_track_m: float | None = Field(description="deepest excursion; null without a track")
-
-
-class UpdateRecord(_Frozen):
-    """One training, and what became of its weights."""
-
-    after_lap: int = Field(description="last lap that it learned from; 0: only the data given")
-    version: str = Field("", description="of its weights; empty if there are none")
-    file: str = Field("", description="of the weights; those of long ago are deleted")
-    samples: int = Field(0, description="learned from")
-    kept: int = Field(0, description="samples kept for the next time")
-    points: int = Field(0, description="training points per output, the most")
-    training_s: float = 0.0
-    metrics: Mapping[str, Mapping[str, float]] = Field(
-        default_factory=dict, description="held out, per output"
-    )
-    verdict: Verdict = "waiting"
-    answer: str = Field("", description="in words")
-    cycle: int | None = Field(None, description="of the controller, at which it took over")
-    acceptance: int | None = Field(None, description="number of the takeover")
-
-
-class Record(_Frozen):
-    """``laps.json``."""
-
-    schema_version: Literal[1] = 1
-    recall: bool = Field(
-        True, description="what the given weights know counts until samples are kept"
-    )
-    laps: list[LapRecord] = Field(default_factory=list)
-    updates: list[UpdateRecord] = Field(default_factory=list)
-    remarks: list[str] = Field(
-        default_factory=list, description="why nothing could be learned from a drive, each once"
-    )
-
-
-class _Files:
-    settings: Final = "settings.json"
-    record: Final = "laps.json"
-    given: Final = "weights-given.bin"
-    plot: Final = "laps.png"
-    worker: Final = "worker.log"
-    lock: Final = "lock"
+_DATABASE: Final = "learn.db"
+_SCHEMA: Final = """
+    PRAGMA synchronous = FULL;
+    PRAGMA locking_mode = EXCLUSIVE;
+    BEGIN EXCLUSIVE;
+    CREATE TABLE IF NOT EXISTS content (name TEXT PRIMARY KEY, data BLOB);
+    COMMIT;
+"""
 
 
 class Journal:
-    """The folder, opened by the one job that writes it, until :meth:`close`; ``with`` it."""
-
-    FILES: Final = _Files
+    """The folder, locked against other jobs until :meth:`close`."""
 
     def __init__(self, folder: Path, settings: LearnSettings) -> None:
-        """Makes the folder, or goes on with what is in it.
+        """Makes the folder, or resumes the job in it.
 
-        InputError if it holds a job of another car or discretisation, or something else, or if
-        another job is at work in it.
+        InputError if it holds a job of another car or discretisation, or something else, if the
+        database is damaged, or if another job runs in the folder.
         """
-        self.folder = folder
-        self.record = Record()
-        path = folder / _Files.settings
-        if folder.is_dir() and not path.exists() and _foreign(folder):
+        path = folder / _DATABASE
+        if folder.is_dir() and not path.exists() and any(folder.iterdir()):
             raise InputError(f"{folder} holds something else; choose another folder")
         folder.mkdir(parents=True, exist_ok=True)
-        self._lock = _locked(folder)
-        try:
-            self.resumed = self.resumable(folder)
-            """There is something to go on with."""
-            if path.exists():
-                self._check(settings)
-                self.record = self._read()
-            write_whole(path, settings.model_dump_json(indent=1) + "\n")
-            clear_partials(folder)  # of a killed job
-        except BaseException:
-            self.close()
-            raise
-
-    @staticmethod
-    def resumable(folder: Path) -> bool:
-        """A job that is given this folder goes on with what is in it."""
-        return (folder / _Files.record).exists()
-
-    @staticmethod
-    def settings_in(folder: Path) -> LearnSettings:
-        """Those of the job that has left this folder; InputError if none has."""
-        path = folder / _Files.settings
-        try:
-            return LearnSettings.model_validate_json(read_whole(path, "the settings"))
-        except (InputError, ValidationError):
-            raise InputError(f"{path} is of no learning job; choose another folder") from None
+        self._database, self.record, stages = _open(path)
+        before, self.record.settings = self.record.settings, settings
+        self.folder, self.settings, self.resumed = folder, settings, before is not None
+        for what in ("car", "name", "discretisation"):
+            if before is not None and getattr(before, what) != getattr(settings, what):
+                self.close()
+                raise InputError(
+                    f"{folder} holds what was learned with another {what}; choose another folder, "
+                    "or the same settings"
+                )
+        names = ("kept", "learning", "new")
+        self._samples = {name: self._dataset(stages.get(name, b"")) for name in names}
+        clear_partials(folder)
+        if self.resumed:
+            self.save()
 
     def close(self) -> None:
-        """Another job may have the folder; nothing may be written after this."""
-        self._lock.close()
+        """Releases the folder; nothing may be written after this."""
+        self._database.close()
 
-    def __enter__(self) -> Self:
-        return self
+    @property
+    def last_accepted(self) -> UpdateRecord | None:
+        """The newest update that a controller took over and kept, if its file exists."""
+        accepted = (one for one in reversed(self.record.updates) if one.verdict == "accepted")
+        return next((one for one in accepted if (self.folder / one.file).is_file()), None)
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def path(self, name: str) -> Path:
-        """Of a file in the folder."""
-        return self.folder / name
-
-    def existing(self, name: str) -> Path | None:
-        """Of a file if it is there."""
-        path = self.path(name)
-        return path if path.is_file() else None
-
-    def begin(self, given: UpdateRecord | None, recall: bool) -> None:
-        """From now on the folder is gone on with: what was given is in it."""
-        updates = [] if given is None else [given]
-        self._write(Record(recall=recall, updates=updates))
-
-    def save(self) -> None:
-        """Writes the record though nothing is new: what else is there will be gone on with."""
-        self._write(self.record)
-
-    def add_lap(self, lap: LapRecord) -> None:
-        """One lap more."""
-        self._write(self.record.model_copy(update={"laps": [*self.record.laps, lap]}))
-
-    def add_update(self, update: UpdateRecord) -> None:
-        """One update more; those before it do not wait for an answer any more."""
-        before = [
-            one.model_copy(update={"verdict": "no answer"}) if one.verdict == "waiting" else one
-            for one in self.record.updates
-        ]
-        self._write(self.record.model_copy(update={"updates": [*before, update]}))
-
-    def remark(self, text: str) -> None:
-        """Notes it, unless it has been."""
-        remarks = self.record.remarks
-        if text not in remarks:
-            newest = [*remarks, text][-_MOST_REMARKS:]
-            self._write(self.record.model_copy(update={"remarks": newest}))
-
-    def change_update(self, version: str, **changes: object) -> UpdateRecord | None:
-        """Changes the last update of this version; None if there is none."""
-        for index in range(len(self.record.updates) - 1, -1, -1):
-            if self.record.updates[index].version == version:
-                changed = self.record.updates[index].model_copy(update=changes)
-                updates = [*self.record.updates]
-                updates[index] = changed
-                self._write(self.record.model_copy(update={"updates": updates}))
-                return changed
-        return None
+    @property
+    def initial(self) -> Path | None:
+        """Weights to start the next training from; none after a failure, which may be theirs."""
+        updates, best = self.record.updates, self.last_accepted
+        failed = updates and updates[-1].verdict in ("refused", "rolled back", "failed")
+        return None if best is None or failed else self.folder / best.file
 
     def update_of(self, version: str) -> UpdateRecord | None:
-        """The last update of this version; None if it is somebody else's."""
+        """The last update of this version; None if it is not one of this job's."""
         updates = (one for one in reversed(self.record.updates) if one.version == version)
         return next(updates, None) if version else None
 
-    def last_accepted(self) -> UpdateRecord | None:
-        """The newest update that the controller took and kept, if its file is there."""
-        for one in reversed(self.record.updates):
-            if one.verdict == "accepted" and self.existing(one.file) is not None:
-                return one
-        return None
+    def add_driven(self, samples: Dataset | None, lap: LapRecord | None = None) -> None:
+        """Adds samples, and the lap that ended with them, if one did, with its number."""
+        if lap is not None:
+            self.record.laps.append(lap)
+            lap.lap = len(self.record.laps)
+        if samples is not None or lap is not None:
+            self.save(new=_joined(self._samples["new"], samples or self._dataset()))
 
-    def declined(self, version: str) -> bool:
-        """These weights were refused or rolled back: nobody wants them a second time."""
-        verdicts = {one.verdict for one in self.record.updates if one.version == version}
-        return bool(verdicts & {"refused", "rolled back"})
+    def take_samples(self) -> list[Dataset]:
+        """For a training: the samples kept, and all others, which are in stage ``learning`` now."""
+        learning = _joined(self._samples["learning"], self._samples["new"])
+        if len(learning):
+            self.save(learning=learning, new=self._dataset())
+        return [self._samples["kept"], learning]
 
-    def free_weights(self, lap: int) -> Path:
-        """A file for the weights after this lap that no update has had."""
-        taken = {one.file for one in self.record.updates}
-        names = (f"weights-{lap:04d}{'' if k == 1 else f'-{k}'}.bin" for k in count(1))
-        return self.path(next(name for name in names if name not in taken))
+    def add_update(
+        self, update: UpdateRecord, weights: GpWeights | None, **samples: Dataset
+    ) -> None:
+        """Adds an update with its weights in a file; those still pending are superseded.
+
+        ``samples``: stages that change with it.
+        """
+        for one in self.record.updates:
+            one.verdict = "superseded" if one.verdict == "pending" else one.verdict
+        if weights is not None:
+            update.version, update.points = weights.version, max(weights.counts)
+            update.metrics = {name: weights.metrics.get(name, {}) for name in OUTPUTS}
+            update.file = f"weights-{len(self.record.updates):04d}.bin"
+            write_weights(self.folder / update.file, weights)
+        self.record.updates.append(update)
+        self.save(**samples)
+
+    def remark(self, text: str) -> None:
+        """Notes why a drive gave nothing to learn from, unless that is noted already."""
+        if text not in self.record.remarks:
+            self.record.remarks = [*self.record.remarks, text][-50:]  # some name a number
+            self.save()
 
     def drop_weights(self, in_use: str) -> None:
-        """Deletes weights files, but for the newest, those last accepted and those in use.
+        """Deletes old weights files, and those that a killed job has left without an update.
 
-        ``in_use``: version that the controller drives with. Weights that a killed job has left
-        without an update go as well, so call it only while no training is under way.
+        ``in_use``: version that the controller drives with, which stays.
         """
         updates = [one for one in self.record.updates if one.file]
-        needed = [*updates[-MOST_WEIGHTS:], self.last_accepted(), self.update_of(in_use)]
+        needed = [*updates[-MOST_WEIGHTS:], self.last_accepted, self.update_of(in_use)]
         names = {one.file for one in needed if one is not None}
-        for path in self.folder.glob("weights-[0-9]*.bin"):
+        for path in self.folder.glob("weights-*.bin"):
             if path.name not in names:
                 path.unlink()
 
-    def _check(self, settings: LearnSettings) -> None:
-        before = self.settings_in(self.folder)
-        for what in ("car", "name", "discretisation"):
-            if getattr(before, what) != getattr(settings, what):
-                raise InputError(
-                    f"{self.folder} holds what was learned with another {what}; choose another "
-                    "folder, or the same settings"
-                )
-
-    def _read(self) -> Record:
-        path = self.path(_Files.record)
-        if not path.exists():
-            return Record()
+    def save(self, **samples: Dataset) -> None:
+        """Writes the record and these samples as one transaction, then ``laps.json``."""
+        self._samples |= samples
+        record = self.record.model_dump_json(indent=1) + "\n"
+        content: dict[str, str | bytes] = {"record": record}
+        for stage, data in samples.items():
+            content[stage] = np.hstack((data.x, data.u, data.x_next)).astype("<f8").tobytes()
         try:
-            return Record.model_validate_json(read_whole(path, "the journal", 1 << 28))
-        except ValidationError as error:
-            raise InputError(
-                f"{path} cannot be read ({faults_in(error)}); choose another folder"
-            ) from None
+            with self._database as database:
+                database.executemany("REPLACE INTO content VALUES (?, ?)", content.items())
+        except sqlite3.Error as error:
+            path = self.folder / _DATABASE
+            raise InputError(f"cannot write {path}: {error}; the job can be resumed") from None
+        write_whole(self.folder / "laps.json", record)
 
-    def _write(self, record: Record) -> None:
-        self.record = record
-        write_whole(self.path(_Files.record), record.model_dump_json(indent=1) + "\n")
-
-
-def _foreign(folder: Path) -> bool:
-    """There is something in it besides what a job that was killed at its very start leaves."""
-    names = (path.name for path in folder.iterdir())
-    return any(name != _Files.lock and not name.startswith(".settings.") for name in names)
+    def _dataset(self, data: bytes = b"") -> Dataset:
+        x, u, x_next = np.split(np.frombuffer(data, "<f8").reshape(-1, 16), [7, 9], axis=1)
+        return Dataset(self.settings.car, self.settings.discretisation.step_s, x, u, x_next)
 
 
-def _locked(folder: Path) -> IO[bytes]:
-    """Nobody else gets it before it is closed, by whatever end of this process.
+def resumable_settings(folder: Path) -> LearnSettings | None:
+    """Settings of the job that a new one in this folder resumes; None if there is none.
 
-    InputError if somebody has it.
+    InputError if the database is damaged, or if another job runs in the folder.
     """
-    lock = (folder / _Files.lock).open("wb")
+    if not (folder / _DATABASE).is_file():
+        return None
+    database, record, _ = _open(folder / _DATABASE)
+    database.close()
+    return record.settings
+
+
+def _open(path: Path) -> tuple[sqlite3.Connection, Record, dict[str, bytes]]:
+    """The database, locked until it is closed, and the record and the samples in it."""
+    database = sqlite3.connect(path, timeout=0)
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        lock.close()
-        raise InputError(
-            f"another learning job is at work in {folder}; end it first, or choose another folder"
-        ) from None
-    return lock
+        database.executescript(_SCHEMA)
+        content: dict[str, Any] = dict(database.execute("SELECT name, data FROM content"))
+        return database, Record.model_validate_json(content.pop("record", "{}")), content
+    except (sqlite3.Error, ValueError) as error:  # pydantic's are ValueErrors
+        database.close()
+        why = f"{path} cannot be read ({str(error).splitlines()[0]}); restore it"
+        if getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_BUSY:
+            why = f"another learning job runs in {path.parent}; end it first"
+        raise InputError(f"{why}, or choose another folder") from None
+
+
+def _joined(first: Dataset, second: Dataset) -> Dataset:
+    """All samples in this order, or evenly spread ones where they are too many."""
+    every = concatenate([first, second])
+    return every.select(evenly(len(every), MOST_NEW))

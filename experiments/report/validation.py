@@ -17,8 +17,7 @@ from experiments.report.bands import band_patch, draw_band, mark_uncertain, unce
 from experiments.report.maps import draw_edges
 from experiments.report.style import INK, MUTED, PAGE_WIDTH, WARNING
 from learning.dataset import Dataset
-from learning.horizon import unbroken
-from learning.validation import Validation
+from learning.validation import Validation, unbroken
 
 __all__ = ["band_figure", "track_figure"]
 

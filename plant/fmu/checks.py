@@ -1,159 +1,138 @@
-"""What a map says of one variable, checked against what the FMU says of it."""
+"""One entry of a map against the one variable that it names; InputError says what to write instead.
+
+Units become factors here, and constants get the type of their variable.
+"""
 
 import difflib
 import math
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Mapping
+
+import numpy as np
 
 from bayesrace.errors import InputError
 from plant.fmu.inspection import Variable
-from plant.fmu.map_file import Driven, Pick
-from plant.fmu.units import Unit, contradicts, parse_quantity, to_si, unit_of
+from plant.fmu.map_file import Driven, Pick, Value
+from plant.fmu.units import contradicts, parse_quantity, to_si, unit_of
 
-__all__ = ["Checks", "Value", "a", "listed"]
-
-Value = float | int | bool | str
+__all__ = ["a", "constant", "conversion", "find", "offset_of", "scalar"]
 
 
-class Checks:
-    """Looks variables up and converts between their units and ours; collects all problems."""
+def find(variables: Mapping[str, Variable], name: str) -> Variable:
+    """The FMU's variable ``name``; InputError with names like it if there is none."""
+    if name in variables:
+        return variables[name]
+    by_lower = {known.lower(): known for known in variables}
+    near = difflib.get_close_matches(name.lower(), by_lower, n=3, cutoff=0.6)
+    names = ", ".join(f"'{by_lower[one]}'" for one in near)
+    raise InputError(f"the FMU has no variable '{name}'" + (f"; near: {names}" if near else ""))
 
-    def __init__(self, variables: Sequence[Variable]) -> None:
-        self.variables = {variable.name: variable for variable in variables}
-        self.problems: list[str] = []
 
-    def find(self, name: str, where: str) -> Variable | None:
-        """The FMU's variable ``name``; None after telling that there is none."""
-        variable = self.variables.get(name)
-        if variable is None:
-            by_lower = {known.lower(): known for known in self.variables}
-            near = difflib.get_close_matches(name.lower(), by_lower, n=3, cutoff=0.6)
-            names = ", ".join(f"'{by_lower[one]}'" for one in near)
-            hint = f"; near: {names}" if near else ""
-            self.problems.append(f"{where}: the FMU has no variable '{name}'{hint}")
-        return variable
+def scalar(variables: Mapping[str, Variable], name: str) -> Variable:
+    """The same, a single real number."""
+    variable = find(variables, name)
+    if not variable.scalar:
+        what = "an array" if variable.array else f"of type {variable.fmi_type}"
+        raise InputError(f"'{name}' is {what}; a single real number is needed")
+    return variable
 
-    def real(self, name: str, where: str) -> Variable | None:
-        """The same, a real number."""
-        variable = self.find(name, where)
-        if variable is None:
-            return None
-        if variable.kind != "real" or variable.array:
-            what = "an array" if variable.array else f"of type {variable.fmi_type}"
-            self.problems.append(f"{where}: '{name}' is {what}; a single real number is needed")
-            return None
-        return variable
 
-    def _si_factor(
-        self, entry: Pick | Driven, variable: Variable, wanted: str, where: str
-    ) -> float | None:
-        """Factor from the variable's unit to ``wanted``; None after telling why there is none."""
-        named = unit_of(entry.unit)
-        if entry.unit is not None and named is None:
-            self.problems.append(
-                f"{where}: unit '{entry.unit}' is not known; give `scale` instead of it"
+def a(causality: str) -> str:
+    """The causality in a sentence, with its article."""
+    words = causality.replace("Parameter", " parameter")
+    return f"{'an' if causality in ('input', 'output') else 'a'} {words}"
+
+
+def conversion(
+    entry: Pick | Driven, variable: Variable, wanted: str, *, outwards: bool = False
+) -> tuple[float, float]:
+    """(scale, offset) from the FMU's variable to our unit, or ``outwards`` from ours to it."""
+    declared = variable.unit
+    if entry.scale is None:
+        factor = _factor(entry, variable, wanted)
+        scale = 1.0 / factor if outwards else factor
+    else:
+        scale = entry.scale
+        if scale == -1.0 and declared and declared.factor != 1.0:
+            raise InputError(
+                f"scale = -1 takes '{variable.name}' as a plain number though the FMU declares "
+                f"'{declared.name}'; for the other direction write sign = -1"
             )
-            return None
-        declared = variable.unit
-        if named and declared and contradicts(named, declared):
-            self.problems.append(
-                f"{where}: the map says '{variable.name}' is in '{named.name}', the FMU declares "
-                f"'{declared.name}'; leave the unit out, or give `scale` if the FMU is wrong"
-            )
-            return None
-        if named is None and declared is None and variable.unit_name not in (None, "", "-"):
-            self.problems.append(
-                f"{where}: '{variable.name}' has the unit '{variable.unit_name}', which is not "
-                "known; give `unit`, or `scale` instead of it"
-            )
-            return None
-        return self._factor(named or declared, variable, wanted, where)
+    offset = offset_of(entry.offset, wanted, abs(scale) if outwards else 1.0)
+    return entry.sign * scale, offset
 
-    def _factor(
-        self, unit: Unit | None, variable: Variable, wanted: str, where: str
-    ) -> float | None:
-        if unit is None:
-            return 1.0  # nothing is said: SI
+
+def _factor(entry: Pick | Driven, variable: Variable, wanted: str) -> float:
+    named, declared = unit_of(entry.unit), variable.unit
+    if entry.unit is not None and named is None:
+        raise InputError(f"unit '{entry.unit}' is not known; give `scale` instead of it")
+    if named and declared and contradicts(named, declared):
+        raise InputError(
+            f"the map says '{variable.name}' is in '{named.name}', the FMU declares "
+            f"'{declared.name}'; leave the unit out, or give `scale` if the FMU is wrong"
+        )
+    unit = named or declared
+    if unit is not None:
         try:
             return to_si(unit, wanted)
         except InputError as error:
-            self.problems.append(f"{where}: the unit of '{variable.name}', {error}")
-            return None
-
-    def conversion(
-        self, entry: Pick | Driven, variable: Variable, wanted: str, where: str, *, outwards: bool
-    ) -> tuple[float, float]:
-        """(scale, offset), from the FMU to us, or ``outwards`` from us to the FMU."""
-        if entry.scale is None:
-            factor = self._si_factor(entry, variable, wanted, where) or 1.0
-            scale = 1.0 / factor if outwards else factor
-        else:
-            scale = entry.scale
-            declared = variable.unit
-            if scale == -1.0 and declared and declared.factor != 1.0:
-                self.problems.append(
-                    f"{where}: scale = -1 takes '{variable.name}' as a plain number though the FMU "
-                    f"declares '{declared.name}'; for the other direction write sign = -1"
-                )
-        offset = entry.offset
-        if isinstance(offset, str):
-            offset = self.offset(offset, wanted, where) * (abs(scale) if outwards else 1.0)
-        return entry.sign * scale, offset
-
-    def offset(self, text: str, wanted: str, where: str) -> float:
-        """An offset with a unit, in ours."""
-        try:
-            number, unit = parse_quantity(text)
-            return number * to_si(unit, wanted)
-        except InputError as error:
-            self.problems.append(f"{where}: offset: {error}")
-            return 0.0
-
-    def fix(self, variable: Variable, value: Any, where: str, into: dict[str, Value]) -> None:
-        """A constant, converted to the variable's type."""
-        try:
-            into[variable.name] = _constant(variable, value)
-        except InputError as error:
-            self.problems.append(f"{where}: {error}")
-
-
-def _constant(variable: Variable, value: Value) -> Value:
-    """``value`` in the variable's type; InputError if it is of another or out of range."""
-    kind = variable.kind
-    fault = InputError(
-        f"{value!r} does not suit '{variable.name}', which is of type {variable.fmi_type}"
-        + (f" with {listed(variable.items)}" if variable.items else "")
-    )
-    result = _typed(variable, value)
-    if result is None or variable.array:
-        raise fault
-    if kind not in ("real", "integer", "enumeration") or isinstance(result, str):
-        return result
-    if not variable.lowest <= result <= variable.highest:
+            raise InputError(f"the unit of '{variable.name}', {error}") from None
+    if variable.unit_name not in (None, "", "-"):
         raise InputError(
-            f"{value!r} is outside {variable.lowest:g} to {variable.highest:g}, "
-            f"which '{variable.name}' allows"
+            f"'{variable.name}' has the unit '{variable.unit_name}', which is not known; give "
+            "`unit`, or `scale` instead of it"
         )
-    return result
+    return 1.0  # neither names a unit: SI
+
+
+def offset_of(offset: float | str, wanted: str, factor: float = 1.0) -> float:
+    """An offset as a number; a text is in a unit of its own and converts to ``wanted``."""
+    if not isinstance(offset, str):
+        return offset
+    try:
+        number, unit = parse_quantity(offset)
+        return number * to_si(unit, wanted) * factor
+    except InputError as error:
+        raise InputError(f"offset: {error}") from None
+
+
+def constant(variable: Variable, value: Value) -> Value:
+    """``value`` in the variable's type; InputError if it is of another or out of range."""
+    result = None if variable.array else _typed(variable, value)
+    if result is None:
+        items = f" with {', '.join(variable.items)}" if variable.items else ""
+        raise InputError(
+            f"{value!r} does not suit '{variable.name}', which is of type "
+            f"{variable.fmi_type}{items}"
+        )
+    if isinstance(result, str) or variable.lowest <= result <= variable.highest:
+        return result
+    raise InputError(
+        f"{value!r} is outside {variable.lowest:g} to {variable.highest:g}, which "
+        f"'{variable.name}' allows"
+    )
 
 
 def _typed(variable: Variable, value: Value) -> Value | None:
+    """The value in the variable's type; None if it has no such value."""
     kind = variable.kind
-    if kind == "string":
-        return value if isinstance(value, str) else None
-    if kind == "real" and isinstance(value, str):
-        return _in_its_unit(variable, value)
-    if kind == "enumeration" and isinstance(value, str):
-        return variable.items.get(value)
     if isinstance(value, str):
-        return None
+        if kind == "real":
+            return _in_its_unit(variable, value)
+        return value if kind == "string" else variable.items.get(value)
     if kind == "boolean":
         return bool(value) if value in (0, 1) else None
     if isinstance(value, bool):
         return None
     if kind in ("integer", "enumeration"):
-        return int(value) if math.isfinite(value) and value == int(value) else None
+        whole = math.isfinite(value) and value == int(value)
+        return int(value) if whole and _holds(variable.fmi_type, int(value)) else None
     return float(value) if kind == "real" else None
+
+
+def _holds(fmi_type: str, value: int) -> bool:
+    """Whether the type's width has this number: Integer, UInt8, Enumeration …"""
+    width = {"Integer": "int32", "Enumeration": "int64"}.get(fmi_type, fmi_type.lower())
+    return bool(np.iinfo(width).min <= value <= np.iinfo(width).max)
 
 
 def _in_its_unit(variable: Variable, text: str) -> float:
@@ -161,22 +140,6 @@ def _in_its_unit(variable: Variable, text: str) -> float:
     own = variable.unit
     if own is None:
         raise InputError(f"'{variable.name}' declares no unit: give a plain number, not '{text}'")
-    if own.exponents != unit.exponents:
+    if own.powers != unit.powers:
         raise InputError(f"'{text}' does not convert to '{own.name}'")
     return number * unit.factor / own.factor
-
-
-def a(causality: str) -> str:
-    """The causality in a sentence, with its article."""
-    spoken = {
-        "calculatedParameter": "a calculated parameter",
-        "structuralParameter": "a structural parameter",
-        "input": "an input",
-        "output": "an output",
-    }
-    return spoken.get(causality, f"a {causality}")
-
-
-def listed(names: Iterable[str]) -> str:
-    """The names in a sentence."""
-    return ", ".join(names)

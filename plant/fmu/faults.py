@@ -1,15 +1,11 @@
-"""What goes wrong with an FMU while it is the car."""
+"""The failure of an FMU while it is the car."""
 
-__all__ = ["CallFailed", "FmuFault"]
+__all__ = ["FmuFault"]
 
 
-class FmuFault(RuntimeError):  # noqa: N818 - what befell the car, not an error of ours
+class FmuFault(RuntimeError):  # noqa: N818 - the car failed, not this program
     """The FMU crashed, hung, refused a step, gave an unusable value or ended the simulation.
 
-    The message says which FMU, what happened, when (plant time) and the FMU's last words. It is
-    no bad input: the run ends, the plant lives on.
+    The message names the FMU, what happened, when (plant time) and the FMU's last words. The input
+    was not bad: the run ends, the plant process goes on.
     """
-
-
-class CallFailed(Exception):  # noqa: N818
-    """Within the FMU's process: it did not do what it was asked; the message says what."""

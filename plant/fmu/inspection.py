@@ -1,30 +1,22 @@
-"""What an FMU says of itself: interface types, platforms and variables, without running it."""
+"""The content of an FMU's model description, read without running the FMU."""
 
 import math
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 from plant.fmu.package import read_description
-from plant.fmu.units import Unit, UnitDefinition, unit_of
+from plant.fmu.units import Unit, unit_of
 
-__all__ = ["FmuDescription", "Kind", "Variable", "describe", "inspect"]
+__all__ = ["FmuDescription", "Variable", "describe", "inspect"]
 
-Kind = Literal["real", "integer", "boolean", "enumeration", "string", "binary", "clock"]
-
-_KINDS: Final[dict[str, Kind]] = {
-    "Real": "real",
-    "Float32": "real",
-    "Float64": "real",
-    "Boolean": "boolean",
-    "Enumeration": "enumeration",
-    "String": "string",
-    "Binary": "binary",
-    "Clock": "clock",
-}
-"""The others are integers of some width."""
+_KINDS: Final = {
+    "Real": "real", "Float32": "real", "Float64": "real", "Boolean": "boolean",
+    "Enumeration": "enumeration", "String": "string", "Binary": "binary", "Clock": "clock",
+}  # fmt: skip
+"""Of variables by FMI's types; the other types are integers of some width."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,14 +24,14 @@ class Variable:
     """One of an FMU's variables."""
 
     name: str
-    kind: Kind
+    kind: str
     fmi_type: str
     causality: str
     variability: str
     initial: str | None
     unit_name: str | None = None
     unit: Unit | None = None
-    """None: not declared, or not understood."""
+    """None: not declared, or not known."""
     lowest: float = -math.inf
     highest: float = math.inf
     start: str | None = None
@@ -55,10 +47,20 @@ class Variable:
             self.initial in ("exact", "approx") or self.causality == "input"
         )
 
+    @property
+    def readable(self) -> bool:
+        """Whether it can be read while the FMU runs."""
+        return self.causality in ("output", "local")
+
+    @property
+    def scalar(self) -> bool:
+        """Whether it is a single real number."""
+        return self.kind == "real" and not self.array
+
 
 @dataclass(frozen=True, slots=True)
 class FmuDescription:
-    """An FMU's model description, as far as driving it as the car needs it."""
+    """An FMU's model description, as far as the plant needs it."""
 
     model_name: str
     fmi_version: str
@@ -69,17 +71,23 @@ class FmuDescription:
     platforms: tuple[str, ...] = ()
     """Folders of binaries, as the FMI version calls them: linux64, x86_64-linux, …"""
     variable_step: bool = False
-    default_step_s: float | None = None
+    internal_step_s: float | None = None
+    experiment_step_s: float | None = None
     needs_tool: bool = False
 
     @property
+    def default_step_s(self) -> float | None:
+        """The FMU's own step, if it states one."""
+        return self.internal_step_s or self.experiment_step_s
+
+    @property
     def co_simulation(self) -> bool:
-        """Whether it brings its own solver, which is what the plant can run."""
+        """Whether it brings its own solver; the plant has none for it."""
         return "Co-Simulation" in self.interfaces
 
 
 def inspect(path: Path) -> FmuDescription:
-    """What the FMU ``path`` says of itself; InputError if it is not an FMU 2 or 3."""
+    """The description of the FMU ``path``; InputError if it is not an FMU 2 or 3."""
     raw = read_description(path)
     with zipfile.ZipFile(path) as archive:
         parts = [PurePosixPath(name.replace("\\", "/")).parts for name in archive.namelist()]
@@ -87,65 +95,48 @@ def inspect(path: Path) -> FmuDescription:
     return describe(raw, tuple(sorted(platforms)))
 
 
-def describe(raw: Any, platforms: Sequence[str] = ()) -> FmuDescription:
+def describe(raw: Any, platforms: tuple[str, ...] = ()) -> FmuDescription:
     """fmpy's ModelDescription ``raw`` as data of our own."""
+    simulation, experiment = raw.coSimulation, raw.defaultExperiment
     kinds = {
-        "Co-Simulation": raw.coSimulation,
+        "Co-Simulation": simulation,
         "Model Exchange": raw.modelExchange,
         "Scheduled Execution": raw.scheduledExecution,
     }
-    definitions = {unit.name: _definition(unit.baseUnit) for unit in raw.unitDefinitions}
-    simulation = raw.coSimulation
+    units = {unit.name: unit_of(unit.name, unit.baseUnit) for unit in raw.unitDefinitions}
+    variables = (one for one in raw.modelVariables if one.causality != "independent")
     return FmuDescription(
         model_name=raw.modelName or "?",
         fmi_version=raw.fmiVersion,
         interfaces=tuple(name for name, interface in kinds.items() if interface is not None),
-        variables=tuple(
-            _variable(variable, definitions)
-            for variable in raw.modelVariables
-            if variable.causality != "independent"
-        ),
+        variables=tuple(_variable(one, units) for one in variables),
         description=raw.description or "",
         tool=raw.generationTool or "",
-        platforms=tuple(platforms),
+        platforms=platforms,
         variable_step=bool(simulation and simulation.canHandleVariableCommunicationStepSize),
-        default_step_s=_step(raw),
+        internal_step_s=_number(simulation and simulation.fixedInternalStepSize),
+        experiment_step_s=_number(experiment and experiment.stepSize),
         needs_tool=bool(simulation and simulation.needsExecutionTool),
     )
 
 
-def _step(raw: Any) -> float | None:
-    fixed = raw.coSimulation.fixedInternalStepSize if raw.coSimulation else None
-    experiment = raw.defaultExperiment.stepSize if raw.defaultExperiment else None
-    return _number(fixed) or _number(experiment)
-
-
-def _number(text: Any) -> float | None:
+def _number(text: Any, otherwise: Any = None) -> Any:
     try:
         value = float(text)
     except (TypeError, ValueError):
-        return None
-    return value if math.isfinite(value) else None
+        return otherwise
+    return value if math.isfinite(value) else otherwise
 
 
-def _definition(base: Any) -> UnitDefinition | None:
-    if base is None:
-        return None
-    exponents = (base.kg, base.m, base.s, base.A, base.K, base.mol, base.cd, base.rad)
-    return UnitDefinition(exponents, base.factor, base.offset)
-
-
-def _variable(raw: Any, definitions: Mapping[str, UnitDefinition | None]) -> Variable:
+def _variable(raw: Any, units: Mapping[str, Unit | None]) -> Variable:
     declared = raw.declaredType
 
-    def attribute(name: str) -> str | None:
+    def attribute(name: str) -> Any:
+        """Of the variable, or else of its declared type."""
         own = getattr(raw, name, None)
-        value = own if own is not None or declared is None else getattr(declared, name, None)
-        return None if value is None else str(value)
+        return getattr(declared, name, None) if own is None else own
 
     unit_name = attribute("unit")
-    lowest, highest = _number(attribute("min")), _number(attribute("max"))
-    items = {} if declared is None else {str(i.name): _item(i.value) for i in declared.items}
     return Variable(
         name=raw.name,
         kind=_KINDS.get(raw.type, "integer"),
@@ -154,16 +145,11 @@ def _variable(raw: Any, definitions: Mapping[str, UnitDefinition | None]) -> Var
         variability=raw.variability,
         initial=raw.initial,
         unit_name=unit_name,
-        unit=unit_of(unit_name, definitions.get(unit_name or "")),
-        lowest=-math.inf if lowest is None else lowest,
-        highest=math.inf if highest is None else highest,
+        unit=units[unit_name] if unit_name in units else unit_of(unit_name),
+        lowest=_number(attribute("min"), -math.inf),
+        highest=_number(attribute("max"), math.inf),
         start=raw.start,
         description=raw.description or "",
         array=bool(raw.dimensions),
-        items=items,
+        items={str(i.name): int(_number(i.value, 0)) for i in declared.items} if declared else {},
     )
-
-
-def _item(value: Any) -> int:
-    number = _number(value)
-    return 0 if number is None else int(number)

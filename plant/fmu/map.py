@@ -1,340 +1,212 @@
 """A map checked against an FMU: what fits becomes a :class:`~plant.fmu.wiring.Wiring`.
 
-All that is missing or wrong is told at once, with what to write into the map instead.
+One error names all that is missing or wrong, each with what to write into the map instead.
 """
 
-from collections.abc import Mapping
-from typing import Any, Final
+from collections.abc import Callable, Iterator, Mapping
+from typing import Final
 
 from bayesrace.errors import InputError
-from plant.fmu.checks import Checks, Value, a, listed
-from plant.fmu.inspection import FmuDescription, Variable, describe
-from plant.fmu.map_file import Driven, FmuMap, HeadingRule, Pick, VelocityRule, parse_map, read_map
-from plant.fmu.wiring import (
-    COMMANDS,
-    STARTS,
-    STATES,
-    BodyVelocity,
-    CosSin,
-    Heading,
-    InputLink,
-    OutputLinks,
-    Quaternion,
-    Signal,
-    SpeedSlip,
-    StartLink,
-    Velocity,
-    Wiring,
-    WorldVelocity,
-)
+from plant.fmu.checks import a, constant, conversion, find, offset_of, scalar
+from plant.fmu.inspection import FmuDescription
+from plant.fmu.map_file import Driven, FmuMap, Pick, Value
+from plant.fmu.wiring import COMMANDS, READINGS, STARTS, STATES, Link, Wiring
 
-__all__ = ["FmuMap", "parse_map", "read_map", "wire"]
+__all__ = ["wire"]
 
-_NOWHERE: Final = Signal(0)
-"""Stands for a signal that is missing, which has been told: no wiring is made of it."""
-
+_VELOCITY: Final = " or [derive] velocity = { world_x, world_y } or { speed, slip }"
 _HINTS: Final = {
-    "psi": "or, from a quaternion or cosine and sine, [derive] psi = …",
-    "vx": "or [derive] velocity = { world_x, world_y } or { speed, slip }",
-    "vy": "or [derive] velocity = { world_x, world_y } or { speed, slip }",
-    "omega": 'or [derive] omega = "psi", from the change of heading',
-    "delta": 'or [derive] delta = "delta_rate", integrated from the steering rate that acts',
+    "psi": " or, from a quaternion or cosine and sine, [derive] psi = …",
+    "vx": _VELOCITY,
+    "vy": _VELOCITY,
+    "omega": ' or [derive] omega = "psi", from the change of heading',
+    "delta": ' or [derive] delta = "delta_rate", integrated from the steering rate that acts',
 }
 
+_NEEDED: Final = (
+    (("d",), {"d", "throttle"}, "the duty cycle d [1] or its part `throttle`"),
+    (
+        ("delta_rate", "delta"),
+        {"delta_rate", "delta"},
+        "the steering rate `delta_rate` [rad/s] or angle `delta` [rad]",
+    ),
+)
+"""Our own names for an input, the quantities of which one must drive an input, and words."""
 
-def wire(description: Any, map_: FmuMap | None = None) -> Wiring:
-    """The wiring of an FMU (fmpy's ModelDescription, or ours of it) by a map.
 
-    What the map leaves out is looked for under our own names. Raises InputError with all that is
-    missing or wrong, and what to put into the map.
+def wire(fmu: FmuDescription, map_: FmuMap | None = None) -> Wiring:
+    """The wiring of an FMU by a map; for what the map leaves out, our own names are taken.
+
+    Raises InputError with all that is missing or wrong, and what to put into the map.
     """
-    fmu = description if isinstance(description, FmuDescription) else describe(description)
+    name = fmu.model_name
     if not fmu.co_simulation:
         has = " and ".join(fmu.interfaces) or "no interface"
         raise InputError(
-            f"the FMU '{fmu.model_name}' has {has} only; export it for Co-Simulation to drive it"
+            f"the FMU '{name}' has {has} only; export it for Co-Simulation to drive it"
         )
-    return _Matching(fmu, map_ or FmuMap()).wiring(given=map_ is not None)
+    matching = _Matching(fmu, map_ or FmuMap())
+    matching.match()
+    if not matching.problems:
+        return matching.wiring()
+    title = f"the map does not fit the FMU '{name}'" if map_ else (
+        f"the FMU '{name}' does not have our names and units, and no map says what its own are"
+    )  # fmt: skip
+    problems = "\n  - ".join(("", *matching.problems))
+    raise InputError(
+        f"{title}:{problems}\n`bayesrace fmu inspect` lists its variables and writes a map"
+    )
 
 
 class _Matching:
-    """One pass over a map; collects problems rather than stopping at the first."""
+    """One pass over a map: each entry becomes a link or a constant, or else a problem."""
 
     def __init__(self, fmu: FmuDescription, map_: FmuMap) -> None:
-        self._fmu = fmu
         self._map = map_
-        self._checks = Checks(fmu.variables)
-        self._outputs: list[str] = []
+        self._variables = {variable.name: variable for variable in fmu.variables}
+        self._inputs: list[Link] = []
+        self._outputs: list[Link] = []
+        self._starts: list[Link] = []
+        self._fixed: dict[str, Value] = {}
+        self._heading_offset = 0.0
+        self.problems: list[str] = []
 
-    def wiring(self, *, given: bool) -> Wiring:
-        picks = self._picks()
-        links = self._links(picks)
-        inputs, fixed = self._inputs()
-        fixed |= self._parameters()
-        starts, constants = self._starts(picks)
-        if self._checks.problems:
-            raise InputError(self._report(given=given))
-        section = self._map.fmu
+    def match(self) -> None:
+        """Take the sections of the map in turn."""
+        map_ = self._map
+        self._states()
+        for quantity, where, pick in map_.derive.read():
+            self._try(where, self._output, quantity, pick)
+        for name, entry in map_.inputs.items():
+            self._try(f"[inputs] {name}", self._input, name, entry)
+        self._other_inputs()
+        for name, value in map_.parameters.items():
+            self._try(f"[parameters] {name}", self._parameter, name, value)
+        for name, entry in map_.start.items():
+            self._try(f"[start] {name}", self._start, name, entry)
+        self._try("[derive] psi", self._heading)
+
+    def wiring(self) -> Wiring:
+        """What the entries have become, if there are no problems."""
+        heading = self._map.derive.psi
         return Wiring(
-            inputs=inputs,
-            outputs=self._outputs,
-            links=links,
-            starts=starts,
-            fixed=fixed | constants,
-            step_s=section.step_s,
-            timeout_s=section.timeout_s,
-            startup_s=section.startup_s,
-            placed=section.placed,
+            self._inputs,
+            self._outputs,
+            [*self._starts, *self._started_outputs()],
+            self._fixed,
+            heading=(heading.sign if heading else 1.0, self._heading_offset),
+            placed=self._map.fmu.placed,
         )
 
-    def _report(self, *, given: bool) -> str:
-        name = self._fmu.model_name
-        said = f"the map does not fit the FMU '{name}'" if given else (
-            f"the FMU '{name}' does not have our names and units, and no map says what its own are"
-        )  # fmt: skip
-        problems = "".join(f"\n  - {problem}" for problem in self._checks.problems)
-        return f"{said}:{problems}\n`bayesrace fmu inspect` lists its variables and writes a map"
+    def _try(self, where: str, check: Callable[..., None], *arguments: object) -> None:
+        try:
+            check(*arguments)
+        except InputError as error:
+            self.problems.append(f"{where}: {error}")
 
-    # -- outputs ------------------------------------------------------------------------------
-
-    def _picks(self) -> dict[str, Pick]:
-        """What [outputs] names, and our own names where neither it nor [derive] says anything."""
-        derive = self._map.derive
-        derived = {
-            "psi": derive.psi,
-            "vx": derive.velocity,
-            "vy": derive.velocity,
-            "omega": derive.omega,
-            "delta": derive.delta,
-        }
-        picks: dict[str, Pick] = {}
+    def _states(self) -> None:
+        """[outputs], and our own names where neither it nor [derive] says anything."""
+        derived, picks = self._map.derive.derived(), dict[str, Pick](self._map.outputs.items())
         for quantity, unit in STATES.items():
-            pick = self._map.outputs.get(quantity)  # type: ignore[call-overload]
-            if pick is not None and derived.get(quantity) is not None:
-                self._checks.problems.append(
-                    f"{quantity} is in [outputs] and in [derive]: give one"
-                )
-            elif pick is not None:
-                picks[quantity] = pick
-            elif derived.get(quantity) is None:
-                own = self._checks.variables.get(quantity)
-                if own is not None and own.causality in ("output", "local"):
-                    picks[quantity] = Pick(variable=quantity)
-                else:
-                    hint = f" {_HINTS[quantity]}" if quantity in _HINTS else ""
-                    self._checks.problems.append(
-                        f"nothing gives our {quantity} [{unit}]: add to [outputs] {quantity} = "
-                        f'{{ variable = "…", unit = "{unit}" }}{hint}'
-                    )
-        return picks
-
-    def _links(self, picks: Mapping[str, Pick]) -> OutputLinks:
-        signals = {name: self._signal(pick, name) for name, pick in picks.items()}
-        derive = self._map.derive
-        psi: Heading = signals.get("psi", _NOWHERE)
-        if derive.psi is not None:
-            psi = self._heading(derive.psi)
-        velocity: Velocity = BodyVelocity(signals.get("vx", _NOWHERE), signals.get("vy", _NOWHERE))
-        if derive.velocity is not None:
-            velocity = self._velocity(derive.velocity)
-        return OutputLinks(
-            x=signals.get("x", _NOWHERE),
-            y=signals.get("y", _NOWHERE),
-            psi=psi,
-            velocity=velocity,
-            omega=signals.get("omega"),
-            delta=signals.get("delta"),
-        )
-
-    def _signal(self, pick: Pick, quantity: str, section: str = "outputs") -> Signal:
-        wanted = STATES[quantity]
-        return self._read(pick, wanted, f"[{section}] {quantity}")
-
-    def _read(self, pick: Pick, wanted: str, where: str) -> Signal:
-        variable = self._checks.real(pick.variable, where)
-        if variable is None:
-            return _NOWHERE
-        if variable.causality not in ("output", "local"):
-            self._checks.problems.append(
-                f"{where}: '{variable.name}' is {a(variable.causality)}; an output is needed"
-                + (f", {_HINTS['delta']}" if where.endswith("] delta") else "")
-            )
-            return _NOWHERE
-        scale, offset = self._checks.conversion(pick, variable, wanted, where, outwards=False)
-        if pick.variable not in self._outputs:
-            self._outputs.append(pick.variable)
-        return Signal(self._outputs.index(pick.variable), scale, offset)
-
-    def _heading(self, rule: HeadingRule) -> Heading:
-        where = "[derive] psi"
-        offset = rule.offset
-        if isinstance(offset, str):
-            offset = self._checks.offset(offset, "rad", where)
-        if rule.quaternion is not None:
-            parts = {
-                name: self._read(getattr(rule.quaternion, name), "1", f"{where}.quaternion.{name}")
-                for name in ("w", "x", "y", "z")
-            }
-            return Quaternion(**parts, sign=rule.sign, offset=offset)
-        assert rule.cos is not None  # noqa: S101  the model checks it
-        assert rule.sin is not None  # noqa: S101
-        cos, sin = self._read(rule.cos, "1", where), self._read(rule.sin, "1", where)
-        return CosSin(cos, sin, sign=rule.sign, offset=offset)
-
-    def _velocity(self, rule: VelocityRule) -> Velocity:
-        where = "[derive] velocity"
-        if rule.world_x is not None and rule.world_y is not None:
-            return WorldVelocity(
-                self._read(rule.world_x, "m/s", f"{where}.world_x"),
-                self._read(rule.world_y, "m/s", f"{where}.world_y"),
-            )
-        assert rule.speed is not None  # noqa: S101  the model checks it
-        speed = self._read(rule.speed, "m/s", f"{where}.speed")
-        slip = None if rule.slip is None else self._read(rule.slip, "rad", f"{where}.slip")
-        return SpeedSlip(speed, slip)
-
-    # -- inputs, parameters, start values -----------------------------------------------------
-
-    def _inputs(self) -> tuple[list[InputLink], dict[str, Value]]:
-        links: list[InputLink] = []
-        fixed: dict[str, Value] = {}
-        for name, entry in self._map.inputs.items():
-            where = f"[inputs] {name}"
-            driven = Driven.of(entry, COMMANDS)
-            if driven is None:
-                variable = self._checks.find(name, where)
-                if variable is not None and self._is_input(variable, where):
-                    self._checks.fix(variable, entry, where, fixed)
-            elif (link := self._input(name, driven, where)) is not None:
-                links.append(link)
-        entries = (Driven.of(entry, COMMANDS) for entry in self._map.inputs.values())
-        links += self._own_inputs({one.source for one in entries if one is not None})
-        self._check_rest({*self._map.inputs, *(link.variable for link in links)})
-        return links, fixed
-
-    def _is_input(self, variable: Variable, where: str) -> bool:
-        if variable.causality == "input":
-            return True
-        remedy = " it goes into [parameters]" if variable.causality == "parameter" else ""
-        self._checks.problems.append(
-            f"{where}: '{variable.name}' is {a(variable.causality)}, not an input;{remedy}"
-        )
-        return False
-
-    def _input(self, name: str, entry: Driven, where: str) -> InputLink | None:
-        wanted = COMMANDS.get(entry.source)
-        if wanted is None:
-            self._checks.problems.append(
-                f"{where}: from = '{entry.source}' is none of {listed(COMMANDS)}"
-            )
-            return None
-        variable = self._checks.real(name, where)
-        if variable is None or not self._is_input(variable, where):
-            return None
-        scale, offset = self._checks.conversion(entry, variable, wanted, where, outwards=True)
-        return InputLink(name, entry.source, scale, offset, variable.lowest, variable.highest)
-
-    def _own_inputs(self, sources: set[str]) -> list[InputLink]:
-        """Drive and steering under our own names where the map says nothing of them."""
-        links = []
-        for needed, own, what in (
-            ({"d", "throttle"}, ("d",), "the duty cycle d [1] or its part `throttle`"),
-            (
-                {"delta_rate", "delta"},
-                ("delta_rate", "delta"),
-                "the steering rate `delta_rate` [rad/s] or angle `delta` [rad]",
-            ),
-        ):
-            if sources & needed:
-                continue
-            free = (name for name in own if name not in self._map.inputs)
-            found = (self._checks.variables.get(name) for name in free)
-            name = next((v.name for v in found if v is not None and v.causality == "input"), None)
-            if name is None:
-                self._checks.problems.append(
-                    f"no input of the FMU takes {what}: add to [inputs] "
-                    f'variable = {{ from = "{own[0]}", unit = "…" }}'
-                )
-            elif link := self._input(name, Driven(source=name), f"[inputs] {name}"):
-                links.append(link)
-        return links
-
-    def _check_rest(self, covered: set[str]) -> None:
-        for variable in self._fmu.variables:
-            if variable.causality != "input" or variable.name in covered:
-                continue
-            if variable.start is None and variable.kind not in ("clock", "binary"):
-                self._checks.problems.append(
-                    f"the FMU's input '{variable.name}' has neither a start value nor a place in "
-                    f'the map: add a constant to [inputs], as "{variable.name}" = 0.0'
-                )
-
-    def _parameters(self) -> dict[str, Value]:
-        fixed: dict[str, Value] = {}
-        for name, value in self._map.parameters.items():
-            where = f"[parameters] {name}"
-            variable = self._checks.find(name, where)
-            if variable is None:
-                continue
-            if variable.causality == "parameter" and variable.variability != "constant":
-                self._checks.fix(variable, value, where, fixed)
-                continue
-            what = variable.causality if variable.variability != "constant" else "constant"
-            into = ""
-            if variable.settable:
-                into = f"; it goes into [{'inputs' if what == 'input' else 'start'}]"
-            self._checks.problems.append(f"{where}: '{name}' is {a(what)}, not a parameter{into}")
-        return fixed
-
-    def _starts(self, picks: Mapping[str, Pick]) -> tuple[list[StartLink], dict[str, Value]]:
-        links: list[StartLink] = []
-        fixed: dict[str, Value] = {}
-        for name, entry in self._map.start.items():
-            where = f"[start] {name}"
-            driven = Driven.of(entry, STARTS)
-            variable = (
-                self._checks.find(name, where) if driven is None else self._checks.real(name, where)
-            )
-            if variable is None:
-                continue
-            if not variable.settable or variable.causality == "input":
-                hint = "a constant goes into [inputs]" if variable.causality == "input" else (
-                    "it cannot be set before initialisation"
-                )  # fmt: skip
-                self._checks.problems.append(
-                    f"{where}: '{name}' is {a(variable.causality)}: {hint}"
-                )
-            elif driven is None:
-                self._checks.fix(variable, entry, where, fixed)
-            elif (wanted := STARTS.get(driven.source)) is None:
-                self._checks.problems.append(
-                    f"{where}: from = '{driven.source}' is none of {listed(STARTS)}"
-                )
+            own = self._variables.get(quantity)
+            if quantity in derived:
+                if quantity in picks:
+                    self.problems.append(f"{quantity} is in [outputs] and in [derive]: give one")
+            elif quantity in picks or (own and own.readable):
+                pick = picks.get(quantity) or Pick(variable=quantity)
+                self._try(f"[outputs] {quantity}", self._output, quantity, pick)
             else:
-                scale, offset = self._checks.conversion(
-                    driven, variable, wanted, where, outwards=True
+                self.problems.append(
+                    f"nothing gives our {quantity} [{unit}]: add to [outputs] {quantity} = "
+                    f'{{ variable = "…", unit = "{unit}" }}{_HINTS.get(quantity, "")}'
                 )
-                links.append(_start(variable, driven.source, scale, offset))
-        return links + self._own_starts(picks, {link.source for link in links}), fixed
 
-    def _own_starts(self, picks: Mapping[str, Pick], sources: set[str]) -> list[StartLink]:
-        """Outputs whose start can be set are started, where the map says nothing else."""
-        links = []
-        for quantity, pick in picks.items():
-            variable = self._checks.variables.get(pick.variable)
-            if variable is None or variable.initial != "exact" or not variable.settable:
-                continue
-            if quantity in sources or pick.variable in self._map.start:
-                continue
-            before = len(self._checks.problems)  # what is wrong with the pick has been told
-            where = f"[outputs] {quantity}"
-            scale, offset = self._checks.conversion(
-                pick, variable, STATES[quantity], where, outwards=False
+    def _output(self, quantity: str, pick: Pick) -> None:
+        variable = scalar(self._variables, pick.variable)
+        if not variable.readable:
+            hint = f",{_HINTS['delta']}" if quantity == "delta" else ""
+            raise InputError(
+                f"'{variable.name}' is {a(variable.causality)}; an output is needed{hint}"
             )
-            del self._checks.problems[before:]
-            links.append(_start(variable, quantity, 1.0 / scale, -offset / scale))
-        return links
+        scale, offset = conversion(pick, variable, READINGS[quantity])
+        self._outputs.append(Link(variable.name, quantity, scale, offset))
 
+    def _heading(self) -> None:
+        if self._map.derive.psi:
+            self._heading_offset = offset_of(self._map.derive.psi.offset, "rad")
 
-def _start(variable: Variable, source: str, scale: float, offset: float) -> StartLink:
-    return StartLink(variable.name, source, scale, offset, variable.lowest, variable.highest)
+    def _link(self, name: str, driven: Driven, quantities: Mapping[str, str]) -> Link:
+        if driven.source not in quantities:
+            raise InputError(f"from = '{driven.source}' is none of {', '.join(quantities)}")
+        variable = scalar(self._variables, name)
+        scale, offset = conversion(driven, variable, quantities[driven.source], outwards=True)
+        return Link(name, driven.source, scale, offset, variable.lowest, variable.highest)
+
+    def _input(self, name: str, entry: Driven | Value) -> None:
+        variable = find(self._variables, name)
+        if variable.causality != "input":
+            remedy = " it goes into [parameters]" if variable.causality == "parameter" else ""
+            raise InputError(f"'{name}' is {a(variable.causality)}, not an input;{remedy}")
+        if isinstance(entry, Driven):
+            self._inputs.append(self._link(name, entry, COMMANDS))
+        else:
+            self._fixed[name] = constant(variable, entry)
+
+    def _other_inputs(self) -> None:
+        """Drive and steering by our own names; what nothing sets needs a start value of its own."""
+        named = self._map.inputs
+        free = {
+            name: one
+            for name, one in self._variables.items()
+            if one.causality == "input" and name not in named
+        }
+        sources = {entry.source for entry in named.values() if isinstance(entry, Driven)}
+        for names, quantities, words in _NEEDED:
+            own = next((name for name in names if name in free), None)
+            if sources & quantities:
+                continue
+            if own is not None:
+                self._try(f"[inputs] {own}", self._input, own, Driven(source=own))
+                del free[own]
+            else:
+                self.problems.append(
+                    f"no input of the FMU takes {words}: add to [inputs] "
+                    f'variable = {{ from = "{names[0]}", unit = "…" }}'
+                )
+        self.problems += (
+            f"the FMU's input '{name}' has neither a start value nor a place in the map: add a "
+            f'constant to [inputs], as "{name}" = 0.0'
+            for name, one in free.items()
+            if one.start is None and one.kind not in ("clock", "binary")
+        )
+
+    def _parameter(self, name: str, value: Value) -> None:
+        variable = find(self._variables, name)
+        what = variable.causality if variable.variability != "constant" else "constant"
+        if what != "parameter":
+            section = "inputs" if what == "input" else "start"
+            into = f"; it goes into [{section}]" if variable.settable else ""
+            raise InputError(f"'{name}' is {a(what)}, not a parameter{into}")
+        self._fixed[name] = constant(variable, value)
+
+    def _start(self, name: str, entry: Driven | Value) -> None:
+        variable = find(self._variables, name)
+        if variable.causality == "input":
+            raise InputError(f"'{name}' is an input: a constant goes into [inputs]")
+        if not variable.settable:
+            is_ = a(variable.causality)
+            raise InputError(f"'{name}' is {is_}: it cannot be set before initialisation")
+        if isinstance(entry, Driven):
+            self._starts.append(self._link(name, entry, STARTS))
+        else:
+            self._fixed[name] = constant(variable, entry)
+
+    def _started_outputs(self) -> Iterator[Link]:
+        """Outputs whose start can be set are started, where the map says nothing else."""
+        sources = {link.quantity for link in self._starts}
+        for link in self._outputs:
+            one = self._variables[link.variable]
+            free = link.quantity in STATES and link.quantity not in sources
+            if free and one.initial == "exact" and one.settable and one.name not in self._map.start:
+                scale, offset = 1.0 / link.scale, -link.offset / link.scale
+                yield Link(one.name, link.quantity, scale, offset, one.lowest, one.highest)

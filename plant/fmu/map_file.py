@@ -1,42 +1,23 @@
 """The map file: TOML that says which of an FMU's variables mean what.
 
-Our value is ``sign * scale * theirs + offset`` for outputs, theirs is ``sign * scale * ours +
-offset`` for inputs and start values; the scale comes from the unit unless it is given.
+``ours = sign * scale * theirs + offset`` for outputs, ``theirs = sign * scale * ours + offset``
+for inputs and start values; the scale follows from the unit unless it is given.
 """
 
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Discriminator,
-    Field,
-    PlainValidator,
-    Tag,
-    ValidationError,
-    model_validator,
-)
+import pydantic
+from pydantic import Discriminator, Field, Tag, model_validator
 
 from bayesrace.errors import InputError
 from bayesrace.files import read_text
+from plant.fmu.wiring import COMMANDS, STARTS
 
-__all__ = [
-    "Derive",
-    "Driven",
-    "FmuMap",
-    "FmuSection",
-    "HeadingRule",
-    "Pick",
-    "QuaternionRule",
-    "VelocityRule",
-    "parse_map",
-    "read_map",
-]
+__all__ = ["Driven", "FmuMap", "Pick", "Value", "parse_map", "read_map"]
 
 
 def _plain(value: Any) -> Any:
@@ -45,27 +26,48 @@ def _plain(value: Any) -> Any:
     raise ValueError("give a finite number, true, false or a text")
 
 
-Value = Annotated[bool | int | float | str, PlainValidator(_plain)]
+def _of_one(sign: float) -> float:
+    if sign in (1.0, -1.0):
+        return sign
+    raise ValueError("sign is 1 or -1; a factor is `scale`")
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(
+Value = Annotated[bool | int | float | str, pydantic.PlainValidator(_plain)]
+Sign = Annotated[float, pydantic.AfterValidator(_of_one)]
+
+
+class _Section(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(
         frozen=True, extra="forbid", allow_inf_nan=False, populate_by_name=True
     )
 
+    def picks(self) -> Iterator[tuple[str, "Pick"]]:
+        """Field and value of each variable that is given."""
+        return ((name, value) for name, value in self if isinstance(value, Pick))
+
 
 class _Affine(_Section):
+    named: ClassVar[str]
+    """The key of the text that will do alone."""
+
     unit: str | None = Field(None, description="the FMU variable's unit; default: as it declares")
-    sign: float = Field(1.0, description="-1: positive the other way round")
+    sign: Sign = Field(1.0, description="-1: positive the other way round")
     scale: float | None = Field(None, description="factor in place of the unit's")
     offset: float | str = Field(
         0.0, description="added after scaling, in the unit of the result, or with one: '90 deg'"
     )
 
+    @model_validator(mode="before")
+    @classmethod
+    def _short(cls, entry: Any) -> Any:
+        if isinstance(entry, dict | cls):
+            return entry
+        if isinstance(entry, str):
+            return {cls.named: entry}
+        raise ValueError('give the name of a variable of the FMU, or { variable = "name", … }')
+
     @model_validator(mode="after")
     def _one_conversion(self) -> Self:
-        if self.sign not in (1.0, -1.0):
-            raise ValueError("sign is 1 or -1; a factor is `scale`")
         if self.scale == 0.0:
             raise ValueError("scale is 0, which loses the value")
         if self.scale is not None and self.unit is not None:
@@ -78,38 +80,28 @@ class _Affine(_Section):
 class Pick(_Affine):
     """One of the FMU's variables, as a quantity of ours."""
 
+    named = "variable"
     variable: str
 
 
 class Driven(_Affine):
-    """What of ours sets one of the FMU's variables."""
+    """The quantity of ours that sets one of the FMU's variables."""
 
+    named = "from"
     source: str = Field(alias="from")
 
-    @classmethod
-    def of(cls, entry: object, sources: Mapping[str, str]) -> Self | None:
-        """The entry as what drives it, in short too (``gas = "throttle"``); None: a constant."""
-        if isinstance(entry, cls):
-            return entry
-        return cls(source=entry) if isinstance(entry, str) and entry in sources else None
+
+def _setting(quantities: Collection[str]) -> Discriminator:
+    """A quantity, by a table or by its name alone, or else a constant."""
+
+    def form(entry: Any) -> str:
+        named = isinstance(entry, dict | Driven) or (isinstance(entry, str) and entry in quantities)
+        return "driven" if named else "constant"
+
+    return Discriminator(form)
 
 
-def _picked(entry: Any) -> Any:
-    if isinstance(entry, str):
-        return {"variable": entry}
-    if not isinstance(entry, dict | Pick):
-        raise ValueError('give the name of a variable of the FMU, or { variable = "name", … }')
-    return entry
-
-
-def _form(entry: Any) -> str:
-    return "table" if isinstance(entry, dict | Driven) else "value"
-
-
-Setting = Annotated[
-    Annotated[Driven, Tag("table")] | Annotated[Value, Tag("value")], Discriminator(_form)
-]
-Picked = Annotated[Pick, BeforeValidator(_picked)]
+Setting = Annotated[Driven, Tag("driven")] | Annotated[Value, Tag("constant")]
 
 
 class FmuSection(_Section):
@@ -125,73 +117,78 @@ class FmuSection(_Section):
     )
 
 
-class QuaternionRule(_Section):
-    """The four parts of the rotation body → world."""
-
-    w: Picked
-    x: Picked
-    y: Picked
-    z: Picked
+class _Quaternion(_Section):
+    w: Pick
+    x: Pick
+    y: Pick
+    z: Pick
 
 
-class HeadingRule(_Section):
-    """[derive] psi: from a quaternion, or from cosine and sine."""
-
-    quaternion: QuaternionRule | None = None
-    cos: Picked | None = None
-    sin: Picked | None = None
-    sign: float = 1.0
+class _Heading(_Section):
+    quaternion: _Quaternion | None = Field(None, description="rotation body → world")
+    cos: Pick | None = None
+    sin: Pick | None = None
+    sign: Sign = 1.0
     offset: float | str = 0.0
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
-        pair = self.cos is not None and self.sin is not None
-        if (self.cos is None) != (self.sin is None) or pair == (self.quaternion is not None):
-            raise ValueError("give either quaternion = { w, x, y, z }, or cos and sin")
-        if self.sign not in (1.0, -1.0):
-            raise ValueError("sign is 1 or -1")
-        return self
+        if {name for name, _ in self.picks()} == (set() if self.quaternion else {"cos", "sin"}):
+            return self
+        raise ValueError("give either quaternion = { w, x, y, z }, or cos and sin")
 
 
-class VelocityRule(_Section):
-    """[derive] velocity: from world velocities, or from speed (and slip angle)."""
-
-    world_x: Picked | None = None
-    world_y: Picked | None = None
-    speed: Picked | None = None
-    slip: Picked | None = None
+class _Velocity(_Section):
+    world_x: Pick | None = None
+    world_y: Pick | None = None
+    speed: Pick | None = None
+    slip: Pick | None = None
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
-        world = self.world_x is not None and self.world_y is not None
-        halves = (self.world_x is None) != (self.world_y is None)
-        slip_alone = self.slip is not None and self.speed is None
-        if halves or slip_alone or world == (self.speed is not None):
-            raise ValueError(
-                "give either world_x and world_y, or speed (and slip; without it the car is taken "
-                "to move where it points)"
-            )
-        return self
+        given = {name for name, _ in self.picks()}
+        if given in ({"world_x", "world_y"}, {"speed"}, {"speed", "slip"}):
+            return self
+        raise ValueError(
+            "give either world_x and world_y, or speed (and slip; without it the car is taken to "
+            "move where it points)"
+        )
 
 
 class Derive(_Section):
-    """[derive]: what the FMU does not say and follows from what it says."""
+    """[derive]: quantities that the FMU does not give and that follow from others."""
 
-    psi: HeadingRule | None = None
-    velocity: VelocityRule | None = None
+    psi: _Heading | None = None
+    velocity: _Velocity | None = None
     omega: Literal["psi"] | None = None
     delta: Literal["delta_rate"] | None = None
 
+    def derived(self) -> set[str]:
+        """The quantities of [outputs] that follow from others."""
+        rules = {name for name, rule in self if rule is not None}
+        return rules - {"velocity"} | ({"vx", "vy"} if "velocity" in rules else set())
+
+    def read(self) -> Iterator[tuple[str, str, Pick]]:
+        """Quantity, place in the map and variable of what the rules read."""
+        quaternion = self.psi and self.psi.quaternion
+        for place, prefix, rule in (
+            ("psi", "", self.psi),
+            ("psi.quaternion", "q", quaternion),
+            ("velocity", "", self.velocity),
+        ):
+            for name, pick in rule.picks() if rule else ():
+                yield prefix + name, f"[derive] {place}.{name}", pick
+
 
 class FmuMap(_Section):
-    """A whole map; what it leaves out is looked for under our own names."""
+    """A whole map; for what it leaves out, variables with our own names are taken."""
 
     fmu: FmuSection = FmuSection()
-    inputs: dict[str, Setting] = {}
-    outputs: dict[Literal["x", "y", "psi", "vx", "vy", "omega", "delta"], Picked] = {}
+    inputs: dict[str, Annotated[Setting, _setting(COMMANDS)]] = {}
+    outputs: dict[Literal["x", "y", "psi", "vx", "vy", "omega", "delta"], Pick] = {}
     derive: Derive = Derive()
     parameters: dict[str, Value] = {}
-    start: dict[str, Setting] = {}
+    start: dict[str, Annotated[Setting, _setting(STARTS)]] = {}
 
 
 def parse_map(text: str, name: str = "map") -> FmuMap:
@@ -200,16 +197,13 @@ def parse_map(text: str, name: str = "map") -> FmuMap:
         return FmuMap.model_validate(tomllib.loads(text))
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{name} is not TOML: {error}; names with dots need quotes") from None
-    except ValidationError as error:
-        raise InputError(f"{name}: {_faults(error)}; docs/fmu.md has the form") from None
-
-
-def _faults(error: ValidationError) -> str:
-    faults = []
-    for one in error.errors():
-        place = ".".join(str(part) for part in one["loc"] if part not in ("table", "value"))
-        faults.append(f"{place}: {one['msg'].removeprefix('Value error, ')}")
-    return "; ".join(faults)
+    except pydantic.ValidationError as error:
+        faults = [
+            f"{'.'.join(str(part) for part in one['loc'] if part not in ('driven', 'constant'))}: "
+            f"{one['msg'].removeprefix('Value error, ')}"
+            for one in error.errors()
+        ]
+        raise InputError(f"{name}: {'; '.join(faults)}; docs/fmu.md has the form") from None
 
 
 def read_map(path: Path) -> FmuMap:

@@ -1,69 +1,63 @@
-"""What an FMU prints: passed on to standard error within bounds, its last line kept."""
+"""The output of an FMU's process: passed on to standard error within bounds, its end kept."""
 
-import contextlib
 import os
+import re
 import select
+from contextlib import suppress
 from typing import Final
 
 __all__ = ["Output"]
 
 _SHOWN: Final = 1 << 16
 """Bytes of one run that are passed on."""
-_CHUNK: Final = 1 << 16
-_KEPT: Final = 600
+_KEPT: Final = 4096
+"""Bytes in which the last words are looked for."""
+_TROUBLE: Final = re.compile(r"^\[FMU (?!info)\w+\] (.+)", re.MULTILINE)
 
 
 class Output:
-    """The reading end of the pipe that is an FMU's standard output and error."""
+    """The reading end of the pipe that is an FMU's standard output and error, and its log."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
         os.set_blocking(descriptor, False)
-        self._left = _SHOWN
-        self._tail = b""
+        self._left, self._tail = _SHOWN, b""
 
     def restart(self) -> None:
-        """A new run: pass on again, forget what was said."""
+        """A new run: pass on again, and forget the output of the last one."""
         self.pump()
-        self._left = _SHOWN
-        self._tail = b""
+        self._left, self._tail = _SHOWN, b""
 
     def pump(self) -> bool:
-        """Takes what is there, a bounded lot; False at the end of the pipe."""
+        """Takes what is there, up to a megabyte; False at the end of the pipe."""
         for _ in range(16):
             try:
-                data = os.read(self._descriptor, _CHUNK)
+                data = os.read(self._descriptor, 1 << 16)
             except BlockingIOError:
                 return True
-            except OSError:  # closed
-                return False
             if not data:
                 return False
             self._tail = (self._tail + data)[-_KEPT:]
-            self._pass_on(data)
+            self._pass_on(data[: self._left])
         return True
 
-    @property
-    def last_line(self) -> str:
-        """The last line printed, "" if there is none."""
-        lines = self._tail.decode(errors="replace").strip().splitlines()
-        return lines[-1].strip() if lines else ""
+    def last_words(self) -> str:
+        """The last message of its log that reports trouble, or else the last line."""
+        self.pump()
+        text = self._tail.decode(errors="replace").strip()
+        lines: list[str] = _TROUBLE.findall(text) or text.splitlines()
+        return lines[-1].removeprefix("[FMU info]").strip() if lines else ""
 
     def close(self) -> None:
         """No more."""
-        with contextlib.suppress(OSError):
-            os.close(self._descriptor)
-        self._descriptor = -1
+        os.close(self._descriptor)
 
     def _pass_on(self, data: bytes) -> None:
-        if self._left <= 0:
-            return
-        data = data[: self._left]
         self._left -= len(data)
-        if self._left <= 0:
+        if data and not self._left:
             data += b"\n[what else the FMU prints is not shown]\n"
+        # A standard error that nothing reads must not hold up the car: then it is lost.
         for begin in range(0, len(data), select.PIPE_BUF):
-            # A standard error that nobody reads must not hold up the car: then it is lost.
-            with contextlib.suppress(OSError, ValueError):
+            with suppress(OSError, ValueError):
                 if select.select((), (2,), (), 0)[1]:
                     os.write(2, data[begin : begin + select.PIPE_BUF])

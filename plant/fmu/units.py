@@ -1,50 +1,48 @@
-"""Units that an FMU declares or a map names, as factors to SI; angles count as a dimension.
+"""Units that an FMU declares or a map names, as factors to SI; an angle counts as a dimension.
 
-Pint knows the names; angles are told apart from numbers here because a duty cycle in degrees is a
-mistake, though both have no dimension for pint. An FMU's own definition of a unit (FMI 2.0.2,
-2.2.2; FMI 3.0, 2.4.3) stands for names that pint does not know.
+Pint knows the names. It takes an angle for a plain number; here the two differ, because a duty
+cycle in degrees is a mistake. The FMU's own definition of a unit (FMI 2.0.2, 2.2.2; FMI 3.0,
+2.4.3) holds for names that pint does not know.
 """
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
 
 from bayesrace.errors import InputError
 
-__all__ = ["Unit", "UnitDefinition", "contradicts", "parse_quantity", "to_si", "unit_of"]
+__all__ = ["Unit", "contradicts", "parse_quantity", "to_si", "unit_of"]
 
-_BASES: Final = ("gram", "meter", "second", "ampere", "kelvin", "mole", "candela", "radian")
-_RAD: Final = _BASES.index("radian")
-_KILOGRAM: Final = 1e-3
+_BASES: Final = {
+    "gram": "kg", "meter": "m", "second": "s", "ampere": "A", "kelvin": "K", "mole": "mol",
+    "candela": "cd", "radian": "rad",
+}  # fmt: skip
+"""Pint's base units in FMI's words."""
 
-_LONGEST_NAME: Final = 60
 _SPELLED: Final = re.compile(r"(?:[^\W\d]+|[°%·²³()\s]|\*(?!\*)|/|\^-?\d(?!\d)|1(?=\s*/|$))+")
 """Units, products and powers of one digit: pint computes what it is given, 9^9^9 for days."""
 
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """A unit by name: so many SI units of these exponents (kg m s A K mol cd rad)."""
+    """A unit by name: ``factor`` SI units of these powers of FMI's base units, kg to rad."""
 
     name: str
     factor: float
-    exponents: tuple[float, ...]
+    powers: Mapping[str, float]
 
-
-@dataclass(frozen=True, slots=True)
-class UnitDefinition:
-    """What an FMU says of a unit: exponents (kg m s A K mol cd rad), factor and offset to SI."""
-
-    exponents: tuple[int, ...]
-    factor: float = 1.0
-    offset: float = 0.0
+    @property
+    def plain(self) -> dict[str, float]:
+        """The powers without that of the angle."""
+        return {base: power for base, power in self.powers.items() if base != "rad"}
 
 
 @cache
 def _registry() -> Any:
-    import pint  # half a second, for those who drive an FMU
+    import pint  # takes half a second, and the built-in car needs none of it
 
     registry: Any = pint.UnitRegistry()
     registry.define("@alias kilometer_per_hour = kmph")  # or it reads as thousands of mph
@@ -52,98 +50,80 @@ def _registry() -> Any:
     return registry
 
 
-def _pint_spelling(name: str) -> str:
-    """Products and powers as FMI tools write them (N.m, m/s2, rad.s-1) in pint's spelling."""
-    spelled = name.strip().replace(".", "*")
-    return re.sub(r"([^\W\d_])(-?\d+)", r"\1^\2", spelled)
-
-
 @cache
 def _by_name(name: str) -> Unit | None:
-    spelled = _pint_spelling(name)
-    if len(name) > _LONGEST_NAME or not _SPELLED.fullmatch(spelled):
+    """The unit as pint knows it, in the spellings of FMI tools too: N.m, m/s2, rad.s-1."""
+    spelled = re.sub(r"([^\W\d_])(-?\d+)", r"\1^\2", name.strip().replace(".", "*"))
+    if len(name) > 60 or not _SPELLED.fullmatch(spelled):
         return None
     try:
         one = _registry().Quantity(1.0, spelled).to_root_units()
-        factor = float(one.magnitude)
-        powers = {str(base): float(power) for base, power in one.unit_items()}
+        powers = {_BASES[str(base)]: float(power) for base, power in one.unit_items()}
+        factor = float(one.magnitude) * 1e-3 ** powers.get("kg", 0.0)
     except Exception:  # pint raises what its tokenizer, parser and converters raise
         return None
-    if set(powers) - set(_BASES) or not math.isfinite(factor):
-        return None
-    exponents = tuple(powers.get(base, 0.0) for base in _BASES)
-    return Unit(name, factor * _KILOGRAM ** exponents[0], exponents)
+    return Unit(name, factor, powers) if math.isfinite(factor) else None
 
 
-def unit_of(name: str | None, definition: UnitDefinition | None = None) -> Unit | None:
-    """The unit called ``name``, which the FMU defines so; None if it says nothing known.
+def unit_of(name: str | None, definition: Any = None) -> Unit | None:
+    """The unit called ``name``; None if it is not known.
 
-    A definition that leaves out that an angle is one, or says nothing at all, as some tools write
-    them, does not overrule the name.
+    ``definition``: fmpy's ``BaseUnit`` if the FMU defines the unit. Some tools write definitions
+    that leave out the angle, or everything; these do not overrule the name.
     """
     if name is None or name.strip() in ("", "-"):
         return None
     known = _by_name(name)
     if definition is None:
         return known
-    if definition.offset != 0.0 or not math.isfinite(definition.factor) or definition.factor == 0.0:
-        return None  # temperatures: none of ours
-    defined = Unit(name, definition.factor, tuple(float(power) for power in definition.exponents))
+    factor = definition.factor
+    if definition.offset != 0.0 or not math.isfinite(factor) or factor == 0.0:
+        return None  # temperatures: no quantity of the car
+    powers = {
+        base: float(power) for base in _BASES.values() if (power := getattr(definition, base))
+    }
+    defined = Unit(name, factor, powers)
     if known is None:
         return defined
-    says_nothing = definition.factor == 1.0 and not any(definition.exponents)
-    same = defined.exponents[:_RAD] == known.exponents[:_RAD]
-    close = math.isclose(defined.factor, known.factor, rel_tol=1e-4)
-    # Where they agree, the name's factor has all digits.
-    return known if says_nothing or (same and close) else defined
+    empty = factor == 1.0 and not powers
+    same = defined.plain == known.plain and math.isclose(factor, known.factor, rel_tol=1e-4)
+    return known if empty or same else defined  # where both agree, the name's factor is exact
 
 
 def to_si(unit: Unit, wanted: str) -> float:
-    """Factor that turns a value in ``unit`` into one in the SI unit ``wanted``.
+    """Factor from a value in ``unit`` to one in the SI unit ``wanted``.
 
-    Raises InputError for another dimension, and for an angle per time that does not say which.
+    Raises InputError for another dimension, and for a frequency that may count turns or radians.
     """
     si = _by_name(wanted)
-    assert si is not None, wanted  # noqa: S101  our own units are known
-    if unit.exponents == si.exponents:
-        return unit.factor / si.factor
-    plain = unit.exponents[:_RAD] == si.exponents[:_RAD]
-    if plain and si.exponents[_RAD] and not unit.exponents[_RAD]:
-        if unit.factor == si.factor:
-            return 1.0  # radians, as SI has them: 1 and 1/s
-        which = '"rpm" or "rad/min"' if si.exponents[2] else '"turn" or "rad"'
+    assert si is not None, wanted  # noqa: S101  the car's own units are known
+    open_ = unit.plain == si.plain and "rad" not in unit.powers
+    if unit.powers == si.powers or (open_ and unit.factor == si.factor):
+        return unit.factor / si.factor  # 1 and 1/s are radians, as SI has them
+    if open_:
+        which = '"rpm" or "rad/min"' if si.plain else '"turn" or "rad"'
         raise InputError(
             f"'{unit.name}' may count turns or radians: say unit = {which} or the like"
         )
-    raise InputError(f"'{unit.name}' does not convert to {_spoken(wanted)}")
-
-
-def _spoken(unit: str) -> str:
-    return "a plain number" if unit == "1" else f"'{unit}'"
+    target = "a plain number" if wanted == "1" else f"'{wanted}'"
+    raise InputError(f"'{unit.name}' does not convert to {target}")
 
 
 def contradicts(named: Unit, declared: Unit) -> bool:
-    """Whether the map's unit cannot be what the FMU declares.
+    """Whether the map's unit cannot be the one that the FMU declares.
 
-    A declared frequency that leaves open what it counts (1/min) allows any angle per time.
+    A declared frequency (1/min), which leaves open what it counts, allows any angle per time.
     """
-    if named.exponents == declared.exponents:
+    if named.powers == declared.powers:
         return not math.isclose(named.factor, declared.factor, rel_tol=1e-4)
-    open_ = (
-        declared.exponents[2] == -1.0
-        and not declared.exponents[_RAD]
-        and named.exponents[:_RAD] == declared.exponents[:_RAD]
-    )
-    return not open_
+    frequency = declared.powers.get("s") == -1.0 and "rad" not in declared.powers
+    return named.plain != declared.plain or not frequency
 
 
 def parse_quantity(text: str) -> tuple[float, Unit]:
     """Number and unit of a text such as ``90 deg``; InputError if it is not one."""
-    match = re.fullmatch(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(.*)", text)
+    match = re.fullmatch(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*)", text)
     unit = unit_of(match[2]) if match else None
-    try:
-        if match and unit:
-            return float(match[1]), unit
-    except ValueError:
-        pass
-    raise InputError(f"'{text}' is not a number with a unit, such as '90 deg'")
+    if match is None or unit is None:
+        raise InputError(f"'{text}' is not a number with a unit, such as '90 deg'")
+    return float(match[1]), unit

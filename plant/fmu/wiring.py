@@ -1,14 +1,13 @@
-"""Between the car's own quantities and an FMU's variables: arithmetic only, no process, no FMU.
+"""The car's quantities as an FMU's variables, by arithmetic alone.
 
-A :class:`Wiring` is what is left of a map (:mod:`plant.fmu.map`) once it has been checked against
-an FMU's description. Every value that passes is affine, ``scale * value + offset``; what the FMU
-does not say is derived from what it says: heading from a quaternion or from a wrapped angle, body
-velocities from world velocities or from speed and slip angle, yaw rate from the heading, steering
-angle from the steering rate that acted.
+Every value that passes is affine, ``scale * value + offset``: a row (:class:`Link`) for each
+variable of the FMU. A few rules derive the state from what the rows read: the heading from a
+quaternion or from cosine and sine, continued by whole turns; body velocities from world velocities
+or from speed and slip angle; the yaw rate from the heading; the steering angle from the rate.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -17,23 +16,7 @@ import numpy.typing as npt
 
 from bayesrace.errors import InputError
 
-__all__ = [
-    "COMMANDS",
-    "STATES",
-    "STARTS",
-    "BodyVelocity",
-    "CosSin",
-    "Heading",
-    "InputLink",
-    "OutputLinks",
-    "Quaternion",
-    "Signal",
-    "SpeedSlip",
-    "StartLink",
-    "Velocity",
-    "Wiring",
-    "WorldVelocity",
-]
+__all__ = ["COMMANDS", "READINGS", "STARTS", "STATES", "Link", "Value", "Wiring"]
 
 Array = npt.NDArray[np.float64]
 Value = float | int | bool | str
@@ -52,235 +35,100 @@ STATES: Final = {
 COMMANDS: Final = {
     "d": "1", "delta_rate": "rad/s", "delta": "rad", "throttle": "1", "brake": "1",
 }  # fmt: skip
-"""What an FMU's input can be driven by, with units: the duty cycle or its positive and (turned
-positive) negative part, and the steering rate or the steering angle at the end of the hold."""
+"""What can drive an FMU's input, with units: the duty cycle or its positive and (turned positive)
+negative part, and the steering rate or the steering angle at the end of the hold."""
 
-STARTS: Final = STATES | {
-    "speed": "m/s", "slip": "rad", "world_vx": "m/s", "world_vy": "m/s",
-    "qw": "1", "qx": "1", "qy": "1", "qz": "1",
-}  # fmt: skip
-"""What an FMU's start value can be set from, with units; q* is the heading as a quaternion."""
+_QUATERNION: Final = dict.fromkeys(("qw", "qx", "qy", "qz"), "1")
+_POLAR: Final = {"speed": "m/s", "slip": "rad"}
 
+STARTS: Final = STATES | _POLAR | {"world_vx": "m/s", "world_vy": "m/s"} | _QUATERNION
+"""What can set an FMU's start value, with units; q* is the heading as a quaternion."""
 
-@dataclass(frozen=True, slots=True)
-class Signal:
-    """One of the FMU's outputs, by its place in :attr:`Wiring.outputs`, in our unit and sign."""
-
-    index: int
-    scale: float = 1.0
-    offset: float = 0.0
-
-    def read(self, outputs: Sequence[float]) -> float:
-        """Our value among the FMU's."""
-        return self.scale * outputs[self.index] + self.offset
+READINGS: Final = (
+    STATES | _POLAR | {"world_x": "m/s", "world_y": "m/s", "cos": "1", "sin": "1"} | _QUATERNION
+)
+"""What an FMU's outputs can mean, with units; world_* are velocities along the axes of x and y."""
 
 
 @dataclass(frozen=True, slots=True)
-class Quaternion:
-    """Heading from the rotation body → world, of any length; yaw is the z-y-x Euler angle."""
+class Link:
+    """One variable of the FMU and the quantity of ours beside it.
 
-    w: Signal
-    x: Signal
-    y: Signal
-    z: Signal
-    sign: float = 1.0
-    offset: float = 0.0
-
-    def read(self, outputs: Sequence[float]) -> float:
-        """Heading [rad] within half a turn of ``offset``; NaN for a quaternion of zeros."""
-        w, x, y, z = (part.read(outputs) for part in (self.w, self.x, self.y, self.z))
-        sine, cosine = 2.0 * (w * z + x * y), w * w + x * x - y * y - z * z
-        return self.sign * _angle(sine, cosine) + self.offset
-
-
-@dataclass(frozen=True, slots=True)
-class CosSin:
-    """Heading from its cosine and sine (of any common length)."""
-
-    cos: Signal
-    sin: Signal
-    sign: float = 1.0
-    offset: float = 0.0
-
-    def read(self, outputs: Sequence[float]) -> float:
-        """Heading [rad] within half a turn of ``offset``; NaN where both are zero."""
-        return self.sign * _angle(self.sin.read(outputs), self.cos.read(outputs)) + self.offset
-
-
-def _angle(sine: float, cosine: float) -> float:
-    return math.nan if sine == cosine == 0.0 else math.atan2(sine, cosine)
-
-
-@dataclass(frozen=True, slots=True)
-class BodyVelocity:
-    """Forward and leftward velocity."""
-
-    vx: Signal
-    vy: Signal
-
-    def read(self, outputs: Sequence[float], psi_rad: float) -> tuple[float, float]:
-        """(vx, vy) [m/s] in the car's frame."""
-        return self.vx.read(outputs), self.vy.read(outputs)
-
-
-@dataclass(frozen=True, slots=True)
-class WorldVelocity:
-    """Velocity along the axes that x and y are measured along."""
-
-    x: Signal
-    y: Signal
-
-    def read(self, outputs: Sequence[float], psi_rad: float) -> tuple[float, float]:
-        """(vx, vy) [m/s] in the car's frame."""
-        return _rotated(self.x.read(outputs), self.y.read(outputs), -psi_rad)
-
-
-@dataclass(frozen=True, slots=True)
-class SpeedSlip:
-    """Speed and the angle of the velocity to the left of the car's axis; None: no side slip."""
-
-    speed: Signal
-    slip: Signal | None
-
-    def read(self, outputs: Sequence[float], psi_rad: float) -> tuple[float, float]:
-        """(vx, vy) [m/s] in the car's frame."""
-        speed = self.speed.read(outputs)
-        if self.slip is None:
-            return speed, 0.0
-        slip = self.slip.read(outputs)
-        return _rotated(speed, 0.0, slip)
-
-
-def _rotated(x: float, y: float, angle_rad: float) -> tuple[float, float]:
-    """(x, y) turned by the angle; NaN for an angle that is not finite."""
-    if not math.isfinite(angle_rad):
-        return math.nan, math.nan
-    cosine, sine = math.cos(angle_rad), math.sin(angle_rad)
-    return cosine * x - sine * y, sine * x + cosine * y
-
-
-Heading = Signal | Quaternion | CosSin
-Velocity = BodyVelocity | WorldVelocity | SpeedSlip
-
-
-@dataclass(frozen=True, slots=True)
-class OutputLinks:
-    """How the state is read from the FMU's outputs."""
-
-    x: Signal
-    y: Signal
-    psi: Heading
-    velocity: Velocity
-    omega: Signal | None
-    """None: from the change of heading."""
-    delta: Signal | None
-    """None: integrated from the steering rate that acted."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Link:
-    """A variable of the FMU that a quantity of ours sets, and the range that the FMU declares."""
+    An output's gives ours, ``scale * theirs + offset``; an input's or a start value's gives theirs,
+    ``scale * ours + offset``, which the FMU allows from ``lowest`` to ``highest``.
+    """
 
     variable: str
-    source: str
-    """Name of our quantity."""
+    quantity: str
     scale: float = 1.0
     offset: float = 0.0
     lowest: float = -math.inf
     highest: float = math.inf
 
-    def _converted(self, ours: Mapping[str, float]) -> float:
-        """The FMU's value, not yet held against its range."""
-        return self.scale * ours[self.source] + self.offset
+    def start(self, quantities: Mapping[str, float]) -> float:
+        """The FMU's start value; a heading is turned into the declared range.
 
-
-@dataclass(frozen=True, slots=True)
-class InputLink(_Link):
-    """An FMU input, and what of :data:`COMMANDS` drives it."""
-
-    def value(self, commands: Mapping[str, float]) -> float:
-        """The FMU's value, within its range: an actuator at its stop stays there."""
-        return min(max(self._converted(commands), self.lowest), self.highest)
-
-
-@dataclass(frozen=True, slots=True)
-class StartLink(_Link):
-    """A start value of the FMU, and what of :data:`STARTS` sets it."""
-
-    def value(self, starts: Mapping[str, float]) -> float:
-        """The FMU's value; a heading is turned into the declared range. InputError outside it."""
-        value = self._converted(starts)
-        if not self.lowest <= value <= self.highest and self.source == "psi":
+        InputError outside the range.
+        """
+        value = self.scale * quantities[self.quantity] + self.offset
+        if not self.lowest <= value <= self.highest and self.quantity == "psi":
             turn = abs(self.scale) * TURN
             anchor = self.lowest if math.isfinite(self.lowest) else self.highest - turn
             value = anchor + (value - anchor) % turn
         if not self.lowest <= value <= self.highest:
             raise InputError(
-                f"the FMU cannot start with {self.variable} = {value:g} (our {self.source} = "
-                f"{starts[self.source]:g}): it allows {self.lowest:g} to {self.highest:g}; start "
-                "elsewhere, or correct unit, sign and offset in the map's [start]"
+                f"the FMU cannot start with {self.variable} = {value:g} (our {self.quantity} = "
+                f"{quantities[self.quantity]:g}): it allows {self.lowest:g} to {self.highest:g}; "
+                "start elsewhere, or correct unit, sign and offset in the map's [start]"
             )
         return value
 
 
-_COMMAND_OF: Final[dict[str, Callable[[float, float, float], float]]] = {
-    "d": lambda d, rate, delta: d,
-    "delta_rate": lambda d, rate, delta: rate,
-    "delta": lambda d, rate, delta: delta,
-    "throttle": lambda d, rate, delta: max(d, 0.0),
-    "brake": lambda d, rate, delta: max(-d, 0.0),
-}
-
-
 class Wiring:
-    """The car's commands as an FMU's inputs, and its outputs as the car's state.
+    """The car's commands as an FMU's inputs, and the FMU's outputs as the car's state.
 
-    Made by :func:`plant.fmu.map.wire`. It remembers what is integrated or unwrapped over a run:
-    :meth:`start_values`, :meth:`begin`, then :meth:`to_inputs` and :meth:`state` in turn.
-
-    ``inputs`` and ``outputs`` are the FMU's variables, all real, in the order in which values are
-    passed; ``fixed`` are parameters and inputs that are set once, before initialisation;
-    ``step_s`` is the communication step that the map asks for, None if it leaves that open;
-    ``timeout_s`` how long the FMU may take for a step, ``startup_s`` for its start; ``placed``: the
-    FMU starts where it likes and its world is moved so that it starts at the asked pose.
+    Over a run it keeps what is integrated or continued: call :meth:`start_values` and
+    :meth:`begin`, then :meth:`to_inputs` and :meth:`state` in turn.
     """
 
     def __init__(
         self,
-        *,
-        inputs: Sequence[InputLink],
-        outputs: Sequence[str],
-        links: OutputLinks,
-        starts: Sequence[StartLink] = (),
+        inputs: Sequence[Link],
+        outputs: Sequence[Link],
+        starts: Sequence[Link] = (),
         fixed: Mapping[str, Value] | None = None,
-        step_s: float | None = None,
-        timeout_s: float = 2.0,
-        startup_s: float = 8.0,
+        *,
+        heading: tuple[float, float] = (1.0, 0.0),
         placed: bool = False,
     ) -> None:
-        self.inputs: tuple[str, ...] = tuple(link.variable for link in inputs)
-        self.outputs: tuple[str, ...] = tuple(outputs)
-        self.fixed: dict[str, Value] = dict(fixed or {})
-        self.step_s = step_s
-        self.timeout_s = timeout_s
-        self.startup_s = startup_s
-        self.placed = placed
-        self._inputs = tuple(inputs)
-        self._starts = tuple(starts)
-        self._links = links
-        self._psi_fmu = 0.0  # unwrapped, in the FMU's world
+        """``inputs`` link to :data:`COMMANDS`, ``outputs`` to :data:`READINGS`, ``starts`` to
+        :data:`STARTS`; ``fixed`` are parameters and inputs that are set once, before
+        initialisation; ``heading``: sign and offset [rad] of one from a quaternion or from cosine
+        and sine; ``placed``: the FMU has a start of its own, which becomes the asked pose.
+        """
+        self.inputs = tuple(link.variable for link in inputs)
+        """The FMU's variables in the order in which values are passed; so ``outputs``."""
+        self.outputs = tuple(link.variable for link in outputs)
+        self.follows_angle = any(link.quantity == "delta" for link in inputs)
+        """Whether an input changes during a hold because the steering angle does."""
+        self._inputs, self._outputs, self._starts = tuple(inputs), tuple(outputs), tuple(starts)
+        self._fixed = dict(fixed or {})
+        self._sign, self._zero = heading
+        self._placed = placed
+        self._psi = 0.0  # continued, in the FMU's world
         self._delta = 0.0  # integrated
-        self._shift: tuple[float, float, float, float, float] | None = None
+        self._turn, self._origin = 0.0, (0.0, 0.0)  # of the FMU's world in ours
 
     def start_values(self, x0: Sequence[float] | Array) -> dict[str, Value]:
-        """What to set before initialisation so that the car starts in ``x0``, (7,).
+        """Values to set before initialisation so that the car starts in ``x0``, (7,).
 
         Parameters, constant inputs, start values, and the inputs of a car whose motor is off and
         whose steering holds still. InputError for a start that the FMU's ranges do not allow.
         """
-        x, y, psi, vx, vy, omega, delta = (float(value) for value in x0)
+        state = dict(zip(STATES, map(float, x0), strict=True))
+        psi, vx, vy = state["psi"], state["vx"], state["vy"]
         world_vx, world_vy = _rotated(vx, vy, psi)
-        starts = dict(zip(STATES, (x, y, psi, vx, vy, omega, delta), strict=True)) | {
+        quantities = state | {
             "speed": math.hypot(vx, vy),
             "slip": math.atan2(vy, vx),
             "world_vx": world_vx,
@@ -290,81 +138,91 @@ class Wiring:
             "qy": 0.0,
             "qz": math.sin(psi / 2.0),
         }
-        still = zip(self.inputs, self.to_inputs((0.0, 0.0), delta, 0.0), strict=True)
-        return self.fixed | dict(still) | {s.variable: s.value(starts) for s in self._starts}
+        still = dict(zip(self.inputs, self.to_inputs((0.0, 0.0), state["delta"]), strict=True))
+        return self._fixed | still | {one.variable: one.start(quantities) for one in self._starts}
+
+    def to_inputs(
+        self, u: Sequence[float], delta_rad: float, times_s: Sequence[float] = (0.0,)
+    ) -> list[float]:
+        """The FMU's inputs, a row for each of the times since ``u`` = (d, delta_rate) began to act.
+
+        ``u`` has passed the guard; ``delta_rad`` is the steering angle when it begins. Values
+        outside the range that the FMU declares are clipped, as an actuator stays at its stop.
+        """
+        d, rate = float(u[0]), float(u[1])
+        ours = {"d": d, "delta_rate": rate, "throttle": max(d, 0.0), "brake": max(-d, 0.0)}
+        rows: list[float] = []
+        for time_s in times_s:
+            ours["delta"] = delta_rad + time_s * rate
+            for one in self._inputs:
+                value = one.scale * ours[one.quantity] + one.offset
+                rows.append(min(max(value, one.lowest), one.highest))
+        return rows
 
     def begin(self, outputs: Sequence[float], x0: Sequence[float] | Array) -> Array:
         """State (7,) after initialisation, where ``x0`` (7,) was asked for.
 
         Raises InputError if the FMU starts elsewhere, unless it is to be placed.
         """
-        asked = np.array(x0, dtype=np.float64)
-        self._shift = None
-        self._psi_fmu = 0.0 if self.placed else float(asked[2])
-        self._delta = float(asked[6])
-        psi = self._unwrapped(outputs)
-        x, y = self._links.x.read(outputs), self._links.y.read(outputs)
-        if self.placed:
-            turn = float(asked[2]) - psi
-            self._shift = (x, y, float(asked[0]), float(asked[1]), turn)
-        else:
-            self._check_pose((x, y, psi), asked)
-        self._psi_fmu = psi
-        omega = float(asked[5])  # there is no change of heading yet to tell it from
-        return self._state(outputs, psi, omega)
-
-    def to_inputs(
-        self, u: Sequence[float], delta_rad: float, duration_s: float
-    ) -> list[float]:  # fmt: skip
-        """The FMU's inputs while ``u`` = (d, delta_rate) acts for ``duration_s``.
-
-        ``u`` has passed the guard. An FMU that takes a steering angle gets the one at the end of
-        the hold, ``delta_rad`` being the one at its beginning.
-        """
-        d, rate = float(u[0]), float(u[1])
-        delta = delta_rad + duration_s * rate
-        commands = {link.source: _COMMAND_OF[link.source](d, rate, delta) for link in self._inputs}
-        return [link.value(commands) for link in self._inputs]
-
-    def state(self, outputs: Sequence[float], u: Sequence[float], duration_s: float) -> Array:
-        """State (7,) after ``u`` acted for ``duration_s``; not finite where the outputs are not.
-
-        The heading is continuous as long as it changes by less than half a turn a call.
-        """
-        psi = self._unwrapped(outputs)
-        omega = (psi - self._psi_fmu) / duration_s
-        self._delta += duration_s * float(u[1])
-        self._psi_fmu = psi
-        return self._state(outputs, psi, omega)
-
-    def _unwrapped(self, outputs: Sequence[float]) -> float:
-        """The FMU's heading, by whole turns nearest to the one before."""
-        psi = self._links.psi.read(outputs)
-        turns = (self._psi_fmu - psi) / TURN
-        # Nothing is added where the FMU counts turns itself: its value stays to the bit.
-        return psi + TURN * round(turns) if math.isfinite(turns) else math.nan
-
-    def _state(self, outputs: Sequence[float], psi: float, omega: float) -> Array:
-        links = self._links
-        x, y = links.x.read(outputs), links.y.read(outputs)
-        vx, vy = links.velocity.read(outputs, psi)
-        if links.omega is not None:
-            omega = links.omega.read(outputs)
-        delta = self._delta if links.delta is None else links.delta.read(outputs)
-        if self._shift is not None:
-            x_fmu, y_fmu, x_asked, y_asked, turn = self._shift
-            dx, dy = _rotated(x - x_fmu, y - y_fmu, turn)
-            x, y, psi = x_asked + dx, y_asked + dy, psi + turn
-        return np.array((x, y, psi, vx, vy, omega, delta))
-
-    def _check_pose(self, pose: tuple[float, float, float], asked: Array) -> None:
-        if not all(math.isfinite(value) for value in pose):
-            return  # said better by who looks at all outputs
-        if max(abs(is_ - want) for is_, want in zip(pose, asked[:3], strict=True)) > POSE_TOLERANCE:
-            x, y, psi = pose
+        asked = [float(value) for value in x0]
+        self._psi = 0.0 if self._placed else asked[2]
+        self._delta = asked[6]
+        ours = self._read(outputs)
+        x, y, psi = pose = ours["x"], ours["y"], ours["psi"]
+        if self._placed:
+            self._turn = asked[2] - psi
+            dx, dy = _rotated(x, y, self._turn)
+            self._origin = asked[0] - dx, asked[1] - dy
+        elif POSE_TOLERANCE < np.abs(np.subtract(pose, asked[:3])).max() < math.inf:
             raise InputError(
                 f"the FMU starts at x = {x:.4g} m, y = {y:.4g} m, psi = {psi:.4g} rad instead of "
                 f"{asked[0]:.4g}, {asked[1]:.4g}, {asked[2]:.4g}; name the variables that set its "
                 "pose in the map's [start] (and check units, signs and offsets), or let "
                 "`placed = true` in [fmu] move its world, if it starts at an origin of its own"
             )
+        return self._state(ours, omega=asked[5])  # the heading has not changed yet
+
+    def state(self, outputs: Sequence[float], u: Sequence[float], duration_s: float) -> Array:
+        """State (7,) after ``u`` acted for ``duration_s``; not finite where the outputs are not.
+
+        The heading is continuous as long as it changes by less than half a turn a call.
+        """
+        before = self._psi
+        ours = self._read(outputs)
+        self._delta += duration_s * float(u[1])
+        return self._state(ours, omega=(self._psi - before) / duration_s)
+
+    def _read(self, outputs: Sequence[float]) -> dict[str, float]:
+        """What the rows and rules make of the outputs, in the FMU's world."""
+        rows = zip(self._outputs, outputs, strict=True)
+        ours = {one.quantity: one.scale * value + one.offset for one, value in rows}
+        if "qw" in ours:  # of any length; yaw is the z-y-x Euler angle
+            w, x, y, z = (ours[name] for name in _QUATERNION)
+            ours["sin"], ours["cos"] = 2.0 * (w * z + x * y), w * w + x * x - y * y - z * z
+        if "cos" in ours:
+            sine, cosine = ours["sin"], ours["cos"]
+            angle = math.nan if sine == cosine == 0.0 else math.atan2(sine, cosine)
+            ours["psi"] = self._sign * angle + self._zero
+        turns = (self._psi - ours["psi"]) / TURN
+        # Nothing is added where the FMU counts turns itself: its value stays to the bit.
+        ours["psi"] = ours["psi"] + TURN * round(turns) if math.isfinite(turns) else math.nan
+        self._psi = ours["psi"]
+        if "world_x" in ours:
+            ours["vx"], ours["vy"] = _rotated(ours["world_x"], ours["world_y"], -ours["psi"])
+        elif "speed" in ours:
+            ours["vx"], ours["vy"] = _rotated(ours["speed"], 0.0, ours.get("slip", 0.0))
+        return ours
+
+    def _state(self, ours: Mapping[str, float], omega: float) -> Array:
+        x, y = _rotated(ours["x"], ours["y"], self._turn)
+        x, y, psi = x + self._origin[0], y + self._origin[1], ours["psi"] + self._turn
+        omega, delta = ours.get("omega", omega), ours.get("delta", self._delta)
+        return np.array((x, y, psi, ours["vx"], ours["vy"], omega, delta))
+
+
+def _rotated(x: float, y: float, angle_rad: float) -> tuple[float, float]:
+    """(x, y) turned by the angle; NaN for an angle that is not finite."""
+    if not math.isfinite(angle_rad):
+        return math.nan, math.nan
+    cosine, sine = math.cos(angle_rad), math.sin(angle_rad)
+    return cosine * x - sine * y, sine * x + cosine * y

@@ -10,12 +10,12 @@
 #define CHECK_END exit(1)
 #endif
 
-#define CHECK(condition)                                                                 \
-    do {                                                                                 \
-        if (!(condition)) {                                                              \
-            fprintf(stderr, "%s:%d: %s\n", __FILE__, __LINE__, #condition);              \
-            CHECK_END;                                                                   \
-        }                                                                                \
+#define CHECK(condition)                                                    \
+    do {                                                                    \
+        if (!(condition)) {                                                 \
+            fprintf(stderr, "%s:%d: %s\n", __FILE__, __LINE__, #condition); \
+            CHECK_END;                                                      \
+        }                                                                   \
     } while (0)
 
 #endif

@@ -31,14 +31,53 @@ typedef fmi2Status Status;
 enum { OK, WARNING, DISCARD, ERROR, FATAL };
 
 enum { /* value references */
-    D, DELTA_RATE, X, Y, PSI, VX, VY, OMEGA, DELTA, AT_S, MODE, GEAR, LIGHT, GEAR_TOLD, LIGHT_TOLD,
-    LABEL, LABEL_LENGTH, INSTANCES, SOFT, SMALL, ROWS, VALUES
+       D,
+       DELTA_RATE,
+       X,
+       Y,
+       PSI,
+       VX,
+       VY,
+       OMEGA,
+       DELTA,
+       AT_S,
+       MODE,
+       GEAR,
+       LIGHT,
+       GEAR_TOLD,
+       LIGHT_TOLD,
+       LABEL,
+       LABEL_LENGTH,
+       INSTANCES,
+       SOFT,
+       SMALL,
+       ROWS,
+       VALUES
 };
 
 enum { /* modes; the numbers are those in tests/faulty_fmu.py */
-    GOOD, ABORT, SEGFAULT, EXIT, HANG, NOT_A_NUMBER, FAIL, REFUSE, FLOOD_LOG, FLOOD_STDOUT, SLOW,
-    TERMINATE, INIT_FAILS, INIT_HANGS, INIT_ABORTS, HUGE_VALUE, CLOSE_ALL, EARLY, STUCK, SAY, WORST,
-    SCRIBBLE, ORPHAN
+       GOOD,
+       ABORT,
+       SEGFAULT,
+       EXIT,
+       HANG,
+       NOT_A_NUMBER,
+       FAIL,
+       REFUSE,
+       FLOOD_LOG,
+       FLOOD_STDOUT,
+       SLOW,
+       TERMINATE,
+       INIT_FAILS,
+       INIT_HANGS,
+       INIT_ABORTS,
+       HUGE_VALUE,
+       CLOSE_ALL,
+       EARLY,
+       SAY,
+       WORST,
+       SCRIBBLE,
+       ORPHAN
 };
 
 typedef struct {
@@ -84,8 +123,10 @@ static Status initialise(Car *car) {
     case INIT_FAILS:
         say(car, ERROR, "this car has no wheels");
         return (Status)ERROR;
-    case INIT_HANGS: wait_for_ever();
-    case INIT_ABORTS: abort();
+    case INIT_HANGS:
+        wait_for_ever();
+    case INIT_ABORTS:
+        abort();
     }
     return (Status)OK;
 }
@@ -95,16 +136,26 @@ static Status strike(Car *car) {
     case ABORT:
         say(car, ERROR, "the engine is on fire");
         abort();
-    case SEGFAULT: raise(SIGSEGV); break;
-    case EXIT: exit(3);
-    case HANG: wait_for_ever();
-    case NOT_A_NUMBER: car->value[VX] = NAN; break;
-    case HUGE_VALUE: car->value[VX] = 1e9; break;
+    case SEGFAULT:
+        raise(SIGSEGV);
+        break;
+    case EXIT:
+        exit(3);
+    case HANG:
+        wait_for_ever();
+    case NOT_A_NUMBER:
+        car->value[VX] = NAN;
+        break;
+    case HUGE_VALUE:
+        car->value[VX] = 1e9;
+        break;
     case FAIL:
         say(car, ERROR, "a wheel came off");
         return (Status)ERROR;
-    case WORST: return (Status)FATAL;
-    case REFUSE: return (Status)DISCARD;
+    case WORST:
+        return (Status)FATAL;
+    case REFUSE:
+        return (Status)DISCARD;
     case FLOOD_LOG:
         for (int i = 0; i < 20000; i++) say(car, i % 2 ? WARNING : OK, "all is well, as always");
         break;
@@ -115,8 +166,12 @@ static Status strike(Car *car) {
     case SAY:
         fprintf(stderr, "assertion failed: wheels == 4\n");
         _exit(7);
-    case SLOW: usleep(60000); break;
-    case TERMINATE: car->ended = true; break;
+    case SLOW:
+        usleep(60000);
+        break;
+    case TERMINATE:
+        car->ended = true;
+        break;
     case ORPHAN: /* leaves a process behind */
         if (fork() == 0) pause();
         abort();
@@ -151,9 +206,9 @@ static Status drive(Car *car, double t, double h) {
 
 #if FMI == 3
 EXPORT fmi3Instance fmi3InstantiateCoSimulation(
-    fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible, fmi3Boolean logging,
-    fmi3Boolean events, fmi3Boolean early, const fmi3ValueReference required[], size_t count,
-    fmi3InstanceEnvironment environment, fmi3LogMessageCallback log,
+    fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible,
+    fmi3Boolean logging, fmi3Boolean events, fmi3Boolean early, const fmi3ValueReference required[],
+    size_t count, fmi3InstanceEnvironment environment, fmi3LogMessageCallback log,
     fmi3IntermediateUpdateCallback update) {
     (void)name, (void)resources, (void)visible, (void)logging, (void)events, (void)early;
     (void)required, (void)count, (void)update;
@@ -171,18 +226,18 @@ EXPORT Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean d, fmi3Flo
 EXPORT Status fmi3EnterConfigurationMode(fmi3Instance c) { return (void)c, (Status)OK; }
 EXPORT Status fmi3ExitConfigurationMode(fmi3Instance c) { return (void)c, (Status)OK; }
 
-#define ACCESS(Name, Type)                                                                        \
-    EXPORT Status fmi3Set##Name(fmi3Instance c, const fmi3ValueReference vr[], size_t n,          \
-                                const Type values[], size_t nv) {                                 \
-        (void)nv;                                                                                 \
-        for (size_t i = 0; i < n; i++) ((Car *)c)->value[vr[i]] = (double)values[i];              \
-        return (Status)OK;                                                                        \
-    }                                                                                             \
-    EXPORT Status fmi3Get##Name(fmi3Instance c, const fmi3ValueReference vr[], size_t n,          \
-                                Type values[], size_t nv) {                                       \
-        (void)nv;                                                                                 \
-        for (size_t i = 0; i < n; i++) values[i] = (Type)((Car *)c)->value[vr[i]];                \
-        return (Status)OK;                                                                        \
+#define ACCESS(Name, Type)                                                               \
+    EXPORT Status fmi3Set##Name(fmi3Instance c, const fmi3ValueReference vr[], size_t n, \
+                                const Type values[], size_t nv) {                        \
+        (void)nv;                                                                        \
+        for (size_t i = 0; i < n; i++) ((Car *)c)->value[vr[i]] = (double)values[i];     \
+        return (Status)OK;                                                               \
+    }                                                                                    \
+    EXPORT Status fmi3Get##Name(fmi3Instance c, const fmi3ValueReference vr[], size_t n, \
+                                Type values[], size_t nv) {                              \
+        (void)nv;                                                                        \
+        for (size_t i = 0; i < n; i++) values[i] = (Type)((Car *)c)->value[vr[i]];       \
+        return (Status)OK;                                                               \
     }
 ACCESS(Float64, fmi3Float64)
 ACCESS(Float32, fmi3Float32)
@@ -205,10 +260,9 @@ EXPORT Status fmi3DoStep(fmi3Instance c, fmi3Float64 t, fmi3Float64 h, fmi3Boole
     (void)none;
     bool halfway = car->value[MODE] == EARLY && h > 1e-3;
     Status status = drive(car, t, halfway ? h / 2 : h);
-    if (car->value[MODE] == STUCK) car->time = t;
     *event = false;
     *terminate = car->ended;
-    *early = halfway || car->value[MODE] == STUCK;
+    *early = halfway;
     *last = car->time;
     return status;
 }
@@ -230,16 +284,16 @@ EXPORT Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean d, Real tolerance
 
 EXPORT Status fmi2EnterInitializationMode(fmi2Component c) { return (void)c, (Status)OK; }
 
-#define ACCESS(Name, Type)                                                                        \
-    EXPORT Status fmi2Set##Name(fmi2Component c, const fmi2ValueReference vr[], size_t n,         \
-                                const Type values[]) {                                            \
-        for (size_t i = 0; i < n; i++) ((Car *)c)->value[vr[i]] = values[i];                      \
-        return (Status)OK;                                                                        \
-    }                                                                                             \
-    EXPORT Status fmi2Get##Name(fmi2Component c, const fmi2ValueReference vr[], size_t n,         \
-                                Type values[]) {                                                  \
-        for (size_t i = 0; i < n; i++) values[i] = (Type)((Car *)c)->value[vr[i]];                \
-        return (Status)OK;                                                                        \
+#define ACCESS(Name, Type)                                                                \
+    EXPORT Status fmi2Set##Name(fmi2Component c, const fmi2ValueReference vr[], size_t n, \
+                                const Type values[]) {                                    \
+        for (size_t i = 0; i < n; i++) ((Car *)c)->value[vr[i]] = values[i];              \
+        return (Status)OK;                                                                \
+    }                                                                                     \
+    EXPORT Status fmi2Get##Name(fmi2Component c, const fmi2ValueReference vr[], size_t n, \
+                                Type values[]) {                                          \
+        for (size_t i = 0; i < n; i++) values[i] = (Type)((Car *)c)->value[vr[i]];        \
+        return (Status)OK;                                                                \
     }
 ACCESS(Real, fmi2Real)
 ACCESS(Integer, fmi2Integer)
@@ -262,12 +316,6 @@ EXPORT Status fmi2GetBooleanStatus(fmi2Component c, const fmi2StatusKind kind, f
     const Car *car = c;
     *told = kind == fmi2Terminated && car->ended;
     return (Status)(car->value[MODE] == REFUSE ? DISCARD : OK); /* then it cannot tell */
-}
-
-EXPORT Status fmi2GetRealStatus(fmi2Component c, const fmi2StatusKind kind, Real *told) {
-    (void)kind;
-    *told = ((Car *)c)->time;
-    return (Status)OK;
 }
 #endif
 

@@ -11,8 +11,7 @@
 static int messages;
 
 static void listen(fmi2ComponentEnvironment environment, fmi2String name, fmi2Status status,
-                   fmi2String category, fmi2String text, ...)
-{
+                   fmi2String category, fmi2String text, ...) {
     (void)environment, (void)name, (void)status, (void)category;
     messages += text[0] != 0;
 }
@@ -23,13 +22,11 @@ static void listen(fmi2ComponentEnvironment environment, fmi2String name, fmi2St
 
 static fmi2CallbackFunctions callbacks = {listen, NULL, NULL, NULL, NULL};
 
-static fmi2Component make(const char *token, const char *uri)
-{
+static fmi2Component make(const char *token, const char *uri) {
     return fmi2Instantiate("one", fmi2CoSimulation, token, uri, &callbacks, 0, 1);
 }
 
-static void states(fmi2Component c)
-{
+static void states(fmi2Component c) {
     fmi2FMUstate a = NULL, none = NULL;
     size_t size = 0;
     FINE(fmi2GetFMUstate(c, &a));
@@ -51,8 +48,7 @@ static void states(fmi2Component c)
     free(bytes);
 }
 
-static void values(fmi2Component c)
-{
+static void values(fmi2Component c) {
     fmi2ValueReference all[FMU_VALUES], strange = FMU_VALUES;
     double v[FMU_VALUES];
     int i = 0;
@@ -77,12 +73,18 @@ static void values(fmi2Component c)
     BAD(fmi2CancelStep(c));
 }
 
-int main(void)
-{
+int main(void) {
     char longest[9000];
     const char *locations[] = {
-        NULL, "", "file:", "file://", "file:///", "file:///a%2", "file:/%", "file:///C:/%41%zz",
-        longest, "http://a/b", "/a%20b/", "a/b", "C:\\a", "C:", ":", "%", longest + 8,
+        NULL,        "",
+        "file:",     "file://",
+        "file:///",  "file:///a%2",
+        "file:/%",   "file:///C:/%41%zz",
+        longest,     "http://a/b",
+        "/a%20b/",   "a/b",
+        "C:\\a",     "C:",
+        ":",         "%",
+        longest + 8,
     };
     memset(longest, 'x', sizeof longest - 1);
     memcpy(longest, "file:///", 8);

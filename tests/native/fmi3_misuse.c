@@ -11,8 +11,7 @@
 static int messages;
 
 static void listen(fmi3InstanceEnvironment environment, fmi3Status status, fmi3String category,
-                   fmi3String text)
-{
+                   fmi3String text) {
     (void)environment, (void)status, (void)category;
     messages += text[0] != 0;
 }
@@ -21,8 +20,7 @@ static void listen(fmi3InstanceEnvironment environment, fmi3Status status, fmi3S
 #define FINE(call) IS(fmi3OK, call)
 #define BAD(call) IS(fmi3Error, call)
 
-static fmi3Instance make(const char *token, const char *resources)
-{
+static fmi3Instance make(const char *token, const char *resources) {
 #if !FMU_STATES
     return fmi3InstantiateCoSimulation("one", token, resources, 0, 1, 0, 0, NULL, 0, NULL, listen,
                                        NULL);
@@ -31,8 +29,7 @@ static fmi3Instance make(const char *token, const char *resources)
 #endif
 }
 
-static void states(fmi3Instance c)
-{
+static void states(fmi3Instance c) {
     fmi3FMUState a = NULL, b = NULL, none = NULL;
     size_t size = 0;
     FINE(fmi3GetFMUState(c, &a));
@@ -67,8 +64,7 @@ static void states(fmi3Instance c)
     /* b is left to fmi3FreeInstance */
 }
 
-static void values(fmi3Instance c)
-{
+static void values(fmi3Instance c) {
     fmi3ValueReference all[FMU_VALUES], strange[] = {FMU_VALUES, 0xffffffff};
     double v[FMU_VALUES];
     fmi3Int32 i = 0;
@@ -96,8 +92,7 @@ static void values(fmi3Instance c)
     BAD(fmi3GetVariableDependencies(c, 0, NULL, NULL, NULL, NULL, 0));
 }
 
-static void run(fmi3Instance c)
-{
+static void run(fmi3Instance c) {
     double v[FMU_VALUES] = {0};
     fmi3Boolean yes;
     const fmi3ValueReference d = FMU_V_d, mass = FMU_V_mass_kg;
@@ -132,8 +127,8 @@ static void run(fmi3Instance c)
     BAD(fmi3SetTime(c, NAN));
     FINE(fmi3SetTime(c, 1));
     double seed[FMU_VALUES] = {1, 1};
-    FINE(fmi3GetDirectionalDerivative(c, der, FMU_STATES, known, FMU_V_der_x, seed, FMU_V_der_x, out,
-                                      FMU_STATES));
+    FINE(fmi3GetDirectionalDerivative(c, der, FMU_STATES, known, FMU_V_der_x, seed, FMU_V_der_x,
+                                      out, FMU_STATES));
     FINE(fmi3GetAdjointDerivative(c, der, FMU_STATES, known, FMU_V_der_x, seed, FMU_STATES, out,
                                   FMU_V_der_x));
     const fmi3ValueReference time = FMU_V_time;
@@ -163,8 +158,7 @@ static void run(fmi3Instance c)
     states(c);
 }
 
-int main(void)
-{
+int main(void) {
     char longest[5000];
     memset(longest, 'x', sizeof longest - 1);
     longest[sizeof longest - 1] = 0;

@@ -27,7 +27,7 @@
 
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
 
-/* --- bytes to numbers ---------------------------------------------------------------------------- */
+/* --- bytes to numbers --- */
 
 static const uint8_t *at, *end;
 
@@ -42,9 +42,9 @@ static double raw(void) {
 }
 
 static double special(void) {
-    static const double values[] = {NAN,     INFINITY, -INFINITY, 0.0,   -0.0,   5e-324, 1e-300,
-                                    1e300,   -1e300,   1e9,       -1e9,  1e4,    1.5,    -1.5,
-                                    1.0e-12, 1.0 / 3};
+    static const double values[] = {NAN,    INFINITY, -INFINITY, 0.0,    -0.0, 5e-324,
+                                    1e-300, 1e300,    -1e300,    1e9,    -1e9, 1e4,
+                                    1.5,    -1.5,     1.0e-12,   1.0 / 3};
     return values[byte() % 16];
 }
 
@@ -56,7 +56,7 @@ static double number(double usual, double spread) {
     return how < 0xf4 ? special() : raw();
 }
 
-/* --- the controllers ----------------------------------------------------------------------------- */
+/* --- the controllers --- */
 
 typedef struct {
     br_mpc *mpc;
@@ -73,15 +73,27 @@ static double table[ROWS][BR_PATH_COLUMNS];
 static void make_path(void) {
     for (int i = 0; i < ROWS; ++i) {
         const double angle = 2 * 3.14159265358979323846 * i / ROWS, c = cos(angle), s = sin(angle);
-        const double row[] = {RADIUS_M * c, RADIUS_M * s, 1.8, -c, -s, -RADIUS_M - 0.2, 0.2 - RADIUS_M};
+        const double row[] = {RADIUS_M * c, RADIUS_M * s,    1.8,           -c,
+                              -s,           -RADIUS_M - 0.2, 0.2 - RADIUS_M};
         memcpy(table[i], row, sizeof row);
     }
 }
 
 static const br_mpc_parameters usual = {
-    .q_position = 1, .r_duty = 5e-3, .r_delta_rate = 1e-4, .s_slack = 100, .margin_m = 0.01,
-    .d_min = -0.1, .d_max = 1, .delta_max_rad = 0.35, .delta_rate_max_radps = 5,
-    .tolerance = 1e-6, .defect_max = 0.1, .settle = 1e-4, .iterations = 3, .iterations_cold = 12,
+    .q_position = 1,
+    .r_duty = 5e-3,
+    .r_delta_rate = 1e-4,
+    .s_slack = 100,
+    .margin_m = 0.01,
+    .d_min = -0.1,
+    .d_max = 1,
+    .delta_max_rad = 0.35,
+    .delta_rate_max_radps = 5,
+    .tolerance = 1e-6,
+    .defect_max = 0.1,
+    .early_stop_tol = 1e-4,
+    .iterations = 3,
+    .iterations_cold = 12,
 };
 
 static br_mpc_parameters parameters;
@@ -109,24 +121,26 @@ static void set_path(controller *c, int count) {
     const int rows = byte() < 0xe0 ? ROWS : byte() - 64;
     const double spacing = number(2 * 3.14159265358979323846 * RADIUS_M / ROWS, 0.05);
     for (int i = 0; i < count; ++i) {
-        const br_mpc_error error = br_mpc_set_path(c[i].mpc, changed[0], rows <= ROWS ? rows : -1, spacing);
+        const br_mpc_error error =
+            br_mpc_set_path(c[i].mpc, changed[0], rows <= ROWS ? rows : -1, spacing);
         CHECK(error == BR_OK || error == BR_ERROR_PATH);
     }
 }
 
 static br_environment around;
 
-static void set_speed_limit(void) {
-    around = (br_environment){number(1, 1), number(0, 5)};
-}
+static void set_speed_limit(void) { around = (br_environment){number(1, 1), number(0, 5)}; }
 
 static void set_weights(controller *c, int count) {
     static double scales[BR_NE][BR_NZ], inputs[BR_NE][POINTS][BR_NZ], alpha[BR_NE][POINTS];
     br_mpc_gp outputs[BR_NE];
     for (int j = 0; j < BR_NE; ++j) {
         const uint8_t how = byte();
-        outputs[j] = (br_mpc_gp){how % 5, how < 0xf8 ? (how >> 2) % (POINTS + 1) : how - 0xfb, number(0, 0.1),
-                                 number(0.1, 1), scales[j], inputs[j][0], alpha[j]};
+        outputs[j] =
+            (br_mpc_gp){how % 5,        how < 0xf8 ? (how >> 2) % (POINTS + 1) : how - 0xfb,
+                        number(0, 0.1), number(0.1, 1),
+                        scales[j],      inputs[j][0],
+                        alpha[j]};
         for (int a = 0; a < BR_NZ; ++a) scales[j][a] = number(1, 0.99);
         for (int i = 0; i < POINTS; ++i) {
             for (int a = 0; a < BR_NZ; ++a) inputs[j][i][a] = number(0.3 * a - 0.1 * i, 2);
@@ -159,7 +173,8 @@ static void check_answer(const double u[BR_NU], br_mpc_status status, const br_m
     CHECK(fabs(u[1]) <= p->delta_rate_max_radps + 1e-6);
     CHECK(info->defect <= p->defect_max && info->bound <= 1e-6 && isfinite(info->stationarity));
     CHECK(isfinite(info->cost) && info->slack_max_m >= 0);
-    if (status == BR_CONVERGED) CHECK(info->stationarity <= p->tolerance && info->defect <= p->tolerance);
+    if (status == BR_CONVERGED)
+        CHECK(info->stationarity <= p->tolerance && info->defect <= p->tolerance);
 }
 
 /* One step or solve of all controllers, which must agree; the car goes where the input takes it. */
@@ -177,9 +192,11 @@ static void step(controller *c, int count, int own_reference, double budget) {
             br_mpc_reference reference[BR_N];
             CHECK(br_mpc_get_reference(c[i].mpc, reference) == BR_OK);
             (&reference[0].x)[cell] += value;
-            error = br_mpc_solve(c[i].mpc, x, before, elapsed, budget, reference, u[i], &status[i], &info[i]);
+            error = br_mpc_solve(c[i].mpc, x, before, elapsed, budget, reference, u[i], &status[i],
+                                 &info[i]);
         } else {
-            error = br_mpc_step(c[i].mpc, x, before, &around, elapsed, budget, u[i], &status[i], &info[i]);
+            error = br_mpc_step(c[i].mpc, x, before, &around, elapsed, budget, u[i], &status[i],
+                                &info[i]);
         }
         CHECK(error == BR_OK || error == BR_ERROR_NOT_READY || error == BR_ERROR_TIME ||
               error == BR_ERROR_PARAMETERS); /* of the environment */
@@ -211,7 +228,8 @@ static void predict(const controller *c) {
     for (int i = 0; i < BR_NX; ++i) from[i] = number(x[i], 0.5);
     u[0] = number(0.3, 1), u[1] = number(0, 6);
     const br_mpc_error error = br_mpc_predict(c->mpc, from, u, number(0.03, 0.07), after);
-    CHECK(error == BR_OK || error == BR_ERROR_NOT_READY || error == BR_ERROR_TIME || error == BR_ERROR_STATE);
+    CHECK(error == BR_OK || error == BR_ERROR_NOT_READY || error == BR_ERROR_TIME ||
+          error == BR_ERROR_STATE);
     if (error) return;
     for (int i = 0; i < BR_NX; ++i) CHECK(isfinite(after[i]));
 }
@@ -223,29 +241,51 @@ static void evaluate(const controller *c) {
     CHECK(br_mpc_evaluate(c->mpc, v, lambda, f, jacobian, hessian) == BR_OK);
 }
 
-/* --- one input ----------------------------------------------------------------------------------- */
+/* --- one input --- */
 
 static void call(controller *c, int count) {
     const int limited = count == 1; /* budgets only without the second controller */
     const uint8_t what = byte();
     switch (what % 16) {
-    case 0: set_parameters(c, count); break;
-    case 1: set_path(c, count); break;
-    case 2: set_weights(c, count); break;
+    case 0:
+        set_parameters(c, count);
+        break;
+    case 1:
+        set_path(c, count);
+        break;
+    case 2:
+        set_weights(c, count);
+        break;
     case 3:
         if (what < 0x40)
             for (int i = 0; i < count; ++i) br_mpc_reset(c[i].mpc);
         break;
     case 4:
-        if (what & 0x40) set_speed_limit();
-        else c->tick = number(1e-4, 1e-4);
+        if (what & 0x40)
+            set_speed_limit();
+        else
+            c->tick = number(1e-4, 1e-4);
         break;
-    case 5: CHECK(br_mpc_set_clock(c->mpc, what & 0x40 ? ticking : NULL, c) == BR_OK); break;
-    case 6: case 7: predict(c); break;
-    case 8: evaluate(c); break;
-    case 9: case 10: case 11: prepare(c, limited ? number(3e-3, 3e-3) : 0); break;
-    case 12: step(c, count, 1, limited ? number(0, 3e-3) : 0); break;
-    default: step(c, count, 0, limited ? number(3e-3, 3e-3) : 0);
+    case 5:
+        CHECK(br_mpc_set_clock(c->mpc, what & 0x40 ? ticking : NULL, c) == BR_OK);
+        break;
+    case 6:
+    case 7:
+        predict(c);
+        break;
+    case 8:
+        evaluate(c);
+        break;
+    case 9:
+    case 10:
+    case 11:
+        prepare(c, limited ? number(3e-3, 3e-3) : 0);
+        break;
+    case 12:
+        step(c, count, 1, limited ? number(0, 3e-3) : 0);
+        break;
+    default:
+        step(c, count, 0, limited ? number(3e-3, 3e-3) : 0);
     }
 }
 
@@ -269,7 +309,8 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
     if (first < 0xf0) /* else the calls must do with what they find */
         for (int i = 0; i < count; ++i) {
             CHECK(br_mpc_set_parameters(c[i].mpc, &usual) == BR_OK);
-            CHECK(br_mpc_set_path(c[i].mpc, table[0], ROWS, 2 * 3.14159265358979323846 * RADIUS_M / ROWS) == BR_OK);
+            CHECK(br_mpc_set_path(c[i].mpc, table[0], ROWS,
+                                  2 * 3.14159265358979323846 * RADIUS_M / ROWS) == BR_OK);
             CHECK(br_mpc_set_clock(c[i].mpc, ticking, &c[i]) == BR_OK);
         }
     for (int calls = 0; calls < 24 && at < end; ++calls) call(c, count);

@@ -1,7 +1,7 @@
 /* Drives the fuzz target without clang: mutation, guided by coverage where gcc gives it.
  *
- *   fuzz INPUTS [SEED [CRASH]]     so many inputs from the seed; CRASH: where to leave a failing one
- *   fuzz --replay FILE             that input once
+ *   fuzz INPUTS [SEED [CRASH]]     so many inputs from the seed; CRASH: where to leave a failing
+ * one fuzz --replay FILE             that input once
  *
  * Compile the code under test with -fsanitize-coverage=trace-pc, this file without. Inputs that
  * reach a new part of the code become parents of others. The same seed gives the same inputs.
@@ -34,7 +34,8 @@ static const char *crash_file;
 
 void __sanitizer_cov_trace_pc(void) {
     static uintptr_t before;
-    const uintptr_t here = (uintptr_t)__builtin_return_address(0) - (uintptr_t)&LLVMFuzzerTestOneInput;
+    const uintptr_t here =
+        (uintptr_t)__builtin_return_address(0) - (uintptr_t)&LLVMFuzzerTestOneInput;
     uint8_t *edge = &seen[(here ^ before) % MAP];
     found += !*edge;
     *edge = 1;
@@ -73,10 +74,18 @@ static void random_bytes(size_t from, size_t to) {
 static void mutate(const input *other) {
     const size_t place = below(trial.size), length = below(trial.size - place);
     switch (below(6)) {
-    case 0: trial.bytes[place] ^= (uint8_t)(1u << below(8)); break;
-    case 1: trial.bytes[place] = (uint8_t)random_number(); break;
-    case 2: random_bytes(place, place + length % 16); break;
-    case 3: random_bytes(trial.size, trial.size + below(LONGEST - trial.size)); break;
+    case 0:
+        trial.bytes[place] ^= (uint8_t)(1u << below(8));
+        break;
+    case 1:
+        trial.bytes[place] = (uint8_t)random_number();
+        break;
+    case 2:
+        random_bytes(place, place + length % 16);
+        break;
+    case 3:
+        random_bytes(trial.size, trial.size + below(LONGEST - trial.size));
+        break;
     case 4: /* leave out a piece */
         memmove(trial.bytes + place, trial.bytes + place + length, trial.size - place - length);
         trial.size -= length;

@@ -35,10 +35,22 @@ static void forbidden(const char *what) {
     fprintf(stderr, "%s called in the control loop\n", what);
     _Exit(3);
 }
-void *__wrap_malloc(size_t size) { forbidden("malloc"); return __real_malloc(size); }
-void *__wrap_calloc(size_t n, size_t size) { forbidden("calloc"); return __real_calloc(n, size); }
-void *__wrap_realloc(void *p, size_t size) { forbidden("realloc"); return __real_realloc(p, size); }
-void __wrap_free(void *p) { forbidden("free"); __real_free(p); }
+void *__wrap_malloc(size_t size) {
+    forbidden("malloc");
+    return __real_malloc(size);
+}
+void *__wrap_calloc(size_t n, size_t size) {
+    forbidden("calloc");
+    return __real_calloc(n, size);
+}
+void *__wrap_realloc(void *p, size_t size) {
+    forbidden("realloc");
+    return __real_realloc(p, size);
+}
+void __wrap_free(void *p) {
+    forbidden("free");
+    __real_free(p);
+}
 #endif
 
 static const double *cursor;
@@ -97,7 +109,8 @@ static void check_not_ready(br_mpc *mpc, const br_mpc_parameters *p) {
     CHECK(br_mpc_predict(mpc, x, u, 0, x) == BR_ERROR_NOT_READY);
     CHECK(br_mpc_set_parameters(mpc, p) == BR_OK);
     CHECK(br_mpc_prepare(mpc, BR_TS, 0) == BR_OK); /* no plan yet: nothing to do */
-    CHECK(br_mpc_step(mpc, x, none, NULL, BR_TS, 0, u, &status, NULL) == BR_ERROR_NOT_READY); /* no path */
+    CHECK(br_mpc_step(mpc, x, none, NULL, BR_TS, 0, u, &status, NULL) ==
+          BR_ERROR_NOT_READY); /* no path */
     CHECK(u[0] == 7 && u[1] == 7);
 }
 
@@ -253,10 +266,13 @@ int main(int argc, char **argv) {
         const double budget = second_half ? (i % 6) * 1e-4 : 0;
         interlude(mpc, i, second_half, weights, none);
         if (second_half && i % 9 == 8) spoiled_solve(mpc, x, d, i);
-        const br_mpc_error error = br_mpc_step(mpc, x, (double[BR_NU]){d}, NULL, elapsed, budget, u, &status, &info);
+        const br_mpc_error error =
+            br_mpc_step(mpc, x, (double[BR_NU]){d}, NULL, elapsed, budget, u, &status, &info);
         predict(mpc, x, u, (i % 10) * 0.01);
-        if (status > BR_ACCEPTABLE) CHECK(u[0] == -9 && u[1] == -9);
-        else CHECK(isfinite(u[0]) && isfinite(u[1]) && info.defect <= parameters.defect_max);
+        if (status > BR_ACCEPTABLE)
+            CHECK(u[0] == -9 && u[1] == -9);
+        else
+            CHECK(isfinite(u[0]) && isfinite(u[1]) && info.defect <= parameters.defect_max);
         const double row[] = {error, status, u[0], u[1]};
         memcpy(&results[4 * i], row, sizeof row);
     }

@@ -35,7 +35,8 @@ static void fill(set *s, int number) {
         s->alpha[i] = 1e-3 * number;
     }
     for (int j = 0; j < BR_NE; ++j)
-        s->outputs[j] = (br_mpc_gp){BR_KERNEL_RBF, POINTS, number, 1, SCALES, &s->inputs[0][0], s->alpha};
+        s->outputs[j] =
+            (br_mpc_gp){BR_KERNEL_RBF, POINTS, number, 1, SCALES, &s->inputs[0][0], s->alpha};
 }
 
 /* Number of the set in use. */
@@ -44,7 +45,8 @@ static int in_use(const double nominal[BR_NX]) {
     CHECK(br_mpc_evaluate(mpc, V, lambda, x, jacobian, hessian) == BR_OK);
     const double size = 1 + 1e-3 * POINTS;
     const int number = (int)lround((x[3] - nominal[3]) / size);
-    for (int i = 3; i < 6; ++i) CHECK(fabs(x[i] - nominal[i] - number * size) < 1e-6 * (1 + number));
+    for (int i = 3; i < 6; ++i)
+        CHECK(fabs(x[i] - nominal[i] - number * size) < 1e-6 * (1 + number));
     return number;
 }
 
@@ -95,8 +97,8 @@ static int control(const double nominal[BR_NX]) {
 int main(void) {
     void *memory = aligned_alloc(64, (br_mpc_memory_size() + 63) / 64 * 64);
     CHECK(memory && br_mpc_init(memory, br_mpc_memory_size(), &mpc) == BR_OK);
-    const br_mpc_parameters parameters = {1, .002, 3e-5, 100, .01, -.1, 1, .35, 5,
-                                          1e-6, .1, 1e-4, 3, 30};
+    const br_mpc_parameters parameters = {1,   .002, 3e-5, 100, .01,  -.1, 1,
+                                          .35, 5,    1e-6, .1,  1e-4, 3,   30};
     CHECK(br_mpc_set_parameters(mpc, &parameters) == BR_OK);
     make_circle();
     CHECK(br_mpc_set_path(mpc, &table[0][0], ROWS, 6.283185307179586 / ROWS) == BR_OK);

@@ -17,7 +17,7 @@ from bayesrace.gp.weights import GpWeights, encode_weights
 from controller.gate.settings import GateSettings
 from controller.gate.store import Accepted
 from controller.latecomer import encode_answer
-from experiments.learn.publishing import Answer
+from experiments.learn.publishing import in_words
 from tests.network.cars import Course
 from tests.programs import until
 from tests.takeover.bench import bench
@@ -307,7 +307,7 @@ def test_a_full_disk_does_not_stop_a_takeover(
         resource.prlimit(made.gatekeeper, resource.RLIMIT_FSIZE, (1000, hard))
         reply = made.accept(again)
         assert "; not kept: store" in reply.text
-        assert ", but not kept: store" in Answer.of(reply).words
+        assert ", but not kept: store" in in_words(reply)
         assert "File too large" in reply.text
         assert (made.version, made.kept()) == (again.version, [])
         assert "File too large" in made.courier.text

@@ -164,7 +164,7 @@ int br_files_load(br_mpc *mpc, const char *folder, const char *identity, char *t
     return failed ? -1 : 0;
 }
 
-/* --- settings --------------------------------------------------------------------------------- */
+/* --- settings --- */
 
 typedef struct {
     const char *name;
@@ -208,9 +208,8 @@ int br_files_settings(const char *folder, br_mpc_parameters *parameters, br_driv
 #define COUNT_OF_PARAMETERS(field) {.name = #field, .whole = &p->field},
 #define OF_DRIVING(field) {.name = #field, .number = &d->field},
 #define COUNT_OF_DRIVING(field) {.name = #field, .whole = &d->field},
-    setting settings[] = {BR_PARAMETERS(OF_PARAMETERS)
-                              BR_SOLVER_FIELDS(OF_PARAMETERS, COUNT_OF_PARAMETERS)
-                                  BR_DRIVING_FIELDS(OF_DRIVING, COUNT_OF_DRIVING)};
+    setting settings[] = {BR_PARAMETERS(OF_PARAMETERS) BR_SOLVER_FIELDS(
+        OF_PARAMETERS, COUNT_OF_PARAMETERS) BR_DRIVING_FIELDS(OF_DRIVING, COUNT_OF_DRIVING)};
     const int count = sizeof settings / sizeof settings[0];
     FILE *file = opened(folder, r.name);
     if (!file) return wrong(&r, "is missing or cannot be read", ANEW);

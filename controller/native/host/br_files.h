@@ -15,9 +15,9 @@
  * BR_NE outputs kernel u32, points n u32, offset f64, scale f64, BR_NZ length scales f64, inputs
  * n x BR_NZ f64, alpha n f64, see br_mpc_gp.
  *
- * settings.txt: a line for each member of br_mpc_parameters and br_driving, its name and its number,
- * or its numbers, in the C locale; what comes after # is a comment. The limits of the inputs are the
- * parameters'.
+ * settings.txt: a line for each member of br_mpc_parameters and br_driving, its name and its
+ * number, or its numbers, in the C locale; what comes after # is a comment. The limits of the
+ * inputs are the parameters'.
  *
  * Whatever a file holds, nothing is read beyond it.
  */

@@ -1,7 +1,7 @@
 /* Turning round: what the planner does where the car is slow and points away from its line.
  *
  * A horizon is too short for a turn to pay: whichever way the car sets off, it first gets farther
- * from the reference, and the optimal plan is to stand still for ever. So the reference is laid
+ * from the reference, and the optimal plan is to stand still for ever. So the reference runs
  * along the turn itself: where the corrected model goes when it steers to one side at a walking
  * pace until it faces the line again. The track's edges do not count on the way; the car may
  * have been across one already, and its turning circle can be wider than the track. All numbers
@@ -15,7 +15,8 @@
 
 /* Angle to the point, seen from the car; positive left. */
 static double bearing(const double x[BR_NX], const double to[2]) {
-    return remainder(atan2(to[1] - x[BR_INDEX_Y], to[0] - x[BR_INDEX_X]) - x[BR_INDEX_PSI], 2 * M_PI);
+    return remainder(atan2(to[1] - x[BR_INDEX_Y], to[0] - x[BR_INDEX_X]) - x[BR_INDEX_PSI],
+                     2 * M_PI);
 }
 
 /* The side to turn to: the nearer one, or, with the line behind, the one with more room. */
@@ -23,11 +24,13 @@ static double side(const double x[BR_NX], double away, const br_mpc_reference *h
     if (fabs(away) < BR_TURN_BEHIND_RAD) return copysign(1, away);
     const double along = here->normal_x * x[BR_INDEX_X] + here->normal_y * x[BR_INDEX_Y];
     const double room_left = here->upper - along, room_right = along - here->lower;
-    const double facing = here->normal_x * -sin(x[BR_INDEX_PSI]) + here->normal_y * cos(x[BR_INDEX_PSI]);
+    const double facing =
+        here->normal_x * -sin(x[BR_INDEX_PSI]) + here->normal_y * cos(x[BR_INDEX_PSI]);
     return copysign(1, (room_left - room_right) * facing);
 }
 
-/* Angle still to be turned by; below zero where the car has turned too far, by a quarter at most. */
+/* Angle still to be turned by; below zero where the car has turned too far, by a quarter at most.
+ */
 static double remaining(double turn, double away) {
     const double angle = turn * away;
     return angle < -M_PI / 2 ? angle + 2 * M_PI : angle;
@@ -51,13 +54,14 @@ static void decide(br_mpc *mpc, const double target[2]) {
     } else if (mpc->turn) {
         if (remaining(mpc->turn, away) < BR_TURN_FACED_RAD) mpc->turn = 0;
     } else if (fabs(away) > BR_TURN_AWAY_RAD &&
-               fabs(remainder(away - bearing_on_line(&mpc->path, target), 2 * M_PI)) > BR_TURN_AWAY_RAD) {
+               fabs(remainder(away - bearing_on_line(&mpc->path, target), 2 * M_PI)) >
+                   BR_TURN_AWAY_RAD) {
         mpc->turn = side(x, away, &mpc->reference[0]);
         mpc->warm = 0;
     }
 }
 
-void br_turn(br_mpc *mpc) {
+void br_turnaround(br_mpc *mpc) {
     double target[2], x[BR_NX], next[BR_NX];
     if (!mpc->turn && fabs(mpc->x0[BR_INDEX_VX]) >= BR_TURN_SLOW_MPS) return;
     br_path_ahead(&mpc->path, BR_TURN_AHEAD_M, target);
@@ -72,7 +76,8 @@ void br_turn(br_mpc *mpc) {
         const double rate = (steering - x[BR_INDEX_DELTA]) / BR_TS;
         double *u = mpc->turn_u[k];
         u[BR_INDEX_DUTY] = fmin(fmax(BR_TURN_THROTTLE_SPM * (pace - x[BR_INDEX_VX]), 0), p->d_max);
-        u[BR_INDEX_DELTA_RATE] = fmin(fmax(rate, -p->delta_rate_max_radps), p->delta_rate_max_radps);
+        u[BR_INDEX_DELTA_RATE] =
+            fmin(fmax(rate, -p->delta_rate_max_radps), p->delta_rate_max_radps);
         br_stage_advance(&mpc->gp[mpc->gp_in_use], x, u, BR_TS, next);
         memcpy(x, next, sizeof x);
         br_mpc_reference *reference = &mpc->reference[k];

@@ -1,0 +1,151 @@
+"""Starting and following runs of one car from outside."""
+
+import time
+from collections.abc import Callable, Collection
+from typing import Any
+
+from bayesrace.errors import InputError
+from bayesrace.messages import (
+    EVENT,
+    RUN,
+    STATUS,
+    STOP,
+    Event,
+    Reply,
+    RunRequest,
+    Status,
+    StatusRequest,
+    StopRequest,
+)
+from bayesrace.transport.client import ask, count_processes, send_rollback, send_weights
+from bayesrace.transport.inbox import Inbox, Item, Kind
+
+__all__ = ["Director", "RefusedError"]
+
+
+class RefusedError(InputError):
+    """A process has refused a request."""
+
+    def __init__(self, what: str, reply: Reply) -> None:
+        super().__init__(f"{what} refused: {reply.text}")
+        self.reply = reply
+        """Its ``data`` has the numbers of the text."""
+
+
+class Director:
+    """Starts and follows runs of one car; for one thread."""
+
+    def __init__(self, session: Any, car: str) -> None:
+        self._session = session
+        self._car = car
+        self.inbox = Inbox(session, car)
+        self.inbox.subscribe(EVENT)
+        self.inbox.watch("plant")
+        self.inbox.watch("controller")
+        # The plant ends a run whose director is away for too long.
+        self.inbox.announce("director")
+
+    def wait_for(self, sources: Collection[str], timeout_s: float) -> None:
+        """Wait until these processes are present and know this one's subscriptions."""
+        deadline = time.monotonic() + timeout_s
+        with self.inbox.receive_signals():
+            while missing := set(sources) - self.inbox.alive:
+                left_s = deadline - time.monotonic()
+                if left_s <= 0:
+                    raise InputError(
+                        f"no {' and no '.join(sorted(missing))} for car '{self._car}' within "
+                        f"{timeout_s:g} s; start it, or check the endpoints"
+                    )
+                _raise_on_signal(self.inbox.get(left_s))
+        # A process that answers a request knows all that was declared before it.
+        for source in sources:
+            self.status(source)
+
+    def wait_until_gone(self, source: str, timeout_s: float) -> None:
+        """Wait until the liveliness token of a process that has ended is gone."""
+        deadline = time.monotonic() + timeout_s
+        while source in self.inbox.alive and (left_s := deadline - time.monotonic()) > 0:
+            self.inbox.get(left_s)
+
+    def status(self, source: str) -> Status:
+        """The process's status."""
+        request = StatusRequest(0, time.monotonic_ns())
+        return ask(self._session, STATUS, self._car, request, source)
+
+    def check_alone(self) -> None:
+        """InputError if several plants or controllers have this name.
+
+        Their messages cannot be told apart: each would drive, or be driven, now and then.
+        """
+        for source in ("plant", "controller"):
+            if (count := count_processes(self._session, self._car, source)) > 1:
+                raise InputError(
+                    f"{count} processes are the {source} of car '{self._car}'; end all but one, or "
+                    "give each car a name of its own (--name)"
+                )
+
+    def start(self, request: RunRequest) -> Reply:
+        """Start a run; InputError with the plant's reason if it refuses."""
+        return _accepted("run", ask(self._session, RUN, self._car, request))
+
+    def stop(self, text: str) -> Reply:
+        """End the current run."""
+        return ask(self._session, STOP, self._car, StopRequest(0, time.monotonic_ns(), text))
+
+    def send_weights(self, data: bytes) -> Reply:
+        """:func:`send_weights`; RefusedError with the reasons if they are refused."""
+        return _accepted("weights", send_weights(self._session, self._car, data))
+
+    def rollback(self, text: str) -> Reply:
+        """:func:`send_rollback`; RefusedError without previous weights."""
+        return _accepted("rollback", send_rollback(self._session, self._car, text))
+
+    def wait_for_end(
+        self,
+        run: int,
+        timeout_s: float,
+        absence_s: float = 1.0,
+        trouble: Callable[[], str] = str,
+    ) -> Event:
+        """The ``run_ended`` event of a run.
+
+        In lockstep the plant ends the run itself when the controller disappears; in real time it
+        brakes and goes on. A process, or the link to it, may be away for ``absence_s``.
+        ``trouble``: a reason to stop waiting, such as a log that cannot be written; empty without.
+        Raises InputError for such a reason, after an absence or the timeout; KeyboardInterrupt on a
+        signal.
+        """
+        deadline = last = time.monotonic() + timeout_s
+        lost: set[str] = set()
+        with self.inbox.receive_signals():
+            while (left_s := deadline - time.monotonic()) > 0:
+                item = self.inbox.get(min(left_s, 1.0))
+                if why_not := trouble():
+                    raise InputError(f"run {run} is aborted: {why_not}")
+                _raise_on_signal(item)
+                if item is None:
+                    continue
+                if item.kind is Kind.GONE:
+                    lost.add(item.name)
+                    deadline = min(deadline, time.monotonic() + absence_s)
+                elif item.kind is Kind.ALIVE:
+                    lost.discard(item.name)
+                    deadline = deadline if lost else last
+                event = item.value
+                if isinstance(event, Event) and (event.run, event.kind) == (run, "run_ended"):
+                    return event
+        if lost:
+            gone = " and ".join(f"the {one} of car '{self._car}' vanished" for one in sorted(lost))
+            raise InputError(f"{gone} during run {run}")
+        raise InputError(f"run {run} of car '{self._car}' did not end in {timeout_s:g} s")
+
+
+def _accepted(what: str, reply: Reply) -> Reply:
+    if not reply.accepted:
+        raise RefusedError(what, reply)
+    return reply
+
+
+def _raise_on_signal(item: Item | None) -> None:
+    if item is not None and item.kind is Kind.SIGNAL:
+        raise KeyboardInterrupt

@@ -1,0 +1,108 @@
+"""The posterior of one output's GP with given hyperparameters.
+
+With K the covariance of the training samples, noise included, and k that with a new point
+(Rasmussen and Williams, "Gaussian Processes for Machine Learning", eq. 2.25 and 2.26)
+
+    alpha = K^-1 y,    mean = k' alpha,    variance = s^2 + noise - k' K^-1 k.
+
+A fold B of the training samples, predicted from all others (section 5.4.2, blockwise):
+
+    y_B - mean_B = C alpha_B,    covariance_B = C,    C = ([K^-1]_BB)^-1.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
+
+from bayesrace.arrays import Floats, Rows
+from bayesrace.errors import InputError
+from bayesrace.gp.expression import kernel_matrix
+from learning.scores import PredictionErrors
+
+__all__ = ["Covariance", "Posterior", "regressor"]
+
+_NU: Final = {"matern05": 0.5, "matern15": 1.5, "matern25": 2.5}
+
+_SINGULAR: Final = "GP: the covariance of the samples is singular; train without repeated samples"
+
+_AT_ONCE: Final = 4096
+"""Points predicted together: their covariances with all training samples are in memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class Covariance:
+    """s^2 k(r) plus noise: kind of kernel, both variances, length scales (6,)."""
+
+    kind: str
+    signal: float
+    lengths: Floats
+    noise: float
+
+    @classmethod
+    def of(cls, kind: str, theta: Floats) -> "Covariance":
+        """From theta = log [signal variance, length scales (6), noise variance]."""
+        signal, *lengths, noise = np.exp(theta)
+        return cls(kind, float(signal), np.array(lengths), float(noise))
+
+    def between(self, a: Floats, b: Floats) -> Floats:
+        """Covariances (n, m) of the noise-free outputs at features ``a`` (n, 6), ``b`` (m, 6)."""
+        return self.signal * kernel_matrix(self.kind, a, b, self.lengths)
+
+
+def regressor(covariance: Covariance, z: Floats, y: Floats) -> GaussianProcessRegressor:
+    """scikit-learn's GP with these hyperparameters, fitted to ``z`` (n, 6) and ``y`` (n,).
+
+    The weights of a controller come from it. InputError if the covariance is singular.
+    """
+    kind, lengths = covariance.kind, covariance.lengths
+    correlation: Any = RBF(lengths) if kind == "rbf" else Matern(lengths, nu=_NU[kind])
+    kernel = ConstantKernel(covariance.signal) * correlation + WhiteKernel(covariance.noise)
+    try:
+        return GaussianProcessRegressor(kernel, alpha=0.0, optimizer=None).fit(z, y)
+    except np.linalg.LinAlgError as error:
+        raise InputError(_SINGULAR) from error
+
+
+class Posterior:
+    """The GP after seeing targets ``y`` (n,) at features ``z`` (n, 6); n may be 0.
+
+    InputError if the covariance of the samples is singular.
+    """
+
+    def __init__(self, covariance: Covariance, z: Floats, y: Floats) -> None:
+        self._covariance, self._z = covariance, z
+        matrix = covariance.between(z, z)
+        matrix[np.diag_indices_from(matrix)] += covariance.noise
+        try:
+            self._factor = cho_factor(matrix, lower=True, overwrite_a=True)
+        except np.linalg.LinAlgError as error:
+            raise InputError(_SINGULAR) from error
+        self.alpha: Floats = cho_solve(self._factor, y)
+        """K^-1 y, (n,)."""
+
+    def predict(self, z: Floats) -> tuple[Floats, Floats]:
+        """Mean and standard deviation, noise included, each (m,), at features ``z`` (m, 6)."""
+        mean, sigma = np.empty(len(z)), np.empty(len(z))
+        noise, prior = self._covariance.noise, self._covariance.signal + self._covariance.noise
+        for begin in range(0, len(z), _AT_ONCE):
+            part = slice(begin, begin + _AT_ONCE)
+            cross = self._covariance.between(self._z, z[part])
+            mean[part] = self.alpha @ cross
+            root = solve_triangular(self._factor[0], cross, lower=True, overwrite_b=True)
+            sigma[part] = np.sqrt(np.maximum(prior - np.einsum("ij,ij->j", root, root), noise))
+        return mean, sigma
+
+    def held_out(self, folds: Rows) -> PredictionErrors:
+        """Errors at the training samples, each predicted without its fold of ``folds`` (n,)."""
+        inverse = cho_solve(self._factor, np.eye(len(folds)))
+        error, sigma = np.empty(len(folds)), np.empty(len(folds))
+        for fold in np.unique(folds):
+            rows = np.flatnonzero(folds == fold)
+            covariance = np.linalg.inv(inverse[np.ix_(rows, rows)])
+            error[rows] = covariance @ self.alpha[rows]
+            sigma[rows] = np.sqrt(np.maximum(np.diag(covariance), self._covariance.noise))
+        return PredictionErrors(error, sigma)

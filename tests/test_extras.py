@@ -1,0 +1,55 @@
+"""A controller host needs few packages: the controller drives without any other."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from bayesrace.vehicles import DEFAULT_CAR
+from experiments.drive import RunPlan
+from experiments.preparation import prepare
+from experiments.progress import stages_on
+from experiments.settings import PreparationSettings
+from experiments.system import started_system
+from tests.command_line import Cli, refused
+from tests.programs import ROOT, peanut
+
+NEEDED = {"eclipse-zenoh", "msgpack", "numpy", "pydantic", "typer"}
+NOT_NEEDED = {"casadi", "fmpy", "jinja2", "matplotlib", "mcap", "pint", "scipy"}
+
+
+@pytest.mark.check
+@pytest.mark.unmeasured
+@pytest.mark.wall_clock
+def test_the_controller_drives_with_its_own_extra_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    python = str(tmp_path / "env" / "bin" / "python")
+    subprocess.run([sys.executable, "-m", "venv", tmp_path / "env"], check=True)
+    install = [python, "-m", "pip", "install", "--quiet", "--no-compile", "-c", "constraints.txt"]
+    subprocess.run([*install, "hatchling", "editables"], cwd=ROOT, check=True)
+    project = ["--no-build-isolation", "--editable", f"{ROOT}[controller]"]
+    subprocess.run([*install, *project], cwd=ROOT, check=True)
+    listed = subprocess.run(
+        [python, "-m", "pip", "list", "--format", "json"], capture_output=True, check=True
+    )
+    installed = {package["name"].lower() for package in json.loads(listed.stdout)}
+    assert installed >= NEEDED
+    assert not installed & NOT_NEEDED
+    with stages_on(Console(quiet=True)) as stages:
+        files = prepare(PreparationSettings(), (str(peanut(tmp_path / "peanut.csv")),), stages)
+    with started_system(DEFAULT_CAR, tmp_path) as system:
+        monkeypatch.setattr("experiments.processes.RUN_MODULE", (python, "-P", "-m"))
+        with system.controller(files.arguments):
+            end = system.drive(files.course.track, RunPlan(1, "bayesrace", 1, 20.0, lockstep=True))
+    assert end.data["reason"] == "laps"
+
+
+def test_a_missing_package_is_named_with_the_extra_that_brings_it(
+    cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "fmpy", None)
+    refused(cli("fmu", "inspect", "car.fmu"), "fmpy", "bayesrace[fmu]")
