@@ -12,21 +12,17 @@
 #define NX 7
 
 /* Calls a generated function, which cannot fail, on its arguments and its one result. */
-#define EVALUATE(function, result, ...)                                                            \
-    do {                                                                                           \
-        const double *arg[function##_SZ_ARG] = {__VA_ARGS__};                                      \
-        double *res[function##_SZ_RES] = {result}, w[function##_SZ_W + 1];                         \
-        int iw[function##_SZ_IW + 1];                                                              \
-        function(arg, res, iw, w, 0);                                                              \
+#define EVALUATE(function, result, ...)                                    \
+    do {                                                                   \
+        const double *arg[function##_SZ_ARG] = {__VA_ARGS__};              \
+        double *res[function##_SZ_RES] = {result}, w[function##_SZ_W + 1]; \
+        int iw[function##_SZ_IW + 1];                                      \
+        function(arg, res, iw, w, 0);                                      \
     } while (0)
 
-size_t fmu_model_size(void) {
-    return 0;
-}
+size_t fmu_model_size(void) { return 0; }
 
-bool fmu_model_create(fmu_instance *car) {
-    return true;
-}
+bool fmu_model_create(fmu_instance *car) { return true; }
 
 #if !FMU_STATES
 
@@ -40,13 +36,9 @@ bool fmu_model_initialise(fmu_instance *car) {
 }
 
 /* The first of two equal values, as in Python: only then signed zeros agree, too. */
-static double least(double a, double b) {
-    return b < a ? b : a;
-}
+static double least(double a, double b) { return b < a ? b : a; }
 
-static double most(double a, double b) {
-    return b > a ? b : a;
-}
+static double most(double a, double b) { return b > a ? b : a; }
 
 static double clipped(double value, double low, double high) {
     return least(most(value, low), high);
@@ -79,8 +71,10 @@ bool fmu_model_step(fmu_instance *car, double h) {
     x[6] = clipped(v[FMU_V_delta] + h * u[1], -angle, angle); /* without rounding of steps */
     for (int i = 0; i < NX; i++)
         if (!isfinite(x[i]))
-            return fmu_refuse(car, "the state after the step from %.9g s is not finite; the step "
-                                   "is undone", v[FMU_V_time]);
+            return fmu_refuse(car,
+                              "the state after the step from %.9g s is not finite; the step "
+                              "is undone",
+                              v[FMU_V_time]);
     memcpy(&v[FMU_V_x], x, sizeof x);
     v[FMU_V_d_applied] = u[0];
     v[FMU_V_delta_rate_applied] = u[1];
@@ -92,9 +86,7 @@ bool fmu_model_step(fmu_instance *car, double h) {
 /* The equations take states, inputs and parameters as one vector, as the values begin. */
 #define KNOWN FMU_V_der_x
 
-bool fmu_model_initialise(fmu_instance *car) {
-    return true;
-}
+bool fmu_model_initialise(fmu_instance *car) { return true; }
 
 void fmu_model_derivatives(const fmu_instance *car, double *dx) {
     EVALUATE(car_rates, dx, car->value);

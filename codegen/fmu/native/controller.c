@@ -30,8 +30,8 @@ size_t fmu_model_size(void) {
 bool fmu_model_create(fmu_instance *instance) {
     controller *c = instance->model;
     char text[256];
-    const br_mpc_error error = br_mpc_init((char *)c + ALIGNED(sizeof *c), br_mpc_memory_size(),
-                                           &c->mpc);
+    const br_mpc_error error =
+        br_mpc_init((char *)c + ALIGNED(sizeof *c), br_mpc_memory_size(), &c->mpc);
     if (error) return fmu_refuse(instance, "controller: %s", br_mpc_error_text(error));
     if (!instance->resources)
         return fmu_refuse(instance, "controller: the importer names no resources folder, which "
@@ -90,8 +90,7 @@ bool fmu_model_initialise(fmu_instance *instance) {
 static bool due(controller *c, double time_s, double period_s) {
     const double early = 1e-6 * period_s;
     if (time_s < c->next_s - early) return false;
-    if (period_s > 0)
-        c->next_s += period_s * (floor((time_s + early - c->next_s) / period_s) + 1);
+    if (period_s > 0) c->next_s += period_s * (floor((time_s + early - c->next_s) / period_s) + 1);
     return true;
 }
 
@@ -111,9 +110,7 @@ static br_measured measured(fmu_instance *instance) {
     return state;
 }
 
-static double known(double value) {
-    return isfinite(value) ? value : -1;
-}
+static double known(double value) { return isfinite(value) ? value : -1; }
 
 static void set_outputs(fmu_instance *instance, const br_decision *decision) {
     static const br_mpc_info nothing;

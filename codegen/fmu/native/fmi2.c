@@ -5,9 +5,7 @@
 
 #include "fmu.h"
 
-const char *fmi2GetTypesPlatform(void) {
-    return fmi2TypesPlatform;
-}
+const char *fmi2GetTypesPlatform(void) { return fmi2TypesPlatform; }
 
 /* Some importers take the text for a printf format, others print it as it is. */
 void fmu_report(const fmu_instance *instance, const char *text) {
@@ -39,8 +37,8 @@ char *fmu_folder(char *location) {
     char *end = location;
     for (; *uri; uri++) {
         const char digits[3] = {uri[1], uri[1] ? uri[2] : 0, 0};
-        const bool coded = *uri == '%' && isxdigit((unsigned char)digits[0])
-                           && isxdigit((unsigned char)digits[1]);
+        const bool coded =
+            *uri == '%' && isxdigit((unsigned char)digits[0]) && isxdigit((unsigned char)digits[1]);
         *end++ = coded ? (char)strtoul(digits, NULL, 16) : *uri;
         if (coded) uri += 2;
     }
@@ -90,9 +88,9 @@ fmi2Status fmi2GetBooleanStatus(fmi2Component c, const fmi2StatusKind kind, fmi2
 }
 
 /* Only for steps that go on in the background, which these FMUs never make. */
-#define STATUS(function, type)                                                                     \
-    fmi2Status function(fmi2Component c, const fmi2StatusKind kind, type *value) {                 \
-        return c ? fmi2Discard : fmi2Error;                                                        \
+#define STATUS(function, type)                                                     \
+    fmi2Status function(fmi2Component c, const fmi2StatusKind kind, type *value) { \
+        return c ? fmi2Discard : fmi2Error;                                        \
     }
 
 STATUS(fmi2GetStatus, fmi2Status)
@@ -101,9 +99,9 @@ STATUS(fmi2GetStringStatus, fmi2String)
 
 /* ---- what these FMUs do not have ---- */
 
-#define ABSENT(function, ...) /* an error unless it concerns no variable */                        \
-    fmi2Status function(fmi2Component c, const fmi2ValueReference vr[], size_t n, __VA_ARGS__) {   \
-        return fmu_absent(c, n, __func__);                                                         \
+#define ABSENT(function, ...) /* an error unless it concerns no variable */                      \
+    fmi2Status function(fmi2Component c, const fmi2ValueReference vr[], size_t n, __VA_ARGS__) { \
+        return fmu_absent(c, n, __func__);                                                       \
     }
 
 ABSENT(fmi2GetString, fmi2String value[])
@@ -113,6 +111,4 @@ ABSENT(fmi2GetRealOutputDerivatives, const fmi2Integer order[], fmi2Real value[]
 ABSENT(fmi2GetDirectionalDerivative, const fmi2ValueReference known[], size_t n_known,
        const fmi2Real seed[], fmi2Real out[])
 
-fmi2Status fmi2CancelStep(fmi2Component c) {
-    return fmu_absent(c, 1, __func__);
-}
+fmi2Status fmi2CancelStep(fmi2Component c) { return fmu_absent(c, 1, __func__); }

@@ -10,9 +10,7 @@ void fmu_report(const fmu_instance *instance, const char *text) {
                                                    "logStatusError", text);
 }
 
-char *fmu_folder(char *location) {
-    return location[0] ? location : NULL;
-}
+char *fmu_folder(char *location) { return location[0] ? location : NULL; }
 
 static void no(fmi3Boolean *answer) {
     if (answer) *answer = fmi3False;
@@ -20,14 +18,13 @@ static void no(fmi3Boolean *answer) {
 
 /* ---- instances ---- */
 
-#define INSTANTIATE(kind, reason, ...)                                                             \
-    fmi3Instance fmi3Instantiate##kind(                                                            \
-        fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible,              \
-        fmi3Boolean logging, __VA_ARGS__) {                                                        \
-        const char *refused = reason;                                                              \
-        if (!refused) return fmu_new(name, token, resources, (void (*)(void))log, environment);    \
-        if (log) log(environment, fmi3Error, "logStatusError", refused);                           \
-        return NULL;                                                                               \
+#define INSTANTIATE(kind, reason, ...)                                                          \
+    fmi3Instance fmi3Instantiate##kind(fmi3String name, fmi3String token, fmi3String resources, \
+                                       fmi3Boolean visible, fmi3Boolean logging, __VA_ARGS__) { \
+        const char *refused = reason;                                                           \
+        if (!refused) return fmu_new(name, token, resources, (void (*)(void))log, environment); \
+        if (log) log(environment, fmi3Error, "logStatusError", refused);                        \
+        return NULL;                                                                            \
     }
 #define ENVIRONMENT fmi3InstanceEnvironment environment, fmi3LogMessageCallback log
 #define OTHER_KIND "this FMU is of another kind"
@@ -53,49 +50,64 @@ fmi3Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean has_tolerance
 
 /* ---- functions for what these FMUs do not have ---- */
 
-#define ABSENT(function, ...) /* an error unless it concerns no variable */                        \
+#define ABSENT(function, ...) /* an error unless it concerns no variable */ \
     fmi3Status function(fmi3Instance c, __VA_ARGS__) { return fmu_absent(c, n, __func__); }
-#define NEVER(function, ...)                                                                       \
+#define NEVER(function, ...) \
     fmi3Status function(__VA_ARGS__) { return fmu_absent(c, 1, __func__); }
 #define NAMED const fmi3ValueReference vr[], size_t n
-#define NO_VARIABLES(type)                                                                         \
-    ABSENT(fmi3Get##type, NAMED, fmi3##type value[], size_t n_values)                              \
+#define NO_VARIABLES(type)                                            \
+    ABSENT(fmi3Get##type, NAMED, fmi3##type value[], size_t n_values) \
     ABSENT(fmi3Set##type, NAMED, const fmi3##type value[], size_t n_values)
 
-NO_VARIABLES(Float32) NO_VARIABLES(Int8) NO_VARIABLES(Int16) NO_VARIABLES(Int64)
-NO_VARIABLES(UInt8) NO_VARIABLES(UInt16) NO_VARIABLES(UInt32) NO_VARIABLES(UInt64)
-NO_VARIABLES(String)
-ABSENT(fmi3GetBinary, NAMED, size_t sizes[], fmi3Binary value[], size_t n_values)
-ABSENT(fmi3SetBinary, NAMED, const size_t sizes[], const fmi3Binary value[], size_t n_values)
-ABSENT(fmi3GetClock, NAMED, fmi3Clock value[])
-ABSENT(fmi3SetClock, NAMED, const fmi3Clock value[])
-ABSENT(fmi3GetIntervalDecimal, NAMED, fmi3Float64 interval[], fmi3IntervalQualifier qualifier[])
-ABSENT(fmi3GetIntervalFraction, NAMED, fmi3UInt64 counter[], fmi3UInt64 resolution[],
-       fmi3IntervalQualifier qualifier[])
-ABSENT(fmi3GetShiftDecimal, NAMED, fmi3Float64 shift[])
-ABSENT(fmi3GetShiftFraction, NAMED, fmi3UInt64 counter[], fmi3UInt64 resolution[])
-ABSENT(fmi3SetIntervalDecimal, NAMED, const fmi3Float64 interval[])
-ABSENT(fmi3SetIntervalFraction, NAMED, const fmi3UInt64 counter[], const fmi3UInt64 resolution[])
-ABSENT(fmi3SetShiftDecimal, NAMED, const fmi3Float64 shift[])
-ABSENT(fmi3SetShiftFraction, NAMED, const fmi3UInt64 counter[], const fmi3UInt64 resolution[])
-ABSENT(fmi3GetOutputDerivatives, NAMED, const fmi3Int32 order[], fmi3Float64 value[],
-       size_t n_values)
-ABSENT(fmi3GetEventIndicators, fmi3Float64 value[], size_t n)
-NEVER(fmi3GetNumberOfVariableDependencies, fmi3Instance c, fmi3ValueReference vr, size_t *n)
-NEVER(fmi3GetVariableDependencies, fmi3Instance c, fmi3ValueReference dependent,
-      size_t of_dependent[], fmi3ValueReference independent[], size_t of_independent[],
-      fmi3DependencyKind kind[], size_t n)
-NEVER(fmi3EnterConfigurationMode, fmi3Instance c)
-NEVER(fmi3ExitConfigurationMode, fmi3Instance c)
-NEVER(fmi3EnterStepMode, fmi3Instance c)
-NEVER(fmi3EvaluateDiscreteStates, fmi3Instance c)
-NEVER(fmi3ActivateModelPartition, fmi3Instance c, fmi3ValueReference clock, fmi3Float64 time)
+NO_VARIABLES(Float32)
+NO_VARIABLES(Int8) NO_VARIABLES(Int16) NO_VARIABLES(Int64) NO_VARIABLES(UInt8) NO_VARIABLES(UInt16)
+    NO_VARIABLES(UInt32) NO_VARIABLES(UInt64) NO_VARIABLES(String)
+        ABSENT(fmi3GetBinary, NAMED, size_t sizes[], fmi3Binary value[], size_t n_values)
+            ABSENT(fmi3SetBinary, NAMED, const size_t sizes[], const fmi3Binary value[],
+                   size_t n_values) ABSENT(fmi3GetClock, NAMED, fmi3Clock value[])
+                ABSENT(fmi3SetClock, NAMED,
+                       const fmi3Clock value[]) ABSENT(fmi3GetIntervalDecimal, NAMED,
+                                                       fmi3Float64 interval[],
+                                                       fmi3IntervalQualifier qualifier[])
+                    ABSENT(fmi3GetIntervalFraction, NAMED, fmi3UInt64 counter[],
+                           fmi3UInt64 resolution[],
+                           fmi3IntervalQualifier qualifier[]) ABSENT(fmi3GetShiftDecimal, NAMED,
+                                                                     fmi3Float64 shift[])
+                        ABSENT(fmi3GetShiftFraction, NAMED, fmi3UInt64 counter[],
+                               fmi3UInt64 resolution[]) ABSENT(fmi3SetIntervalDecimal, NAMED,
+                                                               const fmi3Float64 interval[])
+                            ABSENT(fmi3SetIntervalFraction, NAMED, const fmi3UInt64 counter[],
+                                   const fmi3UInt64 resolution[]) ABSENT(fmi3SetShiftDecimal, NAMED,
+                                                                         const fmi3Float64 shift[])
+                                ABSENT(fmi3SetShiftFraction, NAMED, const fmi3UInt64 counter[],
+                                       const fmi3UInt64 resolution[])
+                                    ABSENT(fmi3GetOutputDerivatives, NAMED, const fmi3Int32 order[],
+                                           fmi3Float64 value[],
+                                           size_t n_values) ABSENT(fmi3GetEventIndicators,
+                                                                   fmi3Float64 value[], size_t n)
+                                        NEVER(fmi3GetNumberOfVariableDependencies, fmi3Instance c,
+                                              fmi3ValueReference vr, size_t *n)
+                                            NEVER(fmi3GetVariableDependencies, fmi3Instance c,
+                                                  fmi3ValueReference dependent,
+                                                  size_t of_dependent[],
+                                                  fmi3ValueReference independent[],
+                                                  size_t of_independent[],
+                                                  fmi3DependencyKind kind[], size_t n)
+                                                NEVER(fmi3EnterConfigurationMode, fmi3Instance c)
+                                                    NEVER(fmi3ExitConfigurationMode, fmi3Instance c)
+                                                        NEVER(fmi3EnterStepMode, fmi3Instance c)
+                                                            NEVER(fmi3EvaluateDiscreteStates,
+                                                                  fmi3Instance c)
+                                                                NEVER(fmi3ActivateModelPartition,
+                                                                      fmi3Instance c,
+                                                                      fmi3ValueReference clock,
+                                                                      fmi3Float64 time)
 
-/* ---- Co-Simulation; the phase refuses it in Model Exchange ---- */
+    /* ---- Co-Simulation; the phase refuses it in Model Exchange ---- */
 
-fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 time, fmi3Float64 h, fmi3Boolean no_rollback,
-                      fmi3Boolean *event, fmi3Boolean *terminate, fmi3Boolean *early,
-                      fmi3Float64 *reached) {
+    fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 time, fmi3Float64 h, fmi3Boolean no_rollback,
+                          fmi3Boolean *event, fmi3Boolean *terminate, fmi3Boolean *early,
+                          fmi3Float64 *reached) {
     REQUIRE(FMU_STEPPING);
     const bool fine = fmu_step(instance, time, h);
     no(event), no(terminate), no(early);
@@ -107,11 +119,11 @@ fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 time, fmi3Float64 h, fmi3Boole
 
 #define INITIALISED (FMU_INITIALISATION | FMU_EVENT | FMU_CONTINUOUS | FMU_TERMINATED)
 
-#define ENTER(mode, before, after)                                                                 \
-    fmi3Status fmi3Enter##mode(fmi3Instance c) {                                                   \
-        REQUIRE(before);                                                                           \
-        instance->phase = after;                                                                   \
-        return fmi3OK;                                                                             \
+#define ENTER(mode, before, after)               \
+    fmi3Status fmi3Enter##mode(fmi3Instance c) { \
+        REQUIRE(before);                         \
+        instance->phase = after;                 \
+        return fmi3OK;                           \
     }
 
 ENTER(EventMode, FMU_CONTINUOUS, FMU_EVENT)
@@ -144,17 +156,17 @@ fmi3Status fmi3SetTime(fmi3Instance c, fmi3Float64 time) {
 }
 
 /* A function of an array x [n] with one number for each state k. */
-#define OF_STATES(function, type, phases, status, assignment)                                      \
-    fmi3Status function(fmi3Instance c, type x[], size_t n) {                                      \
-        REQUIRE(phases);                                                                           \
-        if (!x || n != FMU_STATES) {                                                               \
-            fmu_refuse(instance, "%d continuous states, but an array of %lu", FMU_STATES,          \
-                       (unsigned long)n);                                                          \
-            return fmi3Error;                                                                      \
-        }                                                                                          \
-        const fmi3Status result = status;                                                          \
-        for (size_t k = 0; k < n; k++) assignment;                                                 \
-        return result;                                                                             \
+#define OF_STATES(function, type, phases, status, assignment)                             \
+    fmi3Status function(fmi3Instance c, type x[], size_t n) {                             \
+        REQUIRE(phases);                                                                  \
+        if (!x || n != FMU_STATES) {                                                      \
+            fmu_refuse(instance, "%d continuous states, but an array of %lu", FMU_STATES, \
+                       (unsigned long)n);                                                 \
+            return fmi3Error;                                                             \
+        }                                                                                 \
+        const fmi3Status result = status;                                                 \
+        for (size_t k = 0; k < n; k++) assignment;                                        \
+        return result;                                                                    \
     }
 
 OF_STATES(fmi3SetContinuousStates, const double, FMU_CONTINUOUS, fmi3OK, instance->value[k] = x[k])
@@ -164,10 +176,10 @@ OF_STATES(fmi3GetNominalsOfContinuousStates, double, INITIALISED, fmi3OK,
 OF_STATES(fmi3GetContinuousStateDerivatives, double, INITIALISED, fmu_derivatives(instance),
           x[k] = instance->value[FMU_FIRST_DERIVATIVE + k])
 
-#define COUNT(function, number)                                                                    \
-    fmi3Status function(fmi3Instance c, size_t *n) {                                               \
-        if (c && n) *n = number;                                                                   \
-        return c && n ? fmi3OK : fmi3Error;                                                        \
+#define COUNT(function, number)                      \
+    fmi3Status function(fmi3Instance c, size_t *n) { \
+        if (c && n) *n = number;                     \
+        return c && n ? fmi3OK : fmi3Error;          \
     }
 
 COUNT(fmi3GetNumberOfContinuousStates, FMU_STATES)
@@ -198,8 +210,8 @@ static fmi3Status partial_derivatives(fmu_instance *c, const fmi3ValueReference 
         fmu_refuse(instance, "partial derivatives: a pointer is NULL or a size does not fit");
         return fmi3Error;
     }
-    if (!differentiable(instance, from, n_from, adjoint)
-        || !differentiable(instance, to, n_to, !adjoint))
+    if (!differentiable(instance, from, n_from, adjoint) ||
+        !differentiable(instance, to, n_to, !adjoint))
         return fmi3Error;
     for (size_t i = 0; i < n_from; i++) in[from[i]] += seed[i];
 #if FMU_STATES

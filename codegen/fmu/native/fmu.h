@@ -64,8 +64,8 @@ typedef struct {
 } fmu_instance;
 
 /* Sends an error message (printf format) to the importer's log. Returns false. */
-__attribute__((format(printf, 2, 3)))
-bool fmu_refuse(const fmu_instance *instance, const char *format, ...);
+__attribute__((format(printf, 2, 3))) bool fmu_refuse(const fmu_instance *instance,
+                                                      const char *format, ...);
 
 /* ---- the model; what is bool is false after fmu_refuse, else true ---- */
 
@@ -115,7 +115,7 @@ extern const fmu_variable fmu_variables[FMU_VALUES];
 /* States of Model Exchange come first, their derivatives last but for the time. */
 #define FMU_FIRST_DERIVATIVE (FMU_VALUES - 1 - FMU_STATES)
 #define FMU_IS_STATE(reference) ((int)(reference) < FMU_STATES)
-#define FMU_IS_DERIVATIVE(reference)                                                               \
+#define FMU_IS_DERIVATIVE(reference) \
     ((int)(reference) >= FMU_FIRST_DERIVATIVE && (reference) != FMU_V_time)
 
 /* Passes a message to the importer, in the version's own way. */
@@ -134,8 +134,8 @@ const char *fmu_phase_name(const fmu_instance *instance);
 bool fmu_in_phase(const fmu_instance *instance, unsigned phases, const char *function);
 
 /* Ends an FMI function of `void *c` with an error unless that is an instance in such a phase. */
-#define REQUIRE(phases)                                                                            \
-    fmu_instance *instance = c;                                                                    \
+#define REQUIRE(phases)         \
+    fmu_instance *instance = c; \
     if (!fmu_in_phase(instance, phases, __func__)) return FMI(Error)
 #define ANY_PHASE (~0u)
 

@@ -64,8 +64,10 @@ fmu_instance *fmu_new(const char *name, const char *token, const char *resources
     char *path = instance->resources;
     for (size_t n = path ? strlen(path) : 0; n > 1 && strchr("/\\", path[n - 1]);) path[--n] = 0;
     if (!token || strcmp(token, FMU_TOKEN) != 0)
-        fmu_refuse(instance, "the instantiation token (GUID) is '%s', but this binary belongs to "
-                             "'%s'", token ? token : "", FMU_TOKEN);
+        fmu_refuse(instance,
+                   "the instantiation token (GUID) is '%s', but this binary belongs to "
+                   "'%s'",
+                   token ? token : "", FMU_TOKEN);
     else if (create(instance))
         return instance;
     FMI(FreeInstance)(instance);
@@ -86,13 +88,20 @@ void FMI(FreeInstance)(void *c) {
 
 const char *fmu_phase_name(const fmu_instance *instance) {
     switch (instance->phase) {
-    case FMU_INSTANTIATED: return "instantiated";
-    case FMU_INITIALISATION: return "initialisation";
-    case FMU_EVENT: return "event mode";
-    case FMU_CONTINUOUS: return "continuous-time mode";
-    case FMU_STEPPING: return "stepping";
-    case FMU_TERMINATED: return "terminated";
-    default: return "failed";
+    case FMU_INSTANTIATED:
+        return "instantiated";
+    case FMU_INITIALISATION:
+        return "initialisation";
+    case FMU_EVENT:
+        return "event mode";
+    case FMU_CONTINUOUS:
+        return "continuous-time mode";
+    case FMU_STEPPING:
+        return "stepping";
+    case FMU_TERMINATED:
+        return "terminated";
+    default:
+        return "failed";
     }
 }
 
@@ -132,8 +141,10 @@ bool fmu_step(fmu_instance *instance, double time, double h) {
     double *now = &instance->value[FMU_V_time];
     const double tolerance = 1e-6 * (1 + fabs(*now));
     if (!(h > 0 && h <= LONGEST_STEP_S))
-        return fmu_refuse(instance, "the communication step is %g s, must be positive and at most "
-                                    "%g", h, LONGEST_STEP_S);
+        return fmu_refuse(instance,
+                          "the communication step is %g s, must be positive and at most "
+                          "%g",
+                          h, LONGEST_STEP_S);
     if (!(fabs(time - *now) <= tolerance))
         return fmu_refuse(instance, "asked to continue at %.9g s, but time is %.9g s", time, *now);
     if (time + h > instance->stop_time + tolerance)

@@ -22,8 +22,9 @@ static size_t state_size(void) { return OF_INSTANCE + fmu_model_size(); }
 static fmu_saved *own(const fmu_instance *instance, const void *state) {
     for (fmu_saved *s = instance->saved; s; s = s->next)
         if (s == state) return s;
-    fmu_refuse(instance, "%s", state ? "this state was not made by this instance, or has been freed"
-                                     : "the state is NULL");
+    fmu_refuse(instance, "%s",
+               state ? "this state was not made by this instance, or has been freed"
+                     : "the state is NULL");
     return NULL;
 }
 
@@ -72,12 +73,12 @@ FMI(Status) FMI(FreeFMUState)(void *c, void **state) {
 
 /* ---- as bytes ---- */
 
-#define REQUIRE_BYTES(pointer) /* and that the FMU can serialise at all */                         \
-    REQUIRE(ANY_PHASE);                                                                            \
-    if (!FMU_SERIALISES || !(pointer)) {                                                           \
-        fmu_refuse(instance, FMU_SERIALISES ? "saved state: a pointer is NULL"                     \
-                                            : "this FMU cannot serialise its state");              \
-        return FMI(Error);                                                                         \
+#define REQUIRE_BYTES(pointer) /* and that the FMU can serialise at all */            \
+    REQUIRE(ANY_PHASE);                                                               \
+    if (!FMU_SERIALISES || !(pointer)) {                                              \
+        fmu_refuse(instance, FMU_SERIALISES ? "saved state: a pointer is NULL"        \
+                                            : "this FMU cannot serialise its state"); \
+        return FMI(Error);                                                            \
     }
 
 static uint64_t checksum(const unsigned char *bytes) {

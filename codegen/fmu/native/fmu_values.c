@@ -33,8 +33,8 @@ static bool settable(const fmu_instance *instance, uint32_t reference, double nu
     if (!now || v->role == FMU_CALCULATED)
         return fmu_refuse(instance, "variable '%s' cannot be set in phase '%s'", v->name,
                           fmu_phase_name(instance));
-    const bool inside = v->open ? number > v->min && number < v->max
-                                : number >= v->min && number <= v->max;
+    const bool inside =
+        v->open ? number > v->min && number < v->max : number >= v->min && number <= v->max;
     if (v->role == FMU_INPUT || integrated || (isfinite(number) && inside)) return true;
     return fmu_refuse(instance, "variable '%s' cannot be %g: it must be finite and %s %g and %g",
                       v->name, number, v->open ? "strictly between" : "between", v->min, v->max);
@@ -66,22 +66,22 @@ static FMI(Status) refresh(fmu_instance *instance, const uint32_t *reference, si
 #endif
 #define REFERENCES void *c, const FMI(ValueReference) reference[], size_t n
 
-#define ACCESS(name, type, kind)                                                                   \
-    FMI(Status) FMI(Get##name)(REFERENCES, type value[] COUNT) {                                   \
-        fmu_instance *instance = c;                                                                \
-        if (!accessible(instance, kind, reference, n, value, COUNTED)) return FMI(Error);          \
-        const FMI(Status) status = refresh(instance, reference, n);                                \
-        for (size_t i = 0; i < n; i++) value[i] = (type)instance->value[reference[i]];             \
-        return status;                                                                             \
-    }                                                                                              \
-    FMI(Status) FMI(Set##name)(REFERENCES, const type value[] COUNT) {                             \
-        fmu_instance *instance = c;                                                                \
-        if (!accessible(instance, kind, reference, n, value, COUNTED)) return FMI(Error);          \
-        for (size_t i = 0; i < n; i++)                                                             \
-            if (!settable(instance, reference[i], (double)value[i])) return FMI(Error);            \
-        for (size_t i = 0; i < n; i++)                                                             \
-            instance->value[reference[i]] = kind == FMU_BOOLEAN ? !!value[i] : (double)value[i];   \
-        return FMI(OK);                                                                            \
+#define ACCESS(name, type, kind)                                                                 \
+    FMI(Status) FMI(Get##name)(REFERENCES, type value[] COUNT) {                                 \
+        fmu_instance *instance = c;                                                              \
+        if (!accessible(instance, kind, reference, n, value, COUNTED)) return FMI(Error);        \
+        const FMI(Status) status = refresh(instance, reference, n);                              \
+        for (size_t i = 0; i < n; i++) value[i] = (type)instance->value[reference[i]];           \
+        return status;                                                                           \
+    }                                                                                            \
+    FMI(Status) FMI(Set##name)(REFERENCES, const type value[] COUNT) {                           \
+        fmu_instance *instance = c;                                                              \
+        if (!accessible(instance, kind, reference, n, value, COUNTED)) return FMI(Error);        \
+        for (size_t i = 0; i < n; i++)                                                           \
+            if (!settable(instance, reference[i], (double)value[i])) return FMI(Error);          \
+        for (size_t i = 0; i < n; i++)                                                           \
+            instance->value[reference[i]] = kind == FMU_BOOLEAN ? !!value[i] : (double)value[i]; \
+        return FMI(OK);                                                                          \
     }
 
 #if FMU_FMI == 2
