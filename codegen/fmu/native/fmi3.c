@@ -29,6 +29,7 @@ static void no(fmi3Boolean *answer) {
 #define ENVIRONMENT fmi3InstanceEnvironment environment, fmi3LogMessageCallback log
 #define OTHER_KIND "this FMU is of another kind"
 
+/* clang-format off */
 INSTANTIATE(ModelExchange, FMU_STATES ? NULL : OTHER_KIND, ENVIRONMENT)
 INSTANTIATE(CoSimulation,
             FMU_STATES            ? OTHER_KIND
@@ -38,6 +39,7 @@ INSTANTIATE(CoSimulation,
             size_t n_between, ENVIRONMENT, fmi3IntermediateUpdateCallback update)
 INSTANTIATE(ScheduledExecution, OTHER_KIND, ENVIRONMENT, fmi3ClockUpdateCallback update,
             fmi3LockPreemptionCallback lock, fmi3UnlockPreemptionCallback unlock)
+/* clang-format on */
 
 fmi3Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean has_tolerance,
                                        fmi3Float64 tolerance, fmi3Float64 start,
@@ -50,58 +52,45 @@ fmi3Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean has_tolerance
 
 /* ---- functions for what these FMUs do not have ---- */
 
-#define ABSENT(function, ...) /* an error unless it concerns no variable */ \
+/* clang-format off */
+#define ABSENT(function, ...) /* an error unless it concerns no variable */                        \
     fmi3Status function(fmi3Instance c, __VA_ARGS__) { return fmu_absent(c, n, __func__); }
-#define NEVER(function, ...) \
+#define NEVER(function, ...)                                                                       \
     fmi3Status function(__VA_ARGS__) { return fmu_absent(c, 1, __func__); }
 #define NAMED const fmi3ValueReference vr[], size_t n
-#define NO_VARIABLES(type)                                            \
-    ABSENT(fmi3Get##type, NAMED, fmi3##type value[], size_t n_values) \
+#define NO_VARIABLES(type)                                                                         \
+    ABSENT(fmi3Get##type, NAMED, fmi3##type value[], size_t n_values)                              \
     ABSENT(fmi3Set##type, NAMED, const fmi3##type value[], size_t n_values)
 
-NO_VARIABLES(Float32)
-NO_VARIABLES(Int8) NO_VARIABLES(Int16) NO_VARIABLES(Int64) NO_VARIABLES(UInt8) NO_VARIABLES(UInt16)
-    NO_VARIABLES(UInt32) NO_VARIABLES(UInt64) NO_VARIABLES(String)
-        ABSENT(fmi3GetBinary, NAMED, size_t sizes[], fmi3Binary value[], size_t n_values)
-            ABSENT(fmi3SetBinary, NAMED, const size_t sizes[], const fmi3Binary value[],
-                   size_t n_values) ABSENT(fmi3GetClock, NAMED, fmi3Clock value[])
-                ABSENT(fmi3SetClock, NAMED,
-                       const fmi3Clock value[]) ABSENT(fmi3GetIntervalDecimal, NAMED,
-                                                       fmi3Float64 interval[],
-                                                       fmi3IntervalQualifier qualifier[])
-                    ABSENT(fmi3GetIntervalFraction, NAMED, fmi3UInt64 counter[],
-                           fmi3UInt64 resolution[],
-                           fmi3IntervalQualifier qualifier[]) ABSENT(fmi3GetShiftDecimal, NAMED,
-                                                                     fmi3Float64 shift[])
-                        ABSENT(fmi3GetShiftFraction, NAMED, fmi3UInt64 counter[],
-                               fmi3UInt64 resolution[]) ABSENT(fmi3SetIntervalDecimal, NAMED,
-                                                               const fmi3Float64 interval[])
-                            ABSENT(fmi3SetIntervalFraction, NAMED, const fmi3UInt64 counter[],
-                                   const fmi3UInt64 resolution[]) ABSENT(fmi3SetShiftDecimal, NAMED,
-                                                                         const fmi3Float64 shift[])
-                                ABSENT(fmi3SetShiftFraction, NAMED, const fmi3UInt64 counter[],
-                                       const fmi3UInt64 resolution[])
-                                    ABSENT(fmi3GetOutputDerivatives, NAMED, const fmi3Int32 order[],
-                                           fmi3Float64 value[],
-                                           size_t n_values) ABSENT(fmi3GetEventIndicators,
-                                                                   fmi3Float64 value[], size_t n)
-                                        NEVER(fmi3GetNumberOfVariableDependencies, fmi3Instance c,
-                                              fmi3ValueReference vr, size_t *n)
-                                            NEVER(fmi3GetVariableDependencies, fmi3Instance c,
-                                                  fmi3ValueReference dependent,
-                                                  size_t of_dependent[],
-                                                  fmi3ValueReference independent[],
-                                                  size_t of_independent[],
-                                                  fmi3DependencyKind kind[], size_t n)
-                                                NEVER(fmi3EnterConfigurationMode, fmi3Instance c)
-                                                    NEVER(fmi3ExitConfigurationMode, fmi3Instance c)
-                                                        NEVER(fmi3EnterStepMode, fmi3Instance c)
-                                                            NEVER(fmi3EvaluateDiscreteStates,
-                                                                  fmi3Instance c)
-                                                                NEVER(fmi3ActivateModelPartition,
-                                                                      fmi3Instance c,
-                                                                      fmi3ValueReference clock,
-                                                                      fmi3Float64 time)
+NO_VARIABLES(Float32) NO_VARIABLES(Int8) NO_VARIABLES(Int16) NO_VARIABLES(Int64)
+NO_VARIABLES(UInt8) NO_VARIABLES(UInt16) NO_VARIABLES(UInt32) NO_VARIABLES(UInt64)
+NO_VARIABLES(String)
+ABSENT(fmi3GetBinary, NAMED, size_t sizes[], fmi3Binary value[], size_t n_values)
+ABSENT(fmi3SetBinary, NAMED, const size_t sizes[], const fmi3Binary value[], size_t n_values)
+ABSENT(fmi3GetClock, NAMED, fmi3Clock value[])
+ABSENT(fmi3SetClock, NAMED, const fmi3Clock value[])
+ABSENT(fmi3GetIntervalDecimal, NAMED, fmi3Float64 interval[], fmi3IntervalQualifier qualifier[])
+ABSENT(fmi3GetIntervalFraction, NAMED, fmi3UInt64 counter[], fmi3UInt64 resolution[],
+       fmi3IntervalQualifier qualifier[])
+ABSENT(fmi3GetShiftDecimal, NAMED, fmi3Float64 shift[])
+ABSENT(fmi3GetShiftFraction, NAMED, fmi3UInt64 counter[], fmi3UInt64 resolution[])
+ABSENT(fmi3SetIntervalDecimal, NAMED, const fmi3Float64 interval[])
+ABSENT(fmi3SetIntervalFraction, NAMED, const fmi3UInt64 counter[], const fmi3UInt64 resolution[])
+ABSENT(fmi3SetShiftDecimal, NAMED, const fmi3Float64 shift[])
+ABSENT(fmi3SetShiftFraction, NAMED, const fmi3UInt64 counter[], const fmi3UInt64 resolution[])
+ABSENT(fmi3GetOutputDerivatives, NAMED, const fmi3Int32 order[], fmi3Float64 value[],
+       size_t n_values)
+ABSENT(fmi3GetEventIndicators, fmi3Float64 value[], size_t n)
+NEVER(fmi3GetNumberOfVariableDependencies, fmi3Instance c, fmi3ValueReference vr, size_t *n)
+NEVER(fmi3GetVariableDependencies, fmi3Instance c, fmi3ValueReference dependent,
+      size_t of_dependent[], fmi3ValueReference independent[], size_t of_independent[],
+      fmi3DependencyKind kind[], size_t n)
+NEVER(fmi3EnterConfigurationMode, fmi3Instance c)
+NEVER(fmi3ExitConfigurationMode, fmi3Instance c)
+NEVER(fmi3EnterStepMode, fmi3Instance c)
+NEVER(fmi3EvaluateDiscreteStates, fmi3Instance c)
+NEVER(fmi3ActivateModelPartition, fmi3Instance c, fmi3ValueReference clock, fmi3Float64 time)
+    /* clang-format on */
 
     /* ---- Co-Simulation; the phase refuses it in Model Exchange ---- */
 
@@ -126,8 +115,10 @@ NO_VARIABLES(Int8) NO_VARIABLES(Int16) NO_VARIABLES(Int64) NO_VARIABLES(UInt8) N
         return fmi3OK;                           \
     }
 
+/* clang-format off */
 ENTER(EventMode, FMU_CONTINUOUS, FMU_EVENT)
 ENTER(ContinuousTimeMode, FMU_EVENT, FMU_CONTINUOUS)
+/* clang-format on */
 
 fmi3Status fmi3UpdateDiscreteStates(fmi3Instance c, fmi3Boolean *again, fmi3Boolean *terminate,
                                     fmi3Boolean *nominals, fmi3Boolean *values, fmi3Boolean *timed,
@@ -169,12 +160,14 @@ fmi3Status fmi3SetTime(fmi3Instance c, fmi3Float64 time) {
         return result;                                                                    \
     }
 
+/* clang-format off */
 OF_STATES(fmi3SetContinuousStates, const double, FMU_CONTINUOUS, fmi3OK, instance->value[k] = x[k])
 OF_STATES(fmi3GetContinuousStates, double, INITIALISED, fmi3OK, x[k] = instance->value[k])
 OF_STATES(fmi3GetNominalsOfContinuousStates, double, INITIALISED, fmi3OK,
           x[k] = fmu_variables[k].nominal)
 OF_STATES(fmi3GetContinuousStateDerivatives, double, INITIALISED, fmu_derivatives(instance),
           x[k] = instance->value[FMU_FIRST_DERIVATIVE + k])
+/* clang-format on */
 
 #define COUNT(function, number)                      \
     fmi3Status function(fmi3Instance c, size_t *n) { \
@@ -182,8 +175,10 @@ OF_STATES(fmi3GetContinuousStateDerivatives, double, INITIALISED, fmu_derivative
         return c && n ? fmi3OK : fmi3Error;          \
     }
 
+/* clang-format off */
 COUNT(fmi3GetNumberOfContinuousStates, FMU_STATES)
 COUNT(fmi3GetNumberOfEventIndicators, 0)
+/* clang-format on */
 
 /* Whether all are states or derivatives (unknowns), or none is a derivative (knowns). */
 static bool differentiable(const fmu_instance *instance, const fmi3ValueReference *reference,
