@@ -17,7 +17,14 @@ if TYPE_CHECKING:
 
     from bayesrace.vehicles.models import Model
 
-__all__ = ["PERFECT", "PREDICTION", "SCHEMES", "Discretisation"]
+__all__ = [
+    "PERFECT",
+    "PLANT_SCHEME",
+    "PLANT_SUBSTEP_HZ",
+    "PREDICTION",
+    "SCHEMES",
+    "Discretisation",
+]
 
 Rate = Callable[[Any], Any]
 Ode = Callable[[Any, Any], Any]
@@ -47,6 +54,11 @@ SCHEMES: Final[dict[str, tuple[int, Callable[[Rate, Any, float], Any]]]] = {
     "rk4": (4, _rk4),
 }
 """Scheme name to (order of the global error, one step)."""
+
+PLANT_SCHEME: Final = "rk4"
+PLANT_SUBSTEP_HZ: Final = 1000
+"""The simulated car, in the plant and as an FMU, integrates in steps of 1 ms by this scheme: far
+inside the tyres' stability limit at low speed."""
 
 
 def _pose_from_velocities(x: Any, velocities: Any, h: float) -> Any:

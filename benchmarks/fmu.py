@@ -30,8 +30,7 @@ from bayesrace.gp.weights import read_weights
 from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK
 from bayesrace.vehicles import DEFAULT_CAR, get_car
 from bayesrace.vehicles.models import STATES, dynamic
-from codegen.fmu import pack
-from codegen.fmu.controller import controller_fmu
+from codegen.fmu import car_fmu, controller_fmu, pack
 from controller.cycle_settings import FallbackSettings
 from controller.path_table import make_path_table
 from controller.settings import MpcSettings
@@ -39,7 +38,6 @@ from experiments.closed_loop import Driven, drive_compiled
 from experiments.preparation import Prepared, prepare
 from experiments.progress import stages_on
 from experiments.settings import PreparationSettings
-from plant.fmu.export import car_fmu
 from plant.fmu.simulator import open_fmu
 from plant.simulator import PLANT, Simulator
 
@@ -175,9 +173,10 @@ def print_laps(fmus: dict[str, Path], prepared: Prepared, folder: Path, console:
     for cpu in ("native", "portable"):
         for version, fmu in zip(VERSIONS, fmus.values(), strict=True):
             definition = controller_fmu(
-                artefact, car, path.rows, path.spacing_m, MpcSettings().parameters(car),
-                FallbackSettings().model_dump() | {"brake_fade_mps": car.brake_fade_mps},
-                weights, version, cpu,
+                artefact, car, rows=path.rows, spacing_m=path.spacing_m,
+                settings=MpcSettings().parameters(car),
+                fallback=FallbackSettings().model_dump() | {"brake_fade_mps": car.brake_fade_mps},
+                weights=weights, version=version, cpu=cpu,
             )  # fmt: skip
             controller = pack(definition, folder / f"controller-{cpu}-{version}.fmu")
             x = master(fmu, controller, x0, len(reference.x) - 1)

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bayesrace.errors import InputError
-from bayesrace.integrators import Discretisation
+from bayesrace.integrators import PLANT_SCHEME, PLANT_SUBSTEP_HZ, Discretisation
 from bayesrace.vehicles.models import Model
 from bayesrace.vehicles.parameters import CarParameters
 
@@ -30,22 +30,20 @@ __all__ = [
 
 Array = npt.NDArray[np.float64]
 
-SUBSTEP_HZ: Final = 1000
-"""Integration steps of 1 ms, far inside the tyres' stability limit at low speed."""
-
 
 def plant_discretisation(rate_hz: float = 50.0) -> Discretisation:
     """How the plant integrates when it samples its state at this rate.
 
     Raises InputError unless a period is a whole number of integration steps.
     """
-    substeps = round(SUBSTEP_HZ / rate_hz) if rate_hz > 0 else 0
-    if substeps < 1 or abs(substeps * rate_hz - SUBSTEP_HZ) > 1e-6:
+    substeps = round(PLANT_SUBSTEP_HZ / rate_hz) if rate_hz > 0 else 0
+    if substeps < 1 or abs(substeps * rate_hz - PLANT_SUBSTEP_HZ) > 1e-6:
         raise InputError(
             f"the plant cannot sample at {rate_hz:g} Hz: its period must be a whole number of "
             "milliseconds; 50, 100, 200, 250 or 500 Hz will do"
         )
-    return Discretisation(scheme="rk4", step_s=substeps / SUBSTEP_HZ, substeps=substeps)
+    step_s = substeps / PLANT_SUBSTEP_HZ
+    return Discretisation(scheme=PLANT_SCHEME, step_s=step_s, substeps=substeps)
 
 
 PLANT: Final = plant_discretisation()

@@ -10,8 +10,7 @@ from bayesrace.cache import software
 from bayesrace.cpu import cpu_identity
 from bayesrace.vehicles import get_car
 from codegen.compiler import FLAGS, find_compiler
-from codegen.fmu import pack
-from plant.fmu.export import car_fmu
+from codegen.fmu import car_fmu, pack
 from tests.shared import shared_folder
 
 __all__ = ["packed_car", "unpacked_car"]
@@ -22,9 +21,6 @@ _SOURCES: Final = (
     "codegen",
     "codegen/fmu",
     "codegen/fmu/native",
-    "plant",
-    "plant/fmu",
-    "plant/fmu/native",
 )
 
 Version = Literal[2, 3]

@@ -18,8 +18,7 @@ from bayesrace.gp.weights import GpWeights
 from bayesrace.messages import State
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import STATES, dynamic
-from codegen.fmu import FmuDefinition, pack
-from codegen.fmu.controller import controller_fmu
+from codegen.fmu import FmuDefinition, controller_fmu, pack
 from controller.cycle_settings import CompensationSettings, FallbackSettings
 from controller.driver import Driver
 from controller.mpc import PredictiveController

@@ -20,12 +20,7 @@ ROOT: Final = Path(__file__).resolve().parents[1]
 OUT: Final = ROOT / "build" / "coverage" / "native"
 OURS: Final = {
     path.name
-    for folder in (
-        "controller/native",
-        "controller/native/host",
-        "codegen/fmu/native",
-        "plant/fmu/native",
-    )
+    for folder in ("controller/native", "controller/native/host", "codegen/fmu/native")
     for path in (ROOT / folder).glob("*.[ch]")
 }
 TESTS: Final = (

@@ -20,7 +20,7 @@ from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights, zero_weights
 from bayesrace.vehicles import CarParameters
 from codegen.fmu import pack, write_sources
-from codegen.fmu.resources import exchange_weights
+from codegen.fmu.weights import exchange_weights
 from codegen.host_files import WEIGHTS_FILE, path_file
 from tests.conftest import Circuit, fit_weights
 from tests.fmu_lockstep import (  # noqa: F401 - fixtures are used by name

@@ -18,7 +18,7 @@ from bayesrace.vehicles.models import (
     dynamic,
     dynamic_with_parameters,
 )
-from plant.fmu.export import car_values
+from codegen.fmu.car import car_values
 from plant.simulator import Simulator
 from tests.car_fmu import packed_car, unpacked_car
 

@@ -1,6 +1,8 @@
 """Binaries of an FMU: rebuilt from its own sources, and for processors and systems not this one."""
 
+import html
 import os
+import re
 import shlex
 import shutil
 import struct
@@ -15,9 +17,8 @@ from fmpy import extract
 from bayesrace.errors import InputError
 from bayesrace.vehicles import CarParameters
 from codegen.compiler import find_compiler
-from codegen.fmu import host_platform, pack
+from codegen.fmu import car_fmu, host_platform, pack
 from codegen.fmu.platforms import FLAGS, get_platform
-from plant.fmu.export import car_fmu
 from tests.car_fmu import packed_car, unpacked_car
 from tests.fmu_exports import Version, built_in, commands, driven, slave
 from tests.fmu_master import Slave
@@ -33,11 +34,11 @@ ARM_LIBRARIES = Path("/usr/aarch64-linux-gnu")
 linux = pytest.mark.skipif(sys.platform != "linux", reason="the line in the archive is for Linux")
 
 
-def readme_line(sources: Path) -> list[str]:
-    """The command that the archive states, with the compiler that was found here for cc."""
-    text = (sources / "README.txt").read_text()
-    (line,) = [row for row in text.splitlines() if row.strip().startswith("cc ")]
-    return [*find_compiler().command, *shlex.split(line)[1:]]
+def stated_line(unpacked: Path) -> list[str]:
+    """The command that the FMU states, with the compiler that was found here for cc."""
+    page = (unpacked / "documentation" / "index.html").read_text()
+    (line,) = re.findall(r"<pre>cc (.*)</pre>", page)
+    return [*find_compiler().command, *shlex.split(html.unescape(line))]
 
 
 @linux
@@ -55,7 +56,7 @@ def test_the_sources_rebuild_the_binary_with_the_line_they_state(
     (binary,) = (folder / "binaries").glob("*/*")
     binary.unlink()
     sources = folder / "sources"
-    subprocess.run(readme_line(sources), cwd=sources, check=True)
+    subprocess.run(stated_line(folder), cwd=sources, check=True)
     shutil.move(sources / binary.name, binary)
     again = Slave(packed_car(version), folder)
     again.initialise()

@@ -1,133 +1,62 @@
 """Writes the FMU file: descriptions, sources that rebuild it, binaries, documentation."""
 
-import hashlib
+import shlex
 import tempfile
 import zipfile
-from collections.abc import Iterator, Sequence
-from importlib.metadata import distribution
+from collections.abc import Mapping, Sequence
+from html import escape
 from pathlib import Path
 from typing import Final
 
 from bayesrace.errors import InputError
 from bayesrace.files import replacing
 from codegen.fmu.definition import FmuDefinition
-from codegen.fmu.description import build_description, icon_description, model_description
-from codegen.fmu.icon import car_icon
-from codegen.fmu.page import documentation_page, readme
-from codegen.fmu.platforms import EXPORTS, FLAGS, Platform, compile_binary, get_platform
-from codegen.fmu.platforms import host_platform as _host
-from codegen.fmu.tables import config_header, tables_header
+from codegen.fmu.description import build_description, model_description
+from codegen.fmu.licences import Part, licence_files, third_parties
+from codegen.fmu.platforms import (
+    FLAGS,
+    PLATFORMS,
+    arguments,
+    compile_binary,
+    get_platform,
+    host_platform,
+)
+from codegen.fmu.sources import all_sources, linked_files, token_of
 
 __all__ = ["pack", "write_sources"]
 
-_NATIVE: Final = Path(__file__).parent / "native"
-
-_SHARED: Final = ("fmu_layer.c", "fmu_layer.h", "fmu_model.h", "fmu_saved.c")
-_LAYER: Final = {2: ("fmi2.c",), 3: ("fmi3.c", "fmi3_absent.c")}
-_HEADERS: Final = {
-    2: ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h"),
-    3: ("fmi3Functions.h", "fmi3FunctionTypes.h", "fmi3PlatformTypes.h"),
-}
-
-_DATE: Final = (1980, 1, 1, 0, 0, 0)
-"""Of every file, so that the same FMU is the same file."""
+_STYLE: Final = "body{font:15px/1.5 sans-serif;max-width:60em;margin:2em auto}"
 
 
-def _fmi_headers() -> Path:
-    import fmpy
-
-    return Path(fmpy.__file__).parent / "c-code"
-
-
-def _tree(folder: Path) -> Iterator[Path]:
-    return (path for path in sorted(folder.rglob("*")) if path.is_file())
-
-
-def _fixed_sources(definition: FmuDefinition) -> dict[str, bytes]:
-    """Every file of ``sources/`` that does not depend on the token."""
-    files = {name: (_NATIVE / name).read_bytes() for name in _SHARED + _LAYER[definition.version]}
-    for name in _HEADERS[definition.version]:
-        files[name] = (_fmi_headers() / name).read_bytes()
-    files["fmu_tables.h"] = tables_header(definition).encode()
-    files["exports.map"] = EXPORTS.encode()
-    given = {path.name: path.read_bytes() for path in (*definition.sources, *definition.archives)}
-    given |= {name: text.encode() for name, text in definition.texts.items()}
-    for below, folder in definition.trees.items():
-        given |= {
-            f"{below}/{path.relative_to(folder).as_posix()}": path.read_bytes()
-            for path in _tree(folder)
-        }
-    taken = sorted(files.keys() & given.keys() | given.keys() & {"fmu_config.h", "README.txt"})
-    if taken:
-        raise InputError(f"FMU '{definition.name}': the packer writes {', '.join(taken)} itself")
-    return files | given
-
-
-def _token(definition: FmuDefinition, files: dict[str, bytes], compiled: list[str]) -> str:
-    """Instantiation token: names what was compiled and the resources it was exported with."""
-    digest = hashlib.sha256(model_description(definition, "", compiled))
-    digest.update(config_header(definition, "").encode())
-    for name, content in sorted((files | dict(definition.resources)).items()):
-        digest.update(name.encode() + b"\0" + content + b"\0")
-    text = digest.hexdigest()
-    return f"{{{text[:8]}-{text[8:12]}-{text[12:16]}-{text[16:20]}-{text[20:32]}}}"
-
-
-def _contents(definition: FmuDefinition) -> tuple[dict[str, bytes], list[str]]:
-    """Every file of the archive but the binaries; and what the compiler is given, in order."""
-    files = _fixed_sources(definition)
-    compiled = sorted(name for name in files if name.endswith(".c") and "/" not in name)
-    linked = [*compiled, *(path.name for path in definition.archives)]
-    token = _token(definition, files, compiled)
-    files["fmu_config.h"] = config_header(definition, token).encode()
-    files["README.txt"] = readme(definition, linked).encode()
-    icon = car_icon()
-    contents = {
-        "modelDescription.xml": model_description(definition, token, compiled),
-        "documentation/index.html": documentation_page(definition, linked).encode(),
-    }
-    if licence := distribution("bayesrace").read_text("licenses/LICENSE"):
-        contents["documentation/licenses/license.txt"] = licence.encode()
-    if definition.version == 2:
-        contents["model.png"] = icon
-    else:
-        options = " ".join((*FLAGS, *definition.flags))
-        archives = [path.name for path in definition.archives]
-        files["buildDescription.xml"] = build_description(definition, compiled, options, archives)
-        contents["terminalsAndIcons/terminalsAndIcons.xml"] = icon_description()
-        contents["terminalsAndIcons/icon.png"] = icon
-    contents |= {f"sources/{name}": content for name, content in files.items()}
-    contents |= {f"resources/{name}": content for name, content in definition.resources.items()}
-    return contents, linked
-
-
-def _write_sources(contents: dict[str, bytes], folder: Path) -> None:
-    for name, content in contents.items():
-        if name.startswith("sources/"):
-            path = folder / name.removeprefix("sources/")
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(content)
+def _page(definition: FmuDefinition, parts: Sequence[Part]) -> str:
+    """``documentation/index.html``, with the one command that makes the Linux binary."""
+    kind = "Model Exchange" if definition.states else "Co-Simulation"
+    linux = PLATFORMS["x86_64-linux"]
+    binary = f"{definition.identifier}.so"
+    line = arguments(linux, linked_files(definition, ".c", ".a"), binary, definition.flags)
+    return f"""<!DOCTYPE html><html lang="en"><meta charset="utf-8"><style>{_STYLE}</style>
+<title>{escape(definition.name)}</title><h1>{escape(definition.name)}</h1>
+<p>{escape(definition.description)}. FMI {definition.version}.0 for {kind}.</p>
+{definition.documentation}
+<h2>Building it again</h2>
+<p>In the folder <code>sources</code>, with any C11 compiler; elsewhere than on Linux without the
+<code>-Wl</code> options:</p>
+<pre>{escape(shlex.join(["cc", *line]))}</pre>
+<p>The result belongs into <code>binaries/{linux.folder(definition.version)}</code>; other platforms
+have other folders there.</p>
+<h2>Licences</h2>
+<p>BayesRace is under the MIT licence. Parts of this FMU are by other authors; all texts are in
+<a href="licenses/license.txt">licenses</a>:</p>
+<ul>{"".join(f"<li>{escape(str(part))}</li>" for part in parts)}</ul></html>
+"""
 
 
 def write_sources(definition: FmuDefinition, folder: Path) -> list[str]:
     """Fills ``folder`` with all that is compiled; returns what the compiler is given, in order."""
-    contents, linked = _contents(definition)
-    _write_sources(contents, folder)
-    return linked
-
-
-def _targets(definition: FmuDefinition, platforms: Sequence[str] | None) -> list[Platform]:
-    host = _host()
-    targets = [host] if platforms is None else [get_platform(name) for name in platforms]
-    if not targets:
-        raise InputError("an FMU needs at least one platform")
-    foreign = [target.name for target in targets if target != host]
-    if definition.archives and foreign:
-        raise InputError(
-            f"'{definition.name}' links a library of this machine and cannot be built for "
-            f"{', '.join(foreign)}: export it there"
-        )
-    return targets
+    for name, content in all_sources(definition).items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content)
+    return linked_files(definition, ".c", ".a")
 
 
 def pack(definition: FmuDefinition, out: Path, platforms: Sequence[str] | None = None) -> Path:
@@ -136,11 +65,31 @@ def pack(definition: FmuDefinition, out: Path, platforms: Sequence[str] | None =
     The file appears complete or not at all. Raises InputError for a platform that cannot be built
     for or a place that cannot be written to, CompileError with the compiler's words.
     """
-    targets = _targets(definition, platforms)
-    contents, linked = _contents(definition)
+    host = host_platform()
+    targets = [host] if platforms is None else [get_platform(name) for name in platforms]
+    foreign = ", ".join(target.name for target in targets if target != host)
+    if not targets:
+        raise InputError("an FMU needs at least one platform")
+    if definition.libraries and foreign:
+        raise InputError(
+            f"'{definition.name}' links a library of this machine and cannot be built for "
+            f"{foreign}: export it there"
+        )
+    parts = third_parties(definition, targets)
+    sources = all_sources(definition)
+    contents = {
+        "modelDescription.xml": model_description(definition, token_of(definition)),
+        "documentation/index.html": _page(definition, parts).encode(),
+        **licence_files(parts),
+        **{f"sources/{name}": content for name, content in sources.items()},
+        **{f"resources/{name}": content for name, content in definition.resources.items()},
+    }
+    if definition.version == 3:
+        options = (*FLAGS, *definition.flags)
+        contents["sources/buildDescription.xml"] = build_description(definition, options)
     with tempfile.TemporaryDirectory(prefix="fmu-") as temporary:
         folder = Path(temporary) / "sources"
-        _write_sources(contents, folder)
+        linked = write_sources(definition, folder)
         for target in targets:
             library = Path(temporary) / f"{definition.identifier}{target.suffix}"
             compile_binary(target, folder, linked, library, definition.flags)
@@ -150,19 +99,15 @@ def pack(definition: FmuDefinition, out: Path, platforms: Sequence[str] | None =
     return out
 
 
-def _write(out: Path, contents: dict[str, bytes]) -> None:
-    first = "modelDescription.xml"
+def _write(out: Path, contents: Mapping[str, bytes]) -> None:
+    """The same contents give the same file: no entry has a time or the rights of this machine."""
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        with (
-            replacing(out) as partial,
-            zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive,
-        ):
-            for name in sorted(contents, key=lambda name: (name != first, name)):
-                entry = zipfile.ZipInfo(name, date_time=_DATE)
-                entry.compress_type = zipfile.ZIP_DEFLATED
+        with replacing(out) as partial, zipfile.ZipFile(partial, "w") as archive:
+            for name, content in contents.items():
+                entry = zipfile.ZipInfo(name)
                 entry.external_attr = 0o100644 << 16
                 entry.create_system = 3
-                archive.writestr(entry, contents[name])
+                archive.writestr(entry, content, zipfile.ZIP_DEFLATED)
     except OSError as error:
         raise InputError(f"cannot write the FMU to {out}: {error.strerror}") from None

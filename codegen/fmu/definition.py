@@ -1,24 +1,55 @@
-"""What an FMU is before it is packed: everything the XML, the C and the archive are made from."""
+"""What an FMU is before it is packed: everything that XML, C and archive are made from."""
 
-import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Literal
+from dataclasses import KW_ONLY, dataclass, field
+from math import inf
+from typing import Final, Literal
 
-from bayesrace.errors import InputError
-from codegen.fmu.variables import Variable
-
-__all__ = ["FmuDefinition"]
+__all__ = ["TIME", "FmuDefinition", "Variable"]
 
 
 @dataclass(frozen=True)
-class FmuDefinition:
-    """An FMU of one FMI version and kind, ready for :func:`codegen.fmu.pack`.
+class Variable:
+    """One scalar variable; its value reference is its place in the definition.
 
-    ``sources`` and ``texts`` together implement ``fmu_model.h``; ``fmu_config.h``, the FMI layers
-    and the FMI headers are added by the packer. InputError for a definition that cannot be packed.
+    An input, a parameter, a state and an output that may be set before the run have a ``start``;
+    an output without one is calculated. In C the variable is ``instance->value[FMU_V_<name>]``.
     """
+
+    name: str
+    causality: Literal["input", "output", "parameter", "local", "independent"]
+    description: str
+    _: KW_ONLY
+    kind: Literal["real", "integer", "boolean"] = "real"
+    unit: str | None = None
+    """Modelica style, such as ``m/s`` or ``kg.m2``; ``1`` for a pure number; real ones only."""
+    start: float | None = None
+    min: float = -inf
+    max: float = inf
+    exclusive: bool = False
+    """The value must not be equal to ``min`` or ``max`` either (FMI cannot say that)."""
+    tunable: bool = False
+    """A parameter that may also be set during the run (default: until initialisation ends)."""
+    nominal: float | None = None
+    derivative_of: str | None = None
+    """Model Exchange: the state that this variable is the derivative of."""
+    dependencies: tuple[str, ...] | None = ()
+    """Outputs and derivatives: variables that it depends on directly (None: on all)."""
+
+    @property
+    def variability(self) -> Literal["continuous", "discrete", "fixed", "tunable"]:
+        """As FMI calls it."""
+        if self.causality == "parameter":
+            return "tunable" if self.tunable else "fixed"
+        return "continuous" if self.kind == "real" else "discrete"
+
+
+TIME: Final = Variable("time", "independent", "simulation time", unit="s")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FmuDefinition:
+    """An FMU of one FMI version, ready for :func:`codegen.fmu.pack`."""
 
     name: str
     """Model name shown to people."""
@@ -28,57 +59,35 @@ class FmuDefinition:
     """One line."""
     version: Literal[2, 3]
     """FMI 2.0 or 3.0."""
-    kind: Literal["cs", "me"]
-    """Co-Simulation, or Model Exchange (FMI 3.0 only)."""
     variables: tuple[Variable, ...]
-    """In the order of their value references; time, which every FMU has, comes on top."""
-    sources: tuple[Path, ...]
-    """Hand-written C files and headers; they go flat into ``sources/``."""
-    texts: Mapping[str, str] = field(default_factory=dict)
-    """Generated C files and headers: file name to content."""
-    trees: Mapping[str, Path] = field(default_factory=dict)
-    """Folders of headers to copy below ``sources/``: name there to folder."""
-    archives: tuple[Path, ...] = ()
-    """Static libraries of the host platform to link (then no other platform can be built); they
-    are copied into ``sources/`` as well."""
+    """In the order of their value references. Of Model Exchange: the states first, at the end their
+    derivatives in the same order."""
+    sources: Mapping[str, bytes]
+    """C files that implement the model of ``fmu.h``, with headers, by the path below ``sources/``.
+    A static library of the host platform (``*.a``) is linked; then no other can be built for."""
     flags: tuple[str, ...] = ()
-    """Compiler flags after the packer's own."""
-    constants: Mapping[str, float | int | str] = field(default_factory=dict)
-    """Further macros for ``fmu_config.h``: numbers as exact literals, text as a C string."""
+    """Compiler flags after those of every FMU."""
+    constants: Mapping[str, float] = field(default_factory=dict)
+    """Further macros of ``fmu_config.h``."""
     resources: Mapping[str, bytes] = field(default_factory=dict)
     """Files of the ``resources/`` folder: relative path to content."""
     documentation: str = ""
-    """Body of the documentation page, HTML; the table of variables is added."""
+    """Body of the documentation page, HTML."""
     default_step_s: float = 0.02
-    saves: Literal["none", "instance", "serialised"] = "serialised"
-    """State get and set: not at all; within an instance (model memory may hold pointers into
-    itself); or also as bytes for another instance (model memory holds no pointers)."""
-    derivatives: bool = False
-    """Model Exchange: directional and adjoint derivatives exist."""
-
-    def __post_init__(self) -> None:
-        if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", self.identifier):
-            raise InputError(f"FMU '{self.identifier}': the identifier must be a C identifier")
-        if self.version not in (2, 3):
-            raise InputError(f"FMI version {self.version} cannot be written; choose 2 or 3")
-        if self.kind not in ("cs", "me"):
-            raise InputError(f"FMU kind '{self.kind}' is unknown; choose cs or me")
-        if self.version == 2 and self.kind == "me":
-            raise InputError("Model Exchange is exported for FMI 3.0 only: use --version 3")
-        names = [variable.name for variable in self.variables]
-        repeated = {name for name in (*names, "time") if [*names, "time"].count(name) > 1}
-        if repeated:
-            raise InputError(f"FMU '{self.name}' has two variables named {sorted(repeated)}")
-        known = set(names)
-        for variable in self.variables:
-            others = (*(variable.dependencies or ()), *(variable.initial_dependencies or ()))
-            for other in (variable.derivative_of, *others):
-                if other is not None and other not in known:
-                    raise InputError(f"variable '{variable.name}' refers to unknown '{other}'")
-        if self.states and self.kind == "cs":
-            raise InputError("a Co-Simulation FMU declares no derivatives of states")
+    serialises: bool = True
+    """A saved state can become bytes for another instance: model memory holds no pointers."""
 
     @property
     def states(self) -> tuple[str, ...]:
-        """Continuous states in the order of their derivatives; Model Exchange only."""
+        """Continuous states: some if the FMU is for Model Exchange, else none."""
         return tuple(v.derivative_of for v in self.variables if v.derivative_of is not None)
+
+    @property
+    def all_variables(self) -> tuple[Variable, ...]:
+        """The variables, and time as the last."""
+        return (*self.variables, TIME)
+
+    @property
+    def libraries(self) -> bool:
+        """Whether static libraries are among the sources."""
+        return any(name.endswith(".a") for name in self.sources)

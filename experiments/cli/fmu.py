@@ -1,4 +1,4 @@
-"""``fmu export``, ``weights``, ``inspect``: FMUs for other tools, and of other tools."""
+"""``bayesrace fmu``: exports FMUs, exchanges their weights, lists the variables of any FMU."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -101,7 +101,7 @@ def export(
 ) -> None:
     """Write the car, or the controller of a track, as an FMU, C sources inside."""
     from bayesrace.vehicles import get_car
-    from codegen.fmu import pack
+    from codegen.fmu import car_fmu, pack
 
     parameters = get_car(car)
     number: Literal[2, 3] = 2 if version is Version.two else 3
@@ -110,22 +110,14 @@ def export(
             track=track, raceline=raceline, weights=weights, settings=settings, artefact=artefact,
             cpu=None if cpu == "portable" else cpu,
         )  # fmt: skip
-        from plant.fmu.export import car_fmu
-
         definition = car_fmu(parameters, number, kind.value)
     elif kind is Kind.me:
         raise InputError("a controller is sampled, not continuous: export it with --kind cs")
     else:
         definition = _controller(
-            parameters,
-            number,
-            track or DEFAULT_RACE_TRACK,
-            raceline,
-            weights,
-            settings,
-            artefact,
-            cpu,
-        )
+            parameters, track or DEFAULT_RACE_TRACK, raceline=raceline, weights=weights,
+            settings=settings, artefact=artefact, version=number, cpu=cpu,
+        )  # fmt: skip
     pack(definition, out, platform)
     typer.echo(f"{definition.name}, FMI {number}.0 {kind.value}: {out}")
 
@@ -138,17 +130,18 @@ def _only_for_controllers(**options: object) -> None:
 
 def _controller(
     car: "CarParameters",
-    version: Literal[2, 3],
     track: str,
+    *,
     raceline: Path | None,
     weights: Path | None,
     settings: Path | None,
     artefact: Path | None,
+    version: Literal[2, 3],
     cpu: str,
 ) -> "FmuDefinition":
     from bayesrace.gp.weights import read_weights
     from codegen.build import build
-    from codegen.fmu.controller import controller_fmu
+    from codegen.fmu import controller_fmu
     from codegen.settings import BuildSettings
     from controller.assembly import read_settings
     from controller.cycle_settings import FallbackSettings
@@ -158,13 +151,13 @@ def _controller(
     return controller_fmu(
         artefact or build(BuildSettings(car=car))[0],
         car,
-        table.rows,
-        table.spacing_m,
-        read_settings(settings, MpcSettings).parameters(car),
-        FallbackSettings().model_dump() | {"brake_fade_mps": car.brake_fade_mps},
-        None if weights is None else read_weights(weights),
-        version,
-        cpu,
+        rows=table.rows,
+        spacing_m=table.spacing_m,
+        settings=read_settings(settings, MpcSettings).parameters(car),
+        fallback=FallbackSettings().model_dump() | {"brake_fade_mps": car.brake_fade_mps},
+        weights=None if weights is None else read_weights(weights),
+        version=version,
+        cpu=cpu,
     )
 
 
@@ -176,7 +169,7 @@ def other_weights(
 ) -> None:
     """Copy a controller's FMU with other weights, without compiling."""
     from bayesrace.gp.weights import read_weights
-    from codegen.fmu.resources import exchange_weights
+    from codegen.fmu.weights import exchange_weights
 
     loaded = read_weights(weights)
     exchange_weights(controller, loaded, out)

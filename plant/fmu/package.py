@@ -6,7 +6,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, Final
 
 from fmpy import platform, platform_tuple, read_model_description, sharedLibraryExtension
@@ -21,21 +21,16 @@ _MOST_BYTES: Final = 2 << 30
 _LARGEST_XML: Final = 16_000_000
 """Bytes of a model description; a hundred thousand variables."""
 
-_UNREADABLE: Final = (
-    OSError, RuntimeError, NotImplementedError, EOFError, zipfile.BadZipFile, zlib.error,
-)  # fmt: skip
-"""What :mod:`zipfile` raises at a file that is no archive, damaged, or encrypted."""
-
 
 @contextmanager
 def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
-    """The archive; whatever it lacks becomes an InputError."""
+    """The archive; InputError if the file is none, damaged, or encrypted."""
     if not path.is_file():
         raise InputError(f"no FMU at {path}; give the path of an .fmu file")
     try:
         with zipfile.ZipFile(path) as archive:
             yield archive
-    except _UNREADABLE as error:
+    except (OSError, RuntimeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(
             f"{path} is no FMU, or a damaged one ({error}); export or copy it again"
         ) from None
@@ -58,25 +53,23 @@ def read_description(path: str | os.PathLike[str]) -> Any:
             )
         with archive.open("modelDescription.xml") as xml:
             head = xml.read(1 << 16)
-    version = re.search(rb"fmiVersion\s*=\s*[\"']([^\"']*)[\"']", head)
-    told = version.group(1).decode(errors="replace") if version else "none"
-    if not (told == "2.0" or told.startswith("3.")):
+    stated = re.search(rb"fmiVersion\s*=\s*[\"']([^\"']*)[\"']", head)
+    version = stated.group(1).decode(errors="replace") if stated else "none"
+    if version != "2.0" and not version.startswith("3."):
         raise InputError(
-            f"{path} is for FMI version {told}; versions 2.0 and 3.0 are understood: export it so"
+            f"{path} is for FMI version {version}; versions 2.0 and 3.0 are read: export it so"
         )
     try:
         return read_model_description(str(path), validate=False)
-    except Exception as error:  # it fails with whatever the first wrong line leads to
+    except Exception as error:  # fmpy fails with whatever the first wrong line leads to
         raise InputError(f"{path}: its modelDescription.xml cannot be read: {error}") from None
 
 
 def extract(path: Path, folder: Path) -> None:
     """Unpacks the FMU into an existing folder, and nowhere else; InputError if it cannot be."""
     with _opened(path) as archive:
-        for entry in archive.infolist():
-            name = entry.filename
-            parts = PurePosixPath(name).parts
-            if name.startswith("/") or ".." in parts or "\\" in name or ":" in name:
+        for name in archive.namelist():
+            if name.startswith("/") or ".." in name.split("/") or "\\" in name or ":" in name:
                 raise InputError(
                     f"{path} holds '{name[:200]}', a path that leads out of its folder: not "
                     "unpacked; do not use this file"
@@ -94,12 +87,10 @@ def library(path: Path, folder: Path, description: Any) -> Path:
     name: str = description.coSimulation.modelIdentifier + sharedLibraryExtension
     if "/" in name or "\\" in name:
         raise InputError(f"{path} names '{name[:200]}' as its library, which is no file name")
-    # FMI 2.0 names Intel's platforms alone; where else, the names of 3.0 are in use.
-    fits = (platform_tuple,) if description.fmiVersion.startswith("3.") else (
-        (platform, platform_tuple) if platform_tuple.startswith("x86") else (
-            platform_tuple, platform,
-        )
-    )  # fmt: skip
+    # FMI 2.0 names Intel's platforms alone; for others the names of 3.0 are in use.
+    fits = [platform_tuple]
+    if description.fmiVersion == "2.0":
+        fits.insert(0 if platform_tuple.startswith("x86") else 1, platform)
     for one in fits:
         path_here: Path = folder / "binaries" / one / name
         if path_here.is_file():

@@ -49,12 +49,12 @@ static void states(fmi2Component c) {
 }
 
 static void values(fmi2Component c) {
-    fmi2ValueReference all[FMU_VALUES + 1], strange = FMU_VALUES + 1;
-    double v[FMU_VALUES + 1];
+    fmi2ValueReference all[FMU_VALUES], strange = FMU_VALUES;
+    double v[FMU_VALUES];
     int i = 0;
     fmi2String text = "";
-    for (fmi2ValueReference k = 0; k <= FMU_VALUES; k++) all[k] = k;
-    FINE(fmi2GetReal(c, all, FMU_VALUES + 1, v));
+    for (fmi2ValueReference k = 0; k < FMU_VALUES; k++) all[k] = k;
+    FINE(fmi2GetReal(c, all, FMU_VALUES, v));
     FINE(fmi2GetReal(c, NULL, 0, NULL));
     BAD(fmi2GetReal(c, NULL, 1, v));
     BAD(fmi2SetReal(c, all, 1, NULL));

@@ -21,7 +21,7 @@ static void listen(fmi3InstanceEnvironment environment, fmi3Status status, fmi3S
 #define BAD(call) IS(fmi3Error, call)
 
 static fmi3Instance make(const char *token, const char *resources) {
-#if FMU_CS
+#if !FMU_STATES
     return fmi3InstantiateCoSimulation("one", token, resources, 0, 1, 0, 0, NULL, 0, NULL, listen,
                                        NULL);
 #else
@@ -65,12 +65,12 @@ static void states(fmi3Instance c) {
 }
 
 static void values(fmi3Instance c) {
-    fmi3ValueReference all[FMU_VALUES + 1], strange[] = {FMU_VALUES + 1, 0xffffffff};
-    double v[FMU_VALUES + 1];
+    fmi3ValueReference all[FMU_VALUES], strange[] = {FMU_VALUES, 0xffffffff};
+    double v[FMU_VALUES];
     fmi3Int32 i = 0;
     fmi3Boolean b = 0;
-    for (fmi3ValueReference k = 0; k <= FMU_VALUES; k++) all[k] = k;
-    FINE(fmi3GetFloat64(c, all, FMU_VALUES + 1, v, FMU_VALUES + 1));
+    for (fmi3ValueReference k = 0; k < FMU_VALUES; k++) all[k] = k;
+    FINE(fmi3GetFloat64(c, all, FMU_VALUES, v, FMU_VALUES));
     FINE(fmi3GetFloat64(c, NULL, 0, NULL, 0));
     BAD(fmi3GetFloat64(c, NULL, 1, v, 1));
     BAD(fmi3GetFloat64(c, all, 1, NULL, 1));
@@ -78,7 +78,7 @@ static void values(fmi3Instance c) {
     BAD(fmi3GetFloat64(c, strange, 1, v, 1));
     BAD(fmi3GetFloat64(c, strange + 1, 1, v, 1));
     BAD(fmi3SetFloat64(c, strange, 2, v, 2));
-    BAD(fmi3SetFloat64(c, all + FMU_VALUES, 1, v, 1)); /* time */
+    BAD(fmi3SetFloat64(c, all + FMU_V_time, 1, v, 1));
     BAD(fmi3GetInt32(c, all, 1, &i, 1));
     BAD(fmi3SetInt32(c, all, 1, &i, 1));
     BAD(fmi3GetBoolean(c, all, 1, &b, 1));
@@ -97,7 +97,7 @@ static void run(fmi3Instance c) {
     fmi3Boolean yes;
     const fmi3ValueReference d = FMU_V_d, mass = FMU_V_mass_kg;
     double heavy = 1;
-#if FMU_CS
+#if !FMU_STATES
     BAD(fmi3EnterContinuousTimeMode(c));
     BAD(fmi3SetTime(c, 1));
     BAD(fmi3GetDirectionalDerivative(c, &d, 1, &d, 1, v, 1, v, 1));
@@ -131,7 +131,7 @@ static void run(fmi3Instance c) {
                                       out, FMU_STATES));
     FINE(fmi3GetAdjointDerivative(c, der, FMU_STATES, known, FMU_V_der_x, seed, FMU_STATES, out,
                                   FMU_V_der_x));
-    const fmi3ValueReference time = FMU_VALUES;
+    const fmi3ValueReference time = FMU_V_time;
     out[0] = 1;
     FINE(fmi3GetDirectionalDerivative(c, der, 1, &time, 1, seed, 1, out, 1));
     CHECK(out[0] == 0);

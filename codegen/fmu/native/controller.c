@@ -11,7 +11,7 @@
 
 #include "bayesrace_cycle.h"
 #include "br_files.h"
-#include "fmu_model.h"
+#include "fmu.h"
 
 #define ALIGNED(size) (((size) + 63) / 64 * 64)
 
@@ -27,97 +27,82 @@ size_t fmu_model_size(void) {
     return ALIGNED(sizeof(controller)) + ALIGNED(br_mpc_memory_size()) + br_cycle_memory_size();
 }
 
-int fmu_model_create(fmu_instance *instance, const char *resources) {
+bool fmu_model_create(fmu_instance *instance) {
     controller *c = instance->model;
     char text[256];
-    const br_mpc_error error = br_mpc_init((char *)c + ALIGNED(sizeof *c), br_mpc_memory_size(),
-                                           &c->mpc);
-    if (error) {
-        fmu_log(instance, "controller: %s", br_mpc_error_text(error));
-        return -1;
-    }
-    if (!resources) {
-        fmu_log(instance, "controller: the importer names no resources folder: the racing line and "
-                          "the weights are in there");
-        return -1;
-    }
-    if (br_files_load(c->mpc, resources, BR_MODEL_IDENTITY, text, sizeof text)) {
-        fmu_log(instance, "controller: %s", text);
-        return -1;
-    }
-    return 0;
+    const br_mpc_error error =
+        br_mpc_init((char *)c + ALIGNED(sizeof *c), br_mpc_memory_size(), &c->mpc);
+    if (error) return fmu_refuse(instance, "controller: %s", br_mpc_error_text(error));
+    if (!instance->resources)
+        return fmu_refuse(instance, "controller: the importer names no resources folder, which "
+                                    "holds the racing line and the weights");
+    if (br_files_load(c->mpc, instance->resources, BR_MODEL_IDENTITY, text, sizeof text))
+        return fmu_refuse(instance, "controller: %s", text);
+    return true;
 }
 
-/* Parameters as they are now; any of them may be set between two steps. */
-static int take_parameters(fmu_instance *instance) {
+/* Takes the parameters as they are now; any of them may be set between two steps. */
+static bool take_parameters(fmu_instance *instance) {
     const double *v = instance->value;
     controller *c = instance->model;
 #define TAKE(name) .name = v[FMU_V_##name],
     const br_mpc_parameters parameters = {BR_PARAMETERS(TAKE) BR_SOLVER_FIELDS(TAKE, TAKE)};
 #undef TAKE
-    const double delay_s = v[FMU_V_delay];
     const br_driving driving = {
         .u_low = {parameters.d_min, -parameters.delta_rate_max_radps},
         .u_high = {parameters.d_max, parameters.delta_rate_max_radps},
         .brake_fade_mps = v[FMU_V_brake_fade_mps],
         .standing_mps = v[FMU_V_brake_fade_mps],
-        .stop_mps2 = 1, /* nobody tells an FMU to stop */
+        .stop_mps2 = 1, /* an FMU has no command to stop */
         .shifted_s = v[FMU_V_shifted_s],
         .limit_tolerance = v[FMU_V_limit_tolerance],
         .recover_cycles = (int)v[FMU_V_recover_cycles],
         .compensation = BR_COMPENSATION_FIXED,
-        .delay_s = delay_s,
-        .longest_s = delay_s > 0 ? delay_s : 1,
+        .delay_s = v[FMU_V_delay],
+        .longest_s = v[FMU_V_delay] > 0 ? v[FMU_V_delay] : 1,
         .stale_s = 1, /* every step has its state */
     };
     br_mpc_error error = br_mpc_set_parameters(c->mpc, &parameters);
     if (!error) error = br_cycle_set_driving(c->cycle, &driving);
-    if (error) { /* the ones before stay */
-        fmu_log(instance,
-                "controller: %s (q_position to iterations_cold; d_min must be below d_max)",
-                br_mpc_error_text(error));
-        return -1;
-    }
-    return 0;
+    if (!error) return true;
+    return fmu_refuse(instance, /* and keeps the parameters before */
+                      "controller: %s (q_position to iterations_cold; d_min must be below d_max)",
+                      br_mpc_error_text(error));
 }
 
-int fmu_model_initialise(fmu_instance *instance) {
+bool fmu_model_initialise(fmu_instance *instance) {
     controller *c = instance->model;
     double *v = instance->value;
     char *memory = (char *)c->mpc + ALIGNED(br_mpc_memory_size());
     br_cycle_drive_mpc(memory, br_cycle_memory_size(), c->mpc, 0, &c->cycle);
     br_mpc_reset(c->mpc);
-    if (take_parameters(instance)) return -1;
-    c->next_s = instance->time;
+    if (!take_parameters(instance)) return false;
+    c->next_s = v[FMU_V_time];
     c->cycles = 0;
-    v[FMU_V_d] = v[FMU_V_delta_rate] = 0;
+    memset(&v[FMU_V_d], 0, (FMU_V_time - FMU_V_d) * sizeof *v); /* the outputs */
     v[FMU_V_status] = BR_HALTED;
-    v[FMU_V_usable] = 0;
     v[FMU_V_fallback_level] = BR_STOP;
-    v[FMU_V_iterations_used] = 0;
     v[FMU_V_stationarity] = v[FMU_V_defect] = v[FMU_V_slack_max_m] = -1;
-    v[FMU_V_s_ref_m] = v[FMU_V_lateral_m] = 0;
-    return 0;
+    return true;
 }
 
-/* Once per period, on a grid that does not drift. */
-static int due(controller *c, double time_s, double period_s) {
+/* Whether a control step is due: once per period, on a grid that does not drift. */
+static bool due(controller *c, double time_s, double period_s) {
     const double early = 1e-6 * period_s;
-    if (time_s < c->next_s - early) return 0;
-    if (period_s > 0)
-        c->next_s += period_s * (floor((time_s + early - c->next_s) / period_s) + 1);
-    return 1;
+    if (time_s < c->next_s - early) return false;
+    if (period_s > 0) c->next_s += period_s * (floor((time_s + early - c->next_s) / period_s) + 1);
+    return true;
 }
 
-/* The inputs of the FMU as a received state. Where the importer tells what acts and there is no
- * delay, nothing has to be predicted. */
+/* The inputs of the FMU as a received state. If the importer connects the input that acts and there
+ * is no delay, nothing has to be predicted. */
 static br_measured measured(fmu_instance *instance) {
     controller *c = instance->model;
     const double *v = instance->value;
-    const int connected = v[FMU_V_d_applied_connected] != 0;
+    const bool connected = v[FMU_V_d_applied_connected] != 0;
     br_measured state = {
         .seq = c->cycles++,
-        .time_s = instance->time,
+        .time_s = v[FMU_V_time],
         .u_applied = {[BR_INDEX_DUTY] = connected ? v[FMU_V_d_applied] : 0},
         .lockstep = connected && v[FMU_V_delay] == 0,
     };
@@ -127,7 +112,7 @@ static br_measured measured(fmu_instance *instance) {
 
 static double known(double value) { return isfinite(value) ? value : -1; }
 
-static void tell(fmu_instance *instance, const br_decision *decision) {
+static void set_outputs(fmu_instance *instance, const br_decision *decision) {
     static const br_mpc_info nothing;
     const controller *c = instance->model;
     const br_mpc_info *info = decision->stepped ? br_cycle_info(c->cycle) : &nothing;
@@ -142,23 +127,23 @@ static void tell(fmu_instance *instance, const br_decision *decision) {
     v[FMU_V_stationarity] = known(info->stationarity);
     v[FMU_V_defect] = known(info->defect);
     v[FMU_V_slack_max_m] = known(info->slack_max_m);
-    if (!decision->stepped || status == BR_BAD_STATE) return; /* projected nothing */
+    if (!decision->stepped || status == BR_BAD_STATE) return; /* which projects nothing */
     v[FMU_V_s_ref_m] = info->s_ref_m;
     v[FMU_V_lateral_m] = info->lateral_m;
 }
 
-int fmu_model_step(fmu_instance *instance, double h) {
-    (void)h;
+bool fmu_model_step(fmu_instance *instance, double h) {
     controller *c = instance->model;
     const double *v = instance->value;
-    if (!due(c, instance->time, v[FMU_V_period])) return 0;
+    if (!due(c, v[FMU_V_time], v[FMU_V_period])) return true;
     br_environment around = {v[FMU_V_speed_limit], v[FMU_V_speed_limit_rate]};
     if (around.speed_limit_mps >= NO_SPEED_LIMIT) around.speed_limit_mps = INFINITY;
-    const int failed = take_parameters(instance);
-    if (failed) around.speed_limit_mps = NAN; /* the step refuses: the fallback answers */
+    const bool accepted = take_parameters(instance);
+    if (!accepted) around.speed_limit_mps = NAN; /* the step refuses: the fallback answers */
     const br_measured state = measured(instance);
     br_decision decision;
-    if (br_cycle_answer(c->cycle, &state, &around, instance->time, 0, 0, &decision)) return -1;
-    tell(instance, &decision);
-    return failed;
+    if (br_cycle_answer(c->cycle, &state, &around, v[FMU_V_time], 0, 0, &decision))
+        return fmu_refuse(instance, "controller: the control cycle refuses the state");
+    set_outputs(instance, &decision);
+    return accepted;
 }

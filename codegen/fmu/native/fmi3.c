@@ -1,384 +1,232 @@
-/* FMI 3.0 Co-Simulation and Model Exchange over fmu_layer.h; fmi3_absent.c has the functions for
- * what these FMUs do not have (clocks, arrays, strings, configuration), which must exist. */
+/* FMI 3.0 Co-Simulation and Model Exchange: the functions that 2.0 has in another form, or not.
+ * An importer may load every function, so those of what these FMUs lack exist as well. */
 #include <math.h>
-#include <string.h>
 
-#include "fmi3Functions.h"
-#include "fmu_layer.h"
-#include "fmu_tables.h" /* generated */
+#include "fmu.h"
 
-#define INSTANCE                                                                                   \
-    fmu_instance *instance = c;                                                                    \
-    if (!instance) return fmi3Error
-
-#define IN(...)                                                                                    \
-    INSTANCE;                                                                                      \
-    if (fmu_in_phase(instance, __func__, __VA_ARGS__)) return fmi3Error
-
-#define EVENT (1u << FMU_EVENT)
-#define CONTINUOUS (1u << FMU_CONTINUOUS)
-#define STEPPING (1u << FMU_STEPPING)
-#define INITIALISATION (1u << FMU_INITIALISATION)
-#define TERMINATED (1u << FMU_TERMINATED)
-
-static fmi3Status status(int result)
-{
-    return result == FMU_FINE ? fmi3OK : result == FMU_NOT_FINITE ? fmi3Discard : fmi3Error;
+void fmu_report(const fmu_instance *instance, const char *text) {
+    if (instance->logger)
+        ((fmi3LogMessageCallback)instance->logger)(instance->environment, fmi3Error,
+                                                   "logStatusError", text);
 }
 
-static void put(fmi3Boolean *where, fmi3Boolean value)
-{
-    if (where) *where = value;
-}
+char *fmu_folder(char *location) { return location[0] ? location : NULL; }
 
-void fmu_emit(const fmu_instance *instance, const char *text)
-{
-    fmi3LogMessageCallback log;
-    memcpy(&log, &instance->logger, sizeof log);
-    if (log) log(instance->environment, fmi3Error, "logStatusError", text);
-}
-
-const char *fmi3GetVersion(void)
-{
-    return "3.0";
-}
-
-fmi3Status fmi3SetDebugLogging(fmi3Instance c, fmi3Boolean on, size_t n, const fmi3String names[])
-{
-    (void)on, (void)n, (void)names; /* there are errors only, always passed on */
-    return c ? fmi3OK : fmi3Error;
+static void no(fmi3Boolean *answer) {
+    if (answer) *answer = fmi3False;
 }
 
 /* ---- instances ---- */
 
-static fmi3Instance make(int offered, fmi3String name, fmi3String token, fmi3String resources,
-                         void *environment, fmi3LogMessageCallback log)
-{
-    void *logger = NULL;
-    memcpy(&logger, &log, sizeof logger);
-    if (offered) return fmu_new(name, token, resources, logger, environment);
-    if (log) log(environment, fmi3Error, "logStatusError", "this FMU is of another kind");
-    return NULL;
-}
-
-fmi3Instance fmi3InstantiateModelExchange(fmi3String name, fmi3String token, fmi3String resources,
-                                          fmi3Boolean visible, fmi3Boolean logging,
-                                          fmi3InstanceEnvironment environment,
-                                          fmi3LogMessageCallback log)
-{
-    (void)visible, (void)logging;
-    return make(FMU_ME, name, token, resources, environment, log);
-}
-
-fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3String resources,
-                                         fmi3Boolean visible, fmi3Boolean logging,
-                                         fmi3Boolean events, fmi3Boolean early_return,
-                                         const fmi3ValueReference intermediate[],
-                                         size_t n_intermediate, fmi3InstanceEnvironment environment,
-                                         fmi3LogMessageCallback log,
-                                         fmi3IntermediateUpdateCallback update)
-{
-    (void)visible, (void)logging, (void)early_return, (void)intermediate, (void)update;
-    if (events || n_intermediate) {
-        if (log)
-            log(environment, fmi3Error, "logStatusError",
-                "this FMU has neither event mode nor intermediate variables");
-        return NULL;
+#define INSTANTIATE(kind, reason, ...)                                                          \
+    fmi3Instance fmi3Instantiate##kind(fmi3String name, fmi3String token, fmi3String resources, \
+                                       fmi3Boolean visible, fmi3Boolean logging, __VA_ARGS__) { \
+        const char *refused = reason;                                                           \
+        if (!refused) return fmu_new(name, token, resources, (void (*)(void))log, environment); \
+        if (log) log(environment, fmi3Error, "logStatusError", refused);                        \
+        return NULL;                                                                            \
     }
-    return make(FMU_CS, name, token, resources, environment, log);
-}
+#define ENVIRONMENT fmi3InstanceEnvironment environment, fmi3LogMessageCallback log
+#define OTHER_KIND "this FMU is of another kind"
 
-void fmi3FreeInstance(fmi3Instance c)
-{
-    if (c) fmu_delete(c);
-}
-
-/* ---- phases ---- */
+/* clang-format off */
+INSTANTIATE(ModelExchange, FMU_STATES ? NULL : OTHER_KIND, ENVIRONMENT)
+INSTANTIATE(CoSimulation,
+            FMU_STATES            ? OTHER_KIND
+            : events || n_between ? "this FMU has neither event mode nor intermediate variables"
+                                  : NULL,
+            fmi3Boolean events, fmi3Boolean early_return, const fmi3ValueReference between[],
+            size_t n_between, ENVIRONMENT, fmi3IntermediateUpdateCallback update)
+INSTANTIATE(ScheduledExecution, OTHER_KIND, ENVIRONMENT, fmi3ClockUpdateCallback update,
+            fmi3LockPreemptionCallback lock, fmi3UnlockPreemptionCallback unlock)
+/* clang-format on */
 
 fmi3Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean has_tolerance,
                                        fmi3Float64 tolerance, fmi3Float64 start,
-                                       fmi3Boolean has_stop, fmi3Float64 stop)
-{
-    INSTANCE;
-    (void)has_tolerance, (void)tolerance;
-    if (fmu_enter_initialisation(instance)) return fmi3Error;
-    if (fmu_set_times(instance, start, has_stop, stop) == FMU_FINE) return fmi3OK;
-    instance->phase = FMU_INSTANTIATED;
-    return fmi3Error;
-}
-
-fmi3Status fmi3ExitInitializationMode(fmi3Instance c)
-{
-    INSTANCE;
-    return status(fmu_exit_initialisation(instance));
-}
-
-fmi3Status fmi3EnterEventMode(fmi3Instance c)
-{
-    IN(CONTINUOUS);
-    instance->phase = FMU_EVENT;
+                                       fmi3Boolean has_stop, fmi3Float64 stop) {
+    REQUIRE(FMU_INSTANTIATED);
+    if (!fmu_set_times(instance, start, has_stop, stop)) return fmi3Error;
+    instance->phase = FMU_INITIALISATION;
     return fmi3OK;
 }
 
-fmi3Status fmi3Terminate(fmi3Instance c)
-{
-    INSTANCE;
-    return status(fmu_terminate(instance));
+/* ---- functions for what these FMUs do not have ---- */
+
+/* clang-format off */
+#define ABSENT(function, ...) /* an error unless it concerns no variable */                        \
+    fmi3Status function(fmi3Instance c, __VA_ARGS__) { return fmu_absent(c, n, __func__); }
+#define NEVER(function, ...)                                                                       \
+    fmi3Status function(__VA_ARGS__) { return fmu_absent(c, 1, __func__); }
+#define NAMED const fmi3ValueReference vr[], size_t n
+#define NO_VARIABLES(type)                                                                         \
+    ABSENT(fmi3Get##type, NAMED, fmi3##type value[], size_t n_values)                              \
+    ABSENT(fmi3Set##type, NAMED, const fmi3##type value[], size_t n_values)
+
+NO_VARIABLES(Float32) NO_VARIABLES(Int8) NO_VARIABLES(Int16) NO_VARIABLES(Int64)
+NO_VARIABLES(UInt8) NO_VARIABLES(UInt16) NO_VARIABLES(UInt32) NO_VARIABLES(UInt64)
+NO_VARIABLES(String)
+ABSENT(fmi3GetBinary, NAMED, size_t sizes[], fmi3Binary value[], size_t n_values)
+ABSENT(fmi3SetBinary, NAMED, const size_t sizes[], const fmi3Binary value[], size_t n_values)
+ABSENT(fmi3GetClock, NAMED, fmi3Clock value[])
+ABSENT(fmi3SetClock, NAMED, const fmi3Clock value[])
+ABSENT(fmi3GetIntervalDecimal, NAMED, fmi3Float64 interval[], fmi3IntervalQualifier qualifier[])
+ABSENT(fmi3GetIntervalFraction, NAMED, fmi3UInt64 counter[], fmi3UInt64 resolution[],
+       fmi3IntervalQualifier qualifier[])
+ABSENT(fmi3GetShiftDecimal, NAMED, fmi3Float64 shift[])
+ABSENT(fmi3GetShiftFraction, NAMED, fmi3UInt64 counter[], fmi3UInt64 resolution[])
+ABSENT(fmi3SetIntervalDecimal, NAMED, const fmi3Float64 interval[])
+ABSENT(fmi3SetIntervalFraction, NAMED, const fmi3UInt64 counter[], const fmi3UInt64 resolution[])
+ABSENT(fmi3SetShiftDecimal, NAMED, const fmi3Float64 shift[])
+ABSENT(fmi3SetShiftFraction, NAMED, const fmi3UInt64 counter[], const fmi3UInt64 resolution[])
+ABSENT(fmi3GetOutputDerivatives, NAMED, const fmi3Int32 order[], fmi3Float64 value[],
+       size_t n_values)
+ABSENT(fmi3GetEventIndicators, fmi3Float64 value[], size_t n)
+NEVER(fmi3GetNumberOfVariableDependencies, fmi3Instance c, fmi3ValueReference vr, size_t *n)
+NEVER(fmi3GetVariableDependencies, fmi3Instance c, fmi3ValueReference dependent,
+      size_t of_dependent[], fmi3ValueReference independent[], size_t of_independent[],
+      fmi3DependencyKind kind[], size_t n)
+NEVER(fmi3EnterConfigurationMode, fmi3Instance c)
+NEVER(fmi3ExitConfigurationMode, fmi3Instance c)
+NEVER(fmi3EnterStepMode, fmi3Instance c)
+NEVER(fmi3EvaluateDiscreteStates, fmi3Instance c)
+NEVER(fmi3ActivateModelPartition, fmi3Instance c, fmi3ValueReference clock, fmi3Float64 time)
+    /* clang-format on */
+
+    /* ---- Co-Simulation; the phase refuses it in Model Exchange ---- */
+
+    fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 time, fmi3Float64 h, fmi3Boolean no_rollback,
+                          fmi3Boolean *event, fmi3Boolean *terminate, fmi3Boolean *early,
+                          fmi3Float64 *reached) {
+    REQUIRE(FMU_STEPPING);
+    const bool fine = fmu_step(instance, time, h);
+    no(event), no(terminate), no(early);
+    if (reached) *reached = instance->value[FMU_V_time];
+    return fine ? fmi3OK : fmi3Error;
 }
 
-fmi3Status fmi3Reset(fmi3Instance c)
-{
-    INSTANCE;
-    return status(fmu_reset(instance));
-}
+/* ---- Model Exchange; the phase refuses it in Co-Simulation ---- */
 
-/* ---- values ---- */
+#define INITIALISED (FMU_INITIALISATION | FMU_EVENT | FMU_CONTINUOUS | FMU_TERMINATED)
 
-static void store_int(void *value, size_t i, double number)
-{
-    ((fmi3Int32 *)value)[i] = (fmi3Int32)number;
-}
-
-static double load_int(const void *value, size_t i)
-{
-    return ((const fmi3Int32 *)value)[i];
-}
-
-static void store_boolean(void *value, size_t i, double number)
-{
-    ((fmi3Boolean *)value)[i] = number != 0;
-}
-
-static double load_boolean(const void *value, size_t i)
-{
-    return ((const fmi3Boolean *)value)[i] ? 1 : 0;
-}
-
-/* all variables are scalars */
-static int scalars(const fmu_instance *instance, size_t n, size_t n_values)
-{
-    if (n == n_values) return 1;
-    fmu_log(instance, "%lu scalar variables, but %lu values", (unsigned long)n,
-            (unsigned long)n_values);
-    return 0;
-}
-
-#define ACCESS(name, type, kind, store, load)                                                      \
-    fmi3Status fmi3Get##name(fmi3Instance c, const fmi3ValueReference vr[], size_t n,              \
-                             type value[], size_t n_values)                                        \
-    {                                                                                              \
-        INSTANCE;                                                                                  \
-        if (!scalars(instance, n, n_values)) return fmi3Error;                                     \
-        return status(fmu_get(instance, kind, vr, n, value, store));                               \
-    }                                                                                              \
-    fmi3Status fmi3Set##name(fmi3Instance c, const fmi3ValueReference vr[], size_t n,              \
-                             const type value[], size_t n_values)                                  \
-    {                                                                                              \
-        INSTANCE;                                                                                  \
-        if (!scalars(instance, n, n_values)) return fmi3Error;                                     \
-        return status(fmu_set(instance, kind, vr, n, value, load));                                \
+#define ENTER(mode, before, after)               \
+    fmi3Status fmi3Enter##mode(fmi3Instance c) { \
+        REQUIRE(before);                         \
+        instance->phase = after;                 \
+        return fmi3OK;                           \
     }
 
-ACCESS(Float64, fmi3Float64, FMU_REAL, fmu_store_real, fmu_load_real)
-ACCESS(Int32, fmi3Int32, FMU_INTEGER, store_int, load_int)
-ACCESS(Boolean, fmi3Boolean, FMU_BOOLEAN, store_boolean, load_boolean)
-
-/* ---- saved states ---- */
-
-fmi3Status fmi3GetFMUState(fmi3Instance c, fmi3FMUState *state)
-{
-    INSTANCE;
-    return status(fmu_save(instance, state));
-}
-
-fmi3Status fmi3SetFMUState(fmi3Instance c, fmi3FMUState state)
-{
-    INSTANCE;
-    return status(fmu_restore(instance, state));
-}
-
-fmi3Status fmi3FreeFMUState(fmi3Instance c, fmi3FMUState *state)
-{
-    INSTANCE;
-    return status(fmu_forget(instance, state));
-}
-
-fmi3Status fmi3SerializedFMUStateSize(fmi3Instance c, fmi3FMUState state, size_t *size)
-{
-    INSTANCE;
-    return status(fmu_serialised_size(instance, state, size));
-}
-
-fmi3Status fmi3SerializeFMUState(fmi3Instance c, fmi3FMUState state, fmi3Byte bytes[], size_t size)
-{
-    INSTANCE;
-    return status(fmu_serialise(instance, state, bytes, size));
-}
-
-fmi3Status fmi3DeserializeFMUState(fmi3Instance c, const fmi3Byte bytes[], size_t size,
-                                   fmi3FMUState *state)
-{
-    INSTANCE;
-    return status(fmu_deserialise(instance, bytes, size, state));
-}
-
-/* ---- partial derivatives ---- */
-
-static int partials(const fmu_instance *instance, const fmi3ValueReference *known, size_t n_known,
-                    const fmi3ValueReference *unknown, size_t n_unknown, const double *seed,
-                    const double *out, int sizes_fit)
-{
-    if (!FMU_DERIVATIVES) {
-        fmu_log(instance, "this FMU has no partial derivatives");
-    } else if (!sizes_fit || (n_known && !known) || (n_unknown && !unknown) || !seed || !out) {
-        fmu_log(instance, "partial derivatives: a pointer is NULL or a size does not fit");
-    } else if (!fmu_in_phase(instance, "a partial derivative",
-                             INITIALISATION | EVENT | CONTINUOUS | TERMINATED)) {
-        return fmu_differentiable(instance, known, n_known, unknown, n_unknown);
-    }
-    return FMU_REFUSED;
-}
-
-fmi3Status fmi3GetDirectionalDerivative(fmi3Instance c, const fmi3ValueReference unknown[],
-                                        size_t n_unknown, const fmi3ValueReference known[],
-                                        size_t n_known, const fmi3Float64 seed[], size_t n_seed,
-                                        fmi3Float64 out[], size_t n_out)
-{
-    INSTANCE;
-    if (partials(instance, known, n_known, unknown, n_unknown, seed, out,
-                 n_seed == n_known && n_out == n_unknown))
-        return fmi3Error;
-#if FMU_DERIVATIVES
-    return status(fmu_model_directional(instance, known, n_known, seed, unknown, n_unknown, out));
-#else
-    return fmi3Error;
-#endif
-}
-
-fmi3Status fmi3GetAdjointDerivative(fmi3Instance c, const fmi3ValueReference unknown[],
-                                    size_t n_unknown, const fmi3ValueReference known[],
-                                    size_t n_known, const fmi3Float64 seed[], size_t n_seed,
-                                    fmi3Float64 out[], size_t n_out)
-{
-    INSTANCE;
-    if (partials(instance, known, n_known, unknown, n_unknown, seed, out,
-                 n_seed == n_unknown && n_out == n_known))
-        return fmi3Error;
-#if FMU_DERIVATIVES
-    return status(fmu_model_adjoint(instance, unknown, n_unknown, seed, known, n_known, out));
-#else
-    return fmi3Error;
-#endif
-}
-
-/* ---- Co-Simulation ---- */
-
-fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 time, fmi3Float64 h, fmi3Boolean no_rollback,
-                      fmi3Boolean *event, fmi3Boolean *terminate, fmi3Boolean *early,
-                      fmi3Float64 *reached)
-{
-    INSTANCE;
-    (void)no_rollback;
-    int result = fmu_step(instance, time, h);
-    put(event, fmi3False);
-    put(terminate, fmi3False);
-    put(early, fmi3False);
-    if (reached) *reached = instance->time;
-    return status(result);
-}
-
-/* ---- Model Exchange ---- */
-
-fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance c)
-{
-    IN(EVENT);
-    instance->phase = FMU_CONTINUOUS;
-    return fmi3OK;
-}
+/* clang-format off */
+ENTER(EventMode, FMU_CONTINUOUS, FMU_EVENT)
+ENTER(ContinuousTimeMode, FMU_EVENT, FMU_CONTINUOUS)
+/* clang-format on */
 
 fmi3Status fmi3UpdateDiscreteStates(fmi3Instance c, fmi3Boolean *again, fmi3Boolean *terminate,
                                     fmi3Boolean *nominals, fmi3Boolean *values, fmi3Boolean *timed,
-                                    fmi3Float64 *next)
-{
-    IN(EVENT);
-    put(again, fmi3False);
-    put(terminate, fmi3False);
-    put(nominals, fmi3False);
-    put(values, fmi3False);
-    put(timed, fmi3False);
+                                    fmi3Float64 *next) {
+    REQUIRE(FMU_EVENT);
+    no(again), no(terminate), no(nominals), no(values), no(timed);
     if (next) *next = INFINITY;
     return fmi3OK;
 }
 
 fmi3Status fmi3CompletedIntegratorStep(fmi3Instance c, fmi3Boolean no_rollback, fmi3Boolean *event,
-                                       fmi3Boolean *terminate)
-{
-    IN(CONTINUOUS);
-    (void)no_rollback;
-    put(event, fmi3False);
-    put(terminate, fmi3False);
+                                       fmi3Boolean *terminate) {
+    REQUIRE(FMU_CONTINUOUS);
+    no(event), no(terminate);
     return fmi3OK;
 }
 
-fmi3Status fmi3SetTime(fmi3Instance c, fmi3Float64 time)
-{
-    IN(EVENT | CONTINUOUS);
+fmi3Status fmi3SetTime(fmi3Instance c, fmi3Float64 time) {
+    REQUIRE(FMU_EVENT | FMU_CONTINUOUS);
     if (!isfinite(time)) {
-        fmu_log(instance, "fmi3SetTime: %g is no time", time);
+        fmu_refuse(instance, "fmi3SetTime: %g is no time", time);
         return fmi3Error;
     }
-    instance->time = time;
+    instance->value[FMU_V_time] = time;
     return fmi3OK;
 }
 
+/* A function of an array x [n] with one number for each state k. */
+#define OF_STATES(function, type, phases, status, assignment)                             \
+    fmi3Status function(fmi3Instance c, type x[], size_t n) {                             \
+        REQUIRE(phases);                                                                  \
+        if (!x || n != FMU_STATES) {                                                      \
+            fmu_refuse(instance, "%d continuous states, but an array of %lu", FMU_STATES, \
+                       (unsigned long)n);                                                 \
+            return fmi3Error;                                                             \
+        }                                                                                 \
+        const fmi3Status result = status;                                                 \
+        for (size_t k = 0; k < n; k++) assignment;                                        \
+        return result;                                                                    \
+    }
+
+/* clang-format off */
+OF_STATES(fmi3SetContinuousStates, const double, FMU_CONTINUOUS, fmi3OK, instance->value[k] = x[k])
+OF_STATES(fmi3GetContinuousStates, double, INITIALISED, fmi3OK, x[k] = instance->value[k])
+OF_STATES(fmi3GetNominalsOfContinuousStates, double, INITIALISED, fmi3OK,
+          x[k] = fmu_variables[k].nominal)
+OF_STATES(fmi3GetContinuousStateDerivatives, double, INITIALISED, fmu_derivatives(instance),
+          x[k] = instance->value[FMU_FIRST_DERIVATIVE + k])
+/* clang-format on */
+
+#define COUNT(function, number)                      \
+    fmi3Status function(fmi3Instance c, size_t *n) { \
+        if (c && n) *n = number;                     \
+        return c && n ? fmi3OK : fmi3Error;          \
+    }
+
+/* clang-format off */
+COUNT(fmi3GetNumberOfContinuousStates, FMU_STATES)
+COUNT(fmi3GetNumberOfEventIndicators, 0)
+/* clang-format on */
+
+/* Whether all are states or derivatives (unknowns), or none is a derivative (knowns). */
+static bool differentiable(const fmu_instance *instance, const fmi3ValueReference *reference,
+                           size_t n, bool unknown) {
+    for (size_t i = 0; i < n; i++) {
+        const uint32_t r = reference[i];
+        if (r >= FMU_VALUES || fmu_variables[r].kind != FMU_REAL)
+            return fmu_refuse(instance, "value reference %u is no real variable", (unsigned)r);
+        if (unknown ? !FMU_IS_STATE(r) && !FMU_IS_DERIVATIVE(r) : FMU_IS_DERIVATIVE(r))
+            return fmu_refuse(instance, "'%s' is no %s that can be differentiated",
+                              fmu_variables[r].name, unknown ? "unknown" : "known");
+    }
+    return true;
+}
+
+/* out[to] = the Jacobian, or for an adjoint its transpose, times the seed at `from`. */
+static fmi3Status partial_derivatives(fmu_instance *c, const fmi3ValueReference *from,
+                                      size_t n_from, const fmi3ValueReference *to, size_t n_to,
+                                      const double *seed, bool sizes_fit, double *out,
+                                      bool adjoint) {
+    double in[FMU_VALUES] = {0}, all[FMU_VALUES] = {0};
+    REQUIRE(FMU_STATES ? INITIALISED : 0);
+    if (!seed || !out || !sizes_fit || (n_from && !from) || (n_to && !to)) {
+        fmu_refuse(instance, "partial derivatives: a pointer is NULL or a size does not fit");
+        return fmi3Error;
+    }
+    if (!differentiable(instance, from, n_from, adjoint) ||
+        !differentiable(instance, to, n_to, !adjoint))
+        return fmi3Error;
+    for (size_t i = 0; i < n_from; i++) in[from[i]] += seed[i];
 #if FMU_STATES
-fmi3Status fmi3SetContinuousStates(fmi3Instance c, const fmi3Float64 x[], size_t n)
-{
-    IN(CONTINUOUS);
-    return status(fmu_set_states(instance, x, n));
-}
-
-fmi3Status fmi3GetContinuousStates(fmi3Instance c, fmi3Float64 x[], size_t n)
-{
-    IN(INITIALISATION | EVENT | CONTINUOUS | TERMINATED);
-    return status(fmu_get_states(instance, x, n));
-}
-
-fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance c, fmi3Float64 dx[], size_t n)
-{
-    IN(INITIALISATION | EVENT | CONTINUOUS | TERMINATED);
-    return status(fmu_get_derivatives(instance, dx, n));
-}
-
-fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance c, fmi3Float64 nominal[], size_t n)
-{
-    IN(INITIALISATION | EVENT | CONTINUOUS | TERMINATED);
-    if (fmu_get_states(instance, nominal, n)) return fmi3Error; /* checks the arguments */
-    for (size_t k = 0; k < n; k++) nominal[k] = fmu_nominals[k];
-    return fmi3OK;
-}
+    (adjoint ? fmu_model_adjoint : fmu_model_directional)(instance, in, all);
 #endif
-
-fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance c, size_t *n)
-{
-    INSTANCE;
-    if (!n) return fmi3Error;
-    *n = FMU_STATES;
+    for (size_t i = 0; i < n_to; i++) out[i] = all[to[i]];
     return fmi3OK;
 }
 
-fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance c, size_t *n)
-{
-    INSTANCE;
-    if (!n) return fmi3Error;
-    *n = 0;
-    return fmi3OK;
+#define PARTIAL                                                                                    \
+    fmi3Instance c, const fmi3ValueReference unknown[], size_t n_unknown,                          \
+        const fmi3ValueReference known[], size_t n_known, const fmi3Float64 seed[], size_t n_seed, \
+        fmi3Float64 out[], size_t n_out
+
+fmi3Status fmi3GetDirectionalDerivative(PARTIAL) {
+    return partial_derivatives(c, known, n_known, unknown, n_unknown, seed,
+                               n_seed == n_known && n_out == n_unknown, out, false);
 }
 
-fmi3Status fmi3GetEventIndicators(fmi3Instance c, fmi3Float64 indicators[], size_t n)
-{
-    INSTANCE;
-    (void)indicators;
-    if (n) fmu_log(instance, "this FMU has no event indicators");
-    return n ? fmi3Error : fmi3OK;
+fmi3Status fmi3GetAdjointDerivative(PARTIAL) {
+    return partial_derivatives(c, unknown, n_unknown, known, n_known, seed,
+                               n_seed == n_unknown && n_out == n_known, out, true);
 }

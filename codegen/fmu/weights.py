@@ -20,10 +20,10 @@ def exchange_weights(fmu: Path, weights: GpWeights | None, out: Path) -> None:
     name = f"resources/{WEIGHTS_FILE}"
     try:
         with zipfile.ZipFile(fmu) as archive:
-            members = [(info, archive.read(info)) for info in archive.infolist()]
+            members = {info: archive.read(info) for info in archive.infolist()}
     except (OSError, zipfile.BadZipFile) as error:
         raise InputError(f"{fmu} cannot be read as an FMU: {error}") from None
-    before = next((data for info, data in members if info.filename == name), None)
+    before = next((data for info, data in members.items() if info.filename == name), None)
     if before is None:
         raise InputError(f"{fmu} is not a controller's FMU: it holds no {name}")
     if len(before) < HEAD.size + IDENTITY_BYTES:
@@ -32,5 +32,5 @@ def exchange_weights(fmu: Path, weights: GpWeights | None, out: Path) -> None:
     identity = before[HEAD.size :][:IDENTITY_BYTES].rstrip(b"\0").decode("utf-8", "replace")
     data = weights_file(weights, identity, capacity)
     with replacing(out) as partial, zipfile.ZipFile(partial, "w") as archive:
-        for info, content in members:
+        for info, content in members.items():
             archive.writestr(info, data if info.filename == name else content)

@@ -1,0 +1,151 @@
+/* What the files of an FMU share: the instance, the model's functions, the FMI layer's.
+ *
+ * A model (car.c, controller.c) is a few functions over one array of values. The layer, which owns
+ * the instance, does everything else that FMI demands: phases, arguments, messages, saved states.
+ * It is compiled for one version, FMU_FMI; FMI(Name) is fmi2Name or fmi3Name: functions that are
+ * alike in both are written once, in fmu_instance.c, fmu_values.c and fmu_state.c; fmi2.c or fmi3.c
+ * has the others. A refused call has changed nothing and has sent one message.
+ */
+#ifndef FMU_H
+#define FMU_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#include "fmu_config.h" /* generated: FMU_VALUES, FMU_STATES, FMU_V_<name> of each value */
+
+#if FMU_FMI == 2
+#include "fmi2Functions.h"
+#define FMI(name) fmi2##name
+#define fmi2GetFMUState fmi2GetFMUstate /* in the spelling of 3.0 */
+#define fmi2SetFMUState fmi2SetFMUstate
+#define fmi2FreeFMUState fmi2FreeFMUstate
+#define fmi2SerializedFMUStateSize fmi2SerializedFMUstateSize
+#define fmi2SerializeFMUState fmi2SerializeFMUstate
+#define fmi2DeserializeFMUState fmi2DeSerializeFMUstate
+#else
+#include "fmi3Functions.h"
+#define FMI(name) fmi3##name
+#endif
+
+#if defined(__GNUC__)
+#pragma GCC diagnostic ignored "-Wunused-parameter" /* FMI passes more than these FMUs need */
+#else
+#define __attribute__(x)
+#endif
+
+typedef enum {
+    FMU_INSTANTIATED = 1,
+    FMU_INITIALISATION = 2,
+    FMU_EVENT = 4,      /* Model Exchange */
+    FMU_CONTINUOUS = 8, /* Model Exchange */
+    FMU_STEPPING = 16,  /* Co-Simulation */
+    FMU_TERMINATED = 32,
+    FMU_FAILED = 64 /* until reset, or until a saved state is set */
+} fmu_phase;
+
+typedef struct fmu_saved fmu_saved;
+
+typedef struct {
+    double value[FMU_VALUES]; /* by value reference; integers and booleans as doubles; the last is
+                                 FMU_V_time [s] */
+    double stop_time;         /* infinite where none was given */
+    fmu_phase phase;
+
+    /* A saved state holds what is above, and the model's memory. */
+    void *model;     /* fmu_model_size() bytes, aligned to 64, zeroed before fmu_model_create */
+    char *resources; /* path of the folder without the last separator, or NULL */
+    char *name;
+    void *block;          /* what was allocated */
+    fmu_saved *saved;     /* states that this instance has made and that still live */
+    void (*logger)(void); /* the importer's, to be cast to FMI's type */
+    void *environment;    /* the importer's */
+} fmu_instance;
+
+/* Sends an error message (printf format) to the importer's log. Returns false. */
+__attribute__((format(printf, 2, 3))) bool fmu_refuse(const fmu_instance *instance,
+                                                      const char *format, ...);
+
+/* ---- the model; what is bool is false after fmu_refuse, else true ---- */
+
+size_t fmu_model_size(void); /* bytes of memory that an instance needs beside the values */
+
+/* At instantiation and at reset; values are at their start values. If it fails, there is no
+ * instance. It must not allocate anything: no function of the model releases it. */
+bool fmu_model_create(fmu_instance *instance);
+
+/* At the end of initialisation mode: parameters and start values are finite and within their
+ * bounds. Checks what else they must fulfil and sets the calculated outputs. */
+bool fmu_model_initialise(fmu_instance *instance);
+
+/* Co-Simulation: from time to time + h, 0 < h <= 1000; the caller advances the time. */
+bool fmu_model_step(fmu_instance *instance, double h);
+
+/* Model Exchange: derivatives [FMU_STATES] of the states at the instance's values. */
+void fmu_model_derivatives(const fmu_instance *instance, double *dx);
+
+/* Model Exchange, with the Jacobian J of all values by all values: out = J in, or out = J' in, both
+ * [FMU_VALUES]. Only the rows of states (one for itself) and of their derivatives count. */
+void fmu_model_directional(const fmu_instance *instance, const double *in, double *out);
+void fmu_model_adjoint(const fmu_instance *instance, const double *in, double *out);
+
+/* ---- the layer ---- */
+
+typedef enum { FMU_REAL, FMU_INTEGER, FMU_BOOLEAN } fmu_kind;
+
+typedef enum {
+    FMU_CALCULATED, /* never set from outside */
+    FMU_FIXED,      /* set until the end of initialisation; states of Model Exchange also later */
+    FMU_TUNABLE,    /* set at any time */
+    FMU_INPUT       /* set at any time, to any value */
+} fmu_role;
+
+typedef struct {
+    const char *name;
+    fmu_kind kind;
+    fmu_role role;
+    double start, min, max;
+    bool open; /* min and max themselves are excluded */
+    double nominal;
+} fmu_variable;
+
+extern const fmu_variable fmu_variables[FMU_VALUES];
+
+/* States of Model Exchange come first, their derivatives last but for the time. */
+#define FMU_FIRST_DERIVATIVE (FMU_VALUES - 1 - FMU_STATES)
+#define FMU_IS_STATE(reference) ((int)(reference) < FMU_STATES)
+#define FMU_IS_DERIVATIVE(reference) \
+    ((int)(reference) >= FMU_FIRST_DERIVATIVE && (reference) != FMU_V_time)
+
+/* Passes a message to the importer, in the version's own way. */
+void fmu_report(const fmu_instance *instance, const char *text);
+
+/* The path of the resources folder from what the importer passes, in place; NULL for none. */
+char *fmu_folder(char *location);
+
+/* NULL after a message if the token is another FMU's, or the model refuses. */
+fmu_instance *fmu_new(const char *name, const char *token, const char *resources,
+                      void (*logger)(void), void *environment);
+
+const char *fmu_phase_name(const fmu_instance *instance);
+
+/* Whether the instance, which may be NULL, is in one of the phases; else a message. */
+bool fmu_in_phase(const fmu_instance *instance, unsigned phases, const char *function);
+
+/* Ends an FMI function of `void *c` with an error unless that is an instance in such a phase. */
+#define REQUIRE(phases)         \
+    fmu_instance *instance = c; \
+    if (!fmu_in_phase(instance, phases, __func__)) return FMI(Error)
+#define ANY_PHASE (~0u)
+
+/* Answers a function that these FMUs do not have: with an error unless it concerns no variable. */
+FMI(Status) fmu_absent(const fmu_instance *instance, size_t variables, const char *function);
+
+bool fmu_set_times(fmu_instance *instance, double start, bool has_stop, double stop);
+bool fmu_step(fmu_instance *instance, double time, double h); /* Co-Simulation */
+
+/* Model Exchange: computes the derivatives' values; Discard if they are not finite. */
+FMI(Status) fmu_derivatives(fmu_instance *instance);
+
+#endif
