@@ -12,8 +12,8 @@ from pathlib import Path
 
 import casadi
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from bayesrace.gp.weights import GpWeights
 from bayesrace.vehicles import DEFAULT_CAR, get_car
 from codegen.build import build, casadi_includes
@@ -57,7 +57,7 @@ def compile_harness(artefact: Path, folder: Path) -> Path:
     return out
 
 
-def measure() -> NDArray[np.float64]:
+def measure() -> Floats:
     """Results (problems, routes, 4): time [us], distance, iterations, status."""
     artefact, _ = build(BuildSettings())
     weights = fit_weights(get_car(DEFAULT_CAR), ("rbf", "matern25", "matern15"))

@@ -13,8 +13,8 @@ import argparse
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from bayesrace.vehicles import DEFAULT_CAR, CarParameters, get_car
 from bayesrace.vehicles.models import dynamic, longitudinal_force
 from bayesrace.vehicles.parameters import GRAVITY_MPS2
@@ -57,7 +57,7 @@ def ramp(car: CarParameters, delta_rad: float) -> Sustained:
     return Sustained(delta_rad, lateral[best] / GRAVITY_MPS2, v, v / yaw_rate, drive)
 
 
-def moving_mean(values: NDArray[np.float64], n: int) -> NDArray[np.float64]:
+def moving_mean(values: Floats, n: int) -> Floats:
     """Means of n values in a row."""
     return np.convolve(values, np.full(n, 1 / n), "valid")
 

@@ -14,9 +14,9 @@ from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 
+from bayesrace.arrays import Floats
 from bayesrace.gp.weights import read_weights
 from bayesrace.messages import State
 from bayesrace.raceline import RaceLine
@@ -57,7 +57,7 @@ class Rig:
         self.car = Simulator(dynamic(car))
         self._run = 0
 
-    def place(self, x: NDArray[np.float64]) -> None:
+    def place(self, x: Floats) -> None:
         """Begins a new run there."""
         self.car.reset(x.tolist())
         self._run += 1
@@ -88,7 +88,7 @@ class Rig:
         return 0.0 if output is None else output.s_ref_m
 
 
-def poses(line: RaceLine, count: int, random: np.random.Generator) -> Iterator[NDArray[np.float64]]:
+def poses(line: RaceLine, count: int, random: np.random.Generator) -> Iterator[Floats]:
     """Beside the line, pointing anywhere; half of them stand, the others roll."""
     for _ in range(count):
         i = random.integers(len(line.x_m))

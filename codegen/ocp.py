@@ -13,13 +13,12 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesrace.arrays import Floats
 from codegen.problems.problem import Problem
 
 __all__ = ["OcpNlp", "OcpSolution"]
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,20 +6,20 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 import numpy as np
-import numpy.typing as npt
+
+from bayesrace.arrays import Floats
 
 if TYPE_CHECKING:
     from controller.native_library import Artefact
     from controller.weights.adoption import WeightsPort
 
-__all__ = ["NO_LIMITS", "NO_PLAN", "Array", "ControlLaw", "Controller", "Environment", "StepOutput"]
+__all__ = ["NO_LIMITS", "NO_PLAN", "ControlLaw", "Controller", "Environment", "StepOutput"]
 
-Array = npt.NDArray[np.float64]
 
-NO_PLAN: Final[Array] = np.zeros((0, 2))
+NO_PLAN: Final[Floats] = np.zeros((0, 2))
 """``plan_u`` of a controller that does not look ahead."""
 
-_NO_STATES: Final[Array] = np.zeros((0, 7))
+_NO_STATES: Final[Floats] = np.zeros((0, 7))
 
 
 class Environment(NamedTuple):
@@ -37,14 +37,14 @@ class StepOutput:
     """Result of one step. A controller may hand out the same object each time, with new values;
     the process has used it up before the next step."""
 
-    u: Array
+    u: Floats
     """Shape (2,): d [-], delta_rate [rad/s]. Looked at only if ``status`` is 0."""
     status: int = 0
     """0: usable. Else the controller's own code (1 to 251): the fallback takes over."""
     iterations: int = 0
-    plan_x: Array = field(default_factory=lambda: _NO_STATES)
+    plan_x: Floats = field(default_factory=lambda: _NO_STATES)
     """Shape (N + 1, 7) or (0, 7): predicted states."""
-    plan_u: Array = field(default_factory=lambda: NO_PLAN)
+    plan_u: Floats = field(default_factory=lambda: NO_PLAN)
     """Shape (N, 2) or (0, 2): planned inputs, the first of which is ``u``; the fallback drives on
     along the first ones, as many as the artefact's horizon has."""
     plan_step_s: float = 0.02
@@ -109,8 +109,8 @@ class ControlLaw(Protocol):
 
     def step(
         self,
-        x: Array,
-        u_previous: Array,
+        x: Floats,
+        u_previous: Floats,
         environment: Environment,
         elapsed_s: float,
         budget_s: float = 0.0,
@@ -122,5 +122,5 @@ class ControlLaw(Protocol):
         is as long as its settings say.
         """
 
-    def predict(self, x: Array, u: Array, duration_s: float) -> Array:
+    def predict(self, x: Floats, u: Floats, duration_s: float) -> Floats:
         """State (7,) after ``duration_s`` (at most 1 s) with input ``u`` (2,) held."""

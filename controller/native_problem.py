@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from controller.interface import Environment
 from controller.native_library import (
@@ -25,13 +26,12 @@ from controller.native_library import (
 
 __all__ = ["NativeProblem", "Reference"]
 
-_DOUBLES = npt.NDArray[np.float64]
 
-Reference = _DOUBLES
+Reference = Floats
 """Parameters of the stages 1..N, shape (N, np), in the order of the manifest."""
 
 
-def _address(array: _DOUBLES) -> int:
+def _address(array: Floats) -> int:
     return array.ctypes.data
 
 
@@ -138,7 +138,7 @@ class NativeProblem:
 
     def step(
         self,
-        x: _DOUBLES,
+        x: Floats,
         u_before: npt.ArrayLike,
         *,
         elapsed_s: float | None = None,
@@ -173,7 +173,7 @@ class NativeProblem:
 
     def solve(
         self,
-        x: _DOUBLES,
+        x: Floats,
         u_before: npt.ArrayLike,
         reference: Reference,
         *,
@@ -214,9 +214,7 @@ class NativeProblem:
         """Does the preparation over, to the same bits, so that the step finds its caches warm."""
         self._check(self._rehearse(self._mpc), "rehearse")
 
-    def predict(
-        self, x: _DOUBLES, u: _DOUBLES, duration_s: float, out: _DOUBLES | None = None
-    ) -> _DOUBLES:
+    def predict(self, x: Floats, u: Floats, duration_s: float, out: Floats | None = None) -> Floats:
         """State (nx,) after x (nx,) with u (nu,) held, by the model and the weights in use.
 
         Written into ``out`` (may be x) if given. ``duration_s``: 0 to 1. InputError if it is not,
@@ -239,7 +237,7 @@ class NativeProblem:
         out[:] = self._predicted
         return out
 
-    def read_plan(self) -> tuple[_DOUBLES, _DOUBLES]:
+    def read_plan(self) -> tuple[Floats, Floats]:
         """The last plan, x (N + 1, nx) and u (N, nu), in buffers that the next call overwrites."""
         self._library.br_mpc_get_plan(self._mpc, _address(self.plan_x), _address(self.plan_u))
         return self.plan_x, self.plan_u
@@ -250,7 +248,7 @@ class NativeProblem:
         self._library.br_mpc_get_reference(self._mpc, _address(rows))
         return rows
 
-    def evaluate(self, v: _DOUBLES, costate: _DOUBLES) -> tuple[_DOUBLES, _DOUBLES, _DOUBLES]:
+    def evaluate(self, v: Floats, costate: Floats) -> tuple[Floats, Floats, Floats]:
         """Corrected model at v = [x; u] (nv,): x_next (nx,), J (nx, nv), H of lambda' x_next."""
         nx, nv = self._nx, self._nx + self._nu
         v = np.ascontiguousarray(v, dtype=np.float64)

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.raceline.line import RaceLine
 from bayesrace.tracks import Track
@@ -32,7 +32,7 @@ class PathTable:
     ``rows`` has shape (n, 7), sampled every ``spacing_m`` along the closed racing line.
     """
 
-    rows: npt.NDArray[np.float64]
+    rows: Floats
     spacing_m: float
 
 
@@ -44,7 +44,7 @@ def make_path_table(track: Track, line: RaceLine, spacing_m: float) -> PathTable
     the planner interpolates linearly. InputError if the line belongs to another track.
     """
     count = min(CAPACITY, max(8, math.ceil(line.length_m / spacing_m)))
-    s: npt.NDArray[np.float64] = np.arange(count, dtype=np.float64) * (line.length_m / count)
+    s: Floats = np.arange(count, dtype=np.float64) * (line.length_m / count)
     nodes = np.append(line.s_m, line.s_m[0] + line.length_m)
     xy = PlaneSpline(line.s_m, line.xy_m, line.length_m)(s)
     speed = np.interp(s, nodes, np.append(line.vx_mps, line.vx_mps[0]), period=line.length_m)

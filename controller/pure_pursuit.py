@@ -12,9 +12,10 @@ import math
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.vehicles.parameters import CarParameters
-from controller.interface import NO_LIMITS, Array, Environment, StepOutput
+from controller.interface import NO_LIMITS, Environment, StepOutput
 
 __all__ = ["PurePursuit", "PurePursuitSettings"]
 
@@ -44,9 +45,9 @@ class PurePursuit:
     def __init__(
         self,
         car: CarParameters,
-        x_m: Array,
-        y_m: Array,
-        vx_mps: Array,
+        x_m: Floats,
+        y_m: Floats,
+        vx_mps: Floats,
         settings: PurePursuitSettings | None = None,
     ) -> None:
         """``x_m``, ``y_m``, ``vx_mps``: a closed line's points in order of driving, (n,) each, the
@@ -81,7 +82,7 @@ class PurePursuit:
         self._random = np.random.default_rng(self._settings.seed)
         self._noise[:] = 0.0
 
-    def predict(self, x: Array, u: Array, duration_s: float) -> Array:
+    def predict(self, x: Floats, u: Floats, duration_s: float) -> Floats:
         """Dead reckoning: the velocities stay, the steering goes on at its rate."""
         after = self._predicted
         after[:] = x
@@ -96,8 +97,8 @@ class PurePursuit:
 
     def step(
         self,
-        x: Array,
-        u_previous: Array,
+        x: Floats,
+        u_previous: Floats,
         environment: Environment = NO_LIMITS,
         elapsed_s: float = 0.0,
         budget_s: float = 0.0,
@@ -165,7 +166,7 @@ class PurePursuit:
                 return (first + best) % count
         return int(np.argmin(self._squared_distances(px, py)))
 
-    def _squared_distances(self, px: float, py: float) -> Array:
+    def _squared_distances(self, px: float, py: float) -> Floats:
         offsets = self._points - (px, py)
-        result: Array = np.einsum("ij,ij->i", offsets, offsets)
+        result: Floats = np.einsum("ij,ij->i", offsets, offsets)
         return result

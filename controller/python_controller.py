@@ -10,9 +10,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from controller.driver import STEP_FAILED, UNPREDICTABLE
-from controller.interface import Array, ControlLaw, Environment, StepOutput
+from controller.interface import ControlLaw, Environment, StepOutput
 from controller.native_library import Artefact
 
 __all__ = ["PythonController"]
@@ -144,6 +145,6 @@ class PythonController:
         return 0
 
 
-def _array(pointer: Any, count: int) -> Array:
+def _array(pointer: Any, count: int) -> Floats:
     """A copy."""
     return np.array(pointer[:count])

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bayesrace.arrays import Floats
 from bayesrace.messages import State, Telemetry
 from controller.driver import Decision
-from controller.interface import NO_PLAN, Array, StepOutput
+from controller.interface import NO_PLAN, StepOutput
 
 __all__ = ["Timing", "telemetry_of"]
 
@@ -72,7 +73,7 @@ def telemetry_of(seq: int, state: State, decision: Decision, timing: Timing) -> 
     )
 
 
-def _finite(plan: Array) -> tuple[float, ...]:
+def _finite(plan: Floats) -> tuple[float, ...]:
     """The plan row by row; nothing of it if any of it is no number (receivers would refuse it)."""
     if not len(plan):
         return ()

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import read_weights
 from bayesrace.raceline import RaceLine
@@ -51,7 +52,6 @@ __all__ = [
     "write_result",
 ]
 
-Floats = NDArray[np.float64]
 
 WEIGHTS_FILES: Final = {
     "bayesrace": "weights-bayesrace.bin",

@@ -14,11 +14,11 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 from rich.console import Console
 from rich.table import Table
 
+from bayesrace.arrays import Floats
 from bayesrace.gp.corrected import corrected_function
 from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.integrators import PREDICTION, Discretisation
@@ -41,7 +41,6 @@ from plant.simulator import PLANT
 
 __all__ = ["BenchResult", "BenchSettings", "run_bench"]
 
-Floats = NDArray[np.float64]
 
 _CONVERGED: Final = MpcSettings(
     iterations=100, iterations_cold=100, tolerance=1e-9, early_stop_tol=0

@@ -15,6 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from bayesrace.gp.weights import GpWeights
 from bayesrace.log import LogWriter
 from bayesrace.messages import (
@@ -51,7 +52,6 @@ from plant.vehicle import Vehicle
 
 __all__ = ["ClosedLoop", "Driven", "drive_compiled"]
 
-Floats = NDArray[np.float64]
 
 _EPOCH: Final = 1
 

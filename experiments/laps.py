@@ -8,12 +8,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from bayesrace.messages import Truth
 from bayesrace.tracks import StartLine, Track
 
 __all__ = ["LapTimes", "Trajectory", "time_laps"]
 
-Floats = NDArray[np.float64]
 
 SHORT_CUT: Final = 0.15
 """A leap along the centreline from one sample to the next of more than this share of the track

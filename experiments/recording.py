@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_text
 from bayesrace.integrators import PREDICTION, Discretisation
@@ -33,7 +33,6 @@ from experiments.laps import Trajectory
 
 __all__ = ["RUN_EVENT", "PlannedRun", "Recording", "RunRecord", "read_recording"]
 
-Floats = NDArray[np.float64]
 
 RUN_EVENT: Final = "run"
 """Kind of the event that announces a run of a race before it starts."""

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 from threadpoolctl import threadpool_limits
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
 from bayesrace.vehicles import CarParameters, get_car
@@ -26,8 +26,6 @@ __all__ = [
     "ValidationResult",
     "validate_weights",
 ]
-
-Floats = NDArray[np.float64]
 
 
 class _Frozen(BaseModel):

@@ -11,8 +11,8 @@ from dataclasses import dataclass, fields
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.integrators import PLANT_SCHEME, PLANT_SUBSTEP_HZ, Discretisation
 from bayesrace.vehicles.models import Model
@@ -27,8 +27,6 @@ __all__ = [
     "hold_in_turn",
     "plant_discretisation",
 ]
-
-Array = npt.NDArray[np.float64]
 
 
 def plant_discretisation(rate_hz: float = 50.0) -> Discretisation:
@@ -109,7 +107,7 @@ class PlantGuard:
         return min(max(delta_rad + duration_s * rate, -self._delta_max), self._delta_max)
 
 
-def checked_start(x0: Sequence[float], car: CarParameters) -> Array:
+def checked_start(x0: Sequence[float], car: CarParameters) -> Floats:
     """The start state (7,) of a run; InputError if ``car`` cannot be in it."""
     start = np.asarray(x0, dtype=np.float64)
     if start.shape != (7,) or not np.isfinite(start).all():
@@ -149,10 +147,10 @@ class _Map:
     An ordinary call converts to and from DM, which costs more than the integration itself.
     """
 
-    def __init__(self, function: Any, x: Array, u: Array, p: Array) -> None:
+    def __init__(self, function: Any, x: Floats, u: Floats, p: Floats) -> None:
         self._x = x
         self._p = p  # nor does it keep its arguments
-        self._x_next: Array = np.zeros_like(x)
+        self._x_next: Floats = np.zeros_like(x)
         self._function = function  # the buffer does not keep it alive
         self._buffer, self._evaluate = function.buffer()
         self._buffer.set_arg(0, x.data)
@@ -179,8 +177,8 @@ class Simulator:
         self.u_applied: tuple[float, float] = (0.0, 0.0)
         """What acted during the last period; the mean over it if it changed within."""
         self.steps = 0
-        self.x: Array = np.zeros(len(model.states))
-        self._u: Array = np.zeros(len(model.inputs))
+        self.x: Floats = np.zeros(len(model.states))
+        self._u: Floats = np.zeros(len(model.inputs))
         substep = Discretisation(
             scheme=discretisation.scheme, step_s=self.step_s / self.substeps, substeps=1
         )

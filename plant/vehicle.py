@@ -5,9 +5,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol
 
-import numpy as np
-import numpy.typing as npt
-
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.vehicles.models import dynamic
 from bayesrace.vehicles.parameters import CarParameters
@@ -35,7 +33,7 @@ class Vehicle(Protocol):
     """What acted during the last period; the mean over it if it changed within."""
     steps: int
     """Periods since the reset."""
-    x: npt.NDArray[np.float64]
+    x: Floats
     """State (7,) after the last step: read it, but do not write into it."""
 
     @property

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesrace.arrays import Floats
 from bayesrace.gp.expression import kernel_matrix
 from bayesrace.gp.weights import KERNELS, GpOutput, GpWeights
 from bayesrace.integrators import PREDICTION, Discretisation
@@ -32,7 +33,6 @@ from tests.zig import ziglang
 
 __all__ = ["cli", "ziglang"]  # fixtures for all tests
 
-Floats = NDArray[np.float64]
 
 # the components that change sign in a mirror at the x axis
 MIRROR_STATE = np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0, -1.0])

@@ -4,9 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from bayesrace.arrays import Floats
 from bayesrace.messages import State
 from bayesrace.vehicles import default_car
 from controller.cycle_settings import CompensationSettings, FallbackSettings
@@ -16,7 +14,6 @@ from controller.python_controller import PythonController
 
 __all__ = ["STEP_S", "ScriptedLaw", "scripted_driver", "state"]
 
-Floats = NDArray[np.float64]
 
 STEP_S = 0.02
 

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.log import LogWriter
 from bayesrace.messages import State, Telemetry, Truth, encode
@@ -18,7 +18,6 @@ from learning.training import TrainingSettings
 
 __all__ = ["CAR", "QUICK", "STEP_S", "drive", "logged", "state", "telemetry", "write_log"]
 
-Floats = NDArray[np.float64]
 
 CAR = get_car("orca")
 STEP_S = PREDICTION.step_s

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from bayesrace.vehicles.models import STATES, dynamic
 from bayesrace.vehicles.parameters import CarParameters
 from plant.simulator import Simulator, plant_discretisation
@@ -14,7 +14,6 @@ from tests.fmu_master import Slave
 
 __all__ = ["Commands", "built_in", "commands", "driven", "slave"]
 
-Floats = NDArray[np.float64]
 Commands = Sequence[tuple[float, float]]
 Version = Literal[2, 3]
 Kind = Literal["cs", "me"]

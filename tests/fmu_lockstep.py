@@ -12,8 +12,8 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from bayesrace.gp.weights import GpWeights
 from bayesrace.messages import State
 from bayesrace.vehicles import CarParameters
@@ -42,7 +42,6 @@ __all__ = [
     "versions",
 ]
 
-Floats = NDArray[np.float64]
 
 versions = pytest.mark.parametrize("version", [2, 3])
 

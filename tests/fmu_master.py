@@ -12,13 +12,11 @@ import numpy as np
 from fmpy import extract, read_model_description
 from fmpy.fmi2 import FMU2Slave
 from fmpy.fmi3 import FMU3Slave
-from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from bayesrace.vehicles.models import STATES
 
 __all__ = ["Slave", "drive"]
-
-Floats = NDArray[np.float64]
 
 
 class Slave:

@@ -7,14 +7,14 @@ from typing import Any, Final
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
-import numpy.typing as npt
 
+from bayesrace.arrays import Floats
 from plant.fmu.inspection import FmuDescription, Variable
 from plant.fmu.units import unit_of
 from plant.fmu.wiring import STATES, Wiring
 
 __all__ = [
-    "OWN", "STATE", "TOLERANCE", "Array", "U", "assert_same", "description", "given",
+    "OWN", "STATE", "TOLERANCE", "U", "assert_same", "description", "given",
     "our_names", "own_fmu", "read", "replacing", "taken", "values", "variable", "write_fmu",
 ]  # fmt: skip
 
@@ -97,15 +97,14 @@ STATE = np.array([1.5, -2.25, 0.75, 1.8, -0.3, 4.5, 0.2])
 
 U = (0.4, -2.0)
 TOLERANCE = 1e-12
-Array = npt.NDArray[np.float64]
-Say = Callable[[Array], dict[str, float]]
+Say = Callable[[Floats], dict[str, float]]
 
 
 def values(wiring: Wiring, said: dict[str, float]) -> list[float]:
     return [said[name] for name in wiring.outputs]
 
 
-def read(wiring: Wiring, say: Say, state: Array, start: Array | None = None) -> Array:
+def read(wiring: Wiring, say: Say, state: Floats, start: Floats | None = None) -> Floats:
     """The state that the wiring makes of what the FMU says after a start elsewhere."""
     first = state - np.array([0.01, 0.02, 0.05, 0, 0, 0, 0]) if start is None else start
     wiring.start_values(first)
@@ -113,7 +112,7 @@ def read(wiring: Wiring, say: Say, state: Array, start: Array | None = None) -> 
     return wiring.state(values(wiring, say(state)), U, 0.02)
 
 
-def our_names(state: Array) -> dict[str, float]:
+def our_names(state: Floats) -> dict[str, float]:
     names = ("x", "y", "psi", "vx", "vy", "omega", "delta")
     return dict(zip(names, map(float, state), strict=True))
 
@@ -121,7 +120,7 @@ def our_names(state: Array) -> dict[str, float]:
 def replacing(*quantities: str, **theirs: Callable[[dict[str, float]], float]) -> Say:
     """An FMU that says our names but these quantities, and others instead."""
 
-    def say(state: Array) -> dict[str, float]:
+    def say(state: Floats) -> dict[str, float]:
         own = our_names(state)
         others = {name: value(own) for name, value in theirs.items()}
         return {k: v for k, v in own.items() if k not in quantities} | others
@@ -129,5 +128,5 @@ def replacing(*quantities: str, **theirs: Callable[[dict[str, float]], float]) -
     return say
 
 
-def assert_same(state: Array, wanted: Array) -> None:
+def assert_same(state: Floats, wanted: Floats) -> None:
     assert np.abs(state - wanted).max() < TOLERANCE, state - wanted

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from bayesrace.gp.weights import write_weights, zero_weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.log import LogWriter
@@ -21,7 +21,6 @@ from bayesrace.vehicles import get_car
 
 __all__ = ["LAP_S", "LINE_M", "STEP_S", "Drive", "circle", "track", "write_race"]
 
-Floats = NDArray[np.float64]
 
 STEP_S = 0.02
 LAP_S = 1.31

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.vehicles import default_car
 from experiments.analysis import analyse, read_race, read_result, write_result
 from experiments.laps import time_laps
 from experiments.results import LapResult, RaceResult
 from experiments.table import COLUMNS, print_table
-from tests.synthetic_race import LAP_S, LINE_M, STEP_S, Drive, Floats, circle, track, write_race
+from tests.synthetic_race import LAP_S, LINE_M, STEP_S, Drive, circle, track, write_race
 
 TWO_LAPS: Floats = np.asarray(
     2 * np.pi * STEP_S * np.arange(134) / LAP_S

@@ -7,15 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from bayesrace.transport import Numbering
 from controller.cycle_settings import CompensationSettings
 from controller.driver import Driver
 from controller.interface import StepOutput
 from tests.cycle_rig import STEP_S, ScriptedLaw, scripted_driver, state
-
-Floats = NDArray[np.float64]
 
 
 def exact(x: Floats, u: Floats, duration_s: float) -> Floats:

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from bayesrace.messages import State
 from bayesrace.native_interface import LEVELS, PHASES
 from bayesrace.vehicles import CarParameters, default_car
@@ -29,8 +29,6 @@ from controller.mpc import PredictiveController
 from controller.native_step import NativeStep, StepStatus
 from tests.conftest import SETTINGS, Circuit, discrete
 from tests.cycle_rig import ScriptedLaw, scripted_driver, state
-
-Floats = NDArray[np.float64]
 
 STEP_S = 0.02
 STALE_S = 0.06

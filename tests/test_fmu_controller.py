@@ -6,7 +6,6 @@ from typing import Literal
 import numpy as np
 import pytest
 from fmpy.validation import validate_fmu
-from numpy.typing import NDArray
 
 from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import STATES
@@ -27,8 +26,6 @@ from tests.fmu_lockstep import (  # noqa: F401 - fixtures are used by name
     versions,
 )
 from tests.fmu_master import drive
-
-Floats = NDArray[np.float64]
 
 
 @versions

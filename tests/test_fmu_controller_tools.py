@@ -14,7 +14,6 @@ import pytest
 from fmpy import extract, read_model_description
 from fmpy.fmi2 import FMU2Slave
 from fmpy.validation import validate_fmu
-from numpy.typing import NDArray
 
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights, zero_weights
@@ -35,8 +34,6 @@ from tests.fmu_lockstep import (  # noqa: F401 - fixtures are used by name
 )
 from tests.fmu_master import Slave
 from tests.native_programs import PROGRAMS, SANITIZED, artefact_objects, gcc
-
-Floats = NDArray[np.float64]
 
 
 def test_two_instances_do_not_know_each_other_and_reset_begins_the_same_run_again(

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from fmpy import instantiate_fmu, read_model_description, simulate_fmu
 from fmpy.fmi1 import FMICallException
-from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import (
     DYNAMIC_PARAMETERS,
@@ -21,8 +21,6 @@ from bayesrace.vehicles.models import (
 from codegen.fmu.car import car_values
 from plant.simulator import Simulator
 from tests.car_fmu import packed_car, unpacked_car
-
-Floats = NDArray[np.float64]
 
 KNOWN = (*STATES, *INPUTS, *DYNAMIC_PARAMETERS)
 DERIVATIVES = tuple(f"der_{name}" for name in STATES)

@@ -9,7 +9,6 @@ from typing import Any, Final
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from bayesrace.errors import InputError
 from bayesrace.integrators import PERFECT, PREDICTION
@@ -21,8 +20,6 @@ from codegen.problems.tracking import tracking
 from controller.native_step import NativeStep, StepStatus
 from tests.car_fmu import packed_car
 from tests.conftest import SETTINGS, Circuit, Problem
-
-Floats = NDArray[np.float64]
 
 EXACT: Final = SETTINGS.model_copy(
     update={"iterations": 60, "iterations_cold": 60, "tolerance": 1e-11}

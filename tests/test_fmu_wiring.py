@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given as those
 from hypothesis import strategies as st
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from plant.fmu.map import wire
 from plant.fmu.map_file import parse_map
@@ -17,7 +18,6 @@ from plant.fmu.package import read_description
 from tests.fmu_variables import (
     STATE,
     TOLERANCE,
-    Array,
     U,
     assert_same,
     given,
@@ -102,7 +102,7 @@ def test_heading_from_a_quaternion_of_either_sign_and_any_length(
     wiring = wire(own_fmu(*parts, without=("psi",)), parse_map(f"[derive]\n{rule}"))
     factor = length * half
 
-    def say(state: Array) -> dict[str, float]:
+    def say(state: Floats) -> dict[str, float]:
         angle = state[2] / 2
         q = {"q[0]": 0.0, "q[1]": 0.0, "q[2]": math.sin(angle), "q[3]": math.cos(angle)}
         return our_names(state) | {name: factor * value for name, value in q.items()}
@@ -118,7 +118,7 @@ def test_heading_from_a_quaternion_of_a_car_that_pitches_and_rolls() -> None:
     fmu = own_fmu(*(given(name) for name in "wijk"), without=("psi",))
     wiring = wire(fmu, parse_map(f"[derive]\n{rule}"))
 
-    def say(state: Array) -> dict[str, float]:
+    def say(state: Floats) -> dict[str, float]:
         roll, pitch, yaw = 0.1, -0.2, -state[2]
         (cr, cp, cy), (sr, sp, sy) = (
             [f(angle / 2) for angle in (roll, pitch, yaw)] for f in (math.cos, math.sin)

@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given as those
 from hypothesis import strategies as st
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from plant.fmu.map import wire
 from plant.fmu.map_file import parse_map
 from plant.fmu.wiring import Wiring
 from tests.fmu_variables import (
     STATE,
-    Array,
     U,
     assert_same,
     given,
@@ -156,7 +156,7 @@ def test_a_placed_fmu_drives_the_same_way_from_the_asked_pose(
         vn=lambda s: math.sin(s["psi"]) * s["vx"] + math.cos(s["psi"]) * s["vy"],
     )
 
-    def after(start: tuple[float, float, float]) -> tuple[Array, Array]:
+    def after(start: tuple[float, float, float]) -> tuple[Floats, Floats]:
         """The state there and the one ``distance`` ahead and a quarter turn to the left."""
         first, later = STATE.copy(), STATE.copy()
         x, y, psi = start

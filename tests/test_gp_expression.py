@@ -3,9 +3,9 @@
 import casadi as ca
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from sklearn.gaussian_process import GaussianProcessRegressor
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.gp.expression import evaluate_mean, kernel, kernel_matrix, mean_function
 from bayesrace.gp.weights import KERNELS, GpOutput, GpWeights, zero_weights
@@ -39,7 +39,7 @@ def weights_of(kinds: tuple[str, ...], count: int = 40) -> GpWeights:
     return GpWeights(version="v", car="orca", discretisation="d", outputs=(vx, vy, omega))
 
 
-def points(count: int = 20, seed: int = 9) -> NDArray[np.float64]:
+def points(count: int = 20, seed: int = 9) -> Floats:
     return CENTRE + np.random.default_rng(seed).normal(size=(count, 6))
 
 

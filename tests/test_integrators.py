@@ -2,15 +2,13 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pydantic import ValidationError
 from scipy.integrate import solve_ivp
 
+from bayesrace.arrays import Floats
 from bayesrace.integrators import PERFECT, PREDICTION, SCHEMES, Discretisation
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import MODELS, Model, dynamic, e_kinematic
-
-Floats = NDArray[np.float64]
 
 X = np.array([0.3, -0.2, 0.7, 1.8, 0.1, 1.0, 0.12])
 U = np.array([0.6, -1.5])

@@ -18,9 +18,9 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from rich.console import Console
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights, decode_weights, write_weights, zero_weights
 from bayesrace.integrators import PERFECT, PREDICTION
@@ -173,7 +173,7 @@ def lap_of(data: Dataset, run: int = 1) -> list[State]:
     return [*states[:-1], replace(states[-1], lap=1, final=True)]
 
 
-def rows(*parts: Dataset) -> NDArray[np.float64]:
+def rows(*parts: Dataset) -> Floats:
     """The samples in an order of their own."""
     data = concatenate(parts)
     every = np.hstack((data.x, data.u, data.x_next))

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from bayesrace.gp.weights import GpWeights, zero_weights
 from bayesrace.vehicles import CarParameters
 from controller.native_step import NativeStep
@@ -22,8 +22,6 @@ from tests.native_programs import (
     gcc,
     native_program,
 )
-
-Floats = NDArray[np.float64]
 
 HARNESS = PROGRAMS / "harness.c"
 STEPS = 300

@@ -7,8 +7,8 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.gp.corrected import corrected_function
 from bayesrace.gp.weights import KERNELS, GpWeights, zero_weights
@@ -20,8 +20,6 @@ from controller.native_step import NativeStep
 from controller.settings import MpcSettings
 from tests.conftest import LENGTH_SCALES, fit_weights, smooth_drive
 from tests.scikit import scikit_gp
-
-Floats = NDArray[np.float64]
 
 NOMINAL = np.array([0.3, -0.2, 0.5, 1.8, 0.05, 0.8, 0.08, 0.5, 0.5])
 

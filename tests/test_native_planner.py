@@ -5,16 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.vehicles import CarParameters, default_car
 from controller.native_step import NativeStep
 from controller.path_table import PathTable, make_path_table
 from controller.settings import MpcSettings
 from tests.conftest import Circuit
-
-Floats = NDArray[np.float64]
 
 TS, HORIZON = 0.02, 20
 

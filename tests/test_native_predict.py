@@ -6,9 +6,9 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.gp.expression import mean_function
 from bayesrace.gp.weights import GpWeights
@@ -18,8 +18,6 @@ from bayesrace.vehicles.models import MODELS, Model, dynamic, e_kinematic
 from codegen.stage import advance_function, linearise_function
 from controller.native_step import NativeStep
 from tests.conftest import SETTINGS, Problem, smooth_drive
-
-Floats = NDArray[np.float64]
 
 TS = 0.02
 NONE = np.zeros(7)

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
 from bayesrace.vehicles import CarParameters
@@ -43,9 +43,7 @@ def test_no_mixture_at_full_speed(kinematic_artefact: Path, tmp_path: Path) -> N
     staging(kinematic_artefact, tmp_path, *OPTIMISED)
 
 
-def drive(
-    native: NativeStep, recorded: list[Problem], takeovers: Mapping[int, bytes]
-) -> NDArray[np.float64]:
+def drive(native: NativeStep, recorded: list[Problem], takeovers: Mapping[int, bytes]) -> Floats:
     """Inputs over a recorded drive; the sets are taken over before the steps of these numbers."""
     inputs = []
     for k, problem in enumerate(recorded[:100]):

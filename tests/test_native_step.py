@@ -6,9 +6,9 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from bayesrace.arrays import Floats
 from bayesrace.gp.corrected import corrected_function
 from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import PERFECT, PREDICTION
@@ -30,8 +30,6 @@ from tests.conftest import (
     mirrored_line,
     mirrored_weights,
 )
-
-Floats = NDArray[np.float64]
 
 EXACT = SETTINGS.model_copy(update={"iterations": 60, "iterations_cold": 60, "tolerance": 1e-11})
 TIGHT_IPOPT = {

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
@@ -14,7 +13,6 @@ from bayesrace.vehicles import CarParameters
 from controller.native_step import NativeStep, StepStatus
 from tests.conftest import SETTINGS, Circuit, Problem
 
-Floats = NDArray[np.float64]
 Make = Callable[..., NativeStep]
 
 TS = 0.02

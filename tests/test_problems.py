@@ -10,8 +10,8 @@ import hashlib
 import casadi as ca
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.integrators import Discretisation
 from codegen.build import build
@@ -21,8 +21,6 @@ from codegen.settings import BuildSettings
 from codegen.stage import linearised
 from controller.native_library import Gp, StepStatus
 from controller.native_problem import NativeProblem
-
-Floats = NDArray[np.float64]
 
 HORIZON, STEP_S, CAPACITY = 12, 0.15, 24
 VALUES = {

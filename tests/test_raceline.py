@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.raceline import (
     RaceLine,
@@ -24,7 +25,6 @@ from bayesrace.raceline.guess import speed_profile
 from bayesrace.raceline.identity import line_identity
 from bayesrace.raceline.ocp import car_limits
 from bayesrace.tracks import StartLine, Track, load_track
-from bayesrace.tracks.spline import FloatArray
 from bayesrace.vehicles import described_car, get_car
 from bayesrace.vehicles.parameters import GRAVITY_MPS2
 from tests.reference import reference_file
@@ -53,7 +53,7 @@ def line_on(name: str, **options: Any) -> RaceLine:
     return compute_raceline(track_called(name), car, RaceLineSettings(**options))
 
 
-def closed_difference(values: FloatArray, gain: float = 0.0) -> FloatArray:
+def closed_difference(values: Floats, gain: float = 0.0) -> Floats:
     return np.diff(np.append(values, values[0] + gain))
 
 

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.tracks import (
     DEFAULT_RACE_TRACK,
@@ -21,7 +22,7 @@ from bayesrace.tracks import (
     random_track,
 )
 from bayesrace.tracks.checks import clearance_m, find_crossing
-from bayesrace.tracks.spline import FloatArray, fit_arc_length
+from bayesrace.tracks.spline import fit_arc_length
 from tests.reference import reference_file
 
 
@@ -221,7 +222,7 @@ def minimum_radius(track: Track) -> float:
     return float(1 / np.abs(track.curvature(np.arange(0, track.length_m, 0.01))).max())
 
 
-def nodes(track: Track) -> FloatArray:
+def nodes(track: Track) -> Floats:
     return np.column_stack([track.x_m, track.y_m])
 
 
@@ -300,7 +301,7 @@ def test_a_track_narrower_than_the_car_is_refused_whatever_its_source() -> None:
         (np.eye(2), "too few points"),
     ],
 )
-def test_from_points_names_the_point_that_is_wrong(points: FloatArray, message: str) -> None:
+def test_from_points_names_the_point_that_is_wrong(points: Floats, message: str) -> None:
     with pytest.raises(InputError, match=message):
         Track.from_points("t", points, 0.2, 0.2)
 

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from bayesrace.tracks import Track
 from bayesrace.vehicles import CarParameters, default_car
 from controller.interface import Environment
@@ -13,8 +13,6 @@ from controller.native_step import NativeStep
 from controller.path_table import make_path_table
 from tests.conftest import SETTINGS, Circuit, offset_line
 from tests.test_driver import Rig
-
-Floats = NDArray[np.float64]
 
 
 def standing(

@@ -3,8 +3,8 @@
 import casadi as ca
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.integrators import Discretisation
 from bayesrace.vehicles import CarParameters, get_car
@@ -18,8 +18,6 @@ from bayesrace.vehicles.models import (
     kinematic,
 )
 from tests.conftest import TRUTH
-
-Floats = NDArray[np.float64]
 
 MIRROR = np.array([1.0, -1, -1, 1, -1, -1, -1])
 EPS = 1e-7

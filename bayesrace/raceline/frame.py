@@ -9,10 +9,11 @@ from typing import Final
 
 import numpy as np
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.tracks import Track
 from bayesrace.tracks.shapes import resample_closed, smooth_closed
-from bayesrace.tracks.spline import FloatArray, fit_arc_length
+from bayesrace.tracks.spline import fit_arc_length
 from bayesrace.vehicles.tuning import RacelineTuning
 
 __all__ = ["Frame", "build_frame"]
@@ -27,15 +28,15 @@ _OVERSAMPLING: Final = 8
 class Frame:
     """N stations, arrays (N,): position of station k at offset n is xy[k] + n normal[k]."""
 
-    xy_m: FloatArray
-    normal: FloatArray
-    heading_rad: FloatArray
+    xy_m: Floats
+    normal: Floats
+    heading_rad: Floats
     """Direction of the frame's tangent, continuous."""
-    turn_rad: FloatArray
+    turn_rad: Floats
     """Heading of the next station minus that of this one; sums up to +-2 pi over the lap."""
-    kappa_radpm: FloatArray
-    n_min_m: FloatArray
-    n_max_m: FloatArray
+    kappa_radpm: Floats
+    n_min_m: Floats
+    n_max_m: Floats
     length_m: float
 
 
@@ -69,9 +70,7 @@ def build_frame(track: Track, tuning: RacelineTuning, margin_m: float) -> Frame:
     return Frame(xy, normal, heading, turn, kappa, n_min, n_max, curve.period)
 
 
-def _check_room(
-    track: Track, s: FloatArray, room: FloatArray, margin_m: float, least_m: float
-) -> None:
+def _check_room(track: Track, s: Floats, room: Floats, margin_m: float, least_m: float) -> None:
     tight = room < least_m
     if tight.any():
         at = float(s[int(np.argmax(tight))])
@@ -81,7 +80,7 @@ def _check_room(
         )
 
 
-def _room(track: Track, xy: FloatArray, outward: FloatArray, margin_m: float) -> FloatArray:
+def _room(track: Track, xy: Floats, outward: Floats, margin_m: float) -> Floats:
     """How far one can go from each station along ``outward`` until the margin to the edge."""
     reach = np.full(len(xy), float(np.mean(track.width_left_m + track.width_right_m)) / 2)
     for _ in range(20):

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from bayesrace.tracks.spline import FloatArray
+from bayesrace.arrays import Floats
 
 __all__ = ["speed_profile"]
 
@@ -12,14 +12,14 @@ _TABLE = 400
 
 
 def speed_profile(
-    kappa: FloatArray,
-    step: FloatArray,
+    kappa: Floats,
+    step: Floats,
     grip_mps2: float,
-    drive: Callable[[FloatArray], FloatArray],
-    brake: Callable[[FloatArray], FloatArray],
+    drive: Callable[[Floats], Floats],
+    brake: Callable[[Floats], Floats],
     v_min: float,
     v_max: float,
-) -> FloatArray:
+) -> Floats:
     """Speeds (n,) on a closed path of curvature ``kappa`` (n,), ``step`` (n,) to the next point.
 
     Forward-backward pass within the friction circle ``grip_mps2`` and the acceleration limits

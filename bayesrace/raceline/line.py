@@ -12,10 +12,10 @@ from typing import Final
 
 import numpy as np
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.files import read_text, write_whole
 from bayesrace.tracks.files import read_table
-from bayesrace.tracks.spline import FloatArray
 
 __all__ = ["RACELINE_COLUMNS", "LineIdentity", "RaceLine", "read_raceline", "write_raceline"]
 
@@ -50,13 +50,13 @@ class RaceLine:
     """
 
     track_name: str
-    s_m: FloatArray
-    x_m: FloatArray
-    y_m: FloatArray
-    psi_rad: FloatArray
-    kappa_radpm: FloatArray
-    vx_mps: FloatArray
-    ax_mps2: FloatArray
+    s_m: Floats
+    x_m: Floats
+    y_m: Floats
+    psi_rad: Floats
+    kappa_radpm: Floats
+    vx_mps: Floats
+    ax_mps2: Floats
     length_m: float
     made_for: LineIdentity | None = None
     """None: not known; the line comes from elsewhere."""
@@ -68,7 +68,7 @@ class RaceLine:
         return float(np.sum(2.0 * step / (self.vx_mps + np.roll(self.vx_mps, -1))))
 
     @property
-    def xy_m(self) -> FloatArray:
+    def xy_m(self) -> Floats:
         """The points, shape (n, 2)."""
         return np.column_stack([self.x_m, self.y_m])
 

@@ -23,6 +23,7 @@ from typing import Any, Final
 import casadi as ca
 import numpy as np
 
+from bayesrace.arrays import Floats
 from bayesrace.interrupts import deferred_interrupt
 from bayesrace.raceline.frame import Frame, build_frame
 from bayesrace.raceline.guess import speed_profile
@@ -31,7 +32,6 @@ from bayesrace.raceline.line import RaceLine
 from bayesrace.raceline.sample import Clothoids, sample_line
 from bayesrace.raceline.settings import RaceLineError, RaceLineSettings
 from bayesrace.tracks import Track
-from bayesrace.tracks.spline import FloatArray
 from bayesrace.vehicles.models import longitudinal_force
 from bayesrace.vehicles.parameters import GRAVITY_MPS2, CarParameters
 
@@ -65,7 +65,7 @@ class CarLimits:
         slope = self.car.lr_m / self.car.wheelbase_m * np.tan(self.car.delta_max_rad)
         return float(np.sin(np.arctan(slope)) / self.car.lr_m)
 
-    def straight_values(self, v: FloatArray, d: float) -> FloatArray:
+    def straight_values(self, v: Floats, d: float) -> Floats:
         """``straight`` at many speeds."""
         return np.asarray(self.straight(v.reshape(1, -1), d)).ravel()
 
@@ -111,7 +111,7 @@ class _Problem:
     x: Any
     f: Any
     g: Any
-    g_min: FloatArray
+    g_min: Floats
     length: Any
     """Arc lengths between stations, (N, 1)."""
 
@@ -170,7 +170,7 @@ def _car_within(limits: CarLimits, time: Any, energy: Any, kappa: Any, a: Any) -
     ]
 
 
-def _bounds(frame: Frame, limits: CarLimits, v_max: float) -> tuple[FloatArray, FloatArray]:
+def _bounds(frame: Frame, limits: CarLimits, v_max: float) -> tuple[Floats, Floats]:
     """Lower and upper bounds of x."""
     one = np.ones(len(frame.kappa_radpm))
     kappa, tuning = limits.kappa_max_radpm, limits.car.tuning.raceline
@@ -180,7 +180,7 @@ def _bounds(frame: Frame, limits: CarLimits, v_max: float) -> tuple[FloatArray, 
     return np.concatenate(low), np.concatenate([*high, a_any * one])
 
 
-def _guess(frame: Frame, limits: CarLimits, v_max: float) -> FloatArray:
+def _guess(frame: Frame, limits: CarLimits, v_max: float) -> Floats:
     """x on the frame's own line with the speeds that the car could drive there."""
     car = limits.car
     count = len(frame.kappa_radpm)

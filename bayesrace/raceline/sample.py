@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bayesrace.arrays import Floats
 from bayesrace.raceline.line import RaceLine
 from bayesrace.tracks import StartLine, Track
-from bayesrace.tracks.spline import FloatArray
 
 __all__ = ["Clothoids", "sample_line"]
 
@@ -17,13 +17,13 @@ _GAUSS_X, _GAUSS_W = np.polynomial.legendre.leggauss(6)
 class Clothoids:
     """Closed chain of n clothoids with piecewise linear acceleration; arrays (n,)."""
 
-    xy_m: FloatArray
-    psi_rad: FloatArray
-    kappa_radpm: FloatArray
-    energy: FloatArray
+    xy_m: Floats
+    psi_rad: Floats
+    kappa_radpm: Floats
+    energy: Floats
     """Squared speed [m^2/s^2]."""
-    ax_mps2: FloatArray
-    step_m: FloatArray
+    ax_mps2: Floats
+    step_m: Floats
     """Arc length from each station to the next."""
     turn_rad: float
     """Direction gained over the lap, +-2 pi."""
@@ -33,9 +33,7 @@ class Clothoids:
         """Arc length of the whole path."""
         return float(self.step_m.sum())
 
-    def at(
-        self, s: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    def at(self, s: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
         """xy (m, 2), psi, kappa, v, ax at arc lengths (m,) from station 0, up to two laps on."""
         lap, rest = np.divmod(s, self.length_m)
         knots = np.concatenate([[0.0], np.cumsum(self.step_m[:-1])])
@@ -45,7 +43,7 @@ class Clothoids:
         bend = (self.kappa_radpm[after] - self.kappa_radpm[k]) / length
         gain = (self.ax_mps2[after] - self.ax_mps2[k]) / length
 
-        def psi(way: FloatArray) -> FloatArray:
+        def psi(way: Floats) -> Floats:
             start = (slice(None),) + (None,) * (way.ndim - 1)
             turned = way * (self.kappa_radpm[k][start] + way * bend[start] / 2)
             return np.asarray(self.psi_rad[k][start] + turned)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from bayesrace.tracks.spline import FloatArray
+from bayesrace.arrays import Floats
 
 __all__ = ["MIN_POINTS", "Fault", "clearance_m", "find_crossing", "find_fault", "find_scale_fault"]
 
@@ -42,9 +42,7 @@ class Fault:
         return f"{source}{place}: {self.what}{other}; {self.remedy}"
 
 
-def find_fault(
-    points: FloatArray, right: FloatArray, left: FloatArray, min_width_m: float
-) -> Fault | None:
+def find_fault(points: Floats, right: Floats, left: Floats, min_width_m: float) -> Fault | None:
     """The first fault of points (n, 2) with widths (n,), None if they make a track.
 
     ``min_width_m``: the least width, right plus left, normally that of the car.
@@ -65,7 +63,7 @@ def find_fault(
     return _find_width_fault(right, left, min_width_m) or _find_shape_fault(points)
 
 
-def _find_width_fault(right: FloatArray, left: FloatArray, min_width_m: float) -> Fault | None:
+def _find_width_fault(right: Floats, left: Floats, min_width_m: float) -> Fault | None:
     negative = (right < 0) | (left < 0)
     if negative.any():
         return Fault(
@@ -85,7 +83,7 @@ def _find_width_fault(right: FloatArray, left: FloatArray, min_width_m: float) -
     return None
 
 
-def _find_shape_fault(points: FloatArray) -> Fault | None:
+def _find_shape_fault(points: Floats) -> Fault | None:
     edge = np.roll(points, -1, axis=0) - points
     length = np.linalg.norm(edge, axis=1)
     if length[-1] > _OPEN * length[:-1].max():
@@ -119,7 +117,7 @@ def _find_shape_fault(points: FloatArray) -> Fault | None:
 
 
 def find_scale_fault(
-    points: FloatArray, right: FloatArray, left: FloatArray, car_width_m: float | None
+    points: Floats, right: Floats, left: Floats, car_width_m: float | None
 ) -> Fault | None:
     """Sizes of a track (n, 2), (n,) that fit no track in metres; None if they are plausible.
 
@@ -149,7 +147,7 @@ def find_scale_fault(
     )
 
 
-def find_crossing(points: FloatArray) -> tuple[int, int] | None:
+def find_crossing(points: Floats) -> tuple[int, int] | None:
     """First pair (i, j), i < j, of edges of the closed polygon (n, 2) that meet; None if none."""
     count = len(points)
     following = np.roll(points, -1, axis=0)
@@ -169,7 +167,7 @@ def find_crossing(points: FloatArray) -> tuple[int, int] | None:
     return None
 
 
-def clearance_m(points: FloatArray, skip_m: float) -> float:
+def clearance_m(points: Floats, skip_m: float) -> float:
     """Least distance between points (n, 2) of a closed curve that are > skip_m apart along it."""
     length = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
     s = np.concatenate([[0.0], np.cumsum(length[:-1])])
@@ -180,17 +178,15 @@ def clearance_m(points: FloatArray, skip_m: float) -> float:
     return float(np.sqrt(squared.min()))
 
 
-def _squared(a: FloatArray, b: FloatArray) -> FloatArray:
+def _squared(a: Floats, b: Floats) -> Floats:
     """Squared distances (len(a), len(b))."""
     return np.asarray((a[:, :1] - b[:, 0]) ** 2 + (a[:, 1:] - b[:, 1]) ** 2)
 
 
-def _edges_meet(
-    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray
-) -> npt.NDArray[np.bool_]:
+def _edges_meet(a: Floats, b: Floats, c: Floats, d: Floats) -> npt.NDArray[np.bool_]:
     """Whether edges a-b and c-d (each (m, 2)) meet, touching included."""
 
-    def side(p: FloatArray, q: FloatArray, r: FloatArray) -> FloatArray:
+    def side(p: Floats, q: Floats, r: Floats) -> Floats:
         u, v = q - p, r - p
         return np.asarray(np.sign(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]))
 

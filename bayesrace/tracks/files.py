@@ -10,10 +10,10 @@ from typing import Final
 
 import numpy as np
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.files import read_text, write_whole
 from bayesrace.tracks.checks import find_fault, find_scale_fault
-from bayesrace.tracks.spline import FloatArray
 from bayesrace.tracks.track import Track, drop_repeated
 
 __all__ = ["read_table", "read_track", "write_track"]
@@ -61,7 +61,7 @@ def default_car_width_m(car_width_m: float | None) -> float:
     return get_car(DEFAULT_CAR).width_m
 
 
-def read_table(path: Path, columns: tuple[str, ...]) -> tuple[FloatArray, list[int]]:
+def read_table(path: Path, columns: tuple[str, ...]) -> tuple[Floats, list[int]]:
     """Numbers (n, len(columns)) of a CSV file and the line number of each row.
 
     A header with these names in another order is honoured. Raises InputError for a file that can't

@@ -9,10 +9,10 @@ from typing import Final
 
 import numpy as np
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.tracks.checks import clearance_m, find_crossing
 from bayesrace.tracks.shapes import Corner, rounded_polygon
-from bayesrace.tracks.spline import FloatArray
 from bayesrace.tracks.track import Track
 
 __all__ = ["random_track"]
@@ -46,7 +46,7 @@ def random_track(seed: int) -> Track:
     return Track.from_points(f"random:{seed}", points, width / 2, width / 2)
 
 
-def _candidate(rng: np.random.Generator, width: float) -> FloatArray | None:
+def _candidate(rng: np.random.Generator, width: float) -> Floats | None:
     """One circuit, or None if its corners don't fit or it doesn't keep clear of itself."""
     outline = _outline(_grow(rng, int(rng.integers(7, 13))))
     if outline is None:
@@ -112,7 +112,7 @@ def _outline(cells: set[Cell]) -> list[Cell] | None:
     ]
 
 
-def _with_radii(rng: np.random.Generator, xy: FloatArray, width: float) -> list[Corner] | None:
+def _with_radii(rng: np.random.Generator, xy: Floats, width: float) -> list[Corner] | None:
     """Corners rounded as far as their edges allow, at random; None if one must be too tight."""
     out = np.roll(xy, -1, axis=0) - xy
     into = np.roll(out, 1, axis=0)
@@ -127,7 +127,7 @@ def _with_radii(rng: np.random.Generator, xy: FloatArray, width: float) -> list[
     return [(float(x), float(y), float(r)) for (x, y), r in zip(xy, radius, strict=True)]
 
 
-def _is_good(points: FloatArray, width: float) -> bool:
+def _is_good(points: Floats, width: float) -> bool:
     """Whether length and bends are as promised and all pieces keep clear of one another."""
     edge = np.roll(points, -1, axis=0) - points
     step = np.linalg.norm(edge, axis=1)
@@ -144,7 +144,7 @@ def _is_good(points: FloatArray, width: float) -> bool:
     )
 
 
-def _plain() -> FloatArray:
+def _plain() -> Floats:
     """A rounded rectangle, for when no candidate was good."""
     points = rounded_polygon([(2.0, 0.0, 0.5), (2.0, 2.0, 0.5), (-2.0, 2.0, 0.5), (-2.0, 0.0, 0.5)])
     if points is None:

@@ -4,7 +4,8 @@ from functools import cached_property
 
 import numpy as np
 
-from bayesrace.tracks.spline import FloatArray, PlaneSpline
+from bayesrace.arrays import Floats
+from bayesrace.tracks.spline import PlaneSpline
 
 __all__ = ["CentrelineSearch"]
 
@@ -30,12 +31,12 @@ class CentrelineSearch:
         """The samples as plain floats: the walk below visits few of them, one by one."""
         return self._samples[:, 0].tolist(), self._samples[:, 1].tolist()
 
-    def nearest(self, points: FloatArray) -> FloatArray:
+    def nearest(self, points: Floats) -> Floats:
         """Arc lengths (m,) in [0, period) of the globally nearest curve points to (m, 2)."""
         parts = [self._nearest_chunk(points[i : i + _CHUNK]) for i in range(0, len(points), _CHUNK)]
         return np.concatenate(parts) if parts else np.empty(0)
 
-    def _nearest_chunk(self, points: FloatArray) -> FloatArray:
+    def _nearest_chunk(self, points: Floats) -> Floats:
         # Several pieces can be almost equally near. A local minimum of the true distance is at
         # most half a step from a sample, so every sampled local minimum that is within half a
         # step of the best one may hide the true nearest point: all of them are refined.
@@ -53,13 +54,13 @@ class CentrelineSearch:
         _, first = np.unique(query[order], return_index=True)
         return np.asarray(s[order[first]])
 
-    def descend(self, points: FloatArray, s_guess: float) -> FloatArray:
+    def descend(self, points: Floats, s_guess: float) -> Floats:
         """Foot point (1,) of one point (1, 2) on the piece around ``s_guess``."""
         start = round(s_guess / self._step) % self._count
         sample = self._walk(float(points[0, 0]), float(points[0, 1]), start)
         return self._refine(points, np.array([sample]))
 
-    def follow(self, points: FloatArray, s_guess: float | None, reach: float) -> FloatArray:
+    def follow(self, points: Floats, s_guess: float | None, reach: float) -> Floats:
         """Foot points (m,) of a trajectory (m, 2); global search after gaps beyond ``reach``."""
         if not len(points):
             return np.empty(0)
@@ -97,7 +98,7 @@ class CentrelineSearch:
                 break
         return at
 
-    def _refine(self, points: FloatArray, samples: np.ndarray) -> FloatArray:
+    def _refine(self, points: Floats, samples: np.ndarray) -> Floats:
         """Newton on the derivative of the squared distance, kept within one step by bisection."""
         s = samples * self._step
         low, high = s - self._step, s + self._step

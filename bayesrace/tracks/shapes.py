@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bayesrace.tracks.spline import FloatArray
+from bayesrace.arrays import Floats
 
 __all__ = ["Corner", "resample_closed", "rounded_polygon", "smooth_closed"]
 
@@ -14,7 +14,7 @@ Corner = tuple[float, float, float]
 
 def rounded_polygon(
     corners: Sequence[Corner], spacing_m: float = 0.04, easing_m: float = 0.05
-) -> FloatArray | None:
+) -> Floats | None:
     """Points (n, 2), about ``spacing_m`` apart, along the closed polygon with rounded corners.
 
     Smoothing over ``easing_m`` lets the curvature grow over a short way instead of jumping where
@@ -38,7 +38,7 @@ def rounded_polygon(
     return resample_closed(smooth_closed(points, easing_m / 0.005), spacing_m)
 
 
-def smooth_closed(points: FloatArray, sigma_samples: float) -> FloatArray:
+def smooth_closed(points: Floats, sigma_samples: float) -> Floats:
     """Periodic Gaussian filter of evenly spaced points (n, 2); sigma counted in points."""
     frequency = 2 * np.pi * np.fft.rfftfreq(len(points))
     gain = np.exp(-0.5 * (sigma_samples * frequency) ** 2)
@@ -46,7 +46,7 @@ def smooth_closed(points: FloatArray, sigma_samples: float) -> FloatArray:
     return np.asarray(np.fft.irfft(spectrum, len(points), axis=0))
 
 
-def resample_closed(points: FloatArray, spacing_m: float) -> FloatArray:
+def resample_closed(points: Floats, spacing_m: float) -> Floats:
     """Evenly spaced points on the closed polyline, starting at its first point."""
     closed = np.concatenate([points, points[:1]])
     s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
@@ -55,7 +55,7 @@ def resample_closed(points: FloatArray, spacing_m: float) -> FloatArray:
     return np.column_stack([np.interp(at, s, closed[:, 0]), np.interp(at, s, closed[:, 1])])
 
 
-def _arc(start: FloatArray, direction: FloatArray, turn: float, radius: float) -> FloatArray:
+def _arc(start: Floats, direction: Floats, turn: float, radius: float) -> Floats:
     """Points from ``start`` along an arc that turns by ``turn`` [rad], a few mm apart."""
     count = max(2, int(np.ceil(abs(turn) * radius / 0.005)))
     angle = np.linspace(0.0, turn, count)

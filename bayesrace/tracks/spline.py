@@ -10,9 +10,10 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["FloatArray", "PlaneSpline", "fit_arc_length"]
+from bayesrace.arrays import Floats
 
-FloatArray = npt.NDArray[np.float64]
+__all__ = ["Floats", "PlaneSpline", "fit_arc_length"]
+
 
 _GAUSS_X, _GAUSS_W = np.polynomial.legendre.leggauss(5)
 
@@ -25,12 +26,12 @@ class PlaneSpline:
     first point is not given twice.
     """
 
-    knots: FloatArray
-    points: FloatArray
+    knots: Floats
+    points: Floats
     period: float
 
     @cached_property
-    def _table(self) -> FloatArray:
+    def _table(self) -> Floats:
         """Power coefficients (4, n, 2): point = c0 + c1 t + c2 t^2 + c3 t^3, t from the knot."""
         step = np.diff(np.append(self.knots, self.knots[0] + self.period))
         following = np.roll(self.points, -1, axis=0)
@@ -47,7 +48,7 @@ class PlaneSpline:
             ]
         )
 
-    def __call__(self, s: npt.ArrayLike, derivative: int = 0) -> FloatArray:
+    def __call__(self, s: npt.ArrayLike, derivative: int = 0) -> Floats:
         """Point (..., 2), or its first or second derivative, at any real ``s`` (...)."""
         local, piece = self._locate(np.asarray(s, dtype=float))
         c0, c1, c2, c3 = self._table[:, piece]
@@ -60,7 +61,7 @@ class PlaneSpline:
             value = 2.0 * c2 + 6.0 * t * c3
         return np.asarray(value)
 
-    def derivatives(self, s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def derivatives(self, s: Floats) -> tuple[Floats, Floats, Floats]:
         """Point, first and second derivative in one look-up."""
         local, piece = self._locate(s)
         c0, c1, c2, c3 = self._table[:, piece]
@@ -71,20 +72,20 @@ class PlaneSpline:
             2.0 * c2 + 6.0 * t * c3,
         )
 
-    def piece_lengths(self) -> FloatArray:
+    def piece_lengths(self) -> Floats:
         """Arc length of each of the n pieces (5-point Gauss quadrature)."""
         step = np.diff(np.append(self.knots, self.knots[0] + self.period))
         at = self.knots[:, None] + step[:, None] * (_GAUSS_X + 1.0) / 2.0
         speed = np.linalg.norm(self(at, 1), axis=-1)
         return np.asarray(speed @ _GAUSS_W * step / 2.0)
 
-    def _locate(self, s: FloatArray) -> tuple[FloatArray, npt.NDArray[np.intp]]:
+    def _locate(self, s: Floats) -> tuple[Floats, npt.NDArray[np.intp]]:
         offset = np.mod(s - self.knots[0], self.period)
         piece = np.searchsorted(self.knots - self.knots[0], offset, side="right") - 1
         return offset - (self.knots[piece] - self.knots[0]), piece
 
 
-def fit_arc_length(points: FloatArray) -> PlaneSpline:
+def fit_arc_length(points: Floats) -> PlaneSpline:
     """Periodic spline through ``points`` (n, 2), not repeated, whose parameter is arc length.
 
     Starts from chord lengths; refitting over the measured arc lengths converges in few rounds
@@ -98,7 +99,7 @@ def fit_arc_length(points: FloatArray) -> PlaneSpline:
     return spline
 
 
-def _cyclic_second_derivatives(step: FloatArray, rhs: FloatArray) -> FloatArray:
+def _cyclic_second_derivatives(step: Floats, rhs: Floats) -> Floats:
     """Solves h_{i-1} M_{i-1} + 2 (h_{i-1} + h_i) M_i + h_i M_{i+1} = rhs_i, indices cyclic.
 
     Sherman-Morrison turns the cyclic system into two tridiagonal ones, solved by Thomas'
@@ -119,9 +120,7 @@ def _cyclic_second_derivatives(step: FloatArray, rhs: FloatArray) -> FloatArray:
     return np.asarray(y - z[:, None] * factor)
 
 
-def _tridiagonal(
-    off: FloatArray, diagonal: FloatArray, rhs: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def _tridiagonal(off: Floats, diagonal: Floats, rhs: Floats) -> tuple[Floats, Floats]:
     """Symmetric tridiagonal solve; the last column of ``rhs`` is returned apart."""
     count = len(diagonal)
     e, d = off.tolist(), diagonal.tolist()

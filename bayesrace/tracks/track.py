@@ -12,11 +12,12 @@ from typing import overload
 import numpy as np
 import numpy.typing as npt
 
+from bayesrace.arrays import Floats
 from bayesrace.cache import digest
 from bayesrace.errors import InputError
 from bayesrace.tracks.checks import find_fault
 from bayesrace.tracks.projection import CentrelineSearch
-from bayesrace.tracks.spline import FloatArray, PlaneSpline, fit_arc_length
+from bayesrace.tracks.spline import PlaneSpline, fit_arc_length
 
 __all__ = ["PathProjection", "Projection", "Track"]
 
@@ -37,13 +38,13 @@ class Projection:
 class PathProjection:
     """Where the points of a trajectory are on a track; arrays of shape (m,)."""
 
-    s_m: FloatArray
+    s_m: Floats
     """Arc length of the foot points, in [0, length)."""
-    n_m: FloatArray
+    n_m: Floats
     """Lateral offsets, positive to the left."""
-    off_track_m: FloatArray
+    off_track_m: Floats
     """Distances outside the track; <= 0 inside."""
-    progress_m: FloatArray
+    progress_m: Floats
     """Arc length without wrapping, first value in [-length/2, length/2): + length each lap."""
 
 
@@ -56,11 +57,11 @@ class Track:
     """
 
     name: str
-    s_m: FloatArray
-    x_m: FloatArray
-    y_m: FloatArray
-    width_right_m: FloatArray
-    width_left_m: FloatArray
+    s_m: Floats
+    x_m: Floats
+    y_m: Floats
+    width_right_m: Floats
+    width_left_m: Floats
     length_m: float
 
     @classmethod
@@ -93,9 +94,7 @@ class Track:
         return cls._from_checked(name, points, right, left)
 
     @classmethod
-    def _from_checked(
-        cls, name: str, points: FloatArray, right: FloatArray, left: FloatArray
-    ) -> "Track":
+    def _from_checked(cls, name: str, points: Floats, right: Floats, left: Floats) -> "Track":
         spline = fit_arc_length(points)
         arrays = (spline.knots, points[:, 0].copy(), points[:, 1].copy(), right + 0.0, left + 0.0)
         for array in arrays:
@@ -120,7 +119,7 @@ class Track:
         return CentrelineSearch(self.centreline, spacing_m=total / 16.0)
 
     @cached_property
-    def _width_table(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _width_table(self) -> tuple[Floats, Floats, Floats]:
         right, left = self.width_right_m, self.width_left_m
         return (
             np.append(self.s_m, self.length_m),
@@ -128,34 +127,34 @@ class Track:
             np.append(left, left[0]),
         )
 
-    def position(self, s: npt.ArrayLike) -> FloatArray:
+    def position(self, s: npt.ArrayLike) -> Floats:
         """Centreline point(s), shape (..., 2) [m]."""
         return self.centreline(s)
 
-    def heading(self, s: npt.ArrayLike) -> FloatArray:
+    def heading(self, s: npt.ArrayLike) -> Floats:
         """Direction of the centreline's tangent, in (-pi, pi] [rad]."""
         tangent = self.centreline(s, 1)
         return np.asarray(np.arctan2(tangent[..., 1], tangent[..., 0]))
 
-    def normal(self, s: npt.ArrayLike) -> FloatArray:
+    def normal(self, s: npt.ArrayLike) -> Floats:
         """Unit normal(s) to the left of the driving direction, shape (..., 2)."""
         tangent = self.centreline(s, 1)
         tangent = tangent / np.linalg.norm(tangent, axis=-1, keepdims=True)
         return np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
 
-    def curvature(self, s: npt.ArrayLike) -> FloatArray:
+    def curvature(self, s: npt.ArrayLike) -> Floats:
         """Curvature of the centreline, positive in a left-hand bend [rad/m]."""
         _, first, second = self.centreline.derivatives(np.asarray(s, dtype=float))
         cross = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
         return np.asarray(cross / np.linalg.norm(first, axis=-1) ** 3)
 
-    def widths(self, s: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+    def widths(self, s: npt.ArrayLike) -> tuple[Floats, Floats]:
         """Distance from the centreline to the right and to the left edge, linear in s [m]."""
         nodes, right, left = self._width_table
         wrapped = np.mod(np.asarray(s, dtype=float), self.length_m)
         return np.interp(wrapped, nodes, right), np.interp(wrapped, nodes, left)
 
-    def boundaries(self, spacing_m: float = 0.02) -> tuple[FloatArray, FloatArray]:
+    def boundaries(self, spacing_m: float = 0.02) -> tuple[Floats, Floats]:
         """Right and left edge as points (m, 2), about ``spacing_m`` apart along the centreline."""
         count = max(8, round(self.length_m / spacing_m))
         s = np.arange(count) * (self.length_m / count)
@@ -200,8 +199,8 @@ class Track:
     @overload
     def off_track_m(self, projection: Projection) -> float: ...
     @overload
-    def off_track_m(self, projection: PathProjection) -> FloatArray: ...
-    def off_track_m(self, projection: Projection | PathProjection) -> float | FloatArray:
+    def off_track_m(self, projection: PathProjection) -> Floats: ...
+    def off_track_m(self, projection: Projection | PathProjection) -> float | Floats:
         """How far outside the track [m]; <= 0 inside."""
         return projection.off_track_m
 
@@ -211,24 +210,22 @@ class Track:
         name = f"{self.name}-mirrored"
         return Track._from_checked(name, points, self.width_left_m, self.width_right_m)
 
-    def _projected(self, points: FloatArray, s: FloatArray) -> PathProjection:
+    def _projected(self, points: Floats, s: Floats) -> PathProjection:
         n = self._offsets(points, s)
         progress = np.unwrap(s, period=self.length_m)
         if len(s) and s[0] >= self.length_m / 2:
             progress = progress - self.length_m
         return PathProjection(s, n, self._off_track(s, n), progress)
 
-    def _offsets(self, points: FloatArray, s: FloatArray) -> FloatArray:
+    def _offsets(self, points: Floats, s: Floats) -> Floats:
         return np.asarray(np.sum((points - self.position(s)) * self.normal(s), axis=-1))
 
-    def _off_track(self, s: FloatArray, n: FloatArray) -> FloatArray:
+    def _off_track(self, s: Floats, n: Floats) -> Floats:
         right, left = self.widths(s)
         return np.maximum(n - left, -n - right)
 
 
-def drop_repeated(
-    points: FloatArray, right: FloatArray, left: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def drop_repeated(points: Floats, right: Floats, left: Floats) -> tuple[Floats, Floats, Floats]:
     """The same without a last point that repeats the first (to a thousandth of the spacing)."""
     if len(points) > 2:
         spacing = float(np.median(np.linalg.norm(np.diff(points, axis=0), axis=1)))

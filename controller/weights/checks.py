@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import OUTPUTS, UNITS, GpWeights, decode_weights
 from bayesrace.messages import Scalar
@@ -20,7 +20,6 @@ from controller.weights.settings import GateSettings
 
 __all__ = ["Checks", "Comparison", "Verdict"]
 
-_Floats = npt.NDArray[np.float64]
 
 _CLOCKS_APART_S: Final = 3600.0
 """By which the clock of the training host may be ahead."""
@@ -140,7 +139,7 @@ class Checks:
             )
         return decisive.text
 
-    def compare(self, new: _Floats, old: _Floats, nominal: _Floats) -> Comparison:
+    def compare(self, new: Floats, old: Floats, nominal: Floats) -> Comparison:
         """Errors (n, 3) over the same samples; those that the nominal model lacks do not count."""
         usable = np.isfinite(nominal).all(axis=1)
         rmse = {

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
 from bayesrace.vehicles.parameters import CarParameters
@@ -17,7 +17,6 @@ from controller.weights.states import StateRecord
 
 __all__ = ["OneStepModel", "Sample", "Sampler", "plausible_samples"]
 
-_Floats = npt.NDArray[np.float64]
 
 _LONGEST: Final = 5.0
 """Sampling times that a sample lasts at most; where states come seldom, each makes one."""
@@ -28,9 +27,9 @@ class Sample(NamedTuple):
 
     recorded_ns: int
     duration_s: float
-    x: _Floats
-    u: _Floats
-    x_next: _Floats
+    x: Floats
+    u: Floats
+    x_next: Floats
 
 
 class Sampler:
@@ -77,7 +76,7 @@ class OneStepModel:
         if weights is not None:
             self._step.set_weights(weights)
 
-    def velocities(self, samples: Sequence[Sample]) -> _Floats:
+    def velocities(self, samples: Sequence[Sample]) -> Floats:
         """Predicted vx, vy, omega (n, 3) at the samples' ends; NaN where the model has no value."""
         predicted = np.full((len(samples), 3), np.nan)
         for row, (_, duration_s, x, u, _) in zip(predicted, samples, strict=True):
@@ -87,11 +86,11 @@ class OneStepModel:
                 continue
         return predicted
 
-    def errors(self, samples: Sequence[Sample]) -> _Floats:
+    def errors(self, samples: Sequence[Sample]) -> Floats:
         """One-step errors (n, 3) as velocities after one Ts; infinite without a prediction."""
         after = np.array([sample.x_next[3:6] for sample in samples]).reshape(-1, 3)
         duration_s = np.array([sample.duration_s for sample in samples])[:, None]
-        errors: _Floats = (after - self.velocities(samples)) * (self.step_s / duration_s)
+        errors: Floats = (after - self.velocities(samples)) * (self.step_s / duration_s)
         return np.where(np.isfinite(errors), errors, np.inf)
 
 

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from bayesrace.arrays import Floats
 from bayesrace.messages import Scalar
 from controller.weights.checks import Checks, Comparison
 from controller.weights.prediction import Sample
@@ -24,7 +24,7 @@ class Watch:
         """Of the weights in use; ``before``: samples from before their adoption."""
         self._checks, self._settings = checks, checks.settings
         self._models = (checks.in_use, checks.reference, checks.nominal)
-        self._errors: deque[npt.NDArray[np.float64]] = deque(maxlen=self._settings.watch_window)
+        self._errors: deque[Floats] = deque(maxlen=self._settings.watch_window)
         self._needed = round(self._settings.watch_s / checks.step_s)
         self._driven = self._cycles = self._fallen_back = 0
         for sample in before[-self._settings.watch_window :]:

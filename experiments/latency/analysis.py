@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from bayesrace.tracks import Track
 from experiments.latency.clocks import ClockMap
 from experiments.latency.columns import (
@@ -26,7 +26,6 @@ from experiments.latency.settings import LatencySettings
 
 __all__ = ["Analysis", "Beside", "analyse"]
 
-Floats = NDArray[np.float64]
 
 _IN_FLIGHT: Final = 2
 """So many messages more at the one end of a part than at the other end may be in flight."""

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from typing import Final, Self
 
 import numpy as np
-from numpy.typing import NDArray
+
+from bayesrace.arrays import Floats
 
 __all__ = ["ClockMap"]
 
-Floats = NDArray[np.float64]
 
 _DRIFT: Final = 200e-6
 """Of one clock against another at most: quartz is within 100 ppm on either side."""

@@ -10,13 +10,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from experiments.latency.clocks import ClockMap
 from experiments.latency.columns import Columns, Tables
 from experiments.latency.traffic import heartbeats, traffic
 
 __all__ = ["ANSWER", "LEGS", "Cycles"]
 
-Floats = NDArray[np.float64]
 
 LEGS: Final = {
     "wake_up": ("wake-up error", "controller"),

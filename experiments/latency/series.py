@@ -7,14 +7,13 @@ from typing import Any, Final
 import numpy as np
 from hdrh.histogram import HdrHistogram
 from hdrh.log import HistogramLogWriter
-from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from bayesrace.files import replacing
 from experiments.latency.results import Distribution
 
 __all__ = ["Series", "new_histogram"]
 
-Floats = NDArray[np.float64]
 
 _LARGEST_NS: Final = 60_000_000_000
 _PERCENTILES: Final = (50.0, 90.0, 99.0, 99.9, 100.0)

@@ -8,14 +8,13 @@ heartbeats, of the first and of the last second, at which the fewest were in fli
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from experiments.latency.clocks import ClockMap
 from experiments.latency.columns import Columns, Tables, begins_anew
 
 __all__ = ["heartbeats", "traffic"]
 
-Floats = NDArray[np.float64]
 
 _SECOND: Final = 10
 """Heartbeats in a second."""

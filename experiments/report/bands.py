@@ -6,11 +6,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from experiments.report.style import WARNING
 
 __all__ = ["BAND", "draw_band", "mark_uncertain"]
 
-Floats = NDArray[np.float64]
 
 BAND: Final = "#bcd7ea"
 

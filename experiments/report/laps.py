@@ -3,15 +3,14 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from bayesrace.arrays import Floats
 from bayesrace.tracks import Track
 from experiments.analysis import DrivenRun
 
 __all__ = ["Lap", "first_laps", "flying_laps", "reference_of"]
 
-Floats = NDArray[np.float64]
 
 _SLOW_MPS = 0.05
 _POINTS, _SMOOTH = 600, 0.015

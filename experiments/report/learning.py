@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
-from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from bayesrace.gp.weights import OUTPUTS, UNITS
 from experiments.analysis import DrivenRun
 from experiments.notation import SYMBOLS, UNCERTAIN
@@ -18,7 +18,6 @@ from learning.validation import Validation
 
 __all__ = ["gp_figures", "solve_figure"]
 
-Floats = NDArray[np.float64]
 
 _LAPS = 2.0
 """Shown of the drive."""

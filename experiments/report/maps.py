@@ -9,8 +9,8 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from bayesrace.raceline import RaceLine
 from bayesrace.tracks import Track
 from experiments.analysis import DrivenRun
@@ -20,7 +20,6 @@ from experiments.report.style import INK, MUTED, SURFACE, WARNING, gain_map, loo
 
 __all__ = ["LapMaps", "draw_edges"]
 
-Floats = NDArray[np.float64]
 
 _MARGIN_M: Final = 0.12
 

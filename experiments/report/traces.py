@@ -6,8 +6,8 @@ from typing import Final
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from bayesrace.raceline import RaceLine
 from bayesrace.tracks import Track
 from bayesrace.vehicles import CarParameters
@@ -18,7 +18,6 @@ from experiments.report.style import INK, MUTED, look
 
 __all__ = ["deviation_figures", "input_figures", "speed_figures", "time_figures"]
 
-Floats = NDArray[np.float64]
 
 _LEAP_M: Final = 1.0
 _NEAR_MS: Final = 300.0

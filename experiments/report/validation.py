@@ -8,8 +8,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from bayesrace.gp.weights import OUTPUTS, UNITS
 from bayesrace.tracks import Track
 from experiments.notation import SYMBOLS
@@ -21,7 +21,6 @@ from learning.validation import Validation, unbroken
 
 __all__ = ["band_figure", "track_figure"]
 
-Floats = NDArray[np.float64]
 
 _MEAN: Final = "#0072B2"
 _MARGIN_M: Final = 0.12

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.vehicles.models import STATES
 from bayesrace.vehicles.parameters import CarParameters
@@ -23,7 +23,6 @@ from plant.simulator import PlantGuard, checked_start, hold_in_turn, plant_discr
 
 __all__ = ["FmuSimulator", "communication_step", "open_fmu"]
 
-Array = npt.NDArray[np.float64]
 
 _STEP_S: Final = 1e-3
 """Communication step of an FMU that takes any: the built-in car's substep."""
@@ -79,7 +78,7 @@ class FmuSimulator:
         self.guard = PlantGuard(car)
         self.u_applied: tuple[float, float] = (0.0, 0.0)
         self.steps = 0
-        self.x: Array = np.zeros(len(STATES))
+        self.x: Floats = np.zeros(len(STATES))
         self.substeps = round(period_s / part_s)
         self._host, self._wiring = host, wiring
         self._part_s, self._any_size = part_s, any_size
@@ -130,7 +129,7 @@ class FmuSimulator:
         self._take(wiring.state(outputs, applied, duration_s))
         return applied
 
-    def _take(self, x: Array) -> None:
+    def _take(self, x: Floats) -> None:
         """Makes it the state, if it is one."""
         for name, value in zip(STATES, x.tolist(), strict=True):
             if not abs(value) <= _LIMIT:

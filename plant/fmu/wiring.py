@@ -12,13 +12,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 
 __all__ = ["COMMANDS", "READINGS", "STARTS", "STATES", "Link", "Value", "Wiring"]
 
-Array = npt.NDArray[np.float64]
 Value = float | int | bool | str
 
 TURN: Final = 2.0 * math.pi
@@ -119,7 +118,7 @@ class Wiring:
         self._delta = 0.0  # integrated
         self._turn, self._origin = 0.0, (0.0, 0.0)  # of the FMU's world in ours
 
-    def start_values(self, x0: Sequence[float] | Array) -> dict[str, Value]:
+    def start_values(self, x0: Sequence[float] | Floats) -> dict[str, Value]:
         """Values to set before initialisation so that the car starts in ``x0``, (7,).
 
         Parameters, constant inputs, start values, and the inputs of a car whose motor is off and
@@ -159,7 +158,7 @@ class Wiring:
                 rows.append(min(max(value, one.lowest), one.highest))
         return rows
 
-    def begin(self, outputs: Sequence[float], x0: Sequence[float] | Array) -> Array:
+    def begin(self, outputs: Sequence[float], x0: Sequence[float] | Floats) -> Floats:
         """State (7,) after initialisation, where ``x0`` (7,) was asked for.
 
         Raises InputError if the FMU starts elsewhere, unless it is to be placed.
@@ -182,7 +181,7 @@ class Wiring:
             )
         return self._state(ours, omega=asked[5])  # the heading has not changed yet
 
-    def state(self, outputs: Sequence[float], u: Sequence[float], duration_s: float) -> Array:
+    def state(self, outputs: Sequence[float], u: Sequence[float], duration_s: float) -> Floats:
         """State (7,) after ``u`` acted for ``duration_s``; not finite where the outputs are not.
 
         The heading is continuous as long as it changes by less than half a turn a call.
@@ -213,7 +212,7 @@ class Wiring:
             ours["vx"], ours["vy"] = _rotated(ours["speed"], 0.0, ours.get("slip", 0.0))
         return ours
 
-    def _state(self, ours: Mapping[str, float], omega: float) -> Array:
+    def _state(self, ours: Mapping[str, float], omega: float) -> Floats:
         x, y = _rotated(ours["x"], ours["y"], self._turn)
         x, y, psi = x + self._origin[0], y + self._origin[1], ours["psi"] + self._turn
         omega, delta = ours.get("omega", omega), ours.get("delta", self._delta)

@@ -3,8 +3,9 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesrace.arrays import Floats
 from bayesrace.gp.weights import GpWeights, encode_weights
 from bayesrace.messages import State
 from bayesrace.vehicles import get_car
@@ -19,7 +20,6 @@ from tests.network.cars import Course
 
 __all__ = ["converged", "replayed"]
 
-Floats = NDArray[np.float64]
 
 CAR = get_car("orca")
 

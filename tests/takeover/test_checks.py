@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from bayesrace.arrays import Floats
 from bayesrace.gp.weights import GpOutput, GpWeights, encode_weights
 from bayesrace.vehicles import CarParameters
 from controller.weights.checks import Checks, Verdict
@@ -24,8 +24,6 @@ from controller.weights.watch import Watch
 from tests.conftest import fit_weights, smooth_drive
 from tests.takeover.rig import KINDS
 from tests.takeover.spoilt_weights import SPOILT, spoilt
-
-Floats = NDArray[np.float64]
 
 STEP_S = 0.02
 LIMIT_SAMPLES = 40
