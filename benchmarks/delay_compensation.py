@@ -21,12 +21,12 @@ from bayesrace.messages import TELEMETRY, TRUTH
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK, Track
 from bayesrace.vehicles import DEFAULT_CAR
-from experiments.drive import RunPlan
-from experiments.laps import time_laps
-from experiments.preparation import Prepared, prepare
-from experiments.progress import stages_on
-from experiments.settings import PreparationSettings
-from experiments.system import started_system
+from operation.analysis.laps import time_laps
+from operation.drive import RunPlan
+from operation.preparation import Prepared, prepare
+from operation.settings import PreparationSettings
+from operation.system import started_system
+from operation.terminal.progress import stages_on
 
 DELAYS_MS = (0, 10, 20, 40)
 CAR = DEFAULT_CAR

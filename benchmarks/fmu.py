@@ -34,10 +34,10 @@ from codegen.fmu import car_fmu, controller_fmu, pack
 from controller.cycle_settings import FallbackSettings
 from controller.path_table import make_path_table
 from controller.settings import MpcSettings
-from experiments.closed_loop import Driven, drive_compiled
-from experiments.preparation import Prepared, prepare
-from experiments.progress import stages_on
-from experiments.settings import PreparationSettings
+from operation.closed_loop import Driven, drive_compiled
+from operation.preparation import Prepared, prepare
+from operation.settings import PreparationSettings
+from operation.terminal.progress import stages_on
 from plant.fmu.simulator import open_fmu
 from plant.simulator import PLANT, Simulator
 

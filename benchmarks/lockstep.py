@@ -27,12 +27,12 @@ from bayesrace.recorder import Recorder
 from bayesrace.tracks import DEFAULT_RACE_TRACK
 from bayesrace.vehicles import DEFAULT_CAR, get_car
 from controller.assembly import compiled_controller
-from experiments.closed_loop import ClosedLoop
-from experiments.drive import RunPlan
-from experiments.preparation import Prepared, prepare
-from experiments.progress import stages_on
-from experiments.settings import PreparationSettings
-from experiments.system import System, started_system
+from operation.closed_loop import ClosedLoop
+from operation.drive import RunPlan
+from operation.preparation import Prepared, prepare
+from operation.settings import PreparationSettings
+from operation.system import System, started_system
+from operation.terminal.progress import stages_on
 
 CAR = DEFAULT_CAR
 LIMIT_S = 1000.0

@@ -18,11 +18,11 @@ from rich.console import Console
 from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.vehicles import DEFAULT_CAR, get_car
-from experiments.closed_loop import Driven, drive_compiled
-from experiments.preparation import prepare, trained_weights, training_settings
-from experiments.progress import Stages, stages_on
-from experiments.settings import PreparationSettings
 from learning.dataset import concatenate
+from operation.closed_loop import Driven, drive_compiled
+from operation.preparation import prepare, trained_weights, training_settings
+from operation.settings import PreparationSettings
+from operation.terminal.progress import Stages, stages_on
 
 __all__ = ["drives"]
 

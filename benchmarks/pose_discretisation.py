@@ -22,12 +22,12 @@ from bayesrace.vehicles import DEFAULT_CAR, get_car
 from bayesrace.vehicles.models import e_kinematic
 from codegen.build import build
 from codegen.settings import BuildSettings
-from experiments.closed_loop import Driven, drive_compiled
-from experiments.preparation import prepare, training_settings
-from experiments.progress import stages_on
-from experiments.settings import PreparationSettings
 from learning.dataset import Dataset, concatenate
 from learning.training import train
+from operation.closed_loop import Driven, drive_compiled
+from operation.preparation import prepare, training_settings
+from operation.settings import PreparationSettings
+from operation.terminal.progress import stages_on
 
 CAR = get_car(DEFAULT_CAR)
 TRAINING = training_settings(PreparationSettings())

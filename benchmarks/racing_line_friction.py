@@ -13,7 +13,7 @@ from bayesrace.tracks import DEFAULT_RACE_TRACK, load_track
 from bayesrace.vehicles import DEFAULT_CAR, get_car
 from codegen.build import build
 from codegen.settings import BuildSettings
-from experiments.closed_loop import drive_compiled
+from operation.closed_loop import drive_compiled
 
 FRICTIONS = (0.65, 0.70, 0.75, 0.80, 0.85)
 

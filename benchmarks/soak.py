@@ -100,7 +100,7 @@ CASES = (
 
 def measure(case: Case, share: float, folder: Path, further: list[str]) -> Result:
     """Runs the case; what the command says goes to the terminal."""
-    line = [sys.executable, "-m", "experiments.cli", "latency", *case.options, *further]
+    line = [sys.executable, "-m", "operation.cli", "latency", *case.options, *further]
     duration_s = max(case.duration_s * share, 5.0)
     line += ["--duration", f"{duration_s:g}", "--out", str(folder / case.name)]
     subprocess.run(line, check=True)

@@ -28,9 +28,9 @@ from controller.cycle import Cycle
 from controller.cycle_settings import CompensationSettings
 from controller.mpc import PredictiveController
 from controller.process_settings import ControllerSettings
-from experiments.preparation import prepare
-from experiments.progress import stages_on
-from experiments.settings import PreparationSettings
+from operation.preparation import prepare
+from operation.settings import PreparationSettings
+from operation.terminal.progress import stages_on
 from plant.simulator import Simulator
 
 ASIDE_M: Final = 0.6

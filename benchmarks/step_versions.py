@@ -23,10 +23,10 @@ from rich.console import Console
 from bayesrace.gp.weights import encode_weights, read_weights
 from bayesrace.vehicles.models import dynamic
 from controller.assembly import compiled_controller
-from experiments.bench import BenchSettings
-from experiments.preparation import prepare
-from experiments.progress import stages_on
+from operation.preparation import prepare
+from operation.terminal.progress import stages_on
 from plant.simulator import Simulator
+from studies.bench import BenchSettings
 
 ROOT = Path(__file__).resolve().parents[1]
 

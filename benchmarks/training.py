@@ -23,12 +23,12 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteK
 from bayesrace.arrays import Floats
 from bayesrace.gp.weights import OUTPUTS
 from bayesrace.integrators import PREDICTION
-from experiments.preparation import training_samples
-from experiments.settings import PreparationSettings
 from learning.hyperparameters import BOUNDS, starts
 from learning.residual import residual
 from learning.target import Target
 from learning.training import TrainingSettings, fit
+from operation.preparation import training_samples
+from operation.settings import PreparationSettings
 
 NU = {"matern05": 0.5, "matern15": 1.5, "matern25": 2.5}
 SLACK = 1e-3

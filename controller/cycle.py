@@ -1,7 +1,7 @@
 """The control cycle with its execution times, for the loops that carry the messages.
 
 :mod:`controller.process` receives states and sends actuations over the network;
-``experiments.closed_loop`` does so by function calls. Both answer a lockstep state by
+``operation.closed_loop`` does so by function calls. Both answer a lockstep state by
 :meth:`Cycle.answer`, so their runs are equal to the bit.
 """
 

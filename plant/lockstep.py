@@ -1,6 +1,6 @@
 """A run of the car without transport or clock: start, laps, end, and the loop of a lockstep run.
 
-The plant process exchanges states for inputs over the network; ``experiments.closed_loop`` does so
+The plant process exchanges states for inputs over the network; ``operation.closed_loop`` does so
 by a function call. Both drive the car through :func:`drive_lockstep`, so their runs are equal to
 the bit.
 """

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.cli import main
+from operation.cli import main
 
 __all__ = ["Cli", "Outcome", "cli", "refused"]
 

@@ -9,8 +9,8 @@ from typing import Any
 
 from bayesrace.messages import Event, Status
 from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
-from experiments.drive import RunPlan, run_request
-from experiments.learn.records import LapRecord
+from operation.drive import RunPlan, run_request
+from operation.learn.records import LapRecord
 from tests.network.cars import Course, Program, start_controller, start_plant
 from tests.programs import PATIENCE_S
 

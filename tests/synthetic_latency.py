@@ -5,8 +5,8 @@ from pathlib import Path
 
 from bayesrace.log import LogWriter
 from bayesrace.messages import Actuation, Message, State, Status, Telemetry, Truth, encode
-from experiments.latency.analysis import Analysis, Beside, analyse
-from experiments.latency.settings import LatencySettings
+from studies.latency.analysis import Analysis, Beside, analyse
+from studies.latency.settings import LatencySettings
 
 __all__ = ["PERIOD_NS", "Loop", "report_of"]
 

@@ -12,10 +12,10 @@ from rich.console import Console
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.vehicles import default_car
-from experiments.analysis import analyse, read_race, read_result, write_result
-from experiments.laps import time_laps
-from experiments.results import LapResult, RaceResult
-from experiments.table import COLUMNS, print_table
+from operation.analysis.laps import time_laps
+from operation.analysis.race import analyse, read_race, read_result, write_result
+from operation.analysis.results import LapResult, RaceResult
+from operation.terminal.race_table import COLUMNS, print_table
 from tests.synthetic_race import LAP_S, LINE_M, STEP_S, Drive, circle, track, write_race
 
 TWO_LAPS: Floats = np.asarray(

@@ -24,7 +24,7 @@ from controller.driver import Level
 from controller.mpc import PredictiveController
 from controller.native_step import NativeStep
 from controller.process_settings import ControllerSettings
-from experiments.closed_loop import ClosedLoop
+from operation.closed_loop import ClosedLoop
 from tests.conftest import SETTINGS, Circuit
 from tests.native_programs import SANITIZED, native_program
 from tests.programs import ROOT

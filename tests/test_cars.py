@@ -22,7 +22,7 @@ from bayesrace.vehicles.files import MODELS, SECTIONS
 from codegen.build import problem_of
 from codegen.problems.generate import c_header
 from codegen.settings import BuildSettings
-from experiments.settings import RaceSettings
+from operation.settings import RaceSettings
 from tests.command_line import Cli
 
 ORCA = Path(__file__).parents[1] / "bayesrace" / "cars" / "orca.toml"

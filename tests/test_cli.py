@@ -22,7 +22,7 @@ from bayesrace.raceline.identity import line_identity
 from bayesrace.tracks import write_track
 from bayesrace.transport import Director, free_endpoint
 from bayesrace.vehicles import get_car, write_car
-from experiments.processes import child
+from operation.processes import child
 from tests.command_line import Cli, refused
 from tests.conftest import Circuit
 from tests.programs import environment, finish, peanut, run, start, until
@@ -71,7 +71,7 @@ def test_help_reads_well(cli: Cli, name: str, monkeypatch: pytest.MonkeyPatch) -
 def test_every_option_says_what_it_is(cli: Cli) -> None:
     import typer
 
-    from experiments.cli.app import app
+    from operation.cli.app import app
 
     def leaves(command: Any, *names: str) -> dict[str, Any]:
         below = getattr(command, "commands", None)  # of a group

@@ -22,10 +22,10 @@ from controller.mpc import PredictiveController
 from controller.pure_pursuit import PurePursuit, PurePursuitSettings
 from controller.python_controller import PythonController
 from controller.settings import MpcSettings
-from experiments.closed_loop import ClosedLoop
-from experiments.collect import collect
-from experiments.drive import RunPlan, execute
 from learning.logs import dataset_from_log
+from operation.closed_loop import ClosedLoop
+from operation.collect import collect
+from operation.drive import RunPlan, execute
 from plant.fmu.faults import FmuFault
 from plant.simulator import Simulator
 from tests.conftest import Circuit

@@ -9,11 +9,11 @@ import pytest
 from rich.console import Console
 
 from bayesrace.vehicles import DEFAULT_CAR
-from experiments.drive import RunPlan
-from experiments.preparation import prepare
-from experiments.progress import stages_on
-from experiments.settings import PreparationSettings
-from experiments.system import started_system
+from operation.drive import RunPlan
+from operation.preparation import prepare
+from operation.settings import PreparationSettings
+from operation.system import started_system
+from operation.terminal.progress import stages_on
 from tests.command_line import Cli, refused
 from tests.programs import ROOT, peanut
 
@@ -42,7 +42,7 @@ def test_the_controller_drives_with_its_own_extra_alone(
     with stages_on(Console(quiet=True)) as stages:
         files = prepare(PreparationSettings(), (str(peanut(tmp_path / "peanut.csv")),), stages)
     with started_system(DEFAULT_CAR, tmp_path) as system:
-        monkeypatch.setattr("experiments.processes.RUN_MODULE", (python, "-P", "-m"))
+        monkeypatch.setattr("operation.processes.RUN_MODULE", (python, "-P", "-m"))
         with system.controller(files.arguments):
             end = system.drive(files.course.track, RunPlan(1, "bayesrace", 1, 20.0, lockstep=True))
     assert end.data["reason"] == "laps"

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from bayesrace.errors import InputError
-from experiments.fmu_table import FmuTable
+from operation.terminal.fmu_table import FmuTable
 from plant.fmu.inspection import FmuDescription, inspect
 from plant.fmu.map import wire
 from plant.fmu.map_file import parse_map, read_map

@@ -22,8 +22,8 @@ from bayesrace.log import LogReader
 from bayesrace.messages import STATE, TELEMETRY, State, Truth
 from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
 from bayesrace.vehicles import get_car
-from experiments.recording import PlannedRun, RunRecord
 from learning.logs import dataset_from_messages
+from operation.analysis.recording import PlannedRun, RunRecord
 from tests import programs
 from tests.car_fmu import Version, packed_car
 from tests.faulty_fmu import Mode, faulty_fmu, faulty_library

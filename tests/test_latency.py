@@ -9,11 +9,11 @@ import pytest
 from hdrh.log import HistogramLogReader
 
 from bayesrace.errors import InputError
-from experiments.latency.analysis import Beside, analyse
-from experiments.latency.beside import bare_loop, bare_result
-from experiments.latency.legs import ANSWER, LEGS
-from experiments.latency.series import Series, new_histogram
-from experiments.latency.settings import LatencySettings
+from studies.latency.analysis import Beside, analyse
+from studies.latency.beside import bare_loop, bare_result
+from studies.latency.legs import ANSWER, LEGS
+from studies.latency.series import Series, new_histogram
+from studies.latency.settings import LatencySettings
 from tests.synthetic_latency import PERIOD_NS, Loop, report_of
 
 

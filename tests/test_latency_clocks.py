@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experiments.latency.clocks import ClockMap
-from experiments.latency.legs import ANSWER
+from studies.latency.clocks import ClockMap
+from studies.latency.legs import ANSWER
 from tests.synthetic_latency import PERIOD_NS, Loop, report_of
 
 delays = st.one_of(st.integers(0, 500_000), st.integers(0, 80_000_000))

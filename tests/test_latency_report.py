@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from experiments.latency.analysis import Analysis, Beside, analyse
-from experiments.latency.beside import bare_result
-from experiments.latency.legs import LEGS
-from experiments.latency.report import print_report, write_files
-from experiments.latency.results import Memory
-from experiments.latency.settings import LatencySettings
+from studies.latency.analysis import Analysis, Beside, analyse
+from studies.latency.beside import bare_result
+from studies.latency.legs import LEGS
+from studies.latency.report import print_report, write_files
+from studies.latency.results import Memory
+from studies.latency.settings import LatencySettings
 from tests.synthetic_latency import PERIOD_NS, Loop
 
 

@@ -19,12 +19,12 @@ from bayesrace.log import LogReader
 from bayesrace.messages import STATE
 from bayesrace.tracks import Track
 from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
-from experiments.drive import RunPlan, run_request
-from experiments.latency.legs import LEGS
-from experiments.latency.series import new_histogram
-from experiments.preparation import Prepared, prepare
-from experiments.progress import stages_on
-from experiments.settings import PreparationSettings
+from operation.drive import RunPlan, run_request
+from operation.preparation import Prepared, prepare
+from operation.settings import PreparationSettings
+from operation.terminal.progress import stages_on
+from studies.latency.legs import LEGS
+from studies.latency.series import new_histogram
 from tests.command_line import Cli, refused
 from tests.programs import COMMAND, ROOT, environment, finish, leftovers, peanut, run, start, until
 from tests.shared import session_folder

@@ -15,13 +15,13 @@ from bayesrace.gp.weights import decode_weights, zero_weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.messages import Event, Reply, Scalar
 from bayesrace.vehicles.models import dynamic
-from experiments.learn import publishing
-from experiments.learn.journal import Journal
-from experiments.learn.publishing import Publisher
-from experiments.learn.records import LapRecord, LearnSettings, Record, UpdateRecord
-from experiments.learn.report import draw, print_laps, references
 from learning.training import TrainingSettings
 from learning.worker import NICE, Outcome, Task, Trainer
+from operation.learn import publishing
+from operation.learn.journal import Journal
+from operation.learn.publishing import Publisher
+from operation.learn.records import LapRecord, LearnSettings, Record, UpdateRecord
+from operation.learn.report import draw, print_laps, references
 from tests.driven import CAR, QUICK, drive
 from tests.learning_rig import controller_status, lap
 from tests.programs import until

@@ -9,10 +9,10 @@ import pytest
 from bayesrace.messages import Actuation, State
 from bayesrace.tracks import Track
 from bayesrace.vehicles.models import dynamic
-from experiments.learn import collector
-from experiments.learn.collector import Collector, Stretch
 from learning.dataset import Dataset
 from learning.logs import dataset_from_messages
+from operation.learn import collector
+from operation.learn.collector import Collector, Stretch
 from tests.driven import CAR, STEP_S, drive, logged, telemetry
 
 

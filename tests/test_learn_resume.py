@@ -27,14 +27,14 @@ from bayesrace.integrators import PERFECT, PREDICTION
 from bayesrace.messages import HEARTBEAT, STATE, Message, Reply, State, Status, encode
 from bayesrace.transport import Endpoints, Inbox, Item, Kind
 from bayesrace.vehicles.models import dynamic
-from experiments.learn import collector, job, journal, publishing
-from experiments.learn.publishing import Publisher
-from experiments.learn.records import LearnSettings, Record
-from experiments.learn.report import print_laps
 from learning.arrays import write_npz
 from learning.dataset import Dataset, concatenate
 from learning.pool import recalled
 from learning.worker import Outcome, Task
+from operation.learn import collector, job, journal, publishing
+from operation.learn.publishing import Publisher
+from operation.learn.records import LearnSettings, Record
+from operation.learn.report import print_laps
 from tests.driven import CAR, drive, logged
 from tests.learning_rig import controller_status
 from tests.programs import until

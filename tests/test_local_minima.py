@@ -4,7 +4,7 @@ import pytest
 from rich.console import Console
 
 from benchmarks.many_tracks import drives
-from experiments.progress import stages_on
+from operation.terminal.progress import stages_on
 
 
 @pytest.mark.check

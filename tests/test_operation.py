@@ -40,10 +40,10 @@ from bayesrace.transport import (
     open_session,
 )
 from bayesrace.transport.session import Role
-from experiments.drive import RunPlan, run_request
-from experiments.operation import ask_statuses, command, find, follow, pick
-from experiments.picture import Picture, Process
-from experiments.status_table import COUNTERS_SHOWN, StatusTable
+from operation.analysis.picture import Picture, Process
+from operation.drive import RunPlan, run_request
+from operation.lifecycle import ask_statuses, command, find, follow, pick
+from operation.terminal.status_table import COUNTERS_SHOWN, StatusTable
 from tests.command_line import Cli, refused
 from tests.conftest import Circuit
 from tests.programs import ROOT, environment, finish, run, start, until
@@ -290,7 +290,7 @@ def test_watching_on_a_terminal_redraws_and_sees_coming_and_going(fakes: Fakes) 
     controlling, terminal = os.openpty()
     env = {**environment(), "TERM": "xterm", "COLUMNS": "150", "LINES": "40"}
     process = subprocess.Popen(
-        [sys.executable, "-m", "experiments.cli", "status", "--watch", *options(one)],
+        [sys.executable, "-m", "operation.cli", "status", "--watch", *options(one)],
         stdin=terminal, stdout=terminal, stderr=terminal, env=env, cwd=ROOT,
     )  # fmt: skip
     os.close(terminal)

@@ -11,10 +11,10 @@ from rich.console import Console
 from bayesrace.gp.weights import GpWeights
 from bayesrace.raceline import cached
 from bayesrace.tracks import Track
-from experiments import preparation
-from experiments.preparation import Prepared, prepare
-from experiments.progress import stages_on
-from experiments.settings import PreparationSettings
+from operation import preparation
+from operation.preparation import Prepared, prepare
+from operation.settings import PreparationSettings
+from operation.terminal.progress import stages_on
 from tests.car_fmu import packed_car
 from tests.conftest import offset_line
 

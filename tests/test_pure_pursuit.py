@@ -15,7 +15,7 @@ from codegen.build import build
 from codegen.settings import BuildSettings
 from controller.pure_pursuit import PurePursuit, PurePursuitSettings
 from controller.python_controller import PythonController
-from experiments.closed_loop import ClosedLoop, Driven
+from operation.closed_loop import ClosedLoop, Driven
 from plant.simulator import Simulator
 from tests.conftest import offset_line
 

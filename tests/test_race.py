@@ -14,7 +14,7 @@ import pytest
 from bayesrace.vehicles import default_car, read_car, write_car
 from codegen.build import build
 from codegen.settings import BuildSettings
-from experiments.results import RaceResult, read_result
+from operation.analysis.results import RaceResult, read_result
 from tests.car_fmu import packed_car
 from tests.command_line import Cli, refused
 from tests.foreign_fmu import FOREIGN_MAP, build_foreign_fmu

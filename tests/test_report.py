@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.analysis import analyse, read_race
-from experiments.published import compare_gp, compare_laps
-from experiments.report import render_report
-from experiments.results import RaceResult
-from experiments.table import COLUMNS
+from operation.analysis.published import compare_gp, compare_laps
+from operation.analysis.race import analyse, read_race
+from operation.analysis.results import RaceResult
+from operation.report import render_report
+from operation.terminal.race_table import COLUMNS
 from tests.synthetic_race import LAP_S, Drive, circle, write_race
 from tests.test_analysis import TWO_LAPS, race
 
@@ -134,7 +134,7 @@ def test_names_from_files_are_text_not_markup(tmp_path: Path) -> None:
 
 def test_time_lost_along_the_track_is_known(tmp_path: Path) -> None:
     """A car that is 1 % slower everywhere loses evenly."""
-    from experiments.report.laps import first_laps, reference_of
+    from operation.report.laps import first_laps, reference_of
 
     drives = [
         Drive("bayesrace", circle(TWO_LAPS / 1.01, 1.0)),
@@ -159,8 +159,8 @@ def test_nothing_but_tables_is_wider_than_a_telephone(rendered: tuple[Path, Race
 
 
 def test_a_car_that_wanders_off_does_not_shrink_the_track(tmp_path: Path) -> None:
-    from experiments.report.maps import LapMaps
-    from experiments.report.style import figure_style
+    from operation.report.maps import LapMaps
+    from operation.report.style import figure_style
 
     far = circle(TWO_LAPS[:100], np.linspace(1.0, 50.0, 100))
     analysis = read_race(write_race(tmp_path, [Drive("worstcase", far)]))

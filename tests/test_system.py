@@ -6,12 +6,12 @@ import pytest
 
 from bayesrace.errors import InputError
 from bayesrace.vehicles import DEFAULT_CAR
-from experiments.system import started_system
+from operation.system import started_system
 from tests.programs import until
 
 pytestmark = pytest.mark.wall_clock
 
-OUR_NAMES = ("bayesrace", "codegen", "controller", "experiments", "learning", "plant")
+OUR_NAMES = ("bayesrace", "codegen", "controller", "learning", "operation", "plant", "studies")
 
 
 def test_a_users_files_of_our_names_are_not_imported(

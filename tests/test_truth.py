@@ -16,12 +16,12 @@ from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
 from controller.pure_pursuit import PurePursuit
 from controller.python_controller import PythonController
-from experiments.analysis import analyse, read_race
-from experiments.closed_loop import ClosedLoop, Driven
-from experiments.results import RaceResult
-from experiments.validation import validate_weights
 from learning.logs import dataset_from_log
 from learning.residual import identity
+from operation.analysis.race import analyse, read_race
+from operation.analysis.results import RaceResult
+from operation.analysis.validation import validate_weights
+from operation.closed_loop import ClosedLoop, Driven
 from plant import sensors
 from tests.conftest import Circuit
 from tests.driven import CAR, STEP_S, drive, write_log

@@ -16,15 +16,15 @@ from bayesrace.gp.corrected import corrected_function
 from bayesrace.gp.weights import OUTPUTS, GpWeights, read_weights, write_weights, zero_weights
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.vehicles.models import dynamic, e_kinematic
-from experiments.cli import main
-from experiments.learning_table import print_choices, print_kernels, print_validation
-from experiments.validation import ValidationResult, validate_weights
 from learning.arrays import write_npz
 from learning.assessment import ChoiceScore, KernelScore
 from learning.dataset import Dataset, concatenate
 from learning.residual import identity
 from learning.training import train
 from learning.validation import mismatch, unbroken, validate
+from operation.analysis.validation import ValidationResult, validate_weights
+from operation.cli import main
+from operation.terminal.learning_table import print_choices, print_kernels, print_validation
 from tests.driven import CAR, QUICK, STEP_S, drive, write_log
 
 Program = Callable[..., int]

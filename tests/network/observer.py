@@ -24,7 +24,7 @@ from bayesrace.messages import STATE, State, car_key, decode
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import Track, load_track
 from bayesrace.transport import Director, Endpoints, open_session
-from experiments.drive import RunPlan, run_request
+from operation.drive import RunPlan, run_request
 from tests.network.hosts import Host
 from tests.programs import PATIENCE_S, ROOT, environment, until
 

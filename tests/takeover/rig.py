@@ -28,7 +28,7 @@ from bayesrace.transport import (
 from bayesrace.vehicles import get_car
 from codegen.build import build
 from codegen.settings import BuildSettings
-from experiments.drive import RunPlan, run_request
+from operation.drive import RunPlan, run_request
 from tests.conftest import fit_weights, offset_line
 from tests.network.cars import Course, Program, start_controller, start_plant
 from tests.programs import until

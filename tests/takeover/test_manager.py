@@ -16,7 +16,7 @@ import pytest
 from bayesrace.gp.weights import GpWeights
 from controller.weights.settings import GateSettings
 from controller.weights.store import History, Store
-from experiments.learn.publishing import in_words
+from operation.learn.publishing import in_words
 from tests.network.cars import Course
 from tests.programs import until
 from tests.takeover.bench import bench

@@ -1,1 +1,0 @@
-"""What runs the parts together: race, benchmark, report, command line."""

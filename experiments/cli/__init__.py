@@ -1,5 +1,0 @@
-"""Command line: ``bayesrace``. Each subcommand imports only its own part when it is called."""
-
-from experiments.cli.app import main
-
-__all__ = ["main"]

@@ -1,5 +1,0 @@
-"""The report of a race: one self-contained HTML file, and one picture. Imports matplotlib."""
-
-from experiments.report.render import render_report
-
-__all__ = ["render_report"]

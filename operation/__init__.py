@@ -1,0 +1,1 @@
+"""How the parts run together: preparation, races, drives, learning, reports, command line."""

@@ -1,0 +1,1 @@
+"""What a log shows: laps, results of a race, validation of weights."""

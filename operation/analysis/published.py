@@ -1,0 +1,137 @@
+"""Published numbers for comparison, and when they may stand beside ours.
+
+A. Jain, M. O'Kelly, P. Chaudhari, M. Morari, "BayesRace: Learning to race autonomously using prior
+experience", CoRL 2020: its published code run again on the paper's ETHZ track (standing start at
+.1 m/s, 50 Hz, horizon 20), and its data evaluated again.
+"""
+
+from typing import Final, NamedTuple
+
+from operation.analysis.results import RaceResult
+
+__all__ = ["LIMIT", "SOURCE", "Comparison", "GpComparison", "compare_gp", "compare_laps"]
+
+SOURCE: Final = (
+    "A. Jain, M. O'Kelly, P. Chaudhari, M. Morari: BayesRace: Learning to race autonomously using "
+    "prior experience. Conference on Robot Learning, 2020"
+)
+
+LIMIT: Final = (
+    "What the car can do on ETHZ (minimum-time optimal control with the true model, centre of "
+    "gravity on the track): 7.21 s from standstill, 7.06 s flying."
+)
+
+_TRACK: Final = "ethz"
+
+
+class _Lap(NamedTuple):
+    time_s: float | None
+    off_samples: int | None
+    off_max_m: float | None
+
+
+_LAPS_ON: Final = {
+    "worstcase": _Lap(None, None, None),
+    "bayesrace": _Lap(7.988, 9, 0.015),
+    "bayesrace-updated": _Lap(7.932, 11, 0.015),
+    "bestcase": _Lap(7.797, 12, 0.010),
+}
+_LAPS_OFF: Final = {
+    "worstcase": _Lap(8.694, 24, 0.110),
+    "bayesrace": _Lap(7.792, 17, 0.024),
+    "bayesrace-updated": _Lap(7.692, 17, 0.028),
+    "bestcase": _Lap(7.681, 14, 0.028),
+}
+_SOLVE_MS: Final = {
+    "worstcase": (8.4, 19.0, 21.0),
+    "bayesrace": (148.0, 229.0, 251.0),
+    "bayesrace-updated": (280.0, 401.0, 493.0),
+    "bestcase": (7.9, 13.6, 17.0),
+}
+_GP: Final = {  # RMSE without the GP, RMSE and R² before, RMSE and R² after the update
+    "vx": (0.0570, 0.00555, 0.932, 0.00065, 0.999),
+    "vy": (0.0519, 0.0219, 0.820, 0.00039, 0.9999),
+    "omega": (0.384, 0.176, 0.790, 0.142, 0.864),
+}
+
+
+class Comparison(NamedTuple):
+    """One row, ready to print."""
+
+    controller: str
+    paper_lap: str
+    our_lap: str
+    paper_off: str
+    our_off: str
+    paper_solve: str
+    our_solve: str
+    faster: str
+
+
+class GpComparison(NamedTuple):
+    """One output's row, ready to print."""
+
+    output: str
+    paper: str
+    ours: str
+    paper_updated: str
+    ours_updated: str
+
+
+def compare_laps(result: RaceResult) -> list[Comparison]:
+    """Rows for the controllers that drove; none on any other track than the paper's."""
+    if result.settings.track.lower() != _TRACK:
+        return []
+    published = _LAPS_ON if result.settings.constraints else _LAPS_OFF
+    rows = []
+    for lap in result.laps:
+        paper = published.get(lap.controller)
+        if paper is None:
+            continue
+        p50, p99, most = _SOLVE_MS[lap.controller]
+        ours = lap.solve_us
+        rows.append(
+            Comparison(
+                lap.controller,
+                _time(paper.time_s),
+                _time(lap.lap_time_s),
+                _off(paper.off_samples, paper.off_max_m),
+                _off(lap.off_track_samples, lap.off_track_max_m),
+                f"{p50:g} / {p99:g} / {most:g}",
+                "–"
+                if ours is None
+                else f"{ours.p50 / 1e3:.2f} / {ours.p99 / 1e3:.2f} / {ours.max / 1e3:.2f}",
+                "–" if ours is None or ours.p50 <= 0 else f"{p50 * 1e3 / ours.p50:.0f} ×",
+            )
+        )
+    return rows
+
+
+def compare_gp(result: RaceResult) -> list[GpComparison]:
+    """Rows per output; none on any other track, or without GPs."""
+    if result.settings.track.lower() != _TRACK:
+        return []
+    rows = []
+    for output, (plain, before, r2_before, after, r2_after) in _GP.items():
+        ours, updated = result.gp.get(output), result.gp_updated.get(output)
+        if ours is not None:
+            rows.append(
+                GpComparison(
+                    output,
+                    f"{before:g} ({plain:g}) · {r2_before:g}",
+                    f"{ours.rmse:.3g} ({ours.uncorrected_rmse:.3g}) · {ours.r2:.4f}",
+                    f"{after:g} · {r2_after:g}",
+                    "–" if updated is None else f"{updated.rmse:.3g} · {updated.r2:.4f}",
+                )
+            )
+    return rows
+
+
+def _time(value: float | None) -> str:
+    return "DNF" if value is None else f"{value:.3f}"
+
+
+def _off(samples: int | None, depth_m: float | None) -> str:
+    if samples is None or depth_m is None:
+        return "–"
+    return f"{samples} / {depth_m:.3f}" if samples else "0"

@@ -1,0 +1,249 @@
+"""What a race's log says, in numbers: the one source of ``result.json``, the table and the report.
+
+Everything is computed from the messages in ``run.mcap`` and from the track, racing line and weights
+that lie beside it; nothing is taken over from the processes that were running.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from bayesrace.arrays import Floats
+from bayesrace.errors import InputError
+from bayesrace.gp.weights import read_weights
+from bayesrace.raceline import RaceLine
+from bayesrace.tracks import PathProjection, Track
+from bayesrace.tracks.projection import CentrelineSearch
+from bayesrace.tracks.spline import PlaneSpline
+from learning.dataset import Dataset
+from learning.logs import dataset_from_messages, fallback_cycles
+from learning.validation import Validation, validate
+from operation.analysis.laps import time_laps
+from operation.analysis.recording import PlannedRun, Recording, RunRecord, read_recording
+from operation.analysis.results import (
+    GpMetrics,
+    LapResult,
+    Percentiles,
+    RaceResult,
+    SettingsSummary,
+    read_result,
+    write_result,
+)
+
+__all__ = [
+    "DrivenRun",
+    "GpMetrics",
+    "LapResult",
+    "Percentiles",
+    "PlannedRun",
+    "RaceAnalysis",
+    "RaceResult",
+    "SettingsSummary",
+    "analyse",
+    "line_offset",
+    "read_race",
+    "read_result",
+    "write_result",
+]
+
+
+WEIGHTS_FILES: Final = {
+    "bayesrace": "weights-bayesrace.bin",
+    "bayesrace-updated": "weights-updated.bin",
+}
+
+
+def line_offset(line: RaceLine, xy: Floats, reach_m: float) -> Floats:
+    """Signed distance (n,) of a trajectory (n, 2) from the racing line, positive to its left."""
+    curve = PlaneSpline(line.s_m, line.xy_m, line.length_m)
+    s = CentrelineSearch(curve, reach_m / 16).follow(xy, None, reach_m)
+    tangent, away = curve(s, 1), xy - curve(s)
+    side = np.sign(tangent[:, 0] * away[:, 1] - tangent[:, 1] * away[:, 0])
+    return np.asarray(side * np.linalg.norm(away, axis=1))
+
+
+class DrivenRun:
+    """One run on its track: where the car was and how long its laps took."""
+
+    def __init__(self, record: RunRecord, track: Track, line: RaceLine) -> None:
+        self.record = record
+        self.controller = record.plan.controller
+        xy = record.x[:, :2]
+        self.on_track: PathProjection = track.project_path(xy)
+        self.laps = time_laps(track, record.time_s, xy, self.on_track.s_m)
+        reach_m = float(np.max(track.width_right_m + track.width_left_m))
+        self.offset_m = line_offset(line, xy, reach_m)
+
+    @property
+    def finished(self) -> bool:
+        """Whether a whole lap was driven."""
+        return bool(self.laps.times_s)
+
+    @property
+    def counted(self) -> slice:
+        """The samples that count: up to the last counted crossing, or all."""
+        return slice(0, self.laps.after[-1] if self.finished else len(self.record.truth))
+
+    def lap(self, number: int) -> slice:
+        """Samples of the lap with that number, from 0, with one beyond each end."""
+        after = (0, *self.laps.after)
+        return slice(max(after[number] - 1, 0), after[number + 1] + 1)
+
+    def shown(self, number: int = 0) -> slice:
+        """Samples to show as a lap: that lap, or what there is of a run without one."""
+        return self.lap(number) if self.finished else slice(0, self.laps.cut_at)
+
+    @property
+    def off_track(self) -> NDArray[np.bool_]:
+        """Which of the counted samples are off the track."""
+        return np.asarray(self.on_track.off_track_m[self.counted] > 0)
+
+    @property
+    def ended(self) -> str:
+        """Why the run ended."""
+        if self.laps.cut_at is None:
+            return self.record.ended
+        time_s = float(self.record.time_s[self.laps.cut_at])
+        return f"{self.record.ended}; at {time_s:.2f} s the car left out a piece of the track"
+
+    def digest(self) -> str:
+        """sha256 of the trajectory up to the first sample after the last counted crossing."""
+        states = self.record.x[: self.laps.after[-1] + 1] if self.finished else self.record.x
+        return hashlib.sha256(states.astype("<f8", order="C").tobytes()).hexdigest()
+
+    def result(self) -> LapResult:
+        """The run in numbers."""
+        depth = self.on_track.off_track_m[self.counted]
+        deviation = np.abs(self.offset_m[self.counted])
+        times = self.laps.times_s
+        return LapResult(
+            controller=self.controller,
+            run=self.record.plan.run,
+            finished=self.finished,
+            lap_time_s=times[0] if times else None,
+            flying_lap_time_s=min(times[1:], default=None),
+            lap_times_s=list(times),
+            off_track_samples=int(self.off_track.sum()),
+            off_track_max_m=max(float(np.max(depth, initial=0.0)), 0.0),
+            deviation_mean_m=float(deviation.mean()) if len(deviation) else None,
+            deviation_max_m=float(deviation.max()) if len(deviation) else None,
+            solve_us=_percentiles(self.record.solve_us),
+            fallbacks=self.record.fallbacks,
+            weights_version=self.record.weights_version,
+            trajectory_sha256=self.digest(),
+            samples=len(self.record.truth),
+            ended=self.ended,
+        )
+
+
+def _percentiles(values: Floats) -> Percentiles | None:
+    if not len(values):
+        return None
+    p50, p99, largest = np.percentile(values, [50, 99, 100])
+    return Percentiles(p50=float(p50), p99=float(p99), max=float(largest))
+
+
+class RaceAnalysis:
+    """A recording with all that is computed from it, each thing once."""
+
+    def __init__(self, recording: Recording) -> None:
+        self.recording = recording
+        self.track, self.line = recording.track, recording.line
+        self.runs = [DrivenRun(run, self.track, self.line) for run in recording.runs]
+
+    @cached_property
+    def best_case(self) -> Dataset | None:
+        """The samples on which the GPs are validated: those of the BestCase run."""
+        run = self.recording.run_of("bestcase")
+        if run is None:
+            return None
+        car = self.recording.car
+        step_s = self.recording.discretisation.step_s
+        try:
+            return dataset_from_messages(run.truth, fallback_cycles(run.telemetry), car, step_s)
+        except InputError:  # cut off before its second state
+            return None
+
+    @cached_property
+    def validations(self) -> dict[str, Validation]:
+        """Controller whose weights they are → what they predict of the BestCase run."""
+        data = self.best_case
+        found = {}
+        for controller, name in WEIGHTS_FILES.items():
+            path = self.recording.directory / name
+            if data is not None and len(data) and path.is_file():
+                weights = read_weights(path)
+                # On a busy machine the threads of BLAS wait for each other longer than they work.
+                with threadpool_limits(1):
+                    found[controller] = validate(weights, data, self.recording.discretisation)
+        return found
+
+    @cached_property
+    def result(self) -> RaceResult:
+        """The race in numbers."""
+        gaps = sum(run.record.gaps for run in self.runs)
+        recording = self.recording
+        return RaceResult(
+            settings=_summary(recording),
+            laps=[run.result() for run in self.runs],
+            gp=self._metrics("bayesrace"),
+            gp_updated=self._metrics("bayesrace-updated"),
+            real_time_factor=_real_time_factor(recording.runs),
+            complete=not (gaps or recording.truncated or recording.refused),
+            gaps=gaps,
+            judged_by="truth" if recording.truth else "measurement",
+        )
+
+    def _metrics(self, controller: str) -> dict[str, GpMetrics]:
+        validation = self.validations.get(controller)
+        if validation is None:
+            return {}
+        return {
+            output: GpMetrics.model_validate(dict(metrics))
+            for output, metrics in validation.metrics.items()
+        }
+
+
+def _summary(recording: Recording) -> SettingsSummary:
+    settings = recording.settings
+
+    def name(key: str) -> str:
+        return Path(str(settings.get(key, ""))).stem
+
+    mpc = settings.get("mpc")
+    return SettingsSummary(
+        car=recording.car.name,
+        track=name("track"),
+        train_track=name("train_track"),
+        mode=str(settings.get("mode", "")),
+        seed=int(settings.get("seed", 0)),
+        laps=int(settings.get("laps", 0)),
+        constraints=bool(mpc.get("constraints", True)) if isinstance(mpc, dict) else True,
+        fmu=Path(str(settings.get("fmu") or "")).name,
+    )
+
+
+def _real_time_factor(runs: Sequence[RunRecord]) -> float | None:
+    driven = [run.states for run in runs if run.lockstep and len(run.states) > 1]
+    simulated_s = sum(states[-1].time_s - states[0].time_s for states in driven)
+    wall_ns = sum(states[-1].source_time_ns - states[0].source_time_ns for states in driven)
+    return simulated_s / (wall_ns * 1e-9) if wall_ns > 0 else None
+
+
+def read_race(run_dir: Path) -> RaceAnalysis:
+    """The analysis of a run directory; InputError if it is none.
+
+    A race that was cut short can be analysed, too; what did not finish is marked so.
+    """
+    return RaceAnalysis(read_recording(run_dir))
+
+
+def analyse(run_dir: Path) -> RaceResult:
+    """The outcome of the race in ``run_dir``; InputError if that is no run directory."""
+    return read_race(run_dir).result

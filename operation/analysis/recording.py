@@ -1,0 +1,211 @@
+"""A run directory in memory: settings, track, racing line, and the messages of each run."""
+
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from pydantic import ValidationError
+
+from bayesrace.arrays import Floats
+from bayesrace.errors import InputError, faults_in
+from bayesrace.files import read_text
+from bayesrace.integrators import PREDICTION, Discretisation
+from bayesrace.log import LogReader
+from bayesrace.messages import (
+    HEARTBEAT,
+    TOPICS,
+    Actuation,
+    CarSample,
+    Event,
+    State,
+    Telemetry,
+    Truth,
+)
+from bayesrace.raceline import RaceLine, read_raceline
+from bayesrace.tracks import Track, read_track
+from bayesrace.vehicles import DEFAULT_CAR, CarParameters, described_car
+from operation.analysis.laps import Trajectory
+
+__all__ = ["RUN_EVENT", "PlannedRun", "Recording", "RunRecord", "read_recording"]
+
+
+RUN_EVENT: Final = "run"
+"""Kind of the event that announces a run of a race before it starts."""
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """The controller of a run: the data of a ``kind="run"`` event from the race."""
+
+    run: int
+    controller: str
+    weights_version: str
+
+    @classmethod
+    def from_event(cls, event: Event) -> "PlannedRun | None":
+        """None if it is another event."""
+        if event.source != "race" or event.kind != RUN_EVENT:
+            return None
+        run, controller = event.data.get("run"), event.data.get("controller")
+        if type(run) is not int or type(controller) is not str:
+            return None
+        return cls(run, controller, str(event.data.get("weights_version", "")))
+
+
+@dataclass(eq=False)
+class RunRecord(Trajectory):
+    """All messages of one run, in the order in which they arrived."""
+
+    plan: PlannedRun
+    states: list[State] = field(default_factory=list)
+    truth: list[Truth] = field(default_factory=list)
+    actuations: list[Actuation] = field(default_factory=list)
+    telemetry: list[Telemetry] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
+
+    def add(self, message: Any) -> None:
+        """Appends a message, unless it repeats the last sample, as after a fault of the plant."""
+        lists: dict[type, list[Any]] = {
+            State: self.states, Truth: self.truth, Actuation: self.actuations,
+            Telemetry: self.telemetry, Event: self.events,
+        }  # fmt: skip
+        found = lists[type(message)]
+        if not (isinstance(message, CarSample) and found and found[-1].time_s == message.time_s):
+            found.append(message)
+
+    @cached_property
+    def solve_us(self) -> Floats:
+        """Execution times of the controller's steps [us]."""
+        return np.array([message.solve_us for message in self.telemetry], dtype=np.float64)
+
+    @property
+    def fallbacks(self) -> int:
+        """Cycles that the fallback drove."""
+        return sum(message.fallback > 0 for message in self.telemetry)
+
+    @property
+    def lockstep(self) -> bool:
+        """Whether the plant waited for the controller."""
+        return bool(self.states) and self.states[0].lockstep
+
+    @property
+    def weights_version(self) -> str:
+        """Of the weights that drove, by the actuations; several are joined in order."""
+        versions = dict.fromkeys(message.weights_version for message in self.actuations)
+        return " → ".join(versions) if versions else self.plan.weights_version
+
+    @property
+    def gaps(self) -> int:
+        """Number of messages missing in the numbering, of states missing at the beginning, and of
+        states without their truth."""
+        streams: tuple[Sequence[Any], ...] = (self.states, self.actuations, self.telemetry)
+        missing = sum(_missing(message.seq for message in stream) for stream in streams)
+        missing += len({one.seq for one in self.states} - {one.seq for one in self.truth})
+        if len(self.states) > 1 and self.states[0].time_s > 0:
+            step_s = self.states[1].time_s - self.states[0].time_s
+            missing += round(self.states[0].time_s / step_s) if step_s > 0 else 1
+        return missing
+
+    @property
+    def ended(self) -> str:
+        """Why the run ended: the text of the plant's event, or where the log ends without one."""
+        for event in reversed(self.events):
+            if event.source == "plant" and event.kind == "run_ended":
+                return event.text
+        if not self.states:
+            return "the run never started"
+        return (
+            f"the log ends {self.states[-1].time_s:.2f} s into the run, before the plant reported "
+            "its end: the plant or the race was killed"
+        )
+
+
+def _missing(numbers: Iterable[int]) -> int:
+    # A number that falls is a process that began again, not a loss.
+    return sum(max(after - before - 1, 0) for before, after in pairwise(numbers))
+
+
+@dataclass(eq=False)
+class Recording:
+    """A run directory: settings, track, racing line, and each run's messages."""
+
+    directory: Path
+    settings: dict[str, Any]
+    track: Track
+    line: RaceLine
+    runs: list[RunRecord]
+    truth: bool
+    """The log holds the truth; without it, as of a real car, measurements take its place."""
+    truncated: bool
+    """The log ends without its end mark."""
+    refused: int
+    """Messages of the log that could not be decoded."""
+    started_ns: int | None
+    """Calendar time of the first message [ns since 1970]."""
+
+    @property
+    def car(self) -> CarParameters:
+        """The car that was driven, as the settings describe it."""
+        try:
+            return described_car(self.settings.get("car", DEFAULT_CAR))
+        except InputError as error:
+            raise InputError(f"settings.json, car: {error}") from None
+
+    @property
+    def discretisation(self) -> Discretisation:
+        """The discretisation of the controller's prediction and of the residual."""
+        given = self.settings.get("discretisation")
+        try:
+            return PREDICTION if given is None else Discretisation.model_validate(given)
+        except ValidationError as error:
+            raise InputError(f"settings.json, discretisation: {faults_in(error)}") from None
+
+    def run_of(self, controller: str) -> RunRecord | None:
+        """The last run of that controller, None if it did not drive."""
+        return next((run for run in reversed(self.runs) if run.plan.controller == controller), None)
+
+
+def read_recording(run_dir: Path) -> Recording:
+    """Reads a run directory, also one whose race was cut short; InputError if it is none."""
+    run_dir = Path(run_dir)
+    settings = _read_settings(run_dir / "settings.json")
+    name = Path(str(settings.get("track", "race"))).stem
+    track = replace(read_track(run_dir / "race.csv", car_width_m=0.0), name=name)
+    line = read_raceline(run_dir / "race_raceline.csv", name)
+    reader = LogReader(run_dir / "run.mcap")
+    runs: dict[int, RunRecord] = {}
+    started_ns: int | None = None
+    for entry in reader.messages([topic for topic in TOPICS if topic is not HEARTBEAT]):
+        started_ns = entry.log_time_ns if started_ns is None else started_ns
+        message = entry.message
+        plan = PlannedRun.from_event(message) if isinstance(message, Event) else None
+        run = message.run if plan is None else plan.run
+        record = runs.setdefault(run, RunRecord(PlannedRun(run, "", "")))
+        if plan is None:
+            record.add(message)
+        else:  # a state can overtake it, since it comes from another process
+            record.plan = plan
+    planned = [record for _, record in sorted(runs.items()) if record.plan.controller]
+    truth = any(record.truth for record in planned)
+    for record in planned if not truth else ():
+        names = [one.name for one in fields(Truth)]
+        record.truth = [Truth(*(getattr(state, n) for n in names)) for state in record.states]
+    return Recording(
+        run_dir, settings, track, line, planned, truth, reader.truncated, reader.refused, started_ns
+    )
+
+
+def _read_settings(path: Path) -> dict[str, Any]:
+    text = read_text(path, "the settings", "give the directory of a race")
+    try:
+        settings = json.loads(text)
+    except ValueError as error:
+        raise InputError(f"{path} is no JSON: {error}") from None
+    if not isinstance(settings, dict):
+        raise InputError(f"{path} holds no settings; give the directory of a race")
+    return settings

@@ -1,0 +1,117 @@
+"""The outcome of a race: the content of ``result.json``, and nothing that is not in it."""
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from bayesrace.errors import InputError, faults_in
+from bayesrace.files import read_whole, write_whole
+
+__all__ = [
+    "GpMetrics",
+    "LapResult",
+    "Percentiles",
+    "RaceResult",
+    "SettingsSummary",
+    "read_result",
+    "write_result",
+]
+
+
+class _Frozen(BaseModel):
+    # Numbers that are not finite have no place in JSON: what is not known is null.
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Percentiles(_Frozen):
+    """Execution time of the controller's step over all cycles of a run [us]."""
+
+    p50: float
+    p99: float
+    max: float
+
+
+class LapResult(_Frozen):
+    """One driven controller. Samples count up to the last counted crossing of the start line."""
+
+    controller: str = Field(description="worstcase, bayesrace, bayesrace-updated, bestcase, …")
+    run: int = Field(description="number of the run in all messages of the log")
+    finished: bool = Field(description="at least one lap was driven, all of it")
+    lap_time_s: float | None = Field(description="first lap, from standstill")
+    flying_lap_time_s: float | None = Field(description="best of the laps after the first")
+    lap_times_s: list[float] = Field(description="all laps in order")
+    off_track_samples: int = Field(description="samples with the centre of gravity off the track")
+    off_track_max_m: float = Field(description="deepest excursion, 0 without any")
+    deviation_mean_m: float | None = Field(description="mean distance from the racing line")
+    deviation_max_m: float | None = Field(description="largest distance from the racing line")
+    solve_us: Percentiles | None = Field(description="null without telemetry")
+    fallbacks: int = Field(description="cycles that the fallback drove")
+    weights_version: str = Field(description="of the weights that drove; empty without any")
+    trajectory_sha256: str = Field(
+        description="over all states as little-endian float64, up to and with the first sample "
+        "after the last counted crossing; all states if not finished"
+    )
+    samples: int = Field(description="states of the run in the log")
+    ended: str = Field(description="why the run ended")
+
+
+class GpMetrics(_Frozen):
+    """How well one output's GP predicts the residual of a drive, SI units."""
+
+    rmse: float
+    uncorrected_rmse: float = Field(description="without the GP")
+    r2: float
+    coverage: float = Field(description="share of the residuals in the 95 % interval")
+    log_density: float = Field(description="mean log predictive density")
+
+
+class SettingsSummary(_Frozen):
+    """What was raced; ``settings.json`` has all of it."""
+
+    car: str
+    track: str
+    train_track: str
+    mode: str
+    seed: int
+    laps: int
+    constraints: bool
+    fmu: str = Field("", description="FMU that played the car; empty for the built-in equations")
+
+
+class RaceResult(_Frozen):
+    """``result.json``: made from a run directory by :func:`operation.analysis.race.analyse`."""
+
+    settings: SettingsSummary
+    laps: list[LapResult]
+    gp: dict[str, GpMetrics] = Field(
+        description="output (vx, vy, omega) to metrics of the first weights on the BestCase run; "
+        "empty without these weights or without that run"
+    )
+    gp_updated: dict[str, GpMetrics] = Field(description="the same for the updated weights")
+    real_time_factor: float | None = Field(
+        description="simulated seconds per second of the lockstep runs; null without any"
+    )
+    complete: bool = Field(description="the log is whole: no message missing, refused or cut off")
+    gaps: int = Field(description="messages missing by their numbers")
+    judged_by: Literal["truth", "measurement"] = Field(
+        "measurement",
+        description="what laps and GP metrics are made of: measurement if the log holds no truth",
+    )
+
+    def lap(self, controller: str) -> LapResult | None:
+        """The last run of that controller, None if it did not drive."""
+        return next((lap for lap in reversed(self.laps) if lap.controller == controller), None)
+
+
+def write_result(path: Path, result: RaceResult) -> None:
+    """Writes ``result.json``: the whole file or nothing."""
+    write_whole(path, result.model_dump_json(indent=2) + "\n")
+
+
+def read_result(path: Path) -> RaceResult:
+    """The result in a file; InputError if it is not one."""
+    try:
+        return RaceResult.model_validate_json(read_whole(path, "the result", 1 << 26))
+    except ValidationError as error:
+        raise InputError(f"{path} is no result of a race: {faults_in(error)}") from None

@@ -1,0 +1,167 @@
+"""``bayesrace validate``: weights judged on drives that they were not learned from."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+from threadpoolctl import threadpool_limits
+
+from bayesrace.arrays import Floats
+from bayesrace.errors import InputError
+from bayesrace.gp.weights import GpWeights
+from bayesrace.vehicles import CarParameters, get_car
+from learning.dataset import Dataset, left_out
+from learning.residual import discretisation_of
+from learning.sources import read_samples
+from learning.validation import HORIZON, Validation, mismatch, validate
+from operation.analysis.results import GpMetrics
+from operation.terminal.notation import UNCERTAIN
+
+__all__ = [
+    "Drift",
+    "HorizonResult",
+    "Spread",
+    "Validated",
+    "ValidationResult",
+    "validate_weights",
+]
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Spread(_Frozen):
+    """Of absolute errors over all predictions."""
+
+    mean: float
+    p95: float
+    max: float
+
+    @classmethod
+    def of(cls, errors: Floats) -> "Spread":
+        """From errors (m,), m at least 1."""
+        size = np.abs(errors)
+        return cls(
+            mean=float(size.mean()), p95=float(np.percentile(size, 95)), max=float(size.max())
+        )
+
+
+class Drift(_Frozen):
+    """Driven against predicted at the end of a horizon."""
+
+    position_m: Spread
+    heading_rad: Spread
+    vx_mps: Spread
+    vy_mps: Spread
+    omega_radps: Spread
+
+    @classmethod
+    def of(cls, errors: Floats) -> "Drift":
+        """From states driven minus predicted, (m, 7), m at least 1."""
+        x, y, psi, vx, vy, omega, _ = errors.T
+        return cls(
+            position_m=Spread.of(np.hypot(x, y)),
+            heading_rad=Spread.of(psi),
+            vx_mps=Spread.of(vx),
+            vy_mps=Spread.of(vy),
+            omega_radps=Spread.of(omega),
+        )
+
+
+class HorizonResult(_Frozen):
+    """Open-loop predictions over some steps, without and with the correction."""
+
+    steps: int
+    predictions: int
+    nominal: Drift
+    corrected: Drift
+
+
+class ValidationResult(_Frozen):
+    """What ``--json`` writes."""
+
+    vx: GpMetrics
+    vy: GpMetrics
+    omega: GpMetrics
+    one_step: HorizonResult | None
+    horizon: HorizonResult | None = Field(description="null if no drive is long enough")
+    weights_version: str
+    car: str
+    discretisation: str
+    samples: int
+    dropped: dict[str, int] = Field(description="samples left out, by reason")
+    threshold: float
+    uncertain: int = Field(description="samples whose largest sigma is above the threshold")
+    learned_from: bool = Field(description="these are the samples that the weights learned from")
+
+
+@dataclass(frozen=True, eq=False)
+class Validated:
+    """The numbers, and what they are made of."""
+
+    result: ValidationResult
+    validation: Validation
+    dataset: Dataset
+
+
+def validate_weights(
+    weights: GpWeights,
+    drives: list[Path],
+    name: str = "",
+    runs: tuple[int, ...] | None = None,
+    threshold: float = UNCERTAIN,
+    car: CarParameters | None = None,
+) -> Validated:
+    """Judges weights on logs (MCAP) or arrays (``.npz``), filtered as for training.
+
+    They are judged by what was true; by what was measured, if that is all that a log holds, as that
+    of a real car. The discretisation is the one that the weights were learned with. ``car``:
+    theirs, needed where it is not built in. InputError for drives of another car or step, or
+    without samples.
+    """
+    car = car or get_car(weights.car)
+    discretisation = discretisation_of(weights.discretisation, car)
+    measured, data = (
+        read_samples(drives, car, name, discretisation, runs, truth).dataset
+        for truth in (False, True)
+    )
+    if len(data) == 0:
+        counts = left_out(data.dropped)
+        raise InputError(f"validation: no samples left (left out: {counts}); drive longer")
+    # On a busy machine the threads of BLAS wait for each other longer than they work.
+    with threadpool_limits(1):
+        validation = validate(weights, data, discretisation)
+
+    def over(steps: int) -> HorizonResult | None:
+        plain, corrected = (mismatch(data, discretisation, w, steps) for w in (None, weights))
+        if len(plain) == 0:
+            return None
+        return HorizonResult(
+            steps=steps,
+            predictions=len(plain),
+            nominal=Drift.of(plain),
+            corrected=Drift.of(corrected),
+        )
+
+    metrics = {
+        output: GpMetrics.model_validate(dict(numbers))
+        for output, numbers in validation.metrics.items()
+    }
+    result = ValidationResult(
+        vx=metrics["vx"],
+        vy=metrics["vy"],
+        omega=metrics["omega"],
+        one_step=over(1),
+        horizon=over(HORIZON),
+        weights_version=weights.version,
+        car=weights.car,
+        discretisation=weights.discretisation,
+        samples=len(data),
+        dropped=dict(data.dropped),
+        threshold=threshold,
+        uncertain=int(validation.uncertain(threshold).sum()),
+        learned_from=bool(weights.dataset_digest) and weights.dataset_digest == measured.digest(),
+    )
+    return Validated(result, validation, data)

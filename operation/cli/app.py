@@ -1,0 +1,145 @@
+"""The Typer application: subcommands grouped by task, and errors as one line."""
+
+import io
+import logging
+import shutil
+import sys
+from collections.abc import Callable
+from tempfile import gettempdir
+from typing import Annotated, Final
+
+import typer
+from pydantic import ValidationError
+
+from bayesrace import __version__
+from bayesrace.errors import InputError, faults_in
+from bayesrace.interrupts import remembering_interrupts
+from operation.cli import evaluation, fmu, latency, learning, operation, parts, preparation
+
+__all__ = ["app", "main"]
+
+_INTERRUPTED: Final = 130
+_OUR_OWN: Final = ("bayesrace", "codegen", "operation", "plant", "studies")
+
+_FMU_PACKAGES: Final = ("fmpy", "pint")
+_RACE_PACKAGES: Final = (
+    "casadi", "hdrh", "jinja2", "lz4", "matplotlib", "mcap", "rich", "scipy", "sklearn",
+    "threadpoolctl", "zstandard",
+)  # fmt: skip
+"""Modules that the extras ``fmu`` and ``race`` of pyproject.toml install."""
+
+_TASKS: Final[dict[str, tuple[Callable[..., None], ...]]] = {
+    "Race": (evaluation.race, evaluation.report),
+    "Prepare": (
+        preparation.tracks, preparation.cars, preparation.raceline, preparation.collect,
+        preparation.train, learning.validate, preparation.build,
+    ),
+    "Drive": (
+        parts.plant, parts.controller, evaluation.drive, operation.status, operation.stop,
+        operation.go, operation.router,
+    ),
+    "Learn while driving": (learning.learn, learning.publish, learning.rollback),
+    "Measure": (evaluation.bench, latency.latency),
+    "Export to other tools": (preparation.export,),
+}  # fmt: skip
+
+app = typer.Typer(
+    name="bayesrace",
+    help="Real-time GP-MPC racing: a compiled controller that learns from its own laps.",
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"bayesrace {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_version, is_eager=True, help="Print the version and exit."
+        ),
+    ] = False,
+) -> None:
+    from operation.terminal.printable import PrintableFormatter
+
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(PrintableFormatter("%(name)s: %(message)s"))
+    logging.basicConfig(level=logging.INFO, handlers=[handler])
+
+
+for task, commands in _TASKS.items():
+    for command in commands:
+        app.command(rich_help_panel=task)(command)
+app.add_typer(fmu.fmu, rich_help_panel="Export to other tools")
+
+
+def main() -> None:
+    """Runs the command line; bad input and lost processes end in one line, not in a traceback."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal may lack characters that we print
+            stream.reconfigure(errors="replace")
+    try:
+        # Typer turns Ctrl-C and Exit into the value it returns, and older ones Ctrl-C into Abort.
+        with remembering_interrupts():
+            code = app(standalone_mode=False, prog_name="bayesrace")
+            if code == _INTERRUPTED:
+                raise KeyboardInterrupt
+        sys.exit(code)
+    except (typer.Abort, KeyboardInterrupt):
+        _fail("interrupted", _INTERRUPTED)
+    except Exception as error:
+        text = _in_words(error)
+        if text is None:
+            raise
+        ours = isinstance(error, RuntimeError) and not isinstance(error, RecursionError)
+        _fail(text, 1 if ours else 2)
+
+
+def _in_words(error: Exception) -> str | None:
+    """The message for the user; None for a fault of the program's own, which gets a traceback."""
+    match error:
+        case InputError():
+            return str(error)
+        case ValidationError():
+            return faults_in(error, "settings")
+        case ModuleNotFoundError(name=str(name)):
+            return _missing(name.partition(".")[0])
+        case shutil.Error():  # of several files: source, target, why
+            _, target, why = error.args[0][0]
+            return f"{target}: {why}; choose a path that can be written, or make room"
+        case OSError():
+            where = error.filename or f"the cache, {gettempdir()} or the output"
+            return f"{where}: {error.strerror or error}; choose a path that can be read or written"
+        case RecursionError():
+            return "a file or an option is nested too deeply to be read"
+        case RuntimeError():  # our own: RaceError, RaceLineError, CompileError, FmuFault
+            return str(error) if type(error).__module__.split(".")[0] in _OUR_OWN else None
+    explain = getattr(error, "format_message", None)  # Click's
+    return None if explain is None else str(explain())
+
+
+def _missing(package: str) -> str | None:
+    """What to install for a package; None if no extra brings it."""
+    if package not in (*_FMU_PACKAGES, *_RACE_PACKAGES):
+        return None
+    extra = "fmu" if package in _FMU_PACKAGES else "race"
+    return f"this command needs {package}, which is not installed: pip install 'bayesrace[{extra}]'"
+
+
+def _fail(text: str, code: int = 2) -> None:
+    from operation.terminal.printable import printable
+
+    lines = [printable(line.strip()) for line in text.splitlines() if line.strip()]
+    several = any(line.startswith("- ") for line in lines)  # faults, as of a map: a line each
+    line = ("\n  " if several else "; ").join(lines)
+    if not line:  # no command given: the help has been shown
+        sys.exit(code)
+    typer.secho(f"bayesrace: {line}", err=True, fg=typer.colors.RED)
+    sys.exit(code)

@@ -1,0 +1,205 @@
+"""``race``, ``drive``, ``report``, ``bench``: commands that run several parts together."""
+
+from datetime import UTC, datetime
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bayesrace.files import write_whole
+from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK
+from bayesrace.vehicles import DEFAULT_CAR
+from operation.cli.options import (
+    Car,
+    CarName,
+    Endpoint,
+    FmuFile,
+    FmuMap,
+    Seed,
+    TrackName,
+    connect_to,
+    writable,
+)
+
+__all__ = ["bench", "drive", "race", "report"]
+
+
+class Mode(StrEnum):
+    """How time passes in a run."""
+
+    lockstep = "lockstep"
+    realtime = "realtime"
+
+
+TimeMode = Annotated[
+    Mode,
+    typer.Option(metavar="MODE", help="lockstep: as fast as possible; realtime: by the clock."),
+]
+
+
+def race(
+    car: Car = DEFAULT_CAR,
+    track: TrackName = DEFAULT_RACE_TRACK,
+    train_track: Annotated[
+        str, typer.Option(metavar="TRACK", help="Track of the training drive.")
+    ] = DEFAULT_TRAINING_TRACK,
+    laps: Annotated[
+        int,
+        typer.Option(metavar="N", min=1, max=100, help="Laps per controller, the first from rest."),
+    ] = 2,
+    mode: TimeMode = Mode.lockstep,
+    no_constraints: Annotated[
+        bool, typer.Option("--no-constraints", help="OCP without track constraints.")
+    ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "-o", metavar="DIR", show_default="runs/DATE-TIME", help="Run directory."
+        ),
+    ] = None,
+    seed: Seed = 0,
+    fmu: FmuFile = None,
+    fmu_map: FmuMap = None,
+) -> None:
+    """Drive the paper's comparison: WorstCase, BayesRace, BayesRace-updated, BestCase.
+
+    Computes racing lines, drives the training track by pure pursuit, trains the GPs, builds the
+    controllers, and drives them as two processes over Zenoh. Leaves a run directory with the log,
+    result.json and report.html.
+    """
+
+    from bayesrace.vehicles import get_car
+    from operation.analysis.race import read_race, write_result
+    from operation.race import FILES
+    from operation.race import race as drive_all
+    from operation.report import render_report
+    from operation.settings import RaceSettings
+    from operation.terminal.progress import stages_on
+    from operation.terminal.race_table import print_table
+    from operation.terminal.terminal import Terminal
+
+    settings = RaceSettings(
+        car=get_car(car), track=track, train_track=train_track, laps=laps, mode=mode.value,
+        seed=seed, fmu=fmu, fmu_map=fmu_map,
+    )  # fmt: skip
+    mpc = settings.mpc.model_copy(update={"constraints": not no_constraints})
+    settings = settings.model_copy(update={"mpc": mpc})
+    out = out or Path("runs") / datetime.now(UTC).astimezone().strftime("%Y%m%d-%H%M%S")
+    console = Terminal()
+    with stages_on(console) as stages:
+        drive_all(settings, out, stages)
+        with stages.stage("result and report"):
+            analysis = read_race(out)
+            write_result(out / FILES.result, analysis.result)
+            report = render_report(out, analysis.result, analysis)
+    print_table(analysis.result, console)
+    console.print(f"{report}", highlight=False, soft_wrap=True)
+
+
+def report(
+    run: Annotated[
+        Path,
+        typer.Argument(metavar="DIR", help="Run directory, also of a race that was interrupted."),
+    ],
+) -> None:
+    """Compute result.json, the table and report.html again from a run's log."""
+
+    from operation.analysis.race import read_race, write_result
+    from operation.race import FILES
+    from operation.report import render_report
+    from operation.terminal.race_table import print_table
+    from operation.terminal.terminal import Terminal
+
+    analysis = read_race(run)
+    write_result(run / FILES.result, analysis.result)
+    print_table(analysis.result, Terminal())
+    typer.echo(str(render_report(run, analysis.result, analysis)))
+
+
+def drive(
+    track: TrackName = DEFAULT_RACE_TRACK,
+    laps: Annotated[
+        int, typer.Option(metavar="N", min=1, help="Laps to drive, the first from rest.")
+    ] = 2,
+    mode: TimeMode = Mode.lockstep,
+    endpoint: Endpoint = None,
+    max_time: Annotated[
+        float, typer.Option(metavar="S", min=1, max=1e6, help="Time limit [s].")
+    ] = 60.0,
+    log: Annotated[
+        Path, typer.Option(metavar="FILE", callback=writable, help="Log to write (MCAP).")
+    ] = Path("run.mcap"),
+    car: Car = DEFAULT_CAR,
+    name: CarName = "",
+) -> None:
+    """Start a run on a plant and a controller that are already running, and record it."""
+    from bayesrace.messages import EVENT, Event
+    from bayesrace.recorder import Recorder
+    from bayesrace.tracks import load_track
+    from bayesrace.transport import Director, Publisher, open_session
+    from bayesrace.vehicles import car_text, get_car
+    from operation.drive import RunPlan, execute
+
+    parameters = get_car(car)
+    course = load_track(track, parameters.width_m)
+    name = name or parameters.name
+    about = {"drive": {"car": car_text(parameters), "track": course.name}}
+    with (
+        open_session(connect_to(endpoint)) as session,
+        Recorder(session, name, log, about) as recorder,
+    ):
+        director = Director(session, name)
+        director.wait_for(("plant", "controller"), 10.0)
+        publisher: Publisher[Event] = Publisher(session, EVENT, name, "race")
+        number = director.status("plant").run + 1
+        plan = RunPlan(number, "manual", laps, max_time, mode is Mode.lockstep)
+        end = execute(director, publisher, course, plan, recorder)
+    typer.echo(f"{end.text}; log: {log}")
+
+
+def bench(
+    json_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--json", metavar="FILE", callback=writable, help="Write the numbers to this file."
+        ),
+    ] = None,
+    track: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="TRACK",
+            show_default="three with hairpins",
+            help="Track to record problems on; repeatable.",
+        ),
+    ] = None,
+    problems: Annotated[
+        int,
+        typer.Option(metavar="N", min=10, help="Problems for the compiled step."),
+    ] = 900,
+    peers: Annotated[
+        int, typer.Option(metavar="N", min=1, help="Number of them that IPOPT solves, too.")
+    ] = 25,
+    points: Annotated[
+        int, typer.Option(metavar="N", min=20, max=1024, help="Training points per GP.")
+    ] = 400,
+    seed: Seed = 0,
+    car: Car = DEFAULT_CAR,
+) -> None:
+    """Time the compiled step and the paper's formulation (CasADi, IPOPT) on the same problems."""
+
+    from bayesrace.vehicles import get_car
+    from operation.terminal.progress import stages_on
+    from operation.terminal.terminal import Terminal
+    from studies.bench import BenchSettings, run_bench
+
+    console = Terminal()
+    with stages_on(console) as stages:
+        chosen = {} if not track else {"tracks": tuple(track)}
+        settings = BenchSettings(
+            car=get_car(car), problems=problems, peers=peers, points=points, seed=seed, **chosen
+        )
+        result = run_bench(settings, stages)
+    result.print(console)
+    if json_file:
+        write_whole(json_file, result.model_dump_json(indent=1) + "\n")

@@ -1,0 +1,383 @@
+"""``tracks`` to ``export``: preparation of a drive, each command with files in and out."""
+
+import shutil
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bayesrace.errors import InputError
+from bayesrace.tracks import DEFAULT_RACE_TRACK
+from bayesrace.vehicles import DEFAULT_CAR
+from operation.cli.options import (
+    Car,
+    CarName,
+    FmuFile,
+    FmuMap,
+    OutFile,
+    RaceLineFile,
+    Seed,
+    TrackName,
+    path_on,
+    writable,
+)
+
+__all__ = ["build", "cars", "collect", "export", "raceline", "tracks", "train"]
+
+
+class PredictionModel(StrEnum):
+    """Prediction model of the OCP."""
+
+    e_kinematic = "e_kinematic"
+    dynamic = "dynamic"
+
+
+class KernelChoice(StrEnum):
+    """Kernels by name, and the choice among them."""
+
+    rbf = "rbf"
+    matern05 = "matern05"
+    matern15 = "matern15"
+    matern25 = "matern25"
+    auto = "auto"
+
+
+def tracks(
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="TRACK",
+            show_default="all built in",
+            help="Built-in name, random:SEED or CSV file.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "-o", metavar="FILE", callback=writable, help="Write the track as CSV."
+        ),
+    ] = None,
+) -> None:
+    """List the built-in tracks, check a track file, or write a track to a file."""
+    import numpy as np
+    from rich.table import Table
+
+    from bayesrace.tracks import builtin_tracks, load_track, write_track
+    from operation.terminal.terminal import Terminal
+
+    if out is not None and name is None:
+        raise InputError("--out needs the name of the track to write")
+    table = Table("track", "length m", "width m", "tightest radius m", "points")
+    for one in [name] if name else builtin_tracks():
+        track = load_track(one)
+        width = track.width_left_m + track.width_right_m
+        bend = np.abs(track.curvature(np.arange(0, track.length_m, 0.01))).max()
+        table.add_row(
+            track.name, f"{track.length_m:.2f}", f"{width.min():.2f}–{width.max():.2f}",
+            f"{1 / bend:.2f}", str(len(track.s_m)),
+        )  # fmt: skip
+        if out is not None:
+            write_track(out, track)
+    Terminal().print(table)
+
+
+def cars(
+    car: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="CAR", show_default="all built in", help="Built-in name or TOML file."
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            metavar="FILE",
+            callback=writable,
+            help="Write the car as TOML, tuning included.",
+        ),
+    ] = None,
+) -> None:
+    """List the built-in cars, check a car's file, or write a car to a file with all its values."""
+    from rich.table import Table
+
+    from bayesrace.vehicles import builtin_cars, get_car, write_car
+    from operation.terminal.terminal import Terminal
+
+    if out is not None and car is None:
+        raise InputError("--out needs the name of the car to write")
+    table = Table("car", "wheelbase m", "width m", "mass kg", "friction", "identity")
+    for one in [get_car(car)] if car is not None else builtin_cars().values():
+        table.add_row(
+            one.name, f"{one.wheelbase_m:.4g}", f"{one.width_m:.4g}", f"{one.mass_kg:.4g}",
+            f"{one.friction:.4g}", one.identity,
+        )  # fmt: skip
+        if out is not None:
+            write_car(out, one)
+    Terminal().print(table)
+
+
+def raceline(
+    track: Annotated[
+        str, typer.Argument(metavar="TRACK", help="Built-in name, random:SEED or CSV file.")
+    ],
+    out: OutFile = Path("raceline.csv"),
+    car: Car = DEFAULT_CAR,
+    friction: Annotated[
+        float | None,
+        typer.Option(metavar="MU", show_default="the car's", help="Usable acceleration over g."),
+    ] = None,
+    margin: Annotated[
+        float | None,
+        typer.Option(
+            metavar="M",
+            show_default="by the car's width",
+            help="Least distance of the centre of gravity from the track's edge [m].",
+        ),
+    ] = None,
+) -> None:
+    """Compute the minimum-time racing line of a track."""
+    from bayesrace.raceline import RaceLineSettings, write_raceline
+    from bayesrace.raceline.cached import racing_line
+    from bayesrace.tracks import load_track
+    from bayesrace.vehicles import get_car
+
+    parameters = get_car(car)
+    settings = RaceLineSettings(friction=friction, margin_m=margin)
+    line = racing_line(load_track(track, parameters.width_m), parameters, settings)
+    write_raceline(out, line)
+    typer.echo(f"{line.length_m:.2f} m in {line.lap_time_s:.3f} s: {out}")
+
+
+def collect(
+    track: TrackName,
+    raceline: RaceLineFile,
+    out: OutFile = Path("collect.mcap"),
+    duration: Annotated[
+        float | None,
+        typer.Option(
+            metavar="S",
+            min=1,
+            max=3600,
+            show_default="by the car's tuning",
+            help="Length of the drive [s].",
+        ),
+    ] = None,
+    seed: Seed = 0,
+    fmu: FmuFile = None,
+    fmu_map: FmuMap = None,
+    car: Car = DEFAULT_CAR,
+) -> None:
+    """Drive a track by pure pursuit and log the drive as training data."""
+    from bayesrace.raceline import read_raceline_for
+    from bayesrace.tracks import load_track
+    from bayesrace.vehicles import get_car
+    from codegen.build import build
+    from codegen.settings import BuildSettings
+    from controller.pure_pursuit import PurePursuitSettings
+    from operation.collect import collect as drive
+    from plant.vehicle import open_vehicle
+
+    settings = PurePursuitSettings(seed=seed)
+    parameters = get_car(car)
+    course = load_track(track, parameters.width_m)
+    line = read_raceline_for(raceline, course, parameters)
+    with open_vehicle(parameters, fmu, fmu_map) as vehicle:
+        duration_s = duration or parameters.tuning.pursuit.drive_s
+        artefact, _ = build(BuildSettings(car=parameters))
+        samples = drive(
+            course, line, parameters, artefact, out, duration_s, settings, vehicle=vehicle
+        )
+    typer.echo(f"{samples} samples: {out}")
+
+
+def train(
+    logs: Annotated[
+        list[Path] | None, typer.Argument(metavar="LOG", help="Run logs (MCAP).")
+    ] = None,
+    data: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="FILE", help="Samples in plain arrays (.npz); repeatable."),
+    ] = None,
+    kernel: Annotated[
+        KernelChoice,
+        typer.Option(
+            metavar="KERNEL", help="rbf, matern05, matern15, matern25; auto: the best per output."
+        ),
+    ] = KernelChoice.auto,
+    out: OutFile = Path("weights.bin"),
+    points: Annotated[
+        int, typer.Option(metavar="N", min=20, max=20000, help="Points per output.")
+    ] = 400,
+    restarts: Annotated[
+        int,
+        typer.Option(
+            metavar="N", min=0, max=100, help="Further starts of the optimiser per kernel."
+        ),
+    ] = 2,
+    plot: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            callback=writable,
+            help="Draw the error against the kernel's smoothness (PNG).",
+        ),
+    ] = None,
+    artefact: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            show_default="the default one",
+            help="Built controller to learn for.",
+        ),
+    ] = None,
+    seed: Seed = 0,
+    car: Annotated[
+        str,
+        typer.Option(metavar="CAR", show_default="named by the files", help="Car that drove."),
+    ] = "",
+    name: CarName = "",
+) -> None:
+    """Train the three GPs on the residual in run logs or plain arrays.
+
+    Of more samples than --points, those with the largest predictive variance are chosen one by one;
+    the output compares their error with that of a random choice.
+    """
+
+    from bayesrace.gp.weights import write_weights
+    from bayesrace.manifest import read_manifest
+    from bayesrace.vehicles import get_car
+    from learning.dataset import left_out
+    from learning.residual import discretisation_of
+    from learning.sources import read_samples
+    from learning.training import TrainingSettings, fit
+    from operation.terminal.learning_table import print_choices, print_kernels
+    from operation.terminal.progress import stages_on
+    from operation.terminal.terminal import Terminal
+
+    wanted, parameters = None, get_car(car) if car else None
+    if artefact is not None:
+        manifest = read_manifest(artefact)
+        parameters = parameters or get_car(manifest.car)
+        wanted = discretisation_of(manifest.discretisation, parameters)
+        manifest.check_points(points)
+    samples = read_samples([*(logs or []), *(data or [])], parameters, name, wanted)
+    console = Terminal()
+    every = tuple(one.value for one in KernelChoice if one is not KernelChoice.auto)
+    settings = TrainingSettings(
+        kernels=every if kernel is KernelChoice.auto else (kernel.value,),
+        capacity=points,
+        restarts=restarts,
+        seed=seed,
+    )
+    with stages_on(console) as stages, stages.stage("train the residual") as stage:
+        training = fit(
+            samples.dataset, samples.discretisation, settings, progress=stage.update, compare=True
+        )
+    weights = training.weights
+    write_weights(out, weights)
+    print_kernels(training.kernels, console)
+    print_choices(training.choices, console)
+    if plot is not None:
+        from operation.report.canvas import write_png
+        from operation.report.style import figure_style
+        from operation.report.training import kernel_figure
+
+        with figure_style():
+            write_png(kernel_figure(training.kernels), plot)
+    console.print(
+        f"{weights.version}: {len(samples.dataset)} samples "
+        f"(left out: {left_out(samples.dataset.dropped)}), "
+        f"kernels {', '.join(weights.kernels)}: {out}",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def build(
+    model: Annotated[
+        PredictionModel,
+        typer.Option(metavar="MODEL", help="Prediction model: e_kinematic or dynamic."),
+    ] = PredictionModel.e_kinematic,
+    horizon: Annotated[
+        int, typer.Option(metavar="N", min=2, max=100, help="Stages of the horizon.")
+    ] = 20,
+    gp_capacity: Annotated[
+        int, typer.Option(metavar="N", min=8, max=16384, help="Most points per output.")
+    ] = 1024,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", metavar="DIR", help="Copy the artefact here.")
+    ] = None,
+    car: Car = DEFAULT_CAR,
+) -> None:
+    """Generate and compile a controller, or take it from the cache; prints its folder."""
+    from bayesrace.integrators import PERFECT, PREDICTION
+    from bayesrace.vehicles import get_car
+    from codegen.build import build as make
+    from codegen.settings import BuildSettings
+
+    settings = BuildSettings(
+        car=get_car(car),
+        model=model.value,
+        discretisation=PERFECT if model is PredictionModel.dynamic else PREDICTION,
+        horizon=horizon,
+        gp_capacity=gp_capacity,
+    )
+    folder, _ = make(settings)
+    if out is not None:
+        shutil.copytree(folder, out, dirs_exist_ok=True, copy_function=_replace)
+        folder = out
+    typer.echo(str(folder))
+
+
+def export(
+    out: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write into.")],
+    track: TrackName = DEFAULT_RACE_TRACK,
+    raceline: Annotated[
+        Path | None, typer.Option(metavar="FILE", show_default="computed", help="Racing line.")
+    ] = None,
+    weights: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="GP weights; without them, the uncorrected model."),
+    ] = None,
+    settings: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="OCP settings (JSON).")
+    ] = None,
+    artefact: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", show_default="built", help="Folder of 'bayesrace build'."),
+    ] = None,
+    car: Car = DEFAULT_CAR,
+) -> None:
+    """Write racing line, weights and settings for a C program (examples/c_host)."""
+    from bayesrace.gp.weights import read_weights
+    from bayesrace.manifest import read_manifest
+    from bayesrace.vehicles import get_car
+    from codegen.build import build as make
+    from codegen.host_files import export as write
+    from codegen.settings import BuildSettings
+    from controller.assembly import read_settings
+    from controller.cycle_settings import cycle_values
+    from controller.process_settings import ControllerSettings
+    from controller.settings import MpcSettings
+
+    parameters, process = get_car(car), ControllerSettings()
+    table = path_on(track, raceline, parameters)
+    values = read_settings(settings, MpcSettings).parameters(parameters) | cycle_values(
+        parameters, process.fallback, process.compensation, process.stale_s
+    )
+    folder = artefact or make(BuildSettings(car=parameters))[0]
+    manifest = read_manifest(folder)
+    manifest.check_car(parameters, folder)
+    learned = None if weights is None else read_weights(weights)
+    write(out, manifest, table.rows, table.spacing_m, values, learned)
+    typer.echo(f"{track}, {parameters.name}: {out}")
+
+
+def _replace(source: str, target: str) -> None:
+    """Copies beside the target and renames: a running controller keeps the library it loaded."""
+    beside = f"{target}.new"
+    shutil.copy2(source, beside)
+    Path(beside).replace(target)

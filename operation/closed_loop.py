@@ -1,0 +1,271 @@
+"""Plant and controller in one process: a lockstep run without network, clock or other processes.
+
+The car is driven by the plant's own lockstep loop and the controller's own cycle, so a run is
+equal to the bit to the same run of two processes over Zenoh (tests/test_closed_loop.py). New
+weights are the caller's: nothing validates them, and no command can stop the run.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesrace.arrays import Floats
+from bayesrace.gp.weights import GpWeights
+from bayesrace.log import LogWriter
+from bayesrace.messages import (
+    ACTUATION,
+    EVENT,
+    STATE,
+    TELEMETRY,
+    TRUTH,
+    Event,
+    Message,
+    Scalar,
+    State,
+    Topic,
+    Truth,
+    car_key,
+    encode,
+)
+from bayesrace.raceline import RaceLine
+from bayesrace.tracks import PathProjection, Track
+from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles.models import dynamic
+from controller.assembly import compiled_controller
+from controller.cycle import Cycle
+from controller.driver import Decision
+from controller.interface import Controller
+from controller.process_settings import ControllerSettings
+from learning.dataset import Dataset
+from learning.logs import dataset_from_messages
+from operation.analysis.laps import LapTimes, Trajectory, time_laps
+from operation.drive import RunPlan, announcement, run_request
+from plant.lockstep import CarRun, End, drive_lockstep
+from plant.simulator import Simulator
+from plant.vehicle import Vehicle
+
+__all__ = ["ClosedLoop", "Driven", "drive_compiled"]
+
+
+_EPOCH: Final = 1
+
+_LIMIT: Final = 3.0
+"""A run ends at this multiple of the racing line's time ..."""
+_LIMIT_S: Final = 2.0
+"""... and so much more."""
+
+
+@dataclass(frozen=True, eq=False)
+class Driven(Trajectory):
+    """One run: the truth, what was measured of it, and what the controller decided."""
+
+    car: CarParameters
+    track: Track
+    step_s: float
+    truth: list[Truth]
+    states: list[State]
+    """As measured, one for each truth."""
+    statuses: NDArray[np.int64]
+    """Of the controller's steps, shape (m,); m is n - 1, or n if the car failed or left."""
+    levels: NDArray[np.int64]
+    """Of the fallback, shape (m,); see :class:`controller.driver.Level`."""
+    step_us: Floats
+    """Execution times of the steps that were made, shape (at most m,)."""
+    second_starts: int
+    """Steps that looked for another plan beside the one that went on from before."""
+    end: End
+
+    @cached_property
+    def laps(self) -> LapTimes:
+        """Interpolated within the sampling period."""
+        return time_laps(self.track, self.time_s, self.x[:, :2], self._projected.s_m)
+
+    @property
+    def laps_s(self) -> tuple[float, ...]:
+        """Lap times, the first one from standstill."""
+        return self.laps.times_s
+
+    @cached_property
+    def off_track_m(self) -> Floats:
+        """How far off the track the counted samples are: those up to the end of the last lap, or
+        all of a run without one. Negative on the track."""
+        counted = self.laps.after[-1] if self.laps.after else len(self.x)
+        return self._projected.off_track_m[:counted]
+
+    @property
+    def fallbacks(self) -> int:
+        """Cycles that the fallback drove."""
+        return int((self.levels > 0).sum())
+
+    @cached_property
+    def _projected(self) -> PathProjection:
+        return self.track.project_path(self.x[:, :2])
+
+    def samples(self) -> Dataset:
+        """What can be learned from the measurements, as from the run's log.
+
+        Cycles driven by the fallback are left out. InputError if the run ended before its second
+        state.
+        """
+        cycles = zip(self.states, self.levels, strict=False)
+        fallback = {(state.run, state.seq) for state, level in cycles if level > 0}
+        return dataset_from_messages(self.states, fallback, self.car, self.step_s)
+
+    def __str__(self) -> str:
+        laps = " ".join(f"{t:.3f}" for t in self.laps_s) or "did not finish"
+        off = int((self.off_track_m > 0).sum())
+        text = f"{laps} s, {off} off track"
+        if off:
+            text += f" (deepest {1e3 * float(self.off_track_m.max()):.0f} mm)"
+        return text + (f", {self.fallbacks} fallbacks" if self.fallbacks else "")
+
+
+class ClosedLoop:
+    """A car on a track with its controller; each :meth:`drive` is a run from the start line."""
+
+    def __init__(
+        self,
+        car: CarParameters,
+        track: Track,
+        line: RaceLine,
+        controller: Controller,
+        vehicle: Vehicle | None = None,
+        log: LogWriter | None = None,
+        settings: ControllerSettings | None = None,
+    ) -> None:
+        """``vehicle``: what plays the car; the built-in equations without. ``log``: gets the
+        messages that a race records. ``settings``: of the controller process, as far as they
+        concern lockstep."""
+        self._car, self._track, self._line = car, track, line
+        self._vehicle = vehicle or Simulator(dynamic(car))
+        self._cycle = Cycle(controller, car, settings or ControllerSettings(car=car))
+        self._controller = controller
+        self._log = None if log is None else _Messages(log, car.name)
+        self._run = self._seq = 0
+        self._answer = (0.0, 0.0)
+
+    def drive(
+        self,
+        laps: int = 2,
+        max_time_s: float | None = None,
+        start_speed_mps: float = 0.1,
+        x0: Sequence[float] | None = None,
+        name: str = "",
+    ) -> Driven:
+        """Drives until the laps are done (0: no limit) or the time is up.
+
+        ``max_time_s``: default as in a race, three times the racing line's time. ``x0``: start
+        state (7,) instead of the start line at ``start_speed_mps``. ``name``: of the controller, in
+        the log. Raises InputError if the car cannot start there, FmuFault if it fails at that; a
+        later fault ends the run.
+        """
+        if max_time_s is None:
+            max_time_s = _LIMIT * self._line.lap_time_s * max(laps, 1) + _LIMIT_S
+        self._run += 1
+        plan = RunPlan(self._run, name, laps, max_time_s, True, start_speed_mps)
+        request = run_request(self._track, plan)
+        if x0 is not None:
+            request = replace(request, x0=tuple(map(float, x0)))
+        run = CarRun(request, self._vehicle, _EPOCH)
+        self._states: list[State] = []
+        self._truth: list[Truth] = []
+        self._decided: list[tuple[int, int]] = []
+        self._step_us: list[float] = []
+        second_starts = self._cycle.driver.count("second_starts")
+        if self._log is not None:
+            self._log.begins(plan, self._controller.weights_version)
+        try:
+            end = drive_lockstep(run, self._seq, self._exchange)
+        finally:
+            self._cycle.driver.lost(silent=False)
+        if self._log is not None:
+            self._log.ends(run, end)
+        states, truth = self._states, self._truth
+        self._seq = states[-1].seq + 1
+        if len(states) > 1 and states[-1].time_s == states[-2].time_s:
+            states.pop()  # a fault of the plant repeats the last state
+            truth.pop()
+        decided = np.array(self._decided, dtype=np.int64).reshape(-1, 2)
+        return Driven(
+            self._car,
+            self._track,
+            self._vehicle.step_s,
+            truth,
+            states,
+            decided[:, 0],
+            decided[:, 1],
+            np.array(self._step_us),
+            self._cycle.driver.count("second_starts") - second_starts,
+            end,
+        )
+
+    def _exchange(self, state: State, truth: Truth) -> tuple[float, ...]:
+        """Hands the state to the controller; what it answers."""
+        self._states.append(state)
+        self._truth.append(truth)
+        if self._log is not None:
+            self._log.write(STATE, state)
+            self._log.write(TRUTH, truth)
+        self._cycle.driver.observe(state)
+        if not state.final:
+            self._cycle.answer(state, self._send)
+        return self._answer
+
+    def _send(self, state: State, decision: Decision) -> None:
+        self._answer = decision.d, decision.delta_rate
+        self._decided.append((decision.status, int(decision.level)))
+        if decision.output is not None:
+            self._step_us.append(decision.step_us)
+        if self._log is not None:
+            cycle, received_ns = self._cycle, state.source_time_ns
+            seq = cycle.timing.ticks
+            self._log.write(ACTUATION, cycle.actuation(seq, state, decision))
+            self._log.write(TELEMETRY, cycle.telemetry(seq, state, decision, received_ns))
+
+
+class _Messages:
+    """Writes what a race records into a log."""
+
+    def __init__(self, log: LogWriter, car: str) -> None:
+        self._log, self._car = log, car
+        self._runs = 0
+
+    def write(self, topic: Topic[Any], message: Message, source: str = "") -> None:
+        key = car_key(topic.key, self._car, source)
+        self._log.write(key, encode(message), message.source_time_ns, message.seq)
+
+    def begins(self, plan: RunPlan, weights_version: str) -> None:
+        self.write(EVENT, announcement(plan, self._runs, weights_version), "race")
+        self._event(2 * self._runs, plan.run, "run_started", "in one process", {})
+
+    def ends(self, run: CarRun, end: End) -> None:
+        text = f"run {run.request.run} ended after {run.time_s:.2f} s: {end.text}"
+        data: dict[str, Scalar] = {"reason": end.reason, "time_s": run.time_s, "laps": run.laps}
+        data |= run.vehicle.guard.counters.as_dict()
+        self._event(2 * self._runs + 1, run.request.run, "run_ended", text, data)
+        self._runs += 1
+
+    def _event(self, seq: int, run: int, kind: str, text: str, data: dict[str, Scalar]) -> None:
+        event = Event(seq, time.monotonic_ns(), run, "plant", kind, text[:2000], data)
+        self.write(EVENT, event, "plant")
+
+
+def drive_compiled(
+    artefact: Path,
+    track: Track,
+    line: RaceLine,
+    weights: GpWeights | None = None,
+    *,
+    car: CarParameters,
+    laps: int = 2,
+    vehicle: Vehicle | None = None,
+) -> Driven:
+    """One run of the compiled controller with default settings."""
+    controller = compiled_controller(artefact, car, track, line, weights)
+    return ClosedLoop(car, track, line, controller, vehicle).drive(laps)

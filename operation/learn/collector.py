@@ -1,0 +1,163 @@
+"""Laps and their samples, collected from messages as they arrive."""
+
+import time
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from bayesrace.errors import InputError
+from bayesrace.messages import Actuation, State, Telemetry
+from bayesrace.tracks import StartLine, Track
+from bayesrace.vehicles.parameters import CarParameters
+from learning.dataset import Dataset
+from learning.logs import dataset_from_messages
+from operation.learn.records import LapRecord
+
+__all__ = ["MOST_STATES", "Collector", "Stretch"]
+
+MOST_STATES: Final = 10_000
+"""A stretch without the end of a lap is cut here (200 s at 50 Hz), which bounds the memory."""
+
+_DELAY_S: Final = 0.5
+"""A stretch is given out so long after its end: telemetry comes after the actuation."""
+
+_REMEDIES: Final = {
+    "standstill": "the car stood still, or nearly; see 'bayesrace status' for why",
+    "gap": "messages are lost; give the network and this machine less to do",
+    "fallback": "the fallback drove, as the controller had no solution in time; give it a core of "
+    "its own, a slower racing line, or weights to begin with",
+    "outside limits": "inputs or steering angles are beyond the car's limits; name the car that "
+    "drives: --car",
+    "steering does not match its rate": "the steering angle does not follow the rate that the "
+    "plant reports; correct the FMU's map, or the plant",
+}
+"""By why samples were left out (:mod:`learning.dataset`, :mod:`learning.logs`)."""
+
+
+@dataclass(eq=False)
+class Stretch:
+    """What is driven up to the end of a lap, or a part of it."""
+
+    flying: bool = False
+    begin_s: float | None = None  # plant time when the lap began, if that was seen
+    states: list[State] = field(default_factory=list)
+    versions: dict[str, None] = field(default_factory=dict)
+    end_s: float = 0.0  # monotonic clock
+    samples: Dataset | None = None  # None if no two states are one step apart
+    lap: LapRecord | None = None  # the lap that ended with this stretch, without its number
+    why_not: str = ""  # why none of it can be learned from, and the remedy
+
+
+class Collector:
+    """Takes messages in the order of arrival; :meth:`take` gives out the stretches that have ended.
+
+    Samples are those of :func:`learning.logs.dataset_from_messages`: the same pairs, gaps, fallback
+    cycles and filters as from a log of the same drive. A lap ends where the plant has counted it.
+    """
+
+    def __init__(self, car: CarParameters, step_s: float, track: Track | None = None) -> None:
+        """``track``: times laps to less than a period, and measures excursions."""
+        self._car, self._step_s, self._track = car, step_s, track
+        self._line = None if track is None else StartLine(track)
+        self._open = Stretch()
+        self._ended: deque[Stretch] = deque()
+        self._run, self._laps = (-1, -1), 0
+        self._fallbacks: dict[tuple[int, int], None] = {}
+        """Run and number of the states that the fallback has answered, oldest first."""
+
+    def state(self, state: State) -> None:
+        """Adds a state of the plant."""
+        if (state.epoch, state.run) != self._run:
+            self._end(Stretch(begin_s=state.time_s if state.time_s == 0 else None))
+            self._run, self._laps = (state.epoch, state.run), state.lap
+        states = self._open.states
+        if states and state.seq <= states[-1].seq:
+            return
+        states.append(state)
+        if state.lap > self._laps:
+            self._end_lap(state)
+        elif len(states) >= MOST_STATES:  # the lap keeps its time, should it ever end
+            self._end(Stretch(self._open.flying, self._open.begin_s, [state]))
+        if state.final:
+            self._end(Stretch())
+            self._run = (-1, -1)
+
+    def telemetry(self, message: Telemetry) -> None:
+        """Adds the telemetry of a cycle, which names the cycles that the fallback drove."""
+        if message.fallback > 0:
+            if len(self._fallbacks) >= 2 * MOST_STATES:
+                del self._fallbacks[next(iter(self._fallbacks))]
+            self._fallbacks[message.run, message.state_seq] = None
+
+    def actuation(self, message: Actuation) -> None:
+        """Adds the actuation of a cycle, which names the weights that drive."""
+        states = self._open.states
+        if states and states[0].seq <= message.state_seq and message.run == states[0].run:
+            self._open.versions.setdefault(message.weights_version)
+
+    def take(self, at_once: bool = False) -> list[Stretch]:
+        """Stretches that have ended; ``at_once``: all of them, and the one that has no end yet."""
+        if at_once:
+            self._end(Stretch())
+        before_s = time.monotonic() - (0.0 if at_once else _DELAY_S)
+        done = []
+        while self._ended and self._ended[0].end_s <= before_s:
+            done.append(self._ended.popleft())
+            self._evaluate(done[-1])
+        return done
+
+    def _end_lap(self, state: State) -> None:
+        """The plant has counted a lap: this state is the first one behind the line."""
+        stretch, counted = self._open, state.lap - self._laps
+        self._laps = state.lap
+        crossed_s, time_s = self._crossing_s(stretch.states), None
+        if crossed_s is not None and stretch.begin_s is not None and counted == 1:
+            time_s = crossed_s - stretch.begin_s
+        stretch.lap = LapRecord(run=state.run, time_s=time_s, flying=stretch.flying)
+        self._end(Stretch(flying=True, begin_s=crossed_s, states=[state]))
+
+    def _crossing_s(self, states: list[State]) -> float | None:
+        """Plant time at the line; None if the states around it are missing."""
+        if len(states) < 2 or states[-1].time_s - states[-2].time_s > 0.1:
+            return None
+        before, after = states[-2], states[-1]
+        fraction = 1.0
+        if self._line is not None:
+            crossing = self._line.crossing(before.x[:2], after.x[:2])  # type: ignore[arg-type]
+            fraction = crossing.fraction if crossing.direction == 1 else 1.0
+        return before.time_s + fraction * (after.time_s - before.time_s)
+
+    def _end(self, following: Stretch) -> None:
+        if len(self._open.states) > 1:
+            self._open.end_s = time.monotonic()
+            self._ended.append(self._open)
+        self._open = following
+
+    def _evaluate(self, stretch: Stretch) -> None:
+        states, lap = stretch.states, stretch.lap
+        run, first, last = states[0].run, states[0].seq, states[-1].seq
+        # The last state's own cycle belongs to the next stretch, or there is none.
+        fallbacks = [key for key in self._fallbacks if key[0] == run and first <= key[1] < last]
+        for key in fallbacks:
+            del self._fallbacks[key]
+        why_not = ""
+        try:
+            samples = dataset_from_messages(states, fallbacks, self._car, self._step_s)
+        except InputError as error:
+            why_not = str(error)
+        else:
+            stretch.samples, dropped = samples, samples.dropped
+            if not len(samples):
+                reason = max(dropped, key=lambda one: dropped[one])
+                why_not = _REMEDIES.get(reason, f"the samples are left out: {reason}")
+            if lap is not None:
+                lap.samples, lap.left_out = len(samples), dropped
+        # A short stretch that is no lap, such as the end of a run, may well be of no use.
+        stretch.why_not = why_not if lap is not None or len(states) >= 50 else ""
+        if lap is not None:
+            lap.versions, lap.fallbacks = list(stretch.versions), len(fallbacks)
+            if self._track is not None:
+                path = self._track.project_path(np.array([state.x[:2] for state in states]))
+                lap.off_track_m = max(float(np.max(path.off_track_m)), 0.0)

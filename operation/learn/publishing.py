@@ -1,0 +1,134 @@
+"""Publishing weights to a controller, and what it makes of them."""
+
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+from bayesrace.files import read_whole
+from bayesrace.gp.weights import MAX_BYTES
+from bayesrace.messages import Event, Reply, Status
+from bayesrace.transport import send_weights
+from operation.learn.journal import Journal
+from operation.learn.records import UpdateRecord, Verdict
+
+__all__ = ["NotTakenOverError", "Publisher", "in_words"]
+
+
+class NotTakenOverError(RuntimeError):
+    """A controller has refused weights or a rollback; the message is its reason."""
+
+
+def in_words(reply: Reply) -> str:
+    """A controller's answer to new weights, or to a rollback, as a text."""
+    cycle, number, why_not = (reply.data.get(key) for key in ("cycle", "number", "not_kept"))
+    if not reply.accepted:
+        again = " for now, try again" if reply.data.get("again") is True else ""
+        return f"refused{again}: {reply.text}"
+    if cycle is None:
+        return f"taken over: {reply.text}"
+    which = "" if number is None else f" (acceptance {number})"
+    return f"taken over at cycle {cycle}{which}{f', but not kept: {why_not}' if why_not else ''}"
+
+
+class Publisher:
+    """Sends the weights of updates and notes what becomes of them; for the job's thread.
+
+    A thread of its own waits for the answers; :meth:`poll` notes those that have arrived. Weights
+    without an answer, or refused for now, stay pending: they are sent to the next controller that
+    appears. Weights refused or rolled back are not sent again.
+    """
+
+    def __init__(self, session: Any, journal: Journal, say: Callable[[str], None]) -> None:
+        self._session, self._journal, self._say = session, journal, say
+        self._car = journal.settings.name
+        self._thread = ThreadPoolExecutor(1, "learn-publisher")
+        self.unanswered: deque[tuple[UpdateRecord, Future[Reply]]] = deque()
+        """Updates that were sent, oldest first, with what will be the answer."""
+        self.present = False
+        """A heartbeat has come since the controller appeared or disappeared."""
+        self.closed = False
+        """Nothing is sent any more: what is pending is for the next job."""
+        self.in_use = ""
+        """Version that the controller drives with; empty while that is unknown, or for none."""
+
+    def offer(self, update: UpdateRecord) -> None:
+        """Sends the weights of an update if the controller is there and has not declined them."""
+        version, updates = update.version, self._journal.record.updates
+        verdicts = {one.verdict for one in updates if one.version == version}
+        if verdicts & {"refused", "rolled back"}:
+            self._note(update, "not sent", "the same weights have been declined before")
+        elif version == self.in_use:
+            self._note(update, "accepted", "in use already")
+        elif self.present:
+            self._send(update)
+        else:
+            self._say(f"no controller of car '{self._car}' is there; {version} is pending")
+
+    def heartbeat(self, status: Status) -> None:
+        """The controller is there, and its status names the weights that it drives with.
+
+        One that has just appeared is sent what is pending, or else the last accepted weights if it
+        drives with other ones.
+        """
+        if status.source != "controller":
+            return
+        appeared, self.present, self.in_use = not self.present, True, status.weights_version
+        update, last = self._journal.update_of(self.in_use), self._journal.last_accepted
+        newest = self._journal.record.updates[-1:]
+        if appeared and newest and newest[0].verdict == "pending":
+            self.offer(newest[0])
+        elif appeared and last is not None and self.in_use != last.version:
+            drives_with = self.in_use or "no weights"
+            self._say(f"the controller drives with {drives_with}; sending {last.version}")
+            self._send(last)
+        elif update and update.verdict in ("pending", "superseded") and not self.unanswered:
+            self._note(update, "accepted", "in use")  # the answer was lost
+
+    def event(self, event: Event) -> None:
+        """Notes what the controller has rolled back."""
+        if event.source == "controller" and event.kind == "weights_rolled_back":
+            version = str(event.data.get("from_version", ""))
+            if (update := self._journal.update_of(version)) is not None:
+                update.verdict, update.answer = "rolled back", event.text
+                self._journal.save()
+                version += f" (learned after lap {update.after_lap})"
+            self._say(f"rolled back: {version}: {event.text}")
+
+    def poll(self) -> None:
+        """Notes the answers that have arrived."""
+        while self.unanswered and self.unanswered[0][1].done():
+            update, request = self.unanswered.popleft()
+            if request.cancelled():
+                continue
+            error = request.exception()
+            reply = None if error else request.result()
+            if reply is None or (not reply.accepted and reply.data.get("again") is True):
+                why = str(error) if reply is None else in_words(reply)
+                self._note(update, update.verdict, why)
+            elif reply.accepted:
+                cycle, number = reply.data.get("cycle"), reply.data.get("number")
+                update.cycle = cycle if type(cycle) is int else None
+                update.acceptance = number if type(number) is int else None
+                self._note(update, "accepted", in_words(reply))
+            else:
+                self._note(update, "refused", reply.text)
+
+    def wait(self) -> None:
+        """Waits for the answer that is missing, and notes it."""
+        self._thread.shutdown(wait=True, cancel_futures=True)
+        self.poll()
+
+    def _send(self, update: UpdateRecord) -> None:
+        def call() -> Reply:
+            data = read_whole(self._journal.folder / update.file, "weights file", MAX_BYTES)
+            return send_weights(self._session, self._car, data)
+
+        if not self.closed:
+            self.unanswered.append((update, self._thread.submit(call)))
+
+    def _note(self, update: UpdateRecord, verdict: Verdict, answer: str) -> None:
+        if update.verdict != "rolled back":  # that event may come before the answer
+            update.verdict, update.answer = verdict, answer
+            self._journal.save()
+        self._say(f"{update.version}: {'refused: ' if verdict == 'refused' else ''}{answer}")

@@ -1,0 +1,126 @@
+"""What a learning job did: a table on the terminal, and lap time against lap number."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from operation.analysis.results import read_result
+from operation.learn.records import LapRecord, Record, UpdateRecord
+from operation.report.canvas import write_png
+from operation.report.style import INK, MUTED, WARNING, figure_style, look
+from operation.terminal.terminal import Terminal
+
+__all__ = ["References", "draw", "print_laps", "references"]
+
+References = Mapping[str, float]
+"""Controller to flying lap time [s], drawn for comparison."""
+
+_MOST_ROWS: Final = 40
+
+
+def print_laps(record: Record, console: Console | None = None) -> None:
+    """Prints a row for each of the last laps, with the update that followed it."""
+    console = console or Terminal()
+    updates = {update.after_lap: update for update in record.updates}
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False)
+    for title in ("lap", "time\ns", "new", "of", "in\ns"):
+        table.add_column(title, justify="right", no_wrap=True)
+    for title in ("weights", "controller"):
+        table.add_column(title, no_wrap=True)
+    if 0 in updates:
+        table.add_row("–", "", "", *_cells(updates[0]))
+    for lap in record.laps[-_MOST_ROWS:]:
+        table.add_row(str(lap.lap), _time(lap), str(lap.samples), *_cells(updates.get(lap.lap)))
+    if len(record.laps) > _MOST_ROWS:
+        console.print(Text(f"the last {_MOST_ROWS} of {len(record.laps)} laps"))
+    console.print(table)
+    notes = ["new: samples of the lap; of: samples learned from; in: training time"]
+    if any(not lap.flying or lap.off_track_m for lap in record.laps):
+        notes.append("*: from rest; !: off the track")
+    if any(update.verdict == "pending" for update in record.updates):
+        notes.append("pending: no controller has accepted or refused; sent when the job resumes")
+    for note in (*notes, *(f"nothing to learn from: {remark}" for remark in record.remarks)):
+        console.print(Text(note))
+
+
+def _time(lap: LapRecord) -> str:
+    if lap.time_s is None:
+        return "–"
+    return f"{lap.time_s:.3f}" + ("" if lap.flying else "*") + ("!" if lap.off_track_m else "")
+
+
+def _cells(update: UpdateRecord | None) -> list[str]:
+    if update is None:
+        return [""] * 4
+    cycle = "" if update.cycle is None else f", cycle {update.cycle}"
+    learned = [str(update.samples), f"{update.training_s:.1f}"] if update.samples else ["", ""]
+    return [*learned, update.version, update.verdict + cycle]
+
+
+def references(race: Path | None) -> References:
+    """Flying lap times of a race, from its run directory; InputError if it is none."""
+    laps = [] if race is None else read_result(race / "result.json").laps
+    found = {lap.controller: lap.flying_lap_time_s for lap in laps}
+    return {controller: time_s for controller, time_s in found.items() if time_s is not None}
+
+
+def draw(record: Record, beside: References, path: Path) -> None:
+    """Writes the figure (PNG), whole or not at all; none without a timed lap.
+
+    A line joins flying laps; the weights are at the lower edge, between the laps. A lap that takes
+    far longer than the others is at the upper edge, with its time as a text.
+    """
+    laps = [(lap, lap.time_s) for lap in record.laps if lap.time_s is not None]
+    if not laps:
+        return
+    shown = [*([time_s for lap, time_s in laps if lap.flying] or [laps[0][1]]), *beside.values()]
+    usual = [time_s for time_s in shown if time_s <= 1.25 * float(np.median(shown))]
+    top = max(usual) + max(0.3 * (max(usual) - min(usual)), 0.006 * max(usual))
+    with figure_style():
+        figure = Figure(figsize=(7.2, 3.8))
+        axes = figure.add_subplot(xlabel="lap", ylabel="lap time [s]")
+        axes.set_title("Lap time while learning")
+        line = [(lap.lap, time_s) for lap, time_s in laps if lap.flying and time_s <= top]
+        axes.plot(*np.array(line).reshape(-1, 2).T, color=INK, linewidth=1)
+        for label, colour, fill, these in (
+            ("flying lap", INK, INK, [one for one in laps if one[0].flying]),
+            ("from rest", MUTED, "white", [one for one in laps if not one[0].flying]),
+            ("off the track", WARNING, "none", [one for one in laps if one[0].off_track_m]),
+        ):
+            dots = np.array([(lap.lap, min(time_s, top)) for lap, time_s in these]).reshape(-1, 2)
+            axes.plot(
+                *dots.T, "o", markersize=4.5, markeredgecolor=colour, markerfacecolor=fill,
+                label=label if these else None,
+            )  # fmt: skip
+        for lap, time_s in laps:
+            if time_s > top:
+                axes.annotate(f"↑ {time_s:.2f} s\n", (lap.lap, top), ha="center", fontsize=6.5)
+        green = look("bayesrace-updated").colour
+        for label, marker, colour, verdicts in (
+            ("new weights taken over", "|", green, {"accepted"}),
+            ("refused or rolled back", "x", WARNING, {"refused", "rolled back"}),
+        ):
+            at = [one.after_lap + 0.5 for one in record.updates if one.verdict in verdicts]
+            axes.plot(
+                at, [0.0] * len(at), marker, markersize=8, color=colour, clip_on=False,
+                transform=axes.get_xaxis_transform(), label=label if at else None,
+            )  # fmt: skip
+        for controller, time_s in beside.items():
+            style = look(controller)
+            label = f"{style.name} {time_s:.3f} s"
+            axes.axhline(time_s, color=style.colour, linewidth=1, linestyle="--", label=label)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
+        axes.ticklabel_format(axis="y", useOffset=False)
+        axes.set_xlim(0.4, len(record.laps) + 0.6)
+        axes.margins(y=0.12)
+        figure.legend(loc="lower center", ncols=4, fontsize=7)
+        figure.subplots_adjust(left=0.1, right=0.98, top=0.9, bottom=0.26)
+        write_png(figure, path)

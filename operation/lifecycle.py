@@ -1,0 +1,198 @@
+"""Operating running cars: finding them, their status, stop and go, and the router."""
+
+import logging
+import queue
+import time
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any, Final, Literal, NamedTuple
+
+from bayesrace.errors import InputError
+from bayesrace.interrupts import catching_signals
+from bayesrace.messages import (
+    ALIVE,
+    COMMAND,
+    HEARTBEAT,
+    STATUS,
+    STOP,
+    Command,
+    Message,
+    Reply,
+    StatusRequest,
+    StopRequest,
+    car_key,
+    is_car_name,
+)
+from bayesrace.transport import Endpoints, Inbox, Kind, ask_all, decisive, open_session
+from operation.analysis.picture import SOURCES, Picture, Process
+
+__all__ = ["Action", "Found", "ask_statuses", "command", "find", "follow", "pick", "route"]
+
+_log = logging.getLogger("bayesrace.router")
+
+Found = Mapping[str, Collection[str]]
+"""Name of a car to its processes whose liveliness token is present."""
+
+Action = Literal["stop", "go", "end"]
+
+_DECLARATIONS_S: Final = 0.1
+"""Time that declarations take to arrive after the last link is up."""
+
+
+def find(
+    session: Any,
+    endpoints: Endpoints,
+    timeout_s: float,
+    name: str = "",
+    sources: Collection[str] = SOURCES,
+) -> Found:
+    """Cars in the network with their present processes.
+
+    Returns when the named car's ``sources`` are found, or all endpoints are connected and their
+    processes known, or with what there is after the timeout. Raises InputError if that is nothing,
+    or nothing of the named car.
+    """
+    key = ALIVE.format(car="*", source="*") if not name else car_key(ALIVE, name, "*")
+    deadline = time.monotonic() + timeout_s
+    complete_s: float | None = None
+    while True:
+        found = _tokens(session, key, timeout_s)
+        now_s = time.monotonic()
+        if name and set(sources) <= set(found.get(name, ())):
+            return found
+        if _connected(session) < len(endpoints.connect):
+            complete_s = None
+        elif complete_s is None:
+            complete_s = now_s + _DECLARATIONS_S
+        if now_s >= deadline or (complete_s is not None and found and now_s >= complete_s):
+            break
+        time.sleep(0.02)
+    if not found:
+        raise _not_found(session, endpoints, timeout_s, name)
+    return found
+
+
+def _connected(session: Any) -> int:
+    return len(list(session.info.peers_zid())) + len(list(session.info.routers_zid()))
+
+
+def _tokens(session: Any, key: str, timeout_s: float) -> dict[str, set[str]]:
+    found: dict[str, set[str]] = {}
+    for reply in session.liveliness().get(key, timeout=timeout_s):
+        if reply.ok is not None and (place := _place(str(reply.ok.key_expr))):
+            found.setdefault(place.car, set()).add(place.source)
+    return found
+
+
+class _Place(NamedTuple):
+    car: str
+    source: str
+
+
+def _place(key: str) -> _Place | None:
+    """Car and source of the key of a token or heartbeat; None if the table has no such process."""
+    parts = key.split("/")
+    known = len(parts) == 4 and is_car_name(parts[1]) and parts[3] in SOURCES
+    return _Place(parts[1], parts[3]) if known else None
+
+
+def _not_found(session: Any, endpoints: Endpoints, timeout_s: float, name: str) -> InputError:
+    where = ", ".join(endpoints.connect)
+    remedy = (
+        "start 'bayesrace plant' and 'bayesrace controller', or give their endpoints (--endpoint)"
+    )
+    if not _connected(session):
+        return InputError(f"no connection to {where} within {timeout_s:g} s; {remedy}")
+    others = sorted(_tokens(session, ALIVE.format(car="*", source="*"), timeout_s)) if name else []
+    if others:
+        return InputError(f"no car '{name}' at {where}; cars found: {', '.join(others)}")
+    return InputError(f"no car at {where}, though another process listens there; {remedy}")
+
+
+def ask_statuses(session: Any, found: Found, timeout_s: float) -> Picture:
+    """The status of each process, those included that do not answer in time."""
+    places = {
+        car_key(STATUS.key, car, source): _Place(car, source)
+        for car, sources in found.items()
+        for source in sources
+    }
+    request = StatusRequest(0, time.monotonic_ns())
+    picture = Picture({})
+    for key, answers in ask_all(session, STATUS, places, request, timeout_s).items():
+        status = answers.valid[0] if answers.valid else None
+        fault = "" if status else answers.fault or f"no answer within {timeout_s:g} s"
+        picture.put(*places[key], Process(status, fault, answers.count))
+    return Picture(picture.cars)
+
+
+def pick(found: Found, name: str, everybody: bool, source: str = "controller") -> list[str]:
+    """The cars to command: the named one, all, or the only one; InputError if that is unclear."""
+    cars = sorted(car for car, sources in found.items() if source in sources)
+    if not cars:
+        other = "plant" if source == "controller" else "controller"
+        raise InputError(
+            f"no {source} found, only the {other} of {', '.join(sorted(found))}; "
+            f"start 'bayesrace {source}', or give its endpoint (--endpoint)"
+        )
+    if name or everybody or len(cars) == 1:
+        return cars
+    raise InputError(f"several cars found: {', '.join(cars)}; choose one with --name")
+
+
+def command(
+    session: Any, cars: Collection[str], action: Action, text: str, timeout_s: float
+) -> dict[str, Reply | str]:
+    """Command the controllers of these cars, all at once: each one's reply, or why there is none.
+
+    "end" ends the current runs of their plants. ``text``: the reason.
+    """
+    now_ns = time.monotonic_ns()
+    request: Message = (
+        StopRequest(0, now_ns, text) if action == "end" else Command(0, now_ns, action, text)
+    )
+    service: Any = STOP if action == "end" else COMMAND
+    keys = {car_key(service.key, car): car for car in cars}
+    return {
+        keys[key]: decisive(answers.valid) or answers.fault or f"no answer within {timeout_s:g} s"
+        for key, answers in ask_all(session, service, keys, request, timeout_s).items()
+    }
+
+
+def follow(session: Any, picture: Picture, name: str, period_s: float) -> Iterator[str | None]:
+    """Updates the picture from heartbeats and tokens, of one car or all (""), until a signal.
+
+    Yields the car's name after each heartbeat, and None each ``period_s``. For the main thread.
+    """
+    inbox, due_s = Inbox(session, name or None), 0.0
+    decoder = inbox.subscribe(HEARTBEAT)
+    inbox.watch()
+    with inbox.receive_signals():
+        while True:
+            if (now_s := time.monotonic()) >= due_s:
+                picture.expire(now_s)
+                yield None
+                # After a slow display there is still time to receive.
+                due_s = time.monotonic() + period_s
+            item = inbox.get(max(due_s - time.monotonic(), 0.001))
+            if item is None:
+                continue
+            if item.kind is Kind.SIGNAL:
+                return
+            place = _place(item.key)
+            if place is None:
+                continue
+            if item.kind is Kind.MESSAGE:
+                fault = "" if item.value else decoder.last_reason
+                picture.put(*place, Process(item.value, fault, 1))
+                yield place.car
+            elif item.kind is Kind.GONE:
+                picture.put(*place, None)
+            elif place.source not in picture.cars.get(place.car, {}):
+                picture.put(*place, Process(None, "no heartbeat yet"))
+
+
+def route(endpoints: Endpoints) -> None:
+    """Forward between all that connect to this process, until SIGINT or SIGTERM."""
+    signals: queue.SimpleQueue[int] = queue.SimpleQueue()
+    with catching_signals(signals.put), open_session(endpoints):
+        _log.info("router on %s", ", ".join(endpoints.listen))
+        signals.get()

@@ -1,0 +1,267 @@
+"""What is made before anything can be driven: racing lines, training drive, weights, controllers.
+
+Each depends on settings, files and code alone, is kept in the cache under a digest of all of them,
+and is made only if it is not there. ``race``, ``bench`` and ``latency`` prepare by :func:`prepare`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final, Literal
+
+from bayesrace.cache import cache_folder, digest, kept, software
+from bayesrace.cpu import cpu_identity
+from bayesrace.errors import InputError
+from bayesrace.files import read_whole, replacing
+from bayesrace.gp.weights import GpWeights, encode_weights, read_weights, write_weights
+from bayesrace.integrators import Discretisation
+from bayesrace.log import LogReader
+from bayesrace.messages import STATE, TELEMETRY
+from bayesrace.raceline import RaceLine, RaceLineSettings, read_raceline
+from bayesrace.raceline.cached import raceline_file, racing_line
+from bayesrace.tracks import Track, load_track, write_track
+from bayesrace.vehicles import CarParameters
+from codegen.build import build
+from codegen.compiler import find_compiler
+from codegen.settings import BuildSettings
+from learning.dataset import Dataset
+from learning.logs import dataset_from_messages, fallback_cycles
+from learning.training import Progress, TrainingSettings, train
+from operation.collect import collect
+from operation.settings import PreparationSettings
+from operation.terminal.progress import Stages
+from plant.simulator import PLANT
+from plant.vehicle import open_vehicle
+
+__all__ = [
+    "Course",
+    "Prepared",
+    "Training",
+    "prepare",
+    "trained_weights",
+    "training_drive",
+    "training_samples",
+    "training_settings",
+]
+
+_WEIGHTS_SOURCES: Final = (
+    "bayesrace/vehicles",
+    "bayesrace/integrators.py",
+    "bayesrace/gp",
+    "learning",
+)
+_DRIVE_SOURCES: Final = (
+    "bayesrace/vehicles",
+    "bayesrace/integrators.py",
+    "bayesrace/log.py",
+    "bayesrace/messages",
+    "bayesrace/tracks",
+    "controller",
+    "controller/native",
+    "plant",
+    "plant/fmu",
+    "operation/closed_loop.py",
+    "operation/collect.py",
+    "operation/drive.py",
+)
+
+_TRACK: Final = "race.csv"
+
+_LARGEST_FMU: Final = 1 << 30
+
+PredictionModel = Literal["e_kinematic", "dynamic"]
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """A track with its racing line, and the files that processes read them from."""
+
+    track: Track
+    line: RaceLine
+    track_file: Path
+    line_file: Path
+
+
+@dataclass(frozen=True, eq=False)
+class Training:
+    """The training drive, and what can be learned from it."""
+
+    course: Course
+    log: Path
+    samples: Dataset
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """What plant and controller are started with."""
+
+    courses: tuple[Course, ...]
+    """In the order of the tracks."""
+    training: Training | None
+    """None where weights were given."""
+    weights: Path
+    artefacts: tuple[Path, ...]
+    """In the order of the models."""
+
+    @property
+    def course(self) -> Course:
+        """The first one."""
+        return self.courses[0]
+
+    @property
+    def arguments(self) -> list[str]:
+        """What ``bayesrace controller`` is started with on the first course."""
+        return [
+            "--artefact", str(self.artefacts[0]), "--track", str(self.course.track_file),
+            "--raceline", str(self.course.line_file), "--weights", str(self.weights),
+        ]  # fmt: skip
+
+
+def prepare(
+    settings: PreparationSettings,
+    tracks: Sequence[str],
+    stages: Stages,
+    models: Sequence[PredictionModel] = ("e_kinematic",),
+    raceline: Path | None = None,
+    weights: Path | None = None,
+    artefact: Path | None = None,
+) -> Prepared:
+    """Everything that is needed to drive on ``tracks`` by controllers that predict with ``models``,
+    made or taken from the cache, but for the files that are given.
+
+    Raises InputError for a track or car that cannot be used, RaceLineError, CompileError, and
+    FmuFault if the FMU fails in the training drive.
+    """
+    if artefact is None:
+        find_compiler()  # what is missing is reported now, not after the training
+    car = settings.driven_car
+    driven_on = [load_track(name, car.width_m) for name in tracks]
+    training = None
+    if weights is None:
+        train_track = load_track(settings.train_track, car.width_m)
+        with stages.stage(f"racing line, {train_track.name}"):
+            training_course = _course(train_track, car, settings.raceline)
+    courses = []
+    for track in driven_on:
+        with stages.stage(f"racing line, {track.name}"):
+            courses.append(_course(track, car, settings.raceline, raceline))
+    artefacts = [] if artefact is None else [artefact]
+    if artefact is None:
+        with stages.stage("build the controllers"):
+            artefacts = [_artefact(settings, model) for model in models]
+    if weights is None:
+        with stages.stage("training drive (pure pursuit)"):
+            training = training_drive(training_course, car, settings, artefacts[0])
+        with stages.stage("train the residual") as stage:
+            learned = training.samples, settings.discretisation, training_settings(settings)
+            weights = trained_weights(*learned, progress=stage.update)
+    return Prepared(tuple(courses), training, weights, tuple(artefacts))
+
+
+def _course(
+    track: Track, car: CarParameters, settings: RaceLineSettings, line_file: Path | None = None
+) -> Course:
+    """The racing line computed, from the cache, or from the file that is given."""
+    cached = raceline_file(track, car, settings)
+    line = racing_line(track, car, settings) if line_file is None else read_raceline(line_file)
+    track_file = cached.with_name(_TRACK)
+    track_file.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(track_file) as partial:
+        write_track(partial, track)
+    return Course(track, line, track_file, line_file or cached)
+
+
+def training_drive(
+    course: Course, car: CarParameters, settings: PreparationSettings, artefact: Path
+) -> Training:
+    """The pure-pursuit drive, from the cache if it is there; its log is like a race's.
+
+    ``artefact``: a controller built for the car, whose control cycle drives.
+    Raises InputError for an FMU or map that cannot be used, FmuFault if the FMU fails.
+    """
+    pursuit = settings.pursuit.model_copy(update={"seed": settings.seed})
+    files = [path for path in (settings.fmu, settings.fmu_map) if path is not None]
+    columns = "s_m", "x_m", "y_m", "vx_mps"
+    track = course.track
+    identity = digest(
+        [
+            track.name,
+            *(getattr(course.line, name).tobytes() for name in columns),
+            *(getattr(track, name).tobytes() for name in columns[1:3]),
+            track.width_right_m.tobytes(),
+            track.width_left_m.tobytes(),
+            car.model_dump_json(),
+            pursuit.model_dump_json(),
+            f"{settings.drive_s!r} {settings.start_speed_mps!r} {len(files)}",
+            *(read_whole(path, "the FMU or its map", _LARGEST_FMU) for path in files),
+            cpu_identity(),
+            *software(_DRIVE_SOURCES, ("casadi", "mcap", "numpy")),
+        ]
+    )
+    path = cache_folder() / f"drive-{identity}.mcap"
+
+    def make(partial: Path) -> None:
+        with open_vehicle(car, settings.fmu, settings.fmu_map, 1 / PLANT.step_s) as vehicle:
+            collect(
+                track, course.line, car, artefact, partial, settings.drive_s, pursuit,
+                settings.start_speed_mps, vehicle,
+            )  # fmt: skip
+
+    def read(log: Path) -> Dataset:
+        reader = LogReader(log)
+        states = reader.select(STATE)
+        if reader.truncated or reader.refused:
+            raise InputError(f"{log} is damaged")
+        fallback = fallback_cycles(reader.select(TELEMETRY))
+        return dataset_from_messages(states, fallback, car, settings.discretisation.step_s)
+
+    return Training(course, path, kept(path, make, read))
+
+
+def training_settings(settings: PreparationSettings) -> TrainingSettings:
+    """How weights are learned."""
+    return TrainingSettings(capacity=settings.points, seed=settings.seed)
+
+
+def training_samples(settings: PreparationSettings) -> Dataset:
+    """Those of the training drive alone."""
+    car = settings.driven_car
+    course = _course(load_track(settings.train_track, car.width_m), car, settings.raceline)
+    artefact = _artefact(settings, "e_kinematic")
+    return training_drive(course, car, settings, artefact).samples
+
+
+def trained_weights(
+    samples: Dataset,
+    discretisation: Discretisation,
+    settings: TrainingSettings,
+    initial: GpWeights | None = None,
+    progress: Progress | None = None,
+) -> Path:
+    """File of what :func:`train` returns; trained only if these arguments are new."""
+    identity = digest(
+        [
+            samples.digest(),
+            discretisation.model_dump_json(),
+            settings.model_dump_json(),
+            b"" if initial is None else encode_weights(replace(initial, created_utc_ns=0)),
+            cpu_identity(),
+            *software(_WEIGHTS_SOURCES, ("casadi", "numpy", "scipy", "scikit-learn")),
+        ]
+    )
+    path = cache_folder() / f"weights-{identity}.bin"
+
+    def make(partial: Path) -> None:
+        weights = train(samples, discretisation, settings, initial, progress)
+        write_weights(partial, weights)
+
+    kept(path, make, read_weights)
+    return path
+
+
+def _artefact(settings: PreparationSettings, model: PredictionModel) -> Path:
+    """Folder of the controller that predicts with this model."""
+    wanted = BuildSettings(car=settings.driven_car, discretisation=settings.discretisation)
+    if model == "dynamic":
+        wanted = BuildSettings.best_case(settings.driven_car)
+    return build(wanted)[0]

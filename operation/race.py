@@ -1,0 +1,236 @@
+"""The whole chain: racing lines, training drive, GP, controllers, and the laps of the paper.
+
+Plant and controller are processes of their own, started as a person would start them; this one
+directs, records everything that is said on the network, and hands over weights.
+"""
+
+import shutil
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+from bayesrace.errors import InputError
+from bayesrace.files import write_whole
+from bayesrace.gp.weights import read_weights
+from bayesrace.manifest import MANIFEST
+from bayesrace.recorder import Recorder
+from bayesrace.tracks import load_track
+from bayesrace.vehicles import write_car
+from codegen.compiler import find_compiler
+from learning.dataset import Dataset, concatenate
+from learning.logs import dataset_from_log
+from operation.drive import RunPlan
+from operation.preparation import (
+    Course,
+    PredictionModel,
+    Prepared,
+    prepare,
+    trained_weights,
+    training_settings,
+)
+from operation.settings import RaceSettings
+from operation.system import System, started_system
+from operation.terminal.progress import Stage, Stages
+from plant.fmu.faults import FmuFault
+from plant.simulator import PLANT
+from plant.vehicle import open_vehicle
+
+__all__ = ["FILES", "RaceError", "race"]
+
+_MODELS: Final[tuple[PredictionModel, ...]] = ("e_kinematic", "dynamic")
+"""Of BayesRace and of BestCase."""
+
+
+class RaceError(RuntimeError):
+    """The race could not be driven to its end; the message says why. The log is readable."""
+
+
+@dataclass(frozen=True)
+class _Files:
+    """Names in the run directory."""
+
+    settings: str = "settings.json"
+    car: str = "car.toml"
+    log: str = "run.mcap"
+    collect_log: str = "collect.mcap"
+    result: str = "result.json"
+    weights: str = "weights-bayesrace.bin"
+    weights_updated: str = "weights-updated.bin"
+    mpc: str = "mpc.json"
+    fmu: str = "car.fmu"
+    fmu_map: str = "car-map.toml"
+
+
+FILES: Final = _Files()
+
+
+class _Race:
+    def __init__(self, settings: RaceSettings, out: Path, stages: Stages) -> None:
+        self.settings, self.out, self.stages = settings, out, stages
+        self.car = settings.driven_car
+        self._run = 0
+
+    # Preparation -------------------------------------------------------------------------------
+
+    def prepare(self) -> Prepared:
+        """Everything made, or taken from the cache; copies in the run directory."""
+        fmu, fmu_map = self.fmu_files
+        settings = self.settings.model_copy(update={"fmu": fmu, "fmu_map": fmu_map})
+        with _faults_named():
+            prepared = prepare(settings, (settings.track,), self.stages, _MODELS)
+        if prepared.training is not None:
+            self._keep_course(prepared.training.course, "train")
+            shutil.copyfile(prepared.training.log, self.out / FILES.collect_log)
+        course = self._keep_course(prepared.course, "race")
+        for model, folder in zip(_MODELS, prepared.artefacts, strict=True):
+            shutil.copyfile(folder / MANIFEST, self.out / f"manifest-{model}.json")
+        shutil.copyfile(prepared.weights, self.out / FILES.weights)
+        return replace(prepared, courses=(course,), weights=self.out / FILES.weights)
+
+    def _keep_course(self, course: Course, label: str) -> Course:
+        files = self.out / f"{label}.csv", self.out / f"{label}_raceline.csv"
+        shutil.copyfile(course.track_file, files[0])
+        shutil.copyfile(course.line_file, files[1])
+        return Course(course.track, course.line, *files)
+
+    def keep_fmu(self) -> None:
+        """Copies FMU and map, if there are any, into the run directory, and tries them."""
+        settings = self.settings
+        for source, target in zip((settings.fmu, settings.fmu_map), self.fmu_files, strict=True):
+            if source is not None and target is not None:
+                shutil.copyfile(source, target)
+        # An FMU that cannot be the car is reported now, not in half a minute.
+        with _faults_named(), open_vehicle(self.car, *self.fmu_files, 1 / PLANT.step_s):
+            pass
+
+    @property
+    def car_file(self) -> str:
+        """The car, as the processes read it."""
+        return str(self.out / FILES.car)
+
+    @property
+    def fmu_files(self) -> tuple[Path | None, Path | None]:
+        """FMU and map in the run directory; None for what there is not."""
+        settings = self.settings
+        return (
+            None if settings.fmu is None else self.out / FILES.fmu,
+            None if settings.fmu_map is None else self.out / FILES.fmu_map,
+        )
+
+    @property
+    def plant_options(self) -> list[str]:
+        """Of ``bayesrace plant``."""
+        files = zip(("--fmu", "--map"), self.fmu_files, strict=True)
+        return ["--car", self.car_file, *(str(one) for pair in files if pair[1] for one in pair)]
+
+    @property
+    def both_options(self) -> list[str]:
+        """Of plant and controller: a link in lockstep needs no priorities."""
+        return ["--low-latency"] if self.settings.mode == "lockstep" else []
+
+    def update(self, prepared: Prepared, lap: Dataset, stage: Stage) -> Path:
+        """Weights learned from training drive and lap, beginning with those of the lap."""
+        settings = self.settings
+        samples = [lap] if prepared.training is None else [prepared.training.samples, lap]
+        weights = trained_weights(
+            concatenate(samples),
+            settings.discretisation,
+            training_settings(settings),
+            read_weights(prepared.weights),
+            stage.update,
+        )
+        return Path(shutil.copyfile(weights, self.out / FILES.weights_updated))
+
+    # Driving -----------------------------------------------------------------------------------
+
+    def plan(self, controller: str, course: Course) -> RunPlan:
+        """The next run."""
+        self._run += 1
+        settings = self.settings
+        limit_s = settings.time_limit * course.line.lap_time_s * settings.laps + 2.0
+        lockstep = settings.mode == "lockstep"
+        return RunPlan(
+            self._run, controller, settings.laps, limit_s, lockstep, settings.start_speed_mps
+        )
+
+
+@contextmanager
+def _faults_named(fault: type[Exception] = FmuFault) -> Iterator[None]:
+    """Turns a fault, of the FMU or of a run, into the reason why there is no race."""
+    try:
+        yield
+    except fault as error:
+        raise RaceError(str(error)) from error
+
+
+class _Drives:
+    """The runs of a race, driven and recorded one after the other."""
+
+    def __init__(self, race: _Race, course: Course, system: System, recorder: Recorder) -> None:
+        self._race, self._course = race, course
+        self._system, self._recorder = system, recorder
+
+    def controller(self, artefact: Path, name: str) -> AbstractContextManager[None]:
+        """A controller process for the block; ready for its first run."""
+        race, course = self._race, self._course
+        settings_file = race.out / FILES.mpc
+        write_whole(settings_file, race.settings.mpc.model_dump_json(indent=1) + "\n")
+        options = [
+            "--car", race.car_file, "--artefact", str(artefact), "--track", str(course.track_file),
+            "--raceline", str(course.line_file), "--settings", str(settings_file),
+        ]  # fmt: skip
+        return self._system.controller(options, f"controller-{name}.log")
+
+    def drive(self, controller: str, weights: Path | None = None) -> RunPlan:
+        """One run, with new weights first if there are any; InputError if it broke off."""
+        if weights is not None:
+            self._system.director.send_weights(weights.read_bytes())
+        plan = self._race.plan(controller, self._course)
+        self._system.drive(self._course.track, plan, self._recorder)
+        return plan
+
+    def samples(self, plan: RunPlan) -> Dataset:
+        """What can be learned from a run, from the log."""
+        self._recorder.settle(at_most_s=20.0)  # the next stage reads the log
+        step_s = self._race.settings.discretisation.step_s
+        return dataset_from_log(self._race.out / FILES.log, self._race.car, step_s, (plan.run,))
+
+
+def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
+    """Drives WorstCase, BayesRace, BayesRace-updated and BestCase; leaves everything in ``out``.
+
+    Raises InputError for unusable settings, RaceError when a process is lost (the log stays
+    readable), KeyboardInterrupt on Ctrl-C; no process outlives the call.
+    """
+    if (out / FILES.log).exists():
+        raise InputError(f"{out} holds a run already; choose another folder or remove it")
+    find_compiler()  # what is missing is reported now, before there is a run directory
+    this = _Race(settings, out, stages)
+    for name in (settings.train_track, settings.track):
+        load_track(name, this.car.width_m)
+    out.mkdir(parents=True, exist_ok=True)
+    this.keep_fmu()
+    write_car(this.car_file, this.car)
+    write_whole(out / FILES.settings, settings.model_dump_json(indent=1) + "\n")
+    prepared = this.prepare()
+    artefact, perfect = prepared.artefacts
+    about = {"race": {"settings": settings.model_dump_json()}}
+    with (
+        _faults_named(InputError),
+        started_system(this.car.name, out, this.plant_options, this.both_options) as system,
+        Recorder(system.session, this.car.name, out / FILES.log, about) as recorder,
+    ):
+        drives = _Drives(this, prepared.course, system, recorder)
+        with drives.controller(artefact, "bayesrace"):
+            with stages.stage("drive WorstCase"):
+                drives.drive("worstcase")
+            with stages.stage("drive BayesRace"):
+                driven = drives.drive("bayesrace", prepared.weights)
+            with stages.stage("update the residual") as stage:
+                updated = this.update(prepared, drives.samples(driven), stage)
+            with stages.stage("drive BayesRace-updated"):
+                drives.drive("bayesrace-updated", updated)
+        with drives.controller(perfect, "bestcase"), stages.stage("drive BestCase"):
+            drives.drive("bestcase")

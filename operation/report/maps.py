@@ -1,0 +1,134 @@
+"""Laps drawn on the track: by speed, or by where they gain and lose time on the reference lap."""
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Colormap, Normalize
+from matplotlib.figure import Figure
+
+from bayesrace.arrays import Floats
+from bayesrace.raceline import RaceLine
+from bayesrace.tracks import Track
+from operation.analysis.race import DrivenRun
+from operation.report.canvas import PANEL_WIDTH
+from operation.report.laps import Lap, first_laps, reference_of
+from operation.report.style import INK, MUTED, SURFACE, WARNING, gain_map, look, speed_map
+
+__all__ = ["LapMaps", "draw_edges"]
+
+
+_MARGIN_M: Final = 0.12
+
+
+class _Shade(NamedTuple):
+    """A quantity by which a lap is coloured."""
+
+    values: Floats
+    norm: Normalize
+    colours: Colormap
+    label: str
+
+
+class LapMaps:
+    """The first lap of each run on the track, later laps as a thin line.
+
+    A lap that finished is coloured by the time that it loses on each metre to the reference lap;
+    the reference itself, and a run without a lap, by speed. Off-track samples are those that the
+    result table counts; a run without a lap is shown until the car left out a piece of the track.
+    """
+
+    def __init__(self, runs: Sequence[DrivenRun], track: Track, line: RaceLine) -> None:
+        self.runs, self._track, self._line = runs, track, line
+        self._edges = track.boundaries(0.04)
+        corners = np.concatenate(self._edges)
+        self._low, self._high = corners.min(axis=0) - _MARGIN_M, corners.max(axis=0) + _MARGIN_M
+        laps = {lap.run: lap for lap in first_laps(runs, track) if lap.run.finished}
+        self.reference = reference_of(list(laps.values()))
+        others = [lap for lap in laps.values() if lap is not self.reference]
+        losses = {lap.run: self._loss(lap, self.reference) for lap in others if self.reference}
+        size = np.concatenate([np.zeros(1), *(np.abs(loss) for loss in losses.values())])
+        limit = float(np.percentile(size, 95)) or 1.0
+        top = [float(np.max(run.record.x[run.counted, 3], initial=0.0)) for run in runs]
+        speed = Normalize(0.0, max([*top, float(line.vx_mps.max())]))
+        self._shades = {
+            run: _Shade(losses[run], Normalize(-limit, limit), gain_map(), "time lost [ms/m]")
+            if run in losses
+            else _Shade(run.record.x[run.shown(), 3], speed, speed_map(), "speed vx [m/s]")
+            for run in runs
+        }
+
+    @staticmethod
+    def _loss(lap: Lap, reference: Lap) -> Floats:
+        """Time lost on each metre at the samples of a lap [ms/m]."""
+        s, behind_s = lap.behind(reference)
+        return np.interp(lap.s_m, s, 1e3 * np.gradient(behind_s, s))
+
+    def figures(self) -> list[Figure]:
+        """A figure for each run, with its scale."""
+        return [self._figure([run], 1) for run in self.runs]
+
+    def picture(self) -> Figure:
+        """All runs in one figure."""
+        return self._figure(self.runs, 1 if len(self.runs) == 1 else 2)
+
+    def _figure(self, runs: Sequence[DrivenRun], columns: int) -> Figure:
+        rows = max(1, -(-len(runs) // columns))
+        width, height = self._high - self._low
+        size = PANEL_WIDTH * columns, rows * (min((PANEL_WIDTH - 0.8) * height / width, 6.0) + 0.5)
+        figure = Figure(figsize=size, layout="constrained")
+        grid = figure.subplots(rows, columns, squeeze=False)
+        for axes in grid.flat:
+            axes.axis("off")
+        for axes, run in zip(grid.flat, runs, strict=False):
+            self._draw(axes, run)
+        return figure
+
+    def _draw(self, axes: Axes, run: DrivenRun) -> None:
+        draw_edges(axes, *self._edges)
+        path = np.concatenate([self._line.xy_m, self._line.xy_m[:1]])
+        thin = path[:: max(1, len(path) // 600)]
+        axes.plot(thin[:, 0], thin[:, 1], color=INK, linewidth=0.5, linestyle=(0, (5, 3)))
+        self._draw_start(axes)
+        counted = run.counted if run.finished else run.shown()
+        everything = run.record.x[counted]
+        axes.plot(everything[:, 0], everything[:, 1], color=MUTED, linewidth=0.6)
+        shade, points = self._shades[run], run.record.x[run.shown(), :2]
+        trace = LineCollection(
+            list(np.stack([points[:-1], points[1:]], axis=1)), cmap=shade.colours, norm=shade.norm,
+            linewidth=2.4, capstyle="round",
+        )  # fmt: skip
+        trace.set_array((shade.values[:-1] + shade.values[1:]) / 2)
+        axes.add_collection(trace)
+        off = everything[run.off_track[counted]]
+        axes.plot(off[:, 0], off[:, 1], "x", color=WARNING, markersize=3.6, zorder=5)
+        axes.set(xlim=(self._low[0], self._high[0]), ylim=(self._low[1], self._high[1]))
+        axes.set_aspect("equal")
+        scale = ScalarMappable(shade.norm, shade.colours)
+        bar = axes.figure.colorbar(scale, ax=axes, label=shade.label, shrink=0.6, pad=0.01)
+        bar.outline.set_visible(False)
+        appearance = look(run.controller)
+        time = f"{run.laps.times_s[0]:.3f} s" if run.finished else "did not finish"
+        axes.set_title(appearance.name, color=appearance.colour, fontweight="bold")
+        axes.set_title(f"{time} · {int(run.off_track.sum())} off track", loc="right", color=INK)
+
+    def _draw_start(self, axes: Axes) -> None:
+        right, left = (edge[0] for edge in self._edges)
+        axes.plot(*np.stack([right, left], axis=1), color=INK, linewidth=1.8)
+        x, y, psi = self._track.start_pose()
+        ahead = np.array([np.cos(psi), np.sin(psi)])
+        tip, tail = (x, y) + 0.28 * ahead, (x, y) + 0.03 * ahead
+        arrow = {"arrowstyle": "-|>", "color": INK, "linewidth": 0.8, "shrinkA": 0}
+        axes.annotate("", tuple(tip), tuple(tail), arrowprops=arrow, zorder=6)
+
+
+def draw_edges(axes: Axes, right: Floats, left: Floats) -> None:
+    """The track as an area between its edges, each (n, 2)."""
+    ring = np.concatenate([right, right[:1], left[:1], left[::-1]])
+    axes.fill(ring[:, 0], ring[:, 1], color=SURFACE, linewidth=0)
+    for edge in (right, left):
+        closed = np.concatenate([edge, edge[:1]])
+        axes.plot(closed[:, 0], closed[:, 1], color="#a3a39b", linewidth=0.7)

@@ -1,0 +1,156 @@
+"""The report page: figures and tables put into the template."""
+
+import contextlib
+import json
+import platform
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Final
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from matplotlib.figure import Figure
+
+from bayesrace.files import write_whole
+from operation.analysis.published import LIMIT, SOURCE, compare_gp, compare_laps
+from operation.analysis.race import RaceAnalysis, read_race
+from operation.analysis.results import RaceResult
+from operation.report.canvas import inline_svg, write_png
+from operation.report.learning import gp_figures, solve_figure
+from operation.report.maps import LapMaps
+from operation.report.style import figure_style, look
+from operation.report.traces import (
+    deviation_figures,
+    input_figures,
+    speed_figures,
+    time_figures,
+)
+from operation.terminal.notation import UNCERTAIN
+from operation.terminal.race_table import COLUMNS
+
+__all__ = ["PICTURE", "REPORT", "render_report"]
+
+REPORT: Final = "report.html"
+PICTURE: Final = "lap.png"
+
+_TEMPLATE: Final = "report.html.j2"
+_PACKAGES: Final = ("bayesrace", "casadi", "numpy", "scikit-learn", "eclipse-zenoh")
+
+
+def render_report(run_dir: Path, result: RaceResult, analysis: RaceAnalysis | None = None) -> Path:
+    """Writes ``report.html`` and ``lap.png`` into the run directory; returns the page's path.
+
+    ``result`` is what the tables show; ``analysis`` saves reading the log a second time. InputError
+    if it is no run directory.
+    """
+    run_dir = Path(run_dir)
+    analysis = analysis or read_race(run_dir)
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    page = environment.get_template(_TEMPLATE).render(
+        result=result,
+        columns=COLUMNS,
+        look=look,
+        best=result.lap("bestcase"),
+        facts=_facts(analysis, result),
+        versions=_versions(run_dir),
+        figures=_figures(analysis, run_dir / PICTURE),
+        uncertain=_uncertain(analysis),
+        period_us=round(analysis.recording.discretisation.step_s * 1e6),
+        limit_sigma=UNCERTAIN,
+        laps_compared=compare_laps(result),
+        gp_compared=compare_gp(result),
+        source=SOURCE,
+        limit=LIMIT,
+        title=f"{result.settings.track} · {analysis.track.length_m:.2f} m",
+    )
+    path = run_dir / REPORT
+    write_whole(path, page)
+    return path
+
+
+def _facts(analysis: RaceAnalysis, result: RaceResult) -> list[tuple[str, str]]:
+    summary, line = result.settings, analysis.line
+    started_ns = analysis.recording.started_ns
+    facts = [
+        ("driven", "–" if started_ns is None else _calendar(started_ns)),
+        ("car", f"{summary.car}, simulated by {summary.fmu}" if summary.fmu else summary.car),
+        ("trained on", summary.train_track),
+        ("mode", summary.mode),
+        ("seed", str(summary.seed)),
+        ("track constraints", "on" if summary.constraints else "off"),
+        ("racing line, flying", f"{line.lap_time_s:.3f} s"),
+        ("judged by", result.judged_by),
+    ]
+    if result.real_time_factor is not None:
+        facts.append(("lockstep at", f"{result.real_time_factor:.1f} × real time"))
+    return facts
+
+
+def _calendar(time_ns: int) -> str:
+    return datetime.fromtimestamp(time_ns * 1e-9, tz=UTC).strftime("%Y-%m-%d %H:%M UTC")
+
+
+def _versions(run_dir: Path) -> list[tuple[str, str]]:
+    found = [("Python", platform.python_version())]
+    for package in _PACKAGES:
+        try:
+            found.append((package, version(package)))
+        except PackageNotFoundError:  # run from a checkout that is not installed
+            continue
+    return found + _compilers(run_dir)
+
+
+def _compilers(run_dir: Path) -> list[tuple[str, str]]:
+    """What built the controllers, by the run's manifests: informative, so nothing is refused."""
+    pending: list[Any] = []
+    for path in sorted(run_dir.glob("manifest*.json"), reverse=True):
+        with contextlib.suppress(OSError, ValueError):
+            pending.append(json.loads(path.read_text(encoding="utf-8")))
+    named: dict[tuple[str, str], None] = {}
+    while pending:
+        item = pending.pop()
+        if not isinstance(item, Mapping):
+            continue
+        pending.extend(item.values())
+        if "build_hash" in item and "model" in item:
+            text = f"{str(item['build_hash'])[:12]}, {item.get('compiler', '')}"
+            named[(f"{item['model']} step", text.strip(", "))] = None
+    return list(named)
+
+
+def _uncertain(analysis: RaceAnalysis) -> list[tuple[str, int, int]]:
+    """(name of the controller, samples with a large sigma, all samples) for each GP."""
+    return [
+        (look(controller).name, int(validation.uncertain(UNCERTAIN).sum()), len(validation.sigma))
+        for controller, validation in analysis.validations.items()
+    ]
+
+
+def _figures(analysis: RaceAnalysis, picture: Path) -> dict[str, list[str]]:
+    """Name to panels as SVG; what has nothing to show is left out."""
+    runs, track, line = analysis.runs, analysis.track, analysis.line
+    driven = [run for run in runs if len(run.record.truth) > 1]
+    figures: dict[str, list[Figure]] = {}
+    with figure_style():
+        maps = LapMaps(driven, track, line)
+        write_png(maps.picture(), picture)
+        figures["laps"] = maps.figures()
+        if driven:
+            figures["time"] = time_figures(driven, track)
+            figures["speed"] = speed_figures(driven, track, line)
+            figures["inputs"] = input_figures(driven, track, analysis.recording.car)
+            figures["deviation"] = deviation_figures(driven, track)
+        data = analysis.best_case
+        if data is not None and analysis.validations:
+            progress = track.project_path(data.x[:, :2]).progress_m
+            figures["gp"] = gp_figures(analysis.validations, progress, track.length_m)
+        if any(len(run.record.solve_us) for run in driven):
+            figures["solve"] = [solve_figure(driven)]
+        return {name: [inline_svg(one) for one in some] for name, some in figures.items() if some}

@@ -1,0 +1,101 @@
+"""A plant and its controllers as processes of their own, and the session that directs them."""
+
+import os
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+from bayesrace.errors import InputError
+from bayesrace.messages import EVENT, Event
+from bayesrace.recorder import Recorder
+from bayesrace.tracks import Track
+from bayesrace.transport import Director, Endpoints, Publisher, free_endpoint, open_session
+from operation.drive import RunPlan, execute
+from operation.processes import Child, child, endings
+
+__all__ = ["System", "started_system"]
+
+_START_S: Final = 60.0
+"""Time for a process to start on a machine that is busy."""
+
+
+class System:
+    """One plant, one controller at a time, and the session that directs both."""
+
+    def __init__(
+        self, session: Any, car: str, folder: Path, endpoints: Endpoints, options: Sequence[str]
+    ) -> None:
+        """``folder`` receives the output of the processes; ``options`` are those of both."""
+        self.session = session
+        self.director = Director(session, car)
+        self.children: dict[str, Child] = {}
+        """The processes by what they are, plant and controller."""
+        self._folder, self._options = folder, list(options)
+        self._plant_endpoint, self._controller_endpoint = endpoints.connect
+        self._events: Publisher[Event] = Publisher(session, EVENT, car, "race")
+
+    @contextmanager
+    def controller(self, options: Sequence[str], log: str = "controller.log") -> Iterator[None]:
+        """A controller process for the block; it and the plant are ready for a run.
+
+        ``options`` are those of ``bayesrace controller`` beside the endpoints.
+        InputError, with the last words of a process that has ended, if they do not get ready.
+        """
+        line = [
+            "controller", *options, "--endpoint", self._plant_endpoint,
+            "--listen", self._controller_endpoint, *self._options,
+        ]  # fmt: skip
+        with child(line, self._folder / log) as process:
+            self.children["controller"] = process
+            with self.explained():
+                self._wait_for_both()
+                yield
+            del self.children["controller"]
+        self.director.wait_until_gone("controller", _START_S)
+
+    @contextmanager
+    def explained(self) -> Iterator[None]:
+        """Adds to an InputError of the block how processes of the system have ended."""
+        try:
+            yield
+        except InputError as error:
+            time.sleep(0.2)  # the system reports an end a moment after the network does
+            words = [str(error), *endings(self.children.values())]
+            raise InputError("; ".join(words)) from error
+
+    def drive(self, track: Track, plan: RunPlan, recorder: Recorder | None = None) -> Event:
+        """Drives one run to its end; see :func:`operation.drive.execute`."""
+        return execute(self.director, self._events, track, plan, recorder)
+
+    def _wait_for_both(self) -> None:
+        """Waits as long as the processes live; InputError if they are not there in time."""
+        deadline = time.monotonic() + _START_S
+        while True:
+            try:
+                return self.director.wait_for(("plant", "controller"), 0.5)
+            except InputError:
+                if endings(self.children.values()) or time.monotonic() > deadline:
+                    raise
+
+
+@contextmanager
+def started_system(
+    car: str, folder: Path, plant: Sequence[str] = (), both: Sequence[str] = ()
+) -> Iterator[System]:
+    """A running plant for the block, and the session that directs it.
+
+    ``car`` is its name in message keys, ``plant`` are options of ``bayesrace plant``, ``both``
+    those of plant and controllers. No process outlives the block, however it ends.
+    """
+    endpoints = Endpoints(connect=(free_endpoint(), free_endpoint()))
+    options = ["--parent-pid", str(os.getpid()), *both]
+    line = ["plant", *plant, "--endpoint", endpoints.connect[0], *options]
+    with ExitStack() as stack:
+        process = stack.enter_context(child(line, folder / "plant.log"))
+        session = stack.enter_context(open_session(endpoints))
+        stack.callback(process.stop)  # before the session, so that its end is seen
+        system = System(session, car, folder, endpoints, options)
+        system.children["plant"] = process
+        yield system

@@ -1,0 +1,112 @@
+"""What an FMU's model description contains, on the terminal."""
+
+import math
+from collections.abc import Iterator
+from typing import Final
+
+from rich import box
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from operation.terminal.printable import printable
+from plant.fmu.inspection import FmuDescription, Variable
+
+__all__ = ["FmuTable"]
+
+_SECTIONS: Final = {
+    "inputs": ("input",),
+    "outputs": ("output",),
+    "parameters": ("parameter", "structuralParameter", "calculatedParameter"),
+    "locals": ("local",),
+}
+_COLUMNS: Final = ("variable", "type", "unit", "start", "range", "description")
+
+
+class FmuTable:
+    """An FMU's interfaces, platforms and variables, for rich to print; inputs come first.
+
+    Local variables, of which some tools write thousands, are counted; ``all_`` lists them too.
+    """
+
+    def __init__(self, description: FmuDescription, *, all_: bool = False) -> None:
+        self._fmu, self._all = description, all_
+
+    def __rich_console__(
+        self, console: Console, options: ConsoleOptions
+    ) -> Iterator[RenderableType]:
+        yield from _head(self._fmu)
+        yield self._table()
+        hidden = sum(one.causality == "local" for one in self._fmu.variables)
+        if hidden and not self._all:
+            yield Text(f"and {hidden} local variable(s)", style="dim")
+
+    def _table(self) -> Table:
+        rows = [
+            (title, _cells(variable))
+            for title, causalities in _SECTIONS.items()
+            for variable in self._fmu.variables
+            if variable.causality in causalities and (self._all or title != "locals")
+        ]
+        titles = [title for title, _ in rows]
+        # Room goes to the names: what no variable has gets no column.
+        shown = [i for i in range(len(_COLUMNS)) if any(cells[i].plain for _, cells in rows)]
+        table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, show_edge=False)
+        table.add_column("", style="bold")
+        for i in shown:
+            right = _COLUMNS[i] == "start"
+            table.add_column(_COLUMNS[i], justify="right" if right else "left", overflow="fold")
+        for k, (title, cells) in enumerate(rows):
+            begins = titles[k - 1 : k] != [title]
+            ends = titles[k + 1 : k + 2] not in ([], [title])
+            table.add_row(title if begins else "", *(cells[i] for i in shown), end_section=ends)
+        return table
+
+
+def _head(fmu: FmuDescription) -> Iterator[Text]:
+    interfaces = " and ".join(fmu.interfaces) or "no interface"
+    version = f" · FMI {printable(fmu.fmi_version)} {interfaces}"
+    yield Text.assemble((printable(fmu.model_name), "bold"), version)
+    if fmu.description:
+        yield Text(printable(fmu.description))
+    words = [f"for {', '.join(map(printable, fmu.platforms)) or 'no platform: sources only'}"]
+    if fmu.tool:
+        words.append(f"by {printable(fmu.tool)}")
+    if fmu.default_step_s is not None:
+        words.append(f"step {fmu.default_step_s:g} s")
+    words.append("any step" if fmu.variable_step else "one fixed step")
+    if fmu.needs_tool:
+        words.append("needs the tool it comes from")
+    yield Text(" · ".join(words))
+    if not fmu.co_simulation:
+        yield Text("the plant runs Co-Simulation FMUs only: not this one", style="red")
+
+
+def _cells(variable: Variable) -> list[Text]:
+    unit = variable.unit_name or ""
+    # A unit that is not known has to be in the map.
+    style = "yellow" if unit not in ("", "-") and variable.unit is None else ""
+    return [
+        Text(printable(variable.name)),
+        Text(variable.fmi_type + ("[]" if variable.array else "")),
+        Text(printable(unit), style=style),
+        Text(_short(variable.start)),
+        Text(_range(variable)),
+        Text(printable(variable.description)),
+    ]
+
+
+def _short(start: str | None) -> str:
+    try:
+        return "–" if start is None else f"{float(start):.6g}"
+    except ValueError:
+        return printable(start or "")
+
+
+def _range(variable: Variable) -> str:
+    if variable.items:
+        return printable(", ".join(variable.items))
+    lowest, highest = variable.lowest, variable.highest
+    if math.isinf(lowest):
+        return "" if math.isinf(highest) else f"≤ {highest:g}"
+    return f"≥ {lowest:g}" if math.isinf(highest) else f"{lowest:g} … {highest:g}"

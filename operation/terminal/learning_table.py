@@ -1,0 +1,103 @@
+"""Results of training and validation on the terminal."""
+
+from collections.abc import Sequence
+
+from rich.console import Console
+from rich.text import Text
+
+from bayesrace.gp.weights import OUTPUTS, UNITS
+from learning.assessment import ChoiceScore, KernelScore
+from learning.dataset import left_out
+from operation.analysis.results import GpMetrics
+from operation.analysis.validation import Drift, HorizonResult, Spread, ValidationResult
+from operation.terminal.notation import SMOOTHNESS
+from operation.terminal.terminal import plain_table
+
+__all__ = ["print_choices", "print_kernels", "print_validation"]
+
+
+def print_kernels(scores: Sequence[KernelScore], console: Console) -> None:
+    """The paper's appendix: held-out error against the kernel's smoothness, per output."""
+    titles = [f"{output}\nRMSE {UNITS[output]}\nlog density" for output in OUTPUTS]
+    table = plain_table("kernel", "ν", *titles, padding=0)
+    found = {(score.output, score.kernel): score for score in scores}
+    for kernel, nu in SMOOTHNESS.items():
+        row = [found.get((output, kernel)) for output in OUTPUTS]
+        if any(row):
+            table.add_row(kernel, nu, *(_kernel_cell(score) for score in row))
+    console.print(Text("Kernel by smoothness, held out by parts of the drive", style="bold"))
+    console.print(table)
+    chosen = {score.output: score.kernel for score in scores if score.chosen}
+    text = ", ".join(f"{output}: {chosen[output]}" for output in OUTPUTS if output in chosen)
+    console.print(Text(f"chosen by log predictive density: {text}"))
+
+
+def _kernel_cell(score: KernelScore | None) -> Text:
+    if score is None:
+        return Text("–")
+    text = f"{score.rmse:.3g} · {score.log_density:.2f}{' ✓' if score.chosen else '  '}"
+    return Text(text, style="bold green" if score.chosen else "")
+
+
+def print_choices(scores: Sequence[ChoiceScore], console: Console) -> None:
+    """Held-out errors of chosen samples beside all; prints nothing if all of them fit."""
+    if not scores:
+        return
+    table = plain_table("output", "samples", "points", "RMSE", "log density", left=2)
+    for score in scores:
+        table.add_row(
+            f"{score.output} {UNITS[score.output]}" if score.choice == "all" else "",
+            score.choice, str(score.points), f"{score.rmse:.3g}", f"{score.log_density:.2f}",
+        )  # fmt: skip
+    title = "What choosing samples costs, held out by stretches of the track"
+    console.print(Text(title, style="bold"))
+    console.print(table)
+
+
+def print_validation(result: ValidationResult, console: Console) -> None:
+    """Metrics per output, and the drift over one step and over the horizon."""
+    counts = left_out(result.dropped)
+    console.print(
+        Text(f"{result.weights_version} on {result.samples} samples (left out: {counts})"),
+        style="bold",
+    )
+    if result.learned_from:
+        text = "the weights were learned from these very samples: expect larger errors on others"
+        console.print(Text(text, style="yellow"))
+    table = plain_table("output", "RMSE", "without GP", "R²", "coverage", "log density")
+    metrics: dict[str, GpMetrics] = {o: getattr(result, o) for o in OUTPUTS}
+    for output, one in metrics.items():
+        table.add_row(
+            f"{output} {UNITS[output]}", f"{one.rmse:.3g}", f"{one.uncorrected_rmse:.3g}",
+            f"{one.r2:.4f}", f"{one.coverage:.3f}", f"{one.log_density:.2f}",
+        )  # fmt: skip
+    console.print(table)
+    console.print(
+        Text(
+            f"largest sigma above {result.threshold:g} at {result.uncertain} of {result.samples} "
+            "samples"
+        )
+    )
+    for drift in (result.one_step, result.horizon):
+        if drift is not None:
+            _print_drift(drift, console)
+    if result.horizon is None:
+        console.print(Text("no stretch is long enough for the horizon", style="yellow"))
+
+
+def _print_drift(drift: HorizonResult, console: Console) -> None:
+    steps = "1 step" if drift.steps == 1 else f"{drift.steps} steps, open loop"
+    titles = ("nominal\nmean", "\np95", "\nmax", "corrected\nmean", "\np95", "\nmax")
+    table = plain_table("error", *titles)
+    for label, name in (
+        ("position m", "position_m"), ("heading rad", "heading_rad"), ("vx m/s", "vx_mps"),
+        ("vy m/s", "vy_mps"), ("omega rad/s", "omega_radps"),
+    ):  # fmt: skip
+        table.add_row(label, *_cells(drift.nominal, name), *_cells(drift.corrected, name))
+    console.print(Text(f"{steps} ({drift.predictions} predictions)", style="bold"))
+    console.print(table)
+
+
+def _cells(drift: Drift, name: str) -> list[str]:
+    spread: Spread = getattr(drift, name)
+    return [f"{value:.2g}" for value in (spread.mean, spread.p95, spread.max)]

@@ -1,0 +1,165 @@
+"""The result of a race on the terminal, legible from 80 columns on."""
+
+import re
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from bayesrace.gp.weights import UNITS
+from operation.analysis.published import SOURCE, compare_gp, compare_laps
+from operation.analysis.results import LapResult, RaceResult
+from operation.terminal.terminal import plain_table
+
+__all__ = ["COLUMNS", "Column", "print_table"]
+
+
+class Column(NamedTuple):
+    """One column of the result table, on the terminal and in the report."""
+
+    title: str
+    unit: str
+    cell: Callable[[LapResult], str]
+    meaning: str
+    number: bool = True
+
+
+def _decimals(value: float | None, count: int) -> str:
+    return "–" if value is None else f"{value:.{count}f}"
+
+
+def _first_lap(lap: LapResult) -> str:
+    return _decimals(lap.lap_time_s, 3) if lap.finished else "DNF"
+
+
+def _solve(name: str) -> Callable[[LapResult], str]:
+    def cell(lap: LapResult) -> str:
+        return "–" if lap.solve_us is None else f"{getattr(lap.solve_us, name):.0f}"
+
+    return cell
+
+
+def _excursion(lap: LapResult) -> str:
+    return _decimals(lap.off_track_max_m, 3) if lap.off_track_samples else "–"
+
+
+COLUMNS: Final = (
+    Column("controller", "", lambda lap: lap.controller, "name of the controller", number=False),
+    Column("lap", "s", _first_lap, "first lap, from standstill; DNF: did not finish one"),
+    Column("flying", "s", lambda lap: _decimals(lap.flying_lap_time_s, 3), "best later lap"),
+    Column(
+        "off track", "", lambda lap: str(lap.off_track_samples),
+        "samples with the centre of gravity off the track",
+    ),
+    Column("deepest", "m", _excursion, "largest distance off the track"),
+    Column(
+        "dev mean", "m", lambda lap: _decimals(lap.deviation_mean_m, 3),
+        "mean distance from the racing line",
+    ),
+    Column(
+        "dev max", "m", lambda lap: _decimals(lap.deviation_max_m, 3),
+        "largest distance from the racing line",
+    ),
+    Column("step p50", "µs", _solve("p50"), "median execution time of the control step"),
+    Column("step p99", "µs", _solve("p99"), "99th percentile of the same"),
+    Column("step max", "µs", _solve("max"), "largest of the same"),
+    Column("fall-backs", "", lambda lap: str(lap.fallbacks), "cycles that the fallback drove"),
+    Column(
+        "weights", "", lambda lap: lap.weights_version or "–",
+        "version of the residual's weights", number=False,
+    ),
+)  # fmt: skip
+"""The result table's columns; the report shows the same cells."""
+
+
+def _gp_table(result: RaceResult) -> Table:
+    """One row an output and weights: RMSE with and without the GP, R², coverage."""
+    table = plain_table("output", "GP of", "RMSE", "without GP", "R²", "95 % coverage", left=2)
+    for output in result.gp or result.gp_updated:
+        name = f"{output} {UNITS[output]}"
+        for weights, metrics in (("bayesrace", result.gp), ("updated", result.gp_updated)):
+            if one := metrics.get(output):
+                table.add_row(
+                    name, weights, f"{one.rmse:.3g}", f"{one.uncorrected_rmse:.3g}",
+                    f"{one.r2:.4f}", f"{one.coverage:.3f}",
+                )  # fmt: skip
+                name = ""
+    return table
+
+
+def print_table(result: RaceResult, console: Console) -> None:
+    """Prints one row a controller, the GP's lines, and what went wrong, if anything."""
+    summary = result.settings
+    console.print(
+        Text(
+            f"{summary.track} · {summary.car} · {summary.mode} · seed {summary.seed}"
+            f" · trained on {summary.train_track}"
+            f" · track constraints {'on' if summary.constraints else 'off'}"
+            + (f" · car played by {summary.fmu}" if summary.fmu else ""),
+            style="bold",
+        )
+    )
+    columns = [column for column in COLUMNS if column.title != "weights"]
+    heads = ("\n".join([*re.split("(?<=-)| ", c.title), c.unit]).rstrip() for c in columns)
+    table = plain_table(*heads, padding=0)
+    for lap in result.laps:
+        style = "" if lap.finished else "red"
+        table.add_row(*(Text(column.cell(lap)) for column in columns), style=style)
+    console.print(table)
+    console.print(
+        Text(
+            "lap: first, from standstill; off track: samples, and the deepest; dev: distance from "
+            "the racing line; step: time of a control step; fall-backs: cycles",
+            style="dim",
+        )
+    )
+    for lap in result.laps:
+        if lap.weights_version:
+            console.print(Text(f"{lap.controller}: weights {lap.weights_version}"))
+    _print_notes(result, console)
+
+
+def _print_published(result: RaceResult, console: Console) -> None:
+    """The paper's numbers beside ours, on its track."""
+    laps, outputs = compare_laps(result), compare_gp(result)
+    if not laps:
+        return
+    console.print(Text(f"\nBeside the paper ({SOURCE})"))
+    table = plain_table(
+        "controller", "paper\nlap s", "here\nlap s", "paper\noff track / m", "here\noff track / m"
+    )
+    for lap in laps:
+        table.add_row(lap.controller, lap.paper_lap, lap.our_lap, lap.paper_off, lap.our_off)
+    console.print(table)
+    if not outputs:
+        return
+    rmse = "RMSE (without GP) · R²"
+    table = plain_table("output", "GP of", f"paper\n{rmse}", f"here\n{rmse}", left=2)
+    for row in outputs:
+        table.add_row(row.output, "bayesrace", row.paper, row.ours)
+        table.add_row("", "updated", row.paper_updated, row.ours_updated)
+    console.print(table)
+
+
+def _print_notes(result: RaceResult, console: Console) -> None:
+    if result.gp or result.gp_updated:
+        console.print(_gp_table(result), new_line_start=True)
+    _print_published(result, console)
+    if result.real_time_factor is not None:
+        console.print(Text(f"lockstep at {result.real_time_factor:.1f} × real time"))
+    for lap in result.laps:
+        if not lap.finished:
+            console.print(Text(f"{lap.controller} did not finish: {lap.ended}", style="red"))
+        elif (count := len(lap.lap_times_s)) < result.settings.laps:
+            text = f"{lap.controller} finished {count} of {result.settings.laps} laps: {lap.ended}"
+            console.print(Text(text, style="yellow"))
+    if result.judged_by == "measurement":
+        text = "the log holds no truth: laps and GPs are judged by the measurements"
+        console.print(Text(text, style="yellow"))
+    if not result.complete:
+        lost = (
+            f"{result.gaps} message(s) missing" if result.gaps else "cut off or in part unreadable"
+        )
+        console.print(Text(f"the log is not complete: {lost}", style="yellow"))

@@ -1,0 +1,132 @@
+"""The state of all cars on the terminal: a table of numbers, and below it each latest message."""
+
+from collections.abc import Iterator
+from typing import Final, Literal
+
+from rich import box
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from bayesrace.messages import Status
+from operation.analysis.picture import SOURCES, Picture, Process
+from operation.terminal.printable import printable
+
+__all__ = ["COUNTERS_SHOWN", "StatusTable"]
+
+_VALUES: Final[tuple[tuple[str, Literal["left", "right"]], ...]] = (
+    ("state", "left"),
+    ("rate\nHz", "right"),
+    ("last state\nms ago", "right"),
+    ("weights", "left"),
+    ("deadline\nmisses", "right"),
+    ("fallbacks\nplan/brake/stop", "right"),
+    ("delay\nms", "right"),
+    ("messages\nrefused/lost/stale", "right"),
+)
+"""Shown of each process: columns of the wide table, rows of the narrow ones."""
+
+_WIDE: Final = 115
+"""Columns of a terminal that the wide table fits into, if names are short."""
+
+_COLOURS: Final = {
+    "driving": "green", "running": "green", "fallback": "red", "stopped": "yellow",
+    "waiting": "yellow", "ready": "cyan", "idle": "cyan",
+}  # fmt: skip
+
+COUNTERS_SHOWN: Final = {
+    "controller": (
+        ("deadline_misses",),
+        ("shifted_plan", "brake", "stop"),
+        ("refused", "states_lost", "states_stale"),
+    ),
+    "plant": (("overruns",), ("", "braked", ""), ("refused", "actuations_lost", "stale")),
+}
+"""Counters of each process that are shown as misses, fallbacks, and messages."""
+
+
+class StatusTable:
+    """The picture for rich to print: a row per process, or a table per car where that is too wide.
+
+    ``brief`` cuts each message to a line.
+    """
+
+    def __init__(self, picture: Picture, *, brief: bool = False) -> None:
+        self._cars: dict[str, list[tuple[str, Process]]] = {
+            car: [(source, processes[source]) for source in SOURCES if source in processes]
+            for car, processes in picture.cars.items()
+        }
+        self._brief = brief
+
+    def __rich_console__(
+        self, console: Console, options: ConsoleOptions
+    ) -> Iterator[RenderableType]:
+        if not self._cars:
+            yield "no process is present any more"
+        elif options.max_width >= _WIDE:
+            yield self._wide()
+            yield ""
+        else:
+            for car, processes in self._cars.items():
+                yield _narrow(car, processes)
+                yield ""
+        for car, processes in self._cars.items():
+            for source, process in processes:
+                text = _message(f"{car} {source}", process)
+                text.no_wrap, text.overflow = self._brief, "ellipsis" if self._brief else "fold"
+                yield text
+
+    def _wide(self) -> Table:
+        table = _table("car", "process")
+        for title, justify in _VALUES:
+            table.add_column(title, justify=justify)
+        for car, processes in self._cars.items():
+            for source, process in processes:
+                table.add_row(printable(car), source, *_values(source, process))
+        return table
+
+
+def _narrow(car: str, processes: list[tuple[str, Process]]) -> Table:
+    table = _table(printable(car), *(source for source, _ in processes))
+    columns = [_values(source, process) for source, process in processes]
+    for (title, _), *values in zip(_VALUES, *columns, strict=True):
+        table.add_row(title.replace("\n", " "), *values)
+    return table
+
+
+def _table(*titles: str) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, show_edge=False)
+    for title in titles:
+        table.add_column(title, overflow="fold")
+    return table
+
+
+def _values(source: str, process: Process) -> list[Text | str]:
+    status = process.status
+    if status is None:
+        return [Text("no answer", style="red"), *[""] * (len(_VALUES) - 1)]
+    phase = Text(status.phase, style=_COLOURS.get(status.phase, ""))
+    if process.processes > 1:
+        phase.append(f" ×{process.processes}", style="red")
+    misses, fallbacks, messages = (_counts(status, names) for names in COUNTERS_SHOWN[source])
+    return [
+        phase,
+        f"{status.rate_hz:g}" if status.rate_hz else "lockstep",
+        "–" if status.state_age_s < 0 else f"{status.state_age_s * 1e3:.0f}",
+        Text(printable(status.weights_version) or "–"),
+        misses,
+        fallbacks,
+        f"{status.delay_s * 1e3:.1f}",
+        messages,
+    ]
+
+
+def _counts(status: Status, names: tuple[str, ...]) -> str:
+    return "/".join(str(status.counters.get(name, "–")) for name in names)
+
+
+def _message(who: str, process: Process) -> Text:
+    text = process.fault if process.status is None else process.status.text
+    if process.processes > 1:
+        text = f"{process.processes} processes answer under this name; end all but one. {text}"
+    return Text.assemble((f"{printable(who)}: ", "bold"), printable(text) or "no message")

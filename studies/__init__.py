@@ -1,0 +1,1 @@
+"""What is measured with the parts: execution times and latencies."""

@@ -1,0 +1,202 @@
+"""From the log of a run, and what is known beside it, to the numbers of the report."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from bayesrace.arrays import Floats
+from bayesrace.tracks import Track
+from studies.latency.clocks import ClockMap
+from studies.latency.columns import (
+    MOST_CYCLES,
+    Columns,
+    begins_anew,
+    read_tables,
+    split,
+)
+from studies.latency.legs import ANSWER, LEGS, Cycles
+from studies.latency.results import BareLoop, Clocks, LatencyResult, LegResult, Memory, Traffic
+from studies.latency.series import Series
+from studies.latency.settings import LatencySettings
+
+__all__ = ["Analysis", "Beside", "analyse"]
+
+
+_IN_FLIGHT: Final = 2
+"""So many messages more at the one end of a part than at the other end may be in flight."""
+
+_BATCH: Final = 4096
+_INTERVALS: Final = 60
+"""Of the histogram logs and of the medians, at most; each takes two seconds at least."""
+
+
+@dataclass
+class Beside:
+    """What is known of a measurement besides its log; of a recorded run: nothing."""
+
+    host: str = ""
+    bare: tuple[Series, BareLoop] | None = None
+    rss: dict[str, Memory] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True, eq=False)
+class Analysis:
+    """The result, and the values that it summarises."""
+
+    result: LatencyResult
+    series: dict[str, Series]
+    """By leg, and of the bare loop; one without values is left out."""
+    edges_s: Floats
+    """Of the intervals of logs and medians, since the first state that counts."""
+    begin_s: float
+    """Calendar time of that state."""
+
+
+def analyse(log: Path, settings: LatencySettings, track: Track | None, beside: Beside) -> Analysis:
+    """The analysis of a recorded run; InputError if the log holds no state that counts."""
+    limits = settings.warm_up_s, settings.duration_s
+    tables, car, refused = read_tables(log, settings.car_name, *limits)
+    parts = list(split(tables))
+    # Runs in real time, or those in lockstep if there are no others.
+    chosen = [part for part in parts if not part["states"]["lockstep"][0]] or parts
+    cycles = [Cycles(part) for part in chosen]
+    begin_ns = cycles[0].states["at"][0]
+    span_s = float(np.ptp(np.concatenate([one.states["at"] for one in cycles]))) * 1e-9
+    series = _series([one.legs() for one in cycles], begin_ns)
+    clock = _clocks([one.clock for one in cycles if one.clock is not None])
+    legs = {leg: _leg(leg, one, clock) for leg, one in series.items()}
+    counts = sum((one.counts() for one in cycles), Counter())
+    messages = _traffic(counts, len(cycles))
+    period_us = counts["length_ns"] * 1e-3 / counts["periods"] if counts["periods"] else None
+    rate_hz = float(tables["heartbeats"]["rate_hz"].max(initial=0.0))
+    rate_hz = rate_hz or (1e6 / period_us if period_us else 0.0)
+    restarts = np.count_nonzero(np.diff(tables["states"]["epoch"]))
+    restarts += np.count_nonzero(begins_anew(tables["actuations"]))
+    remarks = {
+        "messages are missing in the log; the run may have had them": counts["unobserved"],
+        "messages of the log could not be decoded": refused,
+        "restarts of plant or controller": restarts,
+        "runs in lockstep are left out": len(parts) - len(chosen),
+        "runs are in lockstep, without deadlines and wake-ups": (
+            len(chosen) if chosen[0]["states"]["lockstep"][0] else 0
+        ),
+        "cycles are the most for one analysis; the log goes on": (
+            MOST_CYCLES if len(tables["states"]) >= MOST_CYCLES else 0
+        ),
+    }
+    bare = beside.bare[1] if beside.bare else None
+    by_name = ("skipped", "deadline_misses", "fallbacks", "repeated_answers", "overtaken_answers",
+               "unobserved")  # fmt: skip
+    result = LatencyResult(
+        car=car,
+        track=settings.track,
+        rate_hz=rate_hz,
+        duration_s=span_s,
+        load=settings.load,
+        attached=bool(settings.attach),
+        recorded=settings.log is not None,
+        started=datetime.fromtimestamp(begin_ns // 1e9, UTC).astimezone().isoformat(),
+        host=beside.host,
+        state_to_actuation_us=legs.get(ANSWER),
+        legs_us=legs,
+        ticks=counts["cycles"] + counts["skipped"],
+        **{name: counts[name] for name in by_name},
+        overruns=counts["overruns"] if len(tables["heartbeats"]) else None,
+        bare_loop_misses=bare.misses if bare else None,
+        bare_loop_us=bare,
+        mean_period_us=period_us,
+        rate_error=period_us * rate_hz * 1e-6 - 1.0 if period_us else None,
+        **{
+            name: sum(getattr(one, name) for one in messages.values()) if messages else None
+            for name in ("sent", "received", "lost")
+        },
+        traffic=messages,
+        rss_growth_bytes=max((one.growth_bytes for one in beside.rss.values()), default=None),
+        rss=beside.rss,
+        restarts=restarts,
+        **_drive(tables["truth"], track),
+        clocks=clock,
+        notes=[*beside.notes, *(f"{many} {text}" for text, many in remarks.items() if many)],
+    )
+    edges_s = np.linspace(0.0, max(span_s, 1e-3), int(np.clip(span_s // 2.0, 1, _INTERVALS)) + 1)
+    if beside.bare:
+        series["bare_loop"] = beside.bare[0]
+    return Analysis(result, series, edges_s, begin_ns * 1e-9)
+
+
+def _series(
+    parts: Sequence[Mapping[str, tuple[Floats, Floats]]], begin_ns: float
+) -> dict[str, Series]:
+    """The values of each leg, all parts together, by rising time."""
+    found = {}
+    for leg in LEGS:
+        columns = [np.array(legs[leg]) for legs in parts if leg in legs]
+        at, ns = np.concatenate(columns, axis=1) if columns else ((), ())
+        if len(at):
+            order = np.argsort(at, kind="stable")
+            found[leg] = Series((at[order] - begin_ns) * 1e-9, ns[order])
+    return found
+
+
+def _leg(leg: str, series: Series, clocks: Clocks | None) -> LegResult:
+    clock = LEGS[leg][1]
+    return LegResult(
+        **series.distribution().model_dump(),
+        clock=clock,
+        uncertainty_us=clocks.uncertainty_us if clocks and clock == "both" else 0.0,
+        min=float(series.ns.min()) * 1e-3,
+        below_zero=int((series.ns < 0).sum()),
+    )
+
+
+def _traffic(counts: Counter[str], parts: int) -> dict[str, Traffic]:
+    """Of states and of actuations, if they are counted."""
+    found = {}
+    for stream in ("states", "actuations"):
+        if f"{stream}_sent" in counts:
+            sent, received, lost = (counts[f"{stream}_{k}"] for k in ("sent", "received", "lost"))
+            left = sent - received - lost
+            found[stream] = Traffic(
+                sent=sent, received=received, lost=lost, in_flight=left,
+                complete=abs(left) <= parts * _IN_FLIGHT,
+            )  # fmt: skip
+    return found
+
+
+def _drive(truth: Columns, track: Track | None) -> dict[str, Any]:
+    """Laps, and samples off the track, all runs together."""
+    one_run = (np.diff(truth["epoch"]) == 0) & (np.diff(truth["run"]) == 0)
+    places = np.column_stack([truth["x_m"], truth["y_m"]])
+    batches = [places[k : k + _BATCH] for k in range(0, len(places), _BATCH)]
+    return {
+        "laps": int(np.diff(truth["lap"])[one_run].sum()) if len(truth) else None,
+        "states": len(truth),
+        "off_track_samples": None if track is None else sum(
+            int((track.project_path(one).off_track_m > 0).sum()) for one in batches
+        ),
+    }  # fmt: skip
+
+
+def _clocks(clocks: Sequence[ClockMap]) -> Clocks | None:
+    if not clocks:
+        return None
+    shared = all(one.shared for one in clocks)
+    uncertainty_us = max(one.uncertainty for one in clocks) * 1e-3
+    offset_s = 0.0 if shared else float(clocks[-1].offset[-1]) * 1e-9
+    text = (
+        f"the controller's is {abs(offset_s):.6f} s {'behind' if offset_s < 0 else 'ahead of'} the "
+        f"plant's; legs from one to the other are corrected, ± {uncertainty_us:.0f} us"
+    )
+    return Clocks(
+        shared=shared,
+        text="plant and controller read one clock" if shared else text,
+        offset_us=offset_s * 1e6,
+        uncertainty_us=uncertainty_us,
+        exchanges=sum(one.exchanges for one in clocks),
+    )

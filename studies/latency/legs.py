@@ -1,0 +1,146 @@
+"""The legs of a control cycle, each computed from the message fields that hold its two times.
+
+Durations that one process measured are exact. What lies between the clocks of both processes is as
+good as the map of one clock to the other (:mod:`studies.latency.clocks`).
+"""
+
+from collections import Counter
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesrace.arrays import Floats
+from studies.latency.clocks import ClockMap
+from studies.latency.columns import Columns, Tables
+from studies.latency.traffic import heartbeats, traffic
+
+__all__ = ["ANSWER", "LEGS", "Cycles"]
+
+
+LEGS: Final = {
+    "wake_up": ("wake-up error", "controller"),
+    "state_transport": ("state transport", "both"),
+    "decode": ("decode", "controller"),
+    "release_wait": ("wait for release", "controller"),
+    "state_age": ("age of state at release", "both"),
+    "feedback": ("feedback", "controller"),
+    "compute": ("cycle", "controller"),
+    "encode": ("encode and send", "controller"),
+    "actuation_transport": ("actuation transport", "both"),
+    "state_to_actuation": ("state → actuation", "plant"),
+    "acting": ("delay until acting", "plant"),
+    "prepare": ("preparation", "controller"),
+}
+"""Title of each leg, and the clock on which it begins and ends; both: it crosses from one to the
+other. In the order of a cycle; docs/latency.md says from where to where each goes."""
+
+ANSWER: Final = "state_to_actuation"
+"""The leg that counts."""
+
+
+class Cycles:
+    """The messages of one plant and controller process, joined by the state that they answer.
+
+    A state is answered more than once where no newer one came in time: the controller predicts it
+    forward. Which of several actuations is which is known only if none of them was lost; the
+    transports of the others are left out.
+    """
+
+    def __init__(self, tables: Tables) -> None:
+        states = tables["states"]
+        self.states = states[_first(states)]
+        self.actuations = tables["actuations"]
+        self.answers, ticks = self._known(tables["answers"]), self._known(tables["ticks"])
+        # After the last state the controller predicts and falls back, until it gives up.
+        self.ticks = ticks[ticks["n"] < self.states["n"][-1]]
+        self._starts = self.ticks[_first(self.ticks, "state")]
+        """The first cycle of each state."""
+        self._sent, self._arrived = _paired(self._known(self.actuations), self.answers)
+        self._arrived_at = self._sampled(self._arrived) + self._arrived["arrival_s"] * 1e9
+        self.clock = ClockMap.of(*self._exchanges())
+        self._tables = tables
+
+    def _exchanges(self) -> tuple[Floats, Floats, Floats, Floats]:
+        """The first answer to each state as an exchange of timestamps: sampled at the plant,
+        received and sent by the controller's clock, arrived at the plant [ns]."""
+        k = _first(self._arrived, "state")
+        _, i, j = np.intersect1d(
+            self._starts["state"], self._arrived["state"][k], return_indices=True
+        )
+        starts, k = self._starts[i], k[j]
+        return self._sampled(starts), starts["received"], self._sent["sent"][k], self._arrived_at[k]
+
+    def legs(self) -> dict[str, tuple[Floats, Floats]]:
+        """Calendar times at the recorder, and values, of each leg that the messages give [ns]."""
+        ticks, starts = self.ticks, self._starts
+        first = self.answers[_first(self.answers, "state")]
+        acted = self.answers[self.answers["acting_s"] >= 0]
+        # Every cycle sends one actuation and one telemetry message, with equal numbers.
+        _, i, j = np.intersect1d(self.actuations["seq"], ticks["seq"], return_indices=True)
+        made, released = self.actuations["sent"][i], ticks["released"][j]
+        legs = {
+            "wake_up": (ticks["at"], ticks["wake_us"] * 1e3),
+            "decode": (starts["at"], starts["decode_us"] * 1e3),
+            "release_wait": (starts["at"], starts["released"] - starts["received"]),
+            "feedback": (ticks["at"], ticks["solve_us"] * 1e3),
+            "compute": (ticks["at"][j], made - released),
+            "encode": (ticks["at"], ticks["encode_us"] * 1e3),
+            "state_to_actuation": (first["at"], first["arrival_s"] * 1e9),
+            "acting": (acted["at"], acted["acting_s"] * 1e9),
+            "prepare": (ticks["at"], ticks["prepare_us"] * 1e3),
+        }
+        if self.clock is not None:
+            readings = starts["received"], ticks["released"], self._sent["sent"]
+            received, released, sent = map(self.clock.to_plant, readings)
+            legs["state_transport"] = starts["at"], received - self._sampled(starts)
+            legs["state_age"] = ticks["at"], released - self._sampled(ticks)
+            legs["actuation_transport"] = self._arrived["at"], self._arrived_at - sent
+        return legs
+
+    def counts(self) -> Counter[str]:
+        """What can be added up over the parts of a log; messages as :func:`traffic` names them."""
+        ticks, answers = self.ticks, self.answers
+        streams = self.states, self.actuations, self._tables["ticks"]
+        beats = heartbeats(self._tables, controller=True)
+        found = {
+            "cycles": len(ticks),
+            "skipped": np.maximum(np.diff(ticks["tick"]) - np.diff(ticks["seq"]), 0).sum(),
+            "deadline_misses": ticks["missed"].sum(),
+            "fallbacks": np.count_nonzero(ticks["fallback"]),
+            "overruns": np.diff(beats["overruns"]).sum(),
+            "periods": np.diff(ticks["seq"]).sum(),
+            "length_ns": np.diff(ticks["released"]).sum(),
+            "repeated_answers": len(answers) - len(_first(answers, "state")),
+            "overtaken_answers": np.count_nonzero(answers["acting_s"] < 0),
+            # By their numbers; the run itself may have had them.
+            "unobserved": sum((np.diff(np.unique(one["seq"])) - 1.0).sum() for one in streams),
+        }
+        if self.clock is not None:
+            found |= traffic(self._tables, self.clock)
+        return Counter({name: int(count) for name, count in found.items()})
+
+    def _sampled(self, rows: Columns) -> Floats:
+        """When the state of each row was, on the plant's clock."""
+        found: Floats = self.states["sampled"][np.searchsorted(self.states["seq"], rows["state"])]
+        return found
+
+    def _known(self, rows: Columns) -> Columns:
+        """The rows whose state is one of those that count."""
+        return rows[np.isin(rows["state"], self.states["seq"])]
+
+
+def _first(table: Columns, key: str = "seq") -> NDArray[np.intp]:
+    """Indices of the first row of each key, by rising keys."""
+    return np.unique(table[key], return_index=True)[1]
+
+
+def _paired(one: Columns, other: Columns) -> tuple[Columns, Columns]:
+    """The rows of the states of which both tables have equally many, the k-th with the k-th."""
+    one, other = (rows[np.argsort(rows["state"], kind="stable")] for rows in (one, other))
+    (keys, counts), (others, more) = (
+        np.unique(rows["state"], return_counts=True) for rows in (one, other)
+    )
+    common, i, j = np.intersect1d(keys, others, return_indices=True)
+    whole = common[counts[i] == more[j]]
+    return one[np.isin(one["state"], whole)], other[np.isin(other["state"], whole)]

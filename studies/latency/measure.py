@@ -1,0 +1,200 @@
+"""Records a run, started here or running elsewhere, and analyses its log."""
+
+import os
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from bayesrace.errors import InputError
+from bayesrace.files import write_whole
+from bayesrace.messages import Event
+from bayesrace.recorder import Recorder
+from bayesrace.tracks import Track, load_track
+from bayesrace.transport import Director, Endpoints, Item, Kind, open_session
+from bayesrace.vehicles import write_car
+from operation.drive import RunPlan, run_request
+from operation.preparation import Prepared, prepare
+from operation.processes import Child, endings
+from operation.settings import PreparationSettings
+from operation.system import started_system
+from operation.terminal.progress import Stages
+from studies.latency.analysis import Beside, analyse
+from studies.latency.beside import read_bare_loop, running_beside
+from studies.latency.report import RESULT, write_files
+from studies.latency.results import LatencyResult, Memory
+from studies.latency.settings import LatencySettings
+
+__all__ = ["LatencyError", "Run", "measure"]
+
+_LOG: Final = "run.mcap"
+
+_ATTACH_S: Final = 10.0
+_AFTERWARDS_S: Final = 60.0
+"""The run's own time limit is this much later than its end by request."""
+_SAMPLE_S: Final = 0.5
+"""Between two samples of the memory of the processes."""
+_MEMORY_S: Final = 60.0
+"""Memory that a process takes in its first minute, or third of a shorter run, is no growth."""
+
+
+class LatencyError(RuntimeError):
+    """The measurement broke off."""
+
+
+@dataclass
+class Run(Beside):
+    """A run while it is recorded, and what is known of it besides the log."""
+
+    car: str = ""
+    children: dict[str, Child] = field(default_factory=dict)
+    """Plant and controller, if they were started here."""
+    ended_early: str = ""
+    error: BaseException | None = None
+    """LatencyError or KeyboardInterrupt, if the recording ended early though it should not have."""
+
+    def watch(self, director: Director, recorder: Recorder, begin_ns: int, end_ns: int) -> None:
+        """Lets the time pass, until the run ends, a process started here ends, or a signal."""
+        warm_ns = begin_ns + min(round(_MEMORY_S * 1e9), (end_ns - begin_ns) // 3)
+        with director.inbox.receive_signals():
+            while not self.ended_early and (left_ns := end_ns - time.monotonic_ns()) > 0:
+                item = director.inbox.get(min(left_ns * 1e-9, _SAMPLE_S))
+                if item is not None:
+                    self._react(item)
+                self.ended_early = self.ended_early or recorder.failed
+                if time.monotonic_ns() >= warm_ns:
+                    self.sample_memory()
+            self.sample_memory()  # at least once: those before may have come late
+        if self.ended_early and self.children and self.error is None:
+            ended = [self.ended_early, *_endings(self.children)]
+            self.error = LatencyError("; ".join(ended))
+        self.notes += [f"ended early: {self.ended_early}"] if self.ended_early else []
+
+    def _react(self, item: Item) -> None:
+        if item.kind is Kind.SIGNAL:
+            self.error, self.ended_early = KeyboardInterrupt(), "interrupted"
+        elif isinstance(item.value, Event) and item.value.kind == "run_ended":
+            self.ended_early = item.value.text
+        elif item.kind is Kind.GONE:
+            text = f"the {item.name} of car '{self.car}' vanished"
+            self.ended_early = text if item.name in self.children else ""
+            self.notes += [] if self.ended_early else [text]
+
+    def sample_memory(self) -> None:
+        """Samples the resident memory of the processes that were started here."""
+        for name, process in self.children.items():
+            with suppress(OSError, IndexError, ValueError):  # it is gone, or there is no /proc
+                pages = int(Path(f"/proc/{process.pid}/statm").read_text().split()[1])
+                now = pages * os.sysconf("SC_PAGE_SIZE")
+                before = self.rss.get(name, Memory(begin_bytes=now, most_bytes=now))
+                most = max(now, before.most_bytes)
+                self.rss[name] = before.model_copy(update={"most_bytes": most})
+
+
+def measure(settings: LatencySettings, out: Path, stages: Stages) -> tuple[LatencyResult, Run]:
+    """Records a run, or takes the log in the settings, and leaves the report's files in ``out``.
+
+    Raises InputError for unusable settings, LatencyError if a process is lost before anything is
+    measured; no process outlives the call.
+    """
+    if any((out / name).exists() for name in (RESULT, *(() if settings.log else (_LOG,)))):
+        raise InputError(f"{out} holds a measurement already; choose another folder or remove it")
+    track = load_track(settings.track, settings.car.width_m) if settings.track else None
+    run = Run(car=settings.car_name)
+    if settings.log is None:
+        _record(run, settings, track, out, stages)
+    with stages.stage("analyse the log"):
+        try:
+            analysis = analyse(settings.log or out / _LOG, settings, track, run)
+        except InputError as error:
+            raise run.error or error from None
+        out.mkdir(parents=True, exist_ok=True)
+        write_whole(out / "settings.json", settings.model_dump_json(indent=1) + "\n")
+        write_files(out, analysis)
+    return analysis.result, run
+
+
+def _record(
+    run: Run, settings: LatencySettings, track: Track | None, out: Path, stages: Stages
+) -> None:
+    """Records the run, and the machine beside it."""
+    start = not settings.attach
+    files = _files(settings, stages) if start else None
+    out.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as stack:
+        with stages.stage("start plant and controller" if start else "attach"):
+            stack.enter_context(_explained(run))
+            if files is not None:
+                plant, both = _options(settings, out)
+                system = stack.enter_context(started_system(run.car, out, plant, both))
+                stack.enter_context(system.controller([*files.arguments, *plant]))
+                session, director, run.children = system.session, system.director, system.children
+            else:
+                session = stack.enter_context(open_session(Endpoints(connect=settings.attach)))
+                director = Director(session, run.car)
+                director.wait_for(("plant", "controller"), _ATTACH_S)
+            rate_hz, phase = director.status("controller").rate_hz, director.status("plant").phase
+            if not start and (phase != "running" or not rate_hz):
+                raise InputError(
+                    f"car '{run.car}' is not driving in real time (plant: {phase}); "
+                    "start a run with 'bayesrace drive --mode realtime'"
+                )
+            about = {"latency": {"settings": settings.model_dump_json()}}
+            recorder = stack.enter_context(Recorder(session, run.car, out / _LOG, about))
+            if track is not None and start:
+                limit_s = settings.warm_up_s + settings.duration_s + _AFTERWARDS_S
+                plan = RunPlan(1, "bayesrace", 0, limit_s, lockstep=False)
+                director.start(run_request(track, plan))
+                stack.callback(_stop, director)
+        begin_ns = time.monotonic_ns() + round(settings.warm_up_s * 1e9)
+        end_ns = begin_ns + round(settings.duration_s * 1e9)
+        count = round(settings.duration_s * rate_hz)
+        with (
+            running_beside(out, settings.load, settings.realtime, rate_hz, begin_ns, count),
+            stages.stage(f"record {settings.duration_s:g} s"),
+        ):
+            run.watch(director, recorder, begin_ns, end_ns)
+    run.host, run.bare = socket.gethostname(), read_bare_loop(out, rate_hz)
+    run.notes += [] if run.bare else ["no bare loop to compare the misses with: it was lost"]
+
+
+def _files(settings: LatencySettings, stages: Stages) -> Prepared:
+    """What plant and controller are started with."""
+    return prepare(
+        PreparationSettings(car=settings.car), (settings.track,), stages,
+        raceline=settings.raceline, weights=settings.weights, artefact=settings.artefact,
+    )  # fmt: skip
+
+
+def _options(settings: LatencySettings, out: Path) -> tuple[list[str], list[str]]:
+    """Options that name the car, and further ones, all of them of plant and controller."""
+    realtime, car_file = settings.realtime, out / "car.toml"
+    write_car(car_file, settings.car)
+    both = ["--name", settings.car_name, "--rate", repr(settings.rate_hz)]
+    both += ["--lock-memory"] if realtime.lock_memory else []
+    both += ["--fifo", str(realtime.fifo)] if realtime.fifo else []
+    return ["--car", str(car_file)], both
+
+
+def _stop(director: Director) -> None:
+    with suppress(InputError):  # the plant may be what was lost
+        director.stop("measured")
+
+
+@contextmanager
+def _explained(run: Run) -> Iterator[None]:
+    """Adds the end of a child to what went wrong because of it."""
+    try:
+        yield
+    except InputError as error:
+        if _endings(run.children):
+            raise LatencyError(str(error)) from error  # which says how they ended
+        raise
+
+
+def _endings(children: dict[str, Child]) -> list[str]:
+    time.sleep(0.2)  # the system reports a death a moment after the network does
+    return endings(children.values())
