@@ -169,7 +169,15 @@ class Recorder:
             why = "it has been deleted" if gone else f"{error.strerror}; make room and drive again"
         self.failed = f"cannot write the log {self._path}: {why}"
         now_ns = time.monotonic_ns()
-        event = Event(0, now_ns, 0, "recorder", "recorder_failed", self.failed[:2000], {})
+        event = Event(
+            seq=0,
+            source_time_ns=now_ns,
+            run=0,
+            source="recorder",
+            kind="recorder_failed",
+            text=self.failed[:2000],
+            data={},
+        )
         # Not to this recorder's own channel, which may be full: put would block.
         with suppress(zenoh.ZError):
             self._session.put(

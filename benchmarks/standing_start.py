@@ -67,9 +67,18 @@ class Rig:
         driver = self._driver
         for _ in range(count):
             state = State(
-                self.car.steps, 0, 1, self._run, self.car.time_s, tuple(self.car.x),
-                self.car.u_applied, 0, False, (), False,
-            )  # fmt: skip
+                seq=self.car.steps,
+                source_time_ns=0,
+                epoch=1,
+                run=self._run,
+                time_s=self.car.time_s,
+                x=tuple(self.car.x),
+                u_applied=self.car.u_applied,
+                lap=0,
+                lockstep=False,
+                answers=(),
+                final=False,
+            )
             if not blind:
                 driver.observe(state)
             decision = driver.decide(state.time_s)

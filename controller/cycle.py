@@ -58,15 +58,15 @@ class Cycle:
     def actuation(self, seq: int, state: State, decision: Decision) -> Actuation:
         """The message that answers ``state``."""
         return Actuation(
-            seq,
-            time.monotonic_ns(),
-            state.epoch,
-            state.run,
-            state.seq,
-            decision.basis_s,
-            (decision.d, decision.delta_rate),
-            self._controller.weights_version,
-            decision.status,
+            seq=seq,
+            source_time_ns=time.monotonic_ns(),
+            epoch=state.epoch,
+            run=state.run,
+            state_seq=state.seq,
+            basis_s=decision.basis_s,
+            u=(decision.d, decision.delta_rate),
+            weights_version=self._controller.weights_version,
+            status=decision.status,
         )
 
     def telemetry(self, seq: int, state: State, decision: Decision, received_ns: int) -> Telemetry:

@@ -88,18 +88,18 @@ class Service:
         age_s = -1.0 if self.arrived_ns is None else (now_ns - self.arrived_ns) * 1e-9
         lockstep = newest is not None and newest.lockstep
         return Status(
-            seq,
-            now_ns,
-            "controller",
-            driver.phase.value,
-            0 if newest is None else newest.epoch,
-            0 if newest is None else newest.run,
-            self._words()[:2000],
-            self._controller.weights_version,
-            0.0 if lockstep else self._rate_hz,
-            age_s,
-            driver.delay_s,
-            self._count(),
+            seq=seq,
+            source_time_ns=now_ns,
+            source="controller",
+            phase=driver.phase.value,
+            epoch=0 if newest is None else newest.epoch,
+            run=0 if newest is None else newest.run,
+            text=self._words()[:2000],
+            weights_version=self._controller.weights_version,
+            rate_hz=0.0 if lockstep else self._rate_hz,
+            state_age_s=age_s,
+            delay_s=driver.delay_s,
+            counters=self._count(),
         )
 
     def _words(self) -> str:
@@ -118,14 +118,18 @@ class Service:
             request.answer(self._command(request))
         elif request.service is ROLLBACK:
             text = "this controller has no weights to go back to"
-            request.answer(Reply(0, time.monotonic_ns(), False, text, {}))
+            request.answer(
+                Reply(seq=0, source_time_ns=time.monotonic_ns(), accepted=False, text=text, data={})
+            )
         else:
             request.answer(self._take_weights(request.payload))
 
     def _command(self, request: Request) -> Reply:
         command, why_not = decode_request(request)
         if command is None:
-            return Reply(0, time.monotonic_ns(), False, why_not, {})
+            return Reply(
+                seq=0, source_time_ns=time.monotonic_ns(), accepted=False, text=why_not, data={}
+            )
         if command.command == "stop":
             self._driver.stop()
             self._text = f"stopped on request: {command.text}"
@@ -133,7 +137,13 @@ class Service:
             self._driver.go()
             self._text = f"driving on request: {command.text}"
         self.announce(command.command, self._text, {})
-        return Reply(0, time.monotonic_ns(), True, self._text[:2000], {})
+        return Reply(
+            seq=0,
+            source_time_ns=time.monotonic_ns(),
+            accepted=True,
+            text=self._text[:2000],
+            data={},
+        )
 
     def _take_weights(self, data: bytes) -> Reply:
         data_map: dict[str, Scalar] = {}
@@ -146,7 +156,9 @@ class Service:
             accepted, text = True, f"weights {version} in use from the next step on"
             data_map["version"] = version
         self.announce("weights_accepted" if accepted else "weights_refused", text, data_map)
-        return Reply(0, time.monotonic_ns(), accepted, text, data_map)
+        return Reply(
+            seq=0, source_time_ns=time.monotonic_ns(), accepted=accepted, text=text, data=data_map
+        )
 
     def announce(self, kind: str, text: str, data: Mapping[str, Scalar]) -> None:
         """Publishes an event; from any thread."""
@@ -155,7 +167,15 @@ class Service:
         run = 0 if newest is None else newest.run
         with self._publishing:
             seq = self._events.next_seq
-            event = Event(seq, now_ns, run, "controller", kind, text[:2000], dict(data))
+            event = Event(
+                seq=seq,
+                source_time_ns=now_ns,
+                run=run,
+                source="controller",
+                kind=kind,
+                text=text[:2000],
+                data=dict(data),
+            )
             self._events.put(event, lockstep=newest is None or newest.lockstep)
 
     def _count(self) -> dict[str, Scalar]:

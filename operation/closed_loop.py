@@ -252,7 +252,15 @@ class _Messages:
         self._runs += 1
 
     def _event(self, seq: int, run: int, kind: str, text: str, data: dict[str, Scalar]) -> None:
-        event = Event(seq, time.monotonic_ns(), run, "plant", kind, text[:2000], data)
+        event = Event(
+            seq=seq,
+            source_time_ns=time.monotonic_ns(),
+            run=run,
+            source="plant",
+            kind=kind,
+            text=text[:2000],
+            data=data,
+        )
         self.write(EVENT, event, "plant")
 
 

@@ -65,7 +65,15 @@ def announcement(plan: RunPlan, seq: int, weights_version: str) -> Event:
         "controller": plan.controller,
         "weights_version": weights_version,
     }
-    return Event(seq, time.monotonic_ns(), plan.run, "race", "run", text, data)
+    return Event(
+        seq=seq,
+        source_time_ns=time.monotonic_ns(),
+        run=plan.run,
+        source="race",
+        kind="run",
+        text=text,
+        data=data,
+    )
 
 
 def execute(

@@ -115,7 +115,7 @@ def ask_statuses(session: Any, found: Found, timeout_s: float) -> Picture:
         for car, sources in found.items()
         for source in sources
     }
-    request = StatusRequest(0, time.monotonic_ns())
+    request = StatusRequest(seq=0, source_time_ns=time.monotonic_ns())
     picture = Picture({})
     for key, answers in ask_all(session, STATUS, places, request, timeout_s).items():
         status = answers.valid[0] if answers.valid else None
@@ -147,7 +147,9 @@ def command(
     """
     now_ns = time.monotonic_ns()
     request: Message = (
-        StopRequest(0, now_ns, text) if action == "end" else Command(0, now_ns, action, text)
+        StopRequest(seq=0, source_time_ns=now_ns, text=text)
+        if action == "end"
+        else Command(seq=0, source_time_ns=now_ns, command=action, text=text)
     )
     service: Any = STOP if action == "end" else COMMAND
     keys = {car_key(service.key, car): car for car in cars}

@@ -70,14 +70,14 @@ class CarRun:
         """What the sensors measure now, and what they measure it of."""
         vehicle, request = self.vehicle, self.request
         truth = Truth(
-            seq,
-            time.monotonic_ns(),
-            self._epoch,
-            request.run,
-            vehicle.time_s,
-            tuple(vehicle.x.tolist()),
-            vehicle.u_applied,
-            self._line.crossings,
+            seq=seq,
+            source_time_ns=time.monotonic_ns(),
+            epoch=self._epoch,
+            run=request.run,
+            time_s=vehicle.time_s,
+            x=tuple(vehicle.x.tolist()),
+            u_applied=vehicle.u_applied,
+            lap=self._line.crossings,
         )
         return measure(truth, request.lockstep, answers, final), truth
 

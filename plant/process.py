@@ -265,7 +265,13 @@ class PlantProcess:
     def _publish_event(self, kind: str, text: str, data: Mapping[str, Scalar]) -> None:
         now_ns = time.monotonic_ns()
         event = Event(
-            self._events.next_seq, now_ns, self._run_number, "plant", kind, text[:2000], data
+            seq=self._events.next_seq,
+            source_time_ns=now_ns,
+            run=self._run_number,
+            source="plant",
+            kind=kind,
+            text=text[:2000],
+            data=data,
         )
         self._events.put(event, lockstep=True)
 
@@ -283,7 +289,9 @@ class PlantProcess:
         }
 
     def _reply(self, accepted: bool, text: str) -> Reply:
-        return Reply(0, time.monotonic_ns(), accepted, text[:2000], {})
+        return Reply(
+            seq=0, source_time_ns=time.monotonic_ns(), accepted=accepted, text=text[:2000], data={}
+        )
 
     def _beat(self) -> End | None:
         """Publishes the status, if it is time to; what ends the current run."""
@@ -297,18 +305,20 @@ class PlantProcess:
         phase = "idle" if self._run is None else "running"
         now_ns = time.monotonic_ns()
         return Status(
-            seq,
-            now_ns,
-            "plant",
-            phase,
-            self._epoch,
-            self._run_number,
-            self._text[:2000],
-            "",
-            self._settings.rate_hz,
-            -1.0 if self._states.sent_ns is None else (now_ns - self._states.sent_ns) * 1e-9,
-            self._settings.delay_s,
-            self._count(),
+            seq=seq,
+            source_time_ns=now_ns,
+            source="plant",
+            phase=phase,
+            epoch=self._epoch,
+            run=self._run_number,
+            text=self._text[:2000],
+            weights_version="",
+            rate_hz=self._settings.rate_hz,
+            state_age_s=-1.0
+            if self._states.sent_ns is None
+            else (now_ns - self._states.sent_ns) * 1e-9,
+            delay_s=self._settings.delay_s,
+            counters=self._count(),
         )
 
 

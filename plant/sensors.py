@@ -11,15 +11,15 @@ def measure(truth: Truth, lockstep: bool, answers: tuple[float, ...], final: boo
     The other arguments are not measured: they concern the exchange of messages, see :class:`State`.
     """
     return State(
-        truth.seq,
-        truth.source_time_ns,
-        truth.epoch,
-        truth.run,
-        truth.time_s,
-        truth.x,
-        truth.u_applied,
-        truth.lap,
-        lockstep,
-        answers,
-        final,
+        seq=truth.seq,
+        source_time_ns=truth.source_time_ns,
+        epoch=truth.epoch,
+        run=truth.run,
+        time_s=truth.time_s,
+        x=truth.x,
+        u_applied=truth.u_applied,
+        lap=truth.lap,
+        lockstep=lockstep,
+        answers=answers,
+        final=final,
     )

@@ -42,7 +42,19 @@ def drive(model: Model, count: int, seed: int, substeps: int = 10, vx: float = 1
 
 def state(run: int, seq: int, x: Floats, u: Floats) -> State:
     time_s = round(seq * STEP_S, 9)
-    return State(seq, 0, 1, run, time_s, tuple(x), tuple(u), 0, True, (), False)
+    return State(
+        seq=seq,
+        source_time_ns=0,
+        epoch=1,
+        run=run,
+        time_s=time_s,
+        x=tuple(x),
+        u_applied=tuple(u),
+        lap=0,
+        lockstep=True,
+        answers=(),
+        final=False,
+    )
 
 
 def telemetry(run: int, state_seq: int, fallback: int) -> Telemetry:
@@ -73,7 +85,7 @@ def write_log(
     for one in logged(data, 0):
         log.write(f"bayesrace/{name}/state", encode(one), 1 + one.seq, one.seq)
     for one in [] if truth is None else logged(truth, 0):
-        sample = Truth(*(getattr(one, field.name) for field in fields(Truth)))
+        sample = Truth(**{field.name: getattr(one, field.name) for field in fields(Truth)})
         log.write(f"bayesrace/{name}/truth", encode(sample), 1 + one.seq, one.seq)
     log.close()
     return path

@@ -113,4 +113,17 @@ def lap(number: int, time_s: float | None, *, flying: bool = True, off_m: float 
 
 def controller_status(version: str) -> Status:
     """A heartbeat of a controller that drives with these weights."""
-    return Status(0, 1, "controller", "driving", 0, 0, "", version, 50.0, 0.0, 0.0, {})
+    return Status(
+        seq=0,
+        source_time_ns=1,
+        source="controller",
+        phase="driving",
+        epoch=0,
+        run=0,
+        text="",
+        weights_version=version,
+        rate_hz=50.0,
+        state_age_s=0.0,
+        delay_s=0.0,
+        counters={},
+    )

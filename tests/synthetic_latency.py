@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from bayesrace.log import LogWriter
 from bayesrace.messages import Actuation, Message, State, Status, Telemetry, Truth, encode
@@ -62,10 +63,16 @@ class Loop:
         seq, self.state_seq = self.state_seq, self.state_seq + 1
         answers, self.answers = tuple(self.answers), []
         now_ns = self.sampled_ns(seq)
-        car = (now_ns, self.epoch, self.run, seq * PERIOD_NS * 1e-9, (0.0,) * 7, (0.0, 0.0))
+        car: dict[str, Any] = {
+            "seq": seq, "source_time_ns": now_ns, "epoch": self.epoch, "run": self.run,
+            "time_s": seq * PERIOD_NS * 1e-9, "x": (0.0,) * 7, "u_applied": (0.0, 0.0),
+            "lap": seq // 100,
+        }  # fmt: skip
         if seen:
-            self._write("state", State(seq, *car, seq // 100, self.lockstep, answers, False), seq)
-            self._write("truth", Truth(seq, *car, seq // 100), seq)
+            self._write(
+                "state", State(**car, lockstep=self.lockstep, answers=answers, final=False), seq
+            )
+            self._write("truth", Truth(**car), seq)
         return seq
 
     def tick(self, seq: int, released_ns: int = 700_000, seen: bool = True) -> None:
@@ -75,10 +82,45 @@ class Loop:
         sent = self.controller_ns(sampled_ns + released_ns + 400_000)
         received = self.controller_ns(sampled_ns + 600_000)
         telemetry = Telemetry(
-            self.sent, sent, self.run, seq, 0, 0, 3, self.ticks, released, received, False, 31.0,
-            42.0, 150.0, 250.0, 53.0, 0.0, (), (), 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0.0, 0.0,
-        )  # fmt: skip
-        actuation = Actuation(self.sent, sent, self.epoch, self.run, seq, 0.0, (0.0, 0.0), "", 0)
+            seq=self.sent,
+            source_time_ns=sent,
+            run=self.run,
+            state_seq=seq,
+            status=0,
+            fallback=0,
+            iterations=3,
+            tick=self.ticks,
+            released_ns=released,
+            received_ns=received,
+            missed=False,
+            wake_us=31.0,
+            decode_us=42.0,
+            prepare_us=150.0,
+            solve_us=250.0,
+            encode_us=53.0,
+            delay_s=0.0,
+            plan_x=(),
+            plan_u=(),
+            residual_dynamics=0.0,
+            residual_bounds=0.0,
+            residual_stationarity=0.0,
+            cost=0.0,
+            cost_shifted=0.0,
+            second_start=0,
+            s_ref_m=0.0,
+            n_ref_m=0.0,
+        )
+        actuation = Actuation(
+            seq=self.sent,
+            source_time_ns=sent,
+            epoch=self.epoch,
+            run=self.run,
+            state_seq=seq,
+            basis_s=0.0,
+            u=(0.0, 0.0),
+            weights_version="",
+            status=0,
+        )
         self.sent, self.ticks = self.sent + 1, self.ticks + 1
         if seen:
             self._write("actuation", actuation, seq)
@@ -103,8 +145,20 @@ class Loop:
         for source, sent_ns, counters in (
             ("plant", at_ns, plant), ("controller", self.controller_ns(at_ns), controller)
         ):  # fmt: skip
-            status = Status(self.beats, sent_ns, source, "running", self.epoch, self.run, "", "",
-                            50.0, 0.0, 0.0, counters)  # fmt: skip
+            status = Status(
+                seq=self.beats,
+                source_time_ns=sent_ns,
+                source=source,
+                phase="running",
+                epoch=self.epoch,
+                run=self.run,
+                text="",
+                weights_version="",
+                rate_hz=50.0,
+                state_age_s=0.0,
+                delay_s=0.0,
+                counters=counters,
+            )
             self._write(f"status/{source}", status, self.state_seq - 1)
         self.beats += 1
 

@@ -7,6 +7,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -92,7 +93,18 @@ class _Log:
 
     def event(self, run: int, source: str, kind: str, text: str, data: dict[str, object]) -> None:
         key = f"event/{source}"
-        self.put(key, Event(self.seq(key), self.now_ns, run, source, kind, text, data))  # type: ignore[arg-type]
+        self.put(
+            key,
+            Event(
+                seq=self.seq(key),
+                source_time_ns=self.now_ns,
+                run=run,
+                source=source,
+                kind=kind,
+                text=text,
+                data=data,  # type: ignore[arg-type]
+            ),
+        )
 
     def drive(self, run: int, drive: Drive) -> None:
         data: dict[str, object] = {
@@ -108,16 +120,30 @@ class _Log:
             u = (0.5, 0.0) if k else (0.0, 0.0)
             now, time_s = self.now_ns, STEP_S * k
             final = k == len(drive.x) - 1
-            sample = seq, now, 1, run, time_s
-            self.put("state", State(*sample, tuple(seen), u, 0, drive.lockstep, (), final))
+            sample: dict[str, Any] = {
+                "seq": seq, "source_time_ns": now, "epoch": 1, "run": run, "time_s": time_s,
+                "u_applied": u, "lap": 0,
+            }  # fmt: skip
+            rest: dict[str, Any] = {"lockstep": drive.lockstep, "answers": (), "final": final}
+            self.put("state", State(**sample, x=tuple(seen), **rest))
             if self._truth:
-                self.put("truth", Truth(*sample, tuple(x), u, 0))
+                self.put("truth", Truth(**sample, x=tuple(x)))
             if k % 10 == 0:
                 self._writer.flush()  # as a recorder does
             if final:
                 break
             actuation = self.seq("actuation")
-            answer = Actuation(actuation, now, 1, run, seq, time_s, u, drive.weights, 0)
+            answer = Actuation(
+                seq=actuation,
+                source_time_ns=now,
+                epoch=1,
+                run=run,
+                state_seq=seq,
+                basis_s=time_s,
+                u=u,
+                weights_version=drive.weights,
+                status=0,
+            )
             self.put("actuation", answer)
             self.put("telemetry", self._telemetry(run, seq, drive, k))
         if drive.ended is not None:
@@ -127,26 +153,34 @@ class _Log:
         level = int(k in drive.fallback_cycles)
         solve_us = float(drive.solve_us[k % len(drive.solve_us)])
         number = self.seq("telemetry")
-        timing = (number, self.now_ns, self.now_ns, False, 0.0, 0.0, 0.0, solve_us, 0.0, 0.0)
         return Telemetry(
-            number,
-            self.now_ns,
-            run,
-            seq,
-            0,
-            level,
-            1,
-            *timing,
-            (),
-            (),
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0,
-            0.0,
-            0.0,
+            seq=number,
+            source_time_ns=self.now_ns,
+            run=run,
+            state_seq=seq,
+            status=0,
+            fallback=level,
+            iterations=1,
+            tick=number,
+            released_ns=self.now_ns,
+            received_ns=self.now_ns,
+            missed=False,
+            wake_us=0.0,
+            decode_us=0.0,
+            prepare_us=0.0,
+            solve_us=solve_us,
+            encode_us=0.0,
+            delay_s=0.0,
+            plan_x=(),
+            plan_u=(),
+            residual_dynamics=0.0,
+            residual_bounds=0.0,
+            residual_stationarity=0.0,
+            cost=0.0,
+            cost_shifted=0.0,
+            second_start=0,
+            s_ref_m=0.0,
+            n_ref_m=0.0,
         )
 
     def close(self) -> None:

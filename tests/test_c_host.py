@@ -120,7 +120,19 @@ def test_over_udp_states_are_answered_and_silence_ends_at_the_fallback(
     plant: socket.socket, circuit: Circuit
 ) -> None:
     x = tuple(map(float, circuit.start(v_mps=1.5)))
-    state = State(0, 0, 7, 3, 0.0, x, (0.0, 0.0), 0, False, (), False)
+    state = State(
+        seq=0,
+        source_time_ns=0,
+        epoch=7,
+        run=3,
+        time_s=0.0,
+        x=x,
+        u_applied=(0.0, 0.0),
+        lap=0,
+        lockstep=False,
+        answers=(),
+        final=False,
+    )
     plant.send(b"no state")
     plant.send(line_of(state).encode())
     rows = [plant.recv(4096).split()]
@@ -142,7 +154,19 @@ def test_over_udp_nobody_else_ends_the_run_or_takes_its_answers(
     plant: socket.socket, circuit: Circuit
 ) -> None:
     x = tuple(map(float, circuit.start(v_mps=1.5)))
-    state = State(0, 0, 7, 3, 0.0, x, (0.0, 0.0), 0, False, (), False)
+    state = State(
+        seq=0,
+        source_time_ns=0,
+        epoch=7,
+        run=3,
+        time_s=0.0,
+        x=x,
+        u_applied=(0.0, 0.0),
+        lap=0,
+        lockstep=False,
+        answers=(),
+        final=False,
+    )
     plant.send(line_of(state).encode())
     plant.recv(4096)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
@@ -199,7 +223,19 @@ def test_no_sanitizer_finds_anything_whatever_the_states_say(
     for k in range(300):
         answers = (0.0, 0.0, 0.02) * int(random.integers(0, 64))
         lockstep = bool(k // 100 % 2)
-        told = State(k, 0, 1, 1, 0.02 * k, x, (0.0, 0.0), 0, lockstep, answers, k % 90 == 89)
+        told = State(
+            seq=k,
+            source_time_ns=0,
+            epoch=1,
+            run=1,
+            time_s=0.02 * k,
+            x=x,
+            u_applied=(0.0, 0.0),
+            lap=0,
+            lockstep=lockstep,
+            answers=answers,
+            final=k % 90 == 89,
+        )
         words = line_of(told).split()
         for _ in range(int(random.integers(0, 3)) if k % 3 == 0 else 0):
             at = random.integers(len(words))

@@ -234,13 +234,36 @@ def test_the_command_refuses_an_unusable_fmu_in_a_line_a_fault(
 def test_a_repeated_last_state_is_no_gap_and_no_sample() -> None:
     def state(seq: int, time_s: float, *, final: bool = False) -> State:
         x = (0.02 * seq, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
-        return State(seq, seq, 1, 1, time_s, x, (0.1, 0.0), 0, True, (), final)
+        return State(
+            seq=seq,
+            source_time_ns=seq,
+            epoch=1,
+            run=1,
+            time_s=time_s,
+            x=x,
+            u_applied=(0.1, 0.0),
+            lap=0,
+            lockstep=True,
+            answers=(),
+            final=final,
+        )
 
     states = [state(0, 0.0), state(1, 0.02), state(2, 0.04), state(3, 0.04, final=True)]
     record = RunRecord(PlannedRun(1, "a controller", ""))
     for message in states:
         record.add(message)
-        record.add(Truth(message.seq, message.seq, 1, 1, message.time_s, message.x, (0.1, 0.0), 0))
+        record.add(
+            Truth(
+                seq=message.seq,
+                source_time_ns=message.seq,
+                epoch=1,
+                run=1,
+                time_s=message.time_s,
+                x=message.x,
+                u_applied=(0.1, 0.0),
+                lap=0,
+            )
+        )
     assert [one.seq for one in record.states] == [one.seq for one in record.truth] == [0, 1, 2]
     assert record.gaps == 0
     data = dataset_from_messages(states, [], get_car("orca"), 0.02)

@@ -28,7 +28,9 @@ from tests.programs import until
 
 SETTINGS = LearnSettings(car=CAR)
 NAME = PREDICTION.identity("e_kinematic", CAR)
-NOT_NOW = Reply(0, 0, False, "the controller ends", {"again": True})
+NOT_NOW = Reply(
+    seq=0, source_time_ns=0, accepted=False, text="the controller ends", data={"again": True}
+)
 
 
 class Desk:
@@ -77,7 +79,17 @@ class Desk:
 
     def roll_back(self, version: str) -> None:
         data: dict[str, Scalar] = {"from_version": version}
-        self.publisher.event(Event(0, 0, 1, "controller", "weights_rolled_back", "because", data))
+        self.publisher.event(
+            Event(
+                seq=0,
+                source_time_ns=0,
+                run=1,
+                source="controller",
+                kind="weights_rolled_back",
+                text="because",
+                data=data,
+            )
+        )
 
     def update(self, version: str) -> UpdateRecord:
         update = self.journal.update_of(version)
@@ -96,7 +108,7 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Desk]:
 
 def yes(version: str, number: int = 1) -> Reply:
     data: dict[str, Scalar] = {"version": version, "cycle": 40 + number, "number": number}
-    return Reply(0, 0, True, "taken", data)
+    return Reply(seq=0, source_time_ns=0, accepted=True, text="taken", data=data)
 
 
 def test_accepted_weights_are_noted_with_their_cycle(desk: Desk) -> None:
@@ -109,7 +121,10 @@ def test_accepted_weights_are_noted_with_their_cycle(desk: Desk) -> None:
 
 def test_declined_weights_are_reported_and_not_sent_again(desk: Desk) -> None:
     desk.start_controller()
-    desk.learn("bad", Reply(0, 0, False, "worse than those in use", {}))
+    desk.learn(
+        "bad",
+        Reply(seq=0, source_time_ns=0, accepted=False, text="worse than those in use", data={}),
+    )
     desk.learn("back", yes("back"))
     desk.roll_back("back")
     assert (desk.verdict("bad"), desk.verdict("back")) == ("refused", "rolled back")
@@ -168,7 +183,7 @@ def test_a_controller_without_the_last_accepted_weights_gets_them(desk: Desk) ->
     """As often as it takes; those refused on the way are not the last accepted."""
     desk.start_controller("old")
     desk.learn("a", yes("a"))
-    desk.learn("bad", Reply(0, 0, False, "worse", {}))
+    desk.learn("bad", Reply(seq=0, source_time_ns=0, accepted=False, text="worse", data={}))
     desk.start_controller("a")  # it has kept them
     assert desk.sent == ["a", "bad"]
     desk.answers["a"] = NOT_NOW
@@ -178,7 +193,9 @@ def test_a_controller_without_the_last_accepted_weights_gets_them(desk: Desk) ->
     assert desk.sent == ["a", "bad", "a", "a"]
     assert (desk.verdict("a"), desk.update("a").acceptance) == ("accepted", 2)
     assert "the controller drives with no weights; sending a" in desk.said
-    desk.answers["a"] = Reply(0, 0, False, "older than those in use", {})
+    desk.answers["a"] = Reply(
+        seq=0, source_time_ns=0, accepted=False, text="older than those in use", data={}
+    )
     desk.start_controller("theirs")
     assert desk.verdict("a") == "refused"
 

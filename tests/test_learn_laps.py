@@ -36,7 +36,17 @@ def fed(
     for one in states:
         made.state(one)
         made.actuation(
-            Actuation(one.seq, 0, 1, one.run, one.seq, 0.0, (0.0, 0.0), f"v{one.seq // 100}", 0)
+            Actuation(
+                seq=one.seq,
+                source_time_ns=0,
+                epoch=1,
+                run=one.run,
+                state_seq=one.seq,
+                basis_s=0.0,
+                u=(0.0, 0.0),
+                weights_version=f"v{one.seq // 100}",
+                status=0,
+            )
         )
         made.telemetry(telemetry(one.run, one.seq, int(one.seq in fallbacks)))
         taken += made.take()
@@ -86,7 +96,19 @@ def test_with_the_track_crossings_are_interpolated() -> None:
     x[:, 0], x[:, 1], x[:, 3] = np.cos(at), np.sin(at), speed
     lap = np.floor(at / (2 * np.pi)).astype(int)
     states = [
-        State(k, 0, 1, 0, k * STEP_S, tuple(x[k]), (0.0, 0.0), int(lap[k]), True, (), False)
+        State(
+            seq=k,
+            source_time_ns=0,
+            epoch=1,
+            run=0,
+            time_s=k * STEP_S,
+            x=tuple(x[k]),
+            u_applied=(0.0, 0.0),
+            lap=int(lap[k]),
+            lockstep=True,
+            answers=(),
+            final=False,
+        )
         for k in range(count)
     ]
     taken, _ = fed(states, track=track)

@@ -233,7 +233,20 @@ def test_a_run_is_stopped_on_request_and_another_refused_meanwhile(rig: Rig) -> 
 
 def test_a_run_of_two_controllers_is_refused_or_no_success(rig: Rig) -> None:
     """Only the plant is connected to both: each would drive now and then."""
-    status = Status(0, 0, "controller", "waiting", 0, 0, "", "", 0.0, -1.0, 0.0, {})
+    status = Status(
+        seq=0,
+        source_time_ns=0,
+        source="controller",
+        phase="waiting",
+        epoch=0,
+        run=0,
+        text="",
+        weights_version="",
+        rate_hz=0.0,
+        state_age_s=-1.0,
+        delay_s=0.0,
+        counters={},
+    )
 
     @contextlib.contextmanager
     def another() -> Iterator[None]:

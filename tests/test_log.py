@@ -26,14 +26,34 @@ KEY, EVENT_KEY = "bayesrace/orca/state", "bayesrace/orca/event/plant"
 
 
 def state(seq: int) -> State:
-    return State(seq, 0, 0, 1, 0.02 * seq, (0.0,) * 7, (0.0, 0.0), 0, True, (), False)
+    return State(
+        seq=seq,
+        source_time_ns=0,
+        epoch=0,
+        run=1,
+        time_s=0.02 * seq,
+        x=(0.0,) * 7,
+        u_applied=(0.0, 0.0),
+        lap=0,
+        lockstep=True,
+        answers=(),
+        final=False,
+    )
 
 
 def write(path: Path, count: int = 50) -> None:
     writer = LogWriter(path, {"settings": {"track": "ethz"}})
     for seq in range(count):
         writer.write(KEY, encode(state(seq)), time.monotonic_ns(), seq)
-    event = Event(0, 0, 1, "plant", "run_ended", "done", {"laps": 1})
+    event = Event(
+        seq=0,
+        source_time_ns=0,
+        run=1,
+        source="plant",
+        kind="run_ended",
+        text="done",
+        data={"laps": 1},
+    )
     writer.write(EVENT_KEY, encode(event), time.monotonic_ns())
     writer.write(KEY, b"junk", time.monotonic_ns())
     writer.write("bayesrace/orca/unknown", b"junk", time.monotonic_ns())
@@ -202,7 +222,20 @@ def test_heartbeats_do_not_keep_a_recorder_from_settling(tmp_path: Path) -> None
         def beats() -> None:
             while not stop.wait(0.02):
                 seq = publisher.next_seq
-                status = Status(seq, 0, "plant", "idle", 0, 0, "", "", 0.0, -1.0, 0.0, {})
+                status = Status(
+                    seq=seq,
+                    source_time_ns=0,
+                    source="plant",
+                    phase="idle",
+                    epoch=0,
+                    run=0,
+                    text="",
+                    weights_version="",
+                    rate_hz=0.0,
+                    state_age_s=-1.0,
+                    delay_s=0.0,
+                    counters={},
+                )
                 publisher.put(status, lockstep=False)
 
         beating = threading.Thread(target=beats)

@@ -44,7 +44,19 @@ from bayesrace.messages.rules import (
 from tests.mutations import KINDS, rules_of
 
 X0 = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 0.1)
-STATE = State(3, 10**9, 8, 1, 0.5, X0, (0.1, 0.2), 0, True, (2.0, 4e-4, 1e-3), False)
+STATE = State(
+    seq=3,
+    source_time_ns=10**9,
+    epoch=8,
+    run=1,
+    time_s=0.5,
+    x=X0,
+    u_applied=(0.1, 0.2),
+    lap=0,
+    lockstep=True,
+    answers=(2.0, 4e-4, 1e-3),
+    final=False,
+)
 
 _text = st.text(st.characters(codec="utf-8"), max_size=30)
 _scalar = st.one_of(
@@ -77,7 +89,7 @@ def values(rule: Any) -> st.SearchStrategy[Any]:
 @st.composite
 def messages(draw: st.DrawFn) -> Message:
     kind = draw(st.sampled_from(KINDS))
-    return kind(*[draw(values(rule)) for rule in rules_of(kind).values()])
+    return kind(**{name: draw(values(rule)) for name, rule in rules_of(kind).items()})
 
 
 @settings(deadline=None)
@@ -144,7 +156,7 @@ def test_every_kind_of_message_is_in_the_table() -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_largest_message_passes_and_what_is_larger_is_not_read(kind: type[Message]) -> None:
-    message = kind(*map(largest, rules_of(kind).values()))
+    message = kind(**{name: largest(rule) for name, rule in rules_of(kind).items()})
     data = encode(message)
     assert decode(kind, data) == message
     assert len(data) <= largest_bytes(kind) <= 1 << 17
@@ -225,11 +237,26 @@ def test_the_decoder_counts_drops_and_logs_at_a_limited_rate(
 def test_a_map_holds_few_finite_scalars(entries: dict[str, Any], fault: str) -> None:
     """The name in the refusal is quoted: it comes from outside and may end on a terminal."""
     with pytest.raises(InputError, match=fault):
-        decode(Event, encode(Event(0, 0, 0, "plant", "kind", "text", entries)))
+        decode(
+            Event,
+            encode(
+                Event(
+                    seq=0,
+                    source_time_ns=0,
+                    run=0,
+                    source="plant",
+                    kind="kind",
+                    text="text",
+                    data=entries,
+                )
+            ),
+        )
 
 
 def test_maps_in_messages_are_read_only() -> None:
-    event = Event(0, 0, 0, "plant", "kind", "text", {"a": 1})
+    event = Event(
+        seq=0, source_time_ns=0, run=0, source="plant", kind="kind", text="text", data={"a": 1}
+    )
     read = decode(Event, encode(event))
     with pytest.raises(TypeError):
         read.data["a"] = 2  # type: ignore[index]

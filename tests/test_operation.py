@@ -78,8 +78,19 @@ class Fake:
         rate, age = (50.0, 0.012) if self.source == "controller" else (0.0, -1.0)
         phase = "driving" if self.source == "controller" else "idle"
         return Status(
-            seq, 0, self.source, phase, 7, 2, self.text, "v3", rate, age, 0.034, COUNTERS
-        )  # fmt: skip
+            seq=seq,
+            source_time_ns=0,
+            source=self.source,
+            phase=phase,
+            epoch=7,
+            run=2,
+            text=self.text,
+            weights_version="v3",
+            rate_hz=rate,
+            state_age_s=age,
+            delay_s=0.034,
+            counters=COUNTERS,
+        )
 
     def serve(self, ready: threading.Event, over: threading.Event) -> None:
         role: Role = "plant" if self.source == "plant" else "controller"
@@ -104,7 +115,9 @@ class Fake:
             return
         self.heard.append(decode_request(item.value)[0])
         text = self.refuses or f"{self.heard[-1].command}: as you say"
-        item.value.answer(Reply(0, 0, not self.refuses, text, {}))
+        item.value.answer(
+            Reply(seq=0, source_time_ns=0, accepted=not self.refuses, text=text, data={})
+        )
 
 
 Fakes = Callable[..., Fake]
@@ -226,7 +239,20 @@ def test_a_narrow_terminal_shows_the_same(fakes: Fakes) -> None:
 
 
 def test_a_heartbeat_that_stops_is_no_answer_any_more() -> None:
-    status = Status(0, 0, "plant", "idle", 1, 0, "", "", 50.0, -1.0, 0.0, {})
+    status = Status(
+        seq=0,
+        source_time_ns=0,
+        source="plant",
+        phase="idle",
+        epoch=1,
+        run=0,
+        text="",
+        weights_version="",
+        rate_hz=50.0,
+        state_age_s=-1.0,
+        delay_s=0.0,
+        counters={},
+    )
     picture = Picture({"a": {"plant": Process(status, "", 1, arrived_s=100.0)}})
     answering = []
     for now_s in (100.5, 102.0):
@@ -403,7 +429,19 @@ def test_a_router_forwards_between_plant_controller_and_observer_and_a_peer_does
         theirs.watch("controller")
         for inbox in (theirs, *receivers):
             take(inbox, Kind.ALIVE)
-        state = State(0, 0, 0, 1, 0.0, (0.0,) * 7, (0.0, 0.0), 0, True, (), False)
+        state = State(
+            seq=0,
+            source_time_ns=0,
+            epoch=0,
+            run=1,
+            time_s=0.0,
+            x=(0.0,) * 7,
+            u_applied=(0.0, 0.0),
+            lap=0,
+            lockstep=True,
+            answers=(),
+            final=False,
+        )
         Publisher(plant, STATE, "a").put(state, lockstep=True)
         for inbox in receivers:
             take(inbox, Kind.MESSAGE)

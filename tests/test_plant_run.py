@@ -79,9 +79,18 @@ def execute(answer: Any, delay_s: float = 0.0) -> tuple[list[State], RunCounters
     start = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
     line = {"line_x_m": 0.0, "line_y_m": 0.0, "line_heading_rad": 0.0}
     request = RunRequest(
-        0, 0, 1, False, start, **line, line_left_m=1.0, line_right_m=1.0, laps=0,
-        max_time_s=0.3, actuation_timeout_s=0.1,
-    )  # fmt: skip
+        seq=0,
+        source_time_ns=0,
+        run=1,
+        lockstep=False,
+        x0=start,
+        **line,
+        line_left_m=1.0,
+        line_right_m=1.0,
+        laps=0,
+        max_time_s=0.3,
+        actuation_timeout_s=0.1,
+    )
     run = Run(
         request, simulator, cast(Inbox, controller), cast(Publisher[State], controller),
         cast(Publisher[Truth], controller), Decoder(Actuation), counters, Numbering(),

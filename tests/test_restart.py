@@ -271,7 +271,7 @@ def test_whoever_asks_without_end_does_not_hold_up_the_loop(rig: Rig) -> None:
     rig.observer.start(1)
     rig.drive_on()
     with open_session(Endpoints(connect=(rig.controller_at,))) as session:
-        request = encode(Command(0, 0, "go", "again"))
+        request = encode(Command(seq=0, source_time_ns=0, command="go", text="again"))
         key, end_s = car_key(COMMAND.key, "orca"), time.monotonic() + 3.0
         answers = []
         while time.monotonic() < end_s:
@@ -325,9 +325,16 @@ def _stale_after(rig: Rig, publisher: Publisher[Actuation], epoch_shift: int, co
         # as new as can be without coming from the future
         basis_s = state.time_s + (now_ns - state.source_time_ns) * 1e-9 - 1e-3
         forgery = Actuation(
-            publisher.next_seq, now_ns, state.epoch + epoch_shift, state.run, state.seq, basis_s,
-            (0.3, 0.0), "forged", 0,
-        )  # fmt: skip
+            seq=publisher.next_seq,
+            source_time_ns=now_ns,
+            epoch=state.epoch + epoch_shift,
+            run=state.run,
+            state_seq=state.seq,
+            basis_s=basis_s,
+            u=(0.3, 0.0),
+            weights_version="forged",
+            status=0,
+        )
         publisher.put(forgery, lockstep=False)
         time.sleep(0.01)
     time.sleep(0.1)

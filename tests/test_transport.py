@@ -58,7 +58,19 @@ def pair() -> Iterator[tuple[Any, Any]]:
 
 
 def state(seq: int) -> State:
-    return State(seq, 0, 0, 1, 0.0, (0.0,) * 7, (0.0, 0.0), 0, True, (), False)
+    return State(
+        seq=seq,
+        source_time_ns=0,
+        epoch=0,
+        run=1,
+        time_s=0.0,
+        x=(0.0,) * 7,
+        u_applied=(0.0, 0.0),
+        lap=0,
+        lockstep=True,
+        answers=(),
+        final=False,
+    )
 
 
 def take(inbox: Inbox, kind: Kind, timeout_s: float = 5.0) -> Item:
@@ -120,31 +132,56 @@ def test_requests_are_answered_and_silence_is_an_error(pair: tuple[Any, Any]) ->
     server.serve(WEIGHTS)
     server.serve(STOP)
     meet(server, client)
-    status = Status(0, 1, "plant", "idle", 5, 0, "fine", "", 50.0, -1.0, 0.0, {"late": 3})
+    status = Status(
+        seq=0,
+        source_time_ns=1,
+        source="plant",
+        phase="idle",
+        epoch=5,
+        run=0,
+        text="fine",
+        weights_version="",
+        rate_hz=50.0,
+        state_age_s=-1.0,
+        delay_s=0.0,
+        counters={"late": 3},
+    )
 
     def answer() -> None:
         take(server, Kind.REQUEST).value.answer(status)
         request = take(server, Kind.REQUEST).value
-        request.answer(Reply(0, 0, True, f"{len(request.payload)} bytes", {}))
+        request.answer(
+            Reply(
+                seq=0,
+                source_time_ns=0,
+                accepted=True,
+                text=f"{len(request.payload)} bytes",
+                data={},
+            )
+        )
         request = take(server, Kind.REQUEST).value
         message, why_not = decode_request(request)
-        assert (message, why_not) == (StopRequest(0, 0, "enough"), "")
-        request.answer(Reply(0, 0, False, "no", {}))
+        assert (message, why_not) == (StopRequest(seq=0, source_time_ns=0, text="enough"), "")
+        request.answer(Reply(seq=0, source_time_ns=0, accepted=False, text="no", data={}))
 
     thread = threading.Thread(target=answer)
     thread.start()
     session = pair[1]
     try:
-        assert ask(session, STATUS, "orca", StatusRequest(0, 0), "plant") == status
+        assert (
+            ask(session, STATUS, "orca", StatusRequest(seq=0, source_time_ns=0), "plant") == status
+        )
         # Larger than one batch of the transport: weights are.
         assert ask(session, WEIGHTS, "orca", bytes(300_000)).text == "300000 bytes"
-        assert not ask(session, STOP, "orca", StopRequest(0, 0, "enough")).accepted
+        assert not ask(
+            session, STOP, "orca", StopRequest(seq=0, source_time_ns=0, text="enough")
+        ).accepted
     finally:
         thread.join()
     with pytest.raises(InputError, match="no answer on bayesrace/other/plant/status"):
-        ask(session, STATUS, "other", StatusRequest(0, 0), "plant")
+        ask(session, STATUS, "other", StatusRequest(seq=0, source_time_ns=0), "plant")
     with pytest.raises(InputError, match=r"within 0\.1 s; .* wait longer \(--timeout\)"):
-        ask(session, STOP, "other", StopRequest(0, 0, ""), timeout_s=0.1)
+        ask(session, STOP, "other", StopRequest(seq=0, source_time_ns=0, text=""), timeout_s=0.1)
 
 
 @contextmanager
@@ -162,8 +199,11 @@ def answering(pair: tuple[Any, Any], service: Service[Any, Any], *data: bytes) -
 
 def test_of_several_under_one_name_a_refusal_is_the_answer(pair: tuple[Any, Any]) -> None:
     """All are heard, and a yes of one does not hide the no of another."""
-    replies = [Reply(0, 0, accepted, "", {}) for accepted in (True, False, True)]
-    request, key = StopRequest(0, 0, ""), car_key(STOP.key, "orca")
+    replies = [
+        Reply(seq=0, source_time_ns=0, accepted=accepted, text="", data={})
+        for accepted in (True, False, True)
+    ]
+    request, key = StopRequest(seq=0, source_time_ns=0, text=""), car_key(STOP.key, "orca")
     encoded = [encode(one) for one in replies]
     with answering(pair, STOP, *encoded):
         for session in pair:
@@ -174,7 +214,10 @@ def test_of_several_under_one_name_a_refusal_is_the_answer(pair: tuple[Any, Any]
 
 
 def test_a_malformed_answer_does_not_hide_the_valid_ones(pair: tuple[Any, Any]) -> None:
-    request, reply = StopRequest(0, 0, ""), Reply(0, 0, True, "", {})
+    request, reply = (
+        StopRequest(seq=0, source_time_ns=0, text=""),
+        Reply(seq=0, source_time_ns=0, accepted=True, text="", data={}),
+    )
     with answering(pair, STOP, b"junk", encode(reply), b"more junk"):
         assert ask(pair[1], STOP, "orca", request) == reply
     with (
@@ -186,7 +229,22 @@ def test_a_malformed_answer_does_not_hide_the_valid_ones(pair: tuple[Any, Any]) 
 
 def test_several_processes_of_one_name_are_reported(pair: tuple[Any, Any]) -> None:
     """Their messages would be mixed, in the car and in the log."""
-    status = encode(Status(0, 0, "controller", "waiting", 0, 0, "", "", 0.0, -1.0, 0.0, {}))
+    status = encode(
+        Status(
+            seq=0,
+            source_time_ns=0,
+            source="controller",
+            phase="waiting",
+            epoch=0,
+            run=0,
+            text="",
+            weights_version="",
+            rate_hz=0.0,
+            state_age_s=-1.0,
+            delay_s=0.0,
+            counters={},
+        )
+    )
 
     def there(number: int) -> None:
         with ExitStack() as stack:
@@ -216,13 +274,15 @@ def test_a_request_beyond_the_limit_is_rejected_as_busy(
     server, client = Inbox(pair[0], "orca"), Inbox(pair[1], "orca")
     server.serve(STOP)
     meet(server, client)
-    key, request = car_key(STOP.key, "orca"), encode(StopRequest(0, 0, ""))
+    key, request = car_key(STOP.key, "orca"), encode(StopRequest(seq=0, source_time_ns=0, text=""))
     waiting = [pair[1].get(key, payload=request, timeout=10.0) for _ in range(16)]
     with pytest.raises(InputError, match=f"on {key}: busy: 16 requests are waiting; try again"):
         ask(pair[1], STOP, "orca", request)
     assert server.requests_rejected == 1
     for _ in waiting:
-        take(server, Kind.REQUEST).value.answer(Reply(0, 0, True, "", {}))
+        take(server, Kind.REQUEST).value.answer(
+            Reply(seq=0, source_time_ns=0, accepted=True, text="", data={})
+        )
     assert all(len(list(answers)) == 1 for answers in waiting)
 
 
@@ -234,7 +294,7 @@ def test_a_malformed_request_is_refused_with_a_reason(pair: tuple[Any, Any]) -> 
     thread.start()
     request = take(server, Kind.REQUEST).value
     message, why_not = decode_request(request)
-    request.answer(Reply(0, 0, False, why_not, {}))
+    request.answer(Reply(seq=0, source_time_ns=0, accepted=False, text=why_not, data={}))
     thread.join()
     assert message is None
     assert why_not.startswith("StopRequest: ")
@@ -250,14 +310,14 @@ def test_a_lost_request_is_repeated_but_for_a_rollback(pair: tuple[Any, Any]) ->
         if len(heard) % 2:
             threading.Timer(0.8, request._query.drop).start()
         else:
-            request.answer(Reply(0, 0, True, "yes", {}))
+            request.answer(Reply(seq=0, source_time_ns=0, accepted=True, text="yes", data={}))
 
     _kept = [declare_service(answerer, one, "orca", answer) for one in (WEIGHTS, ROLLBACK)]
     time.sleep(0.5)  # the declarations travel
     assert ask(asker, WEIGHTS, "orca", b"weights").text == "yes"
     assert heard == ["weights", "weights"]
     with pytest.raises(InputError, match="no answer"):
-        ask(asker, ROLLBACK, "orca", RollbackRequest(0, 0, ""))
+        ask(asker, ROLLBACK, "orca", RollbackRequest(seq=0, source_time_ns=0, text=""))
     assert heard == ["weights", "weights", "rollback"]
 
 
@@ -317,7 +377,9 @@ def test_events_of_all_sources_arrive(pair: tuple[Any, Any]) -> None:
     receiver.subscribe(EVENT)
     meet(sender, receiver)
     for source in ("plant", "race"):
-        event = Event(0, 0, 0, source, "kind", "text", {})
+        event = Event(
+            seq=0, source_time_ns=0, run=0, source=source, kind="kind", text="text", data={}
+        )
         Publisher(pair[0], EVENT, "orca", source).put(event, lockstep=True)
     assert {take(receiver, Kind.MESSAGE).name for _ in range(2)} == {"event"}
 
@@ -332,7 +394,12 @@ def test_an_inbox_takes_several_topics_each_with_its_own_depth_and_decoder(
     publishers = Publisher(pair[0], STATE, "orca"), Publisher(pair[0], EVENT, "orca", "plant")
     for seq in range(100):
         publishers[0].put(state(seq), lockstep=True)
-        publishers[1].put(Event(seq, 0, 0, "plant", "kind", "text", {}), lockstep=True)
+        publishers[1].put(
+            Event(
+                seq=seq, source_time_ns=0, run=0, source="plant", kind="kind", text="text", data={}
+            ),
+            lockstep=True,
+        )
     pair[0].put(car_key(EVENT.key, "orca", "plant"), b"junk")
     time.sleep(0.5)  # all of it arrives
     found: dict[str, list[Any]] = {"state": [], "event": []}
@@ -344,5 +411,10 @@ def test_an_inbox_takes_several_topics_each_with_its_own_depth_and_decoder(
     assert (states.accepted, events.accepted, events.refused) == (10, 100, 1)
     with receiver.stamped():
         publishers[0].put(state(100), lockstep=True)
-        publishers[1].put(Event(100, 0, 0, "plant", "kind", "text", {}), lockstep=True)
+        publishers[1].put(
+            Event(
+                seq=100, source_time_ns=0, run=0, source="plant", kind="kind", text="text", data={}
+            ),
+            lockstep=True,
+        )
         assert {take(receiver, Kind.MESSAGE).name for _ in range(2)} == {"state", "event"}

@@ -127,13 +127,13 @@ def decode(kind: type[M], data: bytes) -> M:
             f"{title}: schema version {version!r:.40}, this program reads "
             f"{kind.SCHEMA}; use the same release on both sides"
         )
-    values = []
+    values = {}
     for name, check in spec.checks:
         try:
-            values.append(check(content[name]))
+            values[name] = check(content[name])
         except ValueError as error:
             raise InputError(f"{title}.{name}: {error}") from None
-    return kind(*values)
+    return kind(**values)
 
 
 def largest_bytes(kind: type[Message]) -> int:

@@ -45,7 +45,7 @@ CarState = Annotated[tuple[float, ...], Vector(7, names=_CAR_STATE)]
 Input = Annotated[tuple[float, ...], Vector(2, names=_INPUT)]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Message:
     """The fields that every message starts with."""
 
@@ -58,7 +58,7 @@ class Message:
     """Sender's monotonic clock when the message was made [ns]."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class CarSample(Message):
     """The car at one moment, measured or true; ``source_time_ns`` is that moment."""
 
@@ -76,7 +76,7 @@ class CarSample(Message):
     """Start-line crossings so far, forwards minus backwards."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class State(CarSample):
     """Measured state of the car, on ``bayesrace/{car}/state``.
 
@@ -97,7 +97,7 @@ class State(CarSample):
     repeats the previous state with its time."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Truth(CarSample):
     """True state behind the :class:`State` of the same ``seq``, on ``bayesrace/{car}/truth``.
 
@@ -105,7 +105,7 @@ class Truth(CarSample):
     """
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Actuation(Message):
     """The controller's answer to one state, on ``bayesrace/{car}/actuation``."""
 
@@ -124,7 +124,7 @@ class Actuation(Message):
     """Status code of the controller's step; 0: converged."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Telemetry(Message):
     """Plan, residuals and timing of one control cycle, on ``bayesrace/{car}/telemetry``."""
 
@@ -179,7 +179,7 @@ class Telemetry(Message):
     """Lateral offset from the racing line, positive to the left."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Event(Message):
     """An occurrence for operators and logs, on ``bayesrace/{car}/event/{source}``."""
 
@@ -190,7 +190,7 @@ class Event(Message):
     data: DataMap
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RunRequest(Message):
     """Request on ``bayesrace/{car}/plant/run`` to start a run; the answer is a :class:`Reply`."""
 
@@ -214,7 +214,7 @@ class RunRequest(Message):
     its newest actuation is older."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class StopRequest(Message):
     """Request on ``bayesrace/{car}/plant/stop`` to end the current run."""
 
@@ -222,12 +222,12 @@ class StopRequest(Message):
     """The reason, for the ``run_ended`` event."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class StatusRequest(Message):
     """Request on ``bayesrace/{car}/{source}/status`` for the :class:`Status` of a process."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RollbackRequest(Message):
     """Request on ``bayesrace/{car}/controller/rollback`` to restore the previous weights.
 
@@ -238,7 +238,7 @@ class RollbackRequest(Message):
     """The reason, for the event."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Command(Message):
     """Request on ``bayesrace/{car}/controller/command``; the answer is a :class:`Reply`."""
 
@@ -248,7 +248,7 @@ class Command(Message):
     """The reason, for the controller's status."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Reply(Message):
     """Answer to a request that changes the state of a process."""
 
@@ -258,7 +258,7 @@ class Reply(Message):
     data: DataMap
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Status(Message):
     """State of a process, on ``bayesrace/{car}/status/{source}`` at 10 Hz and on request."""
 

@@ -143,7 +143,7 @@ def count_processes(
 ) -> int:
     """How many processes answer as the ``source`` of a car, as far as this session sees them."""
     key = car_key(STATUS.key, car, source)
-    request = StatusRequest(0, time.monotonic_ns())
+    request = StatusRequest(seq=0, source_time_ns=time.monotonic_ns())
     return ask_all(session, STATUS, (key,), request, timeout_s)[key].count
 
 
@@ -166,5 +166,5 @@ def send_rollback(session: Any, car: str, text: str, timeout_s: float | None = N
     ``data`` of the answer: ``version`` and ``number`` of the weights in use from ``cycle`` on,
     ``from_version`` and ``from_number`` of the withdrawn ones.
     """
-    request = RollbackRequest(0, time.monotonic_ns(), text[:2000])
+    request = RollbackRequest(seq=0, source_time_ns=time.monotonic_ns(), text=text[:2000])
     return ask(session, ROLLBACK, car, request, timeout_s=timeout_s)

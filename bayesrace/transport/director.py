@@ -69,7 +69,7 @@ class Director:
 
     def status(self, source: str) -> Status:
         """The process's status."""
-        request = StatusRequest(0, time.monotonic_ns())
+        request = StatusRequest(seq=0, source_time_ns=time.monotonic_ns())
         return ask(self._session, STATUS, self._car, request, source)
 
     def check_alone(self) -> None:
@@ -90,7 +90,12 @@ class Director:
 
     def stop(self, text: str) -> Reply:
         """End the current run."""
-        return ask(self._session, STOP, self._car, StopRequest(0, time.monotonic_ns(), text))
+        return ask(
+            self._session,
+            STOP,
+            self._car,
+            StopRequest(seq=0, source_time_ns=time.monotonic_ns(), text=text),
+        )
 
     def send_weights(self, data: bytes) -> Reply:
         """:func:`send_weights`; RefusedError with the reasons if they are refused."""

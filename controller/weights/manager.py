@@ -67,7 +67,15 @@ class _Pending(NamedTuple):
     """Deadline of the adoption; the answer may wait for the store for ``_STORE_S`` longer."""
 
     def reply(self, accepted: bool, text: str, data: Mapping[str, Scalar]) -> None:
-        self.request.answer(Reply(0, time.monotonic_ns(), accepted, text[:2000], dict(data)))
+        self.request.answer(
+            Reply(
+                seq=0,
+                source_time_ns=time.monotonic_ns(),
+                accepted=accepted,
+                text=text[:2000],
+                data=dict(data),
+            )
+        )
 
 
 class WeightUpdateManager:

@@ -194,7 +194,7 @@ def read_recording(run_dir: Path) -> Recording:
     truth = any(record.truth for record in planned)
     for record in planned if not truth else ():
         names = [one.name for one in fields(Truth)]
-        record.truth = [Truth(*(getattr(state, n) for n in names)) for state in record.states]
+        record.truth = [Truth(**{n: getattr(state, n) for n in names}) for state in record.states]
     return Recording(
         run_dir, settings, track, line, planned, truth, reader.truncated, reader.refused, started_ns
     )

@@ -57,7 +57,17 @@ class Bench:
         for _ in range(cycles):
             self._seq += 1
             state = State(
-                self._seq, 0, 1, 1, 0.02 * self._seq, (0.0,) * 7, (0.0, 0.0), 0, False, (), False
+                seq=self._seq,
+                source_time_ns=0,
+                epoch=1,
+                run=1,
+                time_s=0.02 * self._seq,
+                x=(0.0,) * 7,
+                u_applied=(0.0, 0.0),
+                lap=0,
+                lockstep=False,
+                answers=(),
+                final=False,
             )
             self.adoption.record(state, fallen_back)
 
@@ -65,7 +75,7 @@ class Bench:
         return self._pool.submit(ask, self._session, WEIGHTS, CAR, encode_weights(weights))
 
     def roll_back(self) -> "Future[Reply]":
-        request = RollbackRequest(0, 0, "test")
+        request = RollbackRequest(seq=0, source_time_ns=0, text="test")
         return self._pool.submit(ask, self._session, ROLLBACK, CAR, request)
 
     def settle(self, answer: "Future[Reply]") -> Reply:

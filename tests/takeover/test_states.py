@@ -10,7 +10,17 @@ Pair = tuple[SharedStates, SharedStates]
 
 def a_state(seq: int) -> State:
     return State(
-        seq, 0, 2**62 - 1, 3, 0.02 * seq, (float(seq),) * 7, (0.1, 0.2), 0, True, (), False
+        seq=seq,
+        source_time_ns=0,
+        epoch=2**62 - 1,
+        run=3,
+        time_s=0.02 * seq,
+        x=(float(seq),) * 7,
+        u_applied=(0.1, 0.2),
+        lap=0,
+        lockstep=True,
+        answers=(),
+        final=False,
     )
 
 
