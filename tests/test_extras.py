@@ -14,6 +14,7 @@ from operation.preparation import prepare
 from operation.settings import PreparationSettings
 from operation.system import started_system
 from operation.terminal.progress import stages_on
+from tests.car_fmu import packed_car
 from tests.command_line import Cli, refused
 from tests.programs import ROOT, peanut
 
@@ -51,5 +52,8 @@ def test_the_controller_drives_with_its_own_extra_alone(
 def test_a_missing_package_is_named_with_the_extra_that_brings_it(
     cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    fmu = packed_car()
+    for name in [one for one in sys.modules if one.startswith(("plant.fmu", "fmpy"))]:
+        monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "fmpy", None)
-    refused(cli("fmu", "inspect", "car.fmu"), "fmpy", "bayesrace[fmu]")
+    refused(cli("fmu", "inspect", fmu), "fmpy", "bayesrace[fmu]")

@@ -80,7 +80,7 @@ def test_every_leg_is_measured(loaded: Run) -> None:
     result = loaded.result
     assert set(result["legs_us"]) == set(LEGS)
     for name, leg in result["legs_us"].items():
-        assert leg["count"] > 50, name
+        assert leg["count"] >= 10, name
         assert leg["p50"] <= leg["p90"] <= leg["p99"] <= leg["p999"] <= leg["max"], name
         assert leg["below_zero"] == 0, name
     assert result["bare_loop_us"]["count"] > 0

@@ -322,7 +322,10 @@ with open_session(Endpoints(listen=(endpoint,))) as plant:
         Recorder(session, "orca", Path(sys.argv[1]))
         publisher = Publisher(plant, STATE, "orca")
         for seq in range(10**6):
-            state = State(seq, 0, 0, 1, 0.0, (0.0,) * 7, (0.0, 0.0), 0, True, (), False)
+            state = State(
+                seq=seq, source_time_ns=0, epoch=0, run=1, time_s=0.0, x=(0.0,) * 7,
+                u_applied=(0.0, 0.0), lap=0, lockstep=True, answers=(), final=False,
+            )
             publisher.put(state, lockstep=True)
             time.sleep(0.005)
 """

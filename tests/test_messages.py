@@ -328,7 +328,7 @@ def test_what_is_not_finite_is_recorded_and_refused() -> None:
     assert text is not None
     assert b'"time_s":"NaN"' in text
     assert b'"delta_rate":"-Infinity"' in text
-    with pytest.raises(InputError, match=r"State\.time_s: expected a float, got str"):
+    with pytest.raises(InputError, match=r"State\.time_s: .NaN. is not a float"):
         decode(State, from_json(State, text))
 
 

@@ -139,7 +139,7 @@ def controller(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Thresholds for new weights (JSON), see 'controller/weights/settings.py'.",
+            help="Thresholds for new weights (JSON), see docs/learning.md.",
         ),
     ] = None,
     hold: Annotated[
