@@ -32,7 +32,9 @@ M = TypeVar("M", bound=Message)
 _LARGEST_RECORD: Final = 1 << 27
 _MOST_UNPACKED, _RATIO = 1 << 26, 200
 """Bytes that all chunks of a log may unpack to: so many, and this multiple of the file."""
-_DAMAGED: Final = (McapError, struct.error, ValueError, RuntimeError, zstandard.ZstdError)
+_DAMAGED: Final = (
+    McapError, struct.error, ValueError, OverflowError, RuntimeError, zstandard.ZstdError
+)  # fmt: skip
 """What unpacking raises at a file that is cut off or spoilt."""
 _MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
 _BY_PREFIX: Final = {topic.key.split("/")[2]: topic for topic in TOPICS}
@@ -102,8 +104,10 @@ class LogWriter:
     def close(self) -> None:
         """Finish the file with its index; :class:`LogReader` reads it without the index too."""
         if not self._file.closed:
-            self._writer.finish()
-            self._file.close()
+            try:
+                self._writer.finish()
+            finally:
+                self._file.close()
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +191,7 @@ class LogReader:
                         raise InputError(
                             f"{self.path} would unpack to many times its size: no log of a run"
                         )
-                    yield from breakup_chunk(_unpacked(record))
+                    yield from breakup_chunk(_unpacked(record), validate_crc=True)
             except InputError:
                 raise
             except _DAMAGED:

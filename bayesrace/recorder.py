@@ -78,6 +78,8 @@ class Recorder:
             car_key("bayesrace/{car}/**", car), zenoh.handlers.FifoChannel(_CHANNEL_CAPACITY)
         )
         self._quiet_since_ns = time.monotonic_ns()
+        self._writing = False
+        """A message is on its way to the disk, which may hold it up."""
         self._stop = threading.Event()
         self._threads = [
             threading.Thread(target=run, name=f"recorder-{name}", daemon=True)
@@ -93,7 +95,7 @@ class Recorder:
         """
         give_up_ns = time.monotonic_ns() + int(at_most_s * 1e9)
         while (now_ns := time.monotonic_ns()) < give_up_ns:
-            if now_ns - self._quiet_since_ns >= quiet_s * 1e9:
+            if not self._writing and now_ns - self._quiet_since_ns >= quiet_s * 1e9:
                 break
             time.sleep(quiet_s / 5)
         self._flush()
@@ -116,9 +118,10 @@ class Recorder:
                     "%s: %d messages on more than %d keys of other programs were not recorded",
                     self._path, self.counters.unrecorded, _MOST_OTHER_KEYS,
                 )  # fmt: skip
+            counted = {name: str(count) for name, count in asdict(self.counters).items()}
             with suppress(OSError, ValueError):
-                counted = {name: str(count) for name, count in asdict(self.counters).items()}
                 self._writer.add_metadata("recorder", counted)
+            with suppress(OSError, ValueError):
                 self._writer.close()
 
     def __enter__(self) -> Self:
@@ -132,9 +135,11 @@ class Recorder:
         with suppress(zenoh.ZError):  # undeclared and drained
             while True:
                 sample = handler.recv()
+                self._writing = True
                 while sample is not None:
                     self._write(sample)
                     sample = handler.try_recv()
+                self._writing = False
                 # Waking once a batch, not once a message, leaves the CPU to what is recorded.
                 time.sleep(_BATCH_S)
 
@@ -150,12 +155,12 @@ class Recorder:
                 return
             self._other_keys.add(key)
         seq = peek_seq(data)
-        self._count(key, seq)
         if self.failed:
             return
         try:
             with self._lock:
                 self._writer.write(key, data, now_ns, 0 if seq is None else seq & 0xFFFFFFFF)
+            self._count(key, seq)
         except Exception as error:
             self._fail(error)
 

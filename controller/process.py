@@ -100,9 +100,10 @@ class ControllerProcess:
                 adopt=controller.adopt_weights, announce=self._service.announce,
             )  # fmt: skip
             self._adoption = self._weights.adoption
-            self._weights.start()
         inbox.watch("plant")
         inbox.announce("controller")
+        if self._weights is not None:
+            self._weights.start()  # last: what fails before leaves no thread behind
 
     def close(self) -> None:
         """Ends what the process has started."""

@@ -12,8 +12,10 @@ from typing import Final
 import numpy as np
 
 from bayesrace.arrays import Rows
+from bayesrace.errors import InputError
 from learning.hyperparameters import Fit
 from learning.posterior import Covariance, Posterior
+from learning.scores import PredictionErrors
 from learning.target import Target
 
 __all__ = ["ChoiceScore", "KernelScore", "choice_scores", "choose_kernel"]
@@ -53,10 +55,13 @@ def choose_kernel(target: Target, fits: Sequence[Fit]) -> tuple[Fit, list[Kernel
     best: dict[str, Fit] = {}
     for fit in fits:
         best[fit.kind] = max(best.get(fit.kind, fit), fit, key=lambda one: one.log_likelihood)
-    held = {
-        kind: Posterior(fit.covariance, target.z, target.y).held_out(target.folds)
-        for kind, fit in best.items()
-    }
+    held: dict[str, PredictionErrors] = {}
+    for kind, fit in best.items():
+        try:
+            held[kind] = Posterior(fit.covariance, target.z, target.y).held_out(target.folds)
+        except InputError:  # singular at this kernel's optimum; another one may do
+            if kind == [*best][-1] and not held:
+                raise
     chosen = max(held, key=lambda kind: held[kind].log_density)
     scale = target.y_scale
     return best[chosen], [

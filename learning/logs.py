@@ -27,8 +27,8 @@ class LogFacts:
 
     names: tuple[str, ...]
     """Names in the network of the cars whose states it holds."""
-    truth: bool
-    """It holds the true states besides the measured ones."""
+    true: frozenset[str]
+    """Names of the cars whose true states it holds besides the measured ones."""
     car: CarParameters | None
     """The recorded car; None if the log does not name it."""
     discretisation: Discretisation | None
@@ -42,12 +42,15 @@ def log_facts(path: str | os.PathLike[str]) -> LogFacts:
     metadata = reader.metadata()
     settings: dict[str, Any] = dict(metadata.get("collect") or metadata.get("drive") or {})
     try:
-        if "race" in metadata:
-            settings = json.loads(metadata["race"].get("settings", "{}"))
+        for program in ("race", "latency"):
+            if program in metadata:
+                settings = json.loads(metadata[program].get("settings", "{}"))
+        if settings.get("attach"):
+            settings = {}  # those of the program that has attached itself, not of the car
         given = settings.get("discretisation")
         return LogFacts(
             names=tuple(sorted(name for topic, name in keys if topic is STATE)),
-            truth=any(topic is TRUTH for topic, _ in keys),
+            true=frozenset(name for topic, name in keys if topic is TRUTH),
             car=described_car(settings["car"]) if settings.get("car") else None,
             discretisation=None if given is None else Discretisation.model_validate(given),
         )

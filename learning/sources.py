@@ -61,7 +61,7 @@ def read_samples(
     seen: dict[str, Path] = {}
     for path in paths:
         if path in logs:
-            true = truth and logs[path].truth
+            true = truth and drivers[path] in logs[path].true
             samples = dataset_from_log(path, driven, used.step_s, runs, drivers[path], true)
         else:
             samples = filter_dataset(dataset_from_npz(path, driven, used.step_s))

@@ -218,9 +218,9 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
     artefact, perfect = prepared.artefacts
     about = {"race": {"settings": settings.model_dump_json()}}
     with (
-        _faults_named(InputError),
         started_system(this.car.name, out, this.plant_options, this.both_options) as system,
         Recorder(system.session, this.car.name, out / FILES.log, about) as recorder,
+        _faults_named(InputError),
     ):
         drives = _Drives(this, prepared.course, system, recorder)
         with drives.controller(artefact, "bayesrace"):

@@ -29,12 +29,12 @@ def racing_line(
 
 
 def raceline_file(track: Track, car: CarParameters, settings: RaceLineSettings) -> Path:
-    """Where the line is kept, in a folder named after car, the track's shape, settings and code."""
+    """Where the line is kept, in a folder named after car, track, settings and code."""
     identity = digest(
         [
             car.model_dump_json(),
             settings.model_dump_json(),
-            track.identity.rpartition("-")[2],
+            track.identity,
             cpu_identity(),  # on which the last bits depend
             *software(_SOURCES, ("casadi", "numpy")),
         ]

@@ -1,7 +1,9 @@
 """Other weights for a controller's FMU, without compiling anything."""
 
 import zipfile
+import zlib
 from pathlib import Path
+from typing import Final
 
 from bayesrace.errors import InputError
 from bayesrace.files import replacing
@@ -9,6 +11,8 @@ from bayesrace.gp.weights import GpWeights
 from codegen.host_files import HEAD, IDENTITY_BYTES, WEIGHTS_FILE, weights_file
 
 __all__ = ["exchange_weights"]
+
+_LARGEST: Final = 1 << 30
 
 
 def exchange_weights(fmu: Path, weights: GpWeights | None, out: Path) -> None:
@@ -20,8 +24,11 @@ def exchange_weights(fmu: Path, weights: GpWeights | None, out: Path) -> None:
     name = f"resources/{WEIGHTS_FILE}"
     try:
         with zipfile.ZipFile(fmu) as archive:
+            size = sum(info.file_size for info in archive.infolist())
+            if size > _LARGEST:
+                raise InputError(f"{fmu} would unpack to {size >> 20} MB: no FMU of a controller")
             members = {info: archive.read(info) for info in archive.infolist()}
-    except (OSError, zipfile.BadZipFile) as error:
+    except (OSError, RuntimeError, EOFError, zlib.error, zipfile.BadZipFile) as error:
         raise InputError(f"{fmu} cannot be read as an FMU: {error}") from None
     before = next((data for info, data in members.items() if info.filename == name), None)
     if before is None:

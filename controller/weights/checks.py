@@ -60,11 +60,12 @@ class Checks:
     def use(self, in_use: bytes, accepted_utc_ns: int, reference: bytes) -> None:
         """Weights files to compare with: in use, and proven; empty: without correction.
 
-        ``accepted_utc_ns``: of those in use, by the calendar; they count as made no later.
+        ``accepted_utc_ns``: of those in use, by the calendar; they count as made no later. 0: not
+        known, as of those that the controller was started with.
         """
         self.in_use, self.reference = self._model(in_use), self._model(reference)
         made_ns = 0 if self.in_use.weights is None else self.in_use.weights.created_utc_ns
-        self._in_use_made_ns = min(made_ns, accepted_utc_ns)
+        self._in_use_made_ns = min(made_ns, accepted_utc_ns or time.time_ns())
 
     def judge(self, data: bytes, samples: Sequence[Sample]) -> Verdict:
         """Whether a weights file may be adopted, by recent ``samples`` among others."""

@@ -191,10 +191,9 @@ class WeightUpdateManager:
         data, size, history = pending.request.payload, pending.request.size, self._history
         if size > self._most_bytes:
             raise InputError(f"{size} bytes are more than any weights that would fit")
-        if digest_of(data) in history.withdrawn:
-            why_not = "these weights have been rolled back before: they predicted worse than others"
-            raise InputError(f"{why_not}; train again")
+        self._check_not_withdrawn(data)
         verdict = self._judge(data, pending.due_s)
+        self._check_not_withdrawn(data)  # meanwhile the watch may have rolled them back
         facts, packed, watched = verdict["data"], verdict["packed"], self._settings.watch_s > 0
         if not verdict["accepted"]:
             return False, verdict["text"], facts
@@ -204,6 +203,11 @@ class WeightUpdateManager:
         facts |= {"number": new.number, "cycle": offer.cycle, "adoption_us": offer.us}
         text = f"in use from cycle {offer.cycle} on, as number {new.number}; {verdict['text']}"
         return self._kept(pending, f"weights {new.version} {text}", facts)
+
+    def _check_not_withdrawn(self, data: bytes) -> None:
+        if digest_of(data) in self._history.withdrawn:
+            why_not = "these weights have been rolled back before: they predicted worse than others"
+            raise InputError(f"{why_not}; train again")
 
     def _back(self, pending: _Pending) -> _Outcome:
         """Returns to the weights before those in use."""

@@ -1,6 +1,8 @@
 """Thresholds for new weights, with the reason for each; docs/learning.md explains the tests."""
 
-from pydantic import BaseModel, ConfigDict, Field
+from typing import Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 __all__ = ["GateSettings"]
 
@@ -44,3 +46,14 @@ class GateSettings(BaseModel):
         100, ge=1, le=5000, description="newest samples that the watch compares on, at first from "
         "before the adoption: in one fast bend good weights can be worse than none",
     )  # fmt: skip
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        """Windows that hold what is needed in them: else nothing would ever be compared."""
+        if self.watch_least > self.watch_window:
+            raise ValueError(f"watch_least {self.watch_least} is more than watch_window allows")
+        if self.least_samples > self.recent_samples:
+            raise ValueError(
+                f"least_samples {self.least_samples} is more than recent_samples allows"
+            )
+        return self

@@ -6,6 +6,7 @@ start again at any time.
 """
 
 import os
+import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -32,6 +33,7 @@ from operation.learn.report import References, draw, references
 __all__ = ["Learner", "learn"]
 
 _TICK_S: Final = 0.1
+_REST_S: Final = 2.0
 
 
 def learn(
@@ -164,7 +166,9 @@ class Learner:
             self._say(f"{self._inbox.overflowed} messages came faster than they could be read")
 
     def _handle_rest(self) -> None:
-        while (item := self._inbox.get()) is not None:
+        """What waits; a run that sends without end does not hold up the end of the job."""
+        until_s = time.monotonic() + _REST_S
+        while time.monotonic() < until_s and (item := self._inbox.get()) is not None:
             self._handle(item)
 
     def _handle(self, item: Item) -> None:

@@ -105,13 +105,13 @@ class Journal:
     def add_update(
         self, update: UpdateRecord, weights: GpWeights | None, **samples: Dataset
     ) -> None:
-        """Adds an update with its weights in a file; those still pending are superseded.
+        """Adds an update with its weights in a file; new weights supersede those still pending.
 
         ``samples``: stages that change with it.
         """
-        for one in self.record.updates:
-            one.verdict = "superseded" if one.verdict == "pending" else one.verdict
         if weights is not None:
+            for one in self.record.updates:
+                one.verdict = "superseded" if one.verdict == "pending" else one.verdict
             update.version, update.points = weights.version, max(weights.counts)
             update.metrics = {name: weights.metrics.get(name, {}) for name in OUTPUTS}
             update.file = f"weights-{len(self.record.updates):04d}.bin"

@@ -75,9 +75,9 @@ class Publisher:
             return
         appeared, self.present, self.in_use = not self.present, True, status.weights_version
         update, last = self._journal.update_of(self.in_use), self._journal.last_accepted
-        newest = self._journal.record.updates[-1:]
-        if appeared and newest and newest[0].verdict == "pending":
-            self.offer(newest[0])
+        pending = [one for one in self._journal.record.updates if one.verdict == "pending"]
+        if appeared and pending:
+            self.offer(pending[-1])
         elif appeared and last is not None and self.in_use != last.version:
             drives_with = self.in_use or "no weights"
             self._say(f"the controller drives with {drives_with}; sending {last.version}")

@@ -113,7 +113,7 @@ static br_measured measured(fmu_instance *instance) {
 static double known(double value) { return isfinite(value) ? value : -1; }
 
 static void set_outputs(fmu_instance *instance, const br_decision *decision) {
-    static const br_mpc_info nothing;
+    static const br_mpc_info nothing = {.stationarity = NAN, .defect = NAN, .slack_max_m = NAN};
     const controller *c = instance->model;
     const br_mpc_info *info = decision->stepped ? br_cycle_info(c->cycle) : &nothing;
     double *v = instance->value;
