@@ -80,6 +80,7 @@ rest: $(VENV)/.ready-dev
 	$(RUN_TESTS)
 
 coverage: $(VENV)/.ready-dev
+	find build/coverage -name 'data.*' -empty -delete # of processes that tests have killed
 	$(BIN)/coverage combine --quiet
 	$(BIN)/coverage report --skip-covered
 	$(BIN)/python -m tests.native_coverage

@@ -32,7 +32,7 @@ __all__ = [
     "start",
 ]
 
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 """For what takes a second at most on an idle machine."""
 
 PLANT = """

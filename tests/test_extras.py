@@ -24,7 +24,6 @@ NOT_NEEDED = {"casadi", "fmpy", "jinja2", "matplotlib", "mcap", "pint", "scipy"}
 
 @pytest.mark.check
 @pytest.mark.unmeasured
-@pytest.mark.wall_clock
 def test_the_controller_drives_with_its_own_extra_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
