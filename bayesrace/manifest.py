@@ -134,7 +134,7 @@ def check_library(artefact: Path, manifest: Manifest) -> Path:
     try:
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
         for one in (artefact, path):
-            _check_owner(one)
+            check_owner(one)
     except OSError as error:
         raise InputError(
             f"{path} cannot be read ({error.strerror or error}): run 'bayesrace build'"
@@ -144,7 +144,7 @@ def check_library(artefact: Path, manifest: Manifest) -> Path:
     return path
 
 
-def _check_owner(path: Path) -> None:
+def check_owner(path: Path) -> None:
     status = path.stat()
     if status.st_uid not in (os.geteuid(), _ROOT):
         raise InputError(

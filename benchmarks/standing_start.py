@@ -93,7 +93,7 @@ class Rig:
         return UNDER_WAY_M < ahead_m < self._length_m / 2
 
     def _where_m(self) -> float:
-        output = self._driver.decision.output
+        output = self._driver.output
         return 0.0 if output is None else output.s_ref_m
 
 

@@ -50,8 +50,10 @@ class Compiler:
         archives: list[Path],
         out: Path,
         flags: tuple[str, ...] = FLAGS,
+        exports: str = "br_mpc_*; br_cycle_*",
     ) -> None:
-        """Compiles ``sources`` and links them with ``archives`` (their symbols stay hidden)."""
+        """Compiles ``sources`` and links them with ``archives``; hides all symbols but ``exports``,
+        patterns with semicolons between."""
         line = [
             *self.command,
             *flags,
@@ -66,9 +68,9 @@ class Compiler:
         if platform.system() == "Linux":
             # A version script instead of --exclude-libs, which zig's linker does not know; -z defs,
             # or a library that lacks a symbol would fail only when it is loaded.
-            exports = out.with_suffix(".map")
-            exports.write_text("{ global: br_mpc_*; br_cycle_*; local: *; };\n")
-            line += [f"-Wl,--version-script={exports}", "-Wl,-z,defs"]
+            script = sources[0].with_suffix(".map")
+            script.write_text(f"{{ global: {exports}; local: *; }};\n")
+            line += [f"-Wl,--version-script={script}", "-Wl,-z,defs"]
         done = subprocess.run(line, capture_output=True, text=True, check=False)
         if done.returncode:
             raise CompileError(f"{shlex.join(line)}\n{_shortened(done.stderr)}")

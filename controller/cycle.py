@@ -73,4 +73,4 @@ class Cycle:
         """How the cycle went; counts it."""
         self.timing.ticks += 1
         self.timing.received_ns = received_ns
-        return telemetry_of(seq, state, decision, self.timing)
+        return telemetry_of(seq, state, decision, self.driver.output, self.timing)

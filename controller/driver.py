@@ -74,8 +74,8 @@ class Decision:
     """Prediction from there to the moment of acting."""
     step_us: float = 0.0
     """Execution time of the step."""
-    output: StepOutput | None = None
-    """Of the step, if one was made."""
+    stepped: bool = False
+    """Whether a step was made; :attr:`Driver.output` has its results."""
 
 
 class Driver:
@@ -149,6 +149,11 @@ class Driver:
         return int(getattr(self._counters, name))
 
     @property
+    def output(self) -> StepOutput | None:
+        """Of the newest cycle's step; None if it made none. The next cycle overwrites it."""
+        return self.controller.result(self._cycle) if self.decision.stepped else None
+
+    @property
     def fallen_back(self) -> bool | None:
         """Whether the newest input was the fallback's for want of a solution; None: the car is
         not driven, or its state is not known."""
@@ -217,7 +222,7 @@ class Driver:
         decision.level, decision.status = _LEVELS[decided.level], decided.status
         decision.basis_s, decision.delay_s = decided.basis_s, decided.delay_s
         decision.step_us = decided.step_us
-        decision.output = self.controller.result(self._cycle) if decided.stepped else None
+        decision.stepped = bool(decided.stepped)
         if decision.status == STEP_FAILED:
             text = self._library.br_mpc_error_text(decided.error).decode()
             self.last_error = self.controller.last_error or text

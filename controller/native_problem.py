@@ -70,6 +70,7 @@ class NativeProblem:
         self._info_address = ct.addressof(self.info)
         self.plan_x = np.zeros((n + 1, self._nx))
         self.plan_u = np.zeros((n, self._nu))
+        self._plan_addresses = _address(self.plan_x), _address(self.plan_u)
         self._u_held_address = _address(self._u_held)
         self._predicted_address = _address(self._predicted)
         self._step = self._library.br_mpc_step
@@ -239,7 +240,7 @@ class NativeProblem:
 
     def read_plan(self) -> tuple[Floats, Floats]:
         """The last plan, x (N + 1, nx) and u (N, nu), in buffers that the next call overwrites."""
-        self._library.br_mpc_get_plan(self._mpc, _address(self.plan_x), _address(self.plan_u))
+        self._library.br_mpc_get_plan(self._mpc, *self._plan_addresses)
         return self.plan_x, self.plan_u
 
     def read_reference(self) -> Reference:

@@ -39,9 +39,11 @@ class Timing:
     """Cycles that took more than their budget."""
 
 
-def telemetry_of(seq: int, state: State, decision: Decision, timing: Timing) -> Telemetry:
-    """The message of one cycle."""
-    output = decision.output or _NO_OUTPUT
+def telemetry_of(
+    seq: int, state: State, decision: Decision, output: StepOutput | None, timing: Timing
+) -> Telemetry:
+    """The message of one cycle; ``output``: of its step, if one was made."""
+    output = output or _NO_OUTPUT
     return Telemetry(
         seq=seq,
         source_time_ns=time.monotonic_ns(),

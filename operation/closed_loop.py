@@ -37,6 +37,7 @@ from bayesrace.raceline import RaceLine
 from bayesrace.tracks import PathProjection, Track
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
+from codegen.compiled import compiled
 from controller.assembly import compiled_controller
 from controller.cycle import Cycle
 from controller.driver import Decision
@@ -143,7 +144,7 @@ class ClosedLoop:
         messages that a race records. ``settings``: of the controller process, as far as they
         concern lockstep."""
         self._car, self._track, self._line = car, track, line
-        self._vehicle = vehicle or Simulator(dynamic(car))
+        self._vehicle = vehicle or Simulator(dynamic(car), compiled=compiled)
         self._cycle = Cycle(controller, car, settings or ControllerSettings(car=car))
         self._controller = controller
         self._log = None if log is None else _Messages(log, car.name)
@@ -220,7 +221,7 @@ class ClosedLoop:
     def _send(self, state: State, decision: Decision) -> None:
         self._answer = decision.d, decision.delta_rate
         self._decided.append((decision.status, int(decision.level)))
-        if decision.output is not None:
+        if decision.stepped:
             self._step_us.append(decision.step_us)
         if self._log is not None:
             cycle, received_ns = self._cycle, state.source_time_ns

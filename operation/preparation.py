@@ -22,6 +22,7 @@ from bayesrace.raceline.cached import raceline_file, racing_line
 from bayesrace.tracks import Track, load_track, write_track
 from bayesrace.vehicles import CarParameters
 from codegen.build import build
+from codegen.compiled import compiled
 from codegen.compiler import find_compiler
 from codegen.settings import BuildSettings
 from learning.dataset import Dataset
@@ -201,7 +202,8 @@ def training_drive(
     path = cache_folder() / f"drive-{identity}.mcap"
 
     def make(partial: Path) -> None:
-        with open_vehicle(car, settings.fmu, settings.fmu_map, 1 / PLANT.step_s) as vehicle:
+        fmu = settings.fmu, settings.fmu_map
+        with open_vehicle(car, *fmu, 1 / PLANT.step_s, compiled) as vehicle:
             collect(
                 track, course.line, car, artefact, partial, settings.drive_s, pursuit,
                 settings.start_speed_mps, vehicle,

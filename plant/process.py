@@ -47,6 +47,7 @@ from bayesrace.vehicles import CarSetting, default_car
 from plant.fmu.faults import FmuFault
 from plant.lockstep import End
 from plant.run import Run, RunCounters
+from plant.simulator import Compile
 from plant.vehicle import Vehicle, open_vehicle
 
 __all__ = ["PlantProcess", "PlantSettings", "main"]
@@ -326,13 +327,16 @@ def _played_by(settings: PlantSettings) -> str:
     return "the built-in car" if settings.fmu is None else f"FMU {settings.fmu.name}"
 
 
-def main(settings: PlantSettings) -> int:
+def main(settings: PlantSettings, compiled: Compile | None = None) -> int:
     """Run a plant until SIGINT or SIGTERM; returns the exit code. Raises InputError at a bad start.
 
+    ``compiled``: of the car's equations, see :class:`plant.simulator.Simulator`.
     Call it from the main thread of a process: it takes over the signals.
     """
     die_with_parent(settings.parent_pid)
-    vehicles = open_vehicle(settings.car, settings.fmu, settings.fmu_map, settings.rate_hz)
+    vehicles = open_vehicle(
+        settings.car, settings.fmu, settings.fmu_map, settings.rate_hz, compiled
+    )
     with vehicles as vehicle, open_session(settings.endpoints, "plant") as session:
         process = PlantProcess(session, settings, vehicle)
         for refusal in prepare_thread(settings.realtime):

@@ -8,7 +8,7 @@ the car brakes.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -18,8 +18,12 @@ from bayesrace.integrators import PLANT_SCHEME, PLANT_SUBSTEP_HZ, Discretisation
 from bayesrace.vehicles.models import Model
 from bayesrace.vehicles.parameters import CarParameters
 
+if TYPE_CHECKING:
+    import casadi as ca
+
 __all__ = [
     "PLANT",
+    "Compile",
     "GuardCounters",
     "PlantGuard",
     "Simulator",
@@ -27,6 +31,9 @@ __all__ = [
     "hold_in_turn",
     "plant_discretisation",
 ]
+
+Compile = Callable[["ca.Function"], "ca.Function"]
+"""Makes machine code of a function, to the same bits."""
 
 
 def plant_discretisation(rate_hz: float = 50.0) -> Discretisation:
@@ -141,26 +148,33 @@ def hold_in_turn(
     return d_sum / substeps, rate_sum / substeps
 
 
-class _Map:
-    """A CasADi map x_next = F(x, u, p) called in place on preallocated buffers.
+class _Substeps:
+    """A CasADi map x_next = F(x, u, p), applied to x and u in place.
 
     An ordinary call converts to and from DM, which costs more than the integration itself.
     """
 
     def __init__(self, function: Any, x: Floats, u: Floats, p: Floats) -> None:
-        self._x = x
-        self._p = p  # nor does it keep its arguments
-        self._x_next: Floats = np.zeros_like(x)
-        self._function = function  # the buffer does not keep it alive
-        self._buffer, self._evaluate = function.buffer()
-        self._buffer.set_arg(0, x.data)
-        self._buffer.set_arg(1, u.data)
-        self._buffer.set_arg(2, p.data)
-        self._buffer.set_res(0, self._x_next.data)
+        self._x, self._x_next = x, np.zeros_like(x)
+        buffers = []
+        for before, after in ((x, self._x_next), (self._x_next, x)):
+            buffer, evaluate = function.buffer()
+            for i, argument in enumerate((before, u, p)):
+                buffer.set_arg(i, argument.data)
+            buffer.set_res(0, after.data)
+            buffers.append((buffer, evaluate))
+        self._evaluate = tuple(evaluate for _, evaluate in buffers)
+        self._alive = function, p, buffers  # the buffers do not keep what they refer to
 
-    def advance(self) -> None:
-        self._evaluate()
-        self._x[:] = self._x_next
+    def advance(self, count: int) -> None:
+        """So many substeps."""
+        forth, back = self._evaluate
+        for _ in range(count // 2):
+            forth()
+            back()
+        if count % 2:
+            forth()
+            self._x[:] = self._x_next
 
 
 class Simulator:
@@ -169,7 +183,13 @@ class Simulator:
     ``x`` is the state after the last step: read it, but do not write into it.
     """
 
-    def __init__(self, model: Model, discretisation: Discretisation = PLANT) -> None:
+    def __init__(
+        self,
+        model: Model,
+        discretisation: Discretisation = PLANT,
+        compiled: Compile | None = None,
+    ) -> None:
+        """Without ``compiled``, CasADi interprets the equations, which takes five times as long."""
         self.car = model.car
         self.step_s = discretisation.step_s
         self.substeps = discretisation.substeps
@@ -183,10 +203,9 @@ class Simulator:
             scheme=discretisation.scheme, step_s=self.step_s / self.substeps, substeps=1
         )
         parameters = np.array(model.parameters, dtype=np.float64)
-        self._period, self._substep = (
-            _Map(steps.for_any_car(model), self.x, self._u, parameters)
-            for steps in (discretisation, substep)
-        )
+        function = substep.for_any_car(model)
+        function = compiled(function) if compiled else function
+        self._equations = _Substeps(function, self.x, self._u, parameters)
 
     @property
     def time_s(self) -> float:
@@ -201,7 +220,7 @@ class Simulator:
 
     def step(self, u: Sequence[float] | None) -> None:
         """Hold the command ``u`` = (d, delta_rate) for one period; None brakes."""
-        self.u_applied = self._hold(u, self._period, 1, self.step_s)
+        self.u_applied = self._hold(u, self.substeps)
         self.steps += 1
 
     def step_switched(self, commands: Sequence[tuple[int, Sequence[float] | None]]) -> None:
@@ -212,21 +231,16 @@ class Simulator:
         if len(commands) == 1 and commands[0][0] == self.substeps:
             self.step(commands[0][1])
             return
-        self.u_applied = hold_in_turn(commands, self.substeps, self._hold_part)
+        self.u_applied = hold_in_turn(commands, self.substeps, self._hold)
         self.steps += 1
 
-    def _hold_part(self, u: Sequence[float] | None, count: int) -> tuple[float, float]:
-        return self._hold(u, self._substep, count, self.step_s * count / self.substeps)
-
-    def _hold(
-        self, u: Sequence[float] | None, advance: _Map, times: int, duration_s: float
-    ) -> tuple[float, float]:
-        x = self.x
+    def _hold(self, u: Sequence[float] | None, count: int) -> tuple[float, float]:
+        """For so many substeps; what acted."""
+        x, duration_s = self.x, self.step_s * count / self.substeps
         vx, delta = float(x[3]), float(x[6])
         guard = self.guard
         applied = guard.brake(vx) if u is None else guard.apply(u, vx, delta, duration_s)
         self._u[0], self._u[1] = applied
-        for _ in range(times):
-            advance.advance()
+        self._equations.advance(count)
         x[6] = guard.angle_after(delta, applied[1], duration_s)
         return applied

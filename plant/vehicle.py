@@ -9,7 +9,7 @@ from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.vehicles.models import dynamic
 from bayesrace.vehicles.parameters import CarParameters
-from plant.simulator import PlantGuard, Simulator, plant_discretisation
+from plant.simulator import Compile, PlantGuard, Simulator, plant_discretisation
 
 __all__ = ["Vehicle", "open_vehicle"]
 
@@ -55,16 +55,22 @@ class Vehicle(Protocol):
 
 @contextmanager
 def open_vehicle(
-    car: CarParameters, fmu: Path | None = None, fmu_map: Path | None = None, rate_hz: float = 50.0
+    car: CarParameters,
+    fmu: Path | None = None,
+    fmu_map: Path | None = None,
+    rate_hz: float = 50.0,
+    compiled: Compile | None = None,
 ) -> Iterator[Vehicle]:
     """The car by the built-in equations, or by an FMU and the map of its variables.
+
+    ``compiled``: of the equations, see :class:`plant.simulator.Simulator`.
 
     Raises InputError if the FMU, the map or the rate cannot be used.
     """
     if fmu is None:
         if fmu_map is not None:
             raise InputError(f"map {fmu_map} without an FMU to apply it to: add --fmu")
-        yield Simulator(dynamic(car), plant_discretisation(rate_hz))
+        yield Simulator(dynamic(car), plant_discretisation(rate_hz), compiled)
         return
     from plant.fmu.simulator import open_fmu  # who drives the built-in car need not wait for fmpy
 

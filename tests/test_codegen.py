@@ -7,6 +7,7 @@ import subprocess
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any, cast
 
 import casadi as ca
 import numpy as np
@@ -46,7 +47,8 @@ def _fresh_compiler_search() -> Iterator[None]:
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty cache, filled by a compiler that does not optimise, which is what takes its time."""
     quick = tuple(flag for flag in FLAGS if flag != "-O3")
-    monkeypatch.setattr(Compiler.shared_library, "__defaults__", (quick,))
+    _, exports = cast("tuple[Any, str]", Compiler.shared_library.__defaults__)
+    monkeypatch.setattr(Compiler.shared_library, "__defaults__", (quick, exports))
     monkeypatch.setenv("BAYESRACE_CACHE", str(tmp_path / "cache"))
     return tmp_path / "cache"
 

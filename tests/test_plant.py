@@ -1,6 +1,7 @@
 """The plant: a car that stays within its limits whatever it is told, and stands when it stands."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,11 +12,14 @@ from bayesrace.errors import InputError
 from bayesrace.integrators import Discretisation
 from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import dynamic
+from codegen.compiled import compiled
+from codegen.compiler import Compiler
 from plant.laps import LineCounter
 from plant.simulator import Simulator
 
 CAR = get_car("orca")
 SIMULATOR = Simulator(dynamic(CAR))
+COMPILED = Simulator(dynamic(CAR), compiled=compiled)
 ANY_FLOAT = st.floats(allow_nan=True, allow_infinity=True)
 START = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
@@ -166,3 +170,33 @@ def test_laps_count_forwards_and_backwards_crossings_within_the_track() -> None:
     assert line.move(0.7, 2.1) == 0  # .3 m to the left: beyond its reach
     line.restart(1.25, 1.9)
     assert line.move(1.25, 2.1) == 1  # .25 m to the right: within
+
+
+@settings(deadline=None)
+@given(driving_states, st.lists(st.tuples(st.floats(-2, 2), st.floats(-9, 9)), max_size=5))
+def test_compiled_equations_have_the_bits_of_interpreted_ones(
+    x0: tuple[float, ...], inputs: list[tuple[float, float]]
+) -> None:
+    for simulator in (SIMULATOR, COMPILED):
+        simulator.reset(x0)
+        for u in inputs:
+            simulator.step(u)
+        simulator.step_switched([(7, (0.5, 1.0)), (13, None)])
+    assert COMPILED.x.tobytes() == SIMULATOR.x.tobytes()
+
+
+def test_without_a_compiler_the_equations_are_interpreted(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    def none() -> Compiler:
+        raise InputError("no C compiler found")
+
+    monkeypatch.setenv("BAYESRACE_CACHE", str(tmp_path))
+    monkeypatch.setattr("codegen.compiled.find_compiler", none)
+    simulator = Simulator(dynamic(CAR), compiled=compiled)
+    assert "no C compiler found" in caplog.text
+    SIMULATOR.reset(START)
+    simulator.reset(START)
+    SIMULATOR.step((0.5, 1.0))
+    simulator.step((0.5, 1.0))
+    assert simulator.x.tobytes() == SIMULATOR.x.tobytes()

@@ -28,7 +28,7 @@ def standing(
 
 def where(rig: Rig) -> float:
     """Arc length of the car's place on the line."""
-    output = rig.driver.decision.output
+    output = rig.driver.output
     assert output is not None
     return output.s_ref_m
 

@@ -72,6 +72,7 @@ def plant(
     from bayesrace.realtime import RealtimeSettings
     from bayesrace.transport import Endpoints
     from bayesrace.vehicles import get_car
+    from codegen.compiled import compiled
     from plant.process import PlantSettings, main
 
     settings = PlantSettings(
@@ -87,7 +88,7 @@ def plant(
         realtime=RealtimeSettings(cpu=cpu, fifo=fifo, lock_memory=lock_memory),
         parent_pid=parent_pid,
     )
-    raise typer.Exit(main(settings))
+    raise typer.Exit(main(settings, compiled))
 
 
 def controller(

@@ -175,6 +175,7 @@ def collect(
     from bayesrace.tracks import load_track
     from bayesrace.vehicles import get_car
     from codegen.build import build
+    from codegen.compiled import compiled
     from codegen.settings import BuildSettings
     from controller.pure_pursuit import PurePursuitSettings
     from operation.collect import collect as drive
@@ -184,7 +185,7 @@ def collect(
     parameters = get_car(car)
     course = load_track(track, parameters.width_m)
     line = read_raceline_for(raceline, course, parameters)
-    with open_vehicle(parameters, fmu, fmu_map) as vehicle:
+    with open_vehicle(parameters, fmu, fmu_map, compiled=compiled) as vehicle:
         duration_s = duration or parameters.tuning.pursuit.drive_s
         artefact, _ = build(BuildSettings(car=parameters))
         samples = drive(

@@ -52,7 +52,7 @@ class Course:
 
 def gentle_course(
     folder: Path,
-    speed_mps: float = 0.8,
+    speed_mps: float = 0.65,
     centre_m: tuple[float, float] = (0.0, 0.0),
     scale: float = 1.0,
 ) -> Course:
