@@ -69,12 +69,17 @@ def finish(process: subprocess.Popen[str]) -> subprocess.CompletedProcess[str]:
     return subprocess.CompletedProcess(process.args, process.returncode, out, err)
 
 
-def until(true: Callable[[], object], what: str, seconds: float = PATIENCE_S) -> None:
-    """Waits until the condition holds; an AssertionError naming it if it never does."""
+def until(
+    true: Callable[[], object], what: str, seconds: float = PATIENCE_S, every_s: float = 0.02
+) -> None:
+    """Waits until the condition holds; an AssertionError naming it if it never does.
+
+    ``every_s``: longer for a condition that takes the processor from what it waits for.
+    """
     deadline = time.monotonic() + seconds
     while not true():
         assert time.monotonic() < deadline, f"not within {seconds:g} s: {what}"
-        time.sleep(0.02)
+        time.sleep(every_s)
 
 
 def _arguments(pid: str) -> list[str]:

