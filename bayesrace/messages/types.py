@@ -156,9 +156,9 @@ class Telemetry(Message):
     delay_s: Annotated[float, Real(0.0, 1e3)]
     """Delay from ``basis_s`` to application that the state is predicted over; 0 without."""
     plan_x: Annotated[tuple[float, ...], Vector(7, rows=501, names=_CAR_STATE)]
-    """Predicted states row by row, N + 1 rows of 7; empty without a prediction."""
+    """Predicted states row by row, N + 1 rows of 7, to 1e-6; empty without a prediction."""
     plan_u: Annotated[tuple[float, ...], Vector(2, rows=500, names=_INPUT)]
-    """Planned inputs row by row, N rows of 2."""
+    """Planned inputs row by row, N rows of 2, to 1e-6."""
     residual_dynamics: Annotated[float, Real(-1.0, 1e12)]
     """Largest dynamics defect of the plan; -1: unknown or not finite (as below)."""
     residual_bounds: Annotated[float, Real(-1.0, 1e12)]
