@@ -174,7 +174,7 @@ def test_each_cycle_names_its_weights_and_the_inputs_do_not_jump(
     time: benchmarks/takeover.py.
     """
     rig.ready()
-    rig.start(1, lockstep=False, seconds=20.0)
+    rig.start(1, lockstep=False, seconds=100.0)
     until(lambda: rig.counters()["ticks"] > 150, "three seconds of driving")
     named, weights = {}, {good.version: good}
     for number in range(10):
