@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,11 +15,6 @@ from learning.logs import dataset_from_messages
 from operation.learn import collector
 from operation.learn.collector import Collector, Stretch
 from tests.driven import CAR, STEP_S, drive, logged, telemetry
-
-
-@pytest.fixture(autouse=True)
-def _at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collector, "_DELAY_S", 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -138,19 +134,49 @@ def test_another_plant_with_the_same_run_is_another_run(states: list[State]) -> 
     assert len(samples(taken + rest)) == 99 + 49
 
 
-def test_a_lap_is_given_out_after_the_telemetry_of_its_last_cycle(
-    states: list[State], monkeypatch: pytest.MonkeyPatch
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
+    """Advances the collector's clock."""
+    now = [0.0]
+    monkeypatch.setattr(collector, "time", SimpleNamespace(monotonic=lambda: now[0]))
+
+    def advance(by_s: float) -> None:
+        now[0] += by_s
+
+    return advance
+
+
+def test_a_lap_waits_for_the_telemetry_of_its_last_cycle_however_long_the_host_stalls(
+    states: list[State], clock: Callable[[float], None]
 ) -> None:
-    monkeypatch.setattr(collector, "_DELAY_S", 1e9)
     made = Collector(CAR, STEP_S)
     for one in states[:70]:
         made.state(one)
+    clock(60.0)  # the telemetry waits to be read
+    assert made.take() == []
+    made.telemetry(telemetry(7, 59, 0))
     assert made.take() == []
     made.telemetry(telemetry(7, 60, 1))
-    monkeypatch.setattr(collector, "_DELAY_S", 0.0)
     (stretch,) = made.take()
     assert stretch.lap is not None
     assert stretch.lap.fallbacks == 1
+
+
+def test_a_lap_whose_telemetry_was_dropped_is_given_out_after_a_while(
+    states: list[State], clock: Callable[[float], None]
+) -> None:
+    made, calls = Collector(CAR, STEP_S), 0
+    for one in states[:70]:
+        made.state(one)
+    while not (taken := made.take()):
+        clock(0.1)
+        calls += 1
+    assert calls == pytest.approx(10 * collector._PATIENCE_S, abs=1)
+    assert taken[0].lap is not None
+    for one in states[70:]:
+        made.state(one)
+    made.telemetry(telemetry(7, 165, 0))  # of a later cycle: the others were dropped
+    assert len(made.take()) == 1
 
 
 @pytest.mark.parametrize(

@@ -118,7 +118,7 @@ class Jobs:
             yield Silent()
 
         for module, name, value in (
-            (collector, "_DELAY_S", 0.0),
+            (collector, "_PATIENCE_S", 0.0),
             (job, "_TICK_S", 0.001),
             (job, "Trainer", lambda _: FakeTrainer(jobs)),
             (job, "Inbox", Fed),

@@ -1,9 +1,9 @@
-"""Publishing weights to a controller, and what it makes of them."""
+"""Publishes weights to a controller, and notes whether it accepts and keeps them."""
 
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any
+from typing import Any, Final
 
 from bayesrace.files import read_whole
 from bayesrace.gp.weights import MAX_BYTES
@@ -13,6 +13,9 @@ from operation.learn.journal import Journal
 from operation.learn.records import UpdateRecord, Verdict
 
 __all__ = ["NotTakenOverError", "Publisher", "in_words"]
+
+_HISTORY: Final = 8
+"""Accepted weights that a controller can roll back."""
 
 
 class NotTakenOverError(RuntimeError):
@@ -32,7 +35,7 @@ def in_words(reply: Reply) -> str:
 
 
 class Publisher:
-    """Sends the weights of updates and notes what becomes of them; for the job's thread.
+    """Sends the weights of updates and notes their verdicts; for the job's thread.
 
     A thread of its own waits for the answers; :meth:`poll` notes those that have arrived. Weights
     without an answer, or refused for now, stay pending: they are sent to the next controller that
@@ -45,6 +48,8 @@ class Publisher:
         self._thread = ThreadPoolExecutor(1, "learn-publisher")
         self.unanswered: deque[tuple[UpdateRecord, Future[Reply]]] = deque()
         """Updates that were sent, oldest first, with what will be the answer."""
+        self._taken_over: deque[tuple[UpdateRecord, int]] = deque(maxlen=_HISTORY)
+        """Updates that the present controller has accepted, and the time of its answer [ns]."""
         self.present = False
         """A heartbeat has come since the controller appeared or disappeared."""
         self.closed = False
@@ -66,34 +71,38 @@ class Publisher:
             self._say(f"no controller of car '{self._car}' is there; {version} is pending")
 
     def heartbeat(self, status: Status) -> None:
-        """The controller is there, and its status names the weights that it drives with.
+        """Compares the weights that the controller's status names with those sent.
 
-        One that has just appeared is sent what is pending, or else the last accepted weights if it
-        drives with other ones.
+        A controller that has just appeared is sent what is pending, or else the last accepted
+        weights if it drives with other ones. A status of later than the takeover, but with a
+        smaller number of the weights in use, shows a rollback, also where its event was lost.
         """
         if status.source != "controller":
             return
         appeared, self.present, self.in_use = not self.present, True, status.weights_version
         update, last = self._journal.update_of(self.in_use), self._journal.last_accepted
         pending = [one for one in self._journal.record.updates if one.verdict == "pending"]
+        if appeared:
+            self._taken_over.clear()
+        drives_with = self.in_use or "no weights"
         if appeared and pending:
             self.offer(pending[-1])
         elif appeared and last is not None and self.in_use != last.version:
-            drives_with = self.in_use or "no weights"
             self._say(f"the controller drives with {drives_with}; sending {last.version}")
             self._send(last)
         elif update and update.verdict in ("pending", "superseded") and not self.unanswered:
             self._note(update, "accepted", "in use")  # the answer was lost
+        number = status.counters.get("weights_number")
+        for update, answered_ns in self._taken_over:
+            earlier = type(number) is int and number < (update.acceptance or 0)
+            # A status from before the takeover may arrive after the answer.
+            if earlier and status.source_time_ns > answered_ns and update.verdict == "accepted":
+                self._roll_back(update.version, f"the controller drives with {drives_with} again")
 
     def event(self, event: Event) -> None:
         """Notes what the controller has rolled back."""
         if event.source == "controller" and event.kind == "weights_rolled_back":
-            version = str(event.data.get("from_version", ""))
-            if (update := self._journal.update_of(version)) is not None:
-                update.verdict, update.answer = "rolled back", event.text
-                self._journal.save()
-                version += f" (learned after lap {update.after_lap})"
-            self._say(f"rolled back: {version}: {event.text}")
+            self._roll_back(str(event.data.get("from_version", "")), event.text)
 
     def poll(self) -> None:
         """Notes the answers that have arrived."""
@@ -110,6 +119,7 @@ class Publisher:
                 cycle, number = reply.data.get("cycle"), reply.data.get("number")
                 update.cycle = cycle if type(cycle) is int else None
                 update.acceptance = number if type(number) is int else None
+                self._taken_over.append((update, reply.source_time_ns))
                 self._note(update, "accepted", in_words(reply))
             else:
                 self._note(update, "refused", reply.text)
@@ -126,6 +136,15 @@ class Publisher:
 
         if not self.closed:
             self.unanswered.append((update, self._thread.submit(call)))
+
+    def _roll_back(self, version: str, why: str) -> None:
+        updates = [one for one in self._journal.record.updates if version == one.version != ""]
+        for update in updates:
+            update.verdict, update.answer = "rolled back", why
+        if updates:
+            self._journal.save()
+            version += f" (learned after lap {updates[-1].after_lap})"
+        self._say(f"rolled back: {version}: {why}")
 
     def _note(self, update: UpdateRecord, verdict: Verdict, answer: str) -> None:
         if update.verdict != "rolled back":  # that event may come before the answer

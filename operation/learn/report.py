@@ -1,4 +1,4 @@
-"""What a learning job did: a table on the terminal, and lap time against lap number."""
+"""Shows the record of a learning job: a table on the terminal, and lap time against lap number."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -7,16 +7,14 @@ from typing import Final
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from rich import box
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from operation.analysis.results import read_result
 from operation.learn.records import LapRecord, Record, UpdateRecord
 from operation.report.canvas import write_png
 from operation.report.style import INK, MUTED, WARNING, figure_style, look
-from operation.terminal.terminal import Terminal
+from operation.terminal.terminal import Terminal, plain_table
 
 __all__ = ["References", "draw", "print_laps", "references"]
 
@@ -30,11 +28,9 @@ def print_laps(record: Record, console: Console | None = None) -> None:
     """Prints a row for each of the last laps, with the update that followed it."""
     console = console or Terminal()
     updates = {update.after_lap: update for update in record.updates}
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False)
-    for title in ("lap", "time\ns", "new", "of", "in\ns"):
-        table.add_column(title, justify="right", no_wrap=True)
-    for title in ("weights", "controller"):
-        table.add_column(title, no_wrap=True)
+    table = plain_table("lap", "time\ns", "new", "of", "in\ns", "weights", "controller", left=0)
+    for column in table.columns[-2:]:
+        column.justify = "left"
     if 0 in updates:
         table.add_row("–", "", "", *_cells(updates[0]))
     for lap in record.laps[-_MOST_ROWS:]:
@@ -90,15 +86,15 @@ def draw(record: Record, beside: References, path: Path) -> None:
         axes.set_title("Lap time while learning")
         line = [(lap.lap, time_s) for lap, time_s in laps if lap.flying and time_s <= top]
         axes.plot(*np.array(line).reshape(-1, 2).T, color=INK, linewidth=1)
-        for label, colour, fill, these in (
-            ("flying lap", INK, INK, [one for one in laps if one[0].flying]),
-            ("from rest", MUTED, "white", [one for one in laps if not one[0].flying]),
-            ("off the track", WARNING, "none", [one for one in laps if one[0].off_track_m]),
+        for label, colour, fill, shown_at in (
+            ("flying lap", INK, INK, lambda lap: lap.flying),
+            ("from rest", MUTED, "white", lambda lap: not lap.flying),
+            ("off the track", WARNING, "none", lambda lap: lap.off_track_m),
         ):
-            dots = np.array([(lap.lap, min(time_s, top)) for lap, time_s in these]).reshape(-1, 2)
+            dots = [(lap.lap, min(time_s, top)) for lap, time_s in laps if shown_at(lap)]
             axes.plot(
-                *dots.T, "o", markersize=4.5, markeredgecolor=colour, markerfacecolor=fill,
-                label=label if these else None,
+                *np.array(dots).reshape(-1, 2).T, "o", markersize=4.5, markeredgecolor=colour,
+                markerfacecolor=fill, label=label if dots else None,
             )  # fmt: skip
         for lap, time_s in laps:
             if time_s > top:
