@@ -11,6 +11,7 @@ from bayesrace.messages import Event, Status
 from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
 from operation.drive import RunPlan, run_request
 from operation.learn.records import LapRecord
+from tests.driven import blank
 from tests.network.cars import Course, Program, start_controller, start_plant
 from tests.programs import PATIENCE_S
 
@@ -113,8 +114,8 @@ def lap(number: int, time_s: float | None, *, flying: bool = True, off_m: float 
 
 def controller_status(version: str, number: int | None = None, time_ns: int = 1) -> Status:
     """A heartbeat of a controller that drives with these weights, accepted as ``number``."""
-    return Status(
-        seq=0, source_time_ns=time_ns, source="controller", phase="driving", epoch=0, run=0,
-        text="", weights_version=version, rate_hz=50.0, state_age_s=0.0, delay_s=0.0,
-        counters={} if number is None else {"weights_number": number},
+    counters = {} if number is None else {"weights_number": number}
+    return blank(
+        Status, source_time_ns=time_ns, source="controller", phase="driving",
+        weights_version=version, rate_hz=50.0, counters=counters,
     )  # fmt: skip

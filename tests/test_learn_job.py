@@ -23,7 +23,7 @@ from operation.learn.journal import Journal
 from operation.learn.publishing import Publisher
 from operation.learn.records import LapRecord, LearnSettings, Record, UpdateRecord
 from operation.learn.report import draw, print_laps, references
-from tests.driven import CAR, QUICK, drive
+from tests.driven import CAR, QUICK, blank, drive
 from tests.learning_rig import controller_status, lap
 from tests.programs import until
 
@@ -32,7 +32,7 @@ NAME = PREDICTION.identity("e_kinematic", CAR)
 
 
 def no(text: str, **data: Scalar) -> Reply:
-    return Reply(seq=0, source_time_ns=0, accepted=False, text=text, data=data)
+    return blank(Reply, text=text, data=data)
 
 
 NOT_NOW = no("the controller ends", again=True)
@@ -84,11 +84,8 @@ class PublisherRig:
 
     def roll_back(self, version: str) -> None:
         data: dict[str, Scalar] = {"from_version": version}
-        event = Event(
-            seq=0, source_time_ns=0, run=1, source="controller", kind="weights_rolled_back",
-            text="because", data=data,
-        )  # fmt: skip
-        self.publisher.event(event)
+        kind, source = "weights_rolled_back", "controller"
+        self.publisher.event(blank(Event, source=source, kind=kind, text="because", data=data))
 
     def update(self, version: str) -> UpdateRecord:
         update = self.journal.update_of(version)
@@ -107,7 +104,7 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[PublisherRi
 
 def yes(version: str, number: int = 1) -> Reply:
     data: dict[str, Scalar] = {"version": version, "cycle": 40 + number, "number": number}
-    return Reply(seq=0, source_time_ns=0, accepted=True, text="taken", data=data)
+    return blank(Reply, accepted=True, text="taken", data=data)
 
 
 def test_accepted_weights_are_noted_with_their_cycle(rig: PublisherRig) -> None:

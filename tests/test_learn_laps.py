@@ -14,7 +14,7 @@ from learning.dataset import Dataset
 from learning.logs import dataset_from_messages
 from operation.learn import collector
 from operation.learn.collector import Collector, Stretch
-from tests.driven import CAR, STEP_S, drive, logged, telemetry
+from tests.driven import CAR, STEP_S, blank, drive, logged, state, telemetry
 
 
 @pytest.fixture(scope="module")
@@ -31,19 +31,8 @@ def fed(
     made, taken = Collector(CAR, STEP_S, track), []
     for one in states:
         made.state(one)
-        made.actuation(
-            Actuation(
-                seq=one.seq,
-                source_time_ns=0,
-                epoch=1,
-                run=one.run,
-                state_seq=one.seq,
-                basis_s=0.0,
-                u=(0.0, 0.0),
-                weights_version=f"v{one.seq // 100}",
-                status=0,
-            )
-        )
+        version = f"v{one.seq // 100}"
+        made.actuation(blank(Actuation, run=one.run, state_seq=one.seq, weights_version=version))
         made.telemetry(telemetry(one.run, one.seq, int(one.seq in fallbacks)))
         taken += made.take()
     return taken, made.take(at_once=True)
@@ -91,22 +80,7 @@ def test_with_the_track_crossings_are_interpolated() -> None:
     x = np.zeros((count, 7))
     x[:, 0], x[:, 1], x[:, 3] = np.cos(at), np.sin(at), speed
     lap = np.floor(at / (2 * np.pi)).astype(int)
-    states = [
-        State(
-            seq=k,
-            source_time_ns=0,
-            epoch=1,
-            run=0,
-            time_s=k * STEP_S,
-            x=tuple(x[k]),
-            u_applied=(0.0, 0.0),
-            lap=int(lap[k]),
-            lockstep=True,
-            answers=(),
-            final=False,
-        )
-        for k in range(count)
-    ]
+    states = [state(0, k, x[k], np.zeros(2), lap=int(lap[k])) for k in range(count)]
     taken, _ = fed(states, track=track)
     times = [one.lap.time_s for one in taken if one.lap is not None]
     assert times == pytest.approx([2 * np.pi / speed] * 2, abs=2e-3)

@@ -24,14 +24,14 @@ class NotTakenOverError(RuntimeError):
 
 def in_words(reply: Reply) -> str:
     """A controller's answer to new weights, or to a rollback, as a text."""
-    cycle, number, why_not = (reply.data.get(key) for key in ("cycle", "number", "not_kept"))
+    data = reply.data
     if not reply.accepted:
-        again = " for now, try again" if reply.data.get("again") is True else ""
-        return f"refused{again}: {reply.text}"
-    if cycle is None:
+        return f"refused{' for now, try again' if data.get('again') is True else ''}: {reply.text}"
+    if "cycle" not in data:
         return f"taken over: {reply.text}"
-    which = "" if number is None else f" (acceptance {number})"
-    return f"taken over at cycle {cycle}{which}{f', but not kept: {why_not}' if why_not else ''}"
+    which = f" (acceptance {data['number']})" if "number" in data else ""
+    which += f", but not kept: {data['not_kept']}" if "not_kept" in data else ""
+    return f"taken over at cycle {data['cycle']}{which}"
 
 
 class Publisher:
@@ -110,17 +110,17 @@ class Publisher:
             update, request = self.unanswered.popleft()
             if request.cancelled():
                 continue
-            error = request.exception()
-            reply = None if error else request.result()
-            if reply is None or (not reply.accepted and reply.data.get("again") is True):
-                why = str(error) if reply is None else in_words(reply)
-                self._note(update, update.verdict, why)
-            elif reply.accepted:
-                cycle, number = reply.data.get("cycle"), reply.data.get("number")
-                update.cycle = cycle if type(cycle) is int else None
-                update.acceptance = number if type(number) is int else None
+            if error := request.exception():
+                self._note(update, update.verdict, str(error))
+                continue
+            reply = request.result()
+            numbers = {name: one for name, one in reply.data.items() if type(one) is int}
+            if reply.accepted:
+                update.cycle, update.acceptance = numbers.get("cycle"), numbers.get("number")
                 self._taken_over.append((update, reply.source_time_ns))
                 self._note(update, "accepted", in_words(reply))
+            elif reply.data.get("again") is True:
+                self._note(update, update.verdict, in_words(reply))
             else:
                 self._note(update, "refused", reply.text)
 
