@@ -53,7 +53,7 @@ class PublisherRig:
         version = decode_weights(data).version
         self.sent.append(version)
         if version not in self.answers:
-            raise InputError("nobody answers")
+            raise InputError("no answer")
         return self.answers[version]
 
     def learn(self, version: str, answer: Reply | None = None) -> None:

@@ -189,7 +189,7 @@ def assert_once(data: Dataset, *parts: Dataset) -> None:
 
 
 def job_killed_at(step: int, folder: Path) -> None:
-    """In a process of its own: a job on FIRST, killed before its so many-th step on the disk."""
+    """Runs a job on FIRST, killed before its step number ``step`` on the disk."""
     steps = itertools.count(1)
 
     def count(*_: Any) -> None:
@@ -307,8 +307,8 @@ def test_what_is_given_at_the_start_is_given_once(
     record = jobs.run(folder, *lap_of(SECOND), data=data, weights=file)
     assert_once(jobs.learned, FIRST, SECOND, *([] if known else [recalled(weights, CAR)]))
     assert [one.version for one in record.updates].count(weights.version) == 1
-    going_on = f"going on in {folder} after lap 0"
-    assert f"{going_on}; --data and --weights not read: only to begin with" in jobs.said
+    resuming = f"resuming in {folder} after lap 0"
+    assert f"{resuming}; --data and --weights not read: only to begin with" in jobs.said
 
 
 @pytest.fixture(scope="module")

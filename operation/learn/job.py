@@ -50,7 +50,7 @@ def learn(
 
     ``data`` and ``weights`` are to begin with, and not read in a folder to resume. The model is
     that of ``artefact``, of the folder, or of ``weights``, else the settings'. InputError for what
-    cannot be used; a plant or a controller that is not there is waited for.
+    cannot be used. The job waits for a plant or a controller that is not there.
     """
     car, before = settings.car, resumable_settings(folder)
     track = None if settings.track is None else load_track(settings.track, car.width_m)
@@ -75,7 +75,7 @@ def learn(
     with closing(Journal(folder, settings)) as journal:
         if journal.resumed:
             why = f"; {' and '.join(unread)} not read: only to begin with" if unread else ""
-            say(f"going on in {folder} after lap {len(journal.record.laps)}{why}")
+            say(f"resuming in {folder} after lap {len(journal.record.laps)}{why}")
         elif given is not None:
             known = samples is not None and given.dataset_digest == samples.digest()
             stages = {} if known else {"kept": recalled(given, car)}

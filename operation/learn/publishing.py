@@ -53,7 +53,7 @@ class Publisher:
         self.present = False
         """A heartbeat has come since the controller appeared or disappeared."""
         self.closed = False
-        """Nothing is sent any more: what is pending is for the next job."""
+        """Nothing is sent any more: pending weights are for the next job."""
         self.in_use = ""
         """Version that the controller drives with; empty while that is unknown, or for none."""
 
@@ -73,8 +73,8 @@ class Publisher:
     def heartbeat(self, status: Status) -> None:
         """Compares the weights that the controller's status names with those sent.
 
-        A controller that has just appeared is sent what is pending, or else the last accepted
-        weights if it drives with other ones. A status of later than the takeover, but with a
+        A controller that has just appeared is sent the pending weights, or else the last accepted
+        ones if it drives with others. A status of later than the takeover, but with a
         smaller number of the weights in use, shows a rollback, also where its event was lost.
         """
         if status.source != "controller":

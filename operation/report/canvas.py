@@ -1,4 +1,4 @@
-"""Figures of one panel; figures to SVG that can stand inside a page, and to PNG."""
+"""Figures of one panel; figures to SVG for the inside of a page, and to PNG."""
 
 import io
 import re

@@ -23,7 +23,7 @@ from operation.report.style import figure_style, look
 from operation.report.timing import solve_figure
 from operation.report.traces import deviation_figures, input_figures, speed_figures, time_figures
 from operation.terminal.notation import UNCERTAIN
-from operation.terminal.race_table import COLUMNS
+from operation.terminal.race_table import COLUMNS, GP_COLUMNS, gp_cells
 
 __all__ = ["PICTURE", "REPORT", "render_report"]
 
@@ -52,6 +52,8 @@ def render_report(run_dir: Path, result: RaceResult, analysis: RaceAnalysis | No
     page = environment.get_template(_TEMPLATE).render(
         result=result,
         columns=COLUMNS,
+        gp_columns=GP_COLUMNS,
+        gp_cells=gp_cells,
         look=look,
         best=result.lap("bestcase"),
         facts=_facts(analysis, result),
