@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, Final
+from typing import Any
 
 from bayesrace.files import read_whole
 from bayesrace.gp.weights import MAX_BYTES
@@ -13,9 +13,6 @@ from operation.learn.journal import Journal
 from operation.learn.records import UpdateRecord, Verdict
 
 __all__ = ["NotTakenOverError", "Publisher", "in_words"]
-
-_HISTORY: Final = 8
-"""Accepted weights that a controller can roll back."""
 
 
 class NotTakenOverError(RuntimeError):
@@ -48,8 +45,9 @@ class Publisher:
         self._thread = ThreadPoolExecutor(1, "learn-publisher")
         self.unanswered: deque[tuple[UpdateRecord, Future[Reply]]] = deque()
         """Updates that were sent, oldest first, with what will be the answer."""
-        self._taken_over: deque[tuple[UpdateRecord, int]] = deque(maxlen=_HISTORY)
-        """Updates that the present controller has accepted, and the time of its answer [ns]."""
+        self._taken_over: deque[tuple[UpdateRecord, int]] = deque(maxlen=8)
+        """The last updates that the present controller accepted, and the times of its answers [ns];
+        it keeps no more weights to roll back to."""
         self.present = False
         """A heartbeat has come since the controller appeared or disappeared."""
         self.closed = False
