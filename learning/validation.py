@@ -23,6 +23,7 @@ from learning.dataset import Dataset
 from learning.posterior import Covariance, Posterior
 from learning.residual import NOMINAL, identity, residual
 from learning.scores import NORMAL_95, PredictionErrors
+from learning.subset import evenly
 
 __all__ = ["HORIZON", "Validation", "mismatch", "predictive_sigma", "unbroken", "validate"]
 
@@ -125,8 +126,7 @@ def mismatch(
     """
     step = corrected_function(NOMINAL(dataset.car), discretisation, weights)
     first = unbroken(dataset, steps)
-    if len(first) > _MAX_STARTS:
-        first = first[np.linspace(0, len(first) - 1, _MAX_STARTS).astype(np.int64)]
+    first = first[evenly(len(first), _MAX_STARTS)]
     if len(first) == 0:
         return np.zeros((0, 7))
     x = dataset.x[first].T

@@ -50,7 +50,7 @@ class Task:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What became of a task."""
+    """The result of a task."""
 
     error: str = ""
     """Why there are no weights; empty if there are."""
@@ -83,7 +83,7 @@ class Trainer:
     """Runs one task at a time in a process that is started again if it has died."""
 
     def __init__(self, folder: Path) -> None:
-        """``folder``: for the task under way and for ``worker.log``, the process's messages."""
+        """``folder``: for the running task and for ``worker.log``, the process's messages."""
         self._folder, self._log = folder, folder / _LOG
         self._log.write_bytes(b"")
         self._process: subprocess.Popen[bytes] | None = None
@@ -110,7 +110,7 @@ class Trainer:
     def start(self, task: Task) -> None:
         """Runs the task; only if not :attr:`busy`. For the main thread."""
         process = self.prepare()
-        os.truncate(self._log, 0)  # the process appends: it goes on at the beginning
+        os.truncate(self._log, 0)  # the process appends: it continues at the beginning
         (self._folder / _OUTCOME).unlink(missing_ok=True)
         write_whole(self._folder / _TASK, pickle.dumps(task))
         self.busy = True

@@ -3,21 +3,22 @@
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, TypeVar, get_args, get_type_hints
 
 import numpy as np
 
 from bayesrace.arrays import Floats
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.log import LogWriter
-from bayesrace.messages import State, Telemetry, Truth, encode
+from bayesrace.messages import Message, State, Telemetry, Truth, encode
 from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import Model
 from learning.dataset import Dataset, dataset_from_arrays
 from learning.training import TrainingSettings
 
-__all__ = ["CAR", "QUICK", "STEP_S", "drive", "logged", "state", "telemetry", "write_log"]
+__all__ = ["CAR", "QUICK", "STEP_S", "blank", "drive", "logged", "state", "telemetry", "write_log"]
 
+M = TypeVar("M", bound=Message)
 
 CAR = get_car("orca")
 STEP_S = PREDICTION.step_s
@@ -40,30 +41,21 @@ def drive(model: Model, count: int, seed: int, substeps: int = 10, vx: float = 1
     return dataset_from_arrays(CAR, STEP_S, np.array(x), np.array(u))
 
 
-def state(run: int, seq: int, x: Floats, u: Floats) -> State:
+def blank(kind: type[M], /, **known: Any) -> M:
+    """A message of this kind; fields that are not ``known`` are zero or empty."""
+    kinds = get_type_hints(kind, include_extras=True)
+    names = {one.name for one in fields(kind)} - set(known)
+    return kind(**known, **{name: get_args(kinds[name])[0]() for name in names})
+
+
+def state(run: int, seq: int, x: Floats, u: Floats, **known: Any) -> State:
     time_s = round(seq * STEP_S, 9)
-    return State(
-        seq=seq,
-        source_time_ns=0,
-        epoch=1,
-        run=run,
-        time_s=time_s,
-        x=tuple(x),
-        u_applied=tuple(u),
-        lap=0,
-        lockstep=True,
-        answers=(),
-        final=False,
-    )
+    car: dict[str, Any] = {"time_s": time_s, "x": tuple(x), "u_applied": tuple(u), "lockstep": True}
+    return blank(State, **({"seq": seq, "epoch": 1, "run": run} | car | known))
 
 
 def telemetry(run: int, state_seq: int, fallback: int) -> Telemetry:
-    kinds = get_type_hints(Telemetry, include_extras=True)
-    nothing: dict[str, Any] = {
-        one.name: get_args(kinds[one.name])[0]() for one in fields(Telemetry)
-    }
-    known = {"seq": state_seq, "run": run, "state_seq": state_seq, "fallback": fallback}
-    return Telemetry(**(nothing | known))
+    return blank(Telemetry, seq=state_seq, run=run, state_seq=state_seq, fallback=fallback)
 
 
 def logged(data: Dataset, run: int) -> list[State]:

@@ -11,6 +11,7 @@ from bayesrace.messages import Event, Status
 from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
 from operation.drive import RunPlan, run_request
 from operation.learn.records import LapRecord
+from tests.driven import blank
 from tests.network.cars import Course, Program, start_controller, start_plant
 from tests.programs import PATIENCE_S
 
@@ -19,7 +20,7 @@ __all__ = ["Rig", "controller_status", "lap", "learn_arguments", "record", "rigg
 
 @dataclass
 class Rig:
-    """Both processes, their endpoints, and who starts runs."""
+    """Both processes, their endpoints, and a director that starts runs."""
 
     folder: Path
     course: Course
@@ -36,7 +37,7 @@ class Rig:
         return "--endpoint", self.plant_at, "--endpoint", self.controller_at
 
     def kill_both(self) -> None:
-        """Plant and controller, until nobody takes them for present."""
+        """Kills plant and controller, and waits until their tokens are gone."""
         self.controller.kill()
         self.plant.kill()
         for source in ("plant", "controller"):
@@ -111,19 +112,10 @@ def lap(number: int, time_s: float | None, *, flying: bool = True, off_m: float 
     )  # fmt: skip
 
 
-def controller_status(version: str) -> Status:
-    """A heartbeat of a controller that drives with these weights."""
-    return Status(
-        seq=0,
-        source_time_ns=1,
-        source="controller",
-        phase="driving",
-        epoch=0,
-        run=0,
-        text="",
-        weights_version=version,
-        rate_hz=50.0,
-        state_age_s=0.0,
-        delay_s=0.0,
-        counters={},
-    )
+def controller_status(version: str, number: int | None = None, time_ns: int = 1) -> Status:
+    """A heartbeat of a controller that drives with these weights, accepted as ``number``."""
+    counters = {} if number is None else {"weights_number": number}
+    return blank(
+        Status, source_time_ns=time_ns, source="controller", phase="driving",
+        weights_version=version, rate_hz=50.0, counters=counters,
+    )  # fmt: skip

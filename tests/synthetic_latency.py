@@ -8,6 +8,7 @@ from bayesrace.log import LogWriter
 from bayesrace.messages import Actuation, Message, State, Status, Telemetry, Truth, encode
 from studies.latency.analysis import Analysis, Beside, analyse
 from studies.latency.settings import LatencySettings
+from tests.driven import blank
 
 __all__ = ["PERIOD_NS", "Loop", "report_of"]
 
@@ -81,46 +82,12 @@ class Loop:
         released = self.controller_ns(sampled_ns + released_ns)
         sent = self.controller_ns(sampled_ns + released_ns + 400_000)
         received = self.controller_ns(sampled_ns + 600_000)
-        telemetry = Telemetry(
-            seq=self.sent,
-            source_time_ns=sent,
-            run=self.run,
-            state_seq=seq,
-            status=0,
-            fallback=0,
-            iterations=3,
-            tick=self.ticks,
-            released_ns=released,
-            received_ns=received,
-            missed=False,
-            wake_us=31.0,
-            decode_us=42.0,
-            prepare_us=150.0,
-            solve_us=250.0,
-            encode_us=53.0,
-            delay_s=0.0,
-            plan_x=(),
-            plan_u=(),
-            residual_dynamics=0.0,
-            residual_bounds=0.0,
-            residual_stationarity=0.0,
-            cost=0.0,
-            cost_shifted=0.0,
-            second_start=0,
-            s_ref_m=0.0,
-            n_ref_m=0.0,
-        )
-        actuation = Actuation(
-            seq=self.sent,
-            source_time_ns=sent,
-            epoch=self.epoch,
-            run=self.run,
-            state_seq=seq,
-            basis_s=0.0,
-            u=(0.0, 0.0),
-            weights_version="",
-            status=0,
-        )
+        both = {"seq": self.sent, "source_time_ns": sent, "run": self.run, "state_seq": seq}
+        telemetry = blank(
+            Telemetry, **both, tick=self.ticks, released_ns=released, received_ns=received,
+            wake_us=31.0, decode_us=42.0, prepare_us=150.0, solve_us=250.0, encode_us=53.0,
+        )  # fmt: skip
+        actuation = blank(Actuation, **both, epoch=self.epoch, u=(0.0, 0.0))
         self.sent, self.ticks = self.sent + 1, self.ticks + 1
         if seen:
             self._write("actuation", actuation, seq)
@@ -145,20 +112,10 @@ class Loop:
         for source, sent_ns, counters in (
             ("plant", at_ns, plant), ("controller", self.controller_ns(at_ns), controller)
         ):  # fmt: skip
-            status = Status(
-                seq=self.beats,
-                source_time_ns=sent_ns,
-                source=source,
-                phase="running",
-                epoch=self.epoch,
-                run=self.run,
-                text="",
-                weights_version="",
-                rate_hz=50.0,
-                state_age_s=0.0,
-                delay_s=0.0,
-                counters=counters,
-            )
+            status = blank(
+                Status, seq=self.beats, source_time_ns=sent_ns, source=source, phase="running",
+                epoch=self.epoch, run=self.run, rate_hz=50.0, counters=counters,
+            )  # fmt: skip
             self._write(f"status/{source}", status, self.state_seq - 1)
         self.beats += 1
 

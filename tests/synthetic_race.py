@@ -19,6 +19,7 @@ from bayesrace.messages import Actuation, Event, Message, State, Telemetry, Trut
 from bayesrace.raceline import RaceLine, write_raceline
 from bayesrace.tracks import Track, write_track
 from bayesrace.vehicles import get_car
+from tests.driven import blank
 
 __all__ = ["LAP_S", "LINE_M", "STEP_S", "Drive", "circle", "track", "write_race"]
 
@@ -93,18 +94,8 @@ class _Log:
 
     def event(self, run: int, source: str, kind: str, text: str, data: dict[str, object]) -> None:
         key = f"event/{source}"
-        self.put(
-            key,
-            Event(
-                seq=self.seq(key),
-                source_time_ns=self.now_ns,
-                run=run,
-                source=source,
-                kind=kind,
-                text=text,
-                data=data,  # type: ignore[arg-type]
-            ),
-        )
+        known = {"source_time_ns": self.now_ns, "run": run, "data": data}
+        self.put(key, blank(Event, seq=self.seq(key), source=source, kind=kind, text=text, **known))
 
     def drive(self, run: int, drive: Drive) -> None:
         data: dict[str, object] = {
@@ -133,17 +124,10 @@ class _Log:
             if final:
                 break
             actuation = self.seq("actuation")
-            answer = Actuation(
-                seq=actuation,
-                source_time_ns=now,
-                epoch=1,
-                run=run,
-                state_seq=seq,
-                basis_s=time_s,
-                u=u,
-                weights_version=drive.weights,
-                status=0,
-            )
+            answer = blank(
+                Actuation, seq=actuation, source_time_ns=now, epoch=1, run=run, state_seq=seq,
+                basis_s=time_s, u=u, weights_version=drive.weights,
+            )  # fmt: skip
             self.put("actuation", answer)
             self.put("telemetry", self._telemetry(run, seq, drive, k))
         if drive.ended is not None:
@@ -153,35 +137,10 @@ class _Log:
         level = int(k in drive.fallback_cycles)
         solve_us = float(drive.solve_us[k % len(drive.solve_us)])
         number = self.seq("telemetry")
-        return Telemetry(
-            seq=number,
-            source_time_ns=self.now_ns,
-            run=run,
-            state_seq=seq,
-            status=0,
-            fallback=level,
-            iterations=1,
-            tick=number,
-            released_ns=self.now_ns,
-            received_ns=self.now_ns,
-            missed=False,
-            wake_us=0.0,
-            decode_us=0.0,
-            prepare_us=0.0,
-            solve_us=solve_us,
-            encode_us=0.0,
-            delay_s=0.0,
-            plan_x=(),
-            plan_u=(),
-            residual_dynamics=0.0,
-            residual_bounds=0.0,
-            residual_stationarity=0.0,
-            cost=0.0,
-            cost_shifted=0.0,
-            second_start=0,
-            s_ref_m=0.0,
-            n_ref_m=0.0,
-        )
+        return blank(
+            Telemetry, seq=number, source_time_ns=self.now_ns, run=run, state_seq=seq,
+            fallback=level, tick=number, solve_us=solve_us,
+        )  # fmt: skip
 
     def close(self) -> None:
         self._writer.close()

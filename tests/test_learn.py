@@ -44,8 +44,8 @@ def learning(rig: Rig, out: Path, *options: str | Path) -> Iterator[Program]:
         yield job
 
 
-def settled(out: Path, count: int) -> list[dict[str, Any]]:
-    """Waits for so many updates that have an answer; all of them."""
+def answered(out: Path, count: int) -> list[dict[str, Any]]:
+    """Waits until ``count`` updates have an answer; returns all of them."""
 
     def enough() -> bool:
         updates = record(out)["updates"]
@@ -66,7 +66,7 @@ def test_laps_in_lockstep_get_faster_and_stay_on_the_track(tmp_path: Path, cours
     with rigged(tmp_path, blank) as rig, learning(rig, out, "--laps", "4") as job:
         for number in range(2):
             rig.drive(2)
-            settled(out, number + 1)
+            answered(out, number + 1)
         assert job.process.wait(PATIENCE_S) == 0, job.said()
         last = rig.version()
     content = record(out)
@@ -95,16 +95,16 @@ def test_everything_may_be_killed_and_started_again(tmp_path: Path, course: Cour
     given = ("--data", data, "--weights", course.weights_file)
     with rigged(tmp_path, course) as rig:
         with learning(rig, out, *given) as job:
-            first = settled(out, 2)
+            first = answered(out, 2)
             assert [update["after_lap"] for update in first] == [0, 0]
             assert first[0]["answer"] == "in use already"
             rig.drive(1)
-            settled(out, 3)
+            answered(out, 3)
             job.kill()
         with learning(rig, out, *given) as job:
-            assert "going on" in job.said()
+            assert "resuming" in job.said()
             rig.drive(1)
-            updates = settled(out, 4)
+            updates = answered(out, 4)
             assert rig.version() == updates[-1]["version"]
             rig.kill_both()
             until(lambda: "controller is gone" in job.said(), "the loss")
@@ -114,7 +114,7 @@ def test_everything_may_be_killed_and_started_again(tmp_path: Path, course: Cour
             newest = updates[-1]["version"]
             until(lambda: rig.version() == newest, "the weights given again")
             rig.drive(1, lockstep=False)
-            assert settled(out, 5)[-1]["verdict"] == "accepted"
+            assert answered(out, 5)[-1]["verdict"] == "accepted"
             job.process.send_signal(signal.SIGINT)
             assert job.process.wait(PATIENCE_S) == 0, job.said()
     laps = record(out)["laps"]

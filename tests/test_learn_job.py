@@ -4,6 +4,7 @@ import os
 import signal
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,18 +23,22 @@ from operation.learn.journal import Journal
 from operation.learn.publishing import Publisher
 from operation.learn.records import LapRecord, LearnSettings, Record, UpdateRecord
 from operation.learn.report import draw, print_laps, references
-from tests.driven import CAR, QUICK, drive
+from tests.driven import CAR, QUICK, blank, drive
 from tests.learning_rig import controller_status, lap
 from tests.programs import until
 
 SETTINGS = LearnSettings(car=CAR)
 NAME = PREDICTION.identity("e_kinematic", CAR)
-NOT_NOW = Reply(
-    seq=0, source_time_ns=0, accepted=False, text="the controller ends", data={"again": True}
-)
 
 
-class Desk:
+def no(text: str, **data: Scalar) -> Reply:
+    return blank(Reply, text=text, data=data)
+
+
+NOT_NOW = no("the controller ends", again=True)
+
+
+class PublisherRig:
     """A publisher whose controller answers as prepared; without an answer, none comes."""
 
     def __init__(self, journal: Journal, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -48,7 +53,7 @@ class Desk:
         version = decode_weights(data).version
         self.sent.append(version)
         if version not in self.answers:
-            raise InputError("nobody answers")
+            raise InputError("no answer")
         return self.answers[version]
 
     def learn(self, version: str, answer: Reply | None = None) -> None:
@@ -79,17 +84,8 @@ class Desk:
 
     def roll_back(self, version: str) -> None:
         data: dict[str, Scalar] = {"from_version": version}
-        self.publisher.event(
-            Event(
-                seq=0,
-                source_time_ns=0,
-                run=1,
-                source="controller",
-                kind="weights_rolled_back",
-                text="because",
-                data=data,
-            )
-        )
+        kind, source = "weights_rolled_back", "controller"
+        self.publisher.event(blank(Event, source=source, kind=kind, text="because", data=data))
 
     def update(self, version: str) -> UpdateRecord:
         update = self.journal.update_of(version)
@@ -101,103 +97,115 @@ class Desk:
 
 
 @pytest.fixture
-def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Desk]:
+def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[PublisherRig]:
     with closing(Journal(tmp_path / "job", SETTINGS)) as journal:
-        yield Desk(journal, monkeypatch)
+        yield PublisherRig(journal, monkeypatch)
 
 
 def yes(version: str, number: int = 1) -> Reply:
     data: dict[str, Scalar] = {"version": version, "cycle": 40 + number, "number": number}
-    return Reply(seq=0, source_time_ns=0, accepted=True, text="taken", data=data)
+    return blank(Reply, accepted=True, text="taken", data=data)
 
 
-def test_accepted_weights_are_noted_with_their_cycle(desk: Desk) -> None:
-    desk.start_controller()
-    desk.learn("a", yes("a"))
-    update = desk.update("a")
+def test_accepted_weights_are_noted_with_their_cycle(rig: PublisherRig) -> None:
+    rig.start_controller()
+    rig.learn("a", yes("a"))
+    update = rig.update("a")
     assert (update.verdict, update.cycle, update.acceptance) == ("accepted", 41, 1)
-    assert desk.said == ["a: taken over at cycle 41 (acceptance 1)"]
+    assert rig.said == ["a: taken over at cycle 41 (acceptance 1)"]
 
 
-def test_declined_weights_are_reported_and_not_sent_again(desk: Desk) -> None:
-    desk.start_controller()
-    desk.learn(
-        "bad",
-        Reply(seq=0, source_time_ns=0, accepted=False, text="worse than those in use", data={}),
-    )
-    desk.learn("back", yes("back"))
-    desk.roll_back("back")
-    assert (desk.verdict("bad"), desk.verdict("back")) == ("refused", "rolled back")
-    assert "bad: refused: worse than those in use" in desk.said
-    assert "rolled back: back (learned after lap 1): because" in desk.said
+def test_declined_weights_are_reported_and_not_sent_again(rig: PublisherRig) -> None:
+    rig.start_controller()
+    rig.learn("bad", no("worse than those in use"))
+    rig.learn("back", yes("back"))
+    rig.roll_back("back")
+    assert (rig.verdict("bad"), rig.verdict("back")) == ("refused", "rolled back")
+    assert "bad: refused: worse than those in use" in rig.said
+    assert "rolled back: back (learned after lap 1): because" in rig.said
     for version in ("bad", "back"):
-        desk.learn(version, yes(version))
-        assert desk.verdict(version) == "not sent"
-    assert desk.sent == ["bad", "back"]
-    assert desk.journal.last_accepted is None
+        rig.learn(version, yes(version))
+        assert rig.verdict(version) == "not sent"
+    assert rig.sent == ["bad", "back"]
+    assert rig.journal.last_accepted is None
 
 
-def test_an_answer_after_the_rollback_changes_nothing(desk: Desk) -> None:
-    desk.start_controller()
-    desk.answers["a"] = yes("a")
-    desk.offer("a")
-    desk.roll_back("a")
-    desk.work()
-    assert desk.verdict("a") == "rolled back"
+def test_an_answer_after_the_rollback_changes_nothing(rig: PublisherRig) -> None:
+    rig.start_controller()
+    rig.answers["a"] = yes("a")
+    rig.offer("a")
+    rig.roll_back("a")
+    rig.work()
+    assert rig.verdict("a") == "rolled back"
+
+
+def test_a_rollback_whose_event_was_lost_shows_in_the_status(rig: PublisherRig) -> None:
+    """By the number of the weights in use; a status from before the takeover shows none."""
+    rig.start_controller("old")
+    for number, version in enumerate("ab", 1):
+        rig.learn(version, replace(yes(version, number), source_time_ns=100 * number))
+    for version, number, time_ns in (("old", 0, 90), ("a", 1, 190), ("b", 2, 210)):
+        rig.publisher.heartbeat(controller_status(version, number, time_ns))
+    rig.publisher.heartbeat(controller_status("of another publisher", 3, 220))
+    assert (rig.verdict("a"), rig.verdict("b")) == ("accepted", "accepted")
+    rig.publisher.heartbeat(controller_status("a", 1, 230))
+    assert (rig.verdict("a"), rig.verdict("b")) == ("accepted", "rolled back")
+    assert rig.said[-1].endswith("b (learned after lap 1): the controller drives with a again")
+    rig.start_controller("a")  # another one, which begins its numbers anew
+    rig.publisher.heartbeat(controller_status("a", 0, 240))
+    assert rig.verdict("a") == "accepted"
 
 
 @pytest.mark.parametrize("answer", [None, NOT_NOW], ids=["no answer", "refused for now"])
 def test_weights_without_an_answer_are_sent_to_the_next_controller(
-    desk: Desk, answer: Reply | None
+    rig: PublisherRig, answer: Reply | None
 ) -> None:
-    desk.learn("a", yes("a"))
-    assert (desk.sent, desk.verdict("a")) == ([], "pending")
-    desk.start_controller()
-    assert (desk.sent, desk.verdict("a")) == (["a"], "accepted")
-    desk.learn("b", answer)
-    assert desk.verdict("b") == "pending"
-    assert desk.update("b").answer == desk.said[-1].removeprefix("b: ") != ""
-    desk.answers["b"] = yes("b", 2)
-    desk.start_controller("a")
-    assert (desk.sent, desk.verdict("b")) == (["a", "b", "b"], "accepted")
+    rig.learn("a", yes("a"))
+    assert (rig.sent, rig.verdict("a")) == ([], "pending")
+    rig.start_controller()
+    assert (rig.sent, rig.verdict("a")) == (["a"], "accepted")
+    rig.learn("b", answer)
+    assert rig.verdict("b") == "pending"
+    assert rig.update("b").answer == rig.said[-1].removeprefix("b: ") != ""
+    rig.answers["b"] = yes("b", 2)
+    rig.start_controller("a")
+    assert (rig.sent, rig.verdict("b")) == (["a", "b", "b"], "accepted")
 
 
-def test_newer_weights_supersede_pending_ones(desk: Desk) -> None:
-    desk.start_controller()
-    desk.learn("a")
-    desk.learn("b", yes("b"))
-    assert (desk.verdict("a"), desk.verdict("b")) == ("superseded", "accepted")
+def test_newer_weights_supersede_pending_ones(rig: PublisherRig) -> None:
+    rig.start_controller()
+    rig.learn("a")
+    rig.learn("b", yes("b"))
+    assert (rig.verdict("a"), rig.verdict("b")) == ("superseded", "accepted")
 
 
-def test_weights_in_use_without_an_answer_are_accepted(desk: Desk) -> None:
+def test_weights_in_use_without_an_answer_are_accepted(rig: PublisherRig) -> None:
     """The answer was lost, or they were given to the controller at its start."""
-    desk.start_controller("old")
-    desk.learn("a")
-    desk.heartbeat("a")
-    assert desk.verdict("a") == "accepted"
-    desk.learn("a")
-    assert (desk.sent, desk.update("a").answer) == (["a"], "in use already")
+    rig.start_controller("old")
+    rig.learn("a")
+    rig.heartbeat("a")
+    assert rig.verdict("a") == "accepted"
+    rig.learn("a")
+    assert (rig.sent, rig.update("a").answer) == (["a"], "in use already")
 
 
-def test_a_controller_without_the_last_accepted_weights_gets_them(desk: Desk) -> None:
+def test_a_controller_without_the_last_accepted_weights_gets_them(rig: PublisherRig) -> None:
     """As often as it takes; those refused on the way are not the last accepted."""
-    desk.start_controller("old")
-    desk.learn("a", yes("a"))
-    desk.learn("bad", Reply(seq=0, source_time_ns=0, accepted=False, text="worse", data={}))
-    desk.start_controller("a")  # it has kept them
-    assert desk.sent == ["a", "bad"]
-    desk.answers["a"] = NOT_NOW
-    desk.start_controller("old")
-    desk.answers["a"] = yes("a", 2)
-    desk.start_controller("")
-    assert desk.sent == ["a", "bad", "a", "a"]
-    assert (desk.verdict("a"), desk.update("a").acceptance) == ("accepted", 2)
-    assert "the controller drives with no weights; sending a" in desk.said
-    desk.answers["a"] = Reply(
-        seq=0, source_time_ns=0, accepted=False, text="older than those in use", data={}
-    )
-    desk.start_controller("theirs")
-    assert desk.verdict("a") == "refused"
+    rig.start_controller("old")
+    rig.learn("a", yes("a"))
+    rig.learn("bad", no("worse"))
+    rig.start_controller("a")  # it has kept them
+    assert rig.sent == ["a", "bad"]
+    rig.answers["a"] = NOT_NOW
+    rig.start_controller("old")
+    rig.answers["a"] = yes("a", 2)
+    rig.start_controller("")
+    assert rig.sent == ["a", "bad", "a", "a"]
+    assert (rig.verdict("a"), rig.update("a").acceptance) == ("accepted", 2)
+    assert "the controller drives with no weights; sending a" in rig.said
+    rig.answers["a"] = no("older than those in use")
+    rig.start_controller("theirs")
+    assert rig.verdict("a") == "refused"
 
 
 # Training ------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,12 +14,7 @@ from learning.dataset import Dataset
 from learning.logs import dataset_from_messages
 from operation.learn import collector
 from operation.learn.collector import Collector, Stretch
-from tests.driven import CAR, STEP_S, drive, logged, telemetry
-
-
-@pytest.fixture(autouse=True)
-def _at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collector, "_DELAY_S", 0.0)
+from tests.driven import CAR, STEP_S, blank, drive, logged, state, telemetry
 
 
 @pytest.fixture(scope="module")
@@ -35,19 +31,8 @@ def fed(
     made, taken = Collector(CAR, STEP_S, track), []
     for one in states:
         made.state(one)
-        made.actuation(
-            Actuation(
-                seq=one.seq,
-                source_time_ns=0,
-                epoch=1,
-                run=one.run,
-                state_seq=one.seq,
-                basis_s=0.0,
-                u=(0.0, 0.0),
-                weights_version=f"v{one.seq // 100}",
-                status=0,
-            )
-        )
+        version = f"v{one.seq // 100}"
+        made.actuation(blank(Actuation, run=one.run, state_seq=one.seq, weights_version=version))
         made.telemetry(telemetry(one.run, one.seq, int(one.seq in fallbacks)))
         taken += made.take()
     return taken, made.take(at_once=True)
@@ -95,22 +80,7 @@ def test_with_the_track_crossings_are_interpolated() -> None:
     x = np.zeros((count, 7))
     x[:, 0], x[:, 1], x[:, 3] = np.cos(at), np.sin(at), speed
     lap = np.floor(at / (2 * np.pi)).astype(int)
-    states = [
-        State(
-            seq=k,
-            source_time_ns=0,
-            epoch=1,
-            run=0,
-            time_s=k * STEP_S,
-            x=tuple(x[k]),
-            u_applied=(0.0, 0.0),
-            lap=int(lap[k]),
-            lockstep=True,
-            answers=(),
-            final=False,
-        )
-        for k in range(count)
-    ]
+    states = [state(0, k, x[k], np.zeros(2), lap=int(lap[k])) for k in range(count)]
     taken, _ = fed(states, track=track)
     times = [one.lap.time_s for one in taken if one.lap is not None]
     assert times == pytest.approx([2 * np.pi / speed] * 2, abs=2e-3)
@@ -138,19 +108,49 @@ def test_another_plant_with_the_same_run_is_another_run(states: list[State]) -> 
     assert len(samples(taken + rest)) == 99 + 49
 
 
-def test_a_lap_is_given_out_after_the_telemetry_of_its_last_cycle(
-    states: list[State], monkeypatch: pytest.MonkeyPatch
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
+    """Advances the collector's clock."""
+    now = [0.0]
+    monkeypatch.setattr(collector, "time", SimpleNamespace(monotonic=lambda: now[0]))
+
+    def advance(by_s: float) -> None:
+        now[0] += by_s
+
+    return advance
+
+
+def test_a_lap_waits_for_the_telemetry_of_its_last_cycle_however_long_the_host_stalls(
+    states: list[State], clock: Callable[[float], None]
 ) -> None:
-    monkeypatch.setattr(collector, "_DELAY_S", 1e9)
     made = Collector(CAR, STEP_S)
     for one in states[:70]:
         made.state(one)
+    clock(60.0)  # the telemetry waits to be read
+    assert made.take() == []
+    made.telemetry(telemetry(7, 59, 0))
     assert made.take() == []
     made.telemetry(telemetry(7, 60, 1))
-    monkeypatch.setattr(collector, "_DELAY_S", 0.0)
     (stretch,) = made.take()
     assert stretch.lap is not None
     assert stretch.lap.fallbacks == 1
+
+
+def test_a_lap_whose_telemetry_was_dropped_is_given_out_after_a_while(
+    states: list[State], clock: Callable[[float], None]
+) -> None:
+    made, calls = Collector(CAR, STEP_S), 0
+    for one in states[:70]:
+        made.state(one)
+    while not (taken := made.take()):
+        clock(0.1)
+        calls += 1
+    assert calls == pytest.approx(10 * collector._PATIENCE_S, abs=1)
+    assert taken[0].lap is not None
+    for one in states[70:]:
+        made.state(one)
+    made.telemetry(telemetry(7, 165, 0))  # of a later cycle: the others were dropped
+    assert len(made.take()) == 1
 
 
 @pytest.mark.parametrize(

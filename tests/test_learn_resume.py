@@ -35,7 +35,7 @@ from operation.learn import collector, job, journal, publishing
 from operation.learn.publishing import Publisher
 from operation.learn.records import LearnSettings, Record
 from operation.learn.report import print_laps
-from tests.driven import CAR, drive, logged
+from tests.driven import CAR, blank, drive, logged
 from tests.learning_rig import controller_status
 from tests.programs import until
 
@@ -118,7 +118,7 @@ class Jobs:
             yield Silent()
 
         for module, name, value in (
-            (collector, "_DELAY_S", 0.0),
+            (collector, "_PATIENCE_S", 0.0),
             (job, "_TICK_S", 0.001),
             (job, "Trainer", lambda _: FakeTrainer(jobs)),
             (job, "Inbox", Fed),
@@ -189,7 +189,7 @@ def assert_once(data: Dataset, *parts: Dataset) -> None:
 
 
 def job_killed_at(step: int, folder: Path) -> None:
-    """In a process of its own: a job on FIRST, killed before its so many-th step on the disk."""
+    """Runs a job on FIRST, killed before its step number ``step`` on the disk."""
     steps = itertools.count(1)
 
     def count(*_: Any) -> None:
@@ -307,8 +307,8 @@ def test_what_is_given_at_the_start_is_given_once(
     record = jobs.run(folder, *lap_of(SECOND), data=data, weights=file)
     assert_once(jobs.learned, FIRST, SECOND, *([] if known else [recalled(weights, CAR)]))
     assert [one.version for one in record.updates].count(weights.version) == 1
-    going_on = f"going on in {folder} after lap 0"
-    assert f"{going_on}; --data and --weights not read: only to begin with" in jobs.said
+    resuming = f"resuming in {folder} after lap 0"
+    assert f"{resuming}; --data and --weights not read: only to begin with" in jobs.said
 
 
 @pytest.fixture(scope="module")
@@ -347,13 +347,7 @@ def test_an_answer_that_is_missing_when_interrupted_is_noted(
     def send(*_: Any) -> Reply:
         jobs.put(Item(Kind.SIGNAL, "", signal.SIGINT, 0))
         until(lambda: any("waiting for the controller" in line for line in jobs.said), "the end")
-        return Reply(
-            seq=0,
-            source_time_ns=0,
-            accepted=True,
-            text="taken",
-            data={"version": "v1", "cycle": 7, "number": 1},
-        )
+        return blank(Reply, accepted=True, text="taken", data={"cycle": 7, "number": 1})
 
     monkeypatch.setattr(publishing, "send_weights", send)
     record = jobs.run(tmp_path, *lap_of(FIRST), laps=9, controller="")
@@ -367,9 +361,7 @@ def test_pending_weights_are_sent_by_the_next_job_and_accepted_ones_by_the_one_a
 
     def send(_session: Any, _car: str, data: bytes) -> Reply:
         sent.append(decode_weights(data).version)
-        return Reply(
-            seq=0, source_time_ns=0, accepted=True, text="taken", data={"cycle": 7, "number": 1}
-        )
+        return blank(Reply, accepted=True, text="taken", data={"cycle": 7, "number": 1})
 
     monkeypatch.setattr(publishing, "send_weights", send)
     record = jobs.run(tmp_path, *lap_of(FIRST))

@@ -108,8 +108,8 @@ def validate(
             write_whole(path, text)
     if plot is not None or out is not None:
         from operation.report.canvas import write_png
+        from operation.report.gp import band_figure, track_figure
         from operation.report.style import figure_style
-        from operation.report.validation import band_figure, track_figure
 
         with figure_style():
             bands = band_figure(judged.validation, judged.dataset.step_s, threshold)

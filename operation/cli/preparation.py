@@ -283,8 +283,8 @@ def train(
     print_choices(training.choices, console)
     if plot is not None:
         from operation.report.canvas import write_png
+        from operation.report.gp import kernel_figure
         from operation.report.style import figure_style
-        from operation.report.training import kernel_figure
 
         with figure_style():
             write_png(kernel_figure(training.kernels), plot)

@@ -20,8 +20,12 @@ __all__ = ["MOST_STATES", "Collector", "Stretch"]
 MOST_STATES: Final = 10_000
 """A stretch without the end of a lap is cut here (200 s at 50 Hz), which bounds the memory."""
 
-_DELAY_S: Final = 0.5
-"""A stretch is given out so long after its end: telemetry comes after the actuation."""
+_PATIENCE_S: Final = 5.0
+"""A stretch is given out at the latest this long after its end: its telemetry was dropped, or the
+controller is gone."""
+_STALL_S: Final = 0.1
+"""The most by which one call of :meth:`Collector.take` advances that time: what arrives during a
+stall of this host can only be read after it."""
 
 _REMEDIES: Final = {
     "standstill": "the car stood still, or nearly; see 'bayesrace status' for why",
@@ -33,7 +37,7 @@ _REMEDIES: Final = {
     "steering does not match its rate": "the steering angle does not follow the rate that the "
     "plant reports; correct the FMU's map, or the plant",
 }
-"""By why samples were left out (:mod:`learning.dataset`, :mod:`learning.logs`)."""
+"""Remedy by the reason why samples are left out (:mod:`learning.dataset`, :mod:`learning.logs`)."""
 
 
 @dataclass(eq=False)
@@ -44,17 +48,19 @@ class Stretch:
     begin_s: float | None = None  # plant time when the lap began, if that was seen
     states: list[State] = field(default_factory=list)
     versions: dict[str, None] = field(default_factory=dict)
-    end_s: float = 0.0  # monotonic clock
+    reported: int = -1  # newest state of this run in the telemetry so far
+    end_s: float = 0.0  # time that the collector has waited in all, at the end of the stretch
     samples: Dataset | None = None  # None if no two states are one step apart
     lap: LapRecord | None = None  # the lap that ended with this stretch, without its number
     why_not: str = ""  # why none of it can be learned from, and the remedy
 
 
 class Collector:
-    """Takes messages in the order of arrival; :meth:`take` gives out the stretches that have ended.
+    """Makes stretches with their samples and laps of messages, given in the order of arrival.
 
     Samples are those of :func:`learning.logs.dataset_from_messages`: the same pairs, gaps, fallback
     cycles and filters as from a log of the same drive. A lap ends where the plant has counted it.
+    A stretch is given out when the telemetry of its last cycle, or of a later one, has arrived.
     """
 
     def __init__(self, car: CarParameters, step_s: float, track: Track | None = None) -> None:
@@ -64,8 +70,9 @@ class Collector:
         self._open = Stretch()
         self._ended: deque[Stretch] = deque()
         self._run, self._laps = (-1, -1), 0
-        self._fallbacks: dict[tuple[int, int], None] = {}
-        """Run and number of the states that the fallback has answered, oldest first."""
+        self._fallbacks: deque[tuple[int, int]] = deque(maxlen=2 * MOST_STATES)
+        """Run and number of the states that the fallback has answered."""
+        self._waited_s, self._looked_s = 0.0, time.monotonic()
 
     def state(self, state: State) -> None:
         """Adds a state of the plant."""
@@ -85,11 +92,12 @@ class Collector:
             self._run = (-1, -1)
 
     def telemetry(self, message: Telemetry) -> None:
-        """Adds the telemetry of a cycle, which names the cycles that the fallback drove."""
+        """Adds the telemetry of a cycle, which says whether the fallback drove it."""
+        for one in (*self._ended, self._open):
+            if one.states and one.states[0].run == message.run:
+                one.reported = max(one.reported, message.state_seq)
         if message.fallback > 0:
-            if len(self._fallbacks) >= 2 * MOST_STATES:
-                del self._fallbacks[next(iter(self._fallbacks))]
-            self._fallbacks[message.run, message.state_seq] = None
+            self._fallbacks.append((message.run, message.state_seq))
 
     def actuation(self, message: Actuation) -> None:
         """Adds the actuation of a cycle, which names the weights that drive."""
@@ -98,15 +106,22 @@ class Collector:
             self._open.versions.setdefault(message.weights_version)
 
     def take(self, at_once: bool = False) -> list[Stretch]:
-        """Stretches that have ended; ``at_once``: all of them, and the one that has no end yet."""
+        """Stretches that are complete; ``at_once``: all, and the one that has no end yet."""
+        now_s = time.monotonic()
+        self._waited_s += min(now_s - self._looked_s, _STALL_S)
+        self._looked_s = now_s
         if at_once:
             self._end(Stretch())
-        before_s = time.monotonic() - (0.0 if at_once else _DELAY_S)
-        done = []
-        while self._ended and self._ended[0].end_s <= before_s:
+        done: list[Stretch] = []
+        while self._ended and (at_once or self._is_complete(self._ended[0])):
             done.append(self._ended.popleft())
             self._evaluate(done[-1])
         return done
+
+    def _is_complete(self, stretch: Stretch) -> bool:
+        """Whether all telemetry of the stretch has arrived, or is waited for no longer."""
+        last_cycle = stretch.states[-2].seq  # that of the last state belongs to the next stretch
+        return stretch.reported >= last_cycle or self._waited_s >= stretch.end_s + _PATIENCE_S
 
     def _end_lap(self, state: State) -> None:
         """The plant has counted a lap: this state is the first one behind the line."""
@@ -123,41 +138,37 @@ class Collector:
         if len(states) < 2 or states[-1].time_s - states[-2].time_s > 0.1:
             return None
         before, after = states[-2], states[-1]
-        fraction = 1.0
         if self._line is not None:
             crossing = self._line.crossing(before.x[:2], after.x[:2])  # type: ignore[arg-type]
-            fraction = crossing.fraction if crossing.direction == 1 else 1.0
-        return before.time_s + fraction * (after.time_s - before.time_s)
+            if crossing.direction == 1:
+                return before.time_s + crossing.fraction * (after.time_s - before.time_s)
+        return after.time_s
 
     def _end(self, following: Stretch) -> None:
         if len(self._open.states) > 1:
-            self._open.end_s = time.monotonic()
+            self._open.end_s = self._waited_s
             self._ended.append(self._open)
         self._open = following
 
     def _evaluate(self, stretch: Stretch) -> None:
         states, lap = stretch.states, stretch.lap
         run, first, last = states[0].run, states[0].seq, states[-1].seq
-        # The last state's own cycle belongs to the next stretch, or there is none.
-        fallbacks = [key for key in self._fallbacks if key[0] == run and first <= key[1] < last]
-        for key in fallbacks:
-            del self._fallbacks[key]
-        why_not = ""
+        fallbacks = {key for key in self._fallbacks if key[0] == run and first <= key[1] < last}
+        samples, why_not = None, ""
         try:
             samples = dataset_from_messages(states, fallbacks, self._car, self._step_s)
+            if not len(samples):
+                reason = max(samples.dropped, key=lambda one: samples.dropped[one])
+                why_not = _REMEDIES.get(reason, f"the samples are left out: {reason}")
         except InputError as error:
             why_not = str(error)
-        else:
-            stretch.samples, dropped = samples, samples.dropped
-            if not len(samples):
-                reason = max(dropped, key=lambda one: dropped[one])
-                why_not = _REMEDIES.get(reason, f"the samples are left out: {reason}")
-            if lap is not None:
-                lap.samples, lap.left_out = len(samples), dropped
+        stretch.samples = samples
         # A short stretch that is no lap, such as the end of a run, may well be of no use.
         stretch.why_not = why_not if lap is not None or len(states) >= 50 else ""
         if lap is not None:
             lap.versions, lap.fallbacks = list(stretch.versions), len(fallbacks)
+            if samples is not None:
+                lap.samples, lap.left_out = len(samples), samples.dropped
             if self._track is not None:
                 path = self._track.project_path(np.array([state.x[:2] for state in states]))
                 lap.off_track_m = max(float(np.max(path.off_track_m)), 0.0)

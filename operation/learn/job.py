@@ -1,8 +1,8 @@
 """``bayesrace learn``: what is given at the start, and the event loop of the job.
 
-One thread handles everything that happens and waits for nothing else: training is a process of its
-own, and another thread waits for the controller's answers. Plant and controller may start, end and
-start again at any time.
+One thread handles all messages and waits for nothing else: training is a process of its own, and
+another thread waits for the controller's answers. Plant and controller may start, end and start
+again at any time.
 """
 
 import os
@@ -50,7 +50,7 @@ def learn(
 
     ``data`` and ``weights`` are to begin with, and not read in a folder to resume. The model is
     that of ``artefact``, of the folder, or of ``weights``, else the settings'. InputError for what
-    cannot be used; a plant or a controller that is not there is waited for.
+    cannot be used. The job waits for a plant or a controller that is not there.
     """
     car, before = settings.car, resumable_settings(folder)
     track = None if settings.track is None else load_track(settings.track, car.width_m)
@@ -62,8 +62,6 @@ def learn(
     models = {} if before is None else {before.discretisation: str(folder)}
     given = None if weights is None else read_weights(weights)
     if given is not None:
-        if given.car != car.name:
-            raise InputError(f"{weights} is for the car '{given.car}', not '{car.name}'")
         models[discretisation_of(given.discretisation, car)] = str(weights)
     if artefact is not None:
         manifest = read_manifest(artefact)
@@ -77,7 +75,7 @@ def learn(
     with closing(Journal(folder, settings)) as journal:
         if journal.resumed:
             why = f"; {' and '.join(unread)} not read: only to begin with" if unread else ""
-            say(f"going on in {folder} after lap {len(journal.record.laps)}{why}")
+            say(f"resuming in {folder} after lap {len(journal.record.laps)}{why}")
         elif given is not None:
             known = samples is not None and given.dataset_digest == samples.digest()
             stages = {} if known else {"kept": recalled(given, car)}
@@ -123,9 +121,7 @@ class Learner:
         }
         self._due = True
         """A training is to start if there are samples, once the one before has its answer."""
-        self._laps = 0
-        self._remarked: set[str] = set()
-        self._ending = False
+        self._laps, self._ending = 0, False
 
     def run(self) -> None:
         """Follows the car until the wanted number of laps is learned from, or a signal."""
@@ -186,17 +182,12 @@ class Learner:
                 self._say(f"following car '{self._settings.name}'")
 
     def _add(self, stretch: Stretch) -> None:
-        lap, why_not = stretch.lap, stretch.why_not
-        if lap is not None:
-            self._laps += 1
-            self._due = True
-        self._journal.add_driven(stretch.samples, lap)
-        if lap is not None:
-            self._say(_in_words(lap))
-        if why_not and why_not not in self._remarked:
-            self._remarked.add(why_not)
-            self._journal.remark(why_not)
-            self._say(f"nothing to learn from: {why_not}")
+        self._journal.add_driven(stretch.samples, stretch.lap)
+        if stretch.lap is not None:
+            self._laps, self._due = self._laps + 1, True
+            self._say(_in_words(stretch.lap))
+        if stretch.why_not and self._journal.remark(stretch.why_not):
+            self._say(f"nothing to learn from: {stretch.why_not}")
 
     def _start_training(self) -> None:
         journal, settings = self._journal, self._settings

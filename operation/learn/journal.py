@@ -119,11 +119,13 @@ class Journal:
         self.record.updates.append(update)
         self.save(**samples)
 
-    def remark(self, text: str) -> None:
-        """Notes why a drive gave nothing to learn from, unless that is noted already."""
-        if text not in self.record.remarks:
-            self.record.remarks = [*self.record.remarks, text][-50:]  # some name a number
-            self.save()
+    def remark(self, text: str) -> bool:
+        """Notes why a drive gave nothing to learn from; False if that is noted already."""
+        if text in self.record.remarks:
+            return False
+        self.record.remarks = [*self.record.remarks, text][-50:]  # some name a number
+        self.save()
+        return True
 
     def drop_weights(self, in_use: str) -> None:
         """Deletes old weights files, and those that a killed job has left without an update.

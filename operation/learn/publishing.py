@@ -1,4 +1,4 @@
-"""Publishing weights to a controller, and what it makes of them."""
+"""Publishes weights to a controller, and notes whether it accepts and keeps them."""
 
 from collections import deque
 from collections.abc import Callable
@@ -21,18 +21,18 @@ class NotTakenOverError(RuntimeError):
 
 def in_words(reply: Reply) -> str:
     """A controller's answer to new weights, or to a rollback, as a text."""
-    cycle, number, why_not = (reply.data.get(key) for key in ("cycle", "number", "not_kept"))
+    data = reply.data
     if not reply.accepted:
-        again = " for now, try again" if reply.data.get("again") is True else ""
-        return f"refused{again}: {reply.text}"
-    if cycle is None:
+        return f"refused{' for now, try again' if data.get('again') is True else ''}: {reply.text}"
+    if "cycle" not in data:
         return f"taken over: {reply.text}"
-    which = "" if number is None else f" (acceptance {number})"
-    return f"taken over at cycle {cycle}{which}{f', but not kept: {why_not}' if why_not else ''}"
+    which = f" (acceptance {data['number']})" if "number" in data else ""
+    which += f", but not kept: {data['not_kept']}" if "not_kept" in data else ""
+    return f"taken over at cycle {data['cycle']}{which}"
 
 
 class Publisher:
-    """Sends the weights of updates and notes what becomes of them; for the job's thread.
+    """Sends the weights of updates and notes their verdicts; for the job's thread.
 
     A thread of its own waits for the answers; :meth:`poll` notes those that have arrived. Weights
     without an answer, or refused for now, stay pending: they are sent to the next controller that
@@ -45,10 +45,13 @@ class Publisher:
         self._thread = ThreadPoolExecutor(1, "learn-publisher")
         self.unanswered: deque[tuple[UpdateRecord, Future[Reply]]] = deque()
         """Updates that were sent, oldest first, with what will be the answer."""
+        self._taken_over: deque[tuple[UpdateRecord, int]] = deque(maxlen=8)
+        """The last updates that the present controller accepted, and the times of its answers [ns];
+        it keeps no more weights to roll back to."""
         self.present = False
         """A heartbeat has come since the controller appeared or disappeared."""
         self.closed = False
-        """Nothing is sent any more: what is pending is for the next job."""
+        """Nothing is sent any more: pending weights are for the next job."""
         self.in_use = ""
         """Version that the controller drives with; empty while that is unknown, or for none."""
 
@@ -66,34 +69,38 @@ class Publisher:
             self._say(f"no controller of car '{self._car}' is there; {version} is pending")
 
     def heartbeat(self, status: Status) -> None:
-        """The controller is there, and its status names the weights that it drives with.
+        """Compares the weights that the controller's status names with those sent.
 
-        One that has just appeared is sent what is pending, or else the last accepted weights if it
-        drives with other ones.
+        A controller that has just appeared is sent the pending weights, or else the last accepted
+        ones if it drives with others. A status of later than the takeover, but with a
+        smaller number of the weights in use, shows a rollback, also where its event was lost.
         """
         if status.source != "controller":
             return
         appeared, self.present, self.in_use = not self.present, True, status.weights_version
         update, last = self._journal.update_of(self.in_use), self._journal.last_accepted
         pending = [one for one in self._journal.record.updates if one.verdict == "pending"]
+        if appeared:
+            self._taken_over.clear()
+        drives_with = self.in_use or "no weights"
         if appeared and pending:
             self.offer(pending[-1])
         elif appeared and last is not None and self.in_use != last.version:
-            drives_with = self.in_use or "no weights"
             self._say(f"the controller drives with {drives_with}; sending {last.version}")
             self._send(last)
         elif update and update.verdict in ("pending", "superseded") and not self.unanswered:
             self._note(update, "accepted", "in use")  # the answer was lost
+        number = status.counters.get("weights_number")
+        for update, answered_ns in self._taken_over:
+            earlier = type(number) is int and number < (update.acceptance or 0)
+            # A status from before the takeover may arrive after the answer.
+            if earlier and status.source_time_ns > answered_ns and update.verdict == "accepted":
+                self._roll_back(update.version, f"the controller drives with {drives_with} again")
 
     def event(self, event: Event) -> None:
         """Notes what the controller has rolled back."""
         if event.source == "controller" and event.kind == "weights_rolled_back":
-            version = str(event.data.get("from_version", ""))
-            if (update := self._journal.update_of(version)) is not None:
-                update.verdict, update.answer = "rolled back", event.text
-                self._journal.save()
-                version += f" (learned after lap {update.after_lap})"
-            self._say(f"rolled back: {version}: {event.text}")
+            self._roll_back(str(event.data.get("from_version", "")), event.text)
 
     def poll(self) -> None:
         """Notes the answers that have arrived."""
@@ -101,16 +108,17 @@ class Publisher:
             update, request = self.unanswered.popleft()
             if request.cancelled():
                 continue
-            error = request.exception()
-            reply = None if error else request.result()
-            if reply is None or (not reply.accepted and reply.data.get("again") is True):
-                why = str(error) if reply is None else in_words(reply)
-                self._note(update, update.verdict, why)
-            elif reply.accepted:
-                cycle, number = reply.data.get("cycle"), reply.data.get("number")
-                update.cycle = cycle if type(cycle) is int else None
-                update.acceptance = number if type(number) is int else None
+            if error := request.exception():
+                self._note(update, update.verdict, str(error))
+                continue
+            reply = request.result()
+            numbers = {name: one for name, one in reply.data.items() if type(one) is int}
+            if reply.accepted:
+                update.cycle, update.acceptance = numbers.get("cycle"), numbers.get("number")
+                self._taken_over.append((update, reply.source_time_ns))
                 self._note(update, "accepted", in_words(reply))
+            elif reply.data.get("again") is True:
+                self._note(update, update.verdict, in_words(reply))
             else:
                 self._note(update, "refused", reply.text)
 
@@ -126,6 +134,15 @@ class Publisher:
 
         if not self.closed:
             self.unanswered.append((update, self._thread.submit(call)))
+
+    def _roll_back(self, version: str, why: str) -> None:
+        updates = [one for one in self._journal.record.updates if version == one.version != ""]
+        for update in updates:
+            update.verdict, update.answer = "rolled back", why
+        if updates:
+            self._journal.save()
+            version += f" (learned after lap {updates[-1].after_lap})"
+        self._say(f"rolled back: {version}: {why}")
 
     def _note(self, update: UpdateRecord, verdict: Verdict, answer: str) -> None:
         if update.verdict != "rolled back":  # that event may come before the answer

@@ -1,4 +1,4 @@
-"""What a learning job did: a table on the terminal, and lap time against lap number."""
+"""Shows the record of a learning job: a table on the terminal, and lap time against lap number."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -7,16 +7,14 @@ from typing import Final
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from rich import box
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from operation.analysis.results import read_result
 from operation.learn.records import LapRecord, Record, UpdateRecord
 from operation.report.canvas import write_png
 from operation.report.style import INK, MUTED, WARNING, figure_style, look
-from operation.terminal.terminal import Terminal
+from operation.terminal.terminal import Terminal, plain_table
 
 __all__ = ["References", "draw", "print_laps", "references"]
 
@@ -30,11 +28,9 @@ def print_laps(record: Record, console: Console | None = None) -> None:
     """Prints a row for each of the last laps, with the update that followed it."""
     console = console or Terminal()
     updates = {update.after_lap: update for update in record.updates}
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False)
-    for title in ("lap", "time\ns", "new", "of", "in\ns"):
-        table.add_column(title, justify="right", no_wrap=True)
-    for title in ("weights", "controller"):
-        table.add_column(title, no_wrap=True)
+    table = plain_table("lap", "time\ns", "new", "of", "in\ns", "weights", "controller", left=0)
+    for column in table.columns[-2:]:
+        column.justify = "left"
     if 0 in updates:
         table.add_row("–", "", "", *_cells(updates[0]))
     for lap in record.laps[-_MOST_ROWS:]:
@@ -59,7 +55,7 @@ def _time(lap: LapRecord) -> str:
 
 def _cells(update: UpdateRecord | None) -> list[str]:
     if update is None:
-        return [""] * 4
+        return []
     cycle = "" if update.cycle is None else f", cycle {update.cycle}"
     learned = [str(update.samples), f"{update.training_s:.1f}"] if update.samples else ["", ""]
     return [*learned, update.version, update.verdict + cycle]
@@ -68,8 +64,7 @@ def _cells(update: UpdateRecord | None) -> list[str]:
 def references(race: Path | None) -> References:
     """Flying lap times of a race, from its run directory; InputError if it is none."""
     laps = [] if race is None else read_result(race / "result.json").laps
-    found = {lap.controller: lap.flying_lap_time_s for lap in laps}
-    return {controller: time_s for controller, time_s in found.items() if time_s is not None}
+    return {lap.controller: lap.flying_lap_time_s for lap in laps if lap.flying_lap_time_s}
 
 
 def draw(record: Record, beside: References, path: Path) -> None:
@@ -78,31 +73,34 @@ def draw(record: Record, beside: References, path: Path) -> None:
     A line joins flying laps; the weights are at the lower edge, between the laps. A lap that takes
     far longer than the others is at the upper edge, with its time as a text.
     """
-    laps = [(lap, lap.time_s) for lap in record.laps if lap.time_s is not None]
+    laps = [lap for lap in record.laps if lap.time_s is not None]
     if not laps:
         return
-    shown = [*([time_s for lap, time_s in laps if lap.flying] or [laps[0][1]]), *beside.values()]
-    usual = [time_s for time_s in shown if time_s <= 1.25 * float(np.median(shown))]
-    top = max(usual) + max(0.3 * (max(usual) - min(usual)), 0.006 * max(usual))
+    number, time_s = np.array([(lap.lap, lap.time_s) for lap in laps]).T
+    flying = np.array([lap.flying for lap in laps])
+    off_track = np.array([bool(lap.off_track_m) for lap in laps])
+    shown = np.array([*(time_s[flying] if flying.any() else time_s[:1]), *beside.values()])
+    usual = shown[shown <= 1.25 * np.median(shown)]
+    top = usual.max() + max(0.3 * np.ptp(usual), 0.006 * usual.max())
     with figure_style():
         figure = Figure(figsize=(7.2, 3.8))
-        axes = figure.add_subplot(xlabel="lap", ylabel="lap time [s]")
-        axes.set_title("Lap time while learning")
-        line = [(lap.lap, time_s) for lap, time_s in laps if lap.flying and time_s <= top]
-        axes.plot(*np.array(line).reshape(-1, 2).T, color=INK, linewidth=1)
-        for label, colour, fill, these in (
-            ("flying lap", INK, INK, [one for one in laps if one[0].flying]),
-            ("from rest", MUTED, "white", [one for one in laps if not one[0].flying]),
-            ("off the track", WARNING, "none", [one for one in laps if one[0].off_track_m]),
+        axes = figure.add_subplot(
+            xlabel="lap", ylabel="lap time [s]", title="Lap time while learning"
+        )
+        line = flying & (time_s <= top)
+        axes.plot(number[line], time_s[line], color=INK, linewidth=1)
+        for label, colour, fill, rows in (
+            ("flying lap", INK, INK, flying),
+            ("from rest", MUTED, "white", ~flying),
+            ("off the track", WARNING, "none", off_track),
         ):
-            dots = np.array([(lap.lap, min(time_s, top)) for lap, time_s in these]).reshape(-1, 2)
             axes.plot(
-                *dots.T, "o", markersize=4.5, markeredgecolor=colour, markerfacecolor=fill,
-                label=label if these else None,
+                number[rows], np.minimum(time_s[rows], top), "o", markersize=4.5,
+                markeredgecolor=colour, markerfacecolor=fill, label=label if rows.any() else None,
             )  # fmt: skip
-        for lap, time_s in laps:
-            if time_s > top:
-                axes.annotate(f"↑ {time_s:.2f} s\n", (lap.lap, top), ha="center", fontsize=6.5)
+        for k in np.flatnonzero(time_s > top):
+            text = f"↑ {time_s[k]:.2f} s\n"
+            axes.annotate(text, (number[k], top), ha="center", fontsize=6.5)
         green = look("bayesrace-updated").colour
         for label, marker, colour, verdicts in (
             ("new weights taken over", "|", green, {"accepted"}),
@@ -113,10 +111,9 @@ def draw(record: Record, beside: References, path: Path) -> None:
                 at, [0.0] * len(at), marker, markersize=8, color=colour, clip_on=False,
                 transform=axes.get_xaxis_transform(), label=label if at else None,
             )  # fmt: skip
-        for controller, time_s in beside.items():
-            style = look(controller)
-            label = f"{style.name} {time_s:.3f} s"
-            axes.axhline(time_s, color=style.colour, linewidth=1, linestyle="--", label=label)
+        for controller, lap_s in beside.items():
+            style, label = look(controller), f"{look(controller).name} {lap_s:.3f} s"
+            axes.axhline(lap_s, color=style.colour, linewidth=1, linestyle="--", label=label)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
         axes.ticklabel_format(axis="y", useOffset=False)
         axes.set_xlim(0.4, len(record.laps) + 0.6)

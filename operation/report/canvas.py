@@ -1,4 +1,4 @@
-"""Figures of one panel; figures to SVG that can stand inside a page, and to PNG."""
+"""Figures of one panel; figures to SVG for the inside of a page, and to PNG."""
 
 import io
 import re
@@ -17,11 +17,10 @@ __all__ = ["PANEL_WIDTH", "inline_svg", "panel", "write_png"]
 PANEL_WIDTH: Final = 5.2
 """Of a panel [inch]: legible on a telephone, and two beside each other on a wide page."""
 
-_PROLOGUE: Final = re.compile(r"^.*?(?=<svg )", re.DOTALL)
-_METADATA: Final = re.compile(r"\s*<metadata>.*?</metadata>", re.DOTALL)
+_NO_METADATA: Final = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+_DROPPED: Final = re.compile(r'\A.*?(?=<svg )|\s*<!--.*?-->|(?<=<g) id="[^"]*"', re.DOTALL)
+"""The prologue, comments, and ids of groups, which would be the same in several figures."""
 _SIZE: Final = re.compile(r'\s(?:width|height)="[^"]*"')
-_GROUP_ID: Final = re.compile(r'<g id="[^"]*"')
-_COMMENT: Final = re.compile(r"\s*<!--.*?-->", re.DOTALL)
 _PATH: Final = re.compile(r' d="[^"]*"')
 _LONG: Final = re.compile(r"(\d+\.\d{2})\d+")
 
@@ -39,18 +38,14 @@ def inline_svg(figure: Figure) -> str:
     """
     buffer = io.StringIO()
     FigureCanvasSVG(figure)
-    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    text = _PROLOGUE.sub("", buffer.getvalue(), count=1)
-    text = _METADATA.sub("", text)
-    text = _COMMENT.sub("", text)
-    tag, rest = text.split(">", 1)
-    text = _GROUP_ID.sub("<g", f"{_SIZE.sub('', tag)}>{rest}")
+    figure.savefig(buffer, format="svg", metadata=_NO_METADATA)
+    text = _SIZE.sub("", _DROPPED.sub("", buffer.getvalue()), count=2)
     # A hundredth of a point is enough for lines; texts keep their digits.
     return _PATH.sub(lambda match: _LONG.sub(r"\1", match.group()), text)
 
 
 def write_png(figure: Figure, path: Path, dpi: int = 120) -> None:
-    """The figure as a PNG file, whole or not at all."""
+    """Writes the figure as a PNG file, whole or not at all."""
     FigureCanvasAgg(figure)
     with replacing(path) as partial:
         figure.savefig(partial, dpi=dpi, metadata={"Software": None})

@@ -46,7 +46,7 @@ class Lap:
 
 
 def first_laps(runs: Sequence[DrivenRun], track: Track) -> list[Lap]:
-    """The first lap of each run, or what there is of it."""
+    """The first lap of each run, or its part that was driven."""
     return [Lap(run, track, 0) for run in runs if len(run.record.truth) > 1]
 
 

@@ -18,7 +18,7 @@ from operation.report.canvas import PANEL_WIDTH
 from operation.report.laps import Lap, first_laps, reference_of
 from operation.report.style import INK, MUTED, SURFACE, WARNING, gain_map, look, speed_map
 
-__all__ = ["LapMaps", "draw_edges"]
+__all__ = ["LapMaps", "draw_edges", "show_all"]
 
 
 _MARGIN_M: Final = 0.12
@@ -44,8 +44,7 @@ class LapMaps:
     def __init__(self, runs: Sequence[DrivenRun], track: Track, line: RaceLine) -> None:
         self.runs, self._track, self._line = runs, track, line
         self._edges = track.boundaries(0.04)
-        corners = np.concatenate(self._edges)
-        self._low, self._high = corners.min(axis=0) - _MARGIN_M, corners.max(axis=0) + _MARGIN_M
+        self._corners = np.concatenate(self._edges)
         laps = {lap.run: lap for lap in first_laps(runs, track) if lap.run.finished}
         self.reference = reference_of(list(laps.values()))
         others = [lap for lap in laps.values() if lap is not self.reference]
@@ -77,7 +76,7 @@ class LapMaps:
 
     def _figure(self, runs: Sequence[DrivenRun], columns: int) -> Figure:
         rows = max(1, -(-len(runs) // columns))
-        width, height = self._high - self._low
+        width, height = np.ptp(self._corners, axis=0) + 2 * _MARGIN_M
         size = PANEL_WIDTH * columns, rows * (min((PANEL_WIDTH - 0.8) * height / width, 6.0) + 0.5)
         figure = Figure(figsize=size, layout="constrained")
         grid = figure.subplots(rows, columns, squeeze=False)
@@ -105,8 +104,7 @@ class LapMaps:
         axes.add_collection(trace)
         off = everything[run.off_track[counted]]
         axes.plot(off[:, 0], off[:, 1], "x", color=WARNING, markersize=3.6, zorder=5)
-        axes.set(xlim=(self._low[0], self._high[0]), ylim=(self._low[1], self._high[1]))
-        axes.set_aspect("equal")
+        show_all(axes, self._corners)
         scale = ScalarMappable(shade.norm, shade.colours)
         bar = axes.figure.colorbar(scale, ax=axes, label=shade.label, shrink=0.6, pad=0.01)
         bar.outline.set_visible(False)
@@ -132,3 +130,9 @@ def draw_edges(axes: Axes, right: Floats, left: Floats) -> None:
     for edge in (right, left):
         closed = np.concatenate([edge, edge[:1]])
         axes.plot(closed[:, 0], closed[:, 1], color="#a3a39b", linewidth=0.7)
+
+
+def show_all(axes: Axes, points: Floats) -> None:
+    """Limits both axes, at one scale, to these points (n, 2) and a margin."""
+    low, high = points.min(axis=0) - _MARGIN_M, points.max(axis=0) + _MARGIN_M
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")

@@ -1,33 +1,29 @@
 """The report page: figures and tables put into the template."""
 
-import contextlib
-import json
 import platform
-from collections.abc import Mapping
+from contextlib import suppress
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
+from pydantic import ValidationError
 
 from bayesrace.files import write_whole
+from bayesrace.manifest import Manifest
 from operation.analysis.published import LIMIT, SOURCE, compare_gp, compare_laps
 from operation.analysis.race import RaceAnalysis, read_race
 from operation.analysis.results import RaceResult
 from operation.report.canvas import inline_svg, write_png
-from operation.report.learning import gp_figures, solve_figure
+from operation.report.gp import gp_figures
 from operation.report.maps import LapMaps
 from operation.report.style import figure_style, look
-from operation.report.traces import (
-    deviation_figures,
-    input_figures,
-    speed_figures,
-    time_figures,
-)
+from operation.report.timing import solve_figure
+from operation.report.traces import deviation_figures, input_figures, speed_figures, time_figures
 from operation.terminal.notation import UNCERTAIN
-from operation.terminal.race_table import COLUMNS
+from operation.terminal.race_table import COLUMNS, GP_COLUMNS, gp_cells
 
 __all__ = ["PICTURE", "REPORT", "render_report"]
 
@@ -56,6 +52,8 @@ def render_report(run_dir: Path, result: RaceResult, analysis: RaceAnalysis | No
     page = environment.get_template(_TEMPLATE).render(
         result=result,
         columns=COLUMNS,
+        gp_columns=GP_COLUMNS,
+        gp_cells=gp_cells,
         look=look,
         best=result.lap("bestcase"),
         facts=_facts(analysis, result),
@@ -108,21 +106,13 @@ def _versions(run_dir: Path) -> list[tuple[str, str]]:
 
 
 def _compilers(run_dir: Path) -> list[tuple[str, str]]:
-    """What built the controllers, by the run's manifests: informative, so nothing is refused."""
-    pending: list[Any] = []
-    for path in sorted(run_dir.glob("manifest*.json"), reverse=True):
-        with contextlib.suppress(OSError, ValueError):
-            pending.append(json.loads(path.read_text(encoding="utf-8")))
-    named: dict[tuple[str, str], None] = {}
-    while pending:
-        item = pending.pop()
-        if not isinstance(item, Mapping):
-            continue
-        pending.extend(item.values())
-        if "build_hash" in item and "model" in item:
-            text = f"{str(item['build_hash'])[:12]}, {item.get('compiler', '')}"
-            named[(f"{item['model']} step", text.strip(", "))] = None
-    return list(named)
+    """What built the controllers, by those of the run's manifests that this program can read."""
+    found = []
+    for path in sorted(run_dir.glob("manifest*.json")):
+        with suppress(OSError, ValidationError):
+            one = Manifest.model_validate_json(path.read_bytes())
+            found.append((f"{one.model} step", f"{one.build_hash[:12]}, {one.compiler}"))
+    return found
 
 
 def _uncertain(analysis: RaceAnalysis) -> list[tuple[str, int, int]]:

@@ -21,10 +21,8 @@ __all__ = ["deviation_figures", "input_figures", "speed_figures", "time_figures"
 
 _LEAP_M: Final = 1.0
 _NEAR_MS: Final = 300.0
-"""A lap that ends farther from the reference leaves the picture, so that the others can be told
-apart."""
+"""A lap that ends farther from the reference leaves the picture, which shows the others larger."""
 _DASHES: Final = (0, (4, 2))
-_TITLES: Final = ("first lap, from standstill", "best flying lap")
 
 
 def _panel(track: Track, title: str, label: str, height: float = 2.0) -> tuple[Figure, Axes]:
@@ -41,16 +39,19 @@ def _plot(axes: Axes, lap: Lap, values: Floats) -> None:
     axes.plot(s, y, color=look(lap.run.controller).colour, linewidth=1.1)
 
 
-def _both(runs: Sequence[DrivenRun], track: Track) -> list[tuple[str, list[Lap]]]:
-    """The first and, where there are any, the best flying laps with their title."""
-    laps = first_laps(runs, track), flying_laps(runs, track)
-    return [(title, some) for title, some in zip(_TITLES, laps, strict=True) if some]
+def _both(runs: Sequence[DrivenRun], track: Track) -> dict[str, list[Lap]]:
+    """The first and, where there are any, the best flying laps by their title."""
+    laps = {
+        "first lap, from standstill": first_laps(runs, track),
+        "best flying lap": flying_laps(runs, track),
+    }
+    return {title: some for title, some in laps.items() if some}
 
 
 def time_figures(runs: Sequence[DrivenRun], track: Track) -> list[Figure]:
     """Time behind the reference lap along the track: a line that rises loses time there."""
     figures = []
-    for title, laps in _both(runs, track):
+    for title, laps in _both(runs, track).items():
         finished = [lap for lap in laps if lap.run.finished]
         reference = reference_of(finished)
         if reference is None or len(finished) < 2:
@@ -75,7 +76,7 @@ def speed_figures(runs: Sequence[DrivenRun], track: Track, line: RaceLine) -> li
     figures = []
     on_line = track.project_points(line.xy_m)
     order = np.argsort(on_line.s_m)[:: max(1, len(line.s_m) // 800)]
-    for title, laps in _both(runs, track):
+    for title, laps in _both(runs, track).items():
         figure, axes = _panel(track, title, "vx [m/s]")
         axes.plot(
             on_line.s_m[order], line.vx_mps[order], color=MUTED, linewidth=0.9, linestyle=_DASHES
@@ -89,17 +90,12 @@ def speed_figures(runs: Sequence[DrivenRun], track: Track, line: RaceLine) -> li
 
 def input_figures(runs: Sequence[DrivenRun], track: Track, car: CarParameters) -> list[Figure]:
     """Duty cycle and steering on the first lap, with the car's limits."""
+    steering, turning = car.delta_max_rad, car.delta_rate_max_radps
     rows: list[tuple[str, str, tuple[float, float], Callable[[DrivenRun], Floats]]] = [
         ("duty cycle", "d [–]", (car.d_min, car.d_max), lambda run: _held(run.record.u[:, 0])),
-        (
-            "steering angle", "δ [rad]", (-car.delta_max_rad, car.delta_max_rad),
-            lambda run: run.record.x[:, 6],
-        ),
-        (
-            "steering rate", "dδ/dt [rad/s]",
-            (-car.delta_rate_max_radps, car.delta_rate_max_radps),
-            lambda run: _held(run.record.u[:, 1]),
-        ),
+        ("steering angle", "δ [rad]", (-steering, steering), lambda run: run.record.x[:, 6]),
+        ("steering rate", "dδ/dt [rad/s]", (-turning, turning),
+         lambda run: _held(run.record.u[:, 1])),
     ]  # fmt: skip
     figures = []
     for title, label, limits, values in rows:
@@ -121,7 +117,7 @@ def deviation_figures(runs: Sequence[DrivenRun], track: Track) -> list[Figure]:
     """Signed distance from the racing line on the first and on the best flying lap."""
     figures = []
     reach = float(np.max(track.width_right_m + track.width_left_m)) / 2
-    for title, laps in _both(runs, track):
+    for title, laps in _both(runs, track).items():
         figure, axes = _panel(track, title, "to the left [m]")
         axes.axhline(0, color=MUTED, linewidth=0.8, linestyle=_DASHES)
         for lap in laps:

@@ -8,9 +8,9 @@ from rich.text import Text
 from bayesrace.gp.weights import OUTPUTS, UNITS
 from learning.assessment import ChoiceScore, KernelScore
 from learning.dataset import left_out
-from operation.analysis.results import GpMetrics
 from operation.analysis.validation import Drift, HorizonResult, Spread, ValidationResult
 from operation.terminal.notation import SMOOTHNESS
+from operation.terminal.race_table import GP_COLUMNS, gp_cells
 from operation.terminal.terminal import plain_table
 
 __all__ = ["print_choices", "print_kernels", "print_validation"]
@@ -56,28 +56,17 @@ def print_choices(scores: Sequence[ChoiceScore], console: Console) -> None:
 
 def print_validation(result: ValidationResult, console: Console) -> None:
     """Metrics per output, and the drift over one step and over the horizon."""
-    counts = left_out(result.dropped)
-    console.print(
-        Text(f"{result.weights_version} on {result.samples} samples (left out: {counts})"),
-        style="bold",
-    )
+    counts = f"{result.samples} samples (left out: {left_out(result.dropped)})"
+    console.print(Text(f"{result.weights_version} on {counts}", style="bold"))
     if result.learned_from:
         text = "the weights were learned from these very samples: expect larger errors on others"
         console.print(Text(text, style="yellow"))
-    table = plain_table("output", "RMSE", "without GP", "R²", "coverage", "log density")
-    metrics: dict[str, GpMetrics] = {o: getattr(result, o) for o in OUTPUTS}
-    for output, one in metrics.items():
-        table.add_row(
-            f"{output} {UNITS[output]}", f"{one.rmse:.3g}", f"{one.uncorrected_rmse:.3g}",
-            f"{one.r2:.4f}", f"{one.coverage:.3f}", f"{one.log_density:.2f}",
-        )  # fmt: skip
+    table = plain_table("output", *GP_COLUMNS)
+    for output in OUTPUTS:
+        table.add_row(f"{output} {UNITS[output]}", *gp_cells(getattr(result, output)))
     console.print(table)
-    console.print(
-        Text(
-            f"largest sigma above {result.threshold:g} at {result.uncertain} of {result.samples} "
-            "samples"
-        )
-    )
+    large = f"largest sigma above {result.threshold:g}"
+    console.print(Text(f"{large} at {result.uncertain} of {result.samples} samples"))
     for drift in (result.one_step, result.horizon):
         if drift is not None:
             _print_drift(drift, console)

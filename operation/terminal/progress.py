@@ -1,14 +1,14 @@
-"""What a person sees while the parts work: a line per stage with its time.
+"""Shows the stages of the work: a line per stage with its time.
 
 A stage that needs results of the cache and computes none of them is marked as such.
 """
 
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
-from typing import Final, Protocol
+from contextlib import contextmanager
+from typing import Final
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
 
 from bayesrace.cache import uses
 from bayesrace.interrupts import raise_if_interrupted
@@ -18,52 +18,47 @@ __all__ = ["Stage", "Stages", "stages_on"]
 _CACHED: Final = "from the cache"
 
 
-class Stage(Protocol):
-    """One stage of the work."""
+class Stage:
+    """One stage of the work, on a progress bar if there is one."""
+
+    def __init__(self, progress: Progress | None, task: TaskID) -> None:
+        self._progress, self._task = progress, task
 
     def update(self, share: float, text: str = "") -> None:
-        """``share`` of it is done (0 to 1); ``text`` says what is going on."""
+        """Shows that ``share`` of it is done (0 to 1), and with ``text`` what is being done."""
+        if self._progress is not None:
+            self._progress.update(self._task, completed=min(share, 1.0), note=text)
 
 
-class Stages(Protocol):
-    """Where stages are shown."""
+class Stages:
+    """All stages of a command: progress bars, or plain lines on the console without them."""
 
-    def stage(self, name: str) -> AbstractContextManager[Stage]:
-        """Context of one stage, marked done when the block ends well; KeyboardInterrupt if not."""
-
-
-class _Shown:
-    def __init__(self, progress: Progress, name: str) -> None:
-        self._progress = progress
-        self._task = progress.add_task(name, total=1.0, note="")
-
-    def update(self, share: float, text: str = "") -> None:
-        self._progress.update(self._task, completed=min(share, 1.0), note=text)
-
-
-class _RichStages:
-    def __init__(self, progress: Progress) -> None:
-        self._progress = progress
+    def __init__(self, console: Console, progress: Progress | None) -> None:
+        self._console, self._progress = console, progress
 
     @contextmanager
     def stage(self, name: str) -> Iterator[Stage]:
-        shown = _Shown(self._progress, name)
+        """Context of one stage, marked done when the block ends well; KeyboardInterrupt if not."""
+        bars, task = self._progress, TaskID(0)
+        if bars is not None:
+            task = bars.add_task(name, total=1.0, note="")
+        else:
+            self._console.print(f"{name} …", highlight=False)
+        stage = Stage(bars, task)
         with uses() as needed:
-            yield shown
+            yield stage
         raise_if_interrupted()
-        shown.update(1.0, _CACHED if _all_found(needed) else "")
-
-
-class _Silent:
-    def update(self, share: float, text: str = "") -> None:
-        """Nothing."""
+        found = bool(needed) and not any(needed)
+        stage.update(1.0, _CACHED if found else "")
+        if found and bars is None:
+            self._console.print(f"{name}: {_CACHED}", highlight=False)
 
 
 @contextmanager
 def stages_on(console: Console) -> Iterator[Stages]:
     """Stages as progress bars on the console, plain lines where it is not a terminal."""
     if not console.is_terminal:
-        yield _PlainStages(console)
+        yield Stages(console, None)
         return
     columns = (
         SpinnerColumn(finished_text="[green]✓"),
@@ -73,22 +68,4 @@ def stages_on(console: Console) -> Iterator[Stages]:
         TextColumn("[dim]{task.fields[note]}"),
     )
     with Progress(*columns, console=console) as progress:
-        yield _RichStages(progress)
-
-
-class _PlainStages:
-    def __init__(self, console: Console) -> None:
-        self._console = console
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[Stage]:
-        self._console.print(f"{name} …", highlight=False)
-        with uses() as needed:
-            yield _Silent()
-        raise_if_interrupted()
-        if _all_found(needed):
-            self._console.print(f"{name}: {_CACHED}", highlight=False)
-
-
-def _all_found(needed: list[bool]) -> bool:
-    return bool(needed) and not any(needed)
+        yield Stages(console, progress)

@@ -10,10 +10,10 @@ from rich.text import Text
 
 from bayesrace.gp.weights import UNITS
 from operation.analysis.published import SOURCE, compare_gp, compare_laps
-from operation.analysis.results import LapResult, RaceResult
+from operation.analysis.results import GpMetrics, LapResult, RaceResult
 from operation.terminal.terminal import plain_table
 
-__all__ = ["COLUMNS", "Column", "print_table"]
+__all__ = ["COLUMNS", "GP_COLUMNS", "Column", "gp_cells", "print_table"]
 
 
 class Column(NamedTuple):
@@ -35,10 +35,7 @@ def _first_lap(lap: LapResult) -> str:
 
 
 def _solve(name: str) -> Callable[[LapResult], str]:
-    def cell(lap: LapResult) -> str:
-        return "–" if lap.solve_us is None else f"{getattr(lap.solve_us, name):.0f}"
-
-    return cell
+    return lambda lap: _decimals(getattr(lap.solve_us, name, None), 0)
 
 
 def _excursion(lap: LapResult) -> str:
@@ -74,17 +71,24 @@ COLUMNS: Final = (
 """The result table's columns; the report shows the same cells."""
 
 
+GP_COLUMNS: Final = ("RMSE", "without GP", "R²", "95 % coverage", "log density")
+"""Columns of :func:`gp_cells`."""
+
+
+def gp_cells(one: GpMetrics) -> list[str]:
+    """The scores of one output's GP, as all tables show them."""
+    errors = [f"{value:.3g}" for value in (one.rmse, one.uncorrected_rmse)]
+    return [*errors, f"{one.r2:.4f}", f"{one.coverage:.3f}", f"{one.log_density:.2f}"]
+
+
 def _gp_table(result: RaceResult) -> Table:
-    """One row an output and weights: RMSE with and without the GP, R², coverage."""
-    table = plain_table("output", "GP of", "RMSE", "without GP", "R²", "95 % coverage", left=2)
+    """One row an output and weights."""
+    table = plain_table("output", "GP of", *GP_COLUMNS, left=2)
     for output in result.gp or result.gp_updated:
         name = f"{output} {UNITS[output]}"
         for weights, metrics in (("bayesrace", result.gp), ("updated", result.gp_updated)):
             if one := metrics.get(output):
-                table.add_row(
-                    name, weights, f"{one.rmse:.3g}", f"{one.uncorrected_rmse:.3g}",
-                    f"{one.r2:.4f}", f"{one.coverage:.3f}",
-                )  # fmt: skip
+                table.add_row(name, weights, *gp_cells(one))
                 name = ""
     return table
 

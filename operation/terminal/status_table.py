@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from typing import Final, Literal
 
-from rich import box
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.table import Table
 from rich.text import Text
@@ -11,6 +10,7 @@ from rich.text import Text
 from bayesrace.messages import Status
 from operation.analysis.picture import SOURCES, Picture, Process
 from operation.terminal.printable import printable
+from operation.terminal.terminal import plain_table
 
 __all__ = ["COUNTERS_SHOWN", "StatusTable"]
 
@@ -77,9 +77,9 @@ class StatusTable:
                 yield text
 
     def _wide(self) -> Table:
-        table = _table("car", "process")
-        for title, justify in _VALUES:
-            table.add_column(title, justify=justify)
+        table = plain_table("car", "process", *(title for title, _ in _VALUES), left=2)
+        for column, (_, justify) in zip(table.columns[2:], _VALUES, strict=True):
+            column.justify, column.no_wrap = justify, justify == "right"
         for car, processes in self._cars.items():
             for source, process in processes:
                 table.add_row(printable(car), source, *_values(source, process))
@@ -87,17 +87,11 @@ class StatusTable:
 
 
 def _narrow(car: str, processes: list[tuple[str, Process]]) -> Table:
-    table = _table(printable(car), *(source for source, _ in processes))
+    sources = [source for source, _ in processes]
+    table = plain_table(printable(car), *sources, left=1 + len(sources))
     columns = [_values(source, process) for source, process in processes]
     for (title, _), *values in zip(_VALUES, *columns, strict=True):
         table.add_row(title.replace("\n", " "), *values)
-    return table
-
-
-def _table(*titles: str) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, show_edge=False)
-    for title in titles:
-        table.add_column(title, overflow="fold")
     return table
 
 

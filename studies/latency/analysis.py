@@ -1,4 +1,4 @@
-"""From the log of a run, and what is known beside it, to the numbers of the report."""
+"""Computes the numbers of the report from the log of a run, and what is known beside it."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -28,7 +28,7 @@ __all__ = ["Analysis", "Beside", "analyse"]
 
 
 _IN_FLIGHT: Final = 2
-"""So many messages more at the one end of a part than at the other end may be in flight."""
+"""Messages in flight at most: sent, but neither received nor lost, at an end of a part."""
 
 _BATCH: Final = 4096
 _INTERVALS: Final = 60
@@ -86,7 +86,7 @@ def analyse(log: Path, settings: LatencySettings, track: Track | None, beside: B
         "runs are in lockstep, without deadlines and wake-ups": (
             len(chosen) if chosen[0]["states"]["lockstep"][0] else 0
         ),
-        "cycles are the most for one analysis; the log goes on": (
+        "cycles are the most for one analysis; the log is longer": (
             MOST_CYCLES if len(tables["states"]) >= MOST_CYCLES else 0
         ),
     }

@@ -100,7 +100,7 @@ def bare_loop(
 
 
 def _run(path: str, realtime: Any, count: int, period_ns: int, begin_ns: int) -> None:
-    """The bare loop as a process; SIGTERM ends it early, with what there is."""
+    """The bare loop as a process; SIGTERM ends it early, and it keeps what it has measured."""
     signals: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, _frame: signals.append(number))
     sys.stdout.writelines(f"{one}\n" for one in prepare_thread(RealtimeSettings(**realtime)))

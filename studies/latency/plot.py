@@ -65,7 +65,7 @@ def _percentiles(axes: Axes, analysis: Analysis) -> None:
                 linewidth=2.2 if name == ANSWER else 1.2,
             )  # fmt: skip
     axes.set(
-        title="so many cycles stay below", xlabel="share of cycles, each step a nine more",
+        title="share of cycles below a time", xlabel="share of cycles, each step a nine more",
         xscale="log", yscale="log", xlim=(1.0, most * 1.1),
     )  # fmt: skip
     axes.set_ylim(bottom=_LEAST_US)

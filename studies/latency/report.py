@@ -1,15 +1,14 @@
-"""The report: a table on the terminal, and the files."""
+"""Shows a measurement: a table on the terminal, and the files."""
 
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from rich import box
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from bayesrace.files import write_whole
+from operation.terminal.terminal import plain_table
 from studies.latency.analysis import Analysis
 from studies.latency.legs import ANSWER, LEGS
 from studies.latency.plot import plot
@@ -35,15 +34,12 @@ def write_files(out: Path, analysis: Analysis) -> None:
 
 
 def print_report(result: LatencyResult, console: Console) -> None:
-    """One row for each leg, then what else is to be known."""
+    """Prints one row for each leg, then counts, clocks, memory and notes."""
     head = [result.car, result.track or "track not known", f"{result.rate_hz:g} Hz"]
     head += [f"{result.duration_s:.0f} s"] + ([f"load {result.load}"] if result.load else [])
     head += ["attached"] * result.attached + ["recorded"] * result.recorded
     console.print(Text(" · ".join(head), style="bold"))
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 0, 0, 1), pad_edge=False)
-    table.add_column("leg [us]", no_wrap=True)
-    for name in ("p50", "p90", "p99", "p99.9", "max", "±", "n"):
-        table.add_column(name, justify="right", no_wrap=True)
+    table = plain_table("leg [us]", "p50", "p90", "p99", "p99.9", "max", "±", "n", padding=0)
     for name, (title, _) in LEGS.items():
         if (leg := result.legs_us.get(name)) is not None:
             title = f"  {title}" if name in _PARTS else title

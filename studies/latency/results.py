@@ -11,7 +11,7 @@ class _Frozen(BaseModel):
 
 
 class Distribution(_Frozen):
-    """Percentiles [us], each the smallest value that so many do not exceed."""
+    """Percentiles [us], each the smallest value that this share of all do not exceed."""
 
     p50: float
     p90: float
