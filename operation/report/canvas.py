@@ -17,6 +17,9 @@ __all__ = ["PANEL_WIDTH", "inline_svg", "panel", "write_png"]
 PANEL_WIDTH: Final = 5.2
 """Of a panel [inch]: legible on a telephone, and two beside each other on a wide page."""
 
+_MARGINS: Final = 0.82, 0.1, 0.42, 0.3
+"""Of a panel: left, right, bottom, top [inch]."""
+
 _NO_METADATA: Final = dict.fromkeys(("Date", "Creator", "Format", "Type"))
 _DROPPED: Final = re.compile(r'\A.*?(?=<svg )|\s*<!--.*?-->|(?<=<g) id="[^"]*"', re.DOTALL)
 """The prologue, comments, and ids of groups, which would be the same in several figures."""
@@ -26,9 +29,16 @@ _LONG: Final = re.compile(r"(\d+\.\d{2})\d+")
 
 
 def panel(height: float) -> tuple[Figure, Axes]:
-    """A figure with a single panel of this height [inch]."""
-    figure = Figure(figsize=(PANEL_WIDTH, height), layout="constrained")
-    return figure, figure.subplots()
+    """A figure with a single panel of this height [inch], with room for title and labels.
+
+    Its margins are fixed: a layout by what is drawn would draw everything twice.
+    """
+    figure = Figure(figsize=(PANEL_WIDTH, height))
+    left, right, bottom, top = (inches / PANEL_WIDTH for inches in _MARGINS)
+    tall = PANEL_WIDTH / height
+    return figure, figure.add_axes(
+        (left, bottom * tall, 1 - left - right, 1 - (bottom + top) * tall)
+    )
 
 
 def inline_svg(figure: Figure) -> str:

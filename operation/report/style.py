@@ -69,6 +69,7 @@ def gain_map() -> Colormap:
 _STYLE: Final[dict[str, Any]] = {
     "font.sans-serif": ["DejaVu Sans", "Arial", "Helvetica"],
     "font.size": 9.0,
+    "axes.formatter.limits": (-7, 7),
     "axes.titlesize": 9.5,
     "axes.titlelocation": "left",
     "axes.titlepad": 6.0,
