@@ -14,7 +14,7 @@ from controller.weights.prediction import Sample
 __all__ = ["Watch"]
 
 _HOPELESS: Final = 0.8
-"""Share of cycles without a solution with which no car can drive."""
+"""Share of cycles without a solution from which on no car can drive."""
 
 
 class Watch:
@@ -57,7 +57,8 @@ class Watch:
         self._driven += 1
         if len(self._errors) < settings.watch_least:
             return None
-        found = self._checks.compare(*np.array(self._errors).transpose(1, 0, 2))
+        new, reference, nominal = np.array(self._errors).transpose(1, 0, 2)
+        found = self._checks.compare(new, [reference], nominal)
         text = f"predicted {found.worse} worse: {found.text}"
         return Comparison(found.worse, text, self.data | found.data) if found.worse else None
 

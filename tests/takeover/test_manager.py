@@ -1,12 +1,15 @@
 """What happens to weights when the validator ends, or hangs, or the disk is full, at bad moments.
 
-Promises guarded: accepted weights are in use and in the store; each request is answered in time;
-there is always a way back; the validator's and the disk's trouble is not the car's.
+Promises guarded: accepted weights are in use and in the store; each request is answered in time and
+truly, each refusal counted; a rollback is always possible; a failing validator or disk does not
+disturb the car, and does not keep the process from ending.
 """
 
 import os
 import resource
 import signal
+import subprocess
+import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -58,7 +61,7 @@ def test_a_validator_that_hangs_is_replaced(
         os.kill(made.validator, signal.SIGSTOP)
         reply = made.settle(made.send(replace(good, version="next")))
         assert not reply.accepted
-        assert "the validator hung, without a heartbeat for 1 s" in reply.text
+        assert "the validator hung, without an answer for 1 s" in reply.text
         assert "send them again in a moment" in reply.text
         assert reply.data == {"again": True}
         assert made.published("validator_ended")
@@ -125,6 +128,33 @@ def test_a_request_when_too_many_wait_is_refused_for_now(
         assert (refused.accepted, refused.data) == (False, {"again": True})
         assert "try later" in refused.text
         assert sum(made.settle(one).accepted for one in answers) == 2
+
+
+def test_every_refusal_is_counted(
+    course: Course, again: GpWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a full queue, by a fault of the controller's own, and at its end."""
+    monkeypatch.setattr("controller.weights.manager._MOST_WAITING", 1)
+    with bench(course) as made:
+
+        def fails(*_: object) -> None:
+            raise RuntimeError("a fault")
+
+        with monkeypatch.context() as patched:
+            patched.setattr(made.manager, "_judge", fails)
+            reply = made.settle(made.send(again))
+        assert (reply.accepted, reply.data) == (False, {"again": True})
+        assert "a fault of the controller's own" in reply.text
+        assert made.status("weights_refused") == 1
+        made.ready(2)
+        answers = [made.send(again)]
+        made.offered()
+        answers += [made.send(again), made.send(again)]
+        until(lambda: any(one.done() for one in answers), "one is refused")
+        assert made.status("weights_refused") == 2
+        made.manager.stop()
+        assert not any(one.result(60.0).accepted for one in answers)
+        assert made.status("weights_refused") == 4
 
 
 def test_requests_are_answered_when_the_controller_ends(course: Course, again: GpWeights) -> None:
@@ -220,13 +250,9 @@ def test_the_watch_ends_while_a_request_rolls_back(
 # The store -----------------------------------------------------------------------------------
 
 
-def test_a_disk_that_hangs_delays_neither_answer_nor_rollback(
-    tmp_path: Path,
-    course: Course,
-    good: GpWeights,
-    again: GpWeights,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+@pytest.fixture
+def disk(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
+    """A disk that hangs until this is set; requests wait a second for it."""
     monkeypatch.setattr("controller.weights.manager._RETURN_S", 12.0)
     monkeypatch.setattr("controller.weights.manager._STORE_S", 1.0)
     free, keep = threading.Event(), Store.keep
@@ -236,7 +262,26 @@ def test_a_disk_that_hangs_delays_neither_answer_nor_rollback(
         keep(store, history)
 
     monkeypatch.setattr(Store, "keep", hangs)
+    return free
+
+
+def test_a_disk_that_hangs_delays_no_answer(
+    tmp_path: Path, course: Course, again: GpWeights, disk: threading.Event
+) -> None:
     with bench(course, store=tmp_path / "store") as made:
+        reply = made.settle(made.send(again))
+        assert "; not kept: the store has not been written in time" in reply.text
+        assert (reply.accepted, made.version, made.kept()) == (True, again.version, [])
+        disk.set()
+        until(lambda: made.kept() == [again.version], "it is kept after all")
+
+
+def test_weights_rolled_back_while_the_store_is_written_are_not_called_accepted(
+    tmp_path: Path, course: Course, good: GpWeights, again: GpWeights, disk: threading.Event
+) -> None:
+    """A disk that hangs delays no rollback; the answer is true when it is sent."""
+    store = tmp_path / "store"
+    with bench(course, store=store) as made:
         answer = made.send(again)
         made.offered()
         made.cycle()
@@ -245,21 +290,26 @@ def test_a_disk_that_hangs_delays_neither_answer_nor_rollback(
         made.offered()
         assert not answer.done()
         reply = made.settle(answer)
-        assert "; not kept: the store has not been written in time" in reply.text
-        assert (reply.accepted, made.version, made.kept()) == (True, good.version, [])
-        free.set()
-        until(lambda: made.manager._history.withdrawn, "the rollback")
-    until(
-        lambda: (
-            len(
-                History.model_validate_json(
-                    (tmp_path / "store" / "index.json").read_text()
-                ).withdrawn
-            )
-            == 1
-        ),
-        "it is kept after all",
-    )
+        assert (reply.accepted, made.version, made.kept()) == (False, good.version, [])
+        assert f"rolled back meanwhile: {good.version} are in use again" in reply.text
+        assert not reply.data.get("again")
+        events = [kind for kind, _ in made.events]
+        assert events == ["weights_accepted", "weights_rolled_back", "weights_refused"]
+        disk.set()
+    assert len(History.model_validate_json((store / "index.json").read_text()).withdrawn) == 1
+
+
+def test_a_disk_that_hangs_does_not_keep_the_process_from_ending(tmp_path: Path) -> None:
+    program = """
+import sys, threading
+from pathlib import Path
+from controller.weights.store import History, Store, StoreWriter
+begun = threading.Event()
+Store.keep = lambda *_: begun.set() or threading.Event().wait()
+StoreWriter(Store(Path(sys.argv[1]), "d"), History(), print).write()
+begun.wait()
+"""
+    subprocess.run([sys.executable, "-c", program, str(tmp_path)], check=True, timeout=60)
 
 
 def test_a_full_disk_does_not_stop_an_adoption(
