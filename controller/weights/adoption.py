@@ -73,7 +73,7 @@ class Adoption:
         """Number of states up to which the watch lets lockstep go on; set by the manager."""
         self.awaited_s = -math.inf
         """Monotonic clock when lockstep has waited for the watch."""
-        self.newest_us = self.longest_us = 0.0
+        self.longest_us = 0.0
         self.missed = 0
         """Times that the watch did not keep up in lockstep."""
 
@@ -110,7 +110,7 @@ class Adoption:
         except InputError as error:
             offer.error = str(error)
         offer.cycle, offer.states = cycle, self.recorded
-        self.newest_us = offer.us = (time.perf_counter_ns() - begin_ns) * 1e-3
+        offer.us = (time.perf_counter_ns() - begin_ns) * 1e-3
         self.longest_us = max(self.longest_us, offer.us)
         offer.done = True
 

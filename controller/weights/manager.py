@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import partial
 from queue import Empty, Full, Queue
 from typing import Any, Final
 
@@ -35,10 +36,8 @@ _ADOPT_S: Final = 2.0
 _END_S: Final = 2.0
 """For the store when the controller ends."""
 
-_POLL_S: Final = 0.005
+_POLL_S: Final = 0.02
 """Between two looks at what is waited for: the control thread wakes no other thread."""
-_IDLE_POLL_S: Final = 0.02
-"""The same while no request is served."""
 _LOCKSTEP_POLL_S, _LOCKSTEP_S = 2e-4, 1.0
 """The same in lockstep, where the control loop waits for the watch; and how long after it has."""
 _PING_S: Final = 1.0
@@ -80,10 +79,13 @@ class WeightUpdateManager:
         self._port, self._history, self._settings = port, port.history, settings
         self._publish, self.adoption = announce, Adoption(adopt)
         arguments = str(port.artefact), settings.model_dump_json(), car_text(port.car)
-        self._supervisor = Supervisor(arguments, settings.hang_s, self._lost)
+        lost, not_kept = (
+            partial(self._warn, kind) for kind in ("validator_ended", "weights_not_kept")
+        )
+        self._supervisor = Supervisor(arguments, settings.hang_s, lost)
         self._writer: StoreWriter | None = None
         if port.store is not None:
-            self._writer = StoreWriter(port.store, port.history, self._not_kept)
+            self._writer = StoreWriter(port.store, port.history, not_kept)
         self._adopted = Offer("")
         """The newest adoption; at first of the weights at the start."""
         self._next, self._stale = 0, True
@@ -108,9 +110,8 @@ class WeightUpdateManager:
     @property
     def text(self) -> str:
         """What is wrong; empty while all is well."""
-        not_kept = self._writer.trouble if self._writer else ""
-        not_kept = not_kept and f"accepted weights cannot be kept: {not_kept}"
-        return "; ".join(filter(None, (self._supervisor.trouble, not_kept)))
+        parts = self._supervisor, self._writer
+        return "; ".join(part.trouble for part in parts if part and part.trouble)
 
     def status(self) -> dict[str, Scalar]:
         """Counters by name."""
@@ -120,7 +121,7 @@ class WeightUpdateManager:
             "weights_watched": not self._history.in_use.proven,
             "validator": self._supervisor.ready,
             "validator_starts": self._supervisor.starts,
-            "adoption_us": self.adoption.newest_us,
+            "adoption_us": self._adopted.us,
             "adoption_longest_us": self.adoption.longest_us,
             "watch_missed": self.adoption.missed,
         }
@@ -170,7 +171,7 @@ class WeightUpdateManager:
         while not self._stopping:
             try:
                 self._follow()
-                self._serve(*self._waiting.get(timeout=self._poll_s(_IDLE_POLL_S)))
+                self._serve(*self._waiting.get(timeout=self._poll_s))
             except Empty:
                 continue
             except Exception:  # without this thread bad weights would not be rolled back
@@ -216,13 +217,12 @@ class WeightUpdateManager:
     def _back(self, request: Request, arrived_s: float) -> _Answer:
         """Returns to the weights before those in use."""
         message, why_not = decode_request(request)
-        entries = self._history.entries
-        if message is not None and arrived_s < self._rolled_back_s:
-            why_not = "the watch has rolled back meanwhile"
-        elif message is not None and len(entries) < 2:
-            why_not = "there are no weights before those in use"
-        if why_not:
+        if message is None:
             raise InputError(why_not)
+        if arrived_s < self._rolled_back_s:
+            raise InputError("the watch has rolled back meanwhile")
+        if len(entries := self._history.entries) < 2:
+            raise InputError("there are no weights before those in use")
         why = f"on request: {message.text}"
         return self._kept(*self._roll_back(entries[-2], "request", why, self._due_s))
 
@@ -234,7 +234,7 @@ class WeightUpdateManager:
         adopted, writer, late = self._adopted, self._keep(), ""
         try:
             why_not = "the store has not been written in time"
-            self._wait(lambda: writer is None or writer.idle, self._due_s + _STORE_S, why_not)
+            self._wait(lambda: not writer or writer.idle, self._due_s + _STORE_S, why_not)
         except _RefusalError as error:
             late = str(error)
         if self._adopted is not adopted:
@@ -249,7 +249,7 @@ class WeightUpdateManager:
         while not done():
             if self._stopping or time.monotonic() > until_s:
                 raise _RefusalError(_ENDS if self._stopping else why_not)
-            time.sleep(self._poll_s(_POLL_S))
+            time.sleep(self._poll_s)
             self._follow()
 
     # Validator -----------------------------------------------------------------------------------
@@ -305,16 +305,11 @@ class WeightUpdateManager:
         if sent is not None and sent is self._check and not self._stale:
             self._check, self._verdict = None, answer["verdict"]
 
-    def _poll_s(self, otherwise_s: float) -> float:
-        """Time to the next look at the validator's answer."""
-        waited_for = time.monotonic() < self.adoption.awaited_s + _LOCKSTEP_S
-        return _LOCKSTEP_POLL_S if waited_for else otherwise_s
-
-    def _lost(self, text: str) -> None:
-        """The validator is gone; the car is driven on with what is in use."""
-        self.adoption.validator = False
-        _log.warning("%s", text)
-        self._announce("validator_ended", text, {})
+    @property
+    def _poll_s(self) -> float:
+        """Time to the next look at what the control thread and the validator have done."""
+        lockstep = time.monotonic() < self.adoption.awaited_s + _LOCKSTEP_S
+        return _LOCKSTEP_POLL_S if lockstep else _POLL_S
 
     def _end_watch(self, worse: str, data: _Data) -> None:
         """The watch has a result: the weights in use are proven, or ``worse``."""
@@ -341,7 +336,7 @@ class WeightUpdateManager:
         self.adoption.offers.append(offer)
         until_s = min(time.monotonic() + _ADOPT_S, due_s)
         while not offer.done:
-            time.sleep(_POLL_S)
+            time.sleep(self._poll_s)
             if self._stopping or time.monotonic() > until_s:
                 why_not = f"the control loop did not adopt them within {_ADOPT_S:g} s"
                 with suppress(IndexError):  # else the control thread is just adopting them
@@ -376,11 +371,10 @@ class WeightUpdateManager:
             self._writer.write()
         return self._writer
 
-    def _not_kept(self, trouble: str) -> None:
-        """In the store's thread."""
-        text = f"accepted weights cannot be kept: {trouble}"
+    def _warn(self, kind: str, text: str) -> None:
+        """Reports trouble, in any thread; the car is driven on with what is in use."""
         _log.warning("%s", text)
-        self._announce("weights_not_kept", text, {})
+        self._announce(kind, text, {})
 
     def _announce(self, kind: str, text: str, data: _Data) -> None:
         """Publishes an event, on which no answer and no rollback depends."""

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from queue import Full, Queue
 from typing import Annotated, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -19,13 +20,11 @@ from bayesrace.files import read_text, read_whole, write_whole
 from bayesrace.gp.weights import MAX_BYTES, decode_weights
 from controller.native_step import pack_weights
 
-__all__ = [
-    "HISTORY", "WITHDRAWN", "AcceptedWeights", "History", "Store", "StoreWriter", "digest_of"
-]  # fmt: skip
+__all__ = ["HISTORY", "AcceptedWeights", "History", "Store", "StoreWriter", "digest_of"]
 
 HISTORY: Final = 8
 """Accepted weights that are kept."""
-WITHDRAWN: Final = 32
+_WITHDRAWN: Final = 32
 """Digests of withdrawn weights that are kept."""
 
 _INDEX: Final = "index.json"
@@ -100,7 +99,7 @@ class History(BaseModel):
         end = self.entries.index(target) + 1
         left, self.entries = self.entries[end:], self.entries[:end]
         if withdraw:
-            self.withdrawn = [*self.withdrawn, *(one.digest for one in left)][-WITHDRAWN:]
+            self.withdrawn = [*self.withdrawn, *(one.digest for one in left)][-_WITHDRAWN:]
 
 
 class Store:
@@ -162,8 +161,7 @@ class StoreWriter:
     def __init__(self, store: Store, history: History, failed: Callable[[str], None]) -> None:
         """``failed`` is called, in that thread, with the reason why weights are not kept."""
         self._store, self._history, self._failed = store, history, failed
-        self._wanted = self._written = 0
-        self._wake = threading.Event()
+        self._due: Queue[None] = Queue(1)
         self.trouble = ""
         """Why the last write has failed; else empty."""
         threading.Thread(target=self._run, name="weights-store", daemon=True).start()
@@ -171,20 +169,20 @@ class StoreWriter:
     @property
     def idle(self) -> bool:
         """Whether all that was to be written has been, or has failed."""
-        return self._written == self._wanted
+        return not self._due.unfinished_tasks
 
     def write(self) -> None:
-        """Has the history written as it is when its turn comes: one write at most waits."""
-        self._wanted += 1
-        self._wake.set()
+        """Has the history written, as it is when its turn comes: one write at most waits."""
+        with suppress(Full):
+            self._due.put_nowait(None)
 
     def _run(self) -> None:
-        while self._wake.wait():
-            self._wake.clear()
-            wanted, trouble = self._wanted, ""
+        while True:
+            self._due.get()
             try:
                 self._store.keep(self._history.model_copy())
+                self.trouble = ""
             except InputError as error:
-                trouble = str(error)
-                self._failed(trouble)
-            self.trouble, self._written = trouble, wanted
+                self.trouble = str(error)
+                self._failed(self.trouble)
+            self._due.task_done()

@@ -21,10 +21,9 @@ import msgpack
 
 from bayesrace.vehicles import described_car
 from controller.weights.adoption import RECORDED
-from controller.weights.checks import Checks
+from controller.weights.checks import Checks, Watch
 from controller.weights.prediction import Sample, Sampler, StateRecord
 from controller.weights.settings import GateSettings
-from controller.weights.watch import Watch
 
 __all__ = ["Validator"]
 

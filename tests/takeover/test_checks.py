@@ -16,10 +16,9 @@ import pytest
 from bayesrace.arrays import Floats
 from bayesrace.gp.weights import GpOutput, GpWeights, encode_weights
 from bayesrace.vehicles import CarParameters
-from controller.weights.checks import Checks, Verdict
+from controller.weights.checks import Checks, Verdict, Watch
 from controller.weights.prediction import Sample, Sampler, StateRecord, plausible_samples
 from controller.weights.settings import GateSettings
-from controller.weights.watch import Watch
 from tests.conftest import fit_weights, smooth_drive
 from tests.takeover.rig import KINDS
 from tests.takeover.spoilt_weights import SPOILT, spoilt
