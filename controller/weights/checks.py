@@ -83,7 +83,7 @@ class Checks:
             facts |= {"samples": len(samples), "probation": probation}
             text = f"on probation: {len(samples)} recent samples are too few to compare"
             if not probation:
-                others = [one.errors(samples) for one in (self.in_use, self.reference)]
+                others = [one.errors(samples) for one in {self.in_use, self.reference}]
                 nominal = self.nominal.errors(samples)
                 worse, text, errors = self.compare(model.errors(samples), others, nominal)
                 facts |= errors

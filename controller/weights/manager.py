@@ -89,7 +89,7 @@ class WeightUpdateManager:
         self._adopted = Offer("")
         """The newest adoption; at first of the weights at the start."""
         self._next, self._stale = 0, True
-        """First state that the validator was not sent; it does not know what is in use now."""
+        """First state that the validator has not been sent; whether it lacks what is in use."""
         self._sent: Mapping[str, Any] = {}
         self._check: bytes | None = None
         self._verdict: Mapping[str, Any] = {}
@@ -270,14 +270,14 @@ class WeightUpdateManager:
         """Exchanges messages with the validator, which is started or replaced if need be."""
         validator = self._supervisor
         if (answer := validator.receive()) is not None:
-            self._heed(answer)
+            self._act_on(answer)
         self.adoption.validator = validator.ready
         if validator.idle and ((message := self._message()) or validator.age_s > _PING_S):
             self._sent = message
             validator.send(message)
 
     def _message(self) -> dict[str, Any]:
-        """What the validator is to know, or to do."""
+        """The next message to the validator; empty if there is nothing new."""
         message: dict[str, Any] = {}
         if states := self.adoption.states(self._next, _CHUNK):
             message["states"], self._next = states, states[-1].number + 1
@@ -293,7 +293,7 @@ class WeightUpdateManager:
             message["check"] = self._check
         return message
 
-    def _heed(self, answer: Mapping[str, Any]) -> None:
+    def _act_on(self, answer: Mapping[str, Any]) -> None:
         """Acts on an answer, unless it is about weights that are not in use any more."""
         if not answer:  # the validator has just started
             self._next, self._stale, self.adoption.allowed = 0, True, -1

@@ -17,12 +17,13 @@ from pathlib import Path
 import pytest
 
 from bayesrace.gp.weights import GpWeights
+from controller.weights.adoption import RECORDED, Adoption
 from controller.weights.settings import GateSettings
 from controller.weights.store import History, Store
 from operation.learn.publishing import in_words
 from tests.network.cars import Course
 from tests.programs import until
-from tests.takeover.bench import bench
+from tests.takeover.bench import a_state, bench
 
 pytestmark = pytest.mark.wall_clock
 
@@ -40,7 +41,7 @@ def test_a_validator_killed_between_verdict_and_adoption(
         assert made.version == good.version
         made.cycle()
         assert made.version == again.version
-        reply = made.settle(answer)
+        reply = made.reply(answer)
         assert (reply.accepted, reply.data["version"]) == (True, again.version)
         assert "not kept" not in reply.text
         until(lambda: made.published("weights_accepted") == [reply.text], "the event")
@@ -48,7 +49,7 @@ def test_a_validator_killed_between_verdict_and_adoption(
             assert made.kept() == [again.version]
         made.ready(2)
         assert made.accept(replace(good, version="next")).data["number"] == 2
-        assert made.settle(made.roll_back()).data["version"] == again.version
+        assert made.reply(made.roll_back()).data["version"] == again.version
 
 
 @pytest.mark.check
@@ -59,7 +60,7 @@ def test_a_validator_that_hangs_is_replaced(
     with bench(course, GateSettings(hang_s=1.0)) as made:
         made.accept(again)
         os.kill(made.validator, signal.SIGSTOP)
-        reply = made.settle(made.send(replace(good, version="next")))
+        reply = made.reply(made.send(replace(good, version="next")))
         assert not reply.accepted
         assert "the validator hung, without an answer for 1 s" in reply.text
         assert "send them again in a moment" in reply.text
@@ -81,8 +82,9 @@ def test_a_validator_that_hangs_is_replaced(
 def test_a_validator_that_is_replaced_watches_from_the_adoption_on(
     course: Course, good: GpWeights, again: GpWeights
 ) -> None:
-    """The states are in the shared memory: the next validator comes to the same result."""
+    """The next validator gets all recent states, message by message: the result is the same."""
     with bench(course) as made:
+        made.drive(200)
         made.accept(again)
         os.kill(made.validator, signal.SIGKILL)
         made.gone()
@@ -92,12 +94,26 @@ def test_a_validator_that_is_replaced_watches_from_the_adoption_on(
         assert made.version == good.version
 
 
+def test_the_newest_states_are_kept_for_the_validator() -> None:
+    adoption = Adoption(lambda _: None)
+    for seq in range(RECORDED + 1000):
+        adoption.record(a_state(seq), seq % 2 == 0)
+    oldest = adoption.states(0, 64)
+    assert [one.number for one in oldest] == list(range(1000, 1064))
+    newest = adoption.states(RECORDED + 998, 64)
+    assert [(one.seq, one.fallen_back) for one in newest] == [
+        (RECORDED + 998, True), (RECORDED + 999, False)
+    ]  # fmt: skip
+    assert (newest[0].x, newest[0].u_applied) == (a_state(0).x, a_state(0).u_applied)
+    assert adoption.states(RECORDED + 1000, 64) == []
+
+
 def test_a_rollback_needs_no_validator(course: Course, good: GpWeights, again: GpWeights) -> None:
     with bench(course) as made:
         made.accept(again)
         os.kill(made.validator, signal.SIGKILL)
         made.gone()
-        assert made.settle(made.roll_back()).data["version"] == good.version
+        assert made.reply(made.roll_back()).data["version"] == good.version
 
 
 def test_an_offer_that_the_control_loop_does_not_adopt_is_withdrawn(
@@ -127,7 +143,7 @@ def test_a_request_when_too_many_wait_is_refused_for_now(
         (refused,) = (one.result() for one in answers if one.done())
         assert (refused.accepted, refused.data) == (False, {"again": True})
         assert "try later" in refused.text
-        assert sum(made.settle(one).accepted for one in answers) == 2
+        assert sum(made.reply(one).accepted for one in answers) == 2
 
 
 def test_every_refusal_is_counted(
@@ -142,7 +158,7 @@ def test_every_refusal_is_counted(
 
         with monkeypatch.context() as patched:
             patched.setattr(made.manager, "_judge", fails)
-            reply = made.settle(made.send(again))
+            reply = made.reply(made.send(again))
         assert (reply.accepted, reply.data) == (False, {"again": True})
         assert "a fault of the controller's own" in reply.text
         assert made.status("weights_refused") == 1
@@ -222,13 +238,13 @@ def test_a_request_to_roll_back_while_the_watch_does(
         third = made.send(replace(again, version="third"))
         made.cycle()
         assert made.version == good.version
-        reply = made.settle(answer)
+        reply = made.reply(answer)
         assert (reply.accepted, reply.text) == (False, "the watch has rolled back meanwhile")
-        reply = made.settle(third)
+        reply = made.reply(third)
         assert (reply.accepted, made.version) == (True, "third")
         until(lambda: len(made.published("weights_rolled_back")) == 1, "the event")
         assert made.status("weights_rolled_back") == 1
-        refused = made.settle(made.send(again))
+        refused = made.reply(made.send(again))
         assert "rolled back before" in refused.text
 
 
@@ -240,7 +256,7 @@ def test_the_watch_ends_while_a_request_rolls_back(
         answer = made.roll_back()
         made.offered()
         made.drive(50, fallen_back=True)
-        reply = made.settle(answer)
+        reply = made.reply(answer)
         assert (reply.accepted, reply.data["by"]) == (True, "request")
         assert made.version == good.version
         assert made.accept(again).data["number"] == 2  # not withdrawn
@@ -269,7 +285,7 @@ def test_a_disk_that_hangs_delays_no_answer(
     tmp_path: Path, course: Course, again: GpWeights, disk: threading.Event
 ) -> None:
     with bench(course, store=tmp_path / "store") as made:
-        reply = made.settle(made.send(again))
+        reply = made.reply(made.send(again))
         assert "; not kept: the store has not been written in time" in reply.text
         assert (reply.accepted, made.version, made.kept()) == (True, again.version, [])
         disk.set()
@@ -289,7 +305,7 @@ def test_weights_rolled_back_while_the_store_is_written_are_not_called_accepted(
         made.drive(25, fallen_back=True)
         made.offered()
         assert not answer.done()
-        reply = made.settle(answer)
+        reply = made.reply(answer)
         assert (reply.accepted, made.version, made.kept()) == (False, good.version, [])
         assert f"rolled back meanwhile: {good.version} are in use again" in reply.text
         assert not reply.data.get("again")
