@@ -4,6 +4,7 @@ In real time nothing here decodes, compares, copies, waits or takes a lock. Noth
 interpreter's lock or wakes another thread either: that would cost a hundred times the adoption.
 """
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -15,10 +16,13 @@ from bayesrace.errors import InputError
 from bayesrace.messages import State
 from bayesrace.vehicles import CarParameters
 from controller.native_step import NativeStep
-from controller.weights.states import ALL, SharedStates
+from controller.weights.prediction import StateRecord
 from controller.weights.store import History, Store
 
-__all__ = ["Adoption", "Offer", "WeightsPort"]
+__all__ = ["RECORDED", "Adoption", "Offer", "WeightsPort"]
+
+RECORDED: Final = 8192
+"""States kept: 16 s at 500 Hz, which is more than the validator looks back."""
 
 _PATIENCE_S: Final = 2.0
 """How long lockstep waits for the watch. Without waiting, one run would differ from the next."""
@@ -38,12 +42,9 @@ class WeightsPort:
 
 @dataclass(eq=False)
 class Offer:
-    """Staged weights; the control thread fills in what has become of them."""
+    """Staged weights; the control thread fills in the result of their adoption."""
 
     version: str
-    revision: int
-    """Of the weights in use: rises with each adoption, of new or of earlier ones."""
-    watched: bool
     done: bool = False
     error: str = ""
     """Why they could not be adopted; else empty."""
@@ -58,26 +59,43 @@ class Offer:
 class Adoption:
     """Holds one offer at most: the update manager makes it, the control thread adopts it."""
 
-    def __init__(self, states: SharedStates, adopt: Callable[[str], None], watched: bool) -> None:
-        """``adopt`` puts what is staged into use, under its version's name. ``watched``: whether
-        the weights in use are."""
-        self._states, self._adopt = states, adopt
-        self.record: Callable[[State, bool | None], None] = states.record
+    def __init__(self, adopt: Callable[[str], None]) -> None:
+        """``adopt`` puts what is staged into use, under its version's name."""
+        self._adopt = adopt
+        self._states: list[StateRecord | None] = [None] * RECORDED
+        self.recorded = 0
+        """Number of states recorded so far."""
         self.offers: deque[Offer] = deque(maxlen=1)
         """The manager appends, and pops what the control thread does not take."""
         self.validator = False
-        """The validator is running; set by the manager."""
-        self._revision, self._watched = 0, watched
-        self.newest_us = self.longest_us = 0.0
+        """A validator works; set by the manager."""
+        self.allowed = math.inf
+        """Number of states up to which the watch lets lockstep go on; set by the manager."""
+        self.awaited_s = -math.inf
+        """Monotonic clock when lockstep has waited for the watch."""
+        self.longest_us = 0.0
         self.missed = 0
         """Times that the watch did not keep up in lockstep."""
+
+    def record(self, state: State, fallen_back: bool | None) -> None:
+        """Keeps a state; ``fallen_back``: see :class:`StateRecord`."""
+        head = self.recorded, state.epoch, state.run, state.seq, state.time_s, time.monotonic_ns()
+        record = StateRecord(*head, state.x, state.u_applied, state.lockstep, fallen_back)
+        self._states[self.recorded % RECORDED] = record
+        self.recorded += 1
+
+    def states(self, begin: int, most: int) -> list[StateRecord]:
+        """For the manager: at most so many states from number ``begin`` on, or the oldest kept."""
+        begin = max(begin, self.recorded - RECORDED)
+        numbers = range(begin, min(begin + most, self.recorded))
+        return [one for number in numbers if (one := self._states[number % RECORDED])]
 
     def between_cycles(self, cycle: int, lockstep: bool = False) -> None:
         """Adopts what is offered; ``cycle``: number of the next one.
 
         In lockstep it lets the watch keep up first, as the plant lets the controller.
         """
-        if lockstep and self._watched:
+        if lockstep and self.allowed < self.recorded:
             self._wait_for_watch()
         if not self.offers:
             return
@@ -88,23 +106,19 @@ class Adoption:
             return
         try:
             self._adopt(offer.version)
-            self._revision, self._watched = offer.revision, offer.watched
+            self.allowed = -1
         except InputError as error:
             offer.error = str(error)
-        offer.cycle, offer.states = cycle, self._states.recorded
-        self.newest_us = offer.us = (time.perf_counter_ns() - begin_ns) * 1e-3
+        offer.cycle, offer.states = cycle, self.recorded
+        offer.us = (time.perf_counter_ns() - begin_ns) * 1e-3
         self.longest_us = max(self.longest_us, offer.us)
         offer.done = True
 
     def _wait_for_watch(self) -> None:
-        """Until it has seen all states, or there is an offer: what it returns to, say."""
-        recorded, deadline = self._states.recorded, time.monotonic() + _PATIENCE_S
-        while self.validator and not self.offers:
-            revision, seen, worse = self._states.progress
-            if revision == self._revision and not worse and seen >= recorded:
-                self._watched = seen < ALL
-                return
-            if time.monotonic() > deadline:
-                self.missed, self._watched = self.missed + 1, False
-                return
+        """Returns when the watch allows the next cycle, or when there is an offer."""
+        self.awaited_s = time.monotonic()
+        deadline = self.awaited_s + _PATIENCE_S
+        while self.validator and not self.offers and self.allowed < self.recorded:
+            if time.monotonic() > deadline:  # it is not waited for until it answers again
+                self.missed, self.allowed = self.missed + 1, math.inf
             time.sleep(_POLL_S)

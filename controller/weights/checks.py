@@ -1,6 +1,7 @@
-"""The tests that new weights have to pass before the controller adopts them."""
+"""What new weights must pass before the controller adopts them, and what is watched after that."""
 
 import time
+from collections import deque
 from collections.abc import Sequence
 from functools import lru_cache
 from itertools import product
@@ -18,15 +19,16 @@ from controller.native_step import pack_weights
 from controller.weights.prediction import OneStepModel, Sample, plausible_samples
 from controller.weights.settings import GateSettings
 
-__all__ = ["Checks", "Comparison", "Verdict"]
-
+__all__ = ["Checks", "Comparison", "Verdict", "Watch"]
 
 _CLOCKS_APART_S: Final = 3600.0
 """By which the clock of the training host may be ahead."""
+_HOPELESS: Final = 0.8
+"""Share of cycles without a solution from which on no car can drive."""
 
 
 class Comparison(NamedTuple):
-    """One-step errors (RMSE) of new and old weights over the same samples."""
+    """One-step errors (RMSE) of new weights and others over the same samples."""
 
     worse: str
     """Outputs for which the new weights are worse, by :class:`GateSettings`; empty: none."""
@@ -38,11 +40,10 @@ class Comparison(NamedTuple):
 class Verdict(NamedTuple):
     """Whether weights may be adopted."""
 
-    accepted: bool
     text: str
     data: dict[str, Scalar]
     packed: bytes = b""
-    """Arrays of accepted weights, see :func:`controller.native_step.pack_weights`."""
+    """Arrays of accepted weights, by :func:`controller.native_step.pack_weights`; else empty."""
 
 
 class Checks:
@@ -82,10 +83,18 @@ class Checks:
             facts |= {"samples": len(samples), "probation": probation}
             text = f"on probation: {len(samples)} recent samples are too few to compare"
             if not probation:
-                text = self._check_errors(model, samples, facts)
+                others = [one.errors(samples) for one in {self.in_use, self.reference}]
+                nominal = self.nominal.errors(samples)
+                worse, text, errors = self.compare(model.errors(samples), others, nominal)
+                facts |= errors
+                if worse:
+                    raise InputError(
+                        f"weights '{facts['version']}' predict {worse} worse than those in use: "
+                        f"{text}; train again, on this car's own laps"
+                    )
         except InputError as error:
-            return Verdict(False, str(error), facts)
-        return Verdict(True, text, facts, pack_weights(model.weights))
+            return Verdict(str(error), facts)
+        return Verdict(text, facts, pack_weights(model.weights))
 
     def _make_model(self, data: bytes) -> OneStepModel:
         weights = decode_weights(data) if data else None
@@ -122,42 +131,77 @@ class Checks:
                     f"rad/s^2) by up to {worst}, and {most} is the most; train again"
                 )
 
-    def _check_errors(
-        self, model: OneStepModel, samples: Sequence[Sample], facts: dict[str, Scalar]
-    ) -> str:
-        """The comparison in words, its numbers in ``facts``; InputError if a set is better."""
-        new, nominal = model.errors(samples), self.nominal.errors(samples)
-        found = [
-            self.compare(new, other.errors(samples), nominal)
-            for other in dict.fromkeys((self.in_use, self.reference))
-        ]
-        decisive = next((one for one in found if one.worse), found[0])
-        facts |= decisive.data
-        if decisive.worse:
-            raise InputError(
-                f"weights '{facts['version']}' predict {decisive.worse} worse than those in use: "
-                f"{decisive.text}; train again, on this car's own laps"
-            )
-        return decisive.text
+    def compare(self, new: Floats, others: Sequence[Floats], nominal: Floats) -> Comparison:
+        """Errors (n, 3) over the same samples; for each output the best of the others counts.
 
-    def compare(self, new: Floats, old: Floats, nominal: Floats) -> Comparison:
-        """Errors (n, 3) over the same samples; those that the nominal model lacks do not count."""
+        Samples for which the nominal model has no error are left out.
+        """
         usable = np.isfinite(nominal).all(axis=1)
-        rmse = {
-            what: np.sqrt((errors[usable] ** 2).sum(axis=0) / max(usable.sum(), 1))
-            for what, errors in (("new", new), ("old", old), ("nominal", nominal))
-        }
-        settings = self.settings
-        slack = settings.worse_share * rmse["nominal"] + self._slack
+        count = int(usable.sum())
+        new_rmse, nominal_rmse, *old = (
+            np.sqrt((errors[usable] ** 2).sum(axis=0) / max(count, 1))
+            for errors in (new, nominal, *others)
+        )
+        rmse = {"new": new_rmse, "old": np.min(old, axis=0), "nominal": nominal_rmse}
+        slack = self.settings.worse_share * rmse["nominal"] + self._slack
         # Written so that infinity on both sides is worse, too.
-        fine = rmse["new"] <= settings.worse_factor * np.minimum(rmse["old"], 1e12) + slack
+        fine = rmse["new"] <= self.settings.worse_factor * np.minimum(rmse["old"], 1e12) + slack
         worse = " and ".join(name for name, good in zip(OUTPUTS, fine, strict=True) if not good)
-        data: dict[str, Scalar] = {"samples": int(usable.sum())}
+        data: dict[str, Scalar] = {"samples": count}
         for (what, errors), (j, name) in product(rmse.items(), enumerate(OUTPUTS)):
             data[f"error_{what}_{name}"] = float(min(errors[j], 1e12))
-        text = ", ".join(
-            f"{name} {old:.4g} to {new:.4g} {UNITS[name]}"
-            for name, old, new in zip(OUTPUTS, rmse["old"], rmse["new"], strict=True)
+        changes = ", ".join(
+            f"{name} {rmse['old'][j]:.4g} to {rmse['new'][j]:.4g} {UNITS[name]}"
+            for j, name in enumerate(OUTPUTS)
         )
-        text = f"one-step errors over {data['samples']} samples go from {text}"
+        text = f"one-step errors over {count} samples go from {changes}"
         return Comparison(worse, text, data)
+
+
+class Watch:
+    """Compares adopted weights with proven ones, state by state, until they are worse or proven."""
+
+    def __init__(self, checks: Checks, before: Sequence[Sample]) -> None:
+        """Of the weights in use; ``before``: samples from before their adoption."""
+        self._checks, self._settings = checks, checks.settings
+        self._models = (checks.in_use, checks.reference, checks.nominal)
+        self._errors: deque[Floats] = deque(maxlen=self._settings.watch_window)
+        self._needed = round(self._settings.watch_s / checks.step_s)
+        self._driven = self._cycles = self._fallen_back = 0
+        for sample in before[-self._settings.watch_window :]:
+            self._append(sample)
+
+    @property
+    def over(self) -> bool:
+        """Whether the weights are proven."""
+        return self._driven >= self._needed
+
+    @property
+    def data(self) -> dict[str, Scalar]:
+        """Counts since the adoption: samples, cycles, and those without a solution."""
+        counts = (self._driven, self._cycles, self._fallen_back)
+        return dict(zip(("driven", "cycles", "fallen_back"), counts, strict=True))
+
+    def add(self, fallen_back: bool | None, sample: Sample | None) -> Comparison | None:
+        """A cycle, with the sample that its state completes; the reason to roll back, if any."""
+        settings = self._settings
+        if fallen_back is not None:
+            self._cycles += 1
+            self._fallen_back += fallen_back
+        hopeless = self._fallen_back > _HOPELESS * self._cycles
+        if hopeless and self._cycles >= settings.watch_cycles:
+            text = f"found no solution in {self._fallen_back} of {self._cycles} cycles"
+            return Comparison("all", text, self.data)
+        if sample is None:
+            return None
+        self._append(sample)
+        self._driven += 1
+        if len(self._errors) < settings.watch_least:
+            return None
+        new, reference, nominal = np.array(self._errors).transpose(1, 0, 2)
+        found = self._checks.compare(new, [reference], nominal)
+        text = f"predicted {found.worse} worse: {found.text}"
+        return Comparison(found.worse, text, self.data | found.data) if found.worse else None
+
+    def _append(self, sample: Sample) -> None:
+        self._errors.append(np.array([model.errors([sample])[0] for model in self._models]))

@@ -1,7 +1,7 @@
 """Takes new weights from a request into the control loop and the store, in a thread of its own.
 
 What takes long is done elsewhere, without the interpreter's lock that the control thread needs: the
-validator process decodes and judges, the compiled code copies, a third thread writes the store.
+validator process decodes and judges, compiled code copies, a third thread writes the store.
 """
 
 import logging
@@ -9,10 +9,10 @@ import math
 import threading
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
+from functools import partial
 from queue import Empty, Full, Queue
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from bayesrace.errors import InputError
 from bayesrace.messages import ROLLBACK, WEIGHTS, Reply, Scalar
@@ -21,61 +21,50 @@ from bayesrace.vehicles import car_text
 from controller.native_step import unpack_weights
 from controller.weights.adoption import Adoption, Offer, WeightsPort
 from controller.weights.settings import GateSettings
-from controller.weights.states import SharedStates
-from controller.weights.store import AcceptedWeights, Store, digest_of
+from controller.weights.store import AcceptedWeights, StoreWriter, digest_of
 from controller.weights.supervisor import Supervisor
 
 __all__ = ["WeightUpdateManager"]
 
 _log = logging.getLogger("bayesrace.controller")
 
-_RETURN_S: Final = 2.0
+_RETURN_S: Final = 3.0
 _STORE_S: Final = 5.0
-"""Shares of a service's time: for the way here and back, for the store after the adoption."""
-_ADOPT_S: Final = 5.0
+"""Shares of a service's time: for the way here and back and a last rollback, and for the store."""
+_ADOPT_S: Final = 2.0
 """The control loop, driving or idle, adopts within a cycle or a heartbeat; this is a stall."""
+_END_S: Final = 2.0
+"""For the store when the controller ends."""
 
-_POLL_S: Final = 0.005
-"""Between two looks for an answer: the control thread wakes no other thread."""
-_WATCH_POLL_S: Final = 0.02
-_IDLE_POLL_S: Final = 0.1
+_POLL_S: Final = 0.02
+"""Between two looks at what is waited for: the control thread wakes no other thread."""
+_LOCKSTEP_POLL_S, _LOCKSTEP_S = 2e-4, 1.0
+"""The same in lockstep, where the control loop waits for the watch; and how long after it has."""
+_PING_S: Final = 1.0
+"""From an answer of the validator to the next message at the latest."""
+_CHUNK: Final = 64
+"""States in a message: packing them takes 0.1 ms of the interpreter's lock."""
 
 _MOST_WAITING: Final = 32
 """Requests; each may hold a file."""
 _FILE_BYTES: Final = 100_000
 """Of a weights file, beyond its arrays."""
 
-_Data = dict[str, Scalar]
-_Outcome = tuple[bool, str, _Data]
-"""Whether a request is accepted, with text and data of answer and event."""
+_Data = Mapping[str, Scalar]
+_Answer = tuple[str, _Data]
+"""Text and data of an answer that accepts a request; a refusal is an InputError."""
 
 _ENDS: Final = "the controller ends"
-_NOT_NOW: Final[_Data] = {"again": True}
-"""Data of a :class:`_NotNowError`."""
+_AGAIN: Final[_Data] = {"again": True}
+"""Data of a refusal whose reason passes: the same request may be accepted later."""
 
 
-class _NotNowError(InputError):
-    """A refusal whose reason passes: the same request may be accepted later."""
+class _RefusalError(InputError):
+    """A refusal with data."""
 
-
-class _Pending(NamedTuple):
-    """A request that has not been answered; times by the monotonic clock."""
-
-    request: Request
-    arrived_s: float
-    due_s: float
-    """Deadline of the adoption; the answer may wait for the store for ``_STORE_S`` longer."""
-
-    def reply(self, accepted: bool, text: str, data: Mapping[str, Scalar]) -> None:
-        self.request.answer(
-            Reply(
-                seq=0,
-                source_time_ns=time.monotonic_ns(),
-                accepted=accepted,
-                text=text[:2000],
-                data=dict(data),
-            )
-        )
+    def __init__(self, text: str, data: _Data = _AGAIN) -> None:
+        super().__init__(text)
+        self.data = data
 
 
 class WeightUpdateManager:
@@ -83,23 +72,34 @@ class WeightUpdateManager:
 
     def __init__(
         self, session: Any, name: str, port: WeightsPort, settings: GateSettings, *,
-        adopt: Callable[[str], None], announce: Callable[[str, str, Mapping[str, Scalar]], None],
+        adopt: Callable[[str], None], announce: Callable[[str, str, _Data], None],
     ) -> None:  # fmt: skip
         """``adopt``: see :class:`Adoption`. ``announce`` publishes an event (kind, text, data), and
         is called from several threads."""
         self._port, self._history, self._settings = port, port.history, settings
-        self._publish, self._states = announce, SharedStates()
-        self.adoption = Adoption(self._states, adopt, watched=not self._history.in_use.proven)
-        self._supervisor = Supervisor(self._states, settings.hang_s, self._context, self._lost)
-        self._revision = self._begin = self._checks = 0
-        """Adoptions, states recorded before the newest, files that the validator was sent."""
-        self._verdict: Mapping[str, Any] | None = None
-        self._rolled_back_s = -math.inf
-        self._counts = {"weights_accepted": 0, "weights_refused": 0, "weights_rolled_back": 0}
-        self._trouble, self._stopping = "", False
-        self._writer = ThreadPoolExecutor(1, "weights-store")
-        self._writing: Future[None] | None = None
-        self._waiting: Queue[_Pending] = Queue(_MOST_WAITING)
+        self._publish, self.adoption = announce, Adoption(adopt)
+        arguments = str(port.artefact), settings.model_dump_json(), car_text(port.car)
+        lost, not_kept = (
+            partial(self._warn, kind) for kind in ("validator_ended", "weights_not_kept")
+        )
+        self._supervisor = Supervisor(arguments, settings.hang_s, lost)
+        self._writer: StoreWriter | None = None
+        if port.store is not None:
+            self._writer = StoreWriter(port.store, port.history, not_kept)
+        self._adopted = Offer("")
+        """The newest adoption; at first of the weights at the start."""
+        self._next, self._stale = 0, True
+        """First state that the validator has not been sent; whether it lacks what is in use."""
+        self._sent: Mapping[str, Any] = {}
+        self._check: bytes | None = None
+        self._verdict: Mapping[str, Any] = {}
+        """Of the file to check, by what is in use."""
+        self._due_s = self._rolled_back_s = -math.inf
+        """Monotonic clock: deadline of the request that is served, but for the store; and when the
+        watch has rolled back."""
+        self._counts = dict.fromkeys(("accepted", "refused", "rolled_back"), 0)
+        self._counting, self._stopping = threading.Lock(), False
+        self._waiting: Queue[tuple[float, Request]] = Queue(_MOST_WAITING)
         self._most_bytes = 3 * 8 * 7 * (port.step.manifest.gp_capacity + 1) + _FILE_BYTES
         self._thread = threading.Thread(target=self._run, name="weights")
         self._services = [
@@ -110,17 +110,18 @@ class WeightUpdateManager:
     @property
     def text(self) -> str:
         """What is wrong; empty while all is well."""
-        return "; ".join(filter(None, (self._supervisor.trouble, self._trouble)))
+        parts = self._supervisor, self._writer
+        return "; ".join(part.trouble for part in parts if part and part.trouble)
 
     def status(self) -> dict[str, Scalar]:
         """Counters by name."""
         return {
-            **self._counts,
+            **{f"weights_{name}": count for name, count in self._counts.items()},
             "weights_number": self._history.in_use.number,
             "weights_watched": not self._history.in_use.proven,
             "validator": self._supervisor.ready,
             "validator_starts": self._supervisor.starts,
-            "adoption_us": self.adoption.newest_us,
+            "adoption_us": self._adopted.us,
             "adoption_longest_us": self.adoption.longest_us,
             "watch_missed": self.adoption.missed,
         }
@@ -130,241 +131,254 @@ class WeightUpdateManager:
         self._thread.start()
 
     def stop(self) -> None:
-        """Refuses what is not answered, and ends threads and validator."""
+        """Refuses what is not answered, and ends threads and validator; within seconds, even if
+        the disk of the store hangs."""
         self._stopping = True
         self._thread.join()
         self._refuse_waiting()
-        self._writer.shutdown(wait=False)
         self._supervisor.close()
+        until_s = time.monotonic() + _END_S
+        while self._writer and not self._writer.idle and time.monotonic() < until_s:
+            time.sleep(_POLL_S)
 
-    # Receiving -----------------------------------------------------------------------------------
+    # Requests ------------------------------------------------------------------------------------
 
     def _arrive(self, request: Request) -> None:
         """In the transport's thread."""
-        now_s = time.monotonic()
-        due_s = now_s + request.service.timeout_s - _RETURN_S - _STORE_S
-        pending = _Pending(request, now_s, due_s)
         try:
-            self._waiting.put_nowait(pending)
+            self._waiting.put_nowait((time.monotonic(), request))
         except Full:
-            pending.reply(False, f"{_MOST_WAITING} requests wait already: try later", _NOT_NOW)
+            full = f"{_MOST_WAITING} requests wait already: try later"
+            self._answer(request, False, full, _AGAIN)
         if self._stopping and not self._thread.is_alive():  # so no request is left behind
             self._refuse_waiting()
 
     def _refuse_waiting(self) -> None:
         with suppress(Empty):
             while True:
-                self._waiting.get_nowait().reply(False, _ENDS, _NOT_NOW)
+                self._answer(self._waiting.get_nowait()[1], False, _ENDS, _AGAIN)
+
+    def _answer(self, request: Request, accepted: bool, text: str, data: _Data) -> None:
+        """Sends the answer, from any thread; every refusal of weights is counted."""
+        if not accepted and request.service is WEIGHTS:
+            with self._counting:
+                self._counts["refused"] += 1
+        now_ns, data = time.monotonic_ns(), dict(data)
+        reply = Reply(seq=0, source_time_ns=now_ns, accepted=accepted, text=text[:2000], data=data)
+        request.answer(reply)
 
     def _run(self) -> None:
         while not self._stopping:
             try:
                 self._follow()
-                idle = self._supervisor.ready and self._history.in_use.proven
-                self._serve(self._waiting.get(timeout=_IDLE_POLL_S if idle else _WATCH_POLL_S))
+                self._serve(*self._waiting.get(timeout=self._poll_s))
             except Empty:
                 continue
             except Exception:  # without this thread bad weights would not be rolled back
                 _log.exception("weights: a fault of the controller's own")
                 self._supervisor.lose("was ended after a fault of the controller's own")
 
-    def _serve(self, pending: _Pending) -> None:
+    def _serve(self, arrived_s: float, request: Request) -> None:
         """From a request to its answer."""
-        back = pending.request.service is ROLLBACK
+        self._due_s = arrived_s + request.service.timeout_s - _RETURN_S - _STORE_S
+        serve = self._update if request.service is WEIGHTS else self._back
+        accepted, text, data = False, "a fault of the controller's own: see its log", _AGAIN
         try:
-            accepted, text, data = (self._back if back else self._update)(pending)
+            text, data = serve(request, arrived_s)
+            accepted = True
         except InputError as refusal:
-            accepted, text = False, str(refusal)
-            data = _NOT_NOW if isinstance(refusal, _NotNowError) else {}
-        except Exception:
-            pending.reply(False, "a fault of the controller's own: see its log", _NOT_NOW)
-            raise
-        pending.reply(accepted, text, data)
-        if accepted:
-            self._announce("weights_rolled_back" if back else "weights_accepted", text, data)
-        elif not back:
-            self._counts["weights_refused"] += 1
-            self._announce("weights_refused", text, data)
+            text, data = str(refusal), getattr(refusal, "data", {})
+        finally:
+            self._answer(request, accepted, text, data)
+            if not accepted and request.service is WEIGHTS:
+                self._announce("weights_refused", text, data)
 
-    def _update(self, pending: _Pending) -> _Outcome:
+    def _update(self, request: Request, _: float) -> _Answer:
         """Validates, stages, adopts and keeps the weights of a request."""
-        data, size, history = pending.request.payload, pending.request.size, self._history
-        if size > self._most_bytes:
-            raise InputError(f"{size} bytes are more than any weights that would fit")
-        self._check_not_withdrawn(data)
-        verdict = self._judge(data, pending.due_s)
-        self._check_not_withdrawn(data)  # meanwhile the watch may have rolled them back
-        facts, packed, watched = verdict["data"], verdict["packed"], self._settings.watch_s > 0
-        if not verdict["accepted"]:
-            return False, verdict["text"], facts
-        offer = self._adopt(packed, facts["version"], watched, pending.due_s)
-        new = history.accept(facts["version"], data, packed, proven=not watched)
-        self._counts["weights_accepted"] += 1
-        facts |= {"number": new.number, "cycle": offer.cycle, "adoption_us": offer.us}
-        text = f"in use from cycle {offer.cycle} on, as number {new.number}; {verdict['text']}"
-        return self._kept(pending, f"weights {new.version} {text}", facts)
-
-    def _check_not_withdrawn(self, data: bytes) -> None:
-        if digest_of(data) in self._history.withdrawn:
+        data, history, watched = request.payload, self._history, self._settings.watch_s > 0
+        if request.size > self._most_bytes:
+            raise InputError(f"{request.size} bytes are more than any weights that would fit")
+        verdict = self._judge(data)
+        if digest_of(data) in history.withdrawn:
             why_not = "these weights have been rolled back before: they predicted worse than others"
             raise InputError(f"{why_not}; train again")
+        if not verdict["packed"]:
+            raise _RefusalError(verdict["text"], verdict["data"])
+        offer = self._adopt(verdict["packed"], verdict["data"]["version"], self._due_s)
+        new = history.accept(offer.version, data, verdict["packed"], proven=not watched)
+        self._counts["accepted"] += 1
+        in_use = f"in use from cycle {offer.cycle} on, as number {new.number}"
+        text = f"weights {new.version} {in_use}; {verdict['text']}"
+        facts = {"number": new.number, "cycle": offer.cycle, "adoption_us": offer.us}
+        facts = verdict["data"] | facts
+        self._announce("weights_accepted", text, facts)
+        return self._kept(text, facts)
 
-    def _back(self, pending: _Pending) -> _Outcome:
+    def _back(self, request: Request, arrived_s: float) -> _Answer:
         """Returns to the weights before those in use."""
-        message, why_not = decode_request(pending.request)
-        if message is not None and pending.arrived_s < self._rolled_back_s:
-            why_not = "the watch has rolled back meanwhile"
-        elif message is not None and len(self._history.entries) < 2:
-            why_not = "there are no weights before those in use"
-        if why_not:
+        message, why_not = decode_request(request)
+        if message is None:
             raise InputError(why_not)
-        target, why = self._history.entries[-2], f"on request: {message.text}"
-        return self._kept(pending, *self._roll_back(target, "request", why, pending.due_s))
+        if arrived_s < self._rolled_back_s:
+            raise InputError("the watch has rolled back meanwhile")
+        if len(entries := self._history.entries) < 2:
+            raise InputError("there are no weights before those in use")
+        why = f"on request: {message.text}"
+        return self._kept(*self._roll_back(entries[-2], "request", why, self._due_s))
 
-    # Validating ----------------------------------------------------------------------------------
+    def _kept(self, text: str, data: _Data) -> _Answer:
+        """Waits for the store; the answer is true when it is sent.
 
-    def _judge(self, data: bytes, due_s: float) -> Mapping[str, Any]:
+        InputError if the watch has rolled back meanwhile.
+        """
+        adopted, writer, late = self._adopted, self._keep(), ""
+        try:
+            why_not = "the store has not been written in time"
+            self._wait(lambda: not writer or writer.idle, self._due_s + _STORE_S, why_not)
+        except _RefusalError as error:
+            late = str(error)
+        if self._adopted is not adopted:
+            now = f"{self._history.in_use.version or 'no weights'} are in use again"
+            raise InputError(f"the watch has rolled back meanwhile: {now}; before that, {text}")
+        if not_kept := late or (writer.trouble if writer else ""):
+            text, data = f"{text}; not kept: {not_kept}", {**data, "not_kept": not_kept}
+        return text, data
+
+    def _wait(self, done: Callable[[], object], until_s: float, why_not: str) -> None:
+        """Follows the validator until ``done``; refuses the request for now when time is over."""
+        while not done():
+            if self._stopping or time.monotonic() > until_s:
+                raise _RefusalError(_ENDS if self._stopping else why_not)
+            time.sleep(self._poll_s)
+            self._follow()
+
+    # Validator -----------------------------------------------------------------------------------
+
+    def _judge(self, data: bytes) -> Mapping[str, Any]:
         """The validator's verdict, by what is in use when it is given."""
-        compared = -1
-        while compared != self._revision or self._verdict is None:
-            if self._supervisor.trouble:
-                raise _NotNowError(f"{self._supervisor.trouble}; send them again in a moment")
-            if self._supervisor.ready and compared != self._revision:
-                compared, self._verdict = self._revision, None
-                self._checks += 1
-                self._supervisor.send({"kind": "check", "check": self._checks, "data": data})
-            self._pause(due_s, "the validator has not answered in time")
+        validator, late = self._supervisor, "the validator has not answered in time"
+        self._check, self._verdict = data, {}
+        try:
+            self._wait(lambda: self._verdict or validator.trouble, self._due_s, late)
+        finally:
+            self._check = None
+        if not self._verdict:
+            raise _RefusalError(f"{validator.trouble}; send them again in a moment")
         return self._verdict
 
-    def _pause(self, until_s: float, why_not: str) -> None:
-        """Waits a moment for the validator; refuses the request when time is over."""
-        if self._stopping or time.monotonic() > until_s:
-            raise _NotNowError(_ENDS if self._stopping else why_not)
-        time.sleep(_POLL_S)
-        self._follow()
-
     def _follow(self) -> None:
-        """Starts or replaces the validator if need be, and follows its messages."""
-        self._supervisor.look()
-        while (message := self._supervisor.receive()) is not None:
-            match message["kind"]:
-                case "ready":
-                    self.adoption.validator = True
-                case "verdict" if message["check"] == self._checks:
-                    self._verdict = message
-                case "watch" if message["revision"] == self._revision:
-                    self._end_watch(message["worse"], message["data"])
+        """Exchanges messages with the validator, which is started or replaced if need be."""
+        validator = self._supervisor
+        if (answer := validator.receive()) is not None:
+            self._act_on(answer)
+        self.adoption.validator = validator.ready
+        if validator.idle and ((message := self._message()) or validator.age_s > _PING_S):
+            self._sent = message
+            validator.send(message)
 
-    def _context(self) -> dict[str, Any]:
-        """What the validator needs to know."""
-        in_use, reference = self._history.in_use, self._history.reference
-        return {
-            "kind": "context", "settings": self._settings.model_dump(),
-            "artefact": str(self._port.artefact), "car": car_text(self._port.car),
-            "in_use": in_use.data, "accepted_utc_ns": in_use.accepted_utc_ns,
-            "reference": reference.data, "watched": not in_use.proven,
-            "revision": self._revision, "begin": self._begin,
+    def _message(self) -> dict[str, Any]:
+        """The next message to the validator; empty if there is nothing new."""
+        message: dict[str, Any] = {}
+        if states := self.adoption.states(self._next, _CHUNK):
+            message["states"], self._next = states, states[-1].number + 1
+        if self._stale and self._next >= self._adopted.states:
+            in_use, reference = self._history.in_use, self._history.reference
+            message["context"] = {
+                "in_use": in_use.data, "accepted_utc_ns": in_use.accepted_utc_ns,
+                "reference": reference.data, "watched": not in_use.proven,
+                "begin": self._adopted.states,
+            }  # fmt: skip
+            self._stale = False
+        if self._check is not None and not self._stale and len(states) < _CHUNK:
+            message["check"] = self._check
+        return message
+
+    def _act_on(self, answer: Mapping[str, Any]) -> None:
+        """Acts on an answer, unless it is about weights that are not in use any more."""
+        if not answer:  # the validator has just started
+            self._next, self._stale, self.adoption.allowed = 0, True, -1
+        elif not self._stale and answer["watch"] is not None:
+            self._end_watch(*answer["watch"])
+        elif not self._stale:
+            self.adoption.allowed = math.inf if answer["seen"] is None else answer["seen"]
+        sent = self._sent.get("check")
+        if sent is not None and sent is self._check and not self._stale:
+            self._check, self._verdict = None, answer["verdict"]
+
+    @property
+    def _poll_s(self) -> float:
+        """Time to the next look at what the control thread and the validator have done."""
+        lockstep = time.monotonic() < self.adoption.awaited_s + _LOCKSTEP_S
+        return _LOCKSTEP_POLL_S if lockstep else _POLL_S
+
+    def _end_watch(self, worse: str, data: _Data) -> None:
+        """The watch has a result: the weights in use are proven, or ``worse``."""
+        if not worse:
+            new = self._history.prove()
+            text = f"weights {new.version} (number {new.number}) are proven"
+            self._announce("weights_proven", text, {"version": new.version, "number": new.number})
+        else:
+            why = f"{self._history.in_use.version} {worse}"
+            try:
+                self._roll_back(self._history.reference, "watch", why, math.inf, data)
+            except InputError as refusal:  # the next validator comes to the same result
+                self._supervisor.lose(f"was ended, as a rollback is not possible now ({refusal})")
+                return
+            self._rolled_back_s = time.monotonic()
+        self._keep()
+
+    # Adoption and store --------------------------------------------------------------------------
+
+    def _adopt(self, packed: bytes, version: str, due_s: float) -> Offer:
+        """Stages weights and waits until the control thread has adopted them."""
+        offer = Offer(version)
+        self._port.step.stage_weights(unpack_weights(packed))
+        self.adoption.offers.append(offer)
+        until_s = min(time.monotonic() + _ADOPT_S, due_s)
+        while not offer.done:
+            time.sleep(self._poll_s)
+            if self._stopping or time.monotonic() > until_s:
+                why_not = f"the control loop did not adopt them within {_ADOPT_S:g} s"
+                with suppress(IndexError):  # else the control thread is just adopting them
+                    self.adoption.offers.pop()
+                    raise _RefusalError(_ENDS if self._stopping else why_not)
+        if offer.error:
+            raise InputError(offer.error)
+        self._adopted = offer
+        return offer
+
+    def _roll_back(
+        self, target: AcceptedWeights, by: str, why: str, due_s: float, data: _Data | None = None
+    ) -> _Answer:
+        """Returns to earlier weights."""
+        left = self._history.in_use
+        offer = self._adopt(target.packed, target.version, due_s)
+        self._history.roll_back(target, withdraw=by == "watch")
+        self._counts["rolled_back"] += 1
+        what = target.version or "no weights, as at the start"
+        text = f"back to {what} (number {target.number}) from cycle {offer.cycle} on; {why}"
+        facts: _Data = {
+            **(data or {}), "version": target.version, "number": target.number, "by": by,
+            "cycle": offer.cycle, "from_version": left.version, "from_number": left.number,
         }  # fmt: skip
+        self._announce("weights_rolled_back", text, facts)
+        return text, facts
 
-    def _lost(self, text: str) -> None:
-        """The validator is gone; the car is driven on with what is in use."""
+    def _keep(self) -> StoreWriter | None:
+        """Has the validator sent what is in use, and the store written."""
+        self._stale = True
+        if self._writer:
+            self._writer.write()
+        return self._writer
+
+    def _warn(self, kind: str, text: str) -> None:
+        """Reports trouble, in any thread; the car is driven on with what is in use."""
         _log.warning("%s", text)
-        self.adoption.validator = False
-        self._announce("validator_ended", text, {})
+        self._announce(kind, text, {})
 
-    def _announce(self, kind: str, text: str, data: Mapping[str, Scalar]) -> None:
+    def _announce(self, kind: str, text: str, data: _Data) -> None:
         """Publishes an event, on which no answer and no rollback depends."""
         try:
             self._publish(kind, text, data)
         except Exception:
             _log.exception("weights: the event %s cannot be published", kind)
-
-    # Adopting ------------------------------------------------------------------------------------
-
-    def _adopt(self, packed: bytes, version: str, watched: bool, due_s: float) -> Offer:
-        """Stages weights and waits until the control thread has adopted them."""
-        offer = Offer(version, self._revision + 1, watched)
-        self._port.step.stage_weights(unpack_weights(packed))
-        self.adoption.offers.append(offer)
-        until_s = min(time.monotonic() + _ADOPT_S, due_s)
-        while not offer.done:
-            time.sleep(_POLL_S)
-            if self._stopping or time.monotonic() > until_s:
-                why_not = f"the control loop did not adopt them within {_ADOPT_S:g} s"
-                with suppress(IndexError):  # else the control thread is just adopting them
-                    self.adoption.offers.pop()
-                    raise _NotNowError(_ENDS if self._stopping else why_not)
-        if offer.error:
-            raise InputError(offer.error)
-        self._revision, self._begin = offer.revision, offer.states
-        return offer
-
-    def _roll_back(
-        self, target: AcceptedWeights, by: str, why: str, due_s: float
-    ) -> tuple[str, _Data]:
-        """Returns to earlier weights."""
-        left = self._history.in_use
-        offer = self._adopt(target.packed, target.version, not target.proven, due_s)
-        self._history.roll_back(target, withdraw=by == "watch")
-        self._counts["weights_rolled_back"] += 1
-        what = target.version or "no weights, as at the start"
-        text = f"back to {what} (number {target.number}) from cycle {offer.cycle} on; {why}"
-        return text, {
-            "version": target.version, "number": target.number, "cycle": offer.cycle,
-            "from_version": left.version, "from_number": left.number, "by": by,
-        }  # fmt: skip
-
-    def _end_watch(self, worse: str, data: Mapping[str, Scalar]) -> None:
-        """The watch has a result: the weights in use are proven, or ``worse``."""
-        if not worse:
-            new = self._history.prove()
-            self._keep()
-            text = f"weights {new.version} (number {new.number}) are proven"
-            self._announce("weights_proven", text, {"version": new.version, "number": new.number})
-            return
-        why = f"{self._history.in_use.version} {worse}"
-        try:
-            text, facts = self._roll_back(self._history.reference, "watch", why, math.inf)
-        except InputError as refusal:  # the next validator comes to the same result
-            self._supervisor.lose(f"was ended, as a rollback is not possible now ({refusal})")
-            return
-        self._rolled_back_s = time.monotonic()
-        self._keep()
-        self._announce("weights_rolled_back", text, {**data, **facts})
-
-    # Storing -------------------------------------------------------------------------------------
-
-    def _keep(self) -> "Future[None] | None":
-        """Sends the validator what is in use, and has it written to the store."""
-        self._supervisor.send(self._context())
-        if self._port.store is not None:
-            last = self._writing
-            if (
-                last is None or last.running() or last.done()
-            ):  # else it has not begun: one is enough
-                self._writing = self._writer.submit(self._write, self._port.store)
-        return self._writing
-
-    def _write(self, store: Store) -> None:
-        """In the store's thread."""
-        try:
-            store.keep(self._history.model_copy())
-            self._trouble = ""
-        except InputError as error:
-            self._trouble = f"accepted weights cannot be kept: {error}"
-            _log.warning("%s", self._trouble)
-            self._announce("weights_not_kept", self._trouble, {})
-            raise
-
-    def _kept(self, pending: _Pending, text: str, data: _Data) -> _Outcome:
-        """Acceptance, once the store is written; it says if that is not so."""
-        writing = self._keep()
-        try:
-            while writing is not None and not writing.done():
-                self._pause(pending.due_s + _STORE_S, "the store has not been written in time")
-            error = None if writing is None else writing.exception()
-        except _NotNowError as late:
-            error = late
-        if error is not None:
-            text, data = f"{text}; not kept: {error}", {**data, "not_kept": str(error)}
-        return True, text, data

@@ -13,13 +13,28 @@ from bayesrace.gp.weights import GpWeights
 from bayesrace.vehicles.parameters import CarParameters
 from controller.native_step import NativeStep
 from controller.settings import MpcSettings
-from controller.weights.states import StateRecord
 
-__all__ = ["OneStepModel", "Sample", "Sampler", "plausible_samples"]
-
+__all__ = ["OneStepModel", "Sample", "Sampler", "StateRecord", "plausible_samples"]
 
 _LONGEST: Final = 5.0
 """Sampling times that a sample lasts at most; where states come seldom, each makes one."""
+
+
+class StateRecord(NamedTuple):
+    """A state as the control thread has recorded it, with its ``number`` among all."""
+
+    number: int
+    epoch: int
+    run: int
+    seq: int
+    time_s: float
+    recorded_ns: int
+    """Monotonic clock, the same in all processes of a machine."""
+    x: tuple[float, ...]
+    u_applied: tuple[float, ...]
+    lockstep: bool
+    fallen_back: bool | None = None
+    """The input of the cycle before was the fallback's; None: the car was not driven."""
 
 
 class Sample(NamedTuple):
@@ -43,8 +58,11 @@ class Sampler:
 
     def add(self, state: StateRecord) -> Sample | None:
         """The sample that this state completes, if any."""
-        if self._states and not _consecutive(self._states[-1], state):
-            self._states = []
+        if self._states:
+            last = self._states[-1]
+            expected = (last.epoch, last.run, last.seq + 1)
+            if (state.epoch, state.run, state.seq) != expected or state.time_s <= last.time_s:
+                self._states = []
         self._states.append(state)
         states, first = self._states, self._states[0]
         duration_s = state.time_s - first.time_s
@@ -58,11 +76,6 @@ class Sampler:
         if abs(duration_s - self._step_s) < 1e-6 * self._step_s:
             duration_s = self._step_s  # for exactly one step the model takes no remainder
         return Sample(state.recorded_ns, duration_s, np.array(first.x), u, np.array(state.x))
-
-
-def _consecutive(before: StateRecord, after: StateRecord) -> bool:
-    same_run = (before.epoch, before.run) == (after.epoch, after.run)
-    return same_run and after.seq == before.seq + 1 and after.time_s > before.time_s
 
 
 class OneStepModel:
@@ -97,17 +110,13 @@ class OneStepModel:
 def plausible_samples(car: CarParameters, step_s: float, count: int) -> list[Sample]:
     """States and inputs over the whole range of the car, always the same ones."""
     vx, slip, turn, steer, push, rate = np.random.default_rng(5).uniform(-1, 1, (count, 6)).T
-    vx = 0.5 * (vx + 1) * _top_speed_mps(car)
+    # The car is fastest where drive and resistance are equal: (cm1 - cm2 v) d = cr0 + cr2 v^2.
+    d_max = car.d_max
+    fastest = np.roots([car.cr2, car.cm2 * d_max, car.cr0 - car.cm1 * d_max])
+    vx = 0.5 * (vx + 1) * max((v for v in fastest.real if v > 0), default=1.0)
     omega = turn * vx * np.tan(car.delta_max_rad) / car.wheelbase_m
     pose, delta = np.zeros((count, 3)), steer * car.delta_max_rad
     x = np.column_stack([pose, vx, 0.3 * slip * vx, omega, delta])
-    d = car.d_min + 0.5 * (push + 1) * (car.d_max - car.d_min)
+    d = car.d_min + 0.5 * (push + 1) * (d_max - car.d_min)
     u = np.column_stack([d, rate * car.delta_rate_max_radps])
     return [Sample(0, step_s, x[k], u[k], x[k]) for k in range(count)]
-
-
-def _top_speed_mps(car: CarParameters) -> float:
-    """Where drive and resistance are equal: (cm1 - cm2 v) d_max = cr0 + cr2 v^2."""
-    a, b, c = car.cr2, car.cm2 * car.d_max, car.cr0 - car.cm1 * car.d_max
-    roots = np.roots([a, b, c]) if a else np.array([-c / b])
-    return max((float(v.real) for v in roots if abs(v.imag) < 1e-9 < v.real), default=1.0)

@@ -33,7 +33,7 @@ class GateSettings(BaseModel):
     recent_s: float = Field(60.0, gt=0, description="older samples: tyres and track have changed")
     least_samples: int = Field(50, ge=1, le=5000, description="with fewer, only on probation")
     hang_s: float = Field(
-        15.0, ge=0.5, le=3600, description="without a heartbeat for so long the validator is "
+        15.0, ge=0.5, le=3600, description="without an answer for so long the validator is "
         "replaced; a check takes some 0.1 s, and many times that beside other work",
     )  # fmt: skip
     watch_s: float = Field(10.0, ge=0, le=3600, description="driving after which weights stay")

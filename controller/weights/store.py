@@ -5,9 +5,12 @@ history. Every file appears whole or not at all.
 """
 
 import hashlib
+import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from queue import Full, Queue
 from typing import Annotated, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -17,11 +20,11 @@ from bayesrace.files import read_text, read_whole, write_whole
 from bayesrace.gp.weights import MAX_BYTES, decode_weights
 from controller.native_step import pack_weights
 
-__all__ = ["HISTORY", "WITHDRAWN", "AcceptedWeights", "History", "Store", "digest_of"]
+__all__ = ["HISTORY", "AcceptedWeights", "History", "Store", "StoreWriter", "digest_of"]
 
 HISTORY: Final = 8
 """Accepted weights that are kept."""
-WITHDRAWN: Final = 32
+_WITHDRAWN: Final = 32
 """Digests of withdrawn weights that are kept."""
 
 _INDEX: Final = "index.json"
@@ -96,7 +99,7 @@ class History(BaseModel):
         end = self.entries.index(target) + 1
         left, self.entries = self.entries[end:], self.entries[:end]
         if withdraw:
-            self.withdrawn = [*self.withdrawn, *(one.digest for one in left)][-WITHDRAWN:]
+            self.withdrawn = [*self.withdrawn, *(one.digest for one in left)][-_WITHDRAWN:]
 
 
 class Store:
@@ -105,21 +108,21 @@ class Store:
     def __init__(self, folder: Path, discretisation: str) -> None:
         """InputError if it cannot be used or belongs to a controller that predicts otherwise."""
         self._folder, path = folder, folder / _INDEX
-        index, why_not = History(), ""
+        self._index, why_not = History(discretisation=discretisation), ""
         try:
             folder.mkdir(parents=True, exist_ok=True)
             if path.exists():
-                index = History.model_validate_json(read_text(path, "the store's index"))
+                self._index = History.model_validate_json(read_text(path, "the store's index"))
         except OSError as error:
             why_not = str(error.strerror)
         except ValidationError:
             why_not = f"{_INDEX} is damaged; remove it"
-        if index.discretisation not in ("", discretisation):
-            why_not = f"holds weights for {index.discretisation}, not for {discretisation}"
+        if self._index.discretisation != discretisation:
+            why_not = f"holds weights for {self._index.discretisation}, not for {discretisation}"
         if why_not:
             raise InputError(f"store {folder}: {why_not}; choose another folder")
         # A folder that cannot be written is an error now, not while the car drives.
-        self._write_index(index.model_copy(update={"discretisation": discretisation}))
+        self._write(_INDEX, self._index.model_dump_json(indent=1).encode())
 
     def restore(self, start: AcceptedWeights) -> History:
         """What an earlier controller has kept, after ``start``; damaged files are left out."""
@@ -135,21 +138,51 @@ class Store:
     def keep(self, history: History) -> None:
         """Makes the folder hold this history; InputError if it cannot."""
         entries = [one for one in history.entries if one.number]  # 0 has a file of its own
-        before = {one.file for one in self._index.entries}
-        for one in entries:
-            if one.file not in before:
-                self._write(one.file, one.data)
-        self._write_index(history.model_copy(update={"entries": entries}))
-        for name in before - {one.file for one in entries}:
+        files = {one.file: one.data for one in entries}
+        there = {path.name for path in self._folder.glob("[0-9]*-*.bin")}
+        for name in files.keys() - there:
+            self._write(name, files[name])
+        index = history.model_copy(update={"entries": entries})
+        self._write(_INDEX, index.model_dump_json(indent=1).encode())
+        for name in there - files.keys():
             with suppress(OSError):
                 (self._folder / name).unlink(missing_ok=True)
-
-    def _write_index(self, index: History) -> None:
-        self._write(_INDEX, index.model_dump_json(indent=1).encode())
-        self._index = index  # not before: it says what the folder holds
 
     def _write(self, name: str, data: bytes) -> None:
         try:
             write_whole(self._folder / name, data)
         except OSError as error:
             raise InputError(f"store {self._folder / name}: {error.strerror or error}") from None
+
+
+class StoreWriter:
+    """Writes a history to its store in a daemon thread: a disk may hang, even at the end."""
+
+    def __init__(self, store: Store, history: History, failed: Callable[[str], None]) -> None:
+        """``failed`` is called, in that thread, with the reason why weights are not kept."""
+        self._store, self._history, self._failed = store, history, failed
+        self._due: Queue[None] = Queue(1)
+        self.trouble = ""
+        """Why the last write has failed; else empty."""
+        threading.Thread(target=self._run, name="weights-store", daemon=True).start()
+
+    @property
+    def idle(self) -> bool:
+        """Whether all that was to be written has been, or has failed."""
+        return not self._due.unfinished_tasks
+
+    def write(self) -> None:
+        """Has the history written, as it is when its turn comes: one write at most waits."""
+        with suppress(Full):
+            self._due.put_nowait(None)
+
+    def _run(self) -> None:
+        while True:
+            self._due.get()
+            try:
+                self._store.keep(self._history.model_copy())
+                self.trouble = ""
+            except InputError as error:
+                self.trouble = str(error)
+                self._failed(self.trouble)
+            self._due.task_done()

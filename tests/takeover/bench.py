@@ -24,9 +24,17 @@ from tests.network.cars import Course
 from tests.programs import until
 from tests.takeover.rig import validators
 
-__all__ = ["Bench", "bench"]
+__all__ = ["Bench", "a_state", "bench"]
 
 CAR = "orca"
+
+
+def a_state(seq: int) -> State:
+    """Of a car that stands, at 50 Hz."""
+    return State(
+        seq=seq, source_time_ns=0, epoch=1, run=1, time_s=0.02 * seq, x=(0.0,) * 7,
+        u_applied=(0.0, 0.0), lap=0, lockstep=False, answers=(), final=False,
+    )  # fmt: skip
 
 
 class Bench:
@@ -56,20 +64,7 @@ class Bench:
         """Records as many states; nothing is adopted."""
         for _ in range(cycles):
             self._seq += 1
-            state = State(
-                seq=self._seq,
-                source_time_ns=0,
-                epoch=1,
-                run=1,
-                time_s=0.02 * self._seq,
-                x=(0.0,) * 7,
-                u_applied=(0.0, 0.0),
-                lap=0,
-                lockstep=False,
-                answers=(),
-                final=False,
-            )
-            self.adoption.record(state, fallen_back)
+            self.adoption.record(a_state(self._seq), fallen_back)
 
     def send(self, weights: GpWeights) -> "Future[Reply]":
         return self._pool.submit(ask, self._session, WEIGHTS, CAR, encode_weights(weights))
@@ -78,7 +73,7 @@ class Bench:
         request = RollbackRequest(seq=0, source_time_ns=0, text="test")
         return self._pool.submit(ask, self._session, ROLLBACK, CAR, request)
 
-    def settle(self, answer: "Future[Reply]") -> Reply:
+    def reply(self, answer: "Future[Reply]") -> Reply:
         """The answer, with cycles going on meanwhile."""
 
         def answered() -> bool:
@@ -92,7 +87,7 @@ class Bench:
         """However often a validator is replaced on a machine that stalls."""
         for _ in range(20):
             self.ready()
-            reply = self.settle(self.send(weights))
+            reply = self.reply(self.send(weights))
             if reply.accepted:
                 return reply
             assert reply.data.get("again"), reply.text

@@ -122,7 +122,7 @@ class Rig:
         return [one for one in found if one.kind == kind]
 
     def held_up(self, end: Event) -> bool:
-        """Whether a run by the wall clock, the first, was on a machine that stalled: it may have
+        """Whether the machine stalled in a run in real time, the first: the stall may have
         taken the car off the track."""
         periods = self.counters()["skipped"] + int(end.data["overruns"])
         return periods > 0 or int(end.data["late"]) > _LATE

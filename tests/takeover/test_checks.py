@@ -16,11 +16,9 @@ import pytest
 from bayesrace.arrays import Floats
 from bayesrace.gp.weights import GpOutput, GpWeights, encode_weights
 from bayesrace.vehicles import CarParameters
-from controller.weights.checks import Checks, Verdict
-from controller.weights.prediction import Sample, Sampler, plausible_samples
+from controller.weights.checks import Checks, Verdict, Watch
+from controller.weights.prediction import Sample, Sampler, StateRecord, plausible_samples
 from controller.weights.settings import GateSettings
-from controller.weights.states import StateRecord
-from controller.weights.watch import Watch
 from tests.conftest import fit_weights, smooth_drive
 from tests.takeover.rig import KINDS
 from tests.takeover.spoilt_weights import SPOILT, spoilt
@@ -86,7 +84,7 @@ def test_honest_weights_pass(
 ) -> None:
     for weights, in_use in ((honest, None), (again, None), (honest, again), (again, honest)):
         verdict = judged(checks, weights, in_use, drive)
-        assert verdict.accepted, verdict.text
+        assert verdict.packed, verdict.text
         assert verdict.data["probation"] is False
         assert verdict.data["samples"] == 500
         for name in ("vx", "vy", "omega"):
@@ -100,7 +98,7 @@ def test_spoilt_weights_are_refused_in_favour_of_good_ones(
     checks: Checks, honest: GpWeights, again: GpWeights, drive: list[Sample], what: str
 ) -> None:
     verdict = judged(checks, spoilt(again, what), honest, drive)
-    assert not verdict.accepted
+    assert not verdict.packed
     assert "worse than those in use" in verdict.text or "absurd" in verdict.text
 
 
@@ -108,7 +106,7 @@ def test_spoilt_weights_are_refused_in_favour_of_good_ones(
 def test_spoilt_weights_are_refused_in_favour_of_none(
     checks: Checks, honest: GpWeights, drive: list[Sample], what: str
 ) -> None:
-    assert not judged(checks, spoilt(honest, what), None, drive).accepted
+    assert not judged(checks, spoilt(honest, what), None, drive).packed
 
 
 def test_good_weights_count_beside_those_in_use_that_may_be_bad(
@@ -117,8 +115,8 @@ def test_good_weights_count_beside_those_in_use_that_may_be_bad(
     """Bad weights on probation are no measure for others."""
     bad = spoilt(honest, "flip omega")
     as_bad = spoilt(again, "flip omega")
-    assert judged(checks, as_bad, bad, drive).accepted
-    assert not judged(checks, as_bad, bad, drive, proven=honest).accepted
+    assert judged(checks, as_bad, bad, drive).packed
+    assert not judged(checks, as_bad, bad, drive, proven=honest).packed
 
 
 @pytest.mark.parametrize("count", [0, 49])
@@ -126,7 +124,7 @@ def test_with_few_samples_weights_are_accepted_on_probation(
     checks: Checks, honest: GpWeights, drive: list[Sample], count: int
 ) -> None:
     verdict = judged(checks, spoilt(honest, "flip vy"), None, drive[:count])
-    assert verdict.accepted
+    assert verdict.packed
     assert (verdict.data["samples"], verdict.data["probation"]) == (count, True)
     assert "on probation" in verdict.text
 
@@ -137,7 +135,7 @@ def test_stale_weights_are_refused(checks: Checks, honest: GpWeights, drive: lis
         weights = replace(honest, created_utc_ns=created)
         for samples in (drive, []):
             verdict = judged(checks, weights, newer, samples)
-            assert verdict.accepted is accepted
+            assert bool(verdict.packed) is accepted
             assert accepted or "stale: made 1 s before those in use, 'newer'" in verdict.text
 
 
@@ -146,10 +144,10 @@ def test_weights_dated_ahead_do_not_make_later_ones_stale(
 ) -> None:
     now_ns = time.time_ns()
     ahead = replace(honest, version="ahead", created_utc_ns=now_ns + 3000 * 10**9)
-    assert judged(checks, ahead).accepted
+    assert judged(checks, ahead).packed
     for after_ns, accepted in ((10**9, True), (-(10**9), False)):
         weights = replace(honest, created_utc_ns=now_ns + after_ns)
-        assert judged(checks, weights, ahead, accepted_utc_ns=now_ns).accepted is accepted
+        assert bool(judged(checks, weights, ahead, accepted_utc_ns=now_ns).packed) is accepted
 
 
 def test_weights_of_another_car_or_model_are_refused(checks: Checks, honest: GpWeights) -> None:
@@ -157,14 +155,14 @@ def test_weights_of_another_car_or_model_are_refused(checks: Checks, honest: GpW
     assert "those of the car 'rover'" in judged(checks, other).text
     other = replace(honest, discretisation="e_kinematic/rk4x1/0.05s/orca-0")
     verdict = judged(checks, other)
-    assert (verdict.accepted, "were learned for" in verdict.text) == (False, True)
+    assert (bool(verdict.packed), "were learned for" in verdict.text) == (False, True)
 
 
 def test_weights_that_do_not_fit_are_refused(checks: Checks, honest: GpWeights) -> None:
     vx, vy, omega = honest.outputs
     large = replace(vx, inputs=np.zeros((1025, 6)), alpha=np.zeros(1025))
     verdict = judged(checks, replace(honest, outputs=(large, vy, omega)))
-    assert (verdict.accepted, "1025 points" in verdict.text) == (False, True)
+    assert (bool(verdict.packed), "1025 points" in verdict.text) == (False, True)
 
 
 @pytest.mark.parametrize("factor", [30.0, 1e6, 1e300])
@@ -175,7 +173,7 @@ def test_absurd_weights_are_refused_without_any_sample(
     vx, vy, omega = honest.outputs
     huge: GpOutput = replace(omega, alpha=omega.alpha * factor)
     verdict = judged(checks, replace(honest, outputs=(vx, vy, huge)))
-    assert not verdict.accepted
+    assert not verdict.packed
     assert "absurd" in verdict.text or "unusable" in verdict.text
 
 
@@ -188,9 +186,9 @@ def test_what_is_absurd_only_where_the_car_is_is_refused(
     spike = np.r_[sample.x[3:7], sample.u]
     narrow = replace(vx, length_scales=np.full(6, 1e-3), inputs=spike[None], alpha=np.array([1e3]))
     weights = replace(honest, outputs=(narrow, vy, omega))
-    assert judged(checks, weights).accepted
+    assert judged(checks, weights).packed
     verdict = judged(checks, weights, None, drive)
-    assert (verdict.accepted, "absurd in its recent states" in verdict.text) == (False, True)
+    assert (bool(verdict.packed), "absurd in its recent states" in verdict.text) == (False, True)
 
 
 def test_plausible_states_are_within_the_cars_limits(car: CarParameters) -> None:
@@ -205,8 +203,8 @@ def test_plausible_states_are_within_the_cars_limits(car: CarParameters) -> None
 def test_an_error_that_is_not_finite_is_worse_than_anything(checks: Checks) -> None:
     infinite, fine = np.full((20, 3), np.inf), np.ones((20, 3))
     for old in (fine, infinite):
-        assert checks.compare(infinite, old, fine).worse == "vx and vy and omega"
-    assert checks.compare(fine, fine, infinite).data["samples"] == 0
+        assert checks.compare(infinite, [old], fine).worse == "vx and vy and omega"
+    assert checks.compare(fine, [fine], infinite).data["samples"] == 0
 
 
 # Watch ---------------------------------------------------------------------------------------

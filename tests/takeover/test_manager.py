@@ -1,12 +1,15 @@
 """What happens to weights when the validator ends, or hangs, or the disk is full, at bad moments.
 
-Promises guarded: accepted weights are in use and in the store; each request is answered in time;
-there is always a way back; the validator's and the disk's trouble is not the car's.
+Promises guarded: accepted weights are in use and in the store; each request is answered in time and
+truly, each refusal counted; a rollback is always possible; a failing validator or disk does not
+disturb the car, and does not keep the process from ending.
 """
 
 import os
 import resource
 import signal
+import subprocess
+import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -14,12 +17,13 @@ from pathlib import Path
 import pytest
 
 from bayesrace.gp.weights import GpWeights
+from controller.weights.adoption import RECORDED, Adoption
 from controller.weights.settings import GateSettings
 from controller.weights.store import History, Store
 from operation.learn.publishing import in_words
 from tests.network.cars import Course
 from tests.programs import until
-from tests.takeover.bench import bench
+from tests.takeover.bench import a_state, bench
 
 pytestmark = pytest.mark.wall_clock
 
@@ -37,7 +41,7 @@ def test_a_validator_killed_between_verdict_and_adoption(
         assert made.version == good.version
         made.cycle()
         assert made.version == again.version
-        reply = made.settle(answer)
+        reply = made.reply(answer)
         assert (reply.accepted, reply.data["version"]) == (True, again.version)
         assert "not kept" not in reply.text
         until(lambda: made.published("weights_accepted") == [reply.text], "the event")
@@ -45,7 +49,7 @@ def test_a_validator_killed_between_verdict_and_adoption(
             assert made.kept() == [again.version]
         made.ready(2)
         assert made.accept(replace(good, version="next")).data["number"] == 2
-        assert made.settle(made.roll_back()).data["version"] == again.version
+        assert made.reply(made.roll_back()).data["version"] == again.version
 
 
 @pytest.mark.check
@@ -56,9 +60,9 @@ def test_a_validator_that_hangs_is_replaced(
     with bench(course, GateSettings(hang_s=1.0)) as made:
         made.accept(again)
         os.kill(made.validator, signal.SIGSTOP)
-        reply = made.settle(made.send(replace(good, version="next")))
+        reply = made.reply(made.send(replace(good, version="next")))
         assert not reply.accepted
-        assert "the validator hung, without a heartbeat for 1 s" in reply.text
+        assert "the validator hung, without an answer for 1 s" in reply.text
         assert "send them again in a moment" in reply.text
         assert reply.data == {"again": True}
         assert made.published("validator_ended")
@@ -78,8 +82,9 @@ def test_a_validator_that_hangs_is_replaced(
 def test_a_validator_that_is_replaced_watches_from_the_adoption_on(
     course: Course, good: GpWeights, again: GpWeights
 ) -> None:
-    """The states are in the shared memory: the next validator comes to the same result."""
+    """The next validator gets all recent states, message by message: the result is the same."""
     with bench(course) as made:
+        made.drive(200)
         made.accept(again)
         os.kill(made.validator, signal.SIGKILL)
         made.gone()
@@ -89,12 +94,26 @@ def test_a_validator_that_is_replaced_watches_from_the_adoption_on(
         assert made.version == good.version
 
 
+def test_the_newest_states_are_kept_for_the_validator() -> None:
+    adoption = Adoption(lambda _: None)
+    for seq in range(RECORDED + 1000):
+        adoption.record(a_state(seq), seq % 2 == 0)
+    oldest = adoption.states(0, 64)
+    assert [one.number for one in oldest] == list(range(1000, 1064))
+    newest = adoption.states(RECORDED + 998, 64)
+    assert [(one.seq, one.fallen_back) for one in newest] == [
+        (RECORDED + 998, True), (RECORDED + 999, False)
+    ]  # fmt: skip
+    assert (newest[0].x, newest[0].u_applied) == (a_state(0).x, a_state(0).u_applied)
+    assert adoption.states(RECORDED + 1000, 64) == []
+
+
 def test_a_rollback_needs_no_validator(course: Course, good: GpWeights, again: GpWeights) -> None:
     with bench(course) as made:
         made.accept(again)
         os.kill(made.validator, signal.SIGKILL)
         made.gone()
-        assert made.settle(made.roll_back()).data["version"] == good.version
+        assert made.reply(made.roll_back()).data["version"] == good.version
 
 
 def test_an_offer_that_the_control_loop_does_not_adopt_is_withdrawn(
@@ -124,7 +143,34 @@ def test_a_request_when_too_many_wait_is_refused_for_now(
         (refused,) = (one.result() for one in answers if one.done())
         assert (refused.accepted, refused.data) == (False, {"again": True})
         assert "try later" in refused.text
-        assert sum(made.settle(one).accepted for one in answers) == 2
+        assert sum(made.reply(one).accepted for one in answers) == 2
+
+
+def test_every_refusal_is_counted(
+    course: Course, again: GpWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a full queue, by a fault of the controller's own, and at its end."""
+    monkeypatch.setattr("controller.weights.manager._MOST_WAITING", 1)
+    with bench(course) as made:
+
+        def fails(*_: object) -> None:
+            raise RuntimeError("a fault")
+
+        with monkeypatch.context() as patched:
+            patched.setattr(made.manager, "_judge", fails)
+            reply = made.reply(made.send(again))
+        assert (reply.accepted, reply.data) == (False, {"again": True})
+        assert "a fault of the controller's own" in reply.text
+        assert made.status("weights_refused") == 1
+        made.ready(2)
+        answers = [made.send(again)]
+        made.offered()
+        answers += [made.send(again), made.send(again)]
+        until(lambda: any(one.done() for one in answers), "one is refused")
+        assert made.status("weights_refused") == 2
+        made.manager.stop()
+        assert not any(one.result(60.0).accepted for one in answers)
+        assert made.status("weights_refused") == 4
 
 
 def test_requests_are_answered_when_the_controller_ends(course: Course, again: GpWeights) -> None:
@@ -192,13 +238,13 @@ def test_a_request_to_roll_back_while_the_watch_does(
         third = made.send(replace(again, version="third"))
         made.cycle()
         assert made.version == good.version
-        reply = made.settle(answer)
+        reply = made.reply(answer)
         assert (reply.accepted, reply.text) == (False, "the watch has rolled back meanwhile")
-        reply = made.settle(third)
+        reply = made.reply(third)
         assert (reply.accepted, made.version) == (True, "third")
         until(lambda: len(made.published("weights_rolled_back")) == 1, "the event")
         assert made.status("weights_rolled_back") == 1
-        refused = made.settle(made.send(again))
+        refused = made.reply(made.send(again))
         assert "rolled back before" in refused.text
 
 
@@ -210,7 +256,7 @@ def test_the_watch_ends_while_a_request_rolls_back(
         answer = made.roll_back()
         made.offered()
         made.drive(50, fallen_back=True)
-        reply = made.settle(answer)
+        reply = made.reply(answer)
         assert (reply.accepted, reply.data["by"]) == (True, "request")
         assert made.version == good.version
         assert made.accept(again).data["number"] == 2  # not withdrawn
@@ -220,13 +266,9 @@ def test_the_watch_ends_while_a_request_rolls_back(
 # The store -----------------------------------------------------------------------------------
 
 
-def test_a_disk_that_hangs_delays_neither_answer_nor_rollback(
-    tmp_path: Path,
-    course: Course,
-    good: GpWeights,
-    again: GpWeights,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+@pytest.fixture
+def disk(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
+    """A disk that hangs until this is set; requests wait a second for it."""
     monkeypatch.setattr("controller.weights.manager._RETURN_S", 12.0)
     monkeypatch.setattr("controller.weights.manager._STORE_S", 1.0)
     free, keep = threading.Event(), Store.keep
@@ -236,7 +278,26 @@ def test_a_disk_that_hangs_delays_neither_answer_nor_rollback(
         keep(store, history)
 
     monkeypatch.setattr(Store, "keep", hangs)
+    return free
+
+
+def test_a_disk_that_hangs_delays_no_answer(
+    tmp_path: Path, course: Course, again: GpWeights, disk: threading.Event
+) -> None:
     with bench(course, store=tmp_path / "store") as made:
+        reply = made.reply(made.send(again))
+        assert "; not kept: the store has not been written in time" in reply.text
+        assert (reply.accepted, made.version, made.kept()) == (True, again.version, [])
+        disk.set()
+        until(lambda: made.kept() == [again.version], "it is kept after all")
+
+
+def test_weights_rolled_back_while_the_store_is_written_are_not_called_accepted(
+    tmp_path: Path, course: Course, good: GpWeights, again: GpWeights, disk: threading.Event
+) -> None:
+    """A disk that hangs delays no rollback; the answer is true when it is sent."""
+    store = tmp_path / "store"
+    with bench(course, store=store) as made:
         answer = made.send(again)
         made.offered()
         made.cycle()
@@ -244,22 +305,27 @@ def test_a_disk_that_hangs_delays_neither_answer_nor_rollback(
         made.drive(25, fallen_back=True)
         made.offered()
         assert not answer.done()
-        reply = made.settle(answer)
-        assert "; not kept: the store has not been written in time" in reply.text
-        assert (reply.accepted, made.version, made.kept()) == (True, good.version, [])
-        free.set()
-        until(lambda: made.manager._history.withdrawn, "the rollback")
-    until(
-        lambda: (
-            len(
-                History.model_validate_json(
-                    (tmp_path / "store" / "index.json").read_text()
-                ).withdrawn
-            )
-            == 1
-        ),
-        "it is kept after all",
-    )
+        reply = made.reply(answer)
+        assert (reply.accepted, made.version, made.kept()) == (False, good.version, [])
+        assert f"rolled back meanwhile: {good.version} are in use again" in reply.text
+        assert not reply.data.get("again")
+        events = [kind for kind, _ in made.events]
+        assert events == ["weights_accepted", "weights_rolled_back", "weights_refused"]
+        disk.set()
+    assert len(History.model_validate_json((store / "index.json").read_text()).withdrawn) == 1
+
+
+def test_a_disk_that_hangs_does_not_keep_the_process_from_ending(tmp_path: Path) -> None:
+    program = """
+import sys, threading
+from pathlib import Path
+from controller.weights.store import History, Store, StoreWriter
+begun = threading.Event()
+Store.keep = lambda *_: begun.set() or threading.Event().wait()
+StoreWriter(Store(Path(sys.argv[1]), "d"), History(), print).write()
+begun.wait()
+"""
+    subprocess.run([sys.executable, "-c", program, str(tmp_path)], check=True, timeout=60)
 
 
 def test_a_full_disk_does_not_stop_an_adoption(
