@@ -1,7 +1,10 @@
 """An FMU in a process of its own: whatever it does there, the plant gets an answer or a reason."""
 
 import contextlib
+import errno
 import math
+import os
+import subprocess
 import tempfile
 import zipfile
 from collections.abc import Iterator
@@ -61,6 +64,24 @@ def processes_of(session: int) -> list[str]:
 def assert_all_gone(session: int) -> None:
     """Killed processes end a moment later, and those left behind are not ours to wait for."""
     until(lambda: not processes_of(session), f"the end of session {session}", PATIENCE_S)
+
+
+def test_a_process_that_does_not_start_is_a_fault_and_leaves_nothing_open(
+    libraries: dict[int, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = faulty_fmu(libraries[3], tmp_path / "faulty.fmu", 3)
+
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(subprocess, "Popen", fail)
+    descriptors = Path("/proc/self/fd")
+    before = set(descriptors.iterdir())
+    with pytest.raises(InputError, match="its process does not start: Resource temporarily"):
+        faulty_host(path)
+    assert set(descriptors.iterdir()) == before
+    assert list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.parametrize("version", [2, 3])

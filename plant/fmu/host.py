@@ -97,8 +97,12 @@ class FmuHost:
         return FmuFault(f"FMU {self.path.name} {at}: {what}{last}")
 
     def _launch(self) -> FmuProcess:
-        process = self._process = FmuProcess(self.path, self._description, self._arguments)
-        self._used = False
+        try:
+            process = FmuProcess(self.path, self._description, self._arguments)
+        except OSError as error:  # no memory, processes, descriptors or disk left
+            why = error.strerror or str(error)
+            raise FmuFault(f"FMU {self.path.name}: its process does not start: {why}") from None
+        self._process, self._used = process, False
         self._values(b"", "while it was loaded")
         return process
 
