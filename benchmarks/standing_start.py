@@ -76,7 +76,7 @@ class Rig:
                 u_applied=self.car.u_applied,
                 lap=0,
                 lockstep=False,
-                answers=(),
+                actuation_delays=(),
                 final=False,
             )
             if not blind:
@@ -121,7 +121,7 @@ def main() -> None:
     with stages_on(console) as stages:
         settings = PreparationSettings(train_track=given.train_track)
         made = prepare(settings, (given.track,), stages)
-    car, track, line = get_car(DEFAULT_CAR), made.course.track, made.course.line
+    car, track, line = get_car(DEFAULT_CAR), made.first.track, made.first.line
     weights = read_weights(made.weights)
     controller = compiled_controller(made.artefacts[0], car, track, line, weights)
     rig, random = Rig(controller, line.length_m), np.random.default_rng(given.seed)

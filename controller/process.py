@@ -229,9 +229,9 @@ class ControllerProcess:
         budget_s = self._settings.budget * schedule.period_ns * 1e-9
         # What has held up a state on its way is part of its age: hence the schedule's plant time,
         # not the time since this state's own arrival.
-        basis_s = max(schedule.plant_time_s(timing.released_ns), state.time_s)
+        decided_at_s = max(schedule.plant_time_s(timing.released_ns), state.time_s)
         spent_s = (time.monotonic_ns() - schedule.release_ns) * 1e-9
-        decision = self._cycle.decide(basis_s, budget_s, spent_s)
+        decision = self._cycle.decide(decided_at_s, budget_s, spent_s)
         timing.overruns += time.monotonic_ns() > schedule.release_ns + 1e9 * budget_s
         self._send(state, decision)
         timing.missed = time.monotonic_ns() > schedule.deadline_ns

@@ -52,7 +52,7 @@ def state(run: int, seq: int, x: Floats, u: Floats) -> State:
         u_applied=tuple(u),
         lap=0,
         lockstep=True,
-        answers=(),
+        actuation_delays=(),
         final=False,
     )
 

@@ -124,7 +124,11 @@ class _Log:
                 "seq": seq, "source_time_ns": now, "epoch": 1, "run": run, "time_s": time_s,
                 "u_applied": u, "lap": 0,
             }  # fmt: skip
-            rest: dict[str, Any] = {"lockstep": drive.lockstep, "answers": (), "final": final}
+            rest: dict[str, Any] = {
+                "lockstep": drive.lockstep,
+                "actuation_delays": (),
+                "final": final,
+            }
             self.put("state", State(**sample, x=tuple(seen), **rest))
             if self._truth:
                 self.put("truth", Truth(**sample, x=tuple(x)))
@@ -139,7 +143,7 @@ class _Log:
                 epoch=1,
                 run=run,
                 state_seq=seq,
-                basis_s=time_s,
+                decided_at_s=time_s,
                 u=u,
                 weights_version=drive.weights,
                 status=0,

@@ -60,7 +60,8 @@ class Rig:
     def state(self, **changes: Any) -> State:
         values: dict[str, Any] = {
             "source_time_ns": 0, "run": 1, "time_s": self.seq * STEP_S, "x": tuple(self.x),
-            "u_applied": tuple(self.u), "lap": 0, "lockstep": False, "answers": (), "final": False,
+            "u_applied": tuple(self.u), "lap": 0, "lockstep": False, "actuation_delays": (),
+            "final": False,
         }  # fmt: skip
         return State(seq=self.seq, epoch=self.epoch, **(values | changes))
 

@@ -244,7 +244,7 @@ def test_a_repeated_last_state_is_no_gap_and_no_sample() -> None:
             u_applied=(0.1, 0.0),
             lap=0,
             lockstep=True,
-            answers=(),
+            actuation_delays=(),
             final=final,
         )
 

@@ -42,7 +42,7 @@ def fed(
                 epoch=1,
                 run=one.run,
                 state_seq=one.seq,
-                basis_s=0.0,
+                decided_at_s=0.0,
                 u=(0.0, 0.0),
                 weights_version=f"v{one.seq // 100}",
                 status=0,
@@ -106,7 +106,7 @@ def test_with_the_track_crossings_are_interpolated() -> None:
             u_applied=(0.0, 0.0),
             lap=int(lap[k]),
             lockstep=True,
-            answers=(),
+            actuation_delays=(),
             final=False,
         )
         for k in range(count)

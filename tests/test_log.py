@@ -36,7 +36,7 @@ def state(seq: int) -> State:
         u_applied=(0.0, 0.0),
         lap=0,
         lockstep=True,
-        answers=(),
+        actuation_delays=(),
         final=False,
     )
 
@@ -324,7 +324,7 @@ with open_session(Endpoints(listen=(endpoint,))) as plant:
         for seq in range(10**6):
             state = State(
                 seq=seq, source_time_ns=0, epoch=0, run=1, time_s=0.0, x=(0.0,) * 7,
-                u_applied=(0.0, 0.0), lap=0, lockstep=True, answers=(), final=False,
+                u_applied=(0.0, 0.0), lap=0, lockstep=True, actuation_delays=(), final=False,
             )
             publisher.put(state, lockstep=True)
             time.sleep(0.005)

@@ -49,7 +49,7 @@ class Controller:
         for changes in self._answer(state):
             values = {
                 "seq": len(self.states) - 1, "source_time_ns": 0, "epoch": state.epoch,
-                "run": state.run, "state_seq": state.seq, "basis_s": state.time_s,
+                "run": state.run, "state_seq": state.seq, "decided_at_s": state.time_s,
                 "u": (1.0, 0.0), "weights_version": "", "status": 0,
             }  # fmt: skip
             actuation = Actuation(**(values | changes))
@@ -106,7 +106,7 @@ def test_an_answered_car_drives_and_the_delays_are_told() -> None:
     assert guarded.braked < 8
     assert states[-1].final
     assert states[-1].x[3] > 1.0
-    rows = np.array([row for state in states for row in state.answers]).reshape(-1, 3)
+    rows = np.array([row for state in states for row in state.actuation_delays]).reshape(-1, 3)
     assert rows[:, 0].tolist() == list(range(len(rows)))
     assert (rows[:, 1] >= 0).all()
     assert (rows[:, 2] > rows[:, 1] - 1e-3).all()  # it acts from the next substep on
@@ -114,7 +114,7 @@ def test_an_answered_car_drives_and_the_delays_are_told() -> None:
 
 def test_an_injected_delay_comes_on_both_ways() -> None:
     states, _, _ = execute(lambda _: [{}], delay_s=0.03)
-    rows = np.array([row for state in states for row in state.answers]).reshape(-1, 3)
+    rows = np.array([row for state in states for row in state.actuation_delays]).reshape(-1, 3)
     assert len(rows) > 3
     assert (rows[:, 1] >= 0.06).all()
     assert (rows[:, 2] >= 0.06).all()
@@ -126,7 +126,7 @@ def test_an_injected_delay_comes_on_both_ways() -> None:
         {"epoch": EPOCH + 1},  # an answer to the plant before a restart, its numbers plausible
         {"run": 2},
         {"state_seq": 10**6},
-        {"basis_s": 1e6},  # it would never grow old, and overtake all that follow
+        {"decided_at_s": 1e6},  # it would never grow old, and overtake all that follow
     ],
 )
 def test_what_is_not_for_this_run_does_not_act(changes: dict[str, Any]) -> None:
@@ -141,11 +141,11 @@ def test_what_is_not_for_this_run_does_not_act(changes: dict[str, Any]) -> None:
 
 def test_an_overtaken_answer_is_told_and_does_not_act() -> None:
     def late_copy(state: State) -> list[dict[str, Any]]:
-        old = {"u": (-0.1, 0.0), "basis_s": max(state.time_s - 0.02, 0.0)}
+        old = {"u": (-0.1, 0.0), "decided_at_s": max(state.time_s - 0.02, 0.0)}
         return [{}, old] if state.seq else [{}]
 
     states, counters, _ = execute(late_copy)
-    rows = np.array([row for state in states for row in state.answers]).reshape(-1, 3)
+    rows = np.array([row for state in states for row in state.actuation_delays]).reshape(-1, 3)
     assert (rows[:, 2] == -1).sum() == counters.stale > 5
     assert states[-1].x[3] > 1.0
 

@@ -68,7 +68,7 @@ def state(seq: int) -> State:
         u_applied=(0.0, 0.0),
         lap=0,
         lockstep=True,
-        answers=(),
+        actuation_delays=(),
         final=False,
     )
 

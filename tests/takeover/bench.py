@@ -66,7 +66,7 @@ class Bench:
                 u_applied=(0.0, 0.0),
                 lap=0,
                 lockstep=False,
-                answers=(),
+                actuation_delays=(),
                 final=False,
             )
             self.adoption.record(state, fallen_back)

@@ -19,7 +19,7 @@ def a_state(seq: int) -> State:
         u_applied=(0.1, 0.2),
         lap=0,
         lockstep=True,
-        answers=(),
+        actuation_delays=(),
         final=False,
     )
 
