@@ -196,8 +196,12 @@ class Run:
         sleep_until_ns(until_ns)
 
     def _receive(self) -> End | None:
-        """Takes what has arrived since the last time; returns what ends the run, if anything."""
-        while (item := self._inbox.get()) is not None:
+        """Takes what has arrived by now, and no more: requests without end must not hold up the
+        car. Returns what ends the run, if anything."""
+        for _ in range(self._inbox.queued):
+            item = self._inbox.get()
+            if item is None:
+                break
             if item.kind is Kind.MESSAGE:
                 actuation = item.value
                 if actuation is None:

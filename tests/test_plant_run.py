@@ -55,8 +55,16 @@ class Controller:
             actuation = Actuation(**(values | changes))
             self._items.append(Item(Kind.MESSAGE, "actuation", actuation, time.monotonic_ns()))
 
+    @property
+    def queued(self) -> int:
+        return len(self._items)
+
     def get(self) -> Item | None:
         return self._items.popleft() if self._items else None
+
+    def ask_again(self, request: Item) -> None:
+        """As a client that sends the next request as soon as the last one is answered."""
+        self._items.append(request)
 
     @contextlib.contextmanager
     def stamped(self) -> Iterator[None]:
@@ -72,9 +80,13 @@ def _played_by(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) 
         yield
 
 
-def execute(answer: Any, delay_s: float = 0.0) -> tuple[list[State], RunCounters, GuardCounters]:
+def execute(
+    answer: Any, delay_s: float = 0.0, flooded: bool = False
+) -> tuple[list[State], RunCounters, GuardCounters]:
     """A run of .3 s in which a state is answered by actuations with these changes."""
     controller, counters, simulator = Controller(answer), RunCounters(), VEHICLE
+    if flooded:
+        controller.ask_again(Item(Kind.REQUEST, "status", None, 0))
     simulator.guard.counters = GuardCounters()
     start = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
     line = {"line_x_m": 0.0, "line_y_m": 0.0, "line_heading_rad": 0.0}
@@ -94,7 +106,7 @@ def execute(answer: Any, delay_s: float = 0.0) -> tuple[list[State], RunCounters
     run = Run(
         request, simulator, cast(Inbox, controller), cast(Publisher[State], controller),
         cast(Publisher[Truth], controller), Decoder(Actuation), counters, Numbering(),
-        lambda _: None, lambda: None, EPOCH, delay_s,
+        controller.ask_again, lambda: None, EPOCH, delay_s,
     )  # fmt: skip
     run.execute()
     return controller.states, counters, simulator.guard.counters
@@ -110,6 +122,12 @@ def test_an_answered_car_drives_and_the_delays_are_told() -> None:
     assert rows[:, 0].tolist() == list(range(len(rows)))
     assert (rows[:, 1] >= 0).all()
     assert (rows[:, 2] > rows[:, 1] - 1e-3).all()  # it acts from the next substep on
+
+
+def test_requests_without_end_do_not_hold_up_the_car() -> None:
+    states, counters, guarded = execute(lambda _: [{}], flooded=True)
+    assert (states[-1].final, counters.stale) == (True, 0)
+    assert guarded.braked < 8
 
 
 def test_an_injected_delay_comes_on_both_ways() -> None:

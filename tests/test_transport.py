@@ -409,6 +409,14 @@ def test_an_inbox_takes_several_topics_each_with_its_own_depth_and_decoder(
     assert [one.seq for one in found["state"]] == list(range(90, 100))
     assert [one.seq for one in found["event"][:-1]] == list(range(100))
     assert (states.accepted, events.accepted, events.refused) == (10, 100, 1)
+    for number in range(100):
+        receiver.put(Item(Kind.SIGNAL, "", number, 0))
+    publishers[0].put(state(99), lockstep=True)
+    time.sleep(0.5)
+    kinds = [item.kind for item in (receiver.get(), receiver.get()) if item is not None]
+    assert kinds == [Kind.SIGNAL, Kind.MESSAGE]  # the queue does not go first until it is empty
+    while receiver.queued:
+        take(receiver, Kind.SIGNAL)
     with receiver.stamped():
         publishers[0].put(state(100), lockstep=True)
         publishers[1].put(
