@@ -3,6 +3,7 @@
 import hashlib
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -140,6 +141,13 @@ def test_gaps_are_counted(tmp_path: Path) -> None:
     assert (result.complete, result.gaps) == (False, 3)
     whole = analyse(write_race(tmp_path, [Drive("bayesrace", circle(TWO_LAPS, 1.0))]))
     assert (whole.complete, whole.gaps) == (True, 0)
+
+
+def test_a_forged_number_is_no_gap(tmp_path: Path) -> None:
+    drive = Drive("bayesrace", circle(TWO_LAPS, 1.0))
+    run = read_race(write_race(tmp_path, [drive])).recording.runs[0]
+    run.actuations.insert(20, replace(run.actuations[20], seq=2**60))
+    assert run.gaps == 0
 
 
 def test_a_killed_plant_is_told(tmp_path: Path) -> None:
