@@ -46,6 +46,8 @@ class PythonController:
     port = None
     """It has nowhere to put weights."""
     weights_version = ""
+    track = ""
+    """Its law knows."""
 
     def __init__(self, artefact: Path, law: ControlLaw) -> None:
         """``artefact``: any built for a car; its control cycle is used, its step is not."""

@@ -96,6 +96,7 @@ class Service:
             run=0 if newest is None else newest.run,
             text=self._words()[:2000],
             weights_version=self._controller.weights_version,
+            track=self._controller.track[:200],
             rate_hz=0.0 if lockstep else self._rate_hz,
             state_age_s=age_s,
             delay_s=driver.delay_s,

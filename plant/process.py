@@ -313,6 +313,7 @@ class PlantProcess:
             run=self._run_number,
             text=self._text[:2000],
             weights_version="",
+            track="",
             rate_hz=self._settings.rate_hz,
             state_age_s=-1.0
             if self._states.sent_ns is None

@@ -122,6 +122,7 @@ def controller_status(version: str) -> Status:
         run=0,
         text="",
         weights_version=version,
+        track="",
         rate_hz=50.0,
         state_age_s=0.0,
         delay_s=0.0,

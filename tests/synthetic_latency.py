@@ -156,6 +156,7 @@ class Loop:
                 run=self.run,
                 text="",
                 weights_version="",
+                track="",
                 rate_hz=50.0,
                 state_age_s=0.0,
                 delay_s=0.0,

@@ -374,6 +374,11 @@ def waiting(
     return Waiting(plant, controller, plant_at, where)
 
 
+def test_drive_refuses_another_track_than_the_controllers(cli: Cli, waiting: Waiting) -> None:
+    outcome = cli("drive", "--track", "paddock", *waiting.where)
+    refused(outcome, "the controller drives the track '", "this run is on 'paddock-", "--track")
+
+
 @pytest.mark.check
 def test_drive_says_when_the_controller_is_lost(
     tmp_path: Path,

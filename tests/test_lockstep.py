@@ -242,6 +242,7 @@ def test_a_run_of_two_controllers_is_refused_or_no_success(rig: Rig) -> None:
         run=0,
         text="",
         weights_version="",
+        track="",
         rate_hz=0.0,
         state_age_s=-1.0,
         delay_s=0.0,

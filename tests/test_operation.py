@@ -56,7 +56,7 @@ COUNTERS = {"deadline_misses": 3, "shifted_plan": 4, "brake": 5, "stop": 6, "ref
             "states_lost": 8, "states_stale": 9}  # fmt: skip
 FIELDS = {
     "answering", "fault", "processes", "status_age_s", "phase", "epoch", "run", "text",
-    "weights_version", "rate_hz", "state_age_s", "delay_s", "counters",
+    "weights_version", "track", "rate_hz", "state_age_s", "delay_s", "counters",
 }  # fmt: skip
 
 
@@ -86,6 +86,7 @@ class Fake:
             run=2,
             text=self.text,
             weights_version="v3",
+            track="",
             rate_hz=rate,
             state_age_s=age,
             delay_s=0.034,
@@ -250,6 +251,7 @@ def test_a_heartbeat_that_stops_is_no_answer_any_more() -> None:
         run=0,
         text="",
         weights_version="",
+        track="",
         rate_hz=50.0,
         state_age_s=-1.0,
         delay_s=0.0,

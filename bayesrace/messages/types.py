@@ -268,6 +268,8 @@ class Reply(Message):
 class Status(Message):
     """State of a process, on ``bayesrace/{car}/status/{source}`` at 10 Hz and on request."""
 
+    SCHEMA: ClassVar[int] = 2
+
     source: Annotated[str, Choice(("plant", "controller"))]
     phase: Annotated[str, Choice(PHASES)]
     """plant: idle, running; controller: waiting (for a state), ready (for ``go``), driving,
@@ -278,6 +280,9 @@ class Status(Message):
     text: Long
     """The latest message for operators, such as why the last run ended."""
     weights_version: Short
+    track: Short
+    """Controller: :attr:`bayesrace.tracks.Track.identity` of the track that it drives; empty: a
+    plant, or a control law that names none."""
     rate_hz: Annotated[float, Real(0.0, 1e5)]
     """Set rate of the loop; 0 in lockstep."""
     state_age_s: Annotated[float, Real(-1.0, 1e9)]

@@ -7,8 +7,8 @@ P}}}``, where P is null if no such process is there, and otherwise holds, always
 - ``fault``: why it is not, or null;
 - ``processes``: how many answer under this name; more than one is a mistake;
 - ``status_age_s``: since the status arrived here [s];
-- ``phase``, ``epoch``, ``run``, ``text``, ``weights_version``, ``delay_s``: as in the message
-  :class:`~bayesrace.messages.Status`;
+- ``phase``, ``epoch``, ``run``, ``text``, ``weights_version``, ``track``, ``delay_s``: as in the
+  message :class:`~bayesrace.messages.Status`;
 - ``rate_hz``: of the loop, null in lockstep;
 - ``state_age_s``: since the process received (controller) or sent (plant) its newest state [s],
   null before the first;
@@ -49,7 +49,7 @@ class ProcessStatus:
         """JSON as in the docstring of this module."""
         status = self.status
         known: dict[str, Any] = dict.fromkeys(
-            ("phase", "epoch", "run", "text", "weights_version", "rate_hz", "state_age_s")
+            ("phase", "epoch", "run", "text", "weights_version", "track", "rate_hz", "state_age_s")
         )
         known |= {"delay_s": None, "counters": None}
         if status is not None:
