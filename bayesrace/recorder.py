@@ -85,7 +85,7 @@ class Recorder:
         for thread in self._threads:
             thread.start()
 
-    def settle(self, quiet_s: float = 0.1, at_most_s: float = 2.0) -> None:
+    def drain(self, quiet_s: float = 0.1, at_most_s: float = 2.0) -> None:
         """Wait until nothing but heartbeats has arrived for a while; all else is in the file then.
 
         Raises InputError if the log cannot be written any more, such as on a full disk.
@@ -104,7 +104,7 @@ class Recorder:
         if self._stop.is_set():
             return
         try:
-            self.settle()
+            self.drain()
         finally:
             self._stop.set()
             self._subscriber.undeclare()

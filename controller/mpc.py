@@ -74,7 +74,7 @@ class PredictiveController:
         info = StepInfo.from_address(self.artefact.library.br_cycle_info(cycle))
         output = self._output
         self.native.read_plan()
-        # Acceptable and converged may both be driven; the residuals below tell them apart.
+        # Acceptable and converged may both be driven; the residuals below distinguish them.
         output.status = 0 if StepStatus(info.status).usable else info.status
         output.iterations = info.iterations
         output.residual_dynamics = info.defect

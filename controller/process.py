@@ -85,7 +85,7 @@ class ControllerProcess:
         self._arrived_ns = 0
         self._serve_ns = 0
         """When the next request may be served."""
-        self._told = False
+        self._reported = False
         inbox = self.inbox = Inbox(session, self.name)
         self._decoder = inbox.subscribe(STATE, newest=NEWEST)
         self._service = Service(
@@ -133,9 +133,9 @@ class ControllerProcess:
             return left
         if item is None:
             self._decoder.report(_log)
-            if not self._service.plant_there and not self._told:
+            if not self._service.plant_there and not self._reported:
                 _log.warning("the plant vanished: killed or unreachable; waiting for it")
-            self._told = not self._service.plant_there
+            self._reported = not self._service.plant_there
             return None
         return self._take(item)
 

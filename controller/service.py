@@ -55,7 +55,7 @@ class Service:
         self.stopping = False
         """The process was asked to end."""
         self.plant_there = True
-        """Its liveliness token has not gone; where there never was one, its states tell."""
+        """Its liveliness token has not gone; without a token, its states show that it is there."""
         self.arrived_ns: int | None = None
         """Monotonic clock when the newest state arrived."""
         inbox.serve(STATUS, "controller")

@@ -27,7 +27,7 @@ _REGULAR = ("laps", "max_time", "left_world")
 
 @dataclass(frozen=True)
 class RunPlan:
-    """One run: its number in all messages, who drives, how long."""
+    """One run: its number in all messages, its controller, its length."""
 
     run: int
     controller: str
@@ -59,7 +59,7 @@ def run_request(track: Track, plan: RunPlan) -> RunRequest:
 
 
 def announcement(plan: RunPlan, seq: int, weights_version: str) -> Event:
-    """What stands in the log before a run: who is going to drive it."""
+    """The event in the log before a run, which names its controller."""
     text = f"run {plan.run}: {plan.controller}"
     data: dict[str, Scalar] = {
         "run": plan.run,
@@ -111,7 +111,7 @@ def execute(
         raise
     except (InputError, KeyboardInterrupt):
         with suppress(InputError):  # a car must not drive on unwatched
-            director.stop("who started the run has left")
+            director.stop("the process that started the run has ended")
         raise
     if end.data.get("reason") not in _REGULAR:
         raise InputError(f"run {plan.run} ({plan.controller}) ended early: {end.text}")

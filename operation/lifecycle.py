@@ -124,7 +124,7 @@ def ask_statuses(session: Any, found: Found, timeout_s: float) -> NetworkStatus:
     return NetworkStatus(network.cars)
 
 
-def pick(found: Found, name: str, everybody: bool, source: str = "controller") -> list[str]:
+def pick(found: Found, name: str, all_cars: bool, source: str = "controller") -> list[str]:
     """The cars to command: the named one, all, or the only one; InputError if that is unclear."""
     cars = sorted(car for car, sources in found.items() if source in sources)
     if not cars:
@@ -133,7 +133,7 @@ def pick(found: Found, name: str, everybody: bool, source: str = "controller") -
             f"no {source} found, only the {other} of {', '.join(sorted(found))}; "
             f"start 'bayesrace {source}', or give its endpoint (--endpoint)"
         )
-    if name or everybody or len(cars) == 1:
+    if name or all_cars or len(cars) == 1:
         return cars
     raise InputError(f"several cars found: {', '.join(cars)}; choose one with --name")
 

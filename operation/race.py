@@ -195,7 +195,7 @@ class _Drives:
 
     def samples(self, plan: RunPlan) -> Dataset:
         """What can be learned from a run, from the log."""
-        self._recorder.settle(at_most_s=20.0)  # the next stage reads the log
+        self._recorder.drain(at_most_s=20.0)  # the next stage reads the log
         step_s = self._race.settings.discretisation.step_s
         return dataset_from_log(self._race.out / FILES.log, self._race.car, step_s, (plan.run,))
 

@@ -149,7 +149,7 @@ class PlantProcess:
         if why_not or self._run is None:
             _log.warning("run refused: %s", why_not)
             return
-        self._text = f"run {message.run} under way"
+        self._text = f"run {message.run} is running"
         mode = "lockstep" if message.lockstep else "free-running"
         self._publish_event("run_started", f"run {message.run} in {mode}", {"mode": mode})
         gc.collect()
@@ -299,7 +299,9 @@ class PlantProcess:
         gone_ns = self._director_gone_ns
         if gone_ns is None or time.monotonic_ns() - gone_ns < _ABANDONED_S * 1e9:
             return None
-        return End("abandoned", f"who started the run has been gone for {_ABANDONED_S:g} s")
+        return End(
+            "abandoned", f"the process that started the run has been gone for {_ABANDONED_S:g} s"
+        )
 
     def _status(self, seq: int = 0) -> Status:
         phase = "idle" if self._run is None else "running"

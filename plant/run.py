@@ -109,7 +109,7 @@ class Run:
             finally:
                 self._inbox.spin_s = 0.0
         with self._inbox.stamped():
-            return self._wall_clock()
+            return self._real_time()
 
     def _send(self, state: State, truth: Truth) -> None:
         """The truth goes second: it must not delay the measurement."""
@@ -152,7 +152,7 @@ class Run:
 
     # Free-running ------------------------------------------------------------------------------
 
-    def _wall_clock(self) -> End:
+    def _real_time(self) -> End:
         period_ns = round(self._simulator.step_s * 1e9)
         seq = self._states.next_seq
         first = self._car.sample(seq)

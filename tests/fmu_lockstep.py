@@ -1,6 +1,6 @@
 """What the tests of the controller's FMU share: the lockstep run that it must drive, exports.
 
-The fixtures ``exported`` and ``lockstep`` are there for who imports their functions.
+The fixtures ``exported`` and ``lockstep`` are there for modules that import their functions.
 """
 
 import fcntl

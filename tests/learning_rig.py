@@ -19,7 +19,7 @@ __all__ = ["Rig", "controller_status", "lap", "learn_arguments", "record", "rigg
 
 @dataclass
 class Rig:
-    """Both processes, their endpoints, and who starts runs."""
+    """Both processes, their endpoints, and the director of their runs."""
 
     folder: Path
     course: Course
@@ -36,7 +36,7 @@ class Rig:
         return "--endpoint", self.plant_at, "--endpoint", self.controller_at
 
     def kill_both(self) -> None:
-        """Plant and controller, until nobody takes them for present."""
+        """Plant and controller, until no process takes them for present."""
         self.controller.kill()
         self.plant.kill()
         for source in ("plant", "controller"):

@@ -1,4 +1,4 @@
-"""A plant and a controller that needs no solver, as processes, and who directs and watches them."""
+"""A plant and a controller that needs no solver, as processes, their director, their observer."""
 
 import contextlib
 import itertools

@@ -1,4 +1,4 @@
-"""The analysis against numbers worked out by hand; what is cut short is told, not guessed."""
+"""The analysis against numbers worked out by hand; what is cut short is reported, not guessed."""
 
 import hashlib
 import io
@@ -150,14 +150,14 @@ def test_a_forged_number_is_no_gap(tmp_path: Path) -> None:
     assert run.gaps == 0
 
 
-def test_a_killed_plant_is_told(tmp_path: Path) -> None:
+def test_a_killed_plant_is_reported(tmp_path: Path) -> None:
     drive = Drive("bayesrace", circle(TWO_LAPS[:60], 1.0), ended=None)
     lap = only_lap(write_race(tmp_path, [drive]))
     assert not lap.finished
     assert "the log ends 1.18 s into the run" in lap.ended
 
 
-def test_a_run_that_never_started_is_told(tmp_path: Path) -> None:
+def test_a_run_that_never_started_is_reported(tmp_path: Path) -> None:
     lap = only_lap(write_race(tmp_path, [Drive("bayesrace", np.zeros((0, 7)), ended=None)]))
     assert not lap.finished
     assert lap.ended == "the run never started"

@@ -88,9 +88,9 @@ def test_a_recorded_drive_is_answered_to_the_bit(
     loop.drive(LAPS)
     log.close()
     reader = LogReader(tmp_path / "log.mcap")
-    told = "".join(line_of(state) for state in reader.select(STATE))
+    sent_lines = "".join(line_of(state) for state in reader.select(STATE))
     done = subprocess.run(
-        [program, data], input=told, capture_output=True, text=True, check=True, timeout=120
+        [program, data], input=sent_lines, capture_output=True, text=True, check=True, timeout=120
     )
     rows = [line.split() for line in done.stdout.splitlines()]
     actuations, telemetry = reader.select(ACTUATION), reader.select(TELEMETRY)
@@ -152,7 +152,7 @@ def test_over_udp_states_are_answered_and_silence_ends_at_the_fallback(
     assert len(rows) < 100
 
 
-def test_over_udp_nobody_else_ends_the_run_or_takes_its_answers(
+def test_over_udp_no_other_sender_ends_the_run_or_takes_its_answers(
     plant: socket.socket, circuit: Circuit
 ) -> None:
     x = tuple(map(float, circuit.start(v_mps=1.5)))
@@ -225,7 +225,7 @@ def test_no_sanitizer_finds_anything_whatever_the_states_say(
     for k in range(300):
         delays = (0.0, 0.0, 0.02) * int(random.integers(0, 64))
         lockstep = bool(k // 100 % 2)
-        told = State(
+        sent = State(
             seq=k,
             source_time_ns=0,
             epoch=1,
@@ -238,7 +238,7 @@ def test_no_sanitizer_finds_anything_whatever_the_states_say(
             actuation_delays=delays,
             final=k % 90 == 89,
         )
-        words = line_of(told).split()
+        words = line_of(sent).split()
         for _ in range(int(random.integers(0, 3)) if k % 3 == 0 else 0):
             at = random.integers(len(words))
             words[at] = str(random.choice(odd[4:] if at < 3 else odd))  # epoch, run, seq: whole

@@ -201,7 +201,7 @@ def test_two_plants_at_once_are_not_mixed(driver: Make) -> None:
     assert made.count("foreign") == 50
 
 
-def test_losses_are_told_also_when_the_first_message_of_a_restarted_sender_is_lost() -> None:
+def test_losses_are_counted_also_when_the_first_message_of_a_restarted_sender_is_lost() -> None:
     numbering = Numbering()
     for seq in (0, 1, 2, 5000, 5001, 3, 4, 6):
         numbering.note(seq)

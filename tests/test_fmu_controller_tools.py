@@ -150,8 +150,8 @@ def test_missing_and_damaged_resources_are_refused_and_named(
 
     said: list[str] = []
 
-    class Told(Slave):
-        def _told(self, text: bytes) -> None:
+    class Listening(Slave):
+        def _log(self, text: bytes) -> None:
             said.append(text.decode())
 
     for change, words in (
@@ -162,7 +162,7 @@ def test_missing_and_damaged_resources_are_refused_and_named(
     ):
         change()
         with pytest.raises(Exception, match="instantiate"):
-            Told(fmu, damaged)
+            Listening(fmu, damaged)
         assert words in said[-1], said
 
 

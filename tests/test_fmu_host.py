@@ -120,7 +120,7 @@ def test_values_of_any_type_are_set_before_the_start(
     version: int, libraries: dict[int, Path], tmp_path: Path
 ) -> None:
     path = faulty_fmu(libraries[version], tmp_path / "f.fmu", version)
-    with closing(faulty_host(path, ("vx", "gear_told", "light_told", "label_length"))) as host:
+    with closing(faulty_host(path, ("vx", "gear_read", "light_read", "label_length"))) as host:
         three = {"soft": 0.5, "small": 255, "rows": 7} if version == 3 else {}
         host.start({"label": "Zürich", "vx": 1, "gear": 3, "light": True, **three})
         assert host.step((0.0, 0.0), 0.01)[1:] == [3.0, 1.0, len("Zürich".encode())]

@@ -106,7 +106,7 @@ def test_the_log_of_a_lockstep_run_is_complete(rig: Rig, tmp_path: Path) -> None
 
 
 @pytest.mark.wall_clock
-def test_free_running_drives_by_the_wall_clock(player: dict[str, str], tmp_path: Path) -> None:
+def test_free_running_drives_in_real_time(player: dict[str, str], tmp_path: Path) -> None:
     log = tmp_path / "log.mcap"
     with running_rig(player, low_latency=False) as rig, Recorder(rig.session, "orca", log) as seen:
         rig.director.wait_for(("plant", "controller"), PATIENCE_S)
@@ -123,7 +123,7 @@ def test_free_running_drives_by_the_wall_clock(player: dict[str, str], tmp_path:
     assert LogReader(log).select(STATE)[-1].time_s == end.data["time_s"]
 
 
-def test_a_plant_for_lockstep_refuses_to_run_by_the_wall_clock(rig: Rig) -> None:
+def test_a_plant_for_lockstep_refuses_to_run_in_real_time(rig: Rig) -> None:
     with pytest.raises(InputError, match=r"started for lockstep \(--low-latency\)"):
         rig.start(lockstep=False)
 
@@ -132,7 +132,7 @@ def test_a_plant_for_lockstep_refuses_to_run_by_the_wall_clock(rig: Rig) -> None
 def test_a_free_running_car_brakes_when_its_controller_dies(
     player: dict[str, str], tmp_path: Path
 ) -> None:
-    """Without priorities or with: by the wall clock the transport's defaults are used."""
+    """Without priorities or with: in real time the transport's defaults are used."""
     log = tmp_path / "log"
     with running_rig(player, low_latency=False) as rig, Recorder(rig.session, "orca", log):
         rig.director.wait_for(("plant",), PATIENCE_S)
@@ -221,7 +221,7 @@ def test_ctrl_c_ends_plant_and_run_cleanly(mortal: Rig, tmp_path: Path) -> None:
 
 def test_a_run_is_stopped_on_request_and_another_refused_meanwhile(rig: Rig) -> None:
     run = rig.start(laps=0, max_time_s=1e5)
-    with pytest.raises(InputError, match=f"busy: run {run} under way"):
+    with pytest.raises(InputError, match=f"busy: run {run} is running"):
         rig.start()
     assert rig.director.status("plant").phase == "running"
     assert rig.director.stop("enough").accepted

@@ -193,7 +193,7 @@ def test_keys_without_end_do_not_fill_the_log(tmp_path: Path) -> None:
             other.put(f"bayesrace/orca/nonsense/{k}", b"x")
         publisher.put(state(1), lockstep=True)
         until(lambda: recorder.counters.unrecorded, "keys beyond measure")
-        recorder.settle()
+        recorder.drain()
         assert recorder.failed == ""
         assert recorder.counters.unrecorded > 700
     assert LogReader(path).select(STATE)[-1] == state(1)
@@ -242,7 +242,7 @@ def test_heartbeats_do_not_keep_a_recorder_from_settling(tmp_path: Path) -> None
         beating = threading.Thread(target=beats)
         beating.start()
         begin_s = time.monotonic()
-        recorder.settle(at_most_s=20.0)
+        recorder.drain(at_most_s=20.0)
         waited_s = time.monotonic() - begin_s
         stop.set()
         beating.join()

@@ -375,11 +375,11 @@ def test_of_several_cars_one_must_be_named(fakes: Fakes) -> None:
     with open_session(endpoints) as session:
         found = find(session, endpoints, PATIENCE_S)
         with pytest.raises(InputError, match="several cars found: a, b; choose one with"):
-            pick(found, "", everybody=False)
-        assert pick(found, "", everybody=True) == ["a", "b"]
-        assert pick(find(session, endpoints, PATIENCE_S, "b"), "b", everybody=False) == ["b"]
+            pick(found, "", all_cars=False)
+        assert pick(found, "", all_cars=True) == ["a", "b"]
+        assert pick(find(session, endpoints, PATIENCE_S, "b"), "b", all_cars=False) == ["b"]
         with pytest.raises(InputError, match="only the plant of c; start 'bayesrace controller'"):
-            pick(find(session, endpoints, 0.3, "c"), "c", everybody=False)
+            pick(find(session, endpoints, 0.3, "c"), "c", all_cars=False)
 
 
 def test_all_are_stopped_though_one_hangs_and_one_refuses(fakes: Fakes, cli: Cli) -> None:
@@ -390,7 +390,7 @@ def test_all_are_stopped_though_one_hangs_and_one_refuses(fakes: Fakes, cli: Cli
     )
     endpoints = where(*ones)
     with open_session(endpoints) as session:
-        cars = pick(find(session, endpoints, PATIENCE_S), "", everybody=True)
+        cars = pick(find(session, endpoints, PATIENCE_S), "", all_cars=True)
         answers = command(session, cars, "stop", "", 0.5)
     assert answers["a"] == "no answer within 0.5 s"
     assert isinstance(answers["b"], Reply)
@@ -519,9 +519,9 @@ def test_real_processes_that_know_only_the_router_are_watched_stopped_and_restar
             director.start(run_request(circuit.track, plan))
             until(lambda: phase("controller") == "driving", "driving")
             done = run("status", "--name", "one", "--json", "--endpoint", endpoint)
-            controller_told = json.loads(done.stdout)["cars"]["one"]["controller"]
-            assert controller_told["rate_hz"] == 50.0
-            assert controller_told["state_age_s"] is not None
+            controller_status = json.loads(done.stdout)["cars"]["one"]["controller"]
+            assert controller_status["rate_hz"] == 50.0
+            assert controller_status["state_age_s"] is not None
             for source, process in json.loads(done.stdout)["cars"]["one"].items():
                 shown = {name for names in COUNTERS_SHOWN[source] for name in names if name}
                 assert shown <= set(process["counters"])

@@ -1,4 +1,4 @@
-"""The plant: a car that stays within its limits whatever it is told, and stands when it stands."""
+"""The plant: a car that stays within its limits whatever input it gets, and stays at standstill."""
 
 import math
 
@@ -69,7 +69,7 @@ def test_a_mirrored_car_drives_the_mirrored_way(
 
 @pytest.mark.parametrize("u", [None, (0.0, 0.0), (CAR.d_min, 0.0), (math.nan, 0.0)])
 def test_a_standing_car_is_never_braked_backwards(u: tuple[float, float] | None) -> None:
-    """The guard brakes to a stand; even a full brake command cannot push past rolling resistance
+    """The guard brakes to standstill; even a full brake command cannot push past rolling resistance
     (d_min Cm1 = -.029 N against Cr0 = .052 N) by more than a creep."""
     SIMULATOR.reset((0.0,) * 7)
     for _ in range(100):

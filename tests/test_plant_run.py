@@ -1,4 +1,4 @@
-"""The plant by the wall clock, with what arrives given: it guards itself against its controller."""
+"""The plant in real time, with what arrives given: it guards itself against its controller."""
 
 import contextlib
 import sys
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.wall_clock
 EPOCH = 7
 
 VEHICLE = cast(Vehicle, None)
-"""What plays the car, in the test under way."""
+"""What plays the car, in the current test."""
 
 
 class Controller:
@@ -112,7 +112,7 @@ def execute(
     return controller.states, counters, simulator.guard.counters
 
 
-def test_an_answered_car_drives_and_the_delays_are_told() -> None:
+def test_an_answered_car_drives_and_the_delays_are_reported() -> None:
     states, counters, guarded = execute(lambda _: [{}])
     assert counters.stale == 0
     assert guarded.braked < 8
@@ -157,7 +157,7 @@ def test_what_is_not_for_this_run_does_not_act(changes: dict[str, Any]) -> None:
     assert guarded.braked < 8
 
 
-def test_an_overtaken_answer_is_told_and_does_not_act() -> None:
+def test_an_overtaken_answer_is_reported_and_does_not_act() -> None:
     def late_copy(state: State) -> list[dict[str, Any]]:
         old = {"u": (-0.1, 0.0), "decided_at_s": max(state.time_s - 0.02, 0.0)}
         return [{}, old] if state.seq else [{}]

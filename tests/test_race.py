@@ -121,9 +121,9 @@ def test_another_car_seed_and_problem_are_driven_and_reported(
     assert race.result["settings"]["constraints"] is False
     assert driven.result["settings"]["constraints"] is True
     assert "constraints off" in race.process.stdout
-    told = (race.out / "result.json").read_text()
+    text = (race.out / "result.json").read_text()
     assert cli("report", race.out).code == 0
-    assert (race.out / "result.json").read_text() == told
+    assert (race.out / "result.json").read_text() == text
     assert read_result(race.out / "result.json").settings.car == "mine"
 
 
@@ -191,8 +191,8 @@ def test_one_seed_gives_one_race_to_the_bit(driven: Race, short: ShortRace, tmp_
 @pytest.mark.check
 def test_a_second_race_prepares_nothing_and_says_so(driven: Race, short: ShortRace) -> None:
     again = short("second")()
-    told = again.process.stdout.splitlines()
-    found = [line.removesuffix(": from the cache") for line in told if line.endswith("the cache")]
+    lines = again.process.stdout.splitlines()
+    found = [line.removesuffix(": from the cache") for line in lines if line.endswith("the cache")]
     assert found == [
         "racing line, peanut",
         "racing line, peanut",
@@ -286,7 +286,7 @@ def test_a_run_directory_is_never_overwritten(driven: Race, cli: Cli) -> None:
 
 @pytest.mark.check
 @pytest.mark.wall_clock
-def test_by_the_wall_clock_it_drives_too(short: ShortRace) -> None:
+def test_in_real_time_it_drives_too(short: ShortRace) -> None:
     race = short("realtime", "--laps", "1", "--mode", "realtime")()
     result = race.result
     assert [lap["controller"] for lap in result["laps"]] == CONTROLLERS

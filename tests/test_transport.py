@@ -208,9 +208,9 @@ def test_of_several_under_one_name_a_refusal_is_the_answer(pair: tuple[Any, Any]
     encoded = [encode(one) for one in replies]
     with answering(pair, STOP, *encoded):
         for session in pair:
-            answers = ask_all(session, STOP, (key, "bayesrace/nobody"), request, 5.0)
+            answers = ask_all(session, STOP, (key, "bayesrace/absent"), request, 5.0)
             assert sorted(map(encode, answers[key].valid)) == sorted(encoded)
-            assert answers["bayesrace/nobody"].count == 0
+            assert answers["bayesrace/absent"].count == 0
             assert ask(session, STOP, "orca", request) == replies[1]
 
 
@@ -251,9 +251,9 @@ def test_several_processes_of_one_name_are_reported(pair: tuple[Any, Any]) -> No
     def there(number: int) -> None:
         with ExitStack() as stack:
             for session in pair[:number]:
-                told = partial(Request.answer_raw, data=status)
+                answer = partial(Request.answer_raw, data=status)
                 stack.enter_context(
-                    declare_service(session, STATUS, "orca", told, None, "controller")
+                    declare_service(session, STATUS, "orca", answer, None, "controller")
                 )
             inboxes = [Inbox(session, "orca") for session in pair]
             meet(*inboxes)

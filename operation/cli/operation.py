@@ -108,7 +108,7 @@ def stop(
     name: Name = "",
     endpoint: Endpoint = None,
     reason: Reason = "",
-    everybody: Annotated[bool, typer.Option("--all", help="All cars that are found.")] = False,
+    all_cars: Annotated[bool, typer.Option("--all", help="All cars that are found.")] = False,
     run: Annotated[
         bool,
         typer.Option("--run", help="End the run of the plant instead, such as an abandoned one."),
@@ -119,10 +119,10 @@ def stop(
 
     Without --name: the only car found. Exit code 2 if it refuses or does not answer.
     """
-    if name and everybody:
+    if name and all_cars:
         raise InputError("--name and --all contradict each other; give one of them")
     action: Literal["stop", "end"] = "end" if run else "stop"
-    _command(action, name, endpoint, reason or "bayesrace stop", everybody, timeout)
+    _command(action, name, endpoint, reason or "bayesrace stop", all_cars, timeout)
 
 
 def go(
@@ -140,7 +140,7 @@ def _command(
     name: str,
     endpoint: list[str] | None,
     reason: str,
-    everybody: bool,
+    all_cars: bool,
     timeout: float,
 ) -> None:
     from bayesrace.messages import Reply
@@ -151,7 +151,7 @@ def _command(
     endpoints = connect_to(endpoint)
     with open_session(endpoints) as session:
         source = "plant" if action == "end" else "controller"
-        cars = pick(find(session, endpoints, timeout, name, (source,)), name, everybody, source)
+        cars = pick(find(session, endpoints, timeout, name, (source,)), name, all_cars, source)
         answers = command(session, cars, action, reason, timeout)
     failures = []
     for car, answer in answers.items():

@@ -1,6 +1,6 @@
 """The legs of a control cycle, each computed from the message fields that hold its two times.
 
-Durations that one process measured are exact. What lies between the clocks of both processes is as
+Durations that one process measured are exact. What is between the clocks of both processes is as
 good as the map of one clock to the other (:mod:`studies.latency.clocks`).
 """
 

@@ -42,7 +42,7 @@ class Series:
         return Distribution(**numbers, count=len(self.ns))
 
     def intervals(self, edges_s: Floats) -> list[Floats]:
-        """The values of each interval; the outer ones take what lies beyond."""
+        """The values of each interval; the outer ones take what is beyond."""
         return np.split(self.ns, np.searchsorted(self.at_s, edges_s[1:-1]))
 
     def write_log(self, path: Path, title: str, epoch_s: float, edges_s: Floats) -> None:
