@@ -3,7 +3,7 @@
 In real time the loop keeps its rate whatever arrives: it wakes shortly before a release,
 looks for the state that is due, steps, sends, and does everything else (telemetry, requests,
 heartbeat, preparation of the next step) in the time that is left. It writes nothing to disk, waits
-for no one and logs nothing while it drives.
+for no other process and logs nothing while it drives.
 """
 
 import gc
@@ -89,8 +89,9 @@ class ControllerProcess:
         inbox = self.inbox = Inbox(session, self.name)
         self._decoder = inbox.subscribe(STATE, newest=NEWEST)
         self._service = Service(
-            session, inbox, self.name, settings.rate_hz, self._driver, controller, self._counters,
-            self._words, controller.port is not None,
+            session, inbox, name=self.name, rate_hz=settings.rate_hz, driver=self._driver,
+            controller=controller, counters=self._counters, words=self._words,
+            takes_weights=controller.port is not None,
         )  # fmt: skip
         self._weights: WeightUpdateManager | None = None
         self._adoption: Adoption | None = None

@@ -1,7 +1,7 @@
 """The whole chain: racing lines, training drive, GP, controllers, and the laps of the paper.
 
 Plant and controller are processes of their own, started as a person would start them; this one
-directs, records everything that is said on the network, and hands over weights.
+directs, records every message on the network, and hands over weights.
 """
 
 import shutil

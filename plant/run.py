@@ -4,7 +4,7 @@ import heapq
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from bayesrace.clock import sleep_until_ns
@@ -34,10 +34,6 @@ class RunCounters:
     overruns: int = 0
     """Periods that the plant itself finished more than a period too late."""
 
-    def as_dict(self) -> dict[str, int]:
-        """Name to count."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
-
 
 class _Waiting(NamedTuple):
     """An actuation that has arrived; the order is that of acting."""
@@ -60,6 +56,7 @@ class Run:
         request: RunRequest,
         simulator: Vehicle,
         inbox: Inbox,
+        *,
         states: Publisher[State],
         truths: Publisher[Truth],
         decoder: Decoder[Actuation],

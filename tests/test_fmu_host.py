@@ -142,13 +142,13 @@ TIMEOUTS_S = {Mode.HANG: 0.2, Mode.ORPHAN: 2.0}
 """Of the step that goes wrong, where that takes the time to find out (ORPHAN: enough to abort)."""
 
 FAULTS = {
-    Mode.ABORT: r"crashed \(SIGABRT\); its last words: the engine is on fire",
+    Mode.ABORT: r"crashed \(SIGABRT\); its last message: the engine is on fire",
     Mode.SEGFAULT: r"crashed \(SIGSEGV\)",
     Mode.EXIT: "ended its own process with exit code 3",
-    Mode.SAY: "exit code 7; its last words: assertion failed: wheels == 4",
+    Mode.SAY: "exit code 7; its last message: assertion failed: wheels == 4",
     Mode.HANG: "did not answer within 0.2 s",
     Mode.NOT_A_NUMBER: "gave vx = nan",
-    Mode.FAIL: r"DoStep failed \(error\); its last words: a wheel came off",
+    Mode.FAIL: r"DoStep failed \(error\); its last message: a wheel came off",
     Mode.WORST: r"DoStep failed \(fatal\)",
     Mode.REFUSE: r"DoStep failed \(discard\)",
     Mode.TERMINATE: "the FMU ended the simulation",
@@ -162,7 +162,7 @@ FAULTS = {
     ("version", "mode"),
     [(2, mode) for mode in FAULTS] + [(3, Mode.FAIL), (3, Mode.REFUSE), (3, Mode.TERMINATE)],
 )
-def test_a_fault_is_reported_with_time_and_last_words(
+def test_a_fault_is_reported_with_time_and_last_message(
     version: int, mode: Mode, hosts: dict[int, FmuHost], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     host = hosts[version]

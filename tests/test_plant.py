@@ -1,6 +1,7 @@
 """The plant: a car that stays within its limits whatever input it gets, and stays at standstill."""
 
 import math
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -36,7 +37,7 @@ def test_limits_hold_for_any_input(
     x0: tuple[float, ...], inputs: list[tuple[float, float] | None]
 ) -> None:
     SIMULATOR.reset(x0)
-    before = SIMULATOR.guard.counters.as_dict()
+    before = asdict(SIMULATOR.guard.counters)
     for u in inputs:
         SIMULATOR.step(u)
         d, rate = SIMULATOR.u_applied
@@ -44,7 +45,7 @@ def test_limits_hold_for_any_input(
         assert abs(rate) <= CAR.delta_rate_max_radps
         assert abs(SIMULATOR.x[6]) <= CAR.delta_max_rad
         assert np.isfinite(SIMULATOR.x).all()
-    after = SIMULATOR.guard.counters.as_dict()
+    after = asdict(SIMULATOR.guard.counters)
     bad = [u for u in inputs if u is not None and not (math.isfinite(u[0]) and math.isfinite(u[1]))]
     assert after["rejected"] - before["rejected"] == len(bad)
     assert after["braked"] - before["braked"] == len(bad) + inputs.count(None)

@@ -23,7 +23,7 @@ pytestmark = pytest.mark.wall_clock
 EPOCH = 7
 
 VEHICLE = cast(Vehicle, None)
-"""What plays the car, in the current test."""
+"""What simulates the car, in the current test."""
 
 
 class Controller:
@@ -72,8 +72,10 @@ class Controller:
 
 
 @pytest.fixture(params=["built-in car", pytest.param("FMU", marks=pytest.mark.check)], autouse=True)
-def _played_by(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Every promise holds whatever plays the car."""
+def _simulated_by(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[None]:
+    """Every promise holds whatever simulates the car."""
     fmu = packed_car() if request.param == "FMU" else None
     with open_vehicle(get_car("orca"), fmu) as vehicle:
         monkeypatch.setattr(sys.modules[__name__], "VEHICLE", vehicle)
@@ -104,9 +106,10 @@ def execute(
         actuation_timeout_s=0.1,
     )
     run = Run(
-        request, simulator, cast(Inbox, controller), cast(Publisher[State], controller),
-        cast(Publisher[Truth], controller), Decoder(Actuation), counters, Numbering(),
-        controller.ask_again, lambda: None, EPOCH, delay_s,
+        request, simulator, cast(Inbox, controller), states=cast(Publisher[State], controller),
+        truths=cast(Publisher[Truth], controller), decoder=Decoder(Actuation), counters=counters,
+        numbering=Numbering(), react=controller.ask_again, beat=lambda: None, epoch=EPOCH,
+        delay_s=delay_s,
     )  # fmt: skip
     run.execute()
     return controller.states, counters, simulator.guard.counters

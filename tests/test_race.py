@@ -217,7 +217,7 @@ def test_the_car_as_an_fmu_gives_the_same_race_to_the_bit(driven: Race, short: S
         assert mine["weights_version"] == other["weights_version"]
     assert race.result["settings"]["fmu"] == fmu.name
     assert (race.out / "car.fmu").read_bytes() == fmu.read_bytes()
-    assert f"car played by {fmu.name}" in race.process.stdout
+    assert f"car simulated by {fmu.name}" in race.process.stdout
     assert leftovers(race.pid) == {}
 
 

@@ -133,7 +133,7 @@ def _missing(numbers: Iterable[int]) -> int:
     return numbering.lost
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, kw_only=True)
 class Recording:
     """A run directory: settings, track, racing line, and each run's messages."""
 
@@ -199,8 +199,9 @@ def read_recording(run_dir: Path) -> Recording:
         names = [one.name for one in fields(Truth)]
         record.truth = [Truth(**{n: getattr(state, n) for n in names}) for state in record.states]
     return Recording(
-        run_dir, settings, track, line, planned, truth, reader.truncated, reader.refused, started_ns
-    )
+        directory=run_dir, settings=settings, track=track, line=line, runs=planned, truth=truth,
+        truncated=reader.truncated, refused=reader.refused, started_ns=started_ns,
+    )  # fmt: skip
 
 
 def _read_settings(path: Path) -> dict[str, Any]:

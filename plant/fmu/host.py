@@ -89,11 +89,11 @@ class FmuHost:
     def fault(self, what: str, when: str = "") -> FmuFault:
         """Ends the process, which is no car any more; the fault to raise."""
         process, self._process = self._process, None
-        words = process.output.last_words() if process is not None else ""
+        words = process.output.last_message() if process is not None else ""
         if process is not None:
             process.kill()
         at = when or f"at t = {self.time_s:.6g} s"
-        last = f"; its last words: {words}" if words else ""
+        last = f"; its last message: {words}" if words else ""
         return FmuFault(f"FMU {self.path.name} {at}: {what}{last}")
 
     def _launch(self) -> FmuProcess:

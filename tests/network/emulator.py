@@ -3,7 +3,7 @@
     python emulator.py LEFT RIGHT [SEED]
 
 forwards every Ethernet frame between the two interfaces, which must not do so themselves (two veth
-ends in a network namespace of their own). It plays what Linux's ``netem`` does, for kernels
+ends in a network namespace of their own). It does what Linux's ``netem`` does, for kernels
 without it. It takes commands as lines on stdin, and answers each with one line of JSON:
 
     set KEY VALUE ...    delay, jitter [s], loss [share of frames], reorder [0 or 1]
