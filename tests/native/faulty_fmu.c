@@ -312,7 +312,8 @@ EXPORT Status fmi2DoStep(fmi2Component c, Real t, Real h, fmi2Boolean none) {
     return ((Car *)c)->ended ? (Status)DISCARD : status;
 }
 
-EXPORT Status fmi2GetBooleanStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Boolean *answer) {
+EXPORT Status fmi2GetBooleanStatus(fmi2Component c, const fmi2StatusKind kind,
+                                   fmi2Boolean *answer) {
     const Car *car = c;
     *answer = kind == fmi2Terminated && car->ended;
     return (Status)(car->value[MODE] == REFUSE ? DISCARD : OK); /* then it does not know */
