@@ -46,7 +46,7 @@ def replacing(path: Path) -> Iterator[Path]:
     """A file to write that takes the place of ``path`` when the block has ended without an error.
 
     It is on the disk before it does: after a power failure ``path`` is the old file or the new one.
-    It lies beside ``path`` and has the same suffix, as some writers add what they miss. OSError as
+    It is beside ``path`` and has the same suffix, as some writers add what they miss. OSError as
     of the block, or of the system, but about ``path``; what was begun is deleted then.
     """
     unique = f"{os.getpid()}.{time.monotonic_ns()}"

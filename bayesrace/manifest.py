@@ -128,7 +128,7 @@ def check_library(artefact: Path, manifest: Manifest) -> Path:
     """The library of the artefact, which is code that will be executed.
 
     InputError if it is not the one that the manifest describes, or others may have put it there:
-    it has to belong to this user or to root, and not to be writable by everybody.
+    it has to belong to this user or to root, and not to be writable for every user.
     """
     path = artefact / LIBRARY
     try:

@@ -174,7 +174,7 @@ MEASURED: Final = (
     ("u_applied", "inputs", "acted during the period before"),
     ("lockstep", "int", "1: the plant waits for the answer"),
     ("delays", "int", "how many delays follow"),
-    ("delays_s", "delays", "from the basis of an input to its acting, measured since the last one"),
+    ("delays_s", "delays", "from the decision on an input to its acting, since the last state"),
 )
 """A state as a controller receives it: name, type, meaning."""
 
@@ -214,7 +214,7 @@ DECISION: Final = (
     ("epoch", "int64", "of the state that this answers"),
     ("run", "int64", "of that state"),
     ("seq", "int64", "of that state"),
-    ("basis_s", "double", "plant time up to which the state is known"),
+    ("decided_at_s", "double", "plant time when the cycle began"),
     ("delay_s", "double", "prediction from there to the moment of acting"),
     ("step_us", "double", "execution time of the step; 0 without a clock"),
     ("late_s", "double", "how much later than its budget it was made; not above 0: in time"),

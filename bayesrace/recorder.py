@@ -18,6 +18,7 @@ from bayesrace.errors import InputError
 from bayesrace.log import LogWriter, topic_of
 from bayesrace.messages import EVENT, HEARTBEAT, Event, car_key, encode
 from bayesrace.messages.codec import peek_seq
+from bayesrace.transport.numbering import Numbering
 
 __all__ = ["FLUSH_PERIOD_S", "Recorder", "RecorderCounters"]
 
@@ -36,11 +37,7 @@ class RecorderCounters:
 
     written: int = 0
     missing: int = 0
-    """Messages that were sent, by their numbers, and did not arrive."""
-    disordered: int = 0
-    """Messages with a number not above the one before, restarts from 0 aside."""
-    restarts: int = 0
-    """Times that a sender began again at 0."""
+    """Messages that were sent, by their numbers (:class:`.Numbering`), and did not arrive."""
     unnumbered: int = 0
     """Messages without a readable number; they are written all the same."""
     unrecorded: int = 0
@@ -68,7 +65,7 @@ class Recorder:
         """Why the log cannot be written; empty while it can. Later messages are not written."""
         self.gaps: list[str] = []
         """The first 20 gaps in the numbering, as text."""
-        self._last: dict[str, int] = {}
+        self._numbering: dict[str, Numbering] = {}
         self._other_keys: set[str] = set()
         self._path, self._session = path, session
         self._event_key = car_key(EVENT.key, car, "recorder")
@@ -88,7 +85,7 @@ class Recorder:
         for thread in self._threads:
             thread.start()
 
-    def settle(self, quiet_s: float = 0.1, at_most_s: float = 2.0) -> None:
+    def drain(self, quiet_s: float = 0.1, at_most_s: float = 2.0) -> None:
         """Wait until nothing but heartbeats has arrived for a while; all else is in the file then.
 
         Raises InputError if the log cannot be written any more, such as on a full disk.
@@ -107,7 +104,7 @@ class Recorder:
         if self._stop.is_set():
             return
         try:
-            self.settle()
+            self.drain()
         finally:
             self._stop.set()
             self._subscriber.undeclare()
@@ -208,12 +205,11 @@ class Recorder:
         if seq is None:
             counters.unnumbered += 1
             return
-        due = self._last.get(key, seq - 1) + 1
-        self._last[key] = seq
-        if seq > due:
-            counters.missing += seq - due
-            if len(self.gaps) < 20:
-                self.gaps.append(f"{key}: {due} to {seq - 1} missing")
-        elif seq < due:
-            counters.restarts += seq == 0
-            counters.disordered += seq > 0
+        if (numbering := self._numbering.get(key)) is None:
+            numbering = self._numbering[key] = Numbering()
+        before = numbering.lost
+        numbering.note(seq)
+        missing = numbering.lost - before  # below 0: a late message
+        counters.missing += missing
+        if missing > 0 and len(self.gaps) < 20:
+            self.gaps.append(f"{key}: {missing} missing before {seq}")

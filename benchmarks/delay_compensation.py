@@ -55,8 +55,8 @@ class Outcome:
 
 def drive(files: Prepared, delay_ms: float, mode: str, laps: int) -> Outcome:
     """Starts both processes, drives, analyses the log."""
-    track = files.course.track
-    plan = RunPlan(1, mode, laps, 3.0 * files.course.line.lap_time_s * laps, lockstep=False)
+    track = files.first.track
+    plan = RunPlan(1, mode, laps, 3.0 * files.first.line.lap_time_s * laps, lockstep=False)
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         system = stack.enter_context(started_system(CAR, folder, ["--delay", f"{delay_ms:g}"]))

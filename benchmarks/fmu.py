@@ -152,8 +152,8 @@ def master(car: Path, controller: Path, x0: list[float], periods: int) -> np.nda
 def print_laps(fmus: dict[str, Path], prepared: Prepared, folder: Path, console: Console) -> None:
     """Two laps of each car, and how far apart their states are at most."""
     car = get_car(DEFAULT_CAR)
-    artefact, course = prepared.artefacts[0], prepared.course
-    track, line, weights = course.track, course.line, read_weights(prepared.weights)
+    artefact, first = prepared.artefacts[0], prepared.first
+    track, line, weights = first.track, first.line, read_weights(prepared.weights)
     table = Table(f"{track.name}, BayesRace", "laps s", "off track", "largest difference")
 
     def row(name: str, own: Driven, x: np.ndarray) -> None:

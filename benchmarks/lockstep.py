@@ -42,7 +42,7 @@ def over_zenoh(system: System, prepared: Prepared, laps: int, run: int, log: Pat
     """Drives a run by two processes, records it if there is a log; its plant time [s]."""
     plan = RunPlan(run, "bayesrace", laps, LIMIT_S, lockstep=True)
     with Recorder(system.session, CAR, log) if log else ExitStack():
-        end = system.drive(prepared.course.track, plan)
+        end = system.drive(prepared.first.track, plan)
     return float(end.data["time_s"])
 
 
@@ -61,9 +61,9 @@ def main() -> None:
     console = Console()
     with stages_on(Console(stderr=True)) as stages:
         prepared = prepare(PreparationSettings(), (options.track,), stages)
-    car, course = get_car(CAR), prepared.course
+    car, first = get_car(CAR), prepared.first
     weights = read_weights(prepared.weights)
-    controller = compiled_controller(prepared.artefacts[0], car, course.track, course.line, weights)
+    controller = compiled_controller(prepared.artefacts[0], car, first.track, first.line, weights)
     factors: dict[str, list[float]] = {}
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -73,7 +73,7 @@ def main() -> None:
         zenoh_log, own_log = folder / "zenoh.mcap", folder / "own.mcap"
 
         def in_one_process(log: LogWriter | None) -> float:
-            loop = ClosedLoop(car, course.track, course.line, controller, log=log)
+            loop = ClosedLoop(car, first.track, first.line, controller, log=log)
             return float(loop.drive(options.laps, LIMIT_S).time_s[-1])
 
         def logged() -> float:
@@ -99,9 +99,7 @@ def main() -> None:
                 factors.setdefault(name, []).append(factor)
             assert np.array_equal(states_of(zenoh_log), states_of(own_log)), "other states"
     base = np.array(factors["over Zenoh, recorded"])
-    console.print(
-        f"{course.track.name}, {options.laps} laps, {options.rounds} rounds; equal states"
-    )
+    console.print(f"{first.track.name}, {options.laps} laps, {options.rounds} rounds; equal states")
     for name, values in factors.items():
         ratio = float(np.median(np.array(values) / base))
         console.print(f"{name:24} {np.median(values):6.1f} x real time, ratio {ratio:5.2f}")

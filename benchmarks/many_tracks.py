@@ -40,11 +40,11 @@ def drives(race: str, training: str, seed: int, stages: Stages) -> dict[str, Dri
     settings = PreparationSettings(train_track=training, seed=seed)
     prepared = prepare(settings, (race,), stages, ("e_kinematic", "dynamic"))
     assert prepared.training is not None
-    course, weights = prepared.course, read_weights(prepared.weights)
+    on, weights = prepared.first, read_weights(prepared.weights)
     nominal, perfect = prepared.artefacts
 
     def drive(artefact: Path, weights: GpWeights | None = None) -> Driven:
-        return drive_compiled(artefact, course.track, course.line, weights, car=CAR)
+        return drive_compiled(artefact, on.track, on.line, weights, car=CAR)
 
     first = drive(nominal, weights)
     both = concatenate([prepared.training.samples, first.samples()])

@@ -68,7 +68,7 @@ def main() -> None:
     with stages_on(Console()) as stages:
         prepared = prepare(settings, (arguments.track,), stages, ("dynamic",))
     assert prepared.training is not None
-    track, line = course = prepared.course.track, prepared.course.line
+    track, line = course = prepared.first.track, prepared.first.line
     best = drive_compiled(prepared.artefacts[0], *course, car=CAR)
     print(f"{track.name}: racing line's own time {line.lap_time_s:.3f} s (flying)")
     print(f"bestcase             {best}", flush=True)

@@ -1,12 +1,12 @@
 """Lockstep over Zenoh: how a process should wait for the other one's answer.
 
     python -m benchmarks.round_trip
-    python -m benchmarks.round_trip --rate 50     one round trip each 20 ms, nobody works or polls:
+    python -m benchmarks.round_trip --rate 50     one round trip each 20 ms, neither works or polls:
                                                   what messages alone cost a free-running loop
 
 Two processes on loopback play ping-pong with the states' size of message; one computes for
 as long as a control step in between, the other as long as the plant. What is printed is the round
-trip without that work. Variants: who takes the message from Zenoh (a callback that fills a queue,
+trip without that work. Variants: what takes the message from Zenoh (a callback that fills a queue,
 or the waiting thread from Zenoh's own channel), whether the waiting thread polls before it sleeps,
 and whether Zenoh sends in the calling thread (low latency).
 docs/decisions/2026-11-21-lockstep-spin.md holds the conclusion.
@@ -128,7 +128,7 @@ def main() -> None:
             f"round trip at {arguments.rate:g} Hz: p50 {p50:.0f}  p90 {p90:.0f}  p99 {p99:.0f} us"
         )
         return
-    print(f"{'who waits':<34} {'sends in':<16} p50 us  p90 us  p99 us")
+    print(f"{'what waits':<34} {'sends in':<16} p50 us  p90 us  p99 us")
     for low_latency in (False, True):
         for way in WAYS:
             p50, p90, p99 = np.percentile(measure(way, low_latency), [50, 90, 99])

@@ -40,7 +40,7 @@ BLIND: Final = 80
 """Longest loss of states, in cycles."""
 AFTER_LOSS: Final = 200
 SECOND: Final = 50
-UNDER_WAY_M: Final = 0.5
+DRIVEN_OFF_M: Final = 0.5
 """Progress along the line within a second."""
 STALE_S: Final = 0.1
 
@@ -76,7 +76,7 @@ class Rig:
                 u_applied=self.car.u_applied,
                 lap=0,
                 lockstep=False,
-                answers=(),
+                actuation_delays=(),
                 final=False,
             )
             if not blind:
@@ -84,13 +84,13 @@ class Rig:
             decision = driver.decide(state.time_s)
             self.car.step((decision.d, decision.delta_rate))
 
-    def under_way(self) -> bool:
+    def has_driven_off(self) -> bool:
         """Whether the next second brings it on along the line."""
         self.cycles(1)
         before_m = self._where_m()
         self.cycles(SECOND)
         ahead_m = (self._where_m() - before_m) % self._length_m
-        return UNDER_WAY_M < ahead_m < self._length_m / 2
+        return DRIVEN_OFF_M < ahead_m < self._length_m / 2
 
     def _where_m(self) -> float:
         output = self._driver.output
@@ -121,7 +121,7 @@ def main() -> None:
     with stages_on(console) as stages:
         settings = PreparationSettings(train_track=given.train_track)
         made = prepare(settings, (given.track,), stages)
-    car, track, line = get_car(DEFAULT_CAR), made.course.track, made.course.line
+    car, track, line = get_car(DEFAULT_CAR), made.first.track, made.first.line
     weights = read_weights(made.weights)
     controller = compiled_controller(made.artefacts[0], car, track, line, weights)
     rig, random = Rig(controller, line.length_m), np.random.default_rng(given.seed)
@@ -129,7 +129,7 @@ def main() -> None:
     for x in poses(line, given.count, random):
         rig.place(x)
         rig.cycles(LATER)
-        if not rig.under_way():
+        if not rig.has_driven_off():
             stood += 1
             console.print(f"not driving from {x.round(3).tolist()}")
     console.print(f"{track.name}: {stood} of {given.count} poses not driving after 15 s")
@@ -139,7 +139,7 @@ def main() -> None:
         rig.cycles(int(random.integers(20, 200)))
         rig.cycles(int(random.integers(5, BLIND)), blind=True)
         rig.cycles(AFTER_LOSS)
-        stood += not rig.under_way()
+        stood += not rig.has_driven_off()
     console.print(f"{track.name}: {stood} of {given.count} losses of the state not overcome")
 
 

@@ -75,12 +75,10 @@ def record(problems: int, seed: int) -> dict[str, Any]:
         prepared = prepare(settings, settings.tracks, stages)
     weights = read_weights(prepared.weights)
     rows: dict[str, list[Any]] = {name: [] for name in ("x", "d", "reference", "first")}
-    for course in prepared.courses:
-        controller = compiled_controller(
-            prepared.artefacts[0], car, course.track, course.line, weights
-        )
+    for one in prepared.tracks:
+        controller = compiled_controller(prepared.artefacts[0], car, one.track, one.line, weights)
         step, simulator = controller.native, Simulator(dynamic(car))
-        simulator.reset([*course.track.start_pose(), 1.0, 0.0, 0.0, 0.0])
+        simulator.reset([*one.track.start_pose(), 1.0, 0.0, 0.0, 0.0])
         for k in range(problems // len(settings.tracks)):
             x, d = simulator.x.copy(), simulator.u_applied[0]
             status = step.step(x, d)

@@ -51,7 +51,8 @@ def compiled_controller(
     step.set_path(make_path_table(track, line, car.tuning.path.spacing_m))
     if weights is not None:
         step.set_weights(weights)
-    return PredictiveController(step, "" if weights is None else weights.version)
+    version = "" if weights is None else weights.version
+    return PredictiveController(step, version, track=track.identity)
 
 
 def predictive_controller(
@@ -69,10 +70,10 @@ def predictive_controller(
     the start, whatever ``weights`` are. Raises InputError naming the file that cannot be used.
     """
     loaded = None if weights is None else read_weights(weights)
-    course = load_track(track, car.width_m)
-    line = read_raceline_for(raceline, course, car)
+    driven_on = load_track(track, car.width_m)
+    line = read_raceline_for(raceline, driven_on, car)
     mpc = read_settings(settings, MpcSettings)
-    step = compiled_controller(artefact, car, course, line, loaded, mpc).native
+    step = compiled_controller(artefact, car, driven_on, line, loaded, mpc).native
     version, data = ("", b"") if loaded is None else (loaded.version, encode_weights(loaded))
     first = AcceptedWeights(
         number=0,
@@ -87,4 +88,4 @@ def predictive_controller(
     if history.in_use is not first:
         step.set_weights(decode_weights(history.in_use.data))
     port = WeightsPort(artefact.resolve(), step, car, history, folder)
-    return PredictiveController(step, history.in_use.version, port)
+    return PredictiveController(step, history.in_use.version, port, driven_on.identity)

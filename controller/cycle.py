@@ -42,10 +42,10 @@ class Cycle:
         send(state, self.decide(state.time_s))
         self.prepare(self.driver.interval_s, 0.0)
 
-    def decide(self, basis_s: float, budget_s: float = 0.0, spent_s: float = 0.0) -> Decision:
+    def decide(self, decided_at_s: float, budget_s: float = 0.0, spent_s: float = 0.0) -> Decision:
         """:meth:`Driver.decide`, timed."""
         begin_ns = time.perf_counter_ns()
-        decision = self.driver.decide(basis_s, budget_s, spent_s)
+        decision = self.driver.decide(decided_at_s, budget_s, spent_s)
         self.timing.solve_us = (time.perf_counter_ns() - begin_ns) * 1e-3
         return decision
 
@@ -63,7 +63,7 @@ class Cycle:
             epoch=state.epoch,
             run=state.run,
             state_seq=state.seq,
-            basis_s=decision.basis_s,
+            decided_at_s=decision.decided_at_s,
             u=(decision.d, decision.delta_rate),
             weights_version=self._controller.weights_version,
             status=decision.status,

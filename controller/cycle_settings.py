@@ -38,7 +38,7 @@ class CompensationSettings(BaseModel):
     mode: Literal["measured", "fixed", "off"] = Field(
         "measured", description="off: the state is taken as it is, as if everything were at once"
     )
-    delay_s: float = Field(0.0, ge=0, le=1, description="delay from basis to acting if fixed")
+    delay_s: float = Field(0.0, ge=0, le=1, description="delay from decision to acting if fixed")
     longest_s: float = Field(
         0.5, gt=0, le=1, description="no prediction goes farther; a longer delay is not covered"
     )

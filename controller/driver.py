@@ -68,8 +68,8 @@ class Decision:
     delta_rate: float = 0.0
     level: Level = Level.STOP
     status: int = HALTED
-    basis_s: float = 0.0
-    """Plant time up to which the state is known."""
+    decided_at_s: float = 0.0
+    """Plant time at which the cycle began, as of :class:`Actuation`."""
     delay_s: float = 0.0
     """Prediction from there to the moment of acting."""
     step_us: float = 0.0
@@ -109,7 +109,7 @@ class Driver:
         self._counters = artefact.Counters.from_address(library.br_cycle_counters(self._cycle))
         self._measured, self._decided = artefact.Measured(), artefact.Decision()
         self._measured_at = ct.addressof(self._measured)
-        self._decided_at = ct.addressof(self._decided)
+        self._decided_address = ct.addressof(self._decided)
         self._decide = library.br_cycle_decide
         self._refused: State | None = None
         self.last_error = ""
@@ -187,7 +187,7 @@ class Driver:
         measured.time_s, measured.lockstep = state.time_s, state.lockstep
         measured.x[:] = state.x
         measured.u_applied[:] = state.u_applied
-        delays_s = state.answers[2::3]
+        delays_s = state.actuation_delays[2::3]
         measured.delays = len(delays_s)
         measured.delays_s[: len(delays_s)] = delays_s
         reception = self._library.br_cycle_observe(self._cycle, self._measured_at)
@@ -203,24 +203,26 @@ class Driver:
 
     def decide(
         self,
-        basis_s: float,
+        decided_at_s: float,
         budget_s: float = 0.0,
         spent_s: float = 0.0,
         environment: Environment | None = None,
     ) -> Decision:
-        """The input on the basis of plant time ``basis_s``, by the newest state.
+        """The input by the newest state, decided at this plant time.
 
         ``budget_s``: how long after its release the cycle should be done; 0: no limit but the
         step's own. ``spent_s``: how long ago the release is. InputError before the first state.
         """
         decided, decision = self._decided, self.decision
         around = None if environment is None else ct.byref(EnvironmentStructure(*environment))
-        error = self._decide(self._cycle, around, basis_s, budget_s, spent_s, self._decided_at)
+        error = self._decide(
+            self._cycle, around, decided_at_s, budget_s, spent_s, self._decided_address
+        )
         self.controller.artefact.check(error, "control cycle")
         self.controller.raise_pending()
         decision.d, decision.delta_rate = decided.u
         decision.level, decision.status = _LEVELS[decided.level], decided.status
-        decision.basis_s, decision.delay_s = decided.basis_s, decided.delay_s
+        decision.decided_at_s, decision.delay_s = decided.decided_at_s, decided.delay_s
         decision.step_us = decided.step_us
         decision.stepped = bool(decided.stepped)
         if decision.status == STEP_FAILED:

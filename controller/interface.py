@@ -85,6 +85,10 @@ class Controller(Protocol):
         """Version of the residual's weights in use; empty if it takes none."""
 
     @property
+    def track(self) -> str:
+        """Identity of the track that it drives, as in :class:`bayesrace.messages.Status`."""
+
+    @property
     def port(self) -> "WeightsPort | None":
         """Where a process stages weights that are checked; None: :meth:`set_weights` is asked."""
 

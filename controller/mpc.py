@@ -15,12 +15,18 @@ class PredictiveController:
     """See :class:`controller.interface.Controller`; BestCase, WorstCase and BayesRace alike."""
 
     def __init__(
-        self, step: NativeStep, weights_version: str = "", port: WeightsPort | None = None
+        self,
+        step: NativeStep,
+        weights_version: str = "",
+        port: WeightsPort | None = None,
+        track: str = "",
     ) -> None:
         """``step``: with parameters and path set. ``weights_version``: of what it holds already.
-        ``port``: how a process takes over new ones; without, :meth:`set_weights` does."""
+        ``port``: how a process takes over new ones; without, :meth:`set_weights` does. ``track``:
+        identity of the track that the path is for."""
         self.native = step
         self.port = port
+        self.track = track
         self._version = weights_version
         self._output = StepOutput(
             u=step.plan_u[0],
@@ -68,7 +74,7 @@ class PredictiveController:
         info = StepInfo.from_address(self.artefact.library.br_cycle_info(cycle))
         output = self._output
         self.native.read_plan()
-        # Acceptable and converged may both be driven; the residuals below tell them apart.
+        # Acceptable and converged may both be driven; the residuals below distinguish them.
         output.status = 0 if StepStatus(info.status).usable else info.status
         output.iterations = info.iterations
         output.residual_dynamics = info.defect

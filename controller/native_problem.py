@@ -150,7 +150,7 @@ class NativeProblem:
 
         ``u_before`` (nu,): the input that acts now; a number stands for all components.
         ``elapsed_s``: since the state of the call before, of whatever status; None: one stage Ts.
-        ``budget_s``: iterate until settled or within this time from now; 0: the iteration limits
+        ``budget_s``: iterate until converged or within this time from now; 0: the iteration limits
         of the settings alone. InputError if ``elapsed_s`` is negative or not finite, or a limit of
         the ``environment`` no limit.
         """

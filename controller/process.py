@@ -3,7 +3,7 @@
 In real time the loop keeps its rate whatever arrives: it wakes shortly before a release,
 looks for the state that is due, steps, sends, and does everything else (telemetry, requests,
 heartbeat, preparation of the next step) in the time that is left. It writes nothing to disk, waits
-for no one and logs nothing while it drives.
+for no other process and logs nothing while it drives.
 """
 
 import gc
@@ -85,12 +85,13 @@ class ControllerProcess:
         self._arrived_ns = 0
         self._serve_ns = 0
         """When the next request may be served."""
-        self._told = False
+        self._reported = False
         inbox = self.inbox = Inbox(session, self.name)
         self._decoder = inbox.subscribe(STATE, newest=NEWEST)
         self._service = Service(
-            session, inbox, self.name, settings.rate_hz, self._driver, controller, self._counters,
-            self._words, controller.port is not None,
+            session, inbox, name=self.name, rate_hz=settings.rate_hz, driver=self._driver,
+            controller=controller, counters=self._counters, words=self._words,
+            takes_weights=controller.port is not None,
         )  # fmt: skip
         self._weights: WeightUpdateManager | None = None
         self._adoption: Adoption | None = None
@@ -133,9 +134,9 @@ class ControllerProcess:
             return left
         if item is None:
             self._decoder.report(_log)
-            if not self._service.plant_there and not self._told:
+            if not self._service.plant_there and not self._reported:
                 _log.warning("the plant vanished: killed or unreachable; waiting for it")
-            self._told = not self._service.plant_there
+            self._reported = not self._service.plant_there
             return None
         return self._take(item)
 
@@ -229,9 +230,9 @@ class ControllerProcess:
         budget_s = self._settings.budget * schedule.period_ns * 1e-9
         # What has held up a state on its way is part of its age: hence the schedule's plant time,
         # not the time since this state's own arrival.
-        basis_s = max(schedule.plant_time_s(timing.released_ns), state.time_s)
+        decided_at_s = max(schedule.plant_time_s(timing.released_ns), state.time_s)
         spent_s = (time.monotonic_ns() - schedule.release_ns) * 1e-9
-        decision = self._cycle.decide(basis_s, budget_s, spent_s)
+        decision = self._cycle.decide(decided_at_s, budget_s, spent_s)
         timing.overruns += time.monotonic_ns() > schedule.release_ns + 1e9 * budget_s
         self._send(state, decision)
         timing.missed = time.monotonic_ns() > schedule.deadline_ns

@@ -1,6 +1,6 @@
 """A control law written in Python, driven by the control cycle in C as the compiled one is.
 
-For comparisons, data collection and tests: it stands behind the same fallback, delay compensation
+For comparisons, data collection and tests: it has the same fallback, delay compensation
 and stop. Each call costs some microseconds for the way from C into Python.
 """
 
@@ -46,6 +46,8 @@ class PythonController:
     port = None
     """It has nowhere to put weights."""
     weights_version = ""
+    track = ""
+    """Its law knows."""
 
     def __init__(self, artefact: Path, law: ControlLaw) -> None:
         """``artefact``: any built for a car; its control cycle is used, its step is not."""

@@ -1,4 +1,4 @@
-"""What others may ask of a running controller: status, stop, go, new weights; and its heartbeat."""
+"""Requests that a running controller serves: status, stop, go, new weights; and its heartbeat."""
 
 import threading
 import time
@@ -13,7 +13,6 @@ from bayesrace.messages import (
     STATUS,
     WEIGHTS,
     Event,
-    Reply,
     Scalar,
     Status,
 )
@@ -31,6 +30,7 @@ class Service:
         self,
         session: Any,
         inbox: Inbox,
+        *,
         name: str,
         rate_hz: float,
         driver: Driver,
@@ -39,8 +39,8 @@ class Service:
         words: Callable[[], str],
         takes_weights: bool,
     ) -> None:
-        """``counters``: what the loop has counted, asked for with each status; ``words``: what
-        else there is to say. ``takes_weights``: another one serves these requests."""
+        """``counters``: counts of the loop, for each status; ``words``: further text for it.
+        ``takes_weights``: the weights update manager serves these requests."""
         self._rate_hz = rate_hz
         self._driver = driver
         self._controller = controller
@@ -53,9 +53,9 @@ class Service:
         self._weights_refused = 0
         self._takes_weights = takes_weights
         self.stopping = False
-        """The process was asked to end."""
+        """The process has received a signal to end."""
         self.plant_there = True
-        """Its liveliness token has not gone; where there never was one, its states tell."""
+        """Its liveliness token has not gone; without a token, its states show that it is there."""
         self.arrived_ns: int | None = None
         """Monotonic clock when the newest state arrived."""
         inbox.serve(STATUS, "controller")
@@ -65,7 +65,7 @@ class Service:
             inbox.serve(ROLLBACK)
 
     def beat(self) -> None:
-        """Publishes the status, if it is time to."""
+        """Publishes the status when it is due."""
         self._heartbeat.beat(self.status)
 
     def react(self, item: Item) -> None:
@@ -96,6 +96,7 @@ class Service:
             run=0 if newest is None else newest.run,
             text=self._words()[:2000],
             weights_version=self._controller.weights_version,
+            track=self._controller.track[:200],
             rate_hz=0.0 if lockstep else self._rate_hz,
             state_age_s=age_s,
             delay_s=driver.delay_s,
@@ -115,21 +116,17 @@ class Service:
         if request.service is STATUS:
             request.answer(self.status())
         elif request.service is COMMAND:
-            request.answer(self._command(request))
+            self._command(request)
         elif request.service is ROLLBACK:
-            text = "this controller has no weights to go back to"
-            request.answer(
-                Reply(seq=0, source_time_ns=time.monotonic_ns(), accepted=False, text=text, data={})
-            )
+            request.reply(False, "this controller has no weights to go back to")
         else:
-            request.answer(self._take_weights(request.payload))
+            self._take_weights(request)
 
-    def _command(self, request: Request) -> Reply:
+    def _command(self, request: Request) -> None:
         command, why_not = decode_request(request)
         if command is None:
-            return Reply(
-                seq=0, source_time_ns=time.monotonic_ns(), accepted=False, text=why_not, data={}
-            )
+            request.reply(False, why_not)
+            return
         if command.command == "stop":
             self._driver.stop()
             self._text = f"stopped on request: {command.text}"
@@ -137,28 +134,18 @@ class Service:
             self._driver.go()
             self._text = f"driving on request: {command.text}"
         self.announce(command.command, self._text, {})
-        return Reply(
-            seq=0,
-            source_time_ns=time.monotonic_ns(),
-            accepted=True,
-            text=self._text[:2000],
-            data={},
-        )
+        request.reply(True, self._text)
 
-    def _take_weights(self, data: bytes) -> Reply:
-        data_map: dict[str, Scalar] = {}
+    def _take_weights(self, request: Request) -> None:
+        data: dict[str, Scalar] = {}
         try:
-            version = self._controller.set_weights(data)
+            data["version"] = version = self._controller.set_weights(request.payload)
+            text = f"weights {version} in use from the next step on"
         except InputError as error:
             self._weights_refused += 1
-            accepted, text = False, str(error)[:2000]
-        else:
-            accepted, text = True, f"weights {version} in use from the next step on"
-            data_map["version"] = version
-        self.announce("weights_accepted" if accepted else "weights_refused", text, data_map)
-        return Reply(
-            seq=0, source_time_ns=time.monotonic_ns(), accepted=accepted, text=text, data=data_map
-        )
+            text = str(error)
+        self.announce("weights_accepted" if data else "weights_refused", text, data)
+        request.reply(bool(data), text, data)
 
     def announce(self, kind: str, text: str, data: Mapping[str, Scalar]) -> None:
         """Publishes an event; from any thread."""

@@ -7,7 +7,7 @@ weights are the caller's: nothing validates them, and no command can stop the ru
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
@@ -248,7 +248,7 @@ class _Messages:
     def ends(self, run: CarRun, end: End) -> None:
         text = f"run {run.request.run} ended after {run.time_s:.2f} s: {end.text}"
         data: dict[str, Scalar] = {"reason": end.reason, "time_s": run.time_s, "laps": run.laps}
-        data |= run.vehicle.guard.counters.as_dict()
+        data |= asdict(run.vehicle.guard.counters)
         self._event(2 * self._runs + 1, run.request.run, "run_ended", text, data)
         self._runs += 1
 

@@ -29,7 +29,7 @@ def collect(
     """Drives for ``duration_s`` and logs the run at ``path``; returns the number of samples.
 
     The same settings give the same drive to the bit. ``artefact``: a controller built for the car,
-    whose control cycle drives. ``vehicle``: what plays the car; the built-in equations without.
+    whose control cycle drives. ``vehicle``: what simulates the car; the built-in equations without.
     Raises FmuFault if it fails.
     """
     pursuit = PurePursuit(car, line.x_m, line.y_m, line.vx_mps, settings)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from bayesrace.errors import InputError
 from bayesrace.messages import Event, RunRequest, Scalar
+from bayesrace.raceline import same_track
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import StartLine, Track
 from bayesrace.transport import Director, Publisher, RefusedError
@@ -26,7 +27,7 @@ _REGULAR = ("laps", "max_time", "left_world")
 
 @dataclass(frozen=True)
 class RunPlan:
-    """One run: its number in all messages, who drives, how long."""
+    """One run: its number in all messages, its controller, its length."""
 
     run: int
     controller: str
@@ -58,7 +59,7 @@ def run_request(track: Track, plan: RunPlan) -> RunRequest:
 
 
 def announcement(plan: RunPlan, seq: int, weights_version: str) -> Event:
-    """What stands in the log before a run: who is going to drive it."""
+    """The event in the log before a run, which names its controller."""
     text = f"run {plan.run}: {plan.controller}"
     data: dict[str, Scalar] = {
         "run": plan.run,
@@ -85,13 +86,16 @@ def execute(
 ) -> Event:
     """Announces and starts the run and waits for its end; the plant's ``run_ended`` event.
 
-    InputError if the plant refuses, the recorder fails, the car was not driven, or the run ended by
-    anything but its laps, its time limit or the car's leaving the world, or several plants or
-    controllers of one name are there, before or after; KeyboardInterrupt on a signal.
+    InputError if the controller drives another track, the plant refuses, the recorder fails, the
+    car was not driven, or the run ended by anything but its laps, its time limit or the car's
+    leaving the world, or several plants or controllers of one name are there, before or after;
+    KeyboardInterrupt on a signal.
     """
     director.check_alone()
-    version = director.status("controller").weights_version
-    publisher.put(announcement(plan, publisher.next_seq, version), lockstep=True)
+    controller = director.status("controller")
+    _check_track(track, controller.track)
+    announced = announcement(plan, publisher.next_seq, controller.weights_version)
+    publisher.put(announced, lockstep=True)
     before = director.status("plant").counters
     try:
         director.start(run_request(track, plan))
@@ -107,13 +111,22 @@ def execute(
         raise
     except (InputError, KeyboardInterrupt):
         with suppress(InputError):  # a car must not drive on unwatched
-            director.stop("who started the run has left")
+            director.stop("the process that started the run has ended")
         raise
     if end.data.get("reason") not in _REGULAR:
         raise InputError(f"run {plan.run} ({plan.controller}) ended early: {end.text}")
     _check_driven(plan, end, before)
     director.check_alone()
     return end
+
+
+def _check_track(track: Track, controllers: str) -> None:
+    """InputError if the controller says that it drives another track: no lap would be completed."""
+    if controllers and not same_track(controllers, track.identity):
+        raise InputError(
+            f"the controller drives the track '{controllers}', this run is on '{track.identity}': "
+            "name the controller's track here (--track), or start a controller with this one"
+        )
 
 
 def _check_driven(plan: RunPlan, end: Event, before: Mapping[str, Scalar]) -> None:

@@ -23,7 +23,7 @@ from bayesrace.messages import (
     is_car_name,
 )
 from bayesrace.transport import Endpoints, Inbox, Kind, ask_all, decisive, open_session
-from operation.analysis.picture import SOURCES, Picture, Process
+from operation.analysis.network_status import SOURCES, NetworkStatus, ProcessStatus
 
 __all__ = ["Action", "Found", "ask_statuses", "command", "find", "follow", "pick", "route"]
 
@@ -108,7 +108,7 @@ def _not_found(session: Any, endpoints: Endpoints, timeout_s: float, name: str) 
     return InputError(f"no car at {where}, though another process listens there; {remedy}")
 
 
-def ask_statuses(session: Any, found: Found, timeout_s: float) -> Picture:
+def ask_statuses(session: Any, found: Found, timeout_s: float) -> NetworkStatus:
     """The status of each process, those included that do not answer in time."""
     places = {
         car_key(STATUS.key, car, source): _Place(car, source)
@@ -116,15 +116,15 @@ def ask_statuses(session: Any, found: Found, timeout_s: float) -> Picture:
         for source in sources
     }
     request = StatusRequest(seq=0, source_time_ns=time.monotonic_ns())
-    picture = Picture({})
+    network = NetworkStatus({})
     for key, answers in ask_all(session, STATUS, places, request, timeout_s).items():
         status = answers.valid[0] if answers.valid else None
         fault = "" if status else answers.fault or f"no answer within {timeout_s:g} s"
-        picture.put(*places[key], Process(status, fault, answers.count))
-    return Picture(picture.cars)
+        network.put(*places[key], ProcessStatus(status, fault, answers.count))
+    return NetworkStatus(network.cars)
 
 
-def pick(found: Found, name: str, everybody: bool, source: str = "controller") -> list[str]:
+def pick(found: Found, name: str, all_cars: bool, source: str = "controller") -> list[str]:
     """The cars to command: the named one, all, or the only one; InputError if that is unclear."""
     cars = sorted(car for car, sources in found.items() if source in sources)
     if not cars:
@@ -133,7 +133,7 @@ def pick(found: Found, name: str, everybody: bool, source: str = "controller") -
             f"no {source} found, only the {other} of {', '.join(sorted(found))}; "
             f"start 'bayesrace {source}', or give its endpoint (--endpoint)"
         )
-    if name or everybody or len(cars) == 1:
+    if name or all_cars or len(cars) == 1:
         return cars
     raise InputError(f"several cars found: {', '.join(cars)}; choose one with --name")
 
@@ -159,8 +159,10 @@ def command(
     }
 
 
-def follow(session: Any, picture: Picture, name: str, period_s: float) -> Iterator[str | None]:
-    """Updates the picture from heartbeats and tokens, of one car or all (""), until a signal.
+def follow(
+    session: Any, network: NetworkStatus, name: str, period_s: float
+) -> Iterator[str | None]:
+    """Updates the network from heartbeats and tokens, of one car or all (""), until a signal.
 
     Yields the car's name after each heartbeat, and None each ``period_s``. For the main thread.
     """
@@ -170,7 +172,7 @@ def follow(session: Any, picture: Picture, name: str, period_s: float) -> Iterat
     with inbox.receive_signals():
         while True:
             if (now_s := time.monotonic()) >= due_s:
-                picture.expire(now_s)
+                network.expire(now_s)
                 yield None
                 # After a slow display there is still time to receive.
                 due_s = time.monotonic() + period_s
@@ -184,12 +186,12 @@ def follow(session: Any, picture: Picture, name: str, period_s: float) -> Iterat
                 continue
             if item.kind is Kind.MESSAGE:
                 fault = "" if item.value else decoder.last_reason
-                picture.put(*place, Process(item.value, fault, 1))
+                network.put(*place, ProcessStatus(item.value, fault, 1))
                 yield place.car
             elif item.kind is Kind.GONE:
-                picture.put(*place, None)
-            elif place.source not in picture.cars.get(place.car, {}):
-                picture.put(*place, Process(None, "no heartbeat yet"))
+                network.put(*place, None)
+            elif place.source not in network.cars.get(place.car, {}):
+                network.put(*place, ProcessStatus(None, "no heartbeat yet"))
 
 
 def route(endpoints: Endpoints) -> None:

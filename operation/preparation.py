@@ -35,8 +35,8 @@ from plant.simulator import PLANT
 from plant.vehicle import open_vehicle
 
 __all__ = [
-    "Course",
     "Prepared",
+    "PreparedTrack",
     "Training",
     "prepare",
     "trained_weights",
@@ -74,7 +74,7 @@ PredictionModel = Literal["e_kinematic", "dynamic"]
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class PreparedTrack:
     """A track with its racing line, and the files that processes read them from."""
 
     track: Track
@@ -87,7 +87,7 @@ class Course:
 class Training:
     """The training drive, and what can be learned from it."""
 
-    course: Course
+    driven_on: PreparedTrack
     log: Path
     samples: Dataset
 
@@ -96,7 +96,7 @@ class Training:
 class Prepared:
     """What plant and controller are started with."""
 
-    courses: tuple[Course, ...]
+    tracks: tuple[PreparedTrack, ...]
     """In the order of the tracks."""
     training: Training | None
     """None where weights were given."""
@@ -105,16 +105,16 @@ class Prepared:
     """In the order of the models."""
 
     @property
-    def course(self) -> Course:
-        """The first one."""
-        return self.courses[0]
+    def first(self) -> PreparedTrack:
+        """The first track."""
+        return self.tracks[0]
 
     @property
     def arguments(self) -> list[str]:
-        """What ``bayesrace controller`` is started with on the first course."""
+        """What ``bayesrace controller`` is started with on the first track."""
         return [
-            "--artefact", str(self.artefacts[0]), "--track", str(self.course.track_file),
-            "--raceline", str(self.course.line_file), "--weights", str(self.weights),
+            "--artefact", str(self.artefacts[0]), "--track", str(self.first.track_file),
+            "--raceline", str(self.first.line_file), "--weights", str(self.weights),
         ]  # fmt: skip
 
 
@@ -141,27 +141,27 @@ def prepare(
     if weights is None:
         train_track = load_track(settings.train_track, car.width_m)
         with stages.stage(f"racing line, {train_track.name}"):
-            training_course = _course(train_track, car, settings.raceline)
-    courses = []
+            training_track = _prepared_track(train_track, car, settings.raceline)
+    prepared_tracks = []
     for track in driven_on:
         with stages.stage(f"racing line, {track.name}"):
-            courses.append(_course(track, car, settings.raceline, raceline))
+            prepared_tracks.append(_prepared_track(track, car, settings.raceline, raceline))
     artefacts = [] if artefact is None else [artefact]
     if artefact is None:
         with stages.stage("build the controllers"):
             artefacts = [_artefact(settings, model) for model in models]
     if weights is None:
         with stages.stage("training drive (pure pursuit)"):
-            training = training_drive(training_course, car, settings, artefacts[0])
+            training = training_drive(training_track, car, settings, artefacts[0])
         with stages.stage("train the residual") as stage:
             learned = training.samples, settings.discretisation, training_settings(settings)
             weights = trained_weights(*learned, progress=stage.update)
-    return Prepared(tuple(courses), training, weights, tuple(artefacts))
+    return Prepared(tuple(prepared_tracks), training, weights, tuple(artefacts))
 
 
-def _course(
+def _prepared_track(
     track: Track, car: CarParameters, settings: RaceLineSettings, line_file: Path | None = None
-) -> Course:
+) -> PreparedTrack:
     """The racing line computed, from the cache, or from the file that is given."""
     cached = raceline_file(track, car, settings)
     line = racing_line(track, car, settings) if line_file is None else read_raceline(line_file)
@@ -169,11 +169,11 @@ def _course(
     track_file.parent.mkdir(parents=True, exist_ok=True)
     with replacing(track_file) as partial:
         write_track(partial, track)
-    return Course(track, line, track_file, line_file or cached)
+    return PreparedTrack(track, line, track_file, line_file or cached)
 
 
 def training_drive(
-    course: Course, car: CarParameters, settings: PreparationSettings, artefact: Path
+    prepared: PreparedTrack, car: CarParameters, settings: PreparationSettings, artefact: Path
 ) -> Training:
     """The pure-pursuit drive, from the cache if it is there; its log is like a race's.
 
@@ -183,11 +183,11 @@ def training_drive(
     pursuit = settings.pursuit.model_copy(update={"seed": settings.seed})
     files = [path for path in (settings.fmu, settings.fmu_map) if path is not None]
     columns = "s_m", "x_m", "y_m", "vx_mps"
-    track = course.track
+    track = prepared.track
     identity = digest(
         [
             track.name,
-            *(getattr(course.line, name).tobytes() for name in columns),
+            *(getattr(prepared.line, name).tobytes() for name in columns),
             *(getattr(track, name).tobytes() for name in columns[1:3]),
             track.width_right_m.tobytes(),
             track.width_left_m.tobytes(),
@@ -205,7 +205,7 @@ def training_drive(
         fmu = settings.fmu, settings.fmu_map
         with open_vehicle(car, *fmu, 1 / PLANT.step_s, compiled) as vehicle:
             collect(
-                track, course.line, car, artefact, partial, settings.drive_s, pursuit,
+                track, prepared.line, car, artefact, partial, settings.drive_s, pursuit,
                 settings.start_speed_mps, vehicle,
             )  # fmt: skip
 
@@ -217,7 +217,7 @@ def training_drive(
         fallback = fallback_cycles(reader.select(TELEMETRY))
         return dataset_from_messages(states, fallback, car, settings.discretisation.step_s)
 
-    return Training(course, path, kept(path, make, read))
+    return Training(prepared, path, kept(path, make, read))
 
 
 def training_settings(settings: PreparationSettings) -> TrainingSettings:
@@ -228,9 +228,9 @@ def training_settings(settings: PreparationSettings) -> TrainingSettings:
 def training_samples(settings: PreparationSettings) -> Dataset:
     """Those of the training drive alone."""
     car = settings.driven_car
-    course = _course(load_track(settings.train_track, car.width_m), car, settings.raceline)
+    track = _prepared_track(load_track(settings.train_track, car.width_m), car, settings.raceline)
     artefact = _artefact(settings, "e_kinematic")
-    return training_drive(course, car, settings, artefact).samples
+    return training_drive(track, car, settings, artefact).samples
 
 
 def trained_weights(

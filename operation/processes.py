@@ -34,12 +34,12 @@ class Child:
         return self._process.pid
 
     def ended(self) -> str:
-        """Why the process is not running any more, with its last words; "" while it runs."""
+        """Why the process is not running any more, with its last message; "" while it runs."""
         code = self._process.poll()
         if code is None:
             return ""
         words = self.output.read_text(errors="replace").strip().splitlines()
-        # Who is killed had no time for last words: those of the start would mislead.
+        # A killed process had no time for a last message: that of its start would mislead.
         said = f": {words[-1]}" if words and code != -signal.SIGKILL else ""
         how = f"was killed by signal {-code}" if code < 0 else f"ended with code {code}"
         return f"{how}{said}"
@@ -53,7 +53,7 @@ class Child:
         return True
 
     def stop(self) -> None:
-        """SIGTERM, and SIGKILL for who does not listen."""
+        """SIGTERM, and SIGKILL if it does not end."""
         if self._process.poll() is None:
             self._process.send_signal(signal.SIGTERM)
             try:

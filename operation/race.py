@@ -1,7 +1,7 @@
 """The whole chain: racing lines, training drive, GP, controllers, and the laps of the paper.
 
 Plant and controller are processes of their own, started as a person would start them; this one
-directs, records everything that is said on the network, and hands over weights.
+directs, records every message on the network, and hands over weights.
 """
 
 import shutil
@@ -23,9 +23,9 @@ from learning.dataset import Dataset, concatenate
 from learning.logs import dataset_from_log
 from operation.drive import RunPlan
 from operation.preparation import (
-    Course,
     PredictionModel,
     Prepared,
+    PreparedTrack,
     prepare,
     trained_weights,
     training_settings,
@@ -81,19 +81,19 @@ class _Race:
         with _faults_named():
             prepared = prepare(settings, (settings.track,), self.stages, _MODELS)
         if prepared.training is not None:
-            self._keep_course(prepared.training.course, "train")
+            self._keep_files(prepared.training.driven_on, "train")
             shutil.copyfile(prepared.training.log, self.out / FILES.collect_log)
-        course = self._keep_course(prepared.course, "race")
+        kept = self._keep_files(prepared.first, "race")
         for model, folder in zip(_MODELS, prepared.artefacts, strict=True):
             shutil.copyfile(folder / MANIFEST, self.out / f"manifest-{model}.json")
         shutil.copyfile(prepared.weights, self.out / FILES.weights)
-        return replace(prepared, courses=(course,), weights=self.out / FILES.weights)
+        return replace(prepared, tracks=(kept,), weights=self.out / FILES.weights)
 
-    def _keep_course(self, course: Course, label: str) -> Course:
+    def _keep_files(self, track: PreparedTrack, label: str) -> PreparedTrack:
         files = self.out / f"{label}.csv", self.out / f"{label}_raceline.csv"
-        shutil.copyfile(course.track_file, files[0])
-        shutil.copyfile(course.line_file, files[1])
-        return Course(course.track, course.line, *files)
+        shutil.copyfile(track.track_file, files[0])
+        shutil.copyfile(track.line_file, files[1])
+        return PreparedTrack(track.track, track.line, *files)
 
     def keep_fmu(self) -> None:
         """Copies FMU and map, if there are any, into the run directory, and tries them."""
@@ -145,11 +145,11 @@ class _Race:
 
     # Driving -----------------------------------------------------------------------------------
 
-    def plan(self, controller: str, course: Course) -> RunPlan:
+    def plan(self, controller: str, track: PreparedTrack) -> RunPlan:
         """The next run."""
         self._run += 1
         settings = self.settings
-        limit_s = settings.time_limit * course.line.lap_time_s * settings.laps + 2.0
+        limit_s = settings.time_limit * track.line.lap_time_s * settings.laps + 2.0
         lockstep = settings.mode == "lockstep"
         return RunPlan(
             self._run, controller, settings.laps, limit_s, lockstep, settings.start_speed_mps
@@ -168,18 +168,20 @@ def _faults_named(fault: type[Exception] = FmuFault) -> Iterator[None]:
 class _Drives:
     """The runs of a race, driven and recorded one after the other."""
 
-    def __init__(self, race: _Race, course: Course, system: System, recorder: Recorder) -> None:
-        self._race, self._course = race, course
+    def __init__(
+        self, race: _Race, track: PreparedTrack, system: System, recorder: Recorder
+    ) -> None:
+        self._race, self._track = race, track
         self._system, self._recorder = system, recorder
 
     def controller(self, artefact: Path, name: str) -> AbstractContextManager[None]:
         """A controller process for the block; ready for its first run."""
-        race, course = self._race, self._course
+        race, track = self._race, self._track
         settings_file = race.out / FILES.mpc
         write_whole(settings_file, race.settings.mpc.model_dump_json(indent=1) + "\n")
         options = [
-            "--car", race.car_file, "--artefact", str(artefact), "--track", str(course.track_file),
-            "--raceline", str(course.line_file), "--settings", str(settings_file),
+            "--car", race.car_file, "--artefact", str(artefact), "--track", str(track.track_file),
+            "--raceline", str(track.line_file), "--settings", str(settings_file),
         ]  # fmt: skip
         return self._system.controller(options, f"controller-{name}.log")
 
@@ -187,13 +189,13 @@ class _Drives:
         """One run, with new weights first if there are any; InputError if it broke off."""
         if weights is not None:
             self._system.director.send_weights(weights.read_bytes())
-        plan = self._race.plan(controller, self._course)
-        self._system.drive(self._course.track, plan, self._recorder)
+        plan = self._race.plan(controller, self._track)
+        self._system.drive(self._track.track, plan, self._recorder)
         return plan
 
     def samples(self, plan: RunPlan) -> Dataset:
         """What can be learned from a run, from the log."""
-        self._recorder.settle(at_most_s=20.0)  # the next stage reads the log
+        self._recorder.drain(at_most_s=20.0)  # the next stage reads the log
         step_s = self._race.settings.discretisation.step_s
         return dataset_from_log(self._race.out / FILES.log, self._race.car, step_s, (plan.run,))
 
@@ -222,7 +224,7 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
         Recorder(system.session, this.car.name, out / FILES.log, about) as recorder,
         _faults_named(InputError),
     ):
-        drives = _Drives(this, prepared.course, system, recorder)
+        drives = _Drives(this, prepared.first, system, recorder)
         with drives.controller(artefact, "bayesrace"):
             with stages.stage("drive WorstCase"):
                 drives.drive("worstcase")

@@ -25,7 +25,9 @@ class PreparationSettings(BaseModel):
     train_track: str = Field(
         DEFAULT_TRAINING_TRACK, description="training track: name, random:SEED or CSV file"
     )
-    fmu: Path | None = Field(None, description="FMU that plays the car; the built-in car without")
+    fmu: Path | None = Field(
+        None, description="FMU that simulates the car; the built-in car without"
+    )
     fmu_map: Path | None = Field(None, description="how the FMU's variables are ours (TOML)")
     seed: int = Field(0, ge=0, description="of the training drive and of the GP's starts")
     start_speed_mps: float = Field(0.1, ge=0, le=5, description="speed at the start line")

@@ -41,7 +41,7 @@ class System:
         """A controller process for the block; it and the plant are ready for a run.
 
         ``options`` are those of ``bayesrace controller`` beside the endpoints.
-        InputError, with the last words of a process that has ended, if they do not get ready.
+        InputError, with the last message of a process that has ended, if they do not get ready.
         """
         line = [
             "controller", *options, "--endpoint", self._plant_endpoint,

@@ -1,1 +1,1 @@
-"""The process that plays the car: simulator, sensors, runs, and the requests it serves."""
+"""The process that simulates the car: simulator, sensors, runs, and the requests it serves."""

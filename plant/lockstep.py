@@ -65,7 +65,7 @@ class CarRun:
         return self.vehicle.time_s
 
     def sample(
-        self, seq: int, answers: tuple[float, ...] = (), final: bool = False
+        self, seq: int, actuation_delays: tuple[float, ...] = (), final: bool = False
     ) -> tuple[State, Truth]:
         """What the sensors measure now, and what they measure it of."""
         vehicle, request = self.vehicle, self.request
@@ -79,7 +79,7 @@ class CarRun:
             u_applied=vehicle.u_applied,
             lap=self._line.crossings,
         )
-        return measure(truth, request.lockstep, answers, final), truth
+        return measure(truth, request.lockstep, actuation_delays, final), truth
 
     def finished(self) -> End | None:
         """Counts laps in the state that has just been reached; what ends the run, if anything."""

@@ -1,10 +1,11 @@
-"""The plant process: waits for a request, runs it, says how it went, waits for the next."""
+"""The plant process: waits for a request, drives the run, reports its end, waits for the next."""
 
 import gc
 import logging
 import secrets
 import time
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,6 @@ from bayesrace.messages import (
     STOP,
     TRUTH,
     Event,
-    Reply,
     RunRequest,
     Scalar,
     Status,
@@ -80,7 +80,8 @@ class PlantSettings(BaseModel):
         description="delay put on states and actuations each, in real time",
     )
     fmu: Path | None = Field(
-        None, description="Co-Simulation FMU that plays the car, instead of the built-in equations"
+        None,
+        description="Co-Simulation FMU that simulates the car, instead of the built-in equations",
     )
     fmu_map: Path | None = Field(
         None, description="TOML file that names the FMU's variables; none: they have our names"
@@ -113,7 +114,7 @@ class PlantProcess:
         self._run: Run | None = None
         self._run_number = 0
         self._runs = 0
-        self._text = f"no run so far with {_played_by(settings)}"
+        self._text = f"no run so far with {_simulated_by(settings)}"
         self._stopping = False
         self._director_gone_ns: int | None = None
         """Since when the director is gone; None: it is there, or never was."""
@@ -142,15 +143,15 @@ class PlantProcess:
                 self._react(item)
 
     def _serve_run(self, request: Request) -> None:
-        """Check and answer the request, then execute it."""
+        """Check and answer the request, then drive the run."""
         message, why_not = decode_request(request)
         if message is not None:
             why_not = self._prepare(message)
-        request.answer(self._reply(not why_not, why_not or f"run {message.run} started"))
+        request.reply(not why_not, why_not or f"run {message.run} started")
         if why_not or self._run is None:
             _log.warning("run refused: %s", why_not)
             return
-        self._text = f"run {message.run} under way"
+        self._text = f"run {message.run} is running"
         mode = "lockstep" if message.lockstep else "free-running"
         self._publish_event("run_started", f"run {message.run} in {mode}", {"mode": mode})
         gc.collect()
@@ -179,15 +180,15 @@ class PlantProcess:
                 message,
                 self._simulator,
                 self.inbox,
-                self._states,
-                self._truths,
-                self._decoder,
-                self._counters,
-                self._numbering,
-                self._react,
-                self._beat,
-                self._epoch,
-                self._settings.delay_s,
+                states=self._states,
+                truths=self._truths,
+                decoder=self._decoder,
+                counters=self._counters,
+                numbering=self._numbering,
+                react=self._react,
+                beat=self._beat,
+                epoch=self._epoch,
+                delay_s=self._settings.delay_s,
             )
         except (InputError, FmuFault) as error:
             return str(error)
@@ -196,7 +197,7 @@ class PlantProcess:
         return ""
 
     def _overheard(self, item: Item) -> None:
-        """An actuation when nothing is driven: received, and no more."""
+        """Count an actuation that arrives when no run drives; it has no effect."""
         if item.value is not None:
             self._numbering.note(item.value.seq)
 
@@ -224,7 +225,7 @@ class PlantProcess:
                 words = f"{end.text}, but {count} controllers drove the car"
                 end = End("several_controllers", words)
         self._text = f"run {message.run} ended after {run.time_s:.2f} s: {end.text}"
-        # A fault is the FMU's, and its last words are in the text.
+        # A fault is the FMU's, and its last message is in the text.
         level = logging.ERROR if end.reason == "plant_fault" else logging.INFO
         _log.log(level, "%s", self._text)
         data: dict[str, Scalar] = {
@@ -250,17 +251,16 @@ class PlantProcess:
 
     def _serve(self, request: Request) -> End | None:
         if request.service is RUN:
-            words = f"busy: {self._text}; 'bayesrace stop --run' ends it"
-            request.answer(self._reply(False, words))
+            request.reply(False, f"busy: {self._text}; 'bayesrace stop --run' ends it")
             return None
         if request.service is STATUS:
             request.answer(self._status())
             return None
         message, why_not = decode_request(request)
         if message is None or self._run is None:
-            request.answer(self._reply(False, why_not or "no run to stop"))
+            request.reply(False, why_not or "no run to stop")
             return None
-        request.answer(self._reply(True, f"run {self._run_number} stops"))
+        request.reply(True, f"run {self._run_number} stops")
         return End("stopped", f"stopped on request: {message.text}")
 
     def _publish_event(self, kind: str, text: str, data: Mapping[str, Scalar]) -> None:
@@ -285,22 +285,19 @@ class PlantProcess:
             "states_sent": self._states.next_seq,
             "actuations_received": self._numbering.received,
             "actuations_lost": self._numbering.lost,
-            **self._counters.as_dict(),
-            **self._simulator.guard.counters.as_dict(),
+            **asdict(self._counters),
+            **asdict(self._simulator.guard.counters),
         }
 
-    def _reply(self, accepted: bool, text: str) -> Reply:
-        return Reply(
-            seq=0, source_time_ns=time.monotonic_ns(), accepted=accepted, text=text[:2000], data={}
-        )
-
     def _beat(self) -> End | None:
-        """Publishes the status, if it is time to; what ends the current run."""
+        """Publishes the status when it is due; returns what ends the current run, if anything."""
         self._heartbeat.beat(self._status)
         gone_ns = self._director_gone_ns
         if gone_ns is None or time.monotonic_ns() - gone_ns < _ABANDONED_S * 1e9:
             return None
-        return End("abandoned", f"who started the run has been gone for {_ABANDONED_S:g} s")
+        return End(
+            "abandoned", f"the process that started the run has been gone for {_ABANDONED_S:g} s"
+        )
 
     def _status(self, seq: int = 0) -> Status:
         phase = "idle" if self._run is None else "running"
@@ -314,6 +311,7 @@ class PlantProcess:
             run=self._run_number,
             text=self._text[:2000],
             weights_version="",
+            track="",
             rate_hz=self._settings.rate_hz,
             state_age_s=-1.0
             if self._states.sent_ns is None
@@ -323,7 +321,7 @@ class PlantProcess:
         )
 
 
-def _played_by(settings: PlantSettings) -> str:
+def _simulated_by(settings: PlantSettings) -> str:
     return "the built-in car" if settings.fmu is None else f"FMU {settings.fmu.name}"
 
 
@@ -342,7 +340,7 @@ def main(settings: PlantSettings, compiled: Compile | None = None) -> int:
         for refusal in prepare_thread(settings.realtime):
             _log.warning("%s", refusal)
         where = ", ".join(settings.endpoints.listen)
-        _log.info("plant of car '%s', %s, on %s", process.name, _played_by(settings), where)
+        _log.info("plant of car '%s', %s, on %s", process.name, _simulated_by(settings), where)
         with process.inbox.receive_signals():
             process.serve()
     return 0

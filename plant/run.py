@@ -4,7 +4,7 @@ import heapq
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from bayesrace.clock import sleep_until_ns
@@ -17,10 +17,10 @@ from plant.vehicle import Vehicle
 __all__ = ["Run", "RunCounters"]
 
 _REMEMBERED: Final = 1024
-"""States whose answers are taken; what answers an older one is stale."""
+"""States to which an actuation may refer; one for an older state is stale."""
 
-_MOST_ANSWERS: Final = 64
-"""Rows that one state message has room for."""
+_MOST_DELAYS: Final = 64
+"""Rows of ``State.actuation_delays`` that one message has room for."""
 
 
 @dataclass(slots=True)
@@ -33,10 +33,6 @@ class RunCounters:
     """Actuations for another plant, run or state than the current one, or overtaken ones."""
     overruns: int = 0
     """Periods that the plant itself finished more than a period too late."""
-
-    def as_dict(self) -> dict[str, int]:
-        """Name to count."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
 class _Waiting(NamedTuple):
@@ -60,6 +56,7 @@ class Run:
         request: RunRequest,
         simulator: Vehicle,
         inbox: Inbox,
+        *,
         states: Publisher[State],
         truths: Publisher[Truth],
         decoder: Decoder[Actuation],
@@ -109,7 +106,7 @@ class Run:
             finally:
                 self._inbox.spin_s = 0.0
         with self._inbox.stamped():
-            return self._wall_clock()
+            return self._real_time()
 
     def _send(self, state: State, truth: Truth) -> None:
         """The truth goes second: it must not delay the measurement."""
@@ -119,7 +116,7 @@ class Run:
     # Lockstep ----------------------------------------------------------------------------------
 
     def _exchange(self, state: State, truth: Truth) -> tuple[float, ...] | End:
-        """Sends the state and waits for its answer; nothing answers the last one."""
+        """Sends the state and waits for its answer; the last one has none."""
         self._send(state, truth)
         return () if state.final else self._answer_to(state.seq)
 
@@ -152,7 +149,7 @@ class Run:
 
     # Free-running ------------------------------------------------------------------------------
 
-    def _wall_clock(self) -> End:
+    def _real_time(self) -> End:
         period_ns = round(self._simulator.step_s * 1e9)
         seq = self._states.next_seq
         first = self._car.sample(seq)
@@ -166,12 +163,12 @@ class Run:
             end = self._receive()
             if end is not None:
                 return end
-            answers, end = self._drive_period(begin_ns, begin_ns + period_ns, seq)
+            delays, end = self._drive_period(begin_ns, begin_ns + period_ns, seq)
             end = end or self._car.finished()
             if end is not None and end.reason == "left_world":
                 return end  # no message could carry this state
             seq += 1
-            self._enqueue(*self._car.sample(seq, answers, final=end is not None))
+            self._enqueue(*self._car.sample(seq, delays, final=end is not None))
             if end is not None:
                 if self._outbox:
                     self._sleep_and_send(self._outbox[-1][0])
@@ -196,8 +193,12 @@ class Run:
         sleep_until_ns(until_ns)
 
     def _receive(self) -> End | None:
-        """Takes what has arrived since the last time; returns what ends the run, if anything."""
-        while (item := self._inbox.get()) is not None:
+        """Takes what has arrived by now, and no more: requests without end must not hold up the
+        car. Returns what ends the run, if anything."""
+        for _ in range(self._inbox.queued):
+            item = self._inbox.get()
+            if item is None:
+                break
             if item.kind is Kind.MESSAGE:
                 actuation = item.value
                 if actuation is None:
@@ -205,7 +206,7 @@ class Run:
                 self._numbering.note(actuation.seq)
                 mine = (actuation.epoch, actuation.run) == (self._epoch, self.request.run)
                 # one from the future would never grow old, and every later one would be overtaken
-                ahead = actuation.basis_s > self._simulator.time_s + 2 * self._simulator.step_s
+                ahead = actuation.decided_at_s > self._simulator.time_s + 2 * self._simulator.step_s
                 if not mine or ahead or actuation.state_seq not in self._sampled_ns:
                     self._counters.stale += 1
                     continue
@@ -220,26 +221,26 @@ class Run:
     def _drive_period(
         self, begin_ns: int, end_ns: int, seq: int
     ) -> tuple[tuple[float, ...], End | None]:
-        """One period of zero-order hold, to the substep; ``State.answers``, and a fault if any."""
+        """Drive one period of zero-order hold: ``State.actuation_delays``, and a fault if any."""
         simulator = self._simulator
         substep_ns = simulator.step_s * 1e9 / simulator.substeps
         commands: list[tuple[int, tuple[float, ...] | None]] = []
-        answers: list[float] = []
+        delays: list[float] = []
         done = 0
         while self._waiting and self._waiting[0].acts_ns < end_ns:
             acts_ns, _, new = heapq.heappop(self._waiting)
             arrival_s = (acts_ns - self._sampled_ns.get(new.state_seq, acts_ns)) * 1e-9
-            if self._held is not None and new.basis_s <= self._held.basis_s:
+            if self._held is not None and new.decided_at_s <= self._held.decided_at_s:
                 self._counters.stale += 1
-                answers += (float(new.state_seq), arrival_s, -1.0)
+                delays += (float(new.state_seq), arrival_s, -1.0)
                 continue
             # It acts from the first substep that begins after its arrival.
             at = min(max(-int((begin_ns - acts_ns) // substep_ns), done), simulator.substeps)
             if at > done:
                 commands.append((at - done, self._fresh(done)))
             self._held, done = new, at
-            acting_s = simulator.time_s + at * substep_ns * 1e-9 - new.basis_s
-            answers += (float(new.state_seq), arrival_s, acting_s)
+            acting_s = simulator.time_s + at * substep_ns * 1e-9 - new.decided_at_s
+            delays += (float(new.state_seq), arrival_s, acting_s)
         if done < simulator.substeps:
             commands.append((simulator.substeps - done, self._fresh(done)))
         end: End | None = None
@@ -249,7 +250,7 @@ class Run:
             end = fault_end(fault)
         if self._held is None or self._held.state_seq < seq:
             self._counters.late += 1
-        return tuple(answers[: 3 * _MOST_ANSWERS]), end
+        return tuple(delays[: 3 * _MOST_DELAYS]), end
 
     def _fresh(self, substep: int) -> tuple[float, ...] | None:
         """The held command, or None (brake) if what it was made from is too old."""
@@ -257,5 +258,5 @@ class Run:
             return None
         simulator = self._simulator
         now_s = simulator.time_s + substep * simulator.step_s / simulator.substeps
-        age_s = now_s - self._held.basis_s
+        age_s = now_s - self._held.decided_at_s
         return self._held.u if age_s <= self.request.actuation_timeout_s else None

@@ -5,7 +5,9 @@ from bayesrace.messages import State, Truth
 __all__ = ["measure"]
 
 
-def measure(truth: Truth, lockstep: bool, answers: tuple[float, ...], final: bool) -> State:
+def measure(
+    truth: Truth, lockstep: bool, actuation_delays: tuple[float, ...], final: bool
+) -> State:
     """What the sensors measure of ``truth``: without error.
 
     The other arguments are not measured: they concern the exchange of messages, see :class:`State`.
@@ -20,6 +22,6 @@ def measure(truth: Truth, lockstep: bool, answers: tuple[float, ...], final: boo
         u_applied=truth.u_applied,
         lap=truth.lap,
         lockstep=lockstep,
-        answers=answers,
+        actuation_delays=actuation_delays,
         final=final,
     )

@@ -7,7 +7,7 @@ the car brakes.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -67,10 +67,6 @@ class GuardCounters:
     """Commands beyond a limit of duty cycle, steering rate or steering angle."""
     braked: int = 0
     """Periods without a usable command."""
-
-    def as_dict(self) -> dict[str, int]:
-        """Name to count."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
 class PlantGuard:

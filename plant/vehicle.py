@@ -72,7 +72,7 @@ def open_vehicle(
             raise InputError(f"map {fmu_map} without an FMU to apply it to: add --fmu")
         yield Simulator(dynamic(car), plant_discretisation(rate_hz), compiled)
         return
-    from plant.fmu.simulator import open_fmu  # who drives the built-in car need not wait for fmpy
+    from plant.fmu.simulator import open_fmu  # the built-in car does not wait for fmpy
 
     with open_fmu(car, fmu, fmu_map, rate_hz) as simulator:
         yield simulator

@@ -167,15 +167,15 @@ def run_bench(settings: BenchSettings, stages: Stages) -> BenchResult:
     horizon = read_manifest(artefact).horizon
     with stages.stage("closed loop"):
         recording = _Recording()
-        for course in prepared.courses:
+        for one in prepared.tracks:
             step, converged = (
-                compiled_controller(artefact, car, course.track, course.line, weights, mpc)
+                compiled_controller(artefact, car, one.track, one.line, weights, mpc)
                 for mpc in (MpcSettings(), _CONVERGED)
             )
             recorder = _Recorder(step.native, converged.native)
             controller = PythonController(artefact, recorder)
-            loop = ClosedLoop(car, course.track, course.line, controller)
-            for count in (50, -(-settings.problems // len(prepared.courses))):
+            loop = ClosedLoop(car, one.track, one.line, controller)
+            for count in (50, -(-settings.problems // len(prepared.tracks))):
                 recorder.recording = _Recording()  # without those that warm up
                 loop.drive(0, count * PLANT.step_s)
             recording += recorder.recording

@@ -67,6 +67,7 @@ def state(seq: int, **changes: Any) -> State:
     """A state of a free-running plant that samples every 20 ms."""
     values: dict[str, Any] = {
         "source_time_ns": 0, "epoch": 1, "run": 1, "time_s": seq * STEP_S, "x": (0.0,) * 7,
-        "u_applied": (0.0, 0.0), "lap": 0, "lockstep": False, "answers": (), "final": False,
+        "u_applied": (0.0, 0.0), "lap": 0, "lockstep": False, "actuation_delays": (),
+        "final": False,
     }  # fmt: skip
     return State(seq=seq, **(values | changes))

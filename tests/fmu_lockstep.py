@@ -1,6 +1,6 @@
 """What the tests of the controller's FMU share: the lockstep run that it must drive, exports.
 
-The fixtures ``exported`` and ``lockstep`` are there for who imports their functions.
+The fixtures ``exported`` and ``lockstep`` are there for modules that import their functions.
 """
 
 import fcntl
@@ -75,7 +75,8 @@ class Lockstep:
         """The input for one state."""
         state = State(
             source_time_ns=0, run=1, time_s=seq * STEP_S, x=tuple(x), lap=0, seq=seq, epoch=1,
-            u_applied=self.plant.u_applied, lockstep=not self.delay_s, answers=(), final=False,
+            u_applied=self.plant.u_applied, lockstep=not self.delay_s, actuation_delays=(),
+            final=False,
         )  # fmt: skip
         self.driver.observe(state)
         decision = self.driver.decide(state.time_s)

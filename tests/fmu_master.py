@@ -43,17 +43,17 @@ class Slave:
     def _logging(self) -> dict[str, Any]:
         """What collects the FMU's messages."""
         if not self.two:
-            return {"logMessage": lambda _, status, category, text: self._told(text)}
+            return {"logMessage": lambda _, status, category, text: self._log(text)}
 
         callbacks = fmpy.fmi2.fmi2CallbackFunctions()
         callbacks.logger = fmpy.fmi2.fmi2CallbackLoggerTYPE(
-            lambda _, name, status, category, text: self._told(text)
+            lambda _, name, status, category, text: self._log(text)
         )
         callbacks.allocateMemory = fmpy.fmi2.defaultCallbacks.allocateMemory
         callbacks.freeMemory = fmpy.fmi2.defaultCallbacks.freeMemory
         return {"callbacks": callbacks}
 
-    def _told(self, text: bytes) -> None:
+    def _log(self, text: bytes) -> None:
         self.messages.append(text.decode())
 
     def initialise(self, values: Mapping[str, float] | None = None) -> None:

@@ -41,7 +41,7 @@ class Loop:
     sent: int = 0
     ticks: int = 0
     beats: int = 0
-    answers: list[float] = field(default_factory=list)
+    delays: list[float] = field(default_factory=list)
     lockstep: bool = False
 
     def __post_init__(self) -> None:
@@ -60,9 +60,9 @@ class Loop:
         return plant_ns + self.ahead_ns + round((plant_ns - self.began_ns) * self.drift)
 
     def state(self, seen: bool = True) -> int:
-        """The next state, with the answers noted since the one before."""
+        """The next state, with the delays noted since the one before."""
         seq, self.state_seq = self.state_seq, self.state_seq + 1
-        answers, self.answers = tuple(self.answers), []
+        delays, self.delays = tuple(self.delays), []
         now_ns = self.sampled_ns(seq)
         car: dict[str, Any] = {
             "seq": seq, "source_time_ns": now_ns, "epoch": self.epoch, "run": self.run,
@@ -71,7 +71,9 @@ class Loop:
         }  # fmt: skip
         if seen:
             self._write(
-                "state", State(**car, lockstep=self.lockstep, answers=answers, final=False), seq
+                "state",
+                State(**car, lockstep=self.lockstep, actuation_delays=delays, final=False),
+                seq,
             )
             self._write("truth", Truth(**car), seq)
         return seq
@@ -95,7 +97,7 @@ class Loop:
 
     def answer(self, seq: int, arrival_s: float = 1.5e-3, acting_s: float = 2.5e-3) -> None:
         """The plant receives an actuation; the next state says so."""
-        self.answers += [float(seq), arrival_s, acting_s]
+        self.delays += [float(seq), arrival_s, acting_s]
 
     def cycle(self) -> int:
         """A state, a cycle on it, and its answer."""

@@ -115,7 +115,11 @@ class _Log:
                 "seq": seq, "source_time_ns": now, "epoch": 1, "run": run, "time_s": time_s,
                 "u_applied": u, "lap": 0,
             }  # fmt: skip
-            rest: dict[str, Any] = {"lockstep": drive.lockstep, "answers": (), "final": final}
+            rest: dict[str, Any] = {
+                "lockstep": drive.lockstep,
+                "actuation_delays": (),
+                "final": final,
+            }
             self.put("state", State(**sample, x=tuple(seen), **rest))
             if self._truth:
                 self.put("truth", Truth(**sample, x=tuple(x)))
@@ -126,7 +130,7 @@ class _Log:
             actuation = self.seq("actuation")
             answer = blank(
                 Actuation, seq=actuation, source_time_ns=now, epoch=1, run=run, state_seq=seq,
-                basis_s=time_s, u=u, weights_version=drive.weights,
+                decided_at_s=time_s, u=u, weights_version=drive.weights,
             )  # fmt: skip
             self.put("actuation", answer)
             self.put("telemetry", self._telemetry(run, seq, drive, k))

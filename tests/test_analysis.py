@@ -1,8 +1,9 @@
-"""The analysis against numbers worked out by hand; what is cut short is told, not guessed."""
+"""The analysis against numbers worked out by hand; what is cut short is reported, not guessed."""
 
 import hashlib
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -142,14 +143,21 @@ def test_gaps_are_counted(tmp_path: Path) -> None:
     assert (whole.complete, whole.gaps) == (True, 0)
 
 
-def test_a_killed_plant_is_told(tmp_path: Path) -> None:
+def test_a_forged_number_is_no_gap(tmp_path: Path) -> None:
+    drive = Drive("bayesrace", circle(TWO_LAPS, 1.0))
+    run = read_race(write_race(tmp_path, [drive])).recording.runs[0]
+    run.actuations.insert(20, replace(run.actuations[20], seq=2**60))
+    assert run.gaps == 0
+
+
+def test_a_killed_plant_is_reported(tmp_path: Path) -> None:
     drive = Drive("bayesrace", circle(TWO_LAPS[:60], 1.0), ended=None)
     lap = only_lap(write_race(tmp_path, [drive]))
     assert not lap.finished
     assert "the log ends 1.18 s into the run" in lap.ended
 
 
-def test_a_run_that_never_started_is_told(tmp_path: Path) -> None:
+def test_a_run_that_never_started_is_reported(tmp_path: Path) -> None:
     lap = only_lap(write_race(tmp_path, [Drive("bayesrace", np.zeros((0, 7)), ended=None)]))
     assert not lap.finished
     assert lap.ended == "the run never started"

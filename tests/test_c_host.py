@@ -68,8 +68,10 @@ def data(
 
 def line_of(state: State) -> str:
     """As the program reads it."""
-    numbers = (state.epoch, state.run, state.seq, state.time_s, int(state.lockstep),
-               int(state.final), *state.x, *state.u_applied, *state.answers[2::3])  # fmt: skip
+    flags = int(state.lockstep), int(state.final)
+    delays_s = state.actuation_delays[2::3]
+    numbers = (state.epoch, state.run, state.seq, state.time_s, *flags, *state.x, *state.u_applied,
+               *delays_s)  # fmt: skip
     return " ".join(map(repr, numbers)) + "\n"
 
 
@@ -86,16 +88,16 @@ def test_a_recorded_drive_is_answered_to_the_bit(
     loop.drive(LAPS)
     log.close()
     reader = LogReader(tmp_path / "log.mcap")
-    told = "".join(line_of(state) for state in reader.select(STATE))
+    sent_lines = "".join(line_of(state) for state in reader.select(STATE))
     done = subprocess.run(
-        [program, data], input=told, capture_output=True, text=True, check=True, timeout=120
+        [program, data], input=sent_lines, capture_output=True, text=True, check=True, timeout=120
     )
     rows = [line.split() for line in done.stdout.splitlines()]
     actuations, telemetry = reader.select(ACTUATION), reader.select(TELEMETRY)
     assert len(rows) == len(actuations) > 100
     for row, sent, how in zip(rows, actuations, telemetry, strict=True):
         assert tuple(map(int, row[:3])) == (sent.epoch, sent.run, sent.state_seq)
-        assert tuple(map(float, row[3:6])) == (sent.basis_s, *sent.u)
+        assert tuple(map(float, row[3:6])) == (sent.decided_at_s, *sent.u)
         assert tuple(map(int, row[6:])) == (sent.status, how.fallback)
 
 
@@ -130,7 +132,7 @@ def test_over_udp_states_are_answered_and_silence_ends_at_the_fallback(
         u_applied=(0.0, 0.0),
         lap=0,
         lockstep=False,
-        answers=(),
+        actuation_delays=(),
         final=False,
     )
     plant.send(b"no state")
@@ -150,7 +152,7 @@ def test_over_udp_states_are_answered_and_silence_ends_at_the_fallback(
     assert len(rows) < 100
 
 
-def test_over_udp_nobody_else_ends_the_run_or_takes_its_answers(
+def test_over_udp_no_other_sender_ends_the_run_or_takes_its_answers(
     plant: socket.socket, circuit: Circuit
 ) -> None:
     x = tuple(map(float, circuit.start(v_mps=1.5)))
@@ -164,7 +166,7 @@ def test_over_udp_nobody_else_ends_the_run_or_takes_its_answers(
         u_applied=(0.0, 0.0),
         lap=0,
         lockstep=False,
-        answers=(),
+        actuation_delays=(),
         final=False,
     )
     plant.send(line_of(state).encode())
@@ -221,9 +223,9 @@ def test_no_sanitizer_finds_anything_whatever_the_states_say(
     odd = ("nan", "inf", "-inf", "1e300", "-1", "0", "9223372036854775807", "-9223372036854775808")
     x = tuple(map(float, circuit.start(v_mps=1.5)))
     for k in range(300):
-        answers = (0.0, 0.0, 0.02) * int(random.integers(0, 64))
+        delays = (0.0, 0.0, 0.02) * int(random.integers(0, 64))
         lockstep = bool(k // 100 % 2)
-        told = State(
+        sent = State(
             seq=k,
             source_time_ns=0,
             epoch=1,
@@ -233,10 +235,10 @@ def test_no_sanitizer_finds_anything_whatever_the_states_say(
             u_applied=(0.0, 0.0),
             lap=0,
             lockstep=lockstep,
-            answers=answers,
+            actuation_delays=delays,
             final=k % 90 == 89,
         )
-        words = line_of(told).split()
+        words = line_of(sent).split()
         for _ in range(int(random.integers(0, 3)) if k % 3 == 0 else 0):
             at = random.integers(len(words))
             words[at] = str(random.choice(odd[4:] if at < 3 else odd))  # epoch, run, seq: whole

@@ -101,18 +101,18 @@ def test_every_value_of_a_car_has_its_place_in_the_file_and_a_unit() -> None:
         ("[limits]", "[tuning.turn]\nslow = 1\n[limits]", ("tuning.turn.slow = 1", "slow_mps")),
     ],
 )
-def test_a_fault_is_told_with_field_value_unit_and_remedy(
+def test_a_fault_is_reported_with_field_value_unit_and_remedy(
     tmp_path: Path, before: str, after: str, words: tuple[str, ...]
 ) -> None:
     text = ORCA.read_text()
     assert before in text
     text = text.replace("brake_fade_mps = 0.1\n", "").replace(before, after)
-    told = refusal(written(tmp_path, text))
-    assert "brake_fade" not in told or after == "[limit]"  # it only follows from others
-    assert [word for word in words if word not in told] == []
+    said = refusal(written(tmp_path, text))
+    assert "brake_fade" not in said or after == "[limit]"  # it only follows from others
+    assert [word for word in words if word not in said] == []
 
 
-def test_a_missing_file_is_told_with_the_remedy(tmp_path: Path) -> None:
+def test_a_missing_file_is_refused_with_the_remedy(tmp_path: Path) -> None:
     assert "bayesrace cars orca --out" in refusal_of_missing(tmp_path / "none.toml")
 
 

@@ -374,6 +374,11 @@ def waiting(
     return Waiting(plant, controller, plant_at, where)
 
 
+def test_drive_refuses_another_track_than_the_controllers(cli: Cli, waiting: Waiting) -> None:
+    outcome = cli("drive", "--track", "paddock", *waiting.where)
+    refused(outcome, "the controller drives the track '", "this run is on 'paddock-", "--track")
+
+
 @pytest.mark.check
 def test_drive_says_when_the_controller_is_lost(
     tmp_path: Path,
@@ -386,7 +391,7 @@ def test_drive_says_when_the_controller_is_lost(
     many = ("--laps", "10000", "--max-time", "3600")
     drive = start("drive", *course[:2], *many, *waiting.where, "--log", log)
     ended.append(drive)
-    until(lambda: log.exists() and log.stat().st_size > 100_000, "a lap under way")
+    until(lambda: log.exists() and log.stat().st_size > 100_000, "a lap in progress")
     waiting.controller.kill()
     done = finish(drive)
     assert done.returncode not in (0, None)
@@ -405,7 +410,7 @@ def test_a_run_whose_director_is_gone_ends_by_itself_or_by_a_command(
     waiting: Waiting,
     ended: list[subprocess.Popen[str]],
 ) -> None:
-    """Nobody watches or records it any more; until then a new one is refused with the remedy."""
+    """Nothing watches or records it any more; until then a new one is refused with the remedy."""
     long = ("drive", *course[:2], "--laps", "10000", "--max-time", "3600", "--mode", "realtime")
 
     def words() -> str:
@@ -415,7 +420,7 @@ def test_a_run_whose_director_is_gone_ends_by_itself_or_by_a_command(
     def killed(log: Path) -> None:
         drive = start(*long, *waiting.where, "--log", log)
         ended.append(drive)
-        until(lambda: log.exists() and log.stat().st_size > 50_000, "a run under way")
+        until(lambda: log.exists() and log.stat().st_size > 50_000, "a run in progress")
         drive.kill()
 
     killed(tmp_path / "one.mcap")
@@ -444,7 +449,7 @@ def test_a_run_in_which_the_car_was_not_driven_is_no_success(
         *waiting.where, "--log", log,
     )  # fmt: skip
     ended.append(drive)
-    until(lambda: log.exists() and log.stat().st_size > 20_000, "a run under way")
+    until(lambda: log.exists() and log.stat().st_size > 20_000, "a run in progress")
     waiting.controller.send_signal(signal.SIGSTOP)
     try:
         done = finish(drive)
@@ -470,7 +475,7 @@ def test_names_do_not_command_the_terminal(cli: Cli) -> None:
 def test_programs_that_are_started_import_nothing_from_the_current_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A user's random.py, or somebody's zenoh.py in a shared folder."""
+    """A user's random.py, or another user's zenoh.py in a shared folder."""
     for name in ("random", "zenoh", "json"):
         (tmp_path / f"{name}.py").write_text("raise SystemExit('imported from the folder')")
     monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""Code generation: the cache's hash sees everything, and what cannot be built or loaded is told."""
+"""Code generation: the cache's hash sees everything, what cannot be built or loaded is reported."""
 
 import hashlib
 import os

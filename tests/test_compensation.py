@@ -34,8 +34,8 @@ class Delayed:
         self.x, self.u, self.time_s = np.zeros(7), np.zeros(2), 0.0
         self.coming: list[tuple[float, Floats]] = []
 
-    def accept(self, basis_s: float, u: Floats) -> None:
-        self.coming.append((basis_s + self.delay_s, u))
+    def accept(self, decided_at_s: float, u: Floats) -> None:
+        self.coming.append((decided_at_s + self.delay_s, u))
 
     def advance(self, until_s: float) -> None:
         while self.coming and self.coming[0][0] <= until_s:
@@ -61,10 +61,10 @@ def drive(
     promised: list[tuple[float, Floats]] = []
     for k in range(60):
         plant.advance(k * STEP_S)
-        answers = (float(k), delay_s, delay_s) if k else ()
+        delays = (float(k), delay_s, delay_s) if k else ()
         if k % every == 0:
             assert driver.observe(
-                state(k, x=tuple(plant.x), u_applied=tuple(plant.u), answers=answers)
+                state(k, x=tuple(plant.x), u_applied=tuple(plant.u), actuation_delays=delays)
             )
         decision = driver.decide(k * STEP_S)
         promised.append((k * STEP_S + delay_s, seen[-1]))
@@ -117,7 +117,7 @@ Make = Callable[..., Driver]
 def test_the_delay_is_the_median_and_overtaken_answers_do_not_count(driver: Make) -> None:
     made = driver()
     for seq, acting_s in enumerate([0.02, 0.02, 0.5, 0.02, -1.0, 0.03, 0.03]):
-        made.observe(state(seq, answers=(0.0, 0.01, acting_s)))
+        made.observe(state(seq, actuation_delays=(0.0, 0.01, acting_s)))
     assert made.delay_s == 0.02
 
 
@@ -201,7 +201,7 @@ def test_two_plants_at_once_are_not_mixed(driver: Make) -> None:
     assert made.count("foreign") == 50
 
 
-def test_losses_are_told_also_when_the_first_message_of_a_restarted_sender_is_lost() -> None:
+def test_losses_are_counted_also_when_the_first_message_of_a_restarted_sender_is_lost() -> None:
     numbering = Numbering()
     for seq in (0, 1, 2, 5000, 5001, 3, 4, 6):
         numbering.note(seq)

@@ -206,7 +206,7 @@ def test_what_promises_more_than_it_holds_costs_no_memory(name: str) -> None:
 
 @pytest.mark.parametrize("name", bombs(100))
 def test_weights_that_promise_more_than_they_hold_cost_little_memory(name: str) -> None:
-    """A checksum is no protection: whoever makes the bytes makes it too."""
+    """A checksum is no protection: an attacker who makes the bytes makes it too."""
     size = 4_000_000
     data = reseal(encode_weights(make_weights())[:BODY] + bombs(size)[name])
     assert peak_bytes(decode_weights, data) < 5 * size

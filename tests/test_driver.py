@@ -60,16 +60,17 @@ class Rig:
     def state(self, **changes: Any) -> State:
         values: dict[str, Any] = {
             "source_time_ns": 0, "run": 1, "time_s": self.seq * STEP_S, "x": tuple(self.x),
-            "u_applied": tuple(self.u), "lap": 0, "lockstep": False, "answers": (), "final": False,
+            "u_applied": tuple(self.u), "lap": 0, "lockstep": False, "actuation_delays": (),
+            "final": False,
         }  # fmt: skip
         return State(seq=self.seq, epoch=self.epoch, **(values | changes))
 
     def cycle(self, late_s: float = 0.0, budget_s: float = 0.0, **changes: Any) -> Decision:
         """A state arrives, is answered, and the plant drives on."""
-        told = self.state(**changes)
-        self.driver.observe(told)
+        received = self.state(**changes)
+        self.driver.observe(received)
         budget_s = budget_s or 1e-9 * (late_s > 0)
-        decision = self.driver.decide(told.time_s, budget_s, late_s, self.environment)
+        decision = self.driver.decide(received.time_s, budget_s, late_s, self.environment)
         self.advance(decision)
         return decision
 
@@ -335,7 +336,7 @@ def test_two_cycles_of_one_controller_tell_their_own_results(
     assert first.cycle().level is Level.SOLUTION
 
 
-def test_a_step_that_is_refused_is_told_why(native: NativeStep, circuit: Circuit) -> None:
+def test_a_refused_step_has_a_reason(native: NativeStep, circuit: Circuit) -> None:
     rig = Rig(native, circuit)
     rig.environment = Environment(speed_limit_mps=-1.0)
     assert rig.cycle().status == STEP_FAILED

@@ -44,7 +44,7 @@ def test_the_controller_drives_with_its_own_extra_alone(
     with started_system(DEFAULT_CAR, tmp_path) as system:
         monkeypatch.setattr("operation.processes.RUN_MODULE", (python, "-P", "-m"))
         with system.controller(files.arguments):
-            end = system.drive(files.course.track, RunPlan(1, "bayesrace", 1, 20.0, lockstep=True))
+            end = system.drive(files.first.track, RunPlan(1, "bayesrace", 1, 20.0, lockstep=True))
     assert end.data["reason"] == "laps"
 
 

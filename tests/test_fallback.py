@@ -50,8 +50,8 @@ class Fallback:
         self._law.answer = None if output is None else lambda _: output
         x = (0.0, 0.0, 0.0, vx_mps, 0.0, 0.0, 0.0)
         self._seq += 1
-        told = state(self._seq, run=self._run, time_s=time_s, x=x, lockstep=True)
-        assert self._driver.observe(told)
+        received = state(self._seq, run=self._run, time_s=time_s, x=x, lockstep=True)
+        assert self._driver.observe(received)
         budget_s = BUDGET_S if late_s else 0.0
         decision = self._driver.decide(time_s, budget_s, late_s)
         return decision.d, decision.delta_rate, decision.level
@@ -119,15 +119,15 @@ def test_a_standing_car_drives_the_first_good_solution(fallback: Make) -> None:
     """Where only every other one is good, three in a row would never come."""
     made = fallback(shifted_s=0.1, recover_cycles=3)
     outputs = [bad(), good(), bad(), good()]
-    told = [made.decide(one, 0.0, k * STEP_S)[2] for k, one in enumerate(outputs)]
-    assert told == [Level.STOP, Level.SOLUTION, Level.SHIFTED_PLAN, Level.SOLUTION]
+    levels = [made.decide(one, 0.0, k * STEP_S)[2] for k, one in enumerate(outputs)]
+    assert levels == [Level.STOP, Level.SOLUTION, Level.SHIFTED_PLAN, Level.SOLUTION]
 
 
 def test_a_car_that_has_come_to_stand_does_so_too(fallback: Make) -> None:
     made = fallback(shifted_s=0.0, recover_cycles=3)
     outputs = [(bad(), 0.2), (good(), 0.15), (good(), 0.05)]
-    told = [made.decide(one, vx, k * STEP_S)[2] for k, (one, vx) in enumerate(outputs)]
-    assert told == [Level.BRAKE, Level.BRAKE, Level.SOLUTION]
+    levels = [made.decide(one, vx, k * STEP_S)[2] for k, (one, vx) in enumerate(outputs)]
+    assert levels == [Level.BRAKE, Level.BRAKE, Level.SOLUTION]
 
 
 @pytest.mark.parametrize(

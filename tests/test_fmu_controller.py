@@ -111,7 +111,7 @@ def test_a_car_that_is_held_is_answered_as_in_lockstep(
     same(answers(exported.slave(exported.fmu(3)), run.x), run)
 
 
-def test_inputs_under_way_and_states_that_nothing_follows_from_are_compensated_for_alike(
+def test_inputs_on_their_way_and_states_that_nothing_follows_from_are_compensated_for_alike(
     exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit
 ) -> None:
     """A delay of two and a half periods; a state that is no state cannot be predicted from."""

@@ -107,7 +107,7 @@ def damaged(data: bytes, random: np.random.Generator) -> list[bytes]:
 
 
 def hostile(data: bytes, random: np.random.Generator) -> list[bytes]:
-    """Counts, kernels, lengths and numbers of somebody who knows the checksum; some are usable."""
+    """Counts, kernels, lengths and numbers with a checksum that fits; some are usable."""
     values = (0, 1, 3, 4, 1024, 1025, 2**31, 2**32 - 1, 0x7FF00000, 0x7FF80000)
     places = (32, 36, 288, 292, 300)
     changes = [(len(data), at, value) for at in places for value in values]

@@ -52,7 +52,7 @@ def test_it_drives_as_the_built_in_car(foreign: Path, tmp_path: Path, settings: 
 
 
 def test_the_map_that_inspection_proposes_fits_as_it_is(foreign: Path, tmp_path: Path) -> None:
-    """This tool declares no units; its descriptions tell them, signs and zeros."""
+    """This tool declares no units; its descriptions state them, signs and zeros."""
     proposal = starting_map(inspect(foreign))
     assert "TO FILL IN" not in proposal
     car = get_car("orca")

@@ -1,7 +1,10 @@
 """An FMU in a process of its own: whatever it does there, the plant gets an answer or a reason."""
 
 import contextlib
+import errno
 import math
+import os
+import subprocess
 import tempfile
 import zipfile
 from collections.abc import Iterator
@@ -63,6 +66,24 @@ def assert_all_gone(session: int) -> None:
     until(lambda: not processes_of(session), f"the end of session {session}", PATIENCE_S)
 
 
+def test_a_process_that_does_not_start_is_a_fault_and_leaves_nothing_open(
+    libraries: dict[int, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = faulty_fmu(libraries[3], tmp_path / "faulty.fmu", 3)
+
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(subprocess, "Popen", fail)
+    descriptors = Path("/proc/self/fd")
+    before = set(descriptors.iterdir())
+    with pytest.raises(InputError, match="its process does not start: Resource temporarily"):
+        faulty_host(path)
+    assert set(descriptors.iterdir()) == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
 @pytest.mark.parametrize("version", [2, 3])
 def test_it_drives_as_its_equations_say(version: int, hosts: dict[int, FmuHost]) -> None:
     host = hosts[version]
@@ -99,7 +120,7 @@ def test_values_of_any_type_are_set_before_the_start(
     version: int, libraries: dict[int, Path], tmp_path: Path
 ) -> None:
     path = faulty_fmu(libraries[version], tmp_path / "f.fmu", version)
-    with closing(faulty_host(path, ("vx", "gear_told", "light_told", "label_length"))) as host:
+    with closing(faulty_host(path, ("vx", "gear_read", "light_read", "label_length"))) as host:
         three = {"soft": 0.5, "small": 255, "rows": 7} if version == 3 else {}
         host.start({"label": "Zürich", "vx": 1, "gear": 3, "light": True, **three})
         assert host.step((0.0, 0.0), 0.01)[1:] == [3.0, 1.0, len("Zürich".encode())]
@@ -121,13 +142,13 @@ TIMEOUTS_S = {Mode.HANG: 0.2, Mode.ORPHAN: 2.0}
 """Of the step that goes wrong, where that takes the time to find out (ORPHAN: enough to abort)."""
 
 FAULTS = {
-    Mode.ABORT: r"crashed \(SIGABRT\); its last words: the engine is on fire",
+    Mode.ABORT: r"crashed \(SIGABRT\); its last message: the engine is on fire",
     Mode.SEGFAULT: r"crashed \(SIGSEGV\)",
     Mode.EXIT: "ended its own process with exit code 3",
-    Mode.SAY: "exit code 7; its last words: assertion failed: wheels == 4",
+    Mode.SAY: "exit code 7; its last message: assertion failed: wheels == 4",
     Mode.HANG: "did not answer within 0.2 s",
     Mode.NOT_A_NUMBER: "gave vx = nan",
-    Mode.FAIL: r"DoStep failed \(error\); its last words: a wheel came off",
+    Mode.FAIL: r"DoStep failed \(error\); its last message: a wheel came off",
     Mode.WORST: r"DoStep failed \(fatal\)",
     Mode.REFUSE: r"DoStep failed \(discard\)",
     Mode.TERMINATE: "the FMU ended the simulation",
@@ -141,7 +162,7 @@ FAULTS = {
     ("version", "mode"),
     [(2, mode) for mode in FAULTS] + [(3, Mode.FAIL), (3, Mode.REFUSE), (3, Mode.TERMINATE)],
 )
-def test_a_fault_is_reported_with_time_and_last_words(
+def test_a_fault_is_reported_with_time_and_last_message(
     version: int, mode: Mode, hosts: dict[int, FmuHost], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     host = hosts[version]

@@ -163,7 +163,7 @@ def test_it_drives(
 # What cannot be used ---------------------------------------------------------------------------
 
 
-def test_other_fmus_are_refused_and_told_why(
+def test_other_fmus_are_refused_with_the_reason(
     exchange: Path, car: CarParameters, tmp_path: Path
 ) -> None:
     def refused(path: Path, words: str) -> None:
@@ -193,7 +193,7 @@ def test_other_fmus_are_refused_and_told_why(
 def test_nothing_is_written_beside_the_fmu_and_nothing_is_left_over(
     exchange: Path, car: CarParameters, tmp_path: Path
 ) -> None:
-    """CasADi itself would extract it to where it lies."""
+    """CasADi itself would extract it to where it is."""
     import subprocess
     import sys
 

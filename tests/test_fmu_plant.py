@@ -40,11 +40,11 @@ HANGS_S = 2.0
 
 
 FAULTS = {
-    Mode.ABORT: r"crashed \(SIGABRT\); its last words: the engine is on fire",
+    Mode.ABORT: r"crashed \(SIGABRT\); its last message: the engine is on fire",
     Mode.EXIT: "exit code 3",
     Mode.HANG: "did not answer within 2 s",
     Mode.NOT_A_NUMBER: "gave vx = nan",
-    Mode.FAIL: r"failed \(error\); its last words: a wheel came off",
+    Mode.FAIL: r"failed \(error\); its last message: a wheel came off",
     Mode.TERMINATE: "the FMU ended the simulation",
     Mode.HUGE_VALUE: r"vx = 1e\+09",
 }
@@ -65,21 +65,21 @@ def car_fmu(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def player(car_fmu: Path) -> dict[str, str]:
-    """Plant settings that say what plays the car."""
+def simulated_by(car_fmu: Path) -> dict[str, str]:
+    """Plant settings that choose what simulates the car."""
     map_ = write_map(car_fmu.with_name("map.toml"), HANGS_S)
     return {"fmu": str(car_fmu), "fmu_map": str(map_)}
 
 
 @pytest.fixture(scope="module")
-def rig(player: dict[str, str]) -> Iterator[Rig]:
-    with running_rig(player) as rig:
+def rig(simulated_by: dict[str, str]) -> Iterator[Rig]:
+    with running_rig(simulated_by) as rig:
         yield rig
 
 
 @pytest.fixture(scope="module")
-def wall_clock_rig(player: dict[str, str]) -> Iterator[Rig]:
-    with running_rig(player, low_latency=False) as rig:
+def wall_clock_rig(simulated_by: dict[str, str]) -> Iterator[Rig]:
+    with running_rig(simulated_by, low_latency=False) as rig:
         yield rig
 
 
@@ -244,7 +244,7 @@ def test_a_repeated_last_state_is_no_gap_and_no_sample() -> None:
             u_applied=(0.1, 0.0),
             lap=0,
             lockstep=True,
-            answers=(),
+            actuation_delays=(),
             final=final,
         )
 

@@ -29,7 +29,7 @@ WINDOWS = "x86_64-windows"
 EVERYWHERE = ("x86_64-linux", "aarch64-linux", WINDOWS)
 
 ARM_LIBRARIES = Path("/usr/aarch64-linux-gnu")
-"""Where Debian's libc6-arm64-cross lies."""
+"""Where Debian's libc6-arm64-cross is."""
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="the line in the archive is for Linux")
 
@@ -157,7 +157,7 @@ def test_cross_compiled_binaries_are_for_their_platform_and_offer_fmi(
 
 
 def emulator(platform: str) -> list[str]:
-    """What stands before the name of a program for this platform to run it here."""
+    """What precedes the name of a program for this platform to run it here."""
     commands = {"aarch64-linux": ("qemu-aarch64", "-L", str(ARM_LIBRARIES)), WINDOWS: ("wine",)}
     command, *arguments = commands[platform]
     if platform != WINDOWS and not (ARM_LIBRARIES / "lib").is_dir():

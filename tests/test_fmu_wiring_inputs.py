@@ -172,7 +172,7 @@ def test_a_placed_fmu_drives_the_same_way_from_the_asked_pose(
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_what_is_not_finite_comes_through_as_such(bad: float) -> None:
-    """Whoever looks at the state must see it; nothing on the way may raise."""
+    """It must be visible in the state; nothing on the way may raise."""
     for text, without, theirs in (
         ("", (), ()),
         ('[derive]\nvelocity = { world_x = "a", world_y = "b" }', ("vx", "vy"), ("a", "b")),

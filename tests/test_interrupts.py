@@ -54,15 +54,15 @@ def test_an_interrupt_anywhere_is_one_interrupt(tmp_path: Path, how: str) -> Non
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
 
 
-def test_signals_are_told_and_do_nothing_else() -> None:
+def test_signals_are_reported_and_do_nothing_else() -> None:
     caught = (signal.SIGINT, signal.SIGTERM)
     before = [signal.getsignal(one) for one in caught]
-    told: list[int] = []
-    with suppress(ZeroDivisionError), catching_signals(told.append):
+    numbers: list[int] = []
+    with suppress(ZeroDivisionError), catching_signals(numbers.append):
         for one in caught:
             signal.raise_signal(one)
         raise ZeroDivisionError
-    assert told == [*caught]
+    assert numbers == [*caught]
     assert [signal.getsignal(one) for one in caught] == before
 
 
@@ -78,10 +78,10 @@ def interruptible() -> Iterator[None]:
 def test_a_signal_while_handlers_are_restored_leaves_none_behind(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Ctrl-C in between must not leave SIGTERM being told to a loop that is over."""
+    """Ctrl-C in between must not leave SIGTERM reported to a loop that has ended."""
     caught = (signal.SIGINT, signal.SIGTERM)
     before = [signal.getsignal(one) for one in caught]
-    told: list[int] = []
+    numbers: list[int] = []
     restore = signal.signal
 
     def struck(*arguments: Any) -> Any:
@@ -89,10 +89,10 @@ def test_a_signal_while_handlers_are_restored_leaves_none_behind(
         signal.raise_signal(signal.SIGINT)
         return handler
 
-    with pytest.raises(KeyboardInterrupt), catching_signals(told.append):
+    with pytest.raises(KeyboardInterrupt), catching_signals(numbers.append):
         monkeypatch.setattr(signal, "signal", struck)
     assert [signal.getsignal(one) for one in caught] == before
-    assert told == [signal.SIGINT]
+    assert numbers == [signal.SIGINT]
 
 
 def test_off_the_main_thread_signals_are_left_alone() -> None:

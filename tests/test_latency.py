@@ -108,7 +108,7 @@ def test_restarted_processes_are_not_mixed_with_those_before(path: Path, restart
             system.cycle()
         if restarted == "plant":
             system.epoch, system.state_seq, system.began_ns = 6, 0, 2 * 10**12
-            system.answers.clear()
+            system.delays.clear()
         else:
             system.sent, system.ahead_ns = 0, 9_000_000_000
         for _ in range(3):

@@ -281,7 +281,7 @@ def _attached(endpoints: list[str], out: Path) -> dict[str, Any]:
 
 @pytest.mark.check
 def test_a_running_system_is_measured_and_left_running(files: Prepared, tmp_path: Path) -> None:
-    with _driving(files, files.course.track, []) as (endpoints, director):
+    with _driving(files, files.first.track, []) as (endpoints, director):
         result = _attached(endpoints, tmp_path / "run")
         assert director.status("plant").phase == "running"
         until(lambda: director.status("controller").phase == "driving", "driven, as before")
@@ -318,7 +318,7 @@ def test_clock_of_another_host_is_found_and_corrected(files: Prepared, tmp_path:
     if why_not := _time_namespaces():
         pytest.skip(f"time namespaces are not allowed here: {why_not}")
     prefix = ["unshare", "--time", "--monotonic=1000", "--fork", "--kill-child"]
-    with _driving(files, files.course.track, prefix) as (endpoints, _):
+    with _driving(files, files.first.track, prefix) as (endpoints, _):
         result = _attached(endpoints, tmp_path / "run")
     clocks = result["clocks"]
     assert clocks["shared"] is False

@@ -47,22 +47,22 @@ PurePursuit = Failing
 @pytest.fixture(
     scope="module", params=["built-in car", pytest.param("FMU", marks=pytest.mark.check)]
 )
-def player(request: pytest.FixtureRequest) -> dict[str, str]:
-    """Plant settings that say what plays the car."""
+def simulated_by(request: pytest.FixtureRequest) -> dict[str, str]:
+    """Plant settings that choose what simulates the car."""
     return {"fmu": str(packed_car())} if request.param == "FMU" else {}
 
 
 @pytest.fixture(scope="module")
-def rig(player: dict[str, str]) -> Iterator[Rig]:
+def rig(simulated_by: dict[str, str]) -> Iterator[Rig]:
     """For tests that leave both processes as they found them."""
-    with running_rig(player) as rig:
+    with running_rig(simulated_by) as rig:
         yield rig
 
 
 @pytest.fixture
-def mortal(player: dict[str, str]) -> Iterator[Rig]:
+def mortal(simulated_by: dict[str, str]) -> Iterator[Rig]:
     """For tests that end one of the processes."""
-    with running_rig(player) as rig:
+    with running_rig(simulated_by) as rig:
         yield rig
 
 
@@ -73,17 +73,17 @@ def digest(log: Path) -> str:
 
 
 def test_two_lockstep_runs_with_one_seed_are_identical(
-    rig: Rig, player: dict[str, str], tmp_path: Path
+    rig: Rig, simulated_by: dict[str, str], tmp_path: Path
 ) -> None:
     for run in (1, 2):
         end = rig.drive(tmp_path / f"{run}.mcap")
         assert end.data["reason"] == "laps", end.text
         assert end.data["rejected"] == end.data["refused"] == end.data["stale"] == 0
     assert digest(tmp_path / "1.mcap") == digest(tmp_path / "2.mcap")
-    with running_rig(player) as other:
+    with running_rig(simulated_by) as other:
         other.drive(tmp_path / "3.mcap")
     assert digest(tmp_path / "1.mcap") == digest(tmp_path / "3.mcap")
-    with running_rig(player, seed=2) as other:
+    with running_rig(simulated_by, seed=2) as other:
         other.drive(tmp_path / "4.mcap")
     assert digest(tmp_path / "1.mcap") != digest(tmp_path / "4.mcap")
 
@@ -106,9 +106,12 @@ def test_the_log_of_a_lockstep_run_is_complete(rig: Rig, tmp_path: Path) -> None
 
 
 @pytest.mark.wall_clock
-def test_free_running_drives_by_the_wall_clock(player: dict[str, str], tmp_path: Path) -> None:
+def test_free_running_drives_in_real_time(simulated_by: dict[str, str], tmp_path: Path) -> None:
     log = tmp_path / "log.mcap"
-    with running_rig(player, low_latency=False) as rig, Recorder(rig.session, "orca", log) as seen:
+    with (
+        running_rig(simulated_by, low_latency=False) as rig,
+        Recorder(rig.session, "orca", log) as seen,
+    ):
         rig.director.wait_for(("plant", "controller"), PATIENCE_S)
         begin = time.monotonic()
         run = rig.start(lockstep=False, laps=0, max_time_s=1e5)
@@ -123,18 +126,18 @@ def test_free_running_drives_by_the_wall_clock(player: dict[str, str], tmp_path:
     assert LogReader(log).select(STATE)[-1].time_s == end.data["time_s"]
 
 
-def test_a_plant_for_lockstep_refuses_to_run_by_the_wall_clock(rig: Rig) -> None:
+def test_a_plant_for_lockstep_refuses_to_run_in_real_time(rig: Rig) -> None:
     with pytest.raises(InputError, match=r"started for lockstep \(--low-latency\)"):
         rig.start(lockstep=False)
 
 
 @pytest.mark.wall_clock
 def test_a_free_running_car_brakes_when_its_controller_dies(
-    player: dict[str, str], tmp_path: Path
+    simulated_by: dict[str, str], tmp_path: Path
 ) -> None:
-    """Without priorities or with: by the wall clock the transport's defaults are used."""
+    """Without priorities or with: in real time the transport's defaults are used."""
     log = tmp_path / "log"
-    with running_rig(player, low_latency=False) as rig, Recorder(rig.session, "orca", log):
+    with running_rig(simulated_by, low_latency=False) as rig, Recorder(rig.session, "orca", log):
         rig.director.wait_for(("plant",), PATIENCE_S)
         run = rig.start(lockstep=False, laps=0, max_time_s=1e5, actuation_timeout_s=0.1)
         rig.wait_until_driving(run)
@@ -156,10 +159,10 @@ def unanswered(rig: Rig) -> int:
 
 
 def test_a_failing_step_goes_down_the_levels_and_the_car_stops(
-    player: dict[str, str], tmp_path: Path
+    simulated_by: dict[str, str], tmp_path: Path
 ) -> None:
     code = CONTROLLER.replace("assert not", FAILING + "assert not")
-    with running_rig(player, controller_code=code) as rig:
+    with running_rig(simulated_by, controller_code=code) as rig:
         end = rig.drive(tmp_path / "log.mcap", laps=0, max_time_s=4.0)
         status = rig.director.status("controller")
     assert end.data["reason"] == "max_time"
@@ -221,7 +224,7 @@ def test_ctrl_c_ends_plant_and_run_cleanly(mortal: Rig, tmp_path: Path) -> None:
 
 def test_a_run_is_stopped_on_request_and_another_refused_meanwhile(rig: Rig) -> None:
     run = rig.start(laps=0, max_time_s=1e5)
-    with pytest.raises(InputError, match=f"busy: run {run} under way"):
+    with pytest.raises(InputError, match=f"busy: run {run} is running"):
         rig.start()
     assert rig.director.status("plant").phase == "running"
     assert rig.director.stop("enough").accepted
@@ -242,6 +245,7 @@ def test_a_run_of_two_controllers_is_refused_or_no_success(rig: Rig) -> None:
         run=0,
         text="",
         weights_version="",
+        track="",
         rate_hz=0.0,
         state_age_s=-1.0,
         delay_s=0.0,
@@ -275,7 +279,9 @@ def test_weights_for_a_controller_without_any_are_refused_with_a_reason(rig: Rig
 
 
 @pytest.mark.parametrize("after_s", [0.0, 1.5])
-def test_processes_do_not_outlive_who_started_them(player: dict[str, str], after_s: float) -> None:
+def test_processes_do_not_outlive_their_starter(
+    simulated_by: dict[str, str], after_s: float
+) -> None:
     """Whether the parent dies while the child runs or while it is still starting."""
     starter = (
         "import os, subprocess, sys, time, json\n"
@@ -286,7 +292,7 @@ def test_processes_do_not_outlive_who_started_them(player: dict[str, str], after
         "print(p.pid, flush=True)\n"
         "time.sleep(60)\n"
     )
-    parent = start(starter, PLANT, json.dumps(player))
+    parent = start(starter, PLANT, json.dumps(simulated_by))
     assert parent.stdout is not None
     assert parent.stdout.readline().strip().isdigit()
     time.sleep(after_s)

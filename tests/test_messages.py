@@ -54,7 +54,7 @@ STATE = State(
     u_applied=(0.1, 0.2),
     lap=0,
     lockstep=True,
-    answers=(2.0, 4e-4, 1e-3),
+    actuation_delays=(2.0, 4e-4, 1e-3),
     final=False,
 )
 
@@ -186,7 +186,7 @@ def _changed(**changes: Any) -> bytes:
         ({"time_s": 1}, "State.time_s: 1 is not a float"),
         ({"time_s": math.nan}, "State.time_s"),
         ({"lockstep": 1}, "State.lockstep"),
-        ({"schema": 2}, "schema version 2, this program reads 1"),
+        ({"schema": 1, "answers": ()}, "schema version 1, this program reads 2"),
         ({"schema": 1.0}, "schema version"),
         ({"extra": 1}, "missing or unknown fields: 'extra'"),
         ({"lap": ...}, "missing or unknown fields: 'lap'"),
@@ -318,7 +318,11 @@ def test_json_names_the_numbers_of_states_and_inputs() -> None:
         zip(("x", "y", "psi", "vx", "vy", "omega", "delta"), X0, strict=True)
     )
     assert content["u_applied"] == {"d": 0.1, "delta_rate": 0.2}
-    assert content["answers"] == {"state_seq": [2.0], "arrival_s": [4e-4], "acting_s": [1e-3]}
+    assert content["actuation_delays"] == {
+        "state_seq": [2.0],
+        "arrival_s": [4e-4],
+        "acting_s": [1e-3],
+    }
     whole = text.replace(b'"time_s":0.5', b'"time_s":2').replace(b'"psi":3.0', b'"psi":3')
     assert decode(State, from_json(State, whole)) == replace(STATE, time_s=2.0)
 

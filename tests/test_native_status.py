@@ -122,7 +122,7 @@ def test_a_step_without_a_path_and_a_wrong_reference_are_input_errors(
         step.solve(np.zeros(7), 0.0, np.zeros((19, 6)))
 
 
-def test_settle_ends_the_iterations_early(
+def test_the_early_stop_ends_the_iterations_early(
     kinematic_artefact: Path, car: CarParameters, weights: GpWeights, recorded: list[Problem]
 ) -> None:
     used = []

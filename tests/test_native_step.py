@@ -217,7 +217,7 @@ def stationarity_at_least(
 def check_residuals(
     step: NativeStep, problem: Problem, f: ca.Function, s: MpcSettings, car: CarParameters
 ) -> float:
-    """Asserts that info tells what the plan is; returns the independent stationarity."""
+    """Asserts that info describes the plan; returns the independent stationarity."""
     x, u, info = step.plan_x, step.plan_u, step.info
     predicted = np.asarray(f(x[:-1].T, u.T)).T
     scale = np.array([1, 1, 1, 1, 1, 10, 1])

@@ -62,11 +62,11 @@ def residual(step: NativeStep) -> float:
 
 
 def test_one_stage_is_the_default_and_one_shift(make: Make, recorded: list[Problem]) -> None:
-    told, untold = make(), make()
+    explicit, implicit = make(), make()
     for k, p in enumerate(recorded[:40]):
-        assert solve(told, p, elapsed_s=TS, budget_s=0.0) is solve(untold, p)
-        assert told.u.tobytes() == untold.u.tobytes()
-        assert told.info.shifts == (1 if k else -1)
+        assert solve(explicit, p, elapsed_s=TS, budget_s=0.0) is solve(implicit, p)
+        assert explicit.u.tobytes() == implicit.u.tobytes()
+        assert explicit.info.shifts == (1 if k else -1)
 
 
 @pytest.mark.parametrize(("elapsed_s", "every"), [(0.002, 10), (0.005, 4), (0.01, 2)])
@@ -155,17 +155,17 @@ def test_a_car_that_was_out_of_sight_is_found_on_the_line(
 # --- the budget --------------------------------------------------------------------------------
 
 
-def test_with_a_budget_the_step_iterates_until_it_settles(
+def test_with_a_budget_the_step_iterates_until_it_converges(
     make: Make, recorded: list[Problem]
 ) -> None:
-    step, settled = make(early_stop_tol=1e-7, tolerance=1e-12), 0
+    step, converged = make(early_stop_tol=1e-7, tolerance=1e-12), 0
     Clock(step, 1e-6)
     for p in recorded[:60]:
         assert solve(step, p, budget_s=1.0).usable
-        settled += residual(step) <= 1e-7
+        converged += residual(step) <= 1e-7
         assert step.info.time_limited == 0
         assert residual(step) <= 1e-7 or step.info.iterations >= SETTINGS.iterations_cold
-    assert settled >= 55  # not where the Hessian is indefinite
+    assert converged >= 55  # not where the Hessian is indefinite
 
 
 @pytest.mark.parametrize("warm", [False, True])

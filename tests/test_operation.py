@@ -40,7 +40,7 @@ from bayesrace.transport import (
     open_session,
 )
 from bayesrace.transport.session import Role
-from operation.analysis.picture import Picture, Process
+from operation.analysis.network_status import NetworkStatus, ProcessStatus
 from operation.drive import RunPlan, run_request
 from operation.lifecycle import ask_statuses, command, find, follow, pick
 from operation.terminal.status_table import COUNTERS_SHOWN, StatusTable
@@ -56,7 +56,7 @@ COUNTERS = {"deadline_misses": 3, "shifted_plan": 4, "brake": 5, "stop": 6, "ref
             "states_lost": 8, "states_stale": 9}  # fmt: skip
 FIELDS = {
     "answering", "fault", "processes", "status_age_s", "phase", "epoch", "run", "text",
-    "weights_version", "rate_hz", "state_age_s", "delay_s", "counters",
+    "weights_version", "track", "rate_hz", "state_age_s", "delay_s", "counters",
 }  # fmt: skip
 
 
@@ -86,6 +86,7 @@ class Fake:
             run=2,
             text=self.text,
             weights_version="v3",
+            track="",
             rate_hz=rate,
             state_age_s=age,
             delay_s=0.034,
@@ -154,16 +155,18 @@ def options(*fakes: Fake) -> list[str]:
     return [word for endpoint in where(*fakes).connect for word in ("--endpoint", endpoint)]
 
 
-def picture_of(endpoints: Endpoints, name: str = "", patience_s: float = PATIENCE_S) -> Picture:
+def status_of(
+    endpoints: Endpoints, name: str = "", patience_s: float = PATIENCE_S
+) -> NetworkStatus:
     with open_session(endpoints) as session:
         found = find(session, endpoints, patience_s, name)
         return ask_statuses(session, found, 1.0)
 
 
-def rendered(picture: Picture, width: int = 160) -> str:
+def rendered(network: NetworkStatus, width: int = 160) -> str:
     console = Console(width=width, color_system=None, force_terminal=False)
     with console.capture() as capture:
-        console.print(StatusTable(picture))
+        console.print(StatusTable(network))
     return capture.get()
 
 
@@ -172,7 +175,7 @@ def rendered(picture: Picture, width: int = 160) -> str:
 
 def test_every_car_is_found_and_json_has_the_documented_form(fakes: Fakes) -> None:
     ones = fakes("a", "plant"), fakes("a", "controller"), fakes("b-2", "plant")
-    content = json.loads(json.dumps(picture_of(where(*ones)).as_json()))
+    content = json.loads(json.dumps(status_of(where(*ones)).as_json()))
     assert set(content) == {"cars"}
     assert set(content["cars"]) == {"a", "b-2"}
     assert content["cars"]["b-2"]["controller"] is None
@@ -188,40 +191,40 @@ def test_a_named_car_is_found_without_waiting_for_the_absent(fakes: Fakes) -> No
     """An endpoint without a listener costs no time if the named car is found."""
     one, two = fakes("a", "plant"), fakes("a", "controller")
     endpoints = Endpoints(connect=(free_endpoint(), *where(one, two).connect))
-    assert set(picture_of(endpoints, "a", patience_s=600.0).cars) == {"a"}
+    assert set(status_of(endpoints, "a", patience_s=600.0).cars) == {"a"}
 
 
 def test_a_present_process_that_hangs_is_shown_as_such(fakes: Fakes) -> None:
     one, two = fakes("a", "plant", mute=True), fakes("a", "controller")
-    picture = picture_of(where(one, two))
-    content = picture.as_json()["cars"]["a"]
+    network = status_of(where(one, two))
+    content = network.as_json()["cars"]["a"]
     assert content["plant"]["answering"] is False
     assert "no answer within 1 s" in content["plant"]["fault"]
     assert content["plant"]["phase"] is None
     assert content["controller"]["answering"] is True
-    assert "a plant: no answer within 1 s" in " ".join(rendered(picture).split())
+    assert "a plant: no answer within 1 s" in " ".join(rendered(network).split())
 
 
 def test_two_processes_under_one_name_are_noticed(fakes: Fakes) -> None:
     """Two controllers that command one car are the worst mistake that names allow."""
     ones = fakes("a", "controller"), fakes("a", "controller")
-    picture = picture_of(where(*ones))
-    assert picture.as_json()["cars"]["a"]["controller"]["processes"] == 2
-    assert "2 processes answer under this name" in rendered(picture)
+    network = status_of(where(*ones))
+    assert network.as_json()["cars"]["a"]["controller"]["processes"] == 2
+    assert "2 processes answer under this name" in rendered(network)
 
 
 def test_absence_is_an_error_that_says_what_to_do(fakes: Fakes) -> None:
     nowhere = Endpoints(connect=(free_endpoint(),))
     with pytest.raises(InputError, match=f"no connection to {nowhere.connect[0]} .*--endpoint"):
-        picture_of(nowhere, patience_s=0.3)
+        status_of(nowhere, patience_s=0.3)
     one, two = fakes("a", "plant"), fakes("b", "plant")
     with pytest.raises(InputError, match=r"no car 'c' at .*; cars found: a, b"):
-        picture_of(where(one, two), "c", patience_s=1.0)
+        status_of(where(one, two), "c", patience_s=1.0)
 
 
 def test_the_table_shows_phase_rate_misses_and_counters(fakes: Fakes) -> None:
     one, two = fakes("a", "plant"), fakes("a", "controller", text="\x1b[2Jgone \x07")
-    text = rendered(picture_of(where(one, two)))
+    text = rendered(status_of(where(one, two)))
     row = next(line for line in text.splitlines() if "controller" in line).split()
     assert row == ["a", "controller", "driving", "50", "12", "v3", "3", "4/5/6", "34.0", "7/8/9"]
     assert "lockstep" in text
@@ -232,7 +235,7 @@ def test_the_table_shows_phase_rate_misses_and_counters(fakes: Fakes) -> None:
 
 def test_a_narrow_terminal_shows_the_same(fakes: Fakes) -> None:
     one, two = fakes("a", "plant", mute=True), fakes("a", "controller")
-    lines = [line.split() for line in rendered(picture_of(where(one, two)), 60).splitlines()]
+    lines = [line.split() for line in rendered(status_of(where(one, two)), 60).splitlines()]
     assert ["a", "plant", "controller"] in lines
     assert ["state", "no", "answer", "driving"] in lines
     assert ["messages", "refused/lost/stale", "7/8/9"] in lines
@@ -248,18 +251,19 @@ def test_a_heartbeat_that_stops_is_no_answer_any_more() -> None:
         run=0,
         text="",
         weights_version="",
+        track="",
         rate_hz=50.0,
         state_age_s=-1.0,
         delay_s=0.0,
         counters={},
     )
-    picture = Picture({"a": {"plant": Process(status, "", 1, arrived_s=100.0)}})
+    network = NetworkStatus({"a": {"plant": ProcessStatus(status, "", 1, arrived_s=100.0)}})
     answering = []
     for now_s in (100.5, 102.0):
-        picture.expire(now_s)
-        answering.append(picture.answering)
+        network.expire(now_s)
+        answering.append(network.answering)
     assert answering == [True, False]
-    assert picture.as_json()["cars"]["a"]["plant"]["fault"] == "no heartbeat for 1 s"
+    assert network.as_json()["cars"]["a"]["plant"]["fault"] == "no heartbeat for 1 s"
 
 
 def test_status_on_the_command_line(fakes: Fakes, cli: Cli) -> None:
@@ -291,7 +295,7 @@ def test_watching_prints_a_line_for_each_heartbeat_until_interrupted(fakes: Fake
 
 def test_messages_on_keys_of_no_car_do_not_end_the_watch(fakes: Fakes) -> None:
     with open_session(where(fakes("a", "plant"))) as session:
-        updates = follow(session, Picture({}), "", 60.0)
+        updates = follow(session, NetworkStatus({}), "", 60.0)
         assert next(updates) is None
         for key in ("bayesrace/**", "bayesrace/*/status/*", "bayesrace/a b/status/plant"):
             session.put(key, b"junk")
@@ -371,11 +375,11 @@ def test_of_several_cars_one_must_be_named(fakes: Fakes) -> None:
     with open_session(endpoints) as session:
         found = find(session, endpoints, PATIENCE_S)
         with pytest.raises(InputError, match="several cars found: a, b; choose one with"):
-            pick(found, "", everybody=False)
-        assert pick(found, "", everybody=True) == ["a", "b"]
-        assert pick(find(session, endpoints, PATIENCE_S, "b"), "b", everybody=False) == ["b"]
+            pick(found, "", all_cars=False)
+        assert pick(found, "", all_cars=True) == ["a", "b"]
+        assert pick(find(session, endpoints, PATIENCE_S, "b"), "b", all_cars=False) == ["b"]
         with pytest.raises(InputError, match="only the plant of c; start 'bayesrace controller'"):
-            pick(find(session, endpoints, 0.3, "c"), "c", everybody=False)
+            pick(find(session, endpoints, 0.3, "c"), "c", all_cars=False)
 
 
 def test_all_are_stopped_though_one_hangs_and_one_refuses(fakes: Fakes, cli: Cli) -> None:
@@ -386,7 +390,7 @@ def test_all_are_stopped_though_one_hangs_and_one_refuses(fakes: Fakes, cli: Cli
     )
     endpoints = where(*ones)
     with open_session(endpoints) as session:
-        cars = pick(find(session, endpoints, PATIENCE_S), "", everybody=True)
+        cars = pick(find(session, endpoints, PATIENCE_S), "", all_cars=True)
         answers = command(session, cars, "stop", "", 0.5)
     assert answers["a"] == "no answer within 0.5 s"
     assert isinstance(answers["b"], Reply)
@@ -439,7 +443,7 @@ def test_a_router_forwards_between_plant_controller_and_observer_and_a_peer_does
             u_applied=(0.0, 0.0),
             lap=0,
             lockstep=True,
-            answers=(),
+            actuation_delays=(),
             final=False,
         )
         Publisher(plant, STATE, "a").put(state, lockstep=True)
@@ -458,7 +462,7 @@ def test_the_router_command_forwards_and_ends_on_sigterm(fakes: Fakes) -> None:
 
         def both_answer() -> bool:
             """The router hears of one before it hears of the other."""
-            content = picture_of(through, "a", patience_s=60.0).as_json()["cars"]["a"]
+            content = status_of(through, "a", patience_s=60.0).as_json()["cars"]["a"]
             return all(one is not None and one["answering"] for one in content.values())
 
         until(both_answer, "answers of both through the router")
@@ -500,10 +504,10 @@ def test_real_processes_that_know_only_the_router_are_watched_stopped_and_restar
 
     def phase(source: str) -> str | None:
         try:
-            picture = picture_of(through, "one", 2.0)
+            network = status_of(through, "one", 2.0)
         except InputError:
             return None
-        process = picture.cars["one"].get(source)
+        process = network.cars["one"].get(source)
         return None if process is None or process.status is None else process.status.phase
 
     try:
@@ -515,9 +519,9 @@ def test_real_processes_that_know_only_the_router_are_watched_stopped_and_restar
             director.start(run_request(circuit.track, plan))
             until(lambda: phase("controller") == "driving", "driving")
             done = run("status", "--name", "one", "--json", "--endpoint", endpoint)
-            controller_told = json.loads(done.stdout)["cars"]["one"]["controller"]
-            assert controller_told["rate_hz"] == 50.0
-            assert controller_told["state_age_s"] is not None
+            controller_status = json.loads(done.stdout)["cars"]["one"]["controller"]
+            assert controller_status["rate_hz"] == 50.0
+            assert controller_status["state_age_s"] is not None
             for source, process in json.loads(done.stdout)["cars"]["one"].items():
                 shown = {name for names in COUNTERS_SHOWN[source] for name in names if name}
                 assert shown <= set(process["counters"])

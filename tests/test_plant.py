@@ -1,6 +1,7 @@
-"""The plant: a car that stays within its limits whatever it is told, and stands when it stands."""
+"""The plant: a car that stays within its limits whatever input it gets, and stays at standstill."""
 
 import math
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +41,7 @@ def test_limits_hold_for_any_input(
     x0: tuple[float, ...], inputs: list[tuple[float, float] | None]
 ) -> None:
     SIMULATOR.reset(x0)
-    before = SIMULATOR.guard.counters.as_dict()
+    before = asdict(SIMULATOR.guard.counters)
     for u in inputs:
         SIMULATOR.step(u)
         d, rate = SIMULATOR.u_applied
@@ -48,7 +49,7 @@ def test_limits_hold_for_any_input(
         assert abs(rate) <= CAR.delta_rate_max_radps
         assert abs(SIMULATOR.x[6]) <= CAR.delta_max_rad
         assert np.isfinite(SIMULATOR.x).all()
-    after = SIMULATOR.guard.counters.as_dict()
+    after = asdict(SIMULATOR.guard.counters)
     bad = [u for u in inputs if u is not None and not (math.isfinite(u[0]) and math.isfinite(u[1]))]
     assert after["rejected"] - before["rejected"] == len(bad)
     assert after["braked"] - before["braked"] == len(bad) + inputs.count(None)
@@ -73,7 +74,7 @@ def test_a_mirrored_car_drives_the_mirrored_way(
 
 @pytest.mark.parametrize("u", [None, (0.0, 0.0), (CAR.d_min, 0.0), (math.nan, 0.0)])
 def test_a_standing_car_is_never_braked_backwards(u: tuple[float, float] | None) -> None:
-    """The guard brakes to a stand; even a full brake command cannot push past rolling resistance
+    """The guard brakes to standstill; even a full brake command cannot push past rolling resistance
     (d_min Cm1 = -.029 N against Cr0 = .052 N) by more than a creep."""
     SIMULATOR.reset((0.0,) * 7)
     for _ in range(100):

@@ -1,4 +1,4 @@
-"""The plant by the wall clock, with what arrives given: it guards itself against its controller."""
+"""The plant in real time, with what arrives given: it guards itself against its controller."""
 
 import contextlib
 import sys
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.wall_clock
 EPOCH = 7
 
 VEHICLE = cast(Vehicle, None)
-"""What plays the car, in the test under way."""
+"""What simulates the car, in the current test."""
 
 
 class Controller:
@@ -49,14 +49,22 @@ class Controller:
         for changes in self._answer(state):
             values = {
                 "seq": len(self.states) - 1, "source_time_ns": 0, "epoch": state.epoch,
-                "run": state.run, "state_seq": state.seq, "basis_s": state.time_s,
+                "run": state.run, "state_seq": state.seq, "decided_at_s": state.time_s,
                 "u": (1.0, 0.0), "weights_version": "", "status": 0,
             }  # fmt: skip
             actuation = Actuation(**(values | changes))
             self._items.append(Item(Kind.MESSAGE, "actuation", actuation, time.monotonic_ns()))
 
+    @property
+    def queued(self) -> int:
+        return len(self._items)
+
     def get(self) -> Item | None:
         return self._items.popleft() if self._items else None
+
+    def ask_again(self, request: Item) -> None:
+        """As a client that sends the next request as soon as the last one is answered."""
+        self._items.append(request)
 
     @contextlib.contextmanager
     def stamped(self) -> Iterator[None]:
@@ -64,17 +72,23 @@ class Controller:
 
 
 @pytest.fixture(params=["built-in car", pytest.param("FMU", marks=pytest.mark.check)], autouse=True)
-def _played_by(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Every promise holds whatever plays the car."""
+def _simulated_by(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[None]:
+    """Every promise holds whatever simulates the car."""
     fmu = packed_car() if request.param == "FMU" else None
     with open_vehicle(get_car("orca"), fmu) as vehicle:
         monkeypatch.setattr(sys.modules[__name__], "VEHICLE", vehicle)
         yield
 
 
-def execute(answer: Any, delay_s: float = 0.0) -> tuple[list[State], RunCounters, GuardCounters]:
+def execute(
+    answer: Any, delay_s: float = 0.0, flooded: bool = False
+) -> tuple[list[State], RunCounters, GuardCounters]:
     """A run of .3 s in which a state is answered by actuations with these changes."""
     controller, counters, simulator = Controller(answer), RunCounters(), VEHICLE
+    if flooded:
+        controller.ask_again(Item(Kind.REQUEST, "status", None, 0))
     simulator.guard.counters = GuardCounters()
     start = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
     line = {"line_x_m": 0.0, "line_y_m": 0.0, "line_heading_rad": 0.0}
@@ -92,29 +106,36 @@ def execute(answer: Any, delay_s: float = 0.0) -> tuple[list[State], RunCounters
         actuation_timeout_s=0.1,
     )
     run = Run(
-        request, simulator, cast(Inbox, controller), cast(Publisher[State], controller),
-        cast(Publisher[Truth], controller), Decoder(Actuation), counters, Numbering(),
-        lambda _: None, lambda: None, EPOCH, delay_s,
+        request, simulator, cast(Inbox, controller), states=cast(Publisher[State], controller),
+        truths=cast(Publisher[Truth], controller), decoder=Decoder(Actuation), counters=counters,
+        numbering=Numbering(), react=controller.ask_again, beat=lambda: None, epoch=EPOCH,
+        delay_s=delay_s,
     )  # fmt: skip
     run.execute()
     return controller.states, counters, simulator.guard.counters
 
 
-def test_an_answered_car_drives_and_the_delays_are_told() -> None:
+def test_an_answered_car_drives_and_the_delays_are_reported() -> None:
     states, counters, guarded = execute(lambda _: [{}])
     assert counters.stale == 0
     assert guarded.braked < 8
     assert states[-1].final
     assert states[-1].x[3] > 1.0
-    rows = np.array([row for state in states for row in state.answers]).reshape(-1, 3)
+    rows = np.array([row for state in states for row in state.actuation_delays]).reshape(-1, 3)
     assert rows[:, 0].tolist() == list(range(len(rows)))
     assert (rows[:, 1] >= 0).all()
     assert (rows[:, 2] > rows[:, 1] - 1e-3).all()  # it acts from the next substep on
 
 
+def test_requests_without_end_do_not_hold_up_the_car() -> None:
+    states, counters, guarded = execute(lambda _: [{}], flooded=True)
+    assert (states[-1].final, counters.stale) == (True, 0)
+    assert guarded.braked < 8
+
+
 def test_an_injected_delay_comes_on_both_ways() -> None:
     states, _, _ = execute(lambda _: [{}], delay_s=0.03)
-    rows = np.array([row for state in states for row in state.answers]).reshape(-1, 3)
+    rows = np.array([row for state in states for row in state.actuation_delays]).reshape(-1, 3)
     assert len(rows) > 3
     assert (rows[:, 1] >= 0.06).all()
     assert (rows[:, 2] >= 0.06).all()
@@ -126,7 +147,7 @@ def test_an_injected_delay_comes_on_both_ways() -> None:
         {"epoch": EPOCH + 1},  # an answer to the plant before a restart, its numbers plausible
         {"run": 2},
         {"state_seq": 10**6},
-        {"basis_s": 1e6},  # it would never grow old, and overtake all that follow
+        {"decided_at_s": 1e6},  # it would never grow old, and overtake all that follow
     ],
 )
 def test_what_is_not_for_this_run_does_not_act(changes: dict[str, Any]) -> None:
@@ -139,13 +160,13 @@ def test_what_is_not_for_this_run_does_not_act(changes: dict[str, Any]) -> None:
     assert guarded.braked < 8
 
 
-def test_an_overtaken_answer_is_told_and_does_not_act() -> None:
+def test_an_overtaken_answer_is_reported_and_does_not_act() -> None:
     def late_copy(state: State) -> list[dict[str, Any]]:
-        old = {"u": (-0.1, 0.0), "basis_s": max(state.time_s - 0.02, 0.0)}
+        old = {"u": (-0.1, 0.0), "decided_at_s": max(state.time_s - 0.02, 0.0)}
         return [{}, old] if state.seq else [{}]
 
     states, counters, _ = execute(late_copy)
-    rows = np.array([row for state in states for row in state.answers]).reshape(-1, 3)
+    rows = np.array([row for state in states for row in state.actuation_delays]).reshape(-1, 3)
     assert (rows[:, 2] == -1).sum() == counters.stale > 5
     assert states[-1].x[3] > 1.0
 

@@ -1,4 +1,4 @@
-"""Weights handed over from the command line: who takes them, who refuses, who is not there."""
+"""Weights sent from the command line: accepted, refused, or without an answer."""
 
 from collections.abc import Iterator
 from contextlib import suppress

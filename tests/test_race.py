@@ -121,9 +121,9 @@ def test_another_car_seed_and_problem_are_driven_and_reported(
     assert race.result["settings"]["constraints"] is False
     assert driven.result["settings"]["constraints"] is True
     assert "constraints off" in race.process.stdout
-    told = (race.out / "result.json").read_text()
+    text = (race.out / "result.json").read_text()
     assert cli("report", race.out).code == 0
-    assert (race.out / "result.json").read_text() == told
+    assert (race.out / "result.json").read_text() == text
     assert read_result(race.out / "result.json").settings.car == "mine"
 
 
@@ -199,7 +199,7 @@ def test_the_car_as_an_fmu_gives_the_same_race_to_the_bit(driven: Race, short: S
         assert mine["weights_version"] == other["weights_version"]
     assert race.result["settings"]["fmu"] == fmu.name
     assert (race.out / "car.fmu").read_bytes() == fmu.read_bytes()
-    assert f"car played by {fmu.name}" in race.process.stdout
+    assert f"car simulated by {fmu.name}" in race.process.stdout
     assert leftovers(race.pid) == {}
 
 

@@ -24,7 +24,7 @@ from tests.programs import finish, leftovers, peanut, run, start, started_by, un
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks into /proc")
 
 ENOUGH = 60
-"""States in the log after which a lap is under way."""
+"""States in the log after which a lap is in progress."""
 
 
 def states_of(log: Path) -> list[State]:
@@ -60,7 +60,7 @@ class Racing:
         assert leftovers(self.process.pid) == {}
         return done.returncode, said
 
-    def assert_log_tells(self, *, ended_by_plant: bool) -> Event | None:
+    def assert_log_explains(self, *, ended_by_plant: bool) -> Event | None:
         """The log is whole up to the last moment; the plant's last word, if it could say one."""
         reader = LogReader(self.out / "run.mcap")
         states = reader.select(STATE)
@@ -97,7 +97,7 @@ def racing(tmp_path: Path) -> Iterator[Racing]:
         return len(states_of(out / "run.mcap")) >= ENOUGH
 
     try:
-        until(driving, "a lap under way", every_s=0.3)
+        until(driving, "a lap in progress", every_s=0.3)
         yield Racing(out, process, started_by(process.pid))
     finally:
         if process.poll() is None:
@@ -108,11 +108,11 @@ def racing(tmp_path: Path) -> Iterator[Racing]:
 
 
 def test_a_race_is_two_more_processes(racing: Racing) -> None:
-    """Ctrl-C at a terminal reaches everybody in the foreground: the race ends all in order."""
+    """Ctrl-C at a terminal reaches every process in the foreground: the race ends all in order."""
     assert sorted(racing.children) == ["controller", "plant"]
     racing.spoil("group", signal.SIGINT)
     assert racing.end() == (130, "bayesrace: interrupted")
-    racing.assert_log_tells(ended_by_plant=True)
+    racing.assert_log_explains(ended_by_plant=True)
     racing.assert_report_shows_it()
 
 
@@ -120,7 +120,7 @@ def test_a_race_is_two_more_processes(racing: Racing) -> None:
 def test_an_interrupt_of_the_race_alone_ends_all(racing: Racing) -> None:
     racing.spoil("race", signal.SIGINT)
     assert racing.end() == (130, "bayesrace: interrupted")
-    racing.assert_log_tells(ended_by_plant=True)
+    racing.assert_log_explains(ended_by_plant=True)
 
 
 @pytest.mark.check
@@ -129,7 +129,7 @@ def test_a_killed_plant_ends_the_race(racing: Racing) -> None:
     code, said = racing.end()
     assert code == 1
     assert "plant was killed by signal 9" in said
-    racing.assert_log_tells(ended_by_plant=False)
+    racing.assert_log_explains(ended_by_plant=False)
     racing.assert_report_shows_it()
 
 
@@ -141,7 +141,7 @@ def test_a_killed_controller_ends_the_race(racing: Racing) -> None:
     assert "was killed by signal 9" in said
     assert "controller" in said
     assert "plant was killed" not in said
-    end = racing.assert_log_tells(ended_by_plant=True)
+    end = racing.assert_log_explains(ended_by_plant=True)
     assert end is not None
     assert end.data["reason"] == "controller_lost"
     racing.assert_report_shows_it()
@@ -153,7 +153,7 @@ def test_a_terminated_plant_ends_the_race_with_its_word(racing: Racing) -> None:
     code, said = racing.end()
     assert code == 1
     assert "plant" in said
-    racing.assert_log_tells(ended_by_plant=True)
+    racing.assert_log_explains(ended_by_plant=True)
 
 
 @pytest.mark.check
@@ -203,10 +203,10 @@ def test_a_pause_of_three_seconds_ends_nothing(tmp_path: Path) -> None:
     arguments = ("--track", track, "--train-track", track, "--out", tmp_path / "race")
     process = start("race", *arguments, "--laps", "1")
     log = tmp_path / "race" / "run.mcap"
-    for who in ("plant", "controller"):
+    for name in ("plant", "controller"):
         driven = len(states_of(log))
         until(lambda: len(states_of(log)) > driven + ENOUGH, "a lap", every_s=0.3)  # noqa: B023
-        victim = started_by(process.pid)[who]
+        victim = started_by(process.pid)[name]
         os.kill(victim, signal.SIGSTOP)
         time.sleep(3.0)
         os.kill(victim, signal.SIGCONT)

@@ -268,7 +268,7 @@ def test_a_line_from_elsewhere_is_accepted_and_said_once(
 ) -> None:
     path = tmp_path / "ring.csv"
     write_raceline(path, ring())
-    path.write_text("# car: a note of somebody\n" + path.read_text())
+    path.write_text("# car: a note\n" + path.read_text())
     assert read_raceline_for(path, track_called("paddock"), CAR).made_for is None
     (record,) = caplog.records
     assert record.levelname == "WARNING"

@@ -55,7 +55,7 @@ def course(tmp_path_factory: pytest.TempPathFactory) -> Course:
 
 @dataclass
 class Rig:
-    """How to start each part, and who watches."""
+    """How to start each part, and the observer."""
 
     start_plant: Callable[..., Program]
     start_controller: Callable[[], Program]
@@ -176,8 +176,8 @@ def _take_over(rig: Rig) -> None:
 
 
 def _answers_since(state: State, seq: int) -> bool:
-    """Whether the state tells that an answer to a state after ``seq`` has acted."""
-    rows = zip(state.answers[::3], state.answers[2::3], strict=True)
+    """Whether the state reports that an answer to a state after ``seq`` has acted."""
+    rows = zip(state.actuation_delays[::3], state.actuation_delays[2::3], strict=True)
     return any(answered > seq and acting_s >= 0 for answered, acting_s in rows)
 
 
@@ -199,7 +199,7 @@ def test_a_plant_started_again_is_found(rig: Rig, fmu: bool) -> None:
         lambda: rig.observer.status("plant").get("epoch", before.epoch) != before.epoch,
         "the new plant",
     )
-    rig.observer.start(1)  # the same number: the epoch alone tells one from the other
+    rig.observer.start(1)  # the same number: the epoch alone distinguishes them
     until(lambda: rig.state().epoch != before.epoch, "a state of the new plant")
     rig.drive_on()
     until(lambda: rig.observer.status("controller")["phase"] == "driving", "it to drive again")
@@ -266,7 +266,7 @@ def test_connections_that_stay_silent_do_not_hold_up_the_states(rig: Rig) -> Non
 
 
 @pytest.mark.check
-def test_whoever_asks_without_end_does_not_hold_up_the_loop(rig: Rig) -> None:
+def test_requests_without_end_do_not_hold_up_the_loop(rig: Rig) -> None:
     plant, controller = rig.start_plant(), rig.start_controller()
     rig.observer.start(1)
     rig.drive_on()
@@ -310,7 +310,12 @@ def test_an_actuation_for_another_plant_does_not_act(rig: Rig) -> None:
     surplus = []  # of answers that acted, over the controller's own: one to each state
     for begin_ns, end_ns in pairwise(marks_ns):
         states = journey.between(begin_ns, end_ns)
-        acted = [acting_s for state in states for acting_s in state.answers[2::3] if acting_s >= 0]
+        acted = [
+            acting_s
+            for state in states
+            for acting_s in state.actuation_delays[2::3]
+            if acting_s >= 0
+        ]
         surplus.append(len(acted) - len(states))
     assert stale[0] >= 100
     assert surplus[1] > surplus[0] + 20
@@ -323,14 +328,14 @@ def _stale_after(rig: Rig, publisher: Publisher[Actuation], epoch_shift: int, co
         state = rig.state()
         now_ns = time.monotonic_ns()
         # as new as can be without coming from the future
-        basis_s = state.time_s + (now_ns - state.source_time_ns) * 1e-9 - 1e-3
+        decided_at_s = state.time_s + (now_ns - state.source_time_ns) * 1e-9 - 1e-3
         forgery = Actuation(
             seq=publisher.next_seq,
             source_time_ns=now_ns,
             epoch=state.epoch + epoch_shift,
             run=state.run,
             state_seq=state.seq,
-            basis_s=basis_s,
+            decided_at_s=decided_at_s,
             u=(0.3, 0.0),
             weights_version="forged",
             status=0,

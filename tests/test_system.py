@@ -26,7 +26,7 @@ def test_a_users_files_of_our_names_are_not_imported(
     assert plant.ended()
 
 
-def test_a_process_that_cannot_start_is_explained_by_its_last_words(tmp_path: Path) -> None:
+def test_a_process_that_cannot_start_is_explained_by_its_last_message(tmp_path: Path) -> None:
     with started_system(DEFAULT_CAR, tmp_path) as system:
         with (
             pytest.raises(InputError, match=r"controller ended with code 2.*CSV file no"),

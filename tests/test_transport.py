@@ -68,7 +68,7 @@ def state(seq: int) -> State:
         u_applied=(0.0, 0.0),
         lap=0,
         lockstep=True,
-        answers=(),
+        actuation_delays=(),
         final=False,
     )
 
@@ -141,6 +141,7 @@ def test_requests_are_answered_and_silence_is_an_error(pair: tuple[Any, Any]) ->
         run=0,
         text="fine",
         weights_version="",
+        track="",
         rate_hz=50.0,
         state_age_s=-1.0,
         delay_s=0.0,
@@ -207,9 +208,9 @@ def test_of_several_under_one_name_a_refusal_is_the_answer(pair: tuple[Any, Any]
     encoded = [encode(one) for one in replies]
     with answering(pair, STOP, *encoded):
         for session in pair:
-            answers = ask_all(session, STOP, (key, "bayesrace/nobody"), request, 5.0)
+            answers = ask_all(session, STOP, (key, "bayesrace/absent"), request, 5.0)
             assert sorted(map(encode, answers[key].valid)) == sorted(encoded)
-            assert answers["bayesrace/nobody"].count == 0
+            assert answers["bayesrace/absent"].count == 0
             assert ask(session, STOP, "orca", request) == replies[1]
 
 
@@ -239,6 +240,7 @@ def test_several_processes_of_one_name_are_reported(pair: tuple[Any, Any]) -> No
             run=0,
             text="",
             weights_version="",
+            track="",
             rate_hz=0.0,
             state_age_s=-1.0,
             delay_s=0.0,
@@ -249,9 +251,9 @@ def test_several_processes_of_one_name_are_reported(pair: tuple[Any, Any]) -> No
     def there(number: int) -> None:
         with ExitStack() as stack:
             for session in pair[:number]:
-                told = partial(Request.answer_raw, data=status)
+                answer = partial(Request.answer_raw, data=status)
                 stack.enter_context(
-                    declare_service(session, STATUS, "orca", told, None, "controller")
+                    declare_service(session, STATUS, "orca", answer, None, "controller")
                 )
             inboxes = [Inbox(session, "orca") for session in pair]
             meet(*inboxes)
@@ -409,6 +411,14 @@ def test_an_inbox_takes_several_topics_each_with_its_own_depth_and_decoder(
     assert [one.seq for one in found["state"]] == list(range(90, 100))
     assert [one.seq for one in found["event"][:-1]] == list(range(100))
     assert (states.accepted, events.accepted, events.refused) == (10, 100, 1)
+    for number in range(100):
+        receiver.put(Item(Kind.SIGNAL, "", number, 0))
+    publishers[0].put(state(99), lockstep=True)
+    time.sleep(0.5)
+    kinds = [item.kind for item in (receiver.get(), receiver.get()) if item is not None]
+    assert kinds == [Kind.SIGNAL, Kind.MESSAGE]  # the queue does not go first until it is empty
+    while receiver.queued:
+        take(receiver, Kind.SIGNAL)
     with receiver.stamped():
         publishers[0].put(state(100), lockstep=True)
         publishers[1].put(

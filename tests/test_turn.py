@@ -1,4 +1,4 @@
-"""A car that stands beside its line, however it points, gets under way along it again."""
+"""A car that stands beside its line, however it points, drives off along it again."""
 
 import math
 
@@ -33,7 +33,7 @@ def where(rig: Rig) -> float:
     return output.s_ref_m
 
 
-def test_a_car_gets_under_way_from_any_pose(native: NativeStep, circuit: Circuit) -> None:
+def test_a_car_drives_off_from_any_pose(native: NativeStep, circuit: Circuit) -> None:
     """Without turning round on purpose, an eighth of such poses end in standing for ever."""
     random = np.random.default_rng(3)
     for _ in range(12):

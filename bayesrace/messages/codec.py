@@ -118,15 +118,15 @@ def decode(kind: type[M], data: bytes) -> M:
         raise InputError(f"{title}: not a message ({error or 'malformed'})") from None
     if type(content) is not dict:
         raise InputError(f"{title}: not a message (no map)")
-    if content.keys() != spec.keys:
-        odd = sorted(repr(name)[:40] for name in content.keys() ^ spec.keys)
-        raise InputError(f"{title}: missing or unknown fields: {', '.join(odd[:5])}")
-    version = content["schema"]
+    version = content.get("schema", kind.SCHEMA)  # first: it explains other fields
     if type(version) is not int or version != kind.SCHEMA:
         raise InputError(
             f"{title}: schema version {version!r:.40}, this program reads "
             f"{kind.SCHEMA}; use the same release on both sides"
         )
+    if content.keys() != spec.keys:
+        odd = sorted(repr(name)[:40] for name in content.keys() ^ spec.keys)
+        raise InputError(f"{title}: missing or unknown fields: {', '.join(odd[:5])}")
     values = {}
     for name, check in spec.checks:
         try:

@@ -65,8 +65,8 @@ def to_json(kind: type[Message], data: bytes) -> bytes | None:
 def from_json(kind: type[Message], data: bytes) -> bytes:
     """The encoded message whose JSON is ``data``, to be checked by ``decode``.
 
-    JSON does not tell 1 from 1.0: where a float belongs, an integer becomes one. InputError if the
-    JSON does not have the form of the message.
+    JSON does not distinguish 1 from 1.0: where a float belongs, an integer becomes one. InputError
+    if the JSON does not have the form of the message.
     """
     form = _FORMS[kind]
     try:

@@ -83,15 +83,17 @@ class State(CarSample):
     The only input of controller and learning.
     """
 
+    SCHEMA: ClassVar[int] = 2
+
     lockstep: Annotated[bool, Flag()]
     """True if the plant waits for the actuation that answers this very message."""
-    answers: Annotated[
+    actuation_delays: Annotated[
         tuple[float, ...],
         Vector(3, limit=1e15, rows=64, names=("state_seq", "arrival_s", "acting_s")),
     ]
-    """Actuations received since the previous state, row by row: ``seq`` of the state that each
-    answers, time from that state to the actuation's arrival [s], and from its ``basis_s`` to its
-    application [s] (-1: superseded, never applied). Empty in lockstep."""
+    """Delays of the actuations received since the previous state, row by row: ``seq`` of the state
+    that each answers, time from that state to the actuation's arrival [s], and from its
+    ``decided_at_s`` to its application [s] (-1: superseded, never applied). Empty in lockstep."""
     final: Annotated[bool, Flag()]
     """True in the last state of a run: no answer to it is applied. After a fault of the plant it
     repeats the previous state with its time."""
@@ -109,13 +111,16 @@ class Truth(CarSample):
 class Actuation(Message):
     """The controller's answer to one state, on ``bayesrace/{car}/actuation``."""
 
+    SCHEMA: ClassVar[int] = 2
+
     epoch: Count
     run: Count
     state_seq: Count
     """``seq`` of the state answered; epoch and run are those of that state."""
-    basis_s: Seconds
-    """Plant time for which the controller took the state as known: ``time_s`` of the state, plus
-    the time since its arrival if the state is not new."""
+    decided_at_s: Seconds
+    """Plant time at which the controller decided on the input: in lockstep ``time_s`` of the state;
+    in real time the controller's estimate, from the arrival times of the states, of the plant time
+    when its cycle began."""
     u: Annotated[tuple[float, ...], Vector(2, limit=1e3, names=_INPUT)]
     """d [-], delta_rate [rad/s]; the plant applies the car's own, narrower limits."""
     weights_version: Short
@@ -154,7 +159,8 @@ class Telemetry(Message):
     encode_us: Seconds
     """Encoding and sending the actuation."""
     delay_s: Annotated[float, Real(0.0, 1e3)]
-    """Delay from ``basis_s`` to application that the state is predicted over; 0 without."""
+    """Delay from ``Actuation.decided_at_s`` to application, over which the state is predicted; 0
+    without."""
     plan_x: Annotated[tuple[float, ...], Vector(7, rows=501, names=_CAR_STATE)]
     """Predicted states row by row, N + 1 rows of 7, to 1e-6; empty without a prediction."""
     plan_u: Annotated[tuple[float, ...], Vector(2, rows=500, names=_INPUT)]
@@ -262,6 +268,8 @@ class Reply(Message):
 class Status(Message):
     """State of a process, on ``bayesrace/{car}/status/{source}`` at 10 Hz and on request."""
 
+    SCHEMA: ClassVar[int] = 2
+
     source: Annotated[str, Choice(("plant", "controller"))]
     phase: Annotated[str, Choice(PHASES)]
     """plant: idle, running; controller: waiting (for a state), ready (for ``go``), driving,
@@ -272,6 +280,9 @@ class Status(Message):
     text: Long
     """The latest message for operators, such as why the last run ended."""
     weights_version: Short
+    track: Short
+    """Controller: :attr:`bayesrace.tracks.Track.identity` of the track that it drives; empty: a
+    plant, or a control law that names none."""
     rate_hz: Annotated[float, Real(0.0, 1e5)]
     """Set rate of the loop; 0 in lockstep."""
     state_age_s: Annotated[float, Real(-1.0, 1e9)]

@@ -3,7 +3,7 @@
 CasADi is imported on the first call of :func:`compute_raceline`, not with this package.
 """
 
-from bayesrace.raceline.identity import check_line, read_raceline_for
+from bayesrace.raceline.identity import check_line, read_raceline_for, same_track
 from bayesrace.raceline.line import LineIdentity, RaceLine, read_raceline, write_raceline
 from bayesrace.raceline.settings import RaceLineError, RaceLineSettings
 from bayesrace.tracks import Track
@@ -18,6 +18,7 @@ __all__ = [
     "compute_raceline",
     "read_raceline",
     "read_raceline_for",
+    "same_track",
     "write_raceline",
 ]
 

@@ -11,7 +11,7 @@ from bayesrace.raceline.settings import RaceLineSettings
 from bayesrace.tracks import Track
 from bayesrace.vehicles.parameters import CarParameters
 
-__all__ = ["check_line", "line_identity", "read_raceline_for"]
+__all__ = ["check_line", "line_identity", "read_raceline_for", "same_track"]
 
 _log = logging.getLogger("bayesrace.raceline")
 
@@ -57,10 +57,15 @@ def check_line(line: RaceLine, track: Track, car: CarParameters, where: str) -> 
             f"{car.friction:g}: run 'bayesrace raceline' for it, or name a car's file with "
             f"friction = {made.friction:g} in [limits]"
         )
-    if _shape(made.track) != _shape(track.identity):
+    if not same_track(made.track, track.identity):
         raise InputError(
             f"{where} was made for the track '{made.track}', this is '{track.identity}': {_REMEDY}"
         )
+
+
+def same_track(one: str, other: str) -> bool:
+    """Whether two :attr:`bayesrace.tracks.Track.identity` are of one shape, whatever the names."""
+    return _shape(one) == _shape(other)
 
 
 def _shape(identity: str) -> str:

@@ -75,7 +75,7 @@ class Director:
     def check_alone(self) -> None:
         """InputError if several plants or controllers have this name.
 
-        Their messages cannot be told apart: each would drive, or be driven, now and then.
+        Nothing distinguishes their messages: each would drive, or be driven, now and then.
         """
         for source in ("plant", "controller"):
             if (count := count_processes(self._session, self._car, source)) > 1:

@@ -2,7 +2,8 @@
 
 Messages of the control path wait in channels of Zenoh's own, one for each topic, which the waiting
 thread polls: that saves a hand-over between threads and halves the round trip (docs/decisions/).
-All else arrives in one queue: other messages, requests, liveliness tokens, signals. No call waits
+All else arrives in one queue: other messages, requests, liveliness tokens, signals. Queue and
+channels take turns, so a flood of requests delays a state by one request at most. No call waits
 for channels and a queue at once, so the thread looks at all of them and sleeps between two looks:
 0.05 ms at first, longer the longer it has waited. An inbox without channels sleeps in its queue.
 """
@@ -102,6 +103,7 @@ class Inbox:
         self._channels: deque[_Channel] = deque()
         """In the order in which they are looked at next."""
         self._stamping = False
+        self._queue_was_last = False
         self.alive: set[str] = set()
         """Sources whose liveliness token is there, as of the items taken so far."""
         self._room = threading.Semaphore(_REQUESTS)
@@ -178,15 +180,14 @@ class Inbox:
         self._queue.put(item)
 
     def get(self, timeout_s: float = 0.0) -> Item | None:
-        """The next item, of the queue or else of the channels in turn; None after the timeout."""
+        """The next item, of queue and channels in turn; None after the timeout."""
         if self._stamping:
             self._empty_channels()
         if self._stamping or not self._channels:
             return self._from_queue(timeout_s)
         begin = time.monotonic()
         while True:
-            item = self._from_channels() if self._queue.empty() else self.poll_queue()
-            if item is not None:
+            if (item := self._in_turn()) is not None:
                 return item
             waited_s = time.monotonic() - begin
             if waited_s >= timeout_s:
@@ -209,6 +210,11 @@ class Inbox:
                 return None
             time.sleep(_POLL_S)
         return item
+
+    @property
+    def queued(self) -> int:
+        """Items that wait in the queue now."""
+        return self._queue.qsize()
 
     def poll_queue(self) -> Item | None:
         """The next item of the queue; does not wait."""
@@ -262,6 +268,16 @@ class Inbox:
         for channel in self._channels:
             while channel.try_recv() is not None:
                 pass
+
+    def _in_turn(self) -> Item | None:
+        """An item of the channels if the last one was of the queue, and the other way round."""
+        if self._queue_was_last or self._queue.empty():
+            self._queue_was_last = False
+            item = self._from_channels()
+            if item is not None or self._queue.empty():
+                return item
+        self._queue_was_last = True
+        return self.poll_queue()
 
     def _from_channels(self) -> Item | None:
         """The next message of those that are there, beginning with the topic after the last one."""

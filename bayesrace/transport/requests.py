@@ -1,12 +1,13 @@
 """The serving side of requests: what a process receives, and how it answers."""
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import zenoh
 
 from bayesrace.errors import InputError
-from bayesrace.messages import Message, Service, car_key, decode, encode
+from bayesrace.messages import Message, Reply, Scalar, Service, car_key, decode, encode
 
 __all__ = ["BUSY", "Request", "declare_service", "decode_request", "in_transport_thread"]
 
@@ -30,6 +31,18 @@ class Request:
     def answer(self, message: Message) -> None:
         """Send the answer; it is dropped if the client has gone."""
         self.answer_raw(encode(message))
+
+    def reply(self, accepted: bool, text: str, data: Mapping[str, Scalar] | None = None) -> None:
+        """Answer with a :class:`.Reply`."""
+        self.answer(
+            Reply(
+                seq=0,
+                source_time_ns=time.monotonic_ns(),
+                accepted=accepted,
+                text=text[:2000],
+                data=data or {},
+            )
+        )
 
     def answer_raw(self, data: bytes) -> None:
         """The same where the answer is not a message."""

@@ -94,7 +94,7 @@ def _builtin(name: str) -> CarParameters:
 
 
 def described_car(description: object) -> CarParameters:
-    """The car that settings, logs or samples tell of: a built-in name, or all its values.
+    """The car that settings, logs or samples describe: a built-in name, or all its values.
 
     ``description``: a name, or the values as mapping or as JSON text. It never names a file.
     Raises InputError for anything else.

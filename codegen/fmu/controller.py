@@ -199,6 +199,10 @@ CPU '{escape(cpu)}'.</p>
 are meant for the plant's step over the same time. So step the controller first, hand its outputs to
 the plant, and step that. If your tool steps all FMUs side by side, set <code>delay</code> to the
 communication step.</p>
+<p>A tunable parameter outside its bounds is refused with the status Discard and keeps its value.
+Parameters that do not fit together, such as <code>d_min</code> above <code>d_max</code>, are
+noticed by the next control step: doStep returns Warning with a message, and all tunable parameters
+have the values of the step before again. The simulation may go on after both.</p>
 <p>If a step gives no usable solution, the outputs are those of the plan before it, then of braking
 along it; see <code>fallback_level</code>. Outputs are always finite.</p>
 <p>Racing line and weights are in <code>resources/{PATH_FILE}</code> and

@@ -19,6 +19,13 @@ _TYPES: Final = {
     2: {"real": "Real", "integer": "Integer", "boolean": "Boolean"},
     3: {"real": "Float64", "integer": "Int32", "boolean": "Boolean"},
 }
+_MESSAGES: Final = {
+    "Warning": "Settings that a step could not use",
+    "Discard": "Why a value was refused",
+    "Error": "Why a call was refused or a step failed",
+}
+"""Statuses that come with a message, and what it says."""
+
 _BASE: Final = {"kilogram": "kg", "meter": "m", "second": "s", "radian": "rad"}
 
 _registry: Final[Any] = cache(pint.UnitRegistry)
@@ -78,8 +85,8 @@ def model_description(definition: FmuDefinition, token: str) -> bytes:
     for unit in sorted({v.unit for v in definition.all_variables if v.unit is not None}):
         SubElement(SubElement(units, "Unit", name=unit), "BaseUnit", _base_units(unit))
     categories = SubElement(root, "LogCategories")
-    why = "Why a call was refused or a step failed"
-    SubElement(categories, "Category", name="logStatusError", description=why)
+    for status, what in _MESSAGES.items():
+        SubElement(categories, "Category", name=f"logStatus{status}", description=what)
     step = repr(definition.default_step_s)
     SubElement(root, "DefaultExperiment", startTime="0", stopTime="10", stepSize=step)
     _variables(root, definition)

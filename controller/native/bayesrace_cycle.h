@@ -68,19 +68,19 @@ BR_API br_mpc_error br_cycle_set_clock(br_cycle *cycle, br_mpc_clock clock, void
  * silent: no single message locks out the plant. */
 BR_API br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state);
 
-/* The input on the basis of plant time basis_s, by the newest state. environment: as of
+/* The input by the newest state, decided at plant time decided_at_s. environment: as of
  * br_mpc_step; a stop on command limits the speed as well. budget_s: how long after its release the
  * cycle should be done, spent_s: how long that is ago; the step has what is left, and a tenth of
  * the budget at least. No budget, no limit: 0. A decision that comes after its budget is one for an
  * input that acts so much later. BR_ERROR_NOT_READY without settings or state. */
 BR_API br_mpc_error br_cycle_decide(br_cycle *cycle, const br_environment *environment,
-                                    double basis_s, double budget_s, double spent_s,
+                                    double decided_at_s, double budget_s, double spent_s,
                                     br_decision *decision);
 
 /* Both in one. BR_ERROR_STATE for a state that is not to be answered; after another error the state
  * has been taken, and br_cycle_decide decides on it. */
 BR_API br_mpc_error br_cycle_answer(br_cycle *cycle, const br_measured *state,
-                                    const br_environment *environment, double basis_s,
+                                    const br_environment *environment, double decided_at_s,
                                     double budget_s, double spent_s, br_decision *decision);
 
 /* br_mpc_prepare for a state that is expected a period after the last one, where one is. */

@@ -184,17 +184,17 @@ static double now(const br_cycle *cycle) { return cycle->clock ? cycle->clock(cy
 
 /* Whether a stop on command is not over yet; limits the speed to what it has got to. Driven to
  * standstill, the car stays on the line and points along it, fit to go on. */
-static int slowing(br_cycle *cycle, double basis_s, br_environment *environment) {
+static int slowing(br_cycle *cycle, double decided_at_s, br_environment *environment) {
     const br_driving *s = &cycle->settings;
     const double vx_mps = cycle->stream.newest.x[BR_INDEX_VX];
     const int rolling = fabs(vx_mps) > s->standing_mps;
     if (!cycle->stopping && !rolling) return 0;
     if (!cycle->stopping) { /* just commanded, or a rolling car taken over on hold */
         cycle->stopping = 1;
-        cycle->stopping_s = basis_s;
+        cycle->stopping_s = decided_at_s;
         cycle->stopping_mps = fmax(vx_mps, 0);
     }
-    const double since_s = basis_s - cycle->stopping_s;
+    const double since_s = decided_at_s - cycle->stopping_s;
     const double limit_mps = fmax(cycle->stopping_mps - s->stop_mps2 * since_s, 0);
     /* Both limits are kept by the lower one falling at the higher rate; NaN is left to be refused.
      */
@@ -220,7 +220,7 @@ static void halt(br_cycle *cycle, double acting_s) {
 /* How fast the car may still be: by the model, braking since it was last seen. A duty cycle that
  * brakes a rolling car drives a standing one backwards. What the model cannot follow leaves the
  * speed as it was last known. */
-static void reckon(br_cycle *cycle, double basis_s) {
+static void reckon(br_cycle *cycle, double decided_at_s) {
     const br_measured *newest = &cycle->stream.newest;
     const br_controller *controller = &cycle->controller;
     double u[BR_NU], *x = cycle->reckoned_x;
@@ -231,9 +231,9 @@ static void reckon(br_cycle *cycle, double basis_s) {
             return;
         cycle->reckoned = 1;
     }
-    const double duration_s = fmin(fmax(basis_s - cycle->reckoned_s, 0), BR_PREDICT_MAX_S);
+    const double duration_s = fmin(fmax(decided_at_s - cycle->reckoned_s, 0), BR_PREDICT_MAX_S);
     if (controller->predict(controller->self, x, cycle->decision.u, duration_s, x)) return;
-    cycle->reckoned_s = basis_s;
+    cycle->reckoned_s = decided_at_s;
     cycle->vx_mps = x[BR_INDEX_VX];
 }
 
@@ -254,7 +254,7 @@ static int step(br_cycle *cycle, const br_environment *environment, double actin
         memcpy(x, newest->x, sizeof x);
         memcpy(u, newest->u_applied, sizeof u);
     } else if (br_delay_at_acting(&cycle->delay, &cycle->settings, controller, newest,
-                                  cycle->decision.basis_s, cycle->counters.delay_s, x, u)) {
+                                  cycle->decision.decided_at_s, cycle->counters.delay_s, x, u)) {
         return BR_UNPREDICTABLE;
     }
     /* Where the delay measured has fallen, the moment of acting may even go back. */
@@ -281,9 +281,9 @@ static void drive(br_cycle *cycle, const br_environment *environment, double act
     const br_measured *newest = &cycle->stream.newest;
     /* Where states come seldom, the next one is no sooner to be had. */
     const double stale_s = fmax(cycle->settings.stale_s, 2 * cycle->counters.interval_s);
-    if (decision->basis_s - newest->time_s > stale_s) {
+    if (decision->decided_at_s - newest->time_s > stale_s) {
         decision->status = BR_NO_STATE;
-        reckon(cycle, decision->basis_s);
+        reckon(cycle, decision->decided_at_s);
     } else {
         cycle->reckoned = 0;
         cycle->vx_mps = newest->x[BR_INDEX_VX];
@@ -299,38 +299,39 @@ static void drive(br_cycle *cycle, const br_environment *environment, double act
     cycle->counters.phase = cycle->halted ? cycle->halted : driving;
 }
 
-br_mpc_error br_cycle_decide(br_cycle *cycle, const br_environment *environment, double basis_s,
-                             double budget_s, double spent_s, br_decision *out) {
+br_mpc_error br_cycle_decide(br_cycle *cycle, const br_environment *environment,
+                             double decided_at_s, double budget_s, double spent_s,
+                             br_decision *out) {
     if (!cycle || !out) return BR_ERROR_NULL;
     if (!cycle->has_settings || !cycle->stream.has_newest) return BR_ERROR_NOT_READY;
-    if (!isfinite(basis_s) || !isfinite(budget_s) || !isfinite(spent_s)) return BR_ERROR_TIME;
+    if (!isfinite(decided_at_s) || !isfinite(budget_s) || !isfinite(spent_s)) return BR_ERROR_TIME;
     br_decision *decision = &cycle->decision;
     const br_measured *newest = &cycle->stream.newest;
     decision->epoch = newest->epoch;
     decision->run = newest->run;
     decision->seq = newest->seq;
-    decision->basis_s = basis_s;
+    decision->decided_at_s = decided_at_s;
     decision->delay_s = newest->lockstep ? 0 : cycle->counters.delay_s;
     decision->stepped = decision->error = 0;
     decision->step_us = decision->late_s = 0;
-    const double acting_s = basis_s + decision->delay_s;
+    const double acting_s = decided_at_s + decision->delay_s;
     br_environment around = {.speed_limit_mps = INFINITY};
     if (environment) around = *environment;
-    if (cycle->halted && !slowing(cycle, basis_s, &around))
+    if (cycle->halted && !slowing(cycle, decided_at_s, &around))
         halt(cycle, acting_s);
     else
         drive(cycle, &around, acting_s, budget_s, spent_s);
-    br_delay_sent(&cycle->delay, basis_s, decision->u);
+    br_delay_sent(&cycle->delay, decided_at_s, decision->u);
     *out = *decision;
     return BR_OK;
 }
 
 br_mpc_error br_cycle_answer(br_cycle *cycle, const br_measured *state,
-                             const br_environment *environment, double basis_s, double budget_s,
-                             double spent_s, br_decision *decision) {
+                             const br_environment *environment, double decided_at_s,
+                             double budget_s, double spent_s, br_decision *decision) {
     if (!cycle || !state || !decision) return BR_ERROR_NULL;
     if (br_cycle_observe(cycle, state) != BR_STATE_NEW) return BR_ERROR_STATE;
-    return br_cycle_decide(cycle, environment, basis_s, budget_s, spent_s, decision);
+    return br_cycle_decide(cycle, environment, decided_at_s, budget_s, spent_s, decision);
 }
 
 /* A car is being driven: a step has been made, and no halt since. */
@@ -343,7 +344,7 @@ void br_cycle_rehearse(br_cycle *cycle) {
     if (!cycle || !cycle->stepped) return;
     double x[BR_NX], u[BR_NU];
     br_delay_at_acting(&cycle->delay, &cycle->settings, &cycle->controller, &cycle->stream.newest,
-                       cycle->decision.basis_s, cycle->counters.delay_s, x, u);
+                       cycle->decision.decided_at_s, cycle->counters.delay_s, x, u);
     cycle->controller.rehearse(cycle->controller.self);
 }
 

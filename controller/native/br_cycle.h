@@ -23,7 +23,7 @@ int br_stream_forget(br_stream *stream, br_counters *counters);
 #define BR_MEDIAN_OF 15 /* delays */
 
 typedef struct {
-    double basis_s, u[BR_NU];
+    double decided_at_s, u[BR_NU];
 } br_sent;
 
 typedef struct {
@@ -35,10 +35,10 @@ typedef struct {
 
 void br_delay_observe(br_delay *delay, const br_driving *settings, const br_measured *state,
                       double *delay_s);
-void br_delay_sent(br_delay *delay, double basis_s, const double u[BR_NU]);
+void br_delay_sent(br_delay *delay, double decided_at_s, const double u[BR_NU]);
 int br_delay_at_acting(br_delay *delay, const br_driving *settings, const br_controller *controller,
-                       const br_measured *state, double basis_s, double delay_s, double x[BR_NX],
-                       double u[BR_NU]);
+                       const br_measured *state, double decided_at_s, double delay_s,
+                       double x[BR_NX], double u[BR_NU]);
 
 /* --- br_fallback.c: what is sent where there is no solution to send --- */
 

@@ -1,9 +1,9 @@
 /* Delay compensation: the state at the moment from which the new input will act.
  *
- * The plant reports, in its own time, how long after its basis each input began to act; the median
- * of the newest ones is the delay. The input made now on the basis of plant time t acts from t +
- * delay on. Until then act the inputs that were sent before, each from its own basis plus the delay
- * on; the corrected model carries the state through them. No clocks have to agree. */
+ * The plant reports, in its own time, how long after the decision on it each input began to act;
+ * the median of the newest delays is the delay. The input decided at plant time t acts from t +
+ * delay on. Until then the inputs that were sent before act, each from its own decision plus the
+ * delay on; the corrected model carries the state through them. No clocks have to agree. */
 #include <math.h>
 #include <string.h>
 
@@ -41,27 +41,27 @@ static void drop_first(br_delay *delay) {
     delay->count -= 1;
 }
 
-void br_delay_sent(br_delay *delay, double basis_s, const double u[BR_NU]) {
+void br_delay_sent(br_delay *delay, double decided_at_s, const double u[BR_NU]) {
     if (delay->count == BR_SENT) drop_first(delay);
     br_sent *one = sent(delay, delay->count++);
-    one->basis_s = basis_s;
+    one->decided_at_s = decided_at_s;
     memcpy(one->u, u, sizeof one->u);
 }
 
-/* x and u when an input made on basis_s begins to act; -1 if the model cannot follow. */
+/* x and u when an input decided at that plant time begins to act; -1 if the model cannot follow. */
 int br_delay_at_acting(br_delay *delay, const br_driving *settings, const br_controller *controller,
-                       const br_measured *state, double basis_s, double delay_s, double x[BR_NX],
-                       double u[BR_NU]) {
+                       const br_measured *state, double decided_at_s, double delay_s,
+                       double x[BR_NX], double u[BR_NU]) {
     double now_s = state->time_s;
-    const double end_s = fmin(basis_s + delay_s, now_s + settings->longest_s);
+    const double end_s = fmin(decided_at_s + delay_s, now_s + settings->longest_s);
     memcpy(x, state->x, sizeof state->x);
     memcpy(u, state->u_applied, sizeof state->u_applied);
     if (settings->compensation == BR_COMPENSATION_OFF) return 0;
-    while (delay->count > 1 && sent(delay, 1)->basis_s + delay_s <= now_s)
+    while (delay->count > 1 && sent(delay, 1)->decided_at_s + delay_s <= now_s)
         drop_first(delay); /* has stopped acting */
     for (int i = 0; i < delay->count; ++i) {
         const br_sent *one = sent(delay, i);
-        const double from_s = one->basis_s + delay_s;
+        const double from_s = one->decided_at_s + delay_s;
         if (from_s >= end_s) break;
         if (from_s > now_s) {
             if (controller->predict(controller->self, x, u, from_s - now_s, x)) return -1;

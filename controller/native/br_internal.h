@@ -144,7 +144,8 @@ struct br_mpc {
     int has_parameters;
     br_path path;
     br_gp gp[2];
-    int gp_in_use; /* written by who has taken the spare buffer, in the control thread */
+    int gp_in_use; /* written by the thread that has taken the spare buffer, in the control thread
+                    */
     atomic_int spare;
     /* the problem */
     double u_before[BR_NU];

@@ -132,7 +132,7 @@ static double penalty(const br_qp *qp) {
 }
 
 /* Full step; halved while neither the merit nor the KKT residuals improve (Newton's own steps may
- * raise the merit near a solution, where the residuals tell the truth). The first iteration of a
+ * raise the merit near a solution, where the residuals are exact). The first iteration of a
  * warm step takes any usable full step: the reference has moved on since the plan was made, so
  * that what the plan is worth now is no measure (measured: half the time at the 99th percentile,
  * and a tenth of the first input's error). Out of time, it leaves the plan at the trial done. */

@@ -26,7 +26,7 @@ static void begin_plan(br_mpc *mpc) {
 }
 
 /* Another iteration would change little that matters until the next step, or, where the Hessian is
- * indefinite and convergence slow, cost more than it gives, which only a budget can tell: with one
+ * indefinite and convergence slow, cost more than it gives, which only a budget shows: with one
  * it goes on. early_stop_tol = 0 means to go on regardless. */
 static int stops_early(const br_mpc *mpc, double *residual) {
     const double before = *residual, early_stop_tol = mpc->parameters.early_stop_tol;

@@ -7,9 +7,10 @@
  *
  *   epoch run seq time_s lockstep final x y psi vx vy omega delta d delta_rate [delay_s ...]
  *
- * and its answer the line 'epoch run seq basis_s d delta_rate status level': 17 digits carry every
- * double. Over UDP the car of a free-running plant also has an input when no state arrives: the
- * controller predicts, then falls back, at its own rate, and gives up after a second of silence.
+ * and its answer the line 'epoch run seq decided_at_s d delta_rate status level': 17 digits carry
+ * every double. Over UDP the car of a free-running plant also has an input when no state arrives:
+ * the controller predicts, then falls back, at its own rate, and gives up after a second of
+ * silence.
  */
 #include <arpa/inet.h>
 #include <errno.h>
@@ -91,8 +92,8 @@ static int read_state(const char *line, br_measured *state, int *final) {
 
 static int write_decision(char *line, size_t size, const br_decision *d) {
     return snprintf(line, size, "%lld %lld %lld %.17g %.17g %.17g %d %d\n", (long long)d->epoch,
-                    (long long)d->run, (long long)d->seq, d->basis_s, d->u[0], d->u[1], d->status,
-                    d->level);
+                    (long long)d->run, (long long)d->seq, d->decided_at_s, d->u[0], d->u[1],
+                    d->status, d->level);
 }
 
 /* Takes a line; the length of the answer, 0 if there is none to be given, -1 if it is no state. */
@@ -139,8 +140,8 @@ static int bridge(host *h, char *out, size_t size) {
         br_cycle_forget(h->cycle);
     }
     if (!h->driving) return 0;
-    const double basis_s = h->newest.time_s + since_s;
-    if (br_cycle_decide(h->cycle, NULL, basis_s, SHARE * h->period_s, 0, &decision)) return 0;
+    const double decided_at_s = h->newest.time_s + since_s;
+    if (br_cycle_decide(h->cycle, NULL, decided_at_s, SHARE * h->period_s, 0, &decision)) return 0;
     return write_decision(out, size, &decision);
 }
 

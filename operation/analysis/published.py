@@ -1,4 +1,4 @@
-"""Published numbers for comparison, and when they may stand beside ours.
+"""Published numbers for comparison, and when ours may be compared with them.
 
 A. Jain, M. O'Kelly, P. Chaudhari, M. Morari, "BayesRace: Learning to race autonomously using prior
 experience", CoRL 2020: its published code run again on the paper's ETHZ track (standing start at

@@ -1,7 +1,7 @@
-"""What a race's log says, in numbers: the one source of ``result.json``, the table and the report.
+"""What a race's log holds, in numbers: the one source of ``result.json``, the table and the report.
 
 Everything is computed from the messages in ``run.mcap`` and from the track, racing line and weights
-that lie beside it; nothing is taken over from the processes that were running.
+beside it; nothing is taken over from the processes that were running.
 """
 
 import hashlib

@@ -4,7 +4,6 @@ import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -28,6 +27,7 @@ from bayesrace.messages import (
 )
 from bayesrace.raceline import RaceLine, read_raceline
 from bayesrace.tracks import Track, read_track
+from bayesrace.transport import Numbering
 from bayesrace.vehicles import DEFAULT_CAR, CarParameters, described_car
 from operation.analysis.laps import Trajectory
 
@@ -126,11 +126,14 @@ class RunRecord(Trajectory):
 
 
 def _missing(numbers: Iterable[int]) -> int:
-    # A number that falls is a process that began again, not a loss.
-    return sum(max(after - before - 1, 0) for before, after in pairwise(numbers))
+    """Messages lost by the rule of the processes: forged numbers and restarts are no losses."""
+    numbering = Numbering()
+    for seq in numbers:
+        numbering.note(seq)
+    return numbering.lost
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, kw_only=True)
 class Recording:
     """A run directory: settings, track, racing line, and each run's messages."""
 
@@ -196,8 +199,9 @@ def read_recording(run_dir: Path) -> Recording:
         names = [one.name for one in fields(Truth)]
         record.truth = [Truth(**{n: getattr(state, n) for n in names}) for state in record.states]
     return Recording(
-        run_dir, settings, track, line, planned, truth, reader.truncated, reader.refused, started_ns
-    )
+        directory=run_dir, settings=settings, track=track, line=line, runs=planned, truth=truth,
+        truncated=reader.truncated, refused=reader.refused, started_ns=started_ns,
+    )  # fmt: skip
 
 
 def _read_settings(path: Path) -> dict[str, Any]:

@@ -76,7 +76,7 @@ class SettingsSummary(_Frozen):
     seed: int
     laps: int
     constraints: bool
-    fmu: str = Field("", description="FMU that played the car; empty for the built-in equations")
+    fmu: str = Field("", description="FMU that simulated the car; empty for the built-in equations")
 
 
 class RaceResult(_Frozen):

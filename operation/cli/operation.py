@@ -14,7 +14,7 @@ from bayesrace.errors import InputError
 from operation.cli.options import Endpoint, ParentPid, connect_to
 
 if TYPE_CHECKING:
-    from operation.analysis.picture import Picture
+    from operation.analysis.network_status import NetworkStatus
     from operation.lifecycle import Action
 
 __all__ = ["go", "router", "status", "stop"]
@@ -68,29 +68,29 @@ def status(
 
     endpoints = connect_to(endpoint)
     with open_session(endpoints) as session, _closed_pipe_allowed():
-        picture = ask_statuses(session, find(session, endpoints, timeout, name), timeout)
+        network = ask_statuses(session, find(session, endpoints, timeout, name), timeout)
         if watch and as_json:
-            for car in follow(session, picture, name, 1.0):
+            for car in follow(session, network, name, 1.0):
                 if car is not None:
-                    _print_json(picture, car)
+                    _print_json(network, car)
         elif watch:
             with Live(console=Terminal(), auto_refresh=False) as live:
-                for car in follow(session, picture, name, _PERIOD_S):
+                for car in follow(session, network, name, _PERIOD_S):
                     if car is None:  # once a period, not for each heartbeat
-                        live.update(StatusTable(picture, brief=True), refresh=True)
+                        live.update(StatusTable(network, brief=True), refresh=True)
         elif as_json:
-            _print_json(picture)
+            _print_json(network)
         else:
-            Terminal().print(StatusTable(picture))
-    if not watch and not picture.answering:
+            Terminal().print(StatusTable(network))
+    if not watch and not network.answering:
         raise InputError(
             f"no answer within {timeout:g} s from the processes found; they hang or are of another "
             "release, or the network is slow (--timeout)"
         )
 
 
-def _print_json(picture: "Picture", car: str | None = None) -> None:
-    typer.echo(json.dumps(picture.as_json(car), allow_nan=False))
+def _print_json(network: "NetworkStatus", car: str | None = None) -> None:
+    typer.echo(json.dumps(network.as_json(car), allow_nan=False))
 
 
 @contextlib.contextmanager
@@ -108,7 +108,7 @@ def stop(
     name: Name = "",
     endpoint: Endpoint = None,
     reason: Reason = "",
-    everybody: Annotated[bool, typer.Option("--all", help="All cars that are found.")] = False,
+    all_cars: Annotated[bool, typer.Option("--all", help="All cars that are found.")] = False,
     run: Annotated[
         bool,
         typer.Option("--run", help="End the run of the plant instead, such as an abandoned one."),
@@ -119,10 +119,10 @@ def stop(
 
     Without --name: the only car found. Exit code 2 if it refuses or does not answer.
     """
-    if name and everybody:
+    if name and all_cars:
         raise InputError("--name and --all contradict each other; give one of them")
     action: Literal["stop", "end"] = "end" if run else "stop"
-    _command(action, name, endpoint, reason or "bayesrace stop", everybody, timeout)
+    _command(action, name, endpoint, reason or "bayesrace stop", all_cars, timeout)
 
 
 def go(
@@ -140,7 +140,7 @@ def _command(
     name: str,
     endpoint: list[str] | None,
     reason: str,
-    everybody: bool,
+    all_cars: bool,
     timeout: float,
 ) -> None:
     from bayesrace.messages import Reply
@@ -151,7 +151,7 @@ def _command(
     endpoints = connect_to(endpoint)
     with open_session(endpoints) as session:
         source = "plant" if action == "end" else "controller"
-        cars = pick(find(session, endpoints, timeout, name, (source,)), name, everybody, source)
+        cars = pick(find(session, endpoints, timeout, name, (source,)), name, all_cars, source)
         answers = command(session, cars, action, reason, timeout)
     failures = []
     for car, answer in answers.items():

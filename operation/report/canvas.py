@@ -1,4 +1,4 @@
-"""Figures of one panel; figures to SVG for the inside of a page, and to PNG."""
+"""Figures of one panel; figures to SVG to be embedded in a page, and to PNG."""
 
 import io
 import re

@@ -21,7 +21,8 @@ __all__ = ["deviation_figures", "input_figures", "speed_figures", "time_figures"
 
 _LEAP_M: Final = 1.0
 _NEAR_MS: Final = 300.0
-"""A lap that ends farther from the reference leaves the picture, which shows the others larger."""
+"""A lap that ends farther from the reference leaves the picture, so that the others remain
+legible."""
 _DASHES: Final = (0, (4, 2))
 
 

@@ -101,7 +101,7 @@ def print_table(result: RaceResult, console: Console) -> None:
             f"{summary.track} · {summary.car} · {summary.mode} · seed {summary.seed}"
             f" · trained on {summary.train_track}"
             f" · track constraints {'on' if summary.constraints else 'off'}"
-            + (f" · car played by {summary.fmu}" if summary.fmu else ""),
+            + (f" · car simulated by {summary.fmu}" if summary.fmu else ""),
             style="bold",
         )
     )

@@ -8,7 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from bayesrace.messages import Status
-from operation.analysis.picture import SOURCES, Picture, Process
+from operation.analysis.network_status import SOURCES, NetworkStatus, ProcessStatus
 from operation.terminal.printable import printable
 from operation.terminal.terminal import plain_table
 
@@ -46,15 +46,15 @@ COUNTERS_SHOWN: Final = {
 
 
 class StatusTable:
-    """The picture for rich to print: a row per process, or a table per car where that is too wide.
+    """The network for rich to print: a row per process, or a table per car where that is too wide.
 
     ``brief`` cuts each message to a line.
     """
 
-    def __init__(self, picture: Picture, *, brief: bool = False) -> None:
-        self._cars: dict[str, list[tuple[str, Process]]] = {
+    def __init__(self, network: NetworkStatus, *, brief: bool = False) -> None:
+        self._cars: dict[str, list[tuple[str, ProcessStatus]]] = {
             car: [(source, processes[source]) for source in SOURCES if source in processes]
-            for car, processes in picture.cars.items()
+            for car, processes in network.cars.items()
         }
         self._brief = brief
 
@@ -86,7 +86,7 @@ class StatusTable:
         return table
 
 
-def _narrow(car: str, processes: list[tuple[str, Process]]) -> Table:
+def _narrow(car: str, processes: list[tuple[str, ProcessStatus]]) -> Table:
     sources = [source for source, _ in processes]
     table = plain_table(printable(car), *sources, left=1 + len(sources))
     columns = [_values(source, process) for source, process in processes]
@@ -95,7 +95,7 @@ def _narrow(car: str, processes: list[tuple[str, Process]]) -> Table:
     return table
 
 
-def _values(source: str, process: Process) -> list[Text | str]:
+def _values(source: str, process: ProcessStatus) -> list[Text | str]:
     status = process.status
     if status is None:
         return [Text("no answer", style="red"), *[""] * (len(_VALUES) - 1)]
@@ -119,7 +119,7 @@ def _counts(status: Status, names: tuple[str, ...]) -> str:
     return "/".join(str(status.counters.get(name, "–")) for name in names)
 
 
-def _message(who: str, process: Process) -> Text:
+def _message(who: str, process: ProcessStatus) -> Text:
     text = process.fault if process.status is None else process.status.text
     if process.processes > 1:
         text = f"{process.processes} processes answer under this name; end all but one. {text}"

@@ -6,6 +6,6 @@ __all__ = ["FmuFault"]
 class FmuFault(RuntimeError):  # noqa: N818 - the car failed, not this program
     """The FMU crashed, hung, refused a step, gave an unusable value or ended the simulation.
 
-    The message names the FMU, what happened, when (plant time) and the FMU's last words. The input
+    The message names the FMU, what happened, when (plant time), and its last message. The input
     was not bad: the run ends, the plant process goes on.
     """

@@ -89,16 +89,20 @@ class FmuHost:
     def fault(self, what: str, when: str = "") -> FmuFault:
         """Ends the process, which is no car any more; the fault to raise."""
         process, self._process = self._process, None
-        words = process.output.last_words() if process is not None else ""
+        words = process.output.last_message() if process is not None else ""
         if process is not None:
             process.kill()
         at = when or f"at t = {self.time_s:.6g} s"
-        last = f"; its last words: {words}" if words else ""
+        last = f"; its last message: {words}" if words else ""
         return FmuFault(f"FMU {self.path.name} {at}: {what}{last}")
 
     def _launch(self) -> FmuProcess:
-        process = self._process = FmuProcess(self.path, self._description, self._arguments)
-        self._used = False
+        try:
+            process = FmuProcess(self.path, self._description, self._arguments)
+        except OSError as error:  # no memory, processes, descriptors or disk left
+            why = error.strerror or str(error)
+            raise FmuFault(f"FMU {self.path.name}: its process does not start: {why}") from None
+        self._process, self._used = process, False
         self._values(b"", "while it was loaded")
         return process
 

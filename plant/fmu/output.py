@@ -11,7 +11,7 @@ __all__ = ["Output"]
 _SHOWN: Final = 1 << 16
 """Bytes of one run that are passed on."""
 _KEPT: Final = 4096
-"""Bytes in which the last words are looked for."""
+"""Bytes in which the last message is looked for."""
 _TROUBLE: Final = re.compile(r"^\[FMU (?!info)\w+\] (.+)", re.MULTILINE)
 
 
@@ -41,7 +41,7 @@ class Output:
             self._pass_on(data[: self._left])
         return True
 
-    def last_words(self) -> str:
+    def last_message(self) -> str:
         """The last message of its log that reports trouble, or else the last line."""
         self.pump()
         text = self._tail.decode(errors="replace").strip()

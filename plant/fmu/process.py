@@ -13,7 +13,7 @@ import socket
 import subprocess
 import tempfile
 import time
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -51,23 +51,28 @@ class FmuProcess:
             raise
 
     def _launch(self, arguments: dict[str, Any]) -> None:
-        # The kernel keeps messages apart: what the FMU writes there is a message of its own.
-        self._socket, theirs = socket.socketpair(type=socket.SOCK_SEQPACKET)
-        self._socket.setblocking(False)
-        reading, writing = os.pipe()
-        self.output = Output(reading)
-        ends = {"folder": str(self.folder), "parent": os.getpid(), "connection": theirs.fileno()}
-        with theirs:
+        with ExitStack() as ours, ExitStack() as theirs:
+            # The kernel keeps messages apart: what the FMU writes there is a message of its own.
+            self._socket, connection = socket.socketpair(type=socket.SOCK_SEQPACKET)
+            ours.enter_context(self._socket)
+            theirs.enter_context(connection)
+            self._socket.setblocking(False)
+            reading, writing = os.pipe()
+            theirs.callback(os.close, writing)
+            self.output = Output(reading)
+            ours.callback(self.output.close)
+            ends = {"folder": str(self.folder), "parent": os.getpid()}
+            ends |= {"connection": connection.fileno()}
             self.popen = subprocess.Popen(
                 [*RUN_MODULE, "plant.fmu.worker", json.dumps(arguments | ends)],
                 stdin=subprocess.DEVNULL,
                 stdout=writing,
                 stderr=writing,
-                pass_fds=(theirs.fileno(),),
+                pass_fds=(connection.fileno(),),
                 # Ctrl-C at the terminal is for the plant, which ends the run in order
                 start_new_session=True,
             )
-        os.close(writing)
+            ours.pop_all()  # it has started: they are closed when it ends
         self._poll = select.poll()
         self._poll.register(self._socket, select.POLLIN)
         self._poll.register(reading, select.POLLIN)

@@ -56,7 +56,7 @@ def _serve(connection: socket.socket, arguments: dict[str, Any]) -> None:
             else:
                 step_s, count, *inputs = array("d", question[1:])
                 instance.step(step_s, int(count), inputs)
-    except CallFailed as failure:  # the plant ends this process, once it has read the last words
+    except CallFailed as failure:  # the plant ends this process, once it has read the message
         connection.send(b"f" + str(failure).encode(errors="replace")[:4000])
         connection.recv(1)
 

@@ -107,8 +107,8 @@ def _rows(message: Any) -> Iterator[tuple[str, tuple[Any, ...]]]:
     match m:
         case messages.State():
             yield "states", (m.seq, m.source_time_ns, m.epoch, m.run, m.lockstep)
-            for k in range(0, len(m.answers), 3):
-                yield "answers", m.answers[k : k + 3]
+            for k in range(0, len(m.actuation_delays), 3):
+                yield "answers", m.actuation_delays[k : k + 3]
         case messages.Truth():
             yield "truth", (m.epoch, m.run, m.lap, *m.x[:2])
         case messages.Actuation():

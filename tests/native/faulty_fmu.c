@@ -44,8 +44,8 @@ enum { /* value references */
        MODE,
        GEAR,
        LIGHT,
-       GEAR_TOLD,
-       LIGHT_TOLD,
+       GEAR_READ,
+       LIGHT_READ,
        LABEL,
        LABEL_LENGTH,
        INSTANCES,
@@ -198,8 +198,8 @@ static Status drive(Car *car, double t, double h) {
     v[PSI] += h * v[OMEGA];
     v[VX] += h * (7.0 * v[D] - v[VX]);
     v[DELTA] += h * v[DELTA_RATE];
-    v[GEAR_TOLD] = v[GEAR];
-    v[LIGHT_TOLD] = v[LIGHT];
+    v[GEAR_READ] = v[GEAR];
+    v[LIGHT_READ] = v[LIGHT];
     car->time = t + h;
     return car->time >= v[AT_S] - 1e-9 ? strike(car) : (Status)OK;
 }
@@ -312,10 +312,11 @@ EXPORT Status fmi2DoStep(fmi2Component c, Real t, Real h, fmi2Boolean none) {
     return ((Car *)c)->ended ? (Status)DISCARD : status;
 }
 
-EXPORT Status fmi2GetBooleanStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Boolean *told) {
+EXPORT Status fmi2GetBooleanStatus(fmi2Component c, const fmi2StatusKind kind,
+                                   fmi2Boolean *answer) {
     const Car *car = c;
-    *told = kind == fmi2Terminated && car->ended;
-    return (Status)(car->value[MODE] == REFUSE ? DISCARD : OK); /* then it cannot tell */
+    *answer = kind == fmi2Terminated && car->ended;
+    return (Status)(car->value[MODE] == REFUSE ? DISCARD : OK); /* then it does not know */
 }
 #endif
 

@@ -14,14 +14,14 @@
 #include "fmi3Functions.h"
 #include "fmu_config.h"
 
-static void told(fmi3InstanceEnvironment e, fmi3Status status, fmi3String kind, fmi3String text) {
+static void listen(fmi3InstanceEnvironment e, fmi3Status status, fmi3String kind, fmi3String text) {
     (void)e, (void)status, (void)kind;
     fprintf(stderr, "%s\n", text);
 }
 
 static fmi3Instance make(const char *name, const char *resources) {
     return fmi3InstantiateCoSimulation(name, FMU_TOKEN, resources, fmi3False, fmi3False, fmi3False,
-                                       fmi3False, NULL, 0, NULL, told, NULL);
+                                       fmi3False, NULL, 0, NULL, listen, NULL);
 }
 
 static void begin(fmi3Instance i) {

@@ -1,7 +1,7 @@
 /* One thread controls, another stages weights, as fast as they can; meant for -fsanitize=thread.
  *
  * Set number g corrects every output by g (1 + n / 1000) wherever its points lie. So what the
- * control thread predicts with tells which set is in use: the same in all outputs, the same until
+ * control thread predicts with show which set is in use: the same in all outputs, the same until
  * it adopts again, and never an older one. Code 1: a promise of the interface is broken.
  */
 #include <math.h>

@@ -3,8 +3,8 @@
     python emulator.py LEFT RIGHT [SEED]
 
 forwards every Ethernet frame between the two interfaces, which must not do so themselves (two veth
-ends in a network namespace of their own). It plays what Linux's ``netem`` does, for kernels
-without it. It is told what to do by lines on stdin, and answers each with one line of JSON:
+ends in a network namespace of their own). It does what Linux's ``netem`` does, for kernels
+without it. It takes commands as lines on stdin, and answers each with one line of JSON:
 
     set KEY VALUE ...    delay, jitter [s], loss [share of frames], reorder [0 or 1]
     cut / join           no frame gets through / they do again
@@ -107,7 +107,7 @@ class Direction:
 
 
 class Emulator:
-    """Both directions, and the words they are told."""
+    """Both directions, and the commands they take."""
 
     def __init__(self, seed: int = 0) -> None:
         self.directions = {

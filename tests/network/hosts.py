@@ -76,7 +76,7 @@ class Host:
         self.name = name
 
     def command(self, *words: str | Path) -> list[str]:
-        """The command line that runs a program there, as a direct child of who starts it."""
+        """The command line that runs a program there, as a direct child of its starter."""
         return ["ip", "netns", "exec", self.name, *map(str, words)]
 
     def do(self, function: Callable[[], T]) -> T:
@@ -159,7 +159,7 @@ class Link:
             raise ValueError(answer["error"])
         return answer
 
-    def tell(self, line: str) -> dict[str, dict[str, int]]:
+    def send(self, line: str) -> dict[str, dict[str, int]]:
         """One line of the emulator's language; the counts by direction."""
         assert self._process.stdin is not None
         self._process.stdin.write(f"{line}\n")
@@ -171,19 +171,19 @@ class Link:
     ) -> None:  # fmt: skip
         """Conditions, see :class:`tests.network.emulator.Conditions`."""
         values = f"delay {delay} jitter {jitter} loss {loss} reorder {int(reorder)}"
-        self.tell(f"set {values} {direction}")
+        self.send(f"set {values} {direction}")
 
     def cut(self, direction: str = "") -> None:
         """Nothing gets through any more."""
-        self.tell(f"cut {direction}")
+        self.send(f"cut {direction}")
 
     def join(self, direction: str = "") -> None:
         """The end of a partition."""
-        self.tell(f"join {direction}")
+        self.send(f"join {direction}")
 
     def counts(self) -> dict[str, dict[str, int]]:
         """Frames by direction, see :class:`tests.network.emulator.Counts`."""
-        return self.tell("counts")
+        return self.send("counts")
 
     def close(self) -> None:
         """Ends the program."""
@@ -218,7 +218,7 @@ def _remove_stale() -> None:
 
 @contextlib.contextmanager
 def network(seed: int = 0) -> Iterator[Network]:
-    """A network that is gone after the block, with a perfect link until told otherwise."""
+    """A network that is gone after the block, with a perfect link until it is changed."""
     _remove_stale()
     prefix = f"bayesrace-{os.getpid()}-{next(_numbers)}"
     hosts = {role: Host(f"{prefix}-{role}") for role in ("plant", "controller", "between")}

@@ -1,4 +1,4 @@
-"""What a log tells about a drive, on the clock of the machine that all processes share."""
+"""What a log holds of a drive, on the clock of the machine that all processes share."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,9 +1,9 @@
-"""Who starts runs, follows and records them: in the test's own process, or on another host.
+"""Starts runs, follows and records them: in the test's own process, or on another host.
 
     python -m tests.network.observer NAME TRACK LOG ENDPOINT...
 
 obeys lines on stdin (``start``, ``state``, ``status SOURCE``, ``stop``) and answers each with a
-line of JSON; the end of stdin ends it, and the run under way.
+line of JSON; the end of stdin ends it, and the current run.
 """
 
 import dataclasses
@@ -75,7 +75,7 @@ class Observer:
         self._newest = sample.payload.to_bytes() or self._newest
 
     def start(self, run: int) -> int:
-        """Starts a run without end, by the wall clock, once both processes are there."""
+        """Starts a run without end, in real time, once both processes are there."""
         self.director.wait_for(("plant", "controller"), PATIENCE_S)
         plan = RunPlan(run, "test", 1, _ENDLESS_S, lockstep=False)
         request = dataclasses.replace(run_request(self._track, plan), laps=0)

@@ -2,7 +2,7 @@
 
 The messages of control travel by TCP, as everything does by default: what the link loses arrives
 late and holds up what comes after it, so an actuation can be 0.2 s late, and Zenoh's qualities of
-service change nothing about it. By UDP a loss is a loss and nobody waits; but Zenoh sends its own
+service change nothing about it. By UDP a loss is a loss and nothing waits; but Zenoh sends its own
 declarations over it once as well, so a connection that is made over a bad link may be deaf. That
 is why the drive by UDP begins on a good one.
 """
@@ -137,7 +137,7 @@ def test_a_car_stops_in_a_partition_and_goes_on(net: Network, start: Start) -> N
     assert cut[0].x[3] > 0.3
     assert abs(last["x"][3]) < STANDING_MPS
     assert abs(cut[-1].x[3]) < STANDING_MPS
-    # what was under way arrives, nothing else: the plant alone has stopped the car
+    # what was on its way arrives, nothing else: the plant alone has stopped the car
     assert plant["braked"] > 0
     assert_nothing_was_broken(plant, controller)
     assert_all_is_accounted_for(plant, controller)
@@ -203,7 +203,7 @@ def test_a_link_that_fails_one_way(net: Network, start: Start, direction: str) -
 
 
 @pytest.mark.check
-def test_losses_by_udp_are_counted_and_hold_up_nobody(net: Network, start: Start) -> None:
+def test_losses_by_udp_are_counted_and_hold_up_nothing(net: Network, start: Start) -> None:
     rig = start("udp")
     rig.drive_on()
     net.link.set(delay=0.02, jitter=0.005, loss=0.05)

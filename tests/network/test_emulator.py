@@ -191,7 +191,9 @@ def test_what_a_killed_process_left_is_removed_by_the_next(namespaces: None) -> 
         assert namespaces_of(child.pid) == []
 
 
-def test_a_machine_without_namespaces_is_told_why(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_machine_without_namespaces_is_refused_with_the_reason(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     assert "root" in why_not_here() or "Linux" in why_not_here()
     monkeypatch.setattr(os, "geteuid", lambda: 0)

@@ -33,7 +33,7 @@ def a_state(seq: int) -> State:
     """Of a car that stands, at 50 Hz."""
     return State(
         seq=seq, source_time_ns=0, epoch=1, run=1, time_s=0.02 * seq, x=(0.0,) * 7,
-        u_applied=(0.0, 0.0), lap=0, lockstep=False, answers=(), final=False,
+        u_applied=(0.0, 0.0), lap=0, lockstep=False, actuation_delays=(), final=False,
     )  # fmt: skip
 
 

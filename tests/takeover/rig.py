@@ -107,7 +107,7 @@ class Rig:
         until(lambda: self.counters()["validator"], "the validator")
 
     def reader(self) -> LogReader:
-        self.recorder.settle()
+        self.recorder.drain()
         return LogReader(self.log)
 
     def states(self, run: int) -> list[State]:

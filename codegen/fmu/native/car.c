@@ -57,7 +57,7 @@ static void guard(const double *v, double duration, double u[2]) {
     u[1] = clipped(rate, -fastest, fastest);
 }
 
-bool fmu_model_step(fmu_instance *car, double h) {
+FMI(Status) fmu_model_step(fmu_instance *car, double h) {
     double *v = car->value, x[NX], next[NX], u[2];
     memcpy(x, &v[FMU_V_x], sizeof x);
     guard(v, h, u);
@@ -71,14 +71,14 @@ bool fmu_model_step(fmu_instance *car, double h) {
     x[6] = clipped(v[FMU_V_delta] + h * u[1], -angle, angle); /* without rounding of steps */
     for (int i = 0; i < NX; i++)
         if (!isfinite(x[i]))
-            return fmu_refuse(car,
-                              "the state after the step from %.9g s is not finite; the step "
-                              "is undone",
-                              v[FMU_V_time]);
+            return fmu_note(car, FMI(Error),
+                            "the state after the step from %.9g s is not finite; the step is "
+                            "undone",
+                            v[FMU_V_time]);
     memcpy(&v[FMU_V_x], x, sizeof x);
     v[FMU_V_d_applied] = u[0];
     v[FMU_V_delta_rate_applied] = u[1];
-    return true;
+    return FMI(OK);
 }
 
 #else

@@ -21,6 +21,7 @@ typedef struct {
     br_cycle *cycle;
     double next_s; /* release of the next control step */
     int64_t cycles;
+    double used[FMU_VALUES]; /* by value reference: the parameters in use */
 } controller;
 
 size_t fmu_model_size(void) {
@@ -41,10 +42,8 @@ bool fmu_model_create(fmu_instance *instance) {
     return true;
 }
 
-/* Takes the parameters as they are now; any of them may be set between two steps. */
-static bool take_parameters(fmu_instance *instance) {
-    const double *v = instance->value;
-    controller *c = instance->model;
+/* Gives the parameters to the step and to the cycle. */
+static br_mpc_error use_parameters(controller *c, const double *v) {
 #define TAKE(name) .name = v[FMU_V_##name],
     const br_mpc_parameters parameters = {BR_PARAMETERS(TAKE) BR_SOLVER_FIELDS(TAKE, TAKE)};
 #undef TAKE
@@ -62,12 +61,27 @@ static bool take_parameters(fmu_instance *instance) {
         .longest_s = v[FMU_V_delay] > 0 ? v[FMU_V_delay] : 1,
         .stale_s = 1, /* every step has its state */
     };
-    br_mpc_error error = br_mpc_set_parameters(c->mpc, &parameters);
-    if (!error) error = br_cycle_set_driving(c->cycle, &driving);
-    if (!error) return true;
-    return fmu_refuse(instance, /* and keeps the parameters before */
-                      "controller: %s (q_position to iterations_cold; d_min must be below d_max)",
-                      br_mpc_error_text(error));
+    const br_mpc_error error = br_mpc_set_parameters(c->mpc, &parameters);
+    return error ? error : br_cycle_set_driving(c->cycle, &driving);
+}
+
+#define UNUSABLE "controller: %s (q_position to iterations_cold; d_min must be below d_max)"
+
+/* Uses what has been set since the step before. Each parameter is within its bounds; those that do
+ * not fit together are given up: step and FMU go on with the parameters of the step before. */
+static FMI(Status) take_parameters(fmu_instance *instance) {
+    controller *c = instance->model;
+    double *v = instance->value;
+    const br_mpc_error error = use_parameters(c, v);
+    if (!error) {
+        memcpy(c->used, v, sizeof c->used);
+        return FMI(OK);
+    }
+    use_parameters(c, c->used);
+    for (int i = 0; i < FMU_VALUES; i++)
+        if (fmu_variables[i].role == FMU_TUNABLE) v[i] = c->used[i];
+    return fmu_note(instance, FMI(Warning), UNUSABLE "; the parameters before stay in use",
+                    br_mpc_error_text(error));
 }
 
 bool fmu_model_initialise(fmu_instance *instance) {
@@ -76,7 +90,9 @@ bool fmu_model_initialise(fmu_instance *instance) {
     char *memory = (char *)c->mpc + ALIGNED(br_mpc_memory_size());
     br_cycle_drive_mpc(memory, br_cycle_memory_size(), c->mpc, 0, &c->cycle);
     br_mpc_reset(c->mpc);
-    if (!take_parameters(instance)) return false;
+    const br_mpc_error error = use_parameters(c, v);
+    if (error) return fmu_refuse(instance, UNUSABLE, br_mpc_error_text(error));
+    memcpy(c->used, v, sizeof c->used);
     c->next_s = v[FMU_V_time];
     c->cycles = 0;
     memset(&v[FMU_V_d], 0, (FMU_V_time - FMU_V_d) * sizeof *v); /* the outputs */
@@ -132,18 +148,17 @@ static void set_outputs(fmu_instance *instance, const br_decision *decision) {
     v[FMU_V_lateral_m] = info->lateral_m;
 }
 
-bool fmu_model_step(fmu_instance *instance, double h) {
+FMI(Status) fmu_model_step(fmu_instance *instance, double h) {
     controller *c = instance->model;
     const double *v = instance->value;
-    if (!due(c, v[FMU_V_time], v[FMU_V_period])) return true;
+    if (!due(c, v[FMU_V_time], v[FMU_V_period])) return FMI(OK);
     br_environment around = {v[FMU_V_speed_limit], v[FMU_V_speed_limit_rate]};
     if (around.speed_limit_mps >= NO_SPEED_LIMIT) around.speed_limit_mps = INFINITY;
-    const bool accepted = take_parameters(instance);
-    if (!accepted) around.speed_limit_mps = NAN; /* the step refuses: the fallback answers */
+    const FMI(Status) status = take_parameters(instance);
     const br_measured state = measured(instance);
     br_decision decision;
     if (br_cycle_answer(c->cycle, &state, &around, v[FMU_V_time], 0, 0, &decision))
-        return fmu_refuse(instance, "controller: the control cycle refuses the state");
+        return fmu_note(instance, FMI(Error), "controller: the control cycle refuses the state");
     set_outputs(instance, &decision);
-    return accepted;
+    return status;
 }

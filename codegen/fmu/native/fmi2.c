@@ -8,7 +8,8 @@
 const char *fmi2GetTypesPlatform(void) { return fmi2TypesPlatform; }
 
 /* Some importers take the text for a printf format, others print it as it is. */
-void fmu_report(const fmu_instance *instance, const char *text) {
+void fmu_report(const fmu_instance *instance, fmi2Status status, const char *category,
+                const char *text) {
     char escaped[1024];
     size_t n = 0;
     for (; *text && n < sizeof escaped - 2; text++) {
@@ -17,8 +18,8 @@ void fmu_report(const fmu_instance *instance, const char *text) {
     }
     escaped[n] = 0;
     if (instance->logger)
-        ((fmi2CallbackLogger)instance->logger)(instance->environment, instance->name, fmi2Error,
-                                               "logStatusError", escaped);
+        ((fmi2CallbackLogger)instance->logger)(instance->environment, instance->name, status,
+                                               category, escaped);
 }
 
 /* ---- instances ---- */
@@ -70,7 +71,7 @@ fmi2Status fmi2EnterInitializationMode(fmi2Component c) {
 
 fmi2Status fmi2DoStep(fmi2Component c, fmi2Real time, fmi2Real h, fmi2Boolean no_rollback) {
     REQUIRE(FMU_STEPPING);
-    return fmu_step(instance, time, h) ? fmi2OK : fmi2Error;
+    return fmu_step(instance, time, h);
 }
 
 fmi2Status fmi2GetRealStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Real *value) {

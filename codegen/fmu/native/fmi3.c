@@ -4,10 +4,10 @@
 
 #include "fmu.h"
 
-void fmu_report(const fmu_instance *instance, const char *text) {
+void fmu_report(const fmu_instance *instance, fmi3Status status, const char *category,
+                const char *text) {
     if (instance->logger)
-        ((fmi3LogMessageCallback)instance->logger)(instance->environment, fmi3Error,
-                                                   "logStatusError", text);
+        ((fmi3LogMessageCallback)instance->logger)(instance->environment, status, category, text);
 }
 
 char *fmu_folder(char *location) { return location[0] ? location : NULL; }
@@ -98,10 +98,10 @@ NEVER(fmi3ActivateModelPartition, fmi3Instance c, fmi3ValueReference clock, fmi3
                           fmi3Boolean *event, fmi3Boolean *terminate, fmi3Boolean *early,
                           fmi3Float64 *reached) {
     REQUIRE(FMU_STEPPING);
-    const bool fine = fmu_step(instance, time, h);
+    const fmi3Status status = fmu_step(instance, time, h);
     no(event), no(terminate), no(early);
     if (reached) *reached = instance->value[FMU_V_time];
-    return fine ? fmi3OK : fmi3Error;
+    return status;
 }
 
 /* ---- Model Exchange; the phase refuses it in Co-Simulation ---- */

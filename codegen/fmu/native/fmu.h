@@ -4,7 +4,11 @@
  * the instance, does everything else that FMI demands: phases, arguments, messages, saved states.
  * It is compiled for one version, FMU_FMI; FMI(Name) is fmi2Name or fmi3Name: functions that are
  * alike in both are written once, in fmu_instance.c, fmu_values.c and fmu_state.c; fmi2.c or fmi3.c
- * has the others. A refused call has changed nothing and has sent one message.
+ * has the others.
+ *
+ * A refused call has changed nothing and has sent one message, with the status that it returns:
+ * Discard for a value outside the bounds of its variable, after which the simulation may go on;
+ * Error for what the standard does not allow.
  */
 #ifndef FMU_H
 #define FMU_H
@@ -67,6 +71,10 @@ typedef struct {
 __attribute__((format(printf, 2, 3))) bool fmu_refuse(const fmu_instance *instance,
                                                       const char *format, ...);
 
+/* Sends a message with the status that the call is about to return. Returns the status. */
+__attribute__((format(printf, 3, 4))) FMI(Status)
+    fmu_note(const fmu_instance *instance, FMI(Status) status, const char *format, ...);
+
 /* ---- the model; what is bool is false after fmu_refuse, else true ---- */
 
 size_t fmu_model_size(void); /* bytes of memory that an instance needs beside the values */
@@ -79,8 +87,9 @@ bool fmu_model_create(fmu_instance *instance);
  * bounds. Checks what else they must fulfil and sets the calculated outputs. */
 bool fmu_model_initialise(fmu_instance *instance);
 
-/* Co-Simulation: from time to time + h, 0 < h <= 1000; the caller advances the time. */
-bool fmu_model_step(fmu_instance *instance, double h);
+/* Co-Simulation: from time to time + h, 0 < h <= 1000; the caller advances the time. Returns OK,
+ * after fmu_note Warning, or after fmu_refuse Error, which ends the simulation. */
+FMI(Status) fmu_model_step(fmu_instance *instance, double h);
 
 /* Model Exchange: derivatives [FMU_STATES] of the states at the instance's values. */
 void fmu_model_derivatives(const fmu_instance *instance, double *dx);
@@ -118,8 +127,9 @@ extern const fmu_variable fmu_variables[FMU_VALUES];
 #define FMU_IS_DERIVATIVE(reference) \
     ((int)(reference) >= FMU_FIRST_DERIVATIVE && (reference) != FMU_V_time)
 
-/* Passes a message to the importer, in the version's own way. */
-void fmu_report(const fmu_instance *instance, const char *text);
+/* Passes a message to the importer, in the version's own way; category: "logStatusError" ... */
+void fmu_report(const fmu_instance *instance, FMI(Status) status, const char *category,
+                const char *text);
 
 /* The path of the resources folder from what the importer passes, in place; NULL for none. */
 char *fmu_folder(char *location);
@@ -143,7 +153,7 @@ bool fmu_in_phase(const fmu_instance *instance, unsigned phases, const char *fun
 FMI(Status) fmu_absent(const fmu_instance *instance, size_t variables, const char *function);
 
 bool fmu_set_times(fmu_instance *instance, double start, bool has_stop, double stop);
-bool fmu_step(fmu_instance *instance, double time, double h); /* Co-Simulation */
+FMI(Status) fmu_step(fmu_instance *instance, double time, double h); /* Co-Simulation */
 
 /* Model Exchange: computes the derivatives' values; Discard if they are not finite. */
 FMI(Status) fmu_derivatives(fmu_instance *instance);

@@ -14,14 +14,29 @@ const char *FMI(GetVersion)(void) { return FMI(Version); }
 
 /* ---- messages ---- */
 
-bool fmu_refuse(const fmu_instance *instance, const char *format, ...) {
+static void report(const fmu_instance *instance, FMI(Status) status, const char *format,
+                   va_list arguments) {
+    static const char *const categories[] = {"logStatusOK", "logStatusWarning", "logStatusDiscard",
+                                             "logStatusError"};
     char text[512];
+    vsnprintf(text, sizeof text, format, arguments);
+    fmu_report(instance, status, categories[status], text);
+}
+
+bool fmu_refuse(const fmu_instance *instance, const char *format, ...) {
     va_list arguments;
     va_start(arguments, format);
-    vsnprintf(text, sizeof text, format, arguments);
+    report(instance, FMI(Error), format, arguments);
     va_end(arguments);
-    fmu_report(instance, text);
     return false;
+}
+
+FMI(Status) fmu_note(const fmu_instance *instance, FMI(Status) status, const char *format, ...) {
+    va_list arguments;
+    va_start(arguments, format);
+    report(instance, status, format, arguments);
+    va_end(arguments);
+    return status;
 }
 
 FMI(Status) fmu_absent(const fmu_instance *instance, size_t variables, const char *function) {
@@ -30,7 +45,7 @@ FMI(Status) fmu_absent(const fmu_instance *instance, size_t variables, const cha
     return FMI(Error);
 }
 
-/* Only errors are logged, and always. */
+/* Only what is not OK is logged, and always. */
 FMI(Status) FMI(SetDebugLogging)(void *c, FMI(Boolean) on, size_t n, const FMI(String) names[]) {
     return c ? FMI(OK) : FMI(Error);
 }
@@ -137,25 +152,26 @@ FMI(Status) FMI(Reset)(void *c) {
     return create(instance) ? FMI(OK) : FMI(Error);
 }
 
-bool fmu_step(fmu_instance *instance, double time, double h) {
+FMI(Status) fmu_step(fmu_instance *instance, double time, double h) {
     double *now = &instance->value[FMU_V_time];
-    const double tolerance = 1e-6 * (1 + fabs(*now));
+    const double tolerance = 1e-6 * (1 + fabs(*now)), end = instance->stop_time;
     if (!(h > 0 && h <= LONGEST_STEP_S))
-        return fmu_refuse(instance,
-                          "the communication step is %g s, must be positive and at most "
-                          "%g",
-                          h, LONGEST_STEP_S);
+        return fmu_note(instance, FMI(Error),
+                        "the communication step is %g s, must be positive and at most %g", h,
+                        LONGEST_STEP_S);
     if (!(fabs(time - *now) <= tolerance))
-        return fmu_refuse(instance, "asked to continue at %.9g s, but time is %.9g s", time, *now);
-    if (time + h > instance->stop_time + tolerance)
-        return fmu_refuse(instance, "%.9g s is after the stop time %.9g s", time + h,
-                          instance->stop_time);
+        return fmu_note(instance, FMI(Error), "asked to continue at %.9g s, but time is %.9g s",
+                        time, *now);
+    if (time + h > end + tolerance)
+        return fmu_note(instance, FMI(Error), "%.9g s is after the stop time %.9g s", time + h,
+                        end);
+    FMI(Status) status = FMI(OK);
 #if !FMU_STATES
-    if (!fmu_model_step(instance, h)) {
-        instance->phase = FMU_FAILED;
-        return false;
-    }
+    status = fmu_model_step(instance, h);
 #endif
-    *now = time + h;
-    return true;
+    if (status == FMI(Error))
+        instance->phase = FMU_FAILED;
+    else
+        *now = time + h;
+    return status;
 }

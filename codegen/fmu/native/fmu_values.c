@@ -23,21 +23,22 @@ static bool accessible(const fmu_instance *instance, fmu_kind kind, const uint32
     return true;
 }
 
-/* Whether a variable may be set to a number now. */
-static bool settable(const fmu_instance *instance, uint32_t reference, double number) {
+/* OK if a variable may be set to a number now. */
+static FMI(Status) settable(const fmu_instance *instance, uint32_t reference, double number) {
     const fmu_variable *v = &fmu_variables[reference];
     const bool before_run = instance->phase & (FMU_INSTANTIATED | FMU_INITIALISATION);
     const bool running = instance->phase & (FMU_EVENT | FMU_CONTINUOUS | FMU_STEPPING);
     const bool integrated = running && FMU_IS_STATE(reference);
     const bool now = before_run || integrated || (running && v->role != FMU_FIXED);
     if (!now || v->role == FMU_CALCULATED)
-        return fmu_refuse(instance, "variable '%s' cannot be set in phase '%s'", v->name,
-                          fmu_phase_name(instance));
+        return fmu_note(instance, FMI(Error), "variable '%s' cannot be set in phase '%s'", v->name,
+                        fmu_phase_name(instance));
     const bool inside =
         v->open ? number > v->min && number < v->max : number >= v->min && number <= v->max;
-    if (v->role == FMU_INPUT || integrated || (isfinite(number) && inside)) return true;
-    return fmu_refuse(instance, "variable '%s' cannot be %g: it must be finite and %s %g and %g",
-                      v->name, number, v->open ? "strictly between" : "between", v->min, v->max);
+    if (v->role == FMU_INPUT || integrated || (isfinite(number) && inside)) return FMI(OK);
+    return fmu_note(instance, FMI(Discard),
+                    "variable '%s' cannot be %g: it must be finite and %s %g and %g", v->name,
+                    number, v->open ? "strictly between" : "between", v->min, v->max);
 }
 
 FMI(Status) fmu_derivatives(fmu_instance *instance) {
@@ -77,8 +78,10 @@ static FMI(Status) refresh(fmu_instance *instance, const uint32_t *reference, si
     FMI(Status) FMI(Set##name)(REFERENCES, const type value[] COUNT) {                           \
         fmu_instance *instance = c;                                                              \
         if (!accessible(instance, kind, reference, n, value, COUNTED)) return FMI(Error);        \
-        for (size_t i = 0; i < n; i++)                                                           \
-            if (!settable(instance, reference[i], (double)value[i])) return FMI(Error);          \
+        for (size_t i = 0; i < n; i++) {                                                         \
+            const FMI(Status) status = settable(instance, reference[i], (double)value[i]);       \
+            if (status != FMI(OK)) return status;                                                \
+        }                                                                                        \
         for (size_t i = 0; i < n; i++)                                                           \
             instance->value[reference[i]] = kind == FMU_BOOLEAN ? !!value[i] : (double)value[i]; \
         return FMI(OK);                                                                          \

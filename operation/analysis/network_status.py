@@ -7,8 +7,8 @@ P}}}``, where P is null if no such process is there, and otherwise holds, always
 - ``fault``: why it is not, or null;
 - ``processes``: how many answer under this name; more than one is a mistake;
 - ``status_age_s``: since the status arrived here [s];
-- ``phase``, ``epoch``, ``run``, ``text``, ``weights_version``, ``delay_s``: as in the message
-  :class:`~bayesrace.messages.Status`;
+- ``phase``, ``epoch``, ``run``, ``text``, ``weights_version``, ``track``, ``delay_s``: as in the
+  message :class:`~bayesrace.messages.Status`;
 - ``rate_hz``: of the loop, null in lockstep;
 - ``state_age_s``: since the process received (controller) or sent (plant) its newest state [s],
   null before the first;
@@ -24,7 +24,7 @@ from typing import Any, Final
 
 from bayesrace.messages import Status
 
-__all__ = ["SOURCES", "Picture", "Process"]
+__all__ = ["SOURCES", "NetworkStatus", "ProcessStatus"]
 
 SOURCES: Final = ("plant", "controller")
 """Processes that a car consists of."""
@@ -34,7 +34,7 @@ _SILENT_S: Final = 1.0
 
 
 @dataclass(frozen=True)
-class Process:
+class ProcessStatus:
     """What is known of a present process."""
 
     status: Status | None = None
@@ -49,7 +49,7 @@ class Process:
         """JSON as in the docstring of this module."""
         status = self.status
         known: dict[str, Any] = dict.fromkeys(
-            ("phase", "epoch", "run", "text", "weights_version", "rate_hz", "state_age_s")
+            ("phase", "epoch", "run", "text", "weights_version", "track", "rate_hz", "state_age_s")
         )
         known |= {"delay_s": None, "counters": None}
         if status is not None:
@@ -66,18 +66,20 @@ class Process:
         }
 
 
-class Picture:
+class NetworkStatus:
     """All cars as known now."""
 
-    def __init__(self, cars: Mapping[str, Mapping[str, Process]]) -> None:
-        self.cars: dict[str, dict[str, Process]] = {car: dict(cars[car]) for car in sorted(cars)}
+    def __init__(self, cars: Mapping[str, Mapping[str, ProcessStatus]]) -> None:
+        self.cars: dict[str, dict[str, ProcessStatus]] = {
+            car: dict(cars[car]) for car in sorted(cars)
+        }
 
     @property
     def answering(self) -> bool:
         """Whether the status of any process is known."""
         return any(one.status for processes in self.cars.values() for one in processes.values())
 
-    def put(self, car: str, source: str, process: Process | None) -> None:
+    def put(self, car: str, source: str, process: ProcessStatus | None) -> None:
         """Update a process; None: it is gone."""
         processes = self.cars.setdefault(car, {})
         if process is None:
@@ -93,7 +95,7 @@ class Picture:
             for source, one in processes.items():
                 if one.status is not None and now_s - one.arrived_s > _SILENT_S:
                     fault = f"no heartbeat for {_SILENT_S:g} s"
-                    processes[source] = Process(None, fault, 0, one.arrived_s)
+                    processes[source] = ProcessStatus(None, fault, 0, one.arrived_s)
 
     def as_json(self, only: str | None = None) -> dict[str, Any]:
         """JSON as in the docstring of this module; ``only``: one car."""
@@ -109,5 +111,5 @@ class Picture:
         }
 
 
-def _json(process: Process | None, now_s: float) -> dict[str, Any] | None:
+def _json(process: ProcessStatus | None, now_s: float) -> dict[str, Any] | None:
     return None if process is None else process.as_json(now_s)
