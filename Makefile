@@ -30,7 +30,7 @@ TOOK = echo "make $@: $$(($$(date +%s) - $(START))) s"
 help:
 	@echo "make race    set up, and drive the whole comparison; leaves runs/DATE-TIME"
 	@echo "make test    set up for testing, and run most tests, in a few minutes"
-	@echo "make check   everything: lint, all tests, coverage; names the tools that it needs"
+	@echo "make check   everything: all tests, lint, coverage; names the tools that it needs"
 	@echo "make lint    ruff, clang-format, mypy, import contracts"
 	@echo "make bench   time the compiled step beside CasADi + IPOPT"
 	@echo "make clean   remove the virtual environment and all caches in this folder"
