@@ -44,9 +44,22 @@ from learning.residual import identity, residual
 from learning.subset import evenly, most_informative
 from learning.target import Target
 
-__all__ = ["MAX_SAMPLES", "MIN_SAMPLES", "Progress", "Training", "TrainingSettings", "fit", "train"]
+__all__ = [
+    "DEFAULT_KERNELS",
+    "MAX_SAMPLES",
+    "MIN_SAMPLES",
+    "Kernel",
+    "Progress",
+    "Training",
+    "TrainingSettings",
+    "fit",
+    "train",
+]
 
-_Kernel = Literal["rbf", "matern05", "matern15", "matern25"]
+Kernel = Literal["rbf", "matern05", "matern15", "matern25"]
+
+DEFAULT_KERNELS: Final[tuple[Kernel, ...]] = ("rbf", "matern25")
+"""Candidates of which held-out errors choose one for each output."""
 
 Progress = Callable[[float, str], None]
 """Called from the training's own thread with the share done (0 to 1) and what was done."""
@@ -64,8 +77,8 @@ class TrainingSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    kernels: tuple[_Kernel, ...] = Field(
-        ("rbf", "matern25"), min_length=1, description="candidates; held-out log density decides"
+    kernels: tuple[Kernel, ...] = Field(
+        DEFAULT_KERNELS, min_length=1, description="candidates; held-out log density decides"
     )
     restarts: int = Field(2, ge=0, le=100, description="further seeded starts per kernel")
     seed: int = Field(0, ge=0)

@@ -149,7 +149,7 @@ class _Race:
         """The next run."""
         self._run += 1
         settings = self.settings
-        limit_s = settings.time_limit * course.line.lap_time_s * settings.laps + 2.0
+        limit_s = settings.limit_s(course.line.lap_time_s)
         lockstep = settings.mode == "lockstep"
         return RunPlan(
             self._run, controller, settings.laps, limit_s, lockstep, settings.start_speed_mps

@@ -80,7 +80,7 @@ def test_the_artefact_describes_itself(kinematic_artefact: Path, car: CarParamet
     manifest = read_manifest(kinematic_artefact)
     settings = BuildSettings()
     assert manifest.discretisation == settings.discretisation.identity("e_kinematic", car)
-    assert (manifest.horizon, manifest.step_s) == (settings.horizon, 0.02)
+    assert (manifest.horizon, manifest.step_s) == (settings.stages, 0.02)
     assert manifest.gp_capacity == settings.gp_capacity
     assert manifest.car == car.name
     assert find_compiler().version == manifest.compiler
