@@ -76,6 +76,14 @@ def test_the_second_build_comes_from_the_cache(cache: Path) -> None:
     assert contents(cache) == [folder]  # nothing temporary is left
 
 
+def test_the_horizon_is_the_cars_unless_it_is_stated(car: CarParameters) -> None:
+    objective = car.tuning.objective.model_copy(update={"horizon": 12})
+    tuning = car.tuning.model_copy(update={"objective": objective})
+    short = car.model_copy(update={"tuning": tuning})
+    assert BuildSettings(car=short).stages == BuildSettings.best_case(short).stages == 12
+    assert BuildSettings(car=short, horizon=10).stages == 10
+
+
 def test_the_artefact_describes_itself(kinematic_artefact: Path, car: CarParameters) -> None:
     manifest = read_manifest(kinematic_artefact)
     settings = BuildSettings()

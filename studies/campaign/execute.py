@@ -21,10 +21,12 @@ from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
 from controller.assembly import compiled_controller
+from controller.path_table import PathTable, make_path_table
 from learning.dataset import concatenate
 from operation.analysis.laps import trajectory_digest
 from operation.closed_loop import ClosedLoop, Driven
 from operation.preparation import (
+    Course,
     PredictionModel,
     Prepared,
     prepare,
@@ -65,7 +67,7 @@ def run_case(task: str, files: Files) -> list[Row]:
             try:
                 rows += runs.drive(controller)
             except Exception as error:  # whatever it is: it must not end the campaign
-                text = " ".join(str(error).split()) or "without a word"
+                text = " ".join(str(error).split()) or "no message"
                 rows.append(
                     {
                         "controller": controller,
@@ -95,6 +97,11 @@ def _prepared(
             models,
             weights=Path(weights) if weights else None,
         )
+
+
+@lru_cache(maxsize=64)
+def _table(course: Course, spacing_m: float) -> PathTable:
+    return make_path_table(course.track, course.line, spacing_m)
 
 
 @lru_cache(maxsize=8)
@@ -160,7 +167,7 @@ class _Runs:
             course.line,
             compiled_controller(
                 files.artefacts[1 if best else 0], car, course.track, course.line, weights,
-                settings.mpc,
+                settings.mpc, table=_table(course, car.tuning.path.spacing_m),
             ),
             _vehicle(settings.true_car.model_dump_json()),
         )  # fmt: skip

@@ -133,9 +133,9 @@ def tune(
         search = _Search(settings, client, {weights: data}, weights)
         with stages.stage("tune") as stage:
             study = _study(settings, storage)
-            while (known := len(study.trials)) < settings.trials:
+            while (known := _finished(study)) < settings.trials:
+                stage.update(known / settings.trials, f"{known} trials")
                 search.batch(study, min(settings.batch, settings.trials - known))
-                stage.update(len(study.trials) / settings.trials, f"{len(study.trials)} trials")
         best = study.best_trial  # the defaults are feasible, so there is one
         tuned = tuned_car(settings.car, best.params)
         with stages.stage("judge on held-out tracks"):
@@ -162,9 +162,13 @@ def _study(settings: TuneSettings, storage: Path) -> optuna.Study:
         study.tell(trial.number, state=optuna.trial.TrialState.FAIL)  # of a killed search
     # Proposals after an interruption must not repeat the first ones.
     study.sampler = optuna.samplers.TPESampler(
-        seed=settings.seed + len(study.trials), multivariate=True
+        seed=settings.seed + _finished(study), multivariate=True
     )
     return study
+
+
+def _finished(study: optuna.Study) -> int:
+    return sum(trial.state.is_finished() for trial in study.get_trials(deepcopy=False))
 
 
 def tuned_car(car: CarParameters, params: Mapping[str, Any]) -> CarParameters:
