@@ -206,6 +206,11 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
     """
     if (out / FILES.log).exists():
         raise InputError(f"{out} holds a run already; choose another folder or remove it")
+    if settings.true_grip != 1:
+        raise InputError(
+            f"true_grip {settings.true_grip:g} is for campaigns: here the car is that of its file; "
+            "give a car with other tyres"
+        )
     find_compiler()  # what is missing is reported now, before there is a run directory
     this = _Race(settings, out, stages)
     for name in (settings.train_track, settings.track):

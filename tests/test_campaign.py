@@ -203,6 +203,30 @@ def test_the_report_is_made_of_the_parquet_files(whole: Path, cli: Cli) -> None:
     refused(cli("campaign-report", whole.parent), "holds no results", "bayesrace campaign")
 
 
+def test_a_case_whose_workers_die_is_a_failed_row_and_reported(tmp_path: Path) -> None:
+    from distributed.scheduler import KilledWorker
+
+    from operation.settings import RaceSettings
+    from studies.campaign.case import Case
+    from studies.campaign.cluster import CampaignError, rows_of
+    from studies.campaign.page import render_campaign
+    from studies.campaign.results import writing
+
+    class Lost:
+        status = "error"
+
+        def __init__(self, error: Exception) -> None:
+            self.exception = lambda: error
+
+    killed = rows_of(Lost(KilledWorker("case", None, 6)), None)
+    assert [row["ended"] for row in killed] == ["failed"]
+    with writing(tmp_path) as results:
+        results.add([Case(RaceSettings()).columns | row for row in killed])
+    assert "each worker that computed this case has died" in render_campaign(tmp_path).read_text()
+    with pytest.raises(CampaignError, match="No module named 'plant'"):
+        rows_of(Lost(ModuleNotFoundError("No module named 'plant'")), None)
+
+
 def test_rows_are_those_of_a_race_over_zenoh(folder: Path, tmp_path: Path) -> None:
     track = folder / "peanut.csv"
     race: Callable[[], Race] = Race.running(

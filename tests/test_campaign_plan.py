@@ -7,11 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights, write_weights
 from bayesrace.vehicles import CarParameters, write_car
+from operation.race import race
 from operation.settings import RaceSettings
+from operation.terminal.progress import stages_on
 from studies.campaign.case import Case, factors
 from studies.campaign.execute import FAILED, run_case
 from studies.campaign.plan import Campaign, read_plan
@@ -134,7 +137,7 @@ def test_a_key_changes_with_all_that_shapes_a_row(
     assert Case(settings).key == Case(RaceSettings()).key
 
 
-def test_every_factor_does_something(car: CarParameters) -> None:
+def test_every_factor_does_something(car: CarParameters, tmp_path: Path) -> None:
     """What a plan may name reaches the car, the controllers or the training."""
     names = set(factors())
     assert names >= {"true_grip", "horizon", "points", "kernels", "raceline.friction", "seed"}
@@ -143,6 +146,9 @@ def test_every_factor_does_something(car: CarParameters) -> None:
     assert settings.true_car.rear.d == 0.5 * car.rear.d
     assert settings.true_car.friction == car.friction
     assert settings.driven_car == car
+    with stages_on(Console(quiet=True)) as stages, pytest.raises(InputError, match="for campaigns"):
+        race(settings, tmp_path / "run", stages)
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_case_travels_as_plain_data_and_for_its_own_software_alone(

@@ -92,10 +92,12 @@ def _compute(
 ) -> Outcome:
     outcome = Outcome()
     for batch in computed(client, left.items(), campaign.files):
-        for key, rows in batch:
+        rows: list[Row] = []
+        for key, own in batch:
             about = left[key].columns
-            results.add([about | row for row in rows])
-            outcome.add(rows)
+            rows += [about | row for row in own]
+            outcome.add(own)
+        results.add(rows)
         shown.update(outcome)
         raise_if_interrupted()
     return outcome

@@ -17,10 +17,10 @@ from distributed import Client, Future, LocalCluster, as_completed
 from distributed.scheduler import KilledWorker
 
 from bayesrace.errors import InputError
-from studies.campaign.case import Case, Files
+from studies.campaign.case import Case, Files, software_identity
 from studies.campaign.execute import FAILED, Row, run_case
 
-__all__ = ["CampaignError", "computed", "connected", "run_worker"]
+__all__ = ["CampaignError", "computed", "connected", "rows_of", "run_worker"]
 
 _PENDING: Final = 1000
 """Cases that the scheduler has at once."""
@@ -46,7 +46,7 @@ def connected(scheduler: str | None, workers: int) -> Iterator[Client]:
 
     Raises InputError if there is no scheduler, or no worker of it within a minute.
     """
-    for name in ("distributed", "bokeh"):
+    for name in ("distributed", "distributed.client", "bokeh"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     with dask.config.set(_QUIET):
         if scheduler is None:
@@ -120,12 +120,13 @@ def computed(
 
     results = as_completed(submitted(_PENDING), with_results=True, raise_errors=False)
     for batch in results.batches():
-        rows = [(future.key.removeprefix("case-"), _rows(future, one)) for future, one in batch]
+        rows = [(future.key.removeprefix("case-"), rows_of(future, one)) for future, one in batch]
         results.update(submitted(len(batch)))
         yield rows
 
 
-def _rows(future: Future, result: Any) -> list[Row]:
+def rows_of(future: Future, result: Any) -> list[Row]:
+    """The rows of a case that is over; CampaignError if no worker can compute."""
     if future.status == "finished":
         rows: list[Row] = result
         return rows
@@ -133,6 +134,6 @@ def _rows(future: Future, result: Any) -> list[Row]:
         raise CampaignError("the scheduler was lost; start the same campaign again to go on")
     error = future.exception()
     if isinstance(error, KilledWorker):
-        died = "the worker died each time that it computed this"
-        return [{"ended": FAILED, "reason": f"{type(error).__name__}: {died}"}]
+        reason = f"{type(error).__name__}: each worker that computed this case has died"
+        return [{"software": software_identity(), "ended": FAILED, "reason": reason}]
     raise CampaignError(f"a worker cannot compute: {type(error).__name__}: {error}")

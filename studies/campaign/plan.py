@@ -187,9 +187,9 @@ class _Reader:
         """A draw depends on its point and its factor alone: what is added to a plan leaves it."""
         for values in itertools.product(*grid.values()):
             point = dict(zip(grid, values, strict=True))
-            told = json.dumps(point, default=lambda car: car.model_dump_json(), sort_keys=True)
+            text = json.dumps(point, default=lambda car: car.model_dump_json(), sort_keys=True)
             for number in range(self._plan.draws):
-                seeds = {name: int(digest([told, name]), 16) for name in drawn}
+                seeds = {name: int(digest([text, name]), 16) for name in drawn}
                 yield point | {
                     name: draw(np.random.default_rng([self._plan.random_seed, number, seeds[name]]))
                     for name, draw in drawn.items()

@@ -1,7 +1,7 @@
 """The results of a campaign: a folder of Parquet, one row a lap, safe against kills.
 
-What workers return is written every second as a small file of its own, whole or not at all.
-When a campaign begins or ends, all of them become one, ``laps.parquet``.
+What workers return at once is written as a small file of its own, whole or not at all. When a
+campaign begins or ends, all of them become one, ``laps.parquet``.
 """
 
 import fcntl
@@ -75,8 +75,6 @@ class Results:
     def __init__(self, folder: Path) -> None:
         """``folder`` exists; see :func:`writing`."""
         self._folder = folder
-        self._pending: list[Row] = []
-        self._written = 0.0
 
     def done(self, again: bool) -> set[str]:
         """Keys of the cases that need not be computed; ``again``: failed ones are."""
@@ -88,25 +86,16 @@ class Results:
         return keys
 
     def add(self, rows: Sequence[Row]) -> None:
-        """All rows of one case; they are on the disk within a second, if more are added."""
-        self._pending += rows
-        if time.monotonic() > self._written + 1.0:
-            self.write()
-
-    def write(self) -> None:
-        """What was added goes to the disk."""
-        if not self._pending:
+        """All rows of some cases; they are on the disk when this returns."""
+        if not rows:
             return
         folder = self._folder / _PARTS
         folder.mkdir(exist_ok=True)
-        table = pa.Table.from_pylist(self._pending, _schema())
+        table = pa.Table.from_pylist(rows, _schema())
         _write(folder / f"{time.time_ns():020d}{_SUFFIX}", table)
-        self._pending.clear()
-        self._written = time.monotonic()
 
     def join(self) -> None:
         """Makes one file of all."""
-        self.write()
         parts = _parts(self._folder)
         if not parts:
             return

@@ -133,8 +133,8 @@ class Laps:
     @property
     def shown(self) -> str:
         """The controller that pairs of settings are shown of."""
-        best = ("bayesrace-updated", "bayesrace")
-        return next((one for one in best if one in self.controllers), self.controllers[0])
+        best = ("bayesrace-updated", "bayesrace", *self.controllers)
+        return next((one for one in best if one in self.controllers), "")
 
     # Factors -----------------------------------------------------------------------------------
 
