@@ -291,8 +291,8 @@ def print_verdict(verdict: Verdict, console: Console) -> None:
         Text(f"on the tuning tracks {100 * verdict.gain:+.2f} % faster than the defaults")
     )
     table = plain_table(
-        "held-out track", "controller", "default\nlap s", "tuned\nlap s", "faster\n%",
-        "default\noff track", "tuned\noff track", left=2,
+        "held-out track", "controller", "default\ns", "tuned\ns", "faster\n%", "default\noff",
+        "tuned\noff", left=2,
     )  # fmt: skip
     for one in verdict.judged:
         share = 100 * (1 - one.tuned.time_s / one.default.time_s)
@@ -301,7 +301,10 @@ def print_verdict(verdict: Verdict, console: Console) -> None:
             f"{share:+.2f}", str(one.default.off_track), str(one.tuned.off_track),
         )  # fmt: skip
     console.print(table)
+    console.print(
+        Text("s: mean of standing and flying lap; off: samples off the track", style="dim")
+    )
     before, after = verdict.off_track
-    text = f"{100 * verdict.held_out_gain:+.2f} % faster, samples off track {before} → {after}"
-    winner = "the tuned car wins" if verdict.wins else "the defaults stay ahead"
-    console.print(Text(f"on held-out tracks {winner}: {text}"))
+    found = f"{100 * verdict.held_out_gain:+.2f} % faster, samples off track {before} → {after}"
+    winner = "the tuned car wins" if verdict.wins else "the defaults win"
+    console.print(Text(f"held-out tracks: {found}: {winner}"))
