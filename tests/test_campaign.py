@@ -32,7 +32,13 @@ mpc.margin_m = [0.005, 0.01, 0.015]
 true_grip = [0.95, 1.0]
 """
 CASES, LAPS = 6, 12
-FAILING = '[grid]\ntrack = "peanut.csv"\nraceline.margin_m = [0.02, 0.5, 0.6]\n'
+FAILING = """
+controllers = ["worstcase", "bayesrace"]
+weights = "weights.bin"
+[grid]
+track = "peanut.csv"
+raceline.margin_m = [0.02, 0.5, 0.6]
+"""
 
 
 @pytest.fixture(scope="module")
@@ -172,7 +178,7 @@ def test_workers_elsewhere_compute_for_a_scheduler(folder: Path, whole: Path) ->
 
 
 def test_a_failed_case_says_why_and_is_computed_again_when_asked(folder: Path) -> None:
-    (folder / "failing.toml").write_text(f"controllers = ['worstcase', 'bestcase']\n{FAILING}")
+    (folder / "failing.toml").write_text(FAILING)
     out = folder / "failing"
     done = run("campaign", folder / "failing.toml", "--out", out, "--workers", "1")
     assert done.returncode == 0, done.stderr
@@ -180,7 +186,7 @@ def test_a_failed_case_says_why_and_is_computed_again_when_asked(folder: Path) -
     assert "2 failed" in done.stdout
     before = rows(out)
     failed = [row for row in before if row["ended"] == "failed"]
-    assert [row["controller"] for row in failed] == ["bestcase", "worstcase"] * 2
+    assert [row["controller"] for row in failed] == ["bayesrace", "worstcase"] * 2
     assert all("margin" in row["reason"] for row in failed)
     page = (out / "report.html").read_text()
     assert "2 × worstcase" in page
