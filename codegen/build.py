@@ -117,7 +117,7 @@ def generate(problem: "Problem", settings: BuildSettings, folder: Path) -> None:
     (folder / "br_config.h").write_text(
         "/* generated: dimensions of this controller */\n"
         "#ifndef BR_CONFIG_H\n#define BR_CONFIG_H\n"
-        f"#define BR_N {settings.horizon}\n"
+        f"#define BR_N {settings.stages}\n"
         f"#define BR_TS {settings.discretisation.step_s!r}\n"
         f"#define BR_GP_CAPACITY {settings.gp_capacity}\n"
         f'#define BR_MODEL_NAME "{settings.model}"\n'
@@ -252,7 +252,7 @@ def _manifest(
         car=car.name,
         car_digest=car.digest(),
         discretisation=_model_identity(settings),
-        horizon=settings.horizon,
+        horizon=settings.stages,
         step_s=settings.discretisation.step_s,
         gp_capacity=settings.gp_capacity,
         casadi=version("casadi"),

@@ -20,10 +20,25 @@ class BuildSettings(BaseModel):
         "e_kinematic", description="model the OCP predicts with; dynamic is BestCase"
     )
     discretisation: Discretisation = Field(PREDICTION, description="scheme, step, sub-steps")
-    horizon: int = Field(20, ge=2, le=100, description="stages N")
+    horizon: int | None = Field(
+        None, ge=2, le=100, description="stages N; the car's, from its tuning, without"
+    )
     gp_capacity: int = Field(1024, ge=8, le=16384, description="training points per output")
 
+    @property
+    def stages(self) -> int:
+        """The horizon, resolved."""
+        return self.horizon or self.car.tuning.objective.horizon
+
     @classmethod
-    def best_case(cls, car: str | CarParameters = DEFAULT_CAR) -> "BuildSettings":
+    def best_case(
+        cls, car: str | CarParameters = DEFAULT_CAR, horizon: int | None = None
+    ) -> "BuildSettings":
         """The controller with the perfect model, for comparison and validation only."""
-        return cls(car=get_car(car), model="dynamic", discretisation=PERFECT, gp_capacity=8)
+        return cls(
+            car=get_car(car),
+            model="dynamic",
+            discretisation=PERFECT,
+            horizon=horizon,
+            gp_capacity=8,
+        )

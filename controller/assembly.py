@@ -13,7 +13,7 @@ from bayesrace.tracks import Track, load_track
 from bayesrace.vehicles import CarParameters
 from controller.mpc import PredictiveController
 from controller.native_step import NativeStep, pack_weights
-from controller.path_table import make_path_table
+from controller.path_table import PathTable, make_path_table
 from controller.settings import MpcSettings
 from controller.weights.adoption import WeightsPort
 from controller.weights.store import AcceptedWeights, History, Store, digest_of
@@ -41,14 +41,16 @@ def compiled_controller(
     line: RaceLine,
     weights: GpWeights | None = None,
     settings: MpcSettings | None = None,
+    *,
+    table: PathTable | None = None,
 ) -> PredictiveController:
     """The compiled controller of ``artefact`` on a track, ready to drive; without ``weights`` it
-    predicts by the uncorrected model.
+    predicts by the uncorrected model. ``table``: of track and line, where it is known already.
 
     Raises InputError if artefact, car, line or weights do not fit together.
     """
     step = NativeStep(artefact, car, settings or MpcSettings())
-    step.set_path(make_path_table(track, line, car.tuning.path.spacing_m))
+    step.set_path(table or make_path_table(track, line, car.tuning.path.spacing_m))
     if weights is not None:
         step.set_weights(weights)
     version = "" if weights is None else weights.version

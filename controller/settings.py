@@ -53,7 +53,7 @@ class MpcSettings(BaseModel):
 
     def parameters(self, car: CarParameters) -> dict[str, float]:
         """Run-time parameters of the tracking problem and settings of its solver, by name."""
-        values = car.tuning.objective.model_dump()
+        values = car.tuning.objective.model_dump(exclude={"horizon"})
         values |= self.model_dump(exclude={"constraints"}, exclude_none=True)
         if not self.constraints:
             values["s_slack"] = 0.0

@@ -23,7 +23,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -38,15 +38,22 @@ from learning.assessment import ChoiceScore, KernelScore, choice_scores, choose_
 from learning.dataset import Dataset, left_out
 from learning.folds import spans, stretches
 from learning.hyperparameters import TOLERANCE, Fit, maximise, starts
+from learning.kernels import DEFAULT_KERNELS, Kernel
 from learning.likelihood import PairDistances
 from learning.posterior import regressor
 from learning.residual import identity, residual
 from learning.subset import evenly, most_informative
 from learning.target import Target
 
-__all__ = ["MAX_SAMPLES", "MIN_SAMPLES", "Progress", "Training", "TrainingSettings", "fit", "train"]
-
-_Kernel = Literal["rbf", "matern05", "matern15", "matern25"]
+__all__ = [
+    "MAX_SAMPLES",
+    "MIN_SAMPLES",
+    "Progress",
+    "Training",
+    "TrainingSettings",
+    "fit",
+    "train",
+]
 
 Progress = Callable[[float, str], None]
 """Called from the training's own thread with the share done (0 to 1) and what was done."""
@@ -64,8 +71,8 @@ class TrainingSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    kernels: tuple[_Kernel, ...] = Field(
-        ("rbf", "matern25"), min_length=1, description="candidates; held-out log density decides"
+    kernels: tuple[Kernel, ...] = Field(
+        DEFAULT_KERNELS, min_length=1, description="candidates; held-out log density decides"
     )
     restarts: int = Field(2, ge=0, le=100, description="further seeded starts per kernel")
     seed: int = Field(0, ge=0)

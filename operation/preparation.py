@@ -192,6 +192,7 @@ def training_drive(
             track.width_right_m.tobytes(),
             track.width_left_m.tobytes(),
             car.model_dump_json(),
+            settings.true_car.model_dump_json(),
             pursuit.model_dump_json(),
             f"{settings.drive_s!r} {settings.start_speed_mps!r} {len(files)}",
             *(read_whole(path, "the FMU or its map", _LARGEST_FMU) for path in files),
@@ -202,8 +203,8 @@ def training_drive(
     path = cache_folder() / f"drive-{identity}.mcap"
 
     def make(partial: Path) -> None:
-        fmu = settings.fmu, settings.fmu_map
-        with open_vehicle(car, *fmu, 1 / PLANT.step_s, compiled) as vehicle:
+        true_car, files = settings.true_car, (settings.fmu, settings.fmu_map)
+        with open_vehicle(true_car, *files, 1 / PLANT.step_s, compiled) as vehicle:
             collect(
                 track, prepared.line, car, artefact, partial, settings.drive_s, pursuit,
                 settings.start_speed_mps, vehicle,
@@ -222,7 +223,12 @@ def training_drive(
 
 def training_settings(settings: PreparationSettings) -> TrainingSettings:
     """How weights are learned."""
-    return TrainingSettings(capacity=settings.points, seed=settings.seed)
+    return TrainingSettings(
+        kernels=settings.kernels,
+        capacity=settings.points,
+        seed=settings.seed,
+        threads=settings.threads,
+    )
 
 
 def training_samples(settings: PreparationSettings) -> Dataset:
@@ -245,7 +251,7 @@ def trained_weights(
         [
             samples.digest(),
             discretisation.model_dump_json(),
-            settings.model_dump_json(),
+            settings.model_dump_json(exclude={"threads"}),
             b"" if initial is None else encode_weights(replace(initial, created_utc_ns=0)),
             cpu_identity(),
             *software(_WEIGHTS_SOURCES, ("casadi", "numpy", "scipy", "scikit-learn")),
@@ -263,7 +269,11 @@ def trained_weights(
 
 def _artefact(settings: PreparationSettings, model: PredictionModel) -> Path:
     """Folder of the controller that predicts with this model."""
-    wanted = BuildSettings(car=settings.driven_car, discretisation=settings.discretisation)
     if model == "dynamic":
-        wanted = BuildSettings.best_case(settings.driven_car)
+        return build(BuildSettings.best_case(settings.true_car, settings.horizon))[0]
+    wanted = BuildSettings(
+        car=settings.driven_car,
+        discretisation=settings.discretisation,
+        horizon=settings.horizon,
+    )
     return build(wanted)[0]

@@ -149,7 +149,7 @@ class _Race:
         """The next run."""
         self._run += 1
         settings = self.settings
-        limit_s = settings.time_limit * track.line.lap_time_s * settings.laps + 2.0
+        limit_s = settings.limit_s(track.line.lap_time_s)
         lockstep = settings.mode == "lockstep"
         return RunPlan(
             self._run, controller, settings.laps, limit_s, lockstep, settings.start_speed_mps
@@ -208,6 +208,11 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
     """
     if (out / FILES.log).exists():
         raise InputError(f"{out} holds a run already; choose another folder or remove it")
+    if settings.true_grip != 1:
+        raise InputError(
+            f"true_grip {settings.true_grip:g} is for campaigns: here the car is that of its file; "
+            "give a car with other tyres"
+        )
     find_compiler()  # what is missing is reported now, before there is a run directory
     this = _Race(settings, out, stages)
     for name in (settings.train_track, settings.track):

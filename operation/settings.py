@@ -11,6 +11,7 @@ from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK
 from bayesrace.vehicles import CarParameters, CarSetting, default_car
 from controller.pure_pursuit import PurePursuitSettings
 from controller.settings import MpcSettings
+from learning.kernels import DEFAULT_KERNELS, Kernel
 from plant.simulator import PLANT
 
 __all__ = ["PreparationSettings", "RaceSettings"]
@@ -29,12 +30,28 @@ class PreparationSettings(BaseModel):
         None, description="FMU that simulates the car; the built-in car without"
     )
     fmu_map: Path | None = Field(None, description="how the FMU's variables are ours (TOML)")
+    true_grip: float = Field(
+        1.0,
+        gt=0,
+        le=3,
+        description="tyre forces of the simulated car, as a multiple of those in its file, "
+        "which all controllers but BestCase assume",
+    )
     seed: int = Field(0, ge=0, description="of the training drive and of the GP's starts")
     start_speed_mps: float = Field(0.1, ge=0, le=5, description="speed at the start line")
     collect_s: float | None = Field(
         None, ge=1, le=3600, description="length of the training drive [s]; None: the car's tuning"
     )
     points: int = Field(400, ge=20, le=1024, description="training points per output")
+    kernels: tuple[Kernel, ...] = Field(
+        DEFAULT_KERNELS, min_length=1, description="candidates of the GPs; held-out errors decide"
+    )
+    threads: int = Field(
+        0, ge=0, description="of the training, which they do not change; 0: one per core"
+    )
+    horizon: int | None = Field(
+        None, ge=2, le=100, description="stages of the OCP; None: the car's, from its tuning"
+    )
     discretisation: Discretisation = PREDICTION
     raceline: RaceLineSettings = RaceLineSettings()
     pursuit: PurePursuitSettings = PurePursuitSettings()
@@ -44,6 +61,28 @@ class PreparationSettings(BaseModel):
         """With the friction that the line is asked for: the controller must assume the same."""
         grip = self.raceline.friction
         return self.car if grip is None else self.car.model_copy(update={"friction": grip})
+
+    @property
+    def true_car(self) -> CarParameters:
+        """What the plant simulates and BestCase knows: the driven car with its true tyres."""
+        car = self.driven_car
+        if self.true_grip == 1:
+            return car
+        peaks = {
+            name: tyre.model_copy(update={"d": self.true_grip * tyre.d})
+            for name, tyre in (("front", car.front), ("rear", car.rear))
+        }
+        return car.model_copy(update=peaks)
+
+    @model_validator(mode="after")
+    def _simulated(self) -> Self:
+        """An FMU has its own tyres."""
+        if self.fmu is not None and self.true_grip != 1:
+            raise ValueError(
+                f"true_grip {self.true_grip:g} is for the built-in car, and {self.fmu} simulates "
+                "the car: leave one of them out"
+            )
+        return self
 
     @property
     def drive_s(self) -> float:
@@ -63,6 +102,10 @@ class RaceSettings(PreparationSettings):
         3.0, gt=1, description="a run ends at this multiple of the racing line's time"
     )
     mpc: MpcSettings = MpcSettings()
+
+    def limit_s(self, line_lap_s: float) -> float:
+        """When a run ends at the latest, on a line whose flying lap takes ``line_lap_s``."""
+        return self.time_limit * line_lap_s * self.laps + 2.0
 
     @model_validator(mode="after")
     def _resolve(self) -> Self:

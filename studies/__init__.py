@@ -1,1 +1,1 @@
-"""What is measured with the parts: execution times and latencies."""
+"""What is measured with the parts: execution times, latencies, laps by the thousand."""

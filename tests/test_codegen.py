@@ -78,11 +78,19 @@ def test_the_second_build_comes_from_the_cache(cache: Path) -> None:
     assert contents(cache) == [folder]  # nothing temporary is left
 
 
+def test_the_horizon_is_the_cars_unless_it_is_stated(car: CarParameters) -> None:
+    objective = car.tuning.objective.model_copy(update={"horizon": 12})
+    tuning = car.tuning.model_copy(update={"objective": objective})
+    short = car.model_copy(update={"tuning": tuning})
+    assert BuildSettings(car=short).stages == BuildSettings.best_case(short).stages == 12
+    assert BuildSettings(car=short, horizon=10).stages == 10
+
+
 def test_the_artefact_describes_itself(kinematic_artefact: Path, car: CarParameters) -> None:
     manifest = read_manifest(kinematic_artefact)
     settings = BuildSettings()
     assert manifest.discretisation == settings.discretisation.identity("e_kinematic", car)
-    assert (manifest.horizon, manifest.step_s) == (settings.horizon, 0.02)
+    assert (manifest.horizon, manifest.step_s) == (settings.stages, 0.02)
     assert manifest.gp_capacity == settings.gp_capacity
     assert manifest.car == car.name
     assert find_compiler().version == manifest.compiler

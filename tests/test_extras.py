@@ -48,6 +48,15 @@ def test_the_controller_drives_with_its_own_extra_alone(
     assert end.data["reason"] == "laps"
 
 
+def test_a_missing_package_of_campaigns_is_named_with_its_extra(
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for name in ("page", "summary", "figures", "results"):
+        monkeypatch.delitem(sys.modules, f"studies.campaign.{name}", raising=False)
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    refused(cli("campaign-report", tmp_path), "pyarrow", "bayesrace[campaign]")
+
+
 def test_a_missing_package_is_named_with_the_extra_that_brings_it(
     cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:

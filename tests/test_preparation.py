@@ -90,6 +90,7 @@ def test_the_training_drive_is_kept_for_all_that_shapes_it(preparing: Preparing)
     for changes in (
         {},
         {"seed": 1},
+        {"true_grip": 0.9},
         {"collect_s": 2.5},
         {"start_speed_mps": 0.2},
         {"train_track": "random:3"},
@@ -99,7 +100,7 @@ def test_the_training_drive_is_kept_for_all_that_shapes_it(preparing: Preparing)
         prepared, _ = preparing(**changes)
         assert prepared.training is not None
         logs.add(prepared.training.log)
-    assert len(logs) == 7
+    assert len(logs) == 8
 
 
 def test_a_damaged_training_drive_is_driven_again(preparing: Preparing) -> None:

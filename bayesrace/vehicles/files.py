@@ -258,5 +258,5 @@ def _line(model: BaseModel, name: str) -> str:
         text = ", ".join(f"{key} = {number!r}" for key, number in value)
         text = f"{{ {text} }}"
     else:
-        text = repr(float(value))
+        text = repr(value)
     return f"{name} = {text}  # {type(model).model_fields[name].description}"

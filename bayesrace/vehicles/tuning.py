@@ -53,12 +53,13 @@ def scaled(reference: float, dimension: tuple[float, float], scales: Scales) -> 
     return float(reference * scales[0] ** dimension[0] * scales[1] ** dimension[1])
 
 
-def _number(reference: float, dimension: tuple[float, float], text: str) -> Any:
+def _number(reference: float, dimension: tuple[float, float], text: str, **bounds: float) -> Any:
     length, acceleration = dimension
     extra: dict[str, Any] = {
         "reference": reference, "length": length, "acceleration": acceleration
     }  # fmt: skip
-    return Field(gt=0, description=text, json_schema_extra=extra)
+    limits: dict[str, Any] = {**bounds} or {"gt": 0}
+    return Field(description=text, json_schema_extra=extra, **limits)
 
 
 class _Section(BaseModel):
@@ -161,13 +162,14 @@ class ScaleTuning(_Section):
 
 
 class ObjectiveTuning(_Section):
-    """Weights of the OCP's cost, where its settings state none."""
+    """Weights, margin and stages of the OCP, where its settings state none."""
 
     q_position: float = _number(1.0, (-2.0, 0.0), "Q: squared position error [1/m^2]")
     r_duty: float = _number(0.002, NONE, "R: squared change of the duty cycle [1]")
     r_delta_rate: float = _number(3e-5, (1.0, -1.0), "R: squared steering rate [s^2/rad^2]")
     s_slack: float = _number(100.0, (-2.0, 0.0), "S: squared track violation [1/m^2]")
     margin_m: float = _number(0.01, LENGTH, "distance kept from the track edges [m]")
+    horizon: int = _number(20, NONE, "stages that the OCP looks ahead [-]", ge=2, le=100)
 
 
 class PursuitTuning(_Section):

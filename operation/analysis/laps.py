@@ -1,5 +1,6 @@
 """Where a car was in truth, and its lap times."""
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,7 +13,7 @@ from bayesrace.arrays import Floats
 from bayesrace.messages import Truth
 from bayesrace.tracks import StartLine, Track
 
-__all__ = ["LapTimes", "Trajectory", "time_laps"]
+__all__ = ["LapTimes", "Trajectory", "time_laps", "trajectory_digest"]
 
 
 SHORT_CUT: Final = 0.15
@@ -84,3 +85,12 @@ def time_laps(track: Track, time_s: Floats, xy: Floats, s_m: Floats) -> LapTimes
         ends.append(before_s + crossing.fraction * (float(time_s[k]) - before_s))
         after.append(k)
     return LapTimes(tuple(np.diff(ends).tolist()), tuple(after), cut_at)
+
+
+def trajectory_digest(x: Floats, laps: LapTimes) -> str:
+    """sha256 of the states (n, 7) up to the first sample after the last counted crossing.
+
+    Of all states where no lap was finished.
+    """
+    states = x[: laps.after[-1] + 1] if laps.after else x
+    return hashlib.sha256(states.astype("<f8", order="C").tobytes()).hexdigest()

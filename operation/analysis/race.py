@@ -4,7 +4,6 @@ Everything is computed from the messages in ``run.mcap`` and from the track, rac
 beside it; nothing is taken over from the processes that were running.
 """
 
-import hashlib
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -24,7 +23,7 @@ from bayesrace.tracks.spline import PlaneSpline
 from learning.dataset import Dataset
 from learning.logs import dataset_from_messages, fallback_cycles
 from learning.validation import Validation, validate
-from operation.analysis.laps import time_laps
+from operation.analysis.laps import time_laps, trajectory_digest
 from operation.analysis.recording import PlannedRun, Recording, RunRecord, read_recording
 from operation.analysis.results import (
     GpMetrics,
@@ -114,8 +113,7 @@ class DrivenRun:
 
     def digest(self) -> str:
         """sha256 of the trajectory up to the first sample after the last counted crossing."""
-        states = self.record.x[: self.laps.after[-1] + 1] if self.finished else self.record.x
-        return hashlib.sha256(states.astype("<f8", order="C").tobytes()).hexdigest()
+        return trajectory_digest(self.record.x, self.laps)
 
     def result(self) -> LapResult:
         """The run in numbers."""

@@ -14,7 +14,16 @@ from pydantic import ValidationError
 from bayesrace import __version__
 from bayesrace.errors import InputError, faults_in
 from bayesrace.interrupts import remembering_interrupts
-from operation.cli import evaluation, fmu, latency, learning, operation, parts, preparation
+from operation.cli import (
+    campaign,
+    evaluation,
+    fmu,
+    latency,
+    learning,
+    operation,
+    parts,
+    preparation,
+)
 
 __all__ = ["app", "main"]
 
@@ -26,7 +35,8 @@ _RACE_PACKAGES: Final = (
     "casadi", "hdrh", "jinja2", "lz4", "matplotlib", "mcap", "rich", "scipy", "sklearn",
     "threadpoolctl", "zstandard",
 )  # fmt: skip
-"""Modules that the extras ``fmu`` and ``race`` of pyproject.toml install."""
+_CAMPAIGN_PACKAGES: Final = ("bokeh", "dask", "distributed", "optuna", "pyarrow")
+"""Modules that the extras ``fmu``, ``race`` and ``campaign`` of pyproject.toml install."""
 
 _TASKS: Final[dict[str, tuple[Callable[..., None], ...]]] = {
     "Race": (evaluation.race, evaluation.report),
@@ -40,6 +50,9 @@ _TASKS: Final[dict[str, tuple[Callable[..., None], ...]]] = {
     ),
     "Learn while driving": (learning.learn, learning.publish, learning.rollback),
     "Measure": (evaluation.bench, latency.latency),
+    "Many laps": (
+        campaign.campaign, campaign.campaign_report, campaign.campaign_worker, campaign.tune,
+    ),
     "Export to other tools": (preparation.export,),
 }  # fmt: skip
 
@@ -127,9 +140,10 @@ def _in_words(error: Exception) -> str | None:
 
 def _missing(package: str) -> str | None:
     """What to install for a package; None if no extra brings it."""
-    if package not in (*_FMU_PACKAGES, *_RACE_PACKAGES):
+    extras = {"fmu": _FMU_PACKAGES, "race": _RACE_PACKAGES, "campaign": _CAMPAIGN_PACKAGES}
+    extra = next((name for name, packages in extras.items() if package in packages), None)
+    if extra is None:
         return None
-    extra = "fmu" if package in _FMU_PACKAGES else "race"
     return f"this command needs {package}, which is not installed: pip install 'bayesrace[{extra}]'"
 
 

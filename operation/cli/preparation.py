@@ -303,8 +303,11 @@ def build(
         typer.Option(metavar="MODEL", help="Prediction model: e_kinematic or dynamic."),
     ] = PredictionModel.e_kinematic,
     horizon: Annotated[
-        int, typer.Option(metavar="N", min=2, max=100, help="Stages of the horizon.")
-    ] = 20,
+        int | None,
+        typer.Option(
+            metavar="N", min=2, max=100, show_default="the car's", help="Stages of the horizon."
+        ),
+    ] = None,
     gp_capacity: Annotated[
         int, typer.Option(metavar="N", min=8, max=16384, help="Most points per output.")
     ] = 1024,

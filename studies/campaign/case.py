@@ -1,0 +1,171 @@
+"""One case of a campaign: settings, and who drives with them; as plain data where it travels."""
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Final, Literal, get_args
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from bayesrace.cache import cache_folder, digest, software
+from bayesrace.files import read_whole, write_whole
+from bayesrace.vehicles import CarParameters
+from operation.settings import RaceSettings
+
+__all__ = [
+    "CONTROLLERS",
+    "Case",
+    "Controller",
+    "Files",
+    "car_identity",
+    "factors",
+    "named_file",
+    "nested",
+    "software_identity",
+]
+
+Controller = Literal["worstcase", "bayesrace", "bayesrace-updated", "bestcase"]
+CONTROLLERS: Final[tuple[Controller, ...]] = get_args(Controller)
+
+_FIXED: Final = (
+    *("mode", "fmu", "fmu_map", "threads"),
+    *("discretisation.step_s", "pursuit.step_s", "pursuit.seed"),
+)
+"""Settings that a campaign does not vary: it drives the built-in car in lockstep, in the plant's
+period, and ``seed`` is the one seed."""
+
+_SOURCES: Final = (
+    "bayesrace", "bayesrace/gp", "bayesrace/messages", "bayesrace/raceline", "bayesrace/tracks",
+    "bayesrace/vehicles", "codegen", "codegen/problems", "controller", "controller/native",
+    "learning", "plant", "operation/analysis/laps.py", "operation/closed_loop.py",
+    "operation/collect.py", "operation/drive.py", "operation/preparation.py",
+    "operation/settings.py", "studies/campaign/execute.py",
+)  # fmt: skip
+_PACKAGES: Final = ("casadi", "mcap", "numpy", "scipy", "scikit-learn")
+
+
+@cache
+def software_identity() -> str:
+    """Digest of the code and the libraries that shape a result."""
+    return digest(software(_SOURCES, _PACKAGES))
+
+
+@cache
+def factors() -> dict[str, FieldInfo]:
+    """Every setting that a plan may vary, by its dotted name."""
+    return {name: field for name, field in _fields(RaceSettings, "") if name not in _FIXED}
+
+
+def _fields(form: type[BaseModel], before: str) -> Iterator[tuple[str, FieldInfo]]:
+    for name, field in form.model_fields.items():
+        inner = field.annotation
+        if name != "car" and isinstance(inner, type) and issubclass(inner, BaseModel):
+            yield from _fields(inner, f"{before}{name}.")
+        else:
+            yield before + name, field
+
+
+def nested(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values by dotted names as the nested data that settings are made of."""
+    result: dict[str, Any] = {}
+    for name, value in values.items():
+        *path, last = name.split(".")
+        place = result
+        for part in path:
+            place = place.setdefault(part, {})
+        place[last] = value
+    return result
+
+
+def flat(settings: RaceSettings) -> dict[str, Any]:
+    """The value of every factor by its dotted name; the car by its own."""
+    values: dict[str, Any] = {}
+    for name in factors():
+        value: Any = settings
+        for part in name.split("."):
+            value = getattr(value, part)
+        values[name] = value
+    return values | {"car": settings.car.name, "kernels": "+".join(settings.kernels)}
+
+
+def car_identity(car: CarParameters) -> str:
+    """Name and digest of all its values; those of :attr:`CarParameters.identity` are fewer."""
+    return f"{car.name}-{digest([car.model_dump_json()])}"
+
+
+Files = dict[str, bytes]
+"""Content of the files that a plan names, by ``DIGEST/NAME``."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """Settings and controllers; files by their names in :data:`Files`."""
+
+    settings: RaceSettings
+    controllers: tuple[Controller, ...] = CONTROLLERS
+    weights: str = ""
+    """Weights that are driven with in place of learned ones; empty without."""
+
+    @property
+    def key(self) -> str:
+        """Changes with everything that shapes the result, but for the CPU that computes it."""
+        settings = self.settings.model_dump_json(exclude={"threads"})
+        return digest([settings, *self.controllers, "", self.weights, software_identity()])
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        """What all rows of the case share: its key, every factor, and the whole settings."""
+        settings = self.settings
+        return {
+            "key": self.key,
+            **flat(settings),
+            "car_identity": car_identity(settings.car),
+            "settings": settings.model_dump_json(exclude={"car", "threads", "fmu", "fmu_map"}),
+        }
+
+    def task(self) -> str:
+        """The case as JSON, with the identity of the software that is to compute it."""
+        return json.dumps(
+            {
+                "settings": self.settings.model_dump(mode="json"),
+                "controllers": self.controllers,
+                "weights": self.weights,
+                "software": software_identity(),
+            }
+        )
+
+    @classmethod
+    def of_task(cls, task: str, files: Files) -> "Case":
+        """The case, with its files written where this machine's cache is.
+
+        Raises RuntimeError if it was made by another version of the software.
+        """
+        data = json.loads(task)
+        if data["software"] != software_identity():
+            raise RuntimeError("this worker runs another version of bayesrace or its libraries")
+        settings = data["settings"]
+        for name in ("track", "train_track"):
+            settings[name] = _placed(settings[name], files)
+        weights = _placed(data["weights"], files)
+        # Workers share the processors: each trains in one thread.
+        settings["threads"] = 1
+        return cls(RaceSettings.model_validate(settings), tuple(data["controllers"]), weights)
+
+
+def _placed(name: str, files: Files) -> str:
+    """Where this machine has the file of that name; what names no file stays as it is."""
+    if name not in files:
+        return name
+    path = cache_folder() / "campaign" / name
+    if not path.exists() or read_whole(path, "a file of the campaign") != files[name]:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, files[name])
+    return str(path)
+
+
+def named_file(path: Path, data: bytes) -> str:
+    """The name of a file in :data:`Files`."""
+    return f"{digest([data])}/{path.name}"
