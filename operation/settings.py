@@ -7,7 +7,6 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.raceline import RaceLineSettings
-from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK
 from bayesrace.vehicles import CarParameters, CarSetting, default_car
 from controller.pure_pursuit import PurePursuitSettings
 from controller.settings import MpcSettings
@@ -23,7 +22,7 @@ class PreparationSettings(BaseModel):
 
     car: CarSetting = Field(default_factory=default_car)
     train_track: str = Field(
-        DEFAULT_TRAINING_TRACK, description="training track: name, random:SEED or CSV file"
+        "", description="training track: name, random:SEED or CSV file; empty: the car's"
     )
     fmu: Path | None = Field(None, description="FMU that plays the car; the built-in car without")
     fmu_map: Path | None = Field(None, description="how the FMU's variables are ours (TOML)")
@@ -36,6 +35,12 @@ class PreparationSettings(BaseModel):
     discretisation: Discretisation = PREDICTION
     raceline: RaceLineSettings = RaceLineSettings()
     pursuit: PurePursuitSettings = PurePursuitSettings()
+
+    @model_validator(mode="after")
+    def _of_the_car(self) -> Self:
+        """What is not stated and the car knows."""
+        object.__setattr__(self, "train_track", self.train_track or self.car.train_track)
+        return self
 
     @property
     def driven_car(self) -> CarParameters:
@@ -52,7 +57,9 @@ class PreparationSettings(BaseModel):
 class RaceSettings(PreparationSettings):
     """Settings of ``bayesrace race``; defaults are the shown run."""
 
-    track: str = Field(DEFAULT_RACE_TRACK, description="race track: name, random:SEED or CSV file")
+    track: str = Field(
+        "", description="race track: name, random:SEED or CSV file; empty: the car's"
+    )
     laps: int = Field(
         2, ge=1, le=100, description="laps a controller drives: one from standstill, then flying"
     )
@@ -72,4 +79,5 @@ class RaceSettings(PreparationSettings):
             raise ValueError(f"all parts must share the plant's period of {PLANT.step_s} s")
         seeded = self.pursuit.model_copy(update={"seed": self.seed})
         object.__setattr__(self, "pursuit", seeded)
+        object.__setattr__(self, "track", self.track or self.car.race_track)
         return self

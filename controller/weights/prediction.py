@@ -97,17 +97,10 @@ class OneStepModel:
 def plausible_samples(car: CarParameters, step_s: float, count: int) -> list[Sample]:
     """States and inputs over the whole range of the car, always the same ones."""
     vx, slip, turn, steer, push, rate = np.random.default_rng(5).uniform(-1, 1, (count, 6)).T
-    vx = 0.5 * (vx + 1) * _top_speed_mps(car)
+    vx = 0.5 * (vx + 1) * car.drive.top_speed_mps(car.d_max)
     omega = turn * vx * np.tan(car.delta_max_rad) / car.wheelbase_m
     pose, delta = np.zeros((count, 3)), steer * car.delta_max_rad
     x = np.column_stack([pose, vx, 0.3 * slip * vx, omega, delta])
     d = car.d_min + 0.5 * (push + 1) * (car.d_max - car.d_min)
     u = np.column_stack([d, rate * car.delta_rate_max_radps])
     return [Sample(0, step_s, x[k], u[k], x[k]) for k in range(count)]
-
-
-def _top_speed_mps(car: CarParameters) -> float:
-    """Where drive and resistance are equal: (cm1 - cm2 v) d_max = cr0 + cr2 v^2."""
-    a, b, c = car.cr2, car.cm2 * car.d_max, car.cr0 - car.cm1 * car.d_max
-    roots = np.roots([a, b, c]) if a else np.array([-c / b])
-    return max((float(v.real) for v in roots if abs(v.imag) < 1e-9 < v.real), default=1.0)

@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from bayesrace.files import write_whole
-from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK
 from bayesrace.vehicles import DEFAULT_CAR
 from operation.cli.options import (
     Car,
@@ -40,10 +39,13 @@ TimeMode = Annotated[
 
 def race(
     car: Car = DEFAULT_CAR,
-    track: TrackName = DEFAULT_RACE_TRACK,
+    track: TrackName = "",
     train_track: Annotated[
-        str, typer.Option(metavar="TRACK", help="Track of the training drive.")
-    ] = DEFAULT_TRAINING_TRACK,
+        str,
+        typer.Option(
+            metavar="TRACK", show_default="the car's", help="Track of the training drive."
+        ),
+    ] = "",
     laps: Annotated[
         int,
         typer.Option(metavar="N", min=1, max=100, help="Laps per controller, the first from rest."),
@@ -118,7 +120,7 @@ def report(
 
 
 def drive(
-    track: TrackName = DEFAULT_RACE_TRACK,
+    track: TrackName = "",
     laps: Annotated[
         int, typer.Option(metavar="N", min=1, help="Laps to drive, the first from rest.")
     ] = 2,
@@ -142,7 +144,7 @@ def drive(
     from operation.drive import RunPlan, execute
 
     parameters = get_car(car)
-    course = load_track(track, parameters.width_m)
+    course = load_track(track or parameters.race_track, parameters.width_m)
     name = name or parameters.name
     about = {"drive": {"car": car_text(parameters), "track": course.name}}
     with (

@@ -46,7 +46,12 @@ Seed = Annotated[
     ),
 ]
 TrackName = Annotated[
-    str, typer.Option(metavar="TRACK", help="Built-in name, random:SEED or CSV file.")
+    str,
+    typer.Option(
+        metavar="TRACK",
+        show_default="the car's",
+        help="Built-in name, random:SEED or CSV file.",
+    ),
 ]
 RaceLineFile = Annotated[
     Path,

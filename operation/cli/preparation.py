@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from bayesrace.errors import InputError
-from bayesrace.tracks import DEFAULT_RACE_TRACK
 from bayesrace.vehicles import DEFAULT_CAR
 from operation.cli.options import (
     Car,
@@ -335,7 +334,7 @@ def build(
 
 def export(
     out: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write into.")],
-    track: TrackName = DEFAULT_RACE_TRACK,
+    track: TrackName = "",
     raceline: Annotated[
         Path | None, typer.Option(metavar="FILE", show_default="computed", help="Racing line.")
     ] = None,
@@ -365,6 +364,7 @@ def export(
     from controller.settings import MpcSettings
 
     parameters, process = get_car(car), ControllerSettings()
+    track = track or parameters.race_track
     table = path_on(track, raceline, parameters)
     values = read_settings(settings, MpcSettings).parameters(parameters) | cycle_values(
         parameters, process.fallback, process.compensation, process.stale_s

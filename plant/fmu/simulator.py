@@ -120,7 +120,9 @@ class FmuSimulator:
         guard, wiring, part_s = self.guard, self._wiring, self._part_s
         # Whole periods are the period itself, to the bit.
         duration_s = self.step_s if count == self.substeps else count * part_s
-        applied = guard.brake(vx) if u is None else guard.apply(u, vx, delta, duration_s)
+        applied = (
+            guard.brake(vx, duration_s) if u is None else guard.apply(u, vx, delta, duration_s)
+        )
         if self._any_size and not wiring.follows_angle:
             part_s, count = duration_s, 1
         times_s = [k * part_s for k in range(1, (count if wiring.follows_angle else 1) + 1)]
