@@ -83,28 +83,28 @@ class PlantGuard:
         self._brake_fade_mps = car.brake_fade_mps
         self.counters = GuardCounters()
 
-    def apply(
-        self, u: Sequence[float] | None, vx_mps: float, delta_rad: float, duration_s: float
-    ) -> tuple[float, float]:
-        """Drive command and steering rate [rad/s] that act for the command ``u``; None brakes."""
+    def apply(self, u: Sequence[float] | None, x: Floats, duration_s: float) -> tuple[float, float]:
+        """Drive command and steering rate [rad/s] that act so long for the command ``u`` in state
+        ``x`` (7,); None brakes."""
+        vx_mps, delta_rad = float(x[3]), float(x[6])
+        lowest = self._drive.braking(vx_mps, self._d_min, duration_s)
         if u is None:
-            return self.brake(vx_mps, duration_s)
+            return self._brake(vx_mps, lowest)
         d, rate = float(u[0]), float(u[1])
         if not (math.isfinite(d) and math.isfinite(rate)):
             self.counters.rejected += 1
-            return self.brake(vx_mps, duration_s)
-        lowest = self._drive.braking(vx_mps, self._d_min, duration_s)
-        d_safe = min(max(d, lowest), self._d_max * self._drive.available(vx_mps))
+            return self._brake(vx_mps, lowest)
+        highest = self._d_max * self._drive.available(vx_mps, float(x[4]))
+        d_safe = min(max(d, lowest), highest)
         rate_safe = self._steerable(rate, delta_rad, duration_s)
         if abs(d_safe - d) > _CLIP_TOLERANCE or abs(rate_safe - rate) > _CLIP_TOLERANCE:
             self.counters.clipped += 1
         return d_safe, rate_safe
 
-    def brake(self, vx_mps: float, duration_s: float) -> tuple[float, float]:
+    def _brake(self, vx_mps: float, lowest: float) -> tuple[float, float]:
         """Full brake while rolling forward, fading to none at standstill; steering held."""
         self.counters.braked += 1
-        d = self._d_min * min(max(vx_mps / self._brake_fade_mps, 0.0), 1.0)
-        return max(d, self._drive.braking(vx_mps, self._d_min, duration_s)), 0.0
+        return max(self._d_min * min(max(vx_mps / self._brake_fade_mps, 0.0), 1.0), lowest), 0.0
 
     def _steerable(self, rate: float, delta_rad: float, duration_s: float) -> float:
         """The nearest rate within its limit that leaves the angle within its own at the end."""
@@ -241,12 +241,9 @@ class Simulator:
     def _hold(self, u: Sequence[float] | None, count: int) -> tuple[float, float]:
         """For so many substeps; what acted."""
         x, duration_s = self.x, self.step_s * count / self.substeps
-        vx, delta = float(x[3]), float(x[6])
-        guard = self.guard
-        applied = (
-            guard.brake(vx, duration_s) if u is None else guard.apply(u, vx, delta, duration_s)
-        )
+        delta = float(x[6])
+        applied = self.guard.apply(u, x, duration_s)
         self._u[0], self._u[1] = applied
         self._equations.advance(count)
-        x[6] = guard.angle_after(delta, applied[1], duration_s)
+        x[6] = self.guard.angle_after(delta, applied[1], duration_s)
         return applied

@@ -161,7 +161,7 @@ def test_the_guard_in_c_is_the_plants(
     )
     delta = share * limits[2]
     guard = PlantGuard(with_numbers(get_car("orca"), values))
-    expected = guard.apply((d, rate), vx, delta, h)
+    expected = guard.apply((d, rate), np.array([0, 0, 0, vx, 0, 0, delta]), h)
     again.reset()
     again.initialise({**values, "vx": vx, "delta": delta})
     again.set({"d": d, "delta_rate": rate})

@@ -14,6 +14,7 @@ from vehiclemodels.vehicle_dynamics_st import vehicle_dynamics_st
 from vehiclemodels.vehicle_parameters import VehicleParameters
 
 from bayesrace.arrays import Floats
+from bayesrace.errors import InputError
 from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import dynamic, e_kinematic, top_command
 from bayesrace.vehicles.parts import LinearTyres
@@ -180,12 +181,16 @@ def test_the_guard_limits_the_acceleration_as_commonroad_does() -> None:
     p.v_min, p.v_max, p.a_max = 0.0, 20.0, CAR.d_max
     p.v_switch = CAR.guard_numbers["power_speed_mps"]
     guard = PlantGuard(CAR)
+
+    def at(v: float) -> Floats:
+        return np.array([0, 0, 0, 0.8 * v, 0.6 * v, 0, 0])
+
     for v in np.linspace(0.5, 18.9, 40):
         for a in (*np.linspace(-CAR.d_max, 12.0, 13), 0.0):
-            acting, _ = guard.apply((a, 0.0), v, 0.0, 0.02)
+            acting, _ = guard.apply((a, 0.0), at(v), 0.02)
             assert acting == pytest.approx(acceleration_constraints(v, a, p), rel=1e-12)
-    assert guard.apply((5.0, 0.0), 20.0, 0.0, 0.02)[0] == 0.0
-    assert guard.apply((-99.0, 0.0), 10.0, 0.0, 0.02)[0] == CAR.d_min
+    assert guard.apply((5.0, 0.0), at(20.0), 0.02)[0] == 0.0
+    assert guard.apply((-99.0, 0.0), at(10.0), 0.02)[0] == CAR.d_min
 
 
 @pytest.mark.parametrize("command", [None, (CAR.d_min, 0.0), (math.nan, 0.0)])
@@ -207,8 +212,10 @@ def test_the_nominal_model_takes_the_acceleration_as_it_is() -> None:
 
 
 def test_saturating_tyres_have_the_stiffness_at_rest_and_the_friction() -> None:
-    soft, p = CAR.saturating(), CAR.equation_numbers
-    assert soft.saturating() is soft
+    soft, p = CAR.on_tyres("pacejka"), CAR.equation_numbers
+    assert soft.on_tyres("pacejka") is soft
+    with pytest.raises(InputError, match="has pacejka tyres"):
+        soft.on_tyres("linear")
     q = soft.equation_numbers
     for axle, lever in (("front", CAR.lr_m), ("rear", CAR.lf_m)):
         load = CAR.mass_kg * 9.81 * lever / CAR.wheelbase_m

@@ -109,13 +109,13 @@ def longitudinal_force(car: CarParameters, vx: Any, d: Any) -> Any:
     return force - (drive.cr0 * _smooth_sign(vx, ROLL_SPEED_MPS) + drive.cr2 * vx * ca.fabs(vx))
 
 
-def top_command(car: CarParameters, vx: Any, d_max: Any) -> Any:
-    """Highest drive command that acts at a speed; the plant's guard has it in numbers."""
+def top_command(car: CarParameters, v: Any, d_max: Any) -> Any:
+    """Highest drive command that acts at a speed v; the plant's guard has it in numbers."""
     drive = car.drive
     if not isinstance(drive, AccelerationDrive):
         return d_max
-    fade = (drive.speed_max_mps - vx) / (0.05 * drive.speed_max_mps)
-    share = drive.power_speed_mps / ca.fmax(vx, drive.power_speed_mps)
+    fade = (drive.speed_max_mps - v) / (0.05 * drive.speed_max_mps)
+    share = drive.power_speed_mps / ca.fmax(v, drive.power_speed_mps)
     return d_max * share * ca.fmin(ca.fmax(fade, 0), 1)
 
 

@@ -14,6 +14,7 @@ from typing import Any, Final
 from pydantic import Field, ValidationInfo, field_validator
 from pydantic_core import to_json
 
+from bayesrace.errors import InputError
 from bayesrace.vehicles.parts import GRAVITY_MPS2, Drive, LinearTyres, Part, Tyres
 from bayesrace.vehicles.tuning import (
     REFERENCE_ACCELERATION_MPS2,
@@ -112,10 +113,18 @@ class CarParameters(Part):
         drive = self.drive.numbers() if self.drive.guarded else {}
         return {name: float(getattr(self, name)) for name in ACTUATORS} | drive
 
-    def saturating(self) -> "CarParameters":
-        """The same car on Pacejka tyres: those of the same stiffness, or those that it has."""
-        if not isinstance(self.tyres, LinearTyres):
+    def on_tyres(self, model: str) -> "CarParameters":
+        """The same car on tyres of this model: its own, or saturating ones in place of linear ones.
+
+        InputError for linear tyres in place of others.
+        """
+        if self.tyres.model == model:
             return self
+        if not isinstance(self.tyres, LinearTyres):
+            raise InputError(
+                f"the car '{self.name}' has {self.tyres.model} tyres: write a car's file with the "
+                f"numbers of {model} ones"
+            )
         tyres = self.tyres.saturating(self.lf_m, self.lr_m, self.mass_kg)
         return self.model_copy(update={"tyres": tyres})
 

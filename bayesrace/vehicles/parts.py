@@ -4,6 +4,7 @@ A drive turns the first input, the drive command d, into a force along the car. 
 is (its name and its unit), and how much of it there is at a speed, are the drive's.
 """
 
+import math
 from typing import Annotated, ClassVar, Final, Literal
 
 import numpy as np
@@ -108,8 +109,8 @@ class DcMotor(Part):
         """Commands of this car as multiples of the reference car's: both are duty cycles."""
         return 1.0
 
-    def available(self, vx_mps: float) -> float:
-        """Share of the highest command that the drive gives at a speed: all of it."""
+    def available(self, vx_mps: float, vy_mps: float) -> float:
+        """Share of the highest command that the drive gives at a velocity: all of it."""
         return 1.0
 
     def braking(self, vx_mps: float, d_min: float, duration_s: float) -> float:
@@ -151,10 +152,11 @@ class AccelerationDrive(Part):
         """Commands of this car as multiples of the reference car's duty cycle."""
         return acceleration_mps2
 
-    def available(self, vx_mps: float) -> float:
-        """Share of the highest acceleration that there is at a speed."""
-        fade = (self.speed_max_mps - vx_mps) / (0.05 * self.speed_max_mps)
-        return self.power_speed_mps / max(vx_mps, self.power_speed_mps) * min(max(fade, 0.0), 1.0)
+    def available(self, vx_mps: float, vy_mps: float) -> float:
+        """Share of the highest acceleration that there is at a velocity."""
+        v = math.sqrt(vx_mps * vx_mps + vy_mps * vy_mps)
+        fade = (self.speed_max_mps - v) / (0.05 * self.speed_max_mps)
+        return self.power_speed_mps / max(v, self.power_speed_mps) * min(max(fade, 0.0), 1.0)
 
     def braking(self, vx_mps: float, d_min: float, duration_s: float) -> float:
         """Lowest acceleration that acts for so long: it stops a car and does not reverse it."""

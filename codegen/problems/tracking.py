@@ -82,7 +82,7 @@ def tracking(model: Model, discretisation: Discretisation) -> Problem:
     s = Symbols.of(len(STATES), len(inputs), len(_REFERENCE), len(parameters))
     x_ref, y_ref, normal_x, normal_y, lower, upper = ca.vertsplit(s.p)
     q, r_d, r_delta, slack, margin, d_min, d_max, delta_max, rate_max = ca.vertsplit(s.theta)
-    x, y, _, vx, _, _, delta = ca.vertsplit(s.x)
+    x, y, _, vx, vy, _, delta = ca.vertsplit(s.x)
     d, rate = ca.vertsplit(s.u)
     error = (x - x_ref) ** 2 + (y - y_ref) ** 2
     cost = q * error + r_d * (d - s.u_before[0]) ** 2 + r_delta * rate**2
@@ -110,7 +110,7 @@ def tracking(model: Model, discretisation: Discretisation) -> Problem:
             Row("track", along, lower + margin, upper - margin, penalty=slack),
         ),
         u_lower=ca.vertcat(brake, -rate_max),
-        u_upper=ca.vertcat(top_command(car, vx, d_max), rate_max),
+        u_upper=ca.vertcat(top_command(car, ca.sqrt(vx**2 + vy**2), d_max), rate_max),
         guess=ca.vertcat(ca.fmin(ca.fmax(s.u_before[0], s.share * d_max), d_max), 0),
         acting=ca.vertcat(
             ca.fmin(ca.fmax(d, d_min), d_max), ca.fmin(ca.fmax(within, -rate_max), rate_max)

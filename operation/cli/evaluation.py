@@ -17,6 +17,7 @@ from operation.cli.options import (
     FmuMap,
     Seed,
     TrackName,
+    Tyres,
     connect_to,
     writable,
 )
@@ -39,6 +40,7 @@ TimeMode = Annotated[
 
 def race(
     car: Car = DEFAULT_CAR,
+    tyres: Tyres = None,
     track: TrackName = "",
     train_track: Annotated[
         str,
@@ -81,8 +83,9 @@ def race(
     from operation.terminal.race_table import print_table
     from operation.terminal.terminal import Terminal
 
+    driven = get_car(car) if tyres is None else get_car(car).on_tyres(tyres)
     settings = RaceSettings(
-        car=get_car(car), track=track, train_track=train_track, laps=laps, mode=mode.value,
+        car=driven, track=track, train_track=train_track, laps=laps, mode=mode.value,
         seed=seed, fmu=fmu, fmu_map=fmu_map,
     )  # fmt: skip
     mpc = settings.mpc.model_copy(update={"constraints": not no_constraints})

@@ -49,8 +49,12 @@ def _solve(name: str) -> Callable[[LapResult], str]:
     return cell
 
 
+def _metres(value: float | None) -> str:
+    return _decimals(value, 3 if value is None or value < 10 else 0)
+
+
 def _excursion(lap: LapResult) -> str:
-    return _decimals(lap.off_track_max_m, 3) if lap.off_track_samples else "–"
+    return _metres(lap.off_track_max_m) if lap.off_track_samples else "–"
 
 
 def _lateral(lap: LapResult) -> str:
@@ -71,11 +75,11 @@ COLUMNS: Final = (
     ),
     Column("deepest", "m", _excursion, "largest distance off the track"),
     Column(
-        "dev mean", "m", lambda lap: _decimals(lap.deviation_mean_m, 3),
+        "dev mean", "m", lambda lap: _metres(lap.deviation_mean_m),
         "mean distance from the racing line",
     ),
     Column(
-        "dev max", "m", lambda lap: _decimals(lap.deviation_max_m, 3),
+        "dev max", "m", lambda lap: _metres(lap.deviation_max_m),
         "largest distance from the racing line",
     ),
     Column(

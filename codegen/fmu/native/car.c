@@ -49,8 +49,9 @@ static double clipped(double value, double low, double high) {
 #ifdef ACCELERATION_DRIVE
 static double highest(const double *v) {
     const double power = v[FMU_V_power_speed_mps], top = v[FMU_V_speed_max_mps];
-    const double fade = (top - v[FMU_V_vx]) / (0.05 * top);
-    return v[FMU_V_d_max] * (power / most(v[FMU_V_vx], power) * clipped(fade, 0.0, 1.0));
+    const double vx = v[FMU_V_vx], vy = v[FMU_V_vy], speed = sqrt(vx * vx + vy * vy);
+    const double fade = (top - speed) / (0.05 * top);
+    return v[FMU_V_d_max] * (power / most(speed, power) * clipped(fade, 0.0, 1.0));
 }
 
 static double lowest(const double *v, double duration) {
