@@ -11,6 +11,7 @@ from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
 from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parts import GRAVITY_MPS2
 from controller.native_step import NativeStep
 from controller.settings import MpcSettings
 from controller.weights.states import StateRecord
@@ -94,11 +95,17 @@ class OneStepModel:
         return np.where(np.isfinite(errors), errors, np.inf)
 
 
+_MOST: Final = 15.0
+"""Times its usable acceleration, no car corners: more than the 1:43 car at full lock and speed."""
+
+
 def plausible_samples(car: CarParameters, step_s: float, count: int) -> list[Sample]:
     """States and inputs over the whole range of the car, always the same ones."""
     vx, slip, turn, steer, push, rate = np.random.default_rng(5).uniform(-1, 1, (count, 6)).T
     vx = 0.5 * (vx + 1) * car.drive.top_speed_mps(car.d_max)
-    omega = turn * vx * np.tan(car.delta_max_rad) / car.wheelbase_m
+    sharpest = vx * np.tan(car.delta_max_rad) / car.wheelbase_m
+    with np.errstate(divide="ignore"):
+        omega = turn * np.minimum(sharpest, _MOST * car.friction * GRAVITY_MPS2 / vx)
     pose, delta = np.zeros((count, 3)), steer * car.delta_max_rad
     x = np.column_stack([pose, vx, 0.3 * slip * vx, omega, delta])
     d = car.d_min + 0.5 * (push + 1) * (car.d_max - car.d_min)
