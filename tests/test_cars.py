@@ -168,7 +168,7 @@ def test_settings_hold_the_whole_car(tmp_path: Path) -> None:
     (tmp_path / "car.toml").unlink()
     again = RaceSettings.model_validate_json(settings.model_dump_json())
     assert again.car == settings.car
-    assert again.car.name == "f1tenth"
+    assert again.car.name == "tenth"
     assert RaceSettings().car == default_car()
 
 
@@ -176,10 +176,10 @@ def test_the_example_of_the_documentation_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cli: Cli
 ) -> None:
     toml, program = example()
-    (tmp_path / "f1tenth.toml").write_text(toml)
-    checked = cli("cars", "f1tenth.toml")
+    (tmp_path / "tenth.toml").write_text(toml)
+    checked = cli("cars", "tenth.toml")
     assert checked.code == 0
-    assert "f1tenth" in checked.out
+    assert "tenth" in checked.out
     monkeypatch.chdir(tmp_path)
     values: dict[str, object] = {}
     exec(compile(program, str(EXTENDING), "exec"), values)  # noqa: S102
