@@ -25,7 +25,9 @@ __all__ = [
 GRAVITY_MPS2: Final = 9.81
 
 _SHAPE: Final = 1.9
-"""Pacejka's C of tyres that are made to saturate: they peak at 1.3 friction / stiffness."""
+_PEAK: Final = 1.0489
+"""Pacejka's C, and the friction, of tyres that saturate in place of linear ones: the friction of
+f1tenth_gym. The mu of linear tyres is a factor of their stiffness alone."""
 
 
 class Part(BaseModel):
@@ -80,11 +82,13 @@ class LinearTyres(Part):
     )
 
     def saturating(self, lf_m: float, lr_m: float, mass_kg: float) -> PacejkaTyres:
-        """Pacejka tyres of the same cornering stiffness at rest, whose peak is the friction."""
+        """Pacejka tyres of the same cornering stiffness at rest, with a peak."""
         load_n = mass_kg * GRAVITY_MPS2 / (lf_m + lr_m)
 
         def axle(stiffness: float, share_m: float) -> Pacejka:
-            return Pacejka(b=stiffness / _SHAPE, c=_SHAPE, d=self.mu * load_n * share_m)
+            return Pacejka(
+                b=self.mu * stiffness / (_SHAPE * _PEAK), c=_SHAPE, d=_PEAK * load_n * share_m
+            )
 
         front, rear = axle(self.front_stiffness, lr_m), axle(self.rear_stiffness, lf_m)
         return PacejkaTyres(model="pacejka", front=front, rear=rear)

@@ -54,7 +54,7 @@ Tyres = Annotated[
     typer.Option(
         metavar="TYRES",
         show_default="the car's",
-        help="pacejka: of the same stiffness and friction as the car's linear tyres, saturating.",
+        help="pacejka: of the same stiffness as the car's linear tyres, saturating.",
     ),
 ]
 Seed = Annotated[
