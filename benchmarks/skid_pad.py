@@ -17,7 +17,7 @@ import numpy as np
 from bayesrace.arrays import Floats
 from bayesrace.vehicles import DEFAULT_CAR, CarParameters, get_car
 from bayesrace.vehicles.models import dynamic, longitudinal_force
-from bayesrace.vehicles.parameters import GRAVITY_MPS2
+from bayesrace.vehicles.parts import GRAVITY_MPS2
 from plant.simulator import Simulator
 
 RAMP_S = 60.0

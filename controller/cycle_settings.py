@@ -69,6 +69,6 @@ def cycle_values(
 
 
 def input_limits(car: CarParameters) -> dict[str, tuple[float, float]]:
-    """The limits of duty cycle and steering rate there."""
+    """The limits of drive command and steering rate there."""
     rate = car.delta_rate_max_radps
     return {"u_low": (car.d_min, -rate), "u_high": (car.d_max, rate)}

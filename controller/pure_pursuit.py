@@ -3,7 +3,7 @@
 Coulter, "Implementation of the pure pursuit path tracking algorithm", 1992: steer on the circle
 through the rear axle and a point ahead on the line, delta = atan(2 L sin(alpha) / l). The steering
 angle is a target that a rate within the car's limit pursues; the speed follows the line's (or
-less) by a proportional duty cycle. A seeded disturbance on both inputs makes the data worth
+less) by a proportional drive command. A seeded disturbance on both inputs makes the data worth
 learning from.
 """
 
@@ -28,8 +28,10 @@ class PurePursuitSettings(BaseModel):
     speed_scale: float = Field(
         default=0.95, gt=0, le=1.5, description="fraction of the line's speed"
     )
-    excite_d: float = Field(
-        default=0.1, ge=0, le=1, description="std. deviation of the d disturbance"
+    excite_d: float | None = Field(
+        default=None,
+        ge=0,
+        description="std. deviation of the disturbance of d; None: the car's, from its tuning",
     )
     excite_delta_rad: float = Field(
         default=0.04, ge=0, le=1, description="std. deviation of the steering disturbance"
@@ -69,6 +71,8 @@ class PurePursuit:
         self._twice_x, self._twice_y = np.tile(self._points, (2, 1)).T.copy()
         self._lengths = np.concatenate([[0.0], np.cumsum(steps)])
         self._tuning = car.tuning.pursuit
+        excite_d = self._settings.excite_d
+        self._excite_d = self._tuning.excite_d if excite_d is None else excite_d
         self._spacing = float(self._lengths[-1]) / len(steps)
         self._nearest: int | None = None
         self._random = np.random.default_rng(self._settings.seed)
@@ -112,7 +116,7 @@ class PurePursuit:
         target_speed = min(target_speed, environment.speed_limit_mps)
         d = (
             self._tuning.speed_gain_spm * (target_speed - vx)
-            + self._hold(vx)
+            + car.drive.hold(vx)
             + float(self._noise[0])
         )
         rate = (delta_target + float(self._noise[1]) - delta) / settings.step_s
@@ -138,17 +142,12 @@ class PurePursuit:
         speed = max(settings.speed_scale * float(self._speeds[ahead]), tuning.speed_min_mps)
         return speed, min(max(delta, -car.delta_max_rad), car.delta_max_rad)
 
-    def _hold(self, vx: float) -> float:
-        """Duty cycle that about balances rolling resistance at this speed."""
-        car = self._car
-        return (car.cr0 + car.cr2 * vx * vx) / max(car.cm1 - car.cm2 * vx, 0.1 * car.cm1)
-
     def _excite(self) -> None:
         """First-order low-pass noise (Ornstein-Uhlenbeck) of the set standard deviations."""
         settings = self._settings
         keep = math.exp(-settings.step_s / settings.excite_s)
         fresh = self._random.standard_normal(2) * math.sqrt(1 - keep * keep)
-        fresh *= (settings.excite_d, settings.excite_delta_rad)
+        fresh *= (self._excite_d, settings.excite_delta_rad)
         self._noise *= keep
         self._noise += fresh
 

@@ -19,7 +19,7 @@ class MpcSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     q_position: float | None = _objective("Q: squared position error [1/m^2]")
-    r_duty: float | None = _objective("R: squared change of the duty cycle")
+    r_duty: float | None = _objective("R: squared change of the drive command")
     r_delta_rate: float | None = _objective("R: squared steering rate [s^2/rad^2]")
     s_slack: float | None = _objective("S: squared track violation [1/m^2]")
     constraints: bool = Field(True, description="track constraints (8d) on or off")

@@ -5,8 +5,8 @@ In the order of use:
 1. :mod:`.dataset` holds one-step samples and filters them. :mod:`.arrays` reads them from plain
    arrays, :mod:`.logs` from run logs, :mod:`.sources` from any mixture of both.
 2. :mod:`.residual` computes what the nominal model misses.
-3. :mod:`.kernels` names the kernels; :mod:`.likelihood` and :mod:`.hyperparameters` find a GP's hyperparameters, :mod:`.subset` the
-   samples that it keeps; :mod:`.posterior` predicts with it.
+3. :mod:`.kernels` names the kernels; :mod:`.likelihood` and :mod:`.hyperparameters` find a GP's
+   hyperparameters, :mod:`.subset` the samples that it keeps; :mod:`.posterior` predicts with it.
 4. :mod:`.folds` cuts a drive for cross-validation, :mod:`.scores` rates predictions,
    :mod:`.target` and :mod:`.assessment` rate kernels and choices of samples.
 5. :mod:`.training` puts these together; :mod:`.pool` and :mod:`.worker` repeat it lap by lap.

@@ -7,7 +7,6 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.raceline import RaceLineSettings
-from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK
 from bayesrace.vehicles import CarParameters, CarSetting, default_car
 from controller.pure_pursuit import PurePursuitSettings
 from controller.settings import MpcSettings
@@ -24,7 +23,7 @@ class PreparationSettings(BaseModel):
 
     car: CarSetting = Field(default_factory=default_car)
     train_track: str = Field(
-        DEFAULT_TRAINING_TRACK, description="training track: name, random:SEED or CSV file"
+        "", description="training track: name, random:SEED or CSV file; empty: the car's"
     )
     fmu: Path | None = Field(
         None, description="FMU that simulates the car; the built-in car without"
@@ -56,6 +55,12 @@ class PreparationSettings(BaseModel):
     raceline: RaceLineSettings = RaceLineSettings()
     pursuit: PurePursuitSettings = PurePursuitSettings()
 
+    @model_validator(mode="after")
+    def _of_the_car(self) -> Self:
+        """What is not stated and the car knows."""
+        object.__setattr__(self, "train_track", self.train_track or self.car.train_track)
+        return self
+
     @property
     def driven_car(self) -> CarParameters:
         """With the friction that the line is asked for: the controller must assume the same."""
@@ -68,11 +73,7 @@ class PreparationSettings(BaseModel):
         car = self.driven_car
         if self.true_grip == 1:
             return car
-        peaks = {
-            name: tyre.model_copy(update={"d": self.true_grip * tyre.d})
-            for name, tyre in (("front", car.front), ("rear", car.rear))
-        }
-        return car.model_copy(update=peaks)
+        return car.model_copy(update={"tyres": car.tyres.with_grip(self.true_grip)})
 
     @model_validator(mode="after")
     def _simulated(self) -> Self:
@@ -93,7 +94,9 @@ class PreparationSettings(BaseModel):
 class RaceSettings(PreparationSettings):
     """Settings of ``bayesrace race``; defaults are the shown run."""
 
-    track: str = Field(DEFAULT_RACE_TRACK, description="race track: name, random:SEED or CSV file")
+    track: str = Field(
+        "", description="race track: name, random:SEED or CSV file; empty: the car's"
+    )
     laps: int = Field(
         2, ge=1, le=100, description="laps a controller drives: one from standstill, then flying"
     )
@@ -117,4 +120,5 @@ class RaceSettings(PreparationSettings):
             raise ValueError(f"all parts must share the plant's period of {PLANT.step_s} s")
         seeded = self.pursuit.model_copy(update={"seed": self.seed})
         object.__setattr__(self, "pursuit", seeded)
+        object.__setattr__(self, "track", self.track or self.car.race_track)
         return self

@@ -1,7 +1,7 @@
 """The car as a simulated thing: guarded input, the true dynamics, one sampling period at a time.
 
-The guard is the car's own: whatever arrives, duty cycle, steering rate and steering angle stay
-within the car's limits, what is not finite never gets to the motor, and without a usable command
+The guard is the car's own: whatever arrives, drive command, steering rate and steering angle stay
+within the car's limits, what is not finite never gets to the drive, and without a usable command
 the car brakes.
 """
 
@@ -64,7 +64,7 @@ class GuardCounters:
     rejected: int = 0
     """Commands that were not finite; the car braked instead."""
     clipped: int = 0
-    """Commands beyond a limit of duty cycle, steering rate or steering angle."""
+    """Commands beyond a limit of drive command, steering rate or steering angle."""
     braked: int = 0
     """Periods without a usable command."""
 
@@ -73,30 +73,34 @@ class PlantGuard:
     """Turns any command into one that the car's actuators can follow for one period."""
 
     def __init__(self, car: CarParameters) -> None:
-        self._d_min, self._d_max = car.d_min, car.d_max
+        self._d_min, self._d_max, self._drive = car.d_min, car.d_max, car.drive
         self._rate_max = car.delta_rate_max_radps
         self._delta_max = car.delta_max_rad
         self._brake_fade_mps = car.brake_fade_mps
         self.counters = GuardCounters()
 
-    def apply(
-        self, u: Sequence[float], vx_mps: float, delta_rad: float, duration_s: float
-    ) -> tuple[float, float]:
-        """Duty cycle [-] and steering rate [rad/s] that act for the command ``u``."""
+    def apply(self, u: Sequence[float] | None, x: Floats, duration_s: float) -> tuple[float, float]:
+        """Drive command and steering rate [rad/s] that act so long for the command ``u`` in state
+        ``x`` (7,); None brakes."""
+        vx_mps, delta_rad = float(x[3]), float(x[6])
+        lowest = self._drive.braking(vx_mps, self._d_min, duration_s)
+        if u is None:
+            return self._brake(vx_mps, lowest)
         d, rate = float(u[0]), float(u[1])
         if not (math.isfinite(d) and math.isfinite(rate)):
             self.counters.rejected += 1
-            return self.brake(vx_mps)
-        d_safe = min(max(d, self._d_min), self._d_max)
+            return self._brake(vx_mps, lowest)
+        highest = self._d_max * self._drive.available(vx_mps, float(x[4]))
+        d_safe = min(max(d, lowest), highest)
         rate_safe = self._steerable(rate, delta_rad, duration_s)
         if abs(d_safe - d) > _CLIP_TOLERANCE or abs(rate_safe - rate) > _CLIP_TOLERANCE:
             self.counters.clipped += 1
         return d_safe, rate_safe
 
-    def brake(self, vx_mps: float) -> tuple[float, float]:
+    def _brake(self, vx_mps: float, lowest: float) -> tuple[float, float]:
         """Full brake while rolling forward, fading to none at standstill; steering held."""
         self.counters.braked += 1
-        return self._d_min * min(max(vx_mps / self._brake_fade_mps, 0.0), 1.0), 0.0
+        return max(self._d_min * min(max(vx_mps / self._brake_fade_mps, 0.0), 1.0), lowest), 0.0
 
     def _steerable(self, rate: float, delta_rad: float, duration_s: float) -> float:
         """The nearest rate within its limit that leaves the angle within its own at the end."""
@@ -233,10 +237,9 @@ class Simulator:
     def _hold(self, u: Sequence[float] | None, count: int) -> tuple[float, float]:
         """For so many substeps; what acted."""
         x, duration_s = self.x, self.step_s * count / self.substeps
-        vx, delta = float(x[3]), float(x[6])
-        guard = self.guard
-        applied = guard.brake(vx) if u is None else guard.apply(u, vx, delta, duration_s)
+        delta = float(x[6])
+        applied = self.guard.apply(u, x, duration_s)
         self._u[0], self._u[1] = applied
         self._equations.advance(count)
-        x[6] = guard.angle_after(delta, applied[1], duration_s)
+        x[6] = self.guard.angle_after(delta, applied[1], duration_s)
         return applied

@@ -57,10 +57,17 @@ class BenchSettings(PreparationSettings):
     """What is measured."""
 
     tracks: tuple[str, ...] = Field(
-        (DEFAULT_RACE_TRACK, "random:11", "random:15"), min_length=1, description="driven on"
+        (), description="driven on; none: the car's race track, and two beside the 1:43 one"
     )
     problems: int = Field(900, ge=10, description="control steps in closed loop, all tracks")
     peers: int = Field(25, ge=1, description="of these, solved by IPOPT")
+
+    @property
+    def driven_on(self) -> tuple[str, ...]:
+        """The tracks, in order; random ones are 1:43 circuits."""
+        race = self.car.race_track
+        more = ("random:11", "random:15") if race == DEFAULT_RACE_TRACK else ()
+        return self.tracks or (race, *more)
 
 
 class Times(BaseModel):
@@ -162,7 +169,7 @@ class _Recording:
 def run_bench(settings: BenchSettings, stages: Stages) -> BenchResult:
     """Measures; takes about a minute, most of it IPOPT's."""
     car = settings.driven_car
-    prepared = prepare(settings, settings.tracks, stages)
+    prepared = prepare(settings, settings.driven_on, stages)
     weights, artefact = read_weights(prepared.weights), prepared.artefacts[0]
     horizon = read_manifest(artefact).horizon
     with stages.stage("closed loop"):

@@ -12,8 +12,9 @@ from rich.console import Console
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
+from bayesrace.messages import Truth
 from bayesrace.vehicles import default_car
-from operation.analysis.laps import time_laps
+from operation.analysis.laps import Trajectory, time_laps
 from operation.analysis.race import analyse, read_race, read_result, write_result
 from operation.analysis.results import LapResult, RaceResult
 from operation.terminal.race_table import COLUMNS, print_table
@@ -40,6 +41,30 @@ def test_two_laps_on_a_circle(tmp_path: Path) -> None:
     assert lap.deviation_mean_m == pytest.approx(1.1 - LINE_M, abs=1e-5)
     assert lap.deviation_max_m == pytest.approx(1.1 - LINE_M, abs=1e-5)
     assert lap.ended == "2 lap(s) done"
+
+
+def test_cornering_is_that_of_the_circle_driven_and_beyond_the_friction_it_is_said(
+    tmp_path: Path,
+) -> None:
+    """At 2 m/s on a circle of 0.5 m, the nose 0.2 rad inwards of the way."""
+    run = Trajectory()
+    run.truth = [
+        Truth(
+            seq=k, source_time_ns=0, epoch=1, run=1, time_s=0.02 * k, u_applied=(0.0, 0.0), lap=0,
+            x=(0.0, 0.0, 0.08 * k, 2 * np.cos(-0.2), 2 * np.sin(-0.2), 4.0, 0.1),
+        )
+        for k in range(50)
+    ]  # fmt: skip
+    np.testing.assert_allclose(run.lateral_mps2, 8.0)
+    np.testing.assert_allclose(run.slip_rad, -0.2)
+    result = analyse(write_race(tmp_path, [Drive("bayesrace", circle(TWO_LAPS, 1.1))]))
+    lap = result.laps[0].model_copy(update={"lateral_max_mps2": 8.0, "slip_max_rad": 0.2})
+    for friction, said in ((0.523, True), (1.0, False)):
+        summary = result.settings.model_copy(update={"friction": friction, "tyres": "linear"})
+        text = io.StringIO()
+        changed = result.model_copy(update={"settings": summary, "laps": [lap]})
+        print_table(changed, Console(file=text, width=80))
+        assert ("bayesrace: 0.82 g across the way, 11° of slip" in text.getvalue()) is said
 
 
 def test_one_lap_has_no_flying_lap(tmp_path: Path) -> None:
@@ -252,7 +277,7 @@ def test_the_table_shows_the_results_numbers_within_80_columns(tmp_path: Path) -
     assert "…" not in text.getvalue()
     for lap in result.laps:
         row = next(line for line in lines if line.split()[:1] == [lap.controller])
-        shown = [column for column in COLUMNS if column.title != "weights"]
+        shown = [column for column in COLUMNS if column.narrow]
         assert row.split() == [column.cell(lap) for column in shown]
         assert not lap.weights_version or f"weights {lap.weights_version}" in text.getvalue()
     assert "worstcase did not finish" in text.getvalue()

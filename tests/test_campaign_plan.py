@@ -12,6 +12,7 @@ from rich.console import Console
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights, write_weights
 from bayesrace.vehicles import CarParameters, write_car
+from bayesrace.vehicles.parts import PacejkaTyres
 from operation.race import race
 from operation.settings import RaceSettings
 from operation.terminal.progress import stages_on
@@ -142,8 +143,10 @@ def test_every_factor_does_something(car: CarParameters, tmp_path: Path) -> None
     names = set(factors())
     assert names >= {"true_grip", "horizon", "points", "kernels", "raceline.friction", "seed"}
     settings = RaceSettings(true_grip=0.5)
-    assert settings.true_car.front.d == 0.5 * car.front.d
-    assert settings.true_car.rear.d == 0.5 * car.rear.d
+    tyres, true = car.tyres, settings.true_car.tyres
+    assert isinstance(tyres, PacejkaTyres)
+    assert isinstance(true, PacejkaTyres)
+    assert (true.front.d, true.rear.d) == (0.5 * tyres.front.d, 0.5 * tyres.rear.d)
     assert settings.true_car.friction == car.friction
     assert settings.driven_car == car
     with stages_on(Console(quiet=True)) as stages, pytest.raises(InputError, match="for campaigns"):

@@ -19,6 +19,7 @@ from bayesrace.vehicles import (
     write_car,
 )
 from bayesrace.vehicles.files import MODELS, SECTIONS
+from bayesrace.vehicles.parts import Pacejka
 from codegen.build import problem_of
 from codegen.problems.generate import c_header
 from codegen.settings import BuildSettings
@@ -72,13 +73,18 @@ def test_a_car_survives_its_file_and_its_description(tmp_path: Path) -> None:
 
 
 def test_every_value_of_a_car_has_its_place_in_the_file_and_a_unit() -> None:
-    models = (names for one in MODELS.values() for names in one.values())
-    placed = [name for names in (*SECTIONS.values(), *models) for name in names]
+    models = [form for one in MODELS.values() for form in one.values()]
+    placed = [*MODELS, *(name for names in SECTIONS.values() for name in names)]
     assert sorted(placed) == sorted(set(CarParameters.model_fields) - {"name", "tuning"})
-    forms = [CarParameters, *(field.annotation for field in Tuning.model_fields.values())]
+    forms = [
+        CarParameters,
+        Pacejka,
+        *models,
+        *(field.annotation for field in Tuning.model_fields.values()),
+    ]
     for form in forms:
         for name, field in form.model_fields.items():  # type: ignore[union-attr]
-            apart = name in ("name", "tuning", "front", "rear")
+            apart = name in ("name", "tuning", "tyres", "drive", "model", "front", "rear")
             assert apart or re.search(r" \[[^]]+\]$", field.description or ""), name
 
 
@@ -162,7 +168,7 @@ def test_settings_hold_the_whole_car(tmp_path: Path) -> None:
     (tmp_path / "car.toml").unlink()
     again = RaceSettings.model_validate_json(settings.model_dump_json())
     assert again.car == settings.car
-    assert again.car.name == "f1tenth"
+    assert again.car.name == "tenth"
     assert RaceSettings().car == default_car()
 
 
@@ -170,10 +176,10 @@ def test_the_example_of_the_documentation_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cli: Cli
 ) -> None:
     toml, program = example()
-    (tmp_path / "f1tenth.toml").write_text(toml)
-    checked = cli("cars", "f1tenth.toml")
+    (tmp_path / "tenth.toml").write_text(toml)
+    checked = cli("cars", "tenth.toml")
     assert checked.code == 0
-    assert "f1tenth" in checked.out
+    assert "tenth" in checked.out
     monkeypatch.chdir(tmp_path)
     values: dict[str, object] = {}
     exec(compile(program, str(EXTENDING), "exec"), values)  # noqa: S102

@@ -129,10 +129,14 @@ def test_an_unknown_track_or_car_is_refused_with_those_there_are(cli: Cli, tmp_p
 def test_cars_are_listed_checked_and_written(cli: Cli, tmp_path: Path) -> None:
     listed = cli("cars")
     assert listed.code == 0
-    assert "orca" in listed.out
-    assert cli("cars", "orca", "--out", "mine.toml").code == 0
+    assert {"orca", "f1tenth"} <= set(listed.out.split())
+    written = cli("cars", "orca", "--out", "mine.toml")
     checked = cli("cars", "mine.toml")
-    assert (checked.code, checked.out) == (0, listed.out)
+    assert (written.code, checked.code, checked.out) == (0, 0, written.out)
+    saturating = cli("cars", "f1tenth", "--tyres", "pacejka", "--out", "saturating.toml")
+    assert saturating.code == 0
+    assert 'model = "pacejka"' in (tmp_path / "saturating.toml").read_text()
+    refused(cli("cars", "orca", "--tyres", "linear"), "orca", "has pacejka tyres")
     refused(cli("cars", "--out", "x.toml"), "--out", "name")
     text = (tmp_path / "mine.toml").read_text()
     (tmp_path / "mine.toml").write_text(text.replace("mass_kg = 0.041", "mass_kg = -1"))

@@ -19,28 +19,17 @@ from bayesrace.errors import InputError
 from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import STATES, dynamic
 from codegen.fmu import Variable, car_fmu, pack
-from codegen.fmu.car import car_values
 from plant.simulator import PlantGuard
 from tests.car_fmu import packed_car, unpacked_car
+from tests.cars import with_numbers
 from tests.fmu_exports import Kind, Version, built_in, commands, driven, slave
 from tests.fmu_master import Slave
 
 etree: Any = pytest.importorskip("lxml.etree")
 
 ALL = [(2, "cs"), (3, "cs"), (3, "me")]
+ORCA = get_car("orca")
 START = {"x": 1.0, "y": -2.0, "psi": 0.5, "vx": 1.2, "vy": 0.1, "omega": -0.4, "delta": 0.1}
-
-
-def with_values(car: CarParameters, values: dict[str, float]) -> CarParameters:
-    """The car with these FMU parameters."""
-    data = car.model_dump()
-    for name, value in values.items():
-        axle, _, coefficient = name.partition("_")
-        if axle in ("front", "rear"):
-            data[axle][coefficient] = value
-        else:
-            data[name] = value
-    return CarParameters.model_validate(data)
 
 
 @pytest.mark.parametrize(("version", "kind"), ALL)
@@ -171,8 +160,8 @@ def test_the_guard_in_c_is_the_plants(
         zip(("d_min", "d_max", "delta_max_rad", "delta_rate_max_radps"), limits, strict=True)
     )
     delta = share * limits[2]
-    guard = PlantGuard(with_values(get_car("orca"), values))
-    expected = guard.apply((d, rate), vx, delta, h)
+    guard = PlantGuard(with_numbers(get_car("orca"), values))
+    expected = guard.apply((d, rate), np.array([0, 0, 0, vx, 0, 0, delta]), h)
     again.reset()
     again.initialise({**values, "vx": vx, "delta": delta})
     again.set({"d": d, "delta_rate": rate})
@@ -181,16 +170,16 @@ def test_the_guard_in_c_is_the_plants(
     assert again.get("delta") == [guard.angle_after(delta, expected[1], h)]
 
 
-@pytest.mark.parametrize("name", sorted(car_values(get_car("orca"))))
+@pytest.mark.parametrize("name", sorted(ORCA.equation_numbers | ORCA.guard_numbers))
 def test_every_parameter_acts_as_in_a_car_with_it(car: CarParameters, name: str) -> None:
     inputs = [(1.3, 8.0)] * 5 + commands(150, 3)  # first beyond the limits
-    value = car_values(car)[name] * 1.25
+    value = (car.equation_numbers | car.guard_numbers)[name] * 1.25
     one = slave()
     one.initialise({name: value})
     rows = driven(one, inputs)
     one.close()
     np.testing.assert_allclose(
-        rows, built_in(with_values(car, {name: value}), inputs), rtol=0, atol=1e-9
+        rows, built_in(with_numbers(car, {name: value}), inputs), rtol=0, atol=1e-9
     )
     assert np.abs(rows - built_in(car, inputs)).max() > 1e-6
 
@@ -268,12 +257,11 @@ def test_a_definition_that_cannot_work_is_refused(car: CarParameters, tmp_path: 
 
 
 def test_symbolic_parameters_give_the_same_equations(car: CarParameters) -> None:
-    from bayesrace.vehicles.models import DYNAMIC_PARAMETERS, dynamic_with_parameters
+    from bayesrace.vehicles.models import dynamic_with_parameters
 
     random = np.random.default_rng(0)
-    values = car_values(car)
-    p = [values[name] for name in DYNAMIC_PARAMETERS]
-    numeric, parametric = dynamic(car).ode, dynamic_with_parameters()
+    p = list(car.equation_numbers.values())
+    numeric, parametric = dynamic(car).ode, dynamic_with_parameters(car)
     for x in random.uniform(-2, 2, (100, 7)):
         u = random.uniform(-1, 1, 2)
         np.testing.assert_allclose(

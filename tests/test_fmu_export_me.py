@@ -10,19 +10,17 @@ from fmpy import instantiate_fmu, read_model_description, simulate_fmu
 from fmpy.fmi1 import FMICallException
 
 from bayesrace.arrays import Floats
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import CarParameters, default_car
 from bayesrace.vehicles.models import (
-    DYNAMIC_PARAMETERS,
     INPUTS,
     STATES,
     dynamic,
     dynamic_with_parameters,
 )
-from codegen.fmu.car import car_values
 from plant.simulator import Simulator
 from tests.car_fmu import packed_car, unpacked_car
 
-KNOWN = (*STATES, *INPUTS, *DYNAMIC_PARAMETERS)
+KNOWN = (*STATES, *INPUTS, *default_car().equation_numbers)
 DERIVATIVES = tuple(f"der_{name}" for name in STATES)
 
 
@@ -85,12 +83,12 @@ def points(count: int, seed: int = 0) -> list[tuple[Floats, Floats]]:
 
 def jacobian(car: CarParameters) -> Any:
     """(x, u) -> d xdot / d KNOWN of the symbolic equations at this car's parameters."""
-    ode = dynamic_with_parameters()
-    x, u, p = ca.SX.sym("x", 7), ca.SX.sym("u", 2), ca.SX.sym("p", len(DYNAMIC_PARAMETERS))
+    ode = dynamic_with_parameters(car)
+    x, u, p = ca.SX.sym("x", 7), ca.SX.sym("u", 2), ca.SX.sym("p", len(car.equation_numbers))
     full = ca.jacobian(ode(x, u, p), ca.vertcat(x, u, p))
     function = ca.Function("J", [x, u, p], [ca.densify(full)])
-    values = car_values(car)
-    return lambda a, b: np.asarray(function(a, b, [values[name] for name in DYNAMIC_PARAMETERS]))
+    values = list(car.equation_numbers.values())
+    return lambda a, b: np.asarray(function(a, b, values))
 
 
 def test_derivatives_are_the_dynamic_models(instance: Instance, car: CarParameters) -> None:

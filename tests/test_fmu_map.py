@@ -171,7 +171,7 @@ MIXED = own_fmu(
         ("[inputs]\ngear = 7", "7 is outside -1 to 6"),
         ("[inputs]\ngear = true", "does not suit"),
         ("[inputs]\ngear = { from = 'd' }", "of type Int32"),
-        ("[inputs]\nd = 0.3", "takes the duty cycle"),
+        ("[inputs]\nd = 0.3", "takes the drive command"),
         ("[parameters]\nmas_kg = 1.0", "near: 'mass_kg'"),
         ("[parameters]\nmass_kg = 0.0", "outside 0.001 to inf"),
         ("[parameters]\nmass_kg = 'heavy'", "not a number with a unit"),
@@ -199,7 +199,7 @@ def test_all_problems_are_reported_at_once() -> None:
     text = str(caught.value)
     for quantity in ("x", "y", "psi", "vx", "vy", "omega", "delta"):
         assert f"nothing gives our {quantity} [" in text
-    assert "the duty cycle" in text
+    assert "the drive command" in text
     assert "the steering rate" in text
     assert "'wheel' has neither a start value nor a place in the map" in text
     assert "fmu inspect" in text

@@ -9,6 +9,7 @@ from bayesrace.arrays import Floats
 from bayesrace.integrators import PERFECT, PREDICTION, SCHEMES, Discretisation
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import MODELS, Model, dynamic, e_kinematic
+from tests.cars import with_numbers
 
 X = np.array([0.3, -0.2, 0.7, 1.8, 0.1, 1.0, 0.12])
 U = np.array([0.6, -1.5])
@@ -139,7 +140,7 @@ def test_identity_changes_with_the_discretisation(
 
 @pytest.mark.parametrize("field", ["lf_m", "lr_m", "mass_kg", "inertia_kgm2", "cm1", "cm2", "cr0"])
 def test_identity_changes_with_the_car(car: CarParameters, field: str) -> None:
-    changed = car.model_copy(update={field: 1.01 * getattr(car, field)})
+    changed = with_numbers(car, {field: 1.01 * car.equation_numbers[field]})
     assert PREDICTION.identity("dynamic", changed) != PREDICTION.identity("dynamic", car)
 
 

@@ -26,7 +26,7 @@ from bayesrace.raceline.identity import line_identity
 from bayesrace.raceline.ocp import car_limits
 from bayesrace.tracks import StartLine, Track, load_track
 from bayesrace.vehicles import described_car, get_car
-from bayesrace.vehicles.parameters import GRAVITY_MPS2
+from bayesrace.vehicles.parts import GRAVITY_MPS2
 from tests.reference import reference_file
 
 CAR = get_car("orca")

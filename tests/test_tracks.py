@@ -226,25 +226,36 @@ def nodes(track: Track) -> Floats:
     return np.column_stack([track.x_m, track.y_m])
 
 
+SIZES = {
+    "paddock": (11, 18, 1.0),
+    "harbour": (11, 18, 1.0),
+    "workshop": (26, 28, 2.0),
+    "airfield": (80, 250, 5.0),
+}
+"""Shortest and longest lap [m], and by how much it is larger than a 1:43 circuit."""
+
+
 @pytest.mark.parametrize("name", builtin_tracks())
 def test_builtin_tracks_are_real_circuits(name: str) -> None:
     """Length, width, hairpins both sharp and clear of the neighbouring piece, bends both ways."""
     track = load_track(name)
     width = track.width_left_m + track.width_right_m
-    assert 11 <= track.length_m <= 18
-    assert width.min() >= 0.37 - 1e-9
-    assert width.max() <= 0.46 + 1e-9
-    assert clearance_m(nodes(track), skip_m=np.pi / 2 * (width[0] + 0.1)) > width[0] + 0.1
+    shortest, longest, size = SIZES[name]
+    assert shortest <= track.length_m <= longest
+    assert width.min() >= 0.37 * size - 1e-9
+    assert width.max() <= 0.5 * size + 1e-9
+    apart = 0.1 * size
+    assert clearance_m(nodes(track), skip_m=np.pi / 2 * (width[0] + apart)) > width[0] + apart
     assert minimum_radius(track) > width[0] / 2 + 0.02
     for edge in track.boundaries(0.02):
         assert find_crossing(edge) is None
     s = np.arange(0, track.length_m, 0.01)
     kappa = track.curvature(s)
-    assert kappa.min() < -2
-    assert kappa.max() > 2
-    bends = s[np.abs(kappa) > 0.4]
-    longest = np.diff(np.append(bends, bends[0] + track.length_m)).max()
-    assert longest > 2.0, "no straight"
+    assert kappa.min() < -2 / size
+    assert kappa.max() > 2 / size
+    bends = s[np.abs(kappa) > 0.4 / size]
+    straight = np.diff(np.append(bends, bends[0] + track.length_m)).max()
+    assert straight > 2.0 * size, "no straight"
     turned = np.array([np.sum(np.clip(kappa, 0, None)), np.sum(np.clip(-kappa, 0, None))]) * 0.01
     assert abs(turned[0] - turned[1]) == pytest.approx(2 * np.pi, abs=1e-2)
     assert turned.min() > np.pi / 2

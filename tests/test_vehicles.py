@@ -17,6 +17,7 @@ from bayesrace.vehicles.models import (
     e_kinematic,
     kinematic,
 )
+from tests.cars import with_numbers
 from tests.conftest import TRUTH
 
 MIRROR = np.array([1.0, -1, -1, 1, -1, -1, -1])
@@ -43,9 +44,10 @@ def table_1_dynamic(car: CarParameters, x: Floats, u: Floats) -> Floats:
     _, _, psi, vx, vy, omega, delta = x
     alpha_f = delta - np.arctan((omega * car.lf_m + vy) / vx)
     alpha_r = np.arctan((omega * car.lr_m - vy) / vx)
-    f_fy = car.front.d * np.sin(car.front.c * np.arctan(car.front.b * alpha_f))
-    f_ry = car.rear.d * np.sin(car.rear.c * np.arctan(car.rear.b * alpha_r))
-    f_rx = (car.cm1 - car.cm2 * vx) * u[0] - car.cr0 - car.cr2 * vx**2
+    p = car.equation_numbers
+    f_fy = p["front_d"] * np.sin(p["front_c"] * np.arctan(p["front_b"] * alpha_f))
+    f_ry = p["rear_d"] * np.sin(p["rear_c"] * np.arctan(p["rear_b"] * alpha_r))
+    f_rx = (p["cm1"] - p["cm2"] * vx) * u[0] - p["cr0"] - p["cr2"] * vx**2
     return np.array(
         [
             vx * np.cos(psi) - vy * np.sin(psi),
@@ -61,7 +63,8 @@ def table_1_dynamic(car: CarParameters, x: Floats, u: Floats) -> Floats:
 
 def table_1_e_kinematic(car: CarParameters, x: Floats, u: Floats) -> Floats:
     _, _, psi, vx, vy, omega, delta = x
-    ax = (car.cm1 - car.cm2 * vx) * u[0] / car.mass_kg
+    p = car.equation_numbers
+    ax = (p["cm1"] - p["cm2"] * vx) * u[0] / car.mass_kg
     turn = (u[1] * vx + delta * ax) / (car.lf_m + car.lr_m)
     return np.array(
         [
@@ -214,5 +217,5 @@ def test_the_digest_sees_what_shapes_the_models_only(car: CarParameters) -> None
     assert same.digest() == car.digest()
     heavier = car.model_copy(update={"mass_kg": 0.042})
     assert heavier.digest() != car.digest()
-    stiffer = car.model_copy(update={"front": car.front.model_copy(update={"b": 2.6})})
+    stiffer = with_numbers(car, {"front_b": 2.6})
     assert stiffer.digest() != car.digest()

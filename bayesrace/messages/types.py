@@ -71,7 +71,7 @@ class CarSample(Message):
     x: CarState
     """x, y [m], psi [rad, unwrapped], vx, vy [m/s], omega [rad/s], delta [rad]."""
     u_applied: Input
-    """d [-] and delta_rate [rad/s] applied during the previous period; zeros at the start."""
+    """d [command] and delta_rate [rad/s] applied during the previous period; zeros at the start."""
     lap: Signed
     """Start-line crossings so far, forwards minus backwards."""
 
@@ -122,7 +122,7 @@ class Actuation(Message):
     in real time the controller's estimate, from the arrival times of the states, of the plant time
     when its cycle began."""
     u: Annotated[tuple[float, ...], Vector(2, limit=1e3, names=_INPUT)]
-    """d [-], delta_rate [rad/s]; the plant applies the car's own, narrower limits."""
+    """d [command], delta_rate [rad/s]; the plant applies the car's own, narrower limits."""
     weights_version: Short
     """Version of the GP weights in use; empty without any."""
     status: Annotated[int, Integer(0, 255)]

@@ -11,9 +11,9 @@ clothoid (kappa linear in its length l) and E has slope 2 a with a linear in l, 
 (' marks the next station; the chord formulas are exact to fourth order in l). No curvature of the
 frame enters: the path is as smooth as the car can drive even where the centreline isn't.
 
-Limits, with ay = kappa E: friction circle a^2 + ay^2 <= (mu g)^2; motor, straight(v, d_min) <= a
+Limits, with ay = kappa E: friction circle a^2 + ay^2 <= (mu g)^2; drive, straight(v, d_min) <= a
 <= straight(v, d_max); steering angle and its rate; track edges less the margin. All of it can be
-measured without tyre curves: mass, geometry, motor and one friction number. What the tyres' slip
+measured without tyre curves: mass, geometry, drive and one friction number. What the tyres' slip
 costs in a bend is left to the controller.
 """
 
@@ -32,8 +32,9 @@ from bayesrace.raceline.line import RaceLine
 from bayesrace.raceline.sample import Clothoids, sample_line
 from bayesrace.raceline.settings import RaceLineError, RaceLineSettings
 from bayesrace.tracks import Track
-from bayesrace.vehicles.models import longitudinal_force
-from bayesrace.vehicles.parameters import GRAVITY_MPS2, CarParameters
+from bayesrace.vehicles.models import longitudinal_force, top_command
+from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parts import GRAVITY_MPS2
 
 __all__ = ["CarLimits", "car_limits", "solve"]
 
@@ -49,7 +50,7 @@ class CarLimits:
     grip_mps2: float
     """Radius of the friction circle."""
     straight: ca.Function
-    """(v, d) to the acceleration without cornering [m/s^2]."""
+    """(v, d) to the acceleration without cornering [m/s^2]; d as the drive can."""
 
     def steering(self, kappa: Any) -> Any:
         """Steering angle that a path of this curvature needs [rad].
@@ -73,7 +74,8 @@ class CarLimits:
 def car_limits(car: CarParameters, settings: RaceLineSettings) -> CarLimits:
     """The limits of a car, friction from the settings or else the car's."""
     v, d = ca.SX.sym("v"), ca.SX.sym("d")
-    straight = longitudinal_force(car, v, d) / car.mass_kg
+    acting = ca.fmin(d, top_command(car, v, car.d_max))
+    straight = longitudinal_force(car, v, acting) / car.mass_kg
     friction = car.friction if settings.friction is None else settings.friction
     return CarLimits(
         car=car,

@@ -1,7 +1,8 @@
-"""Built-in 1:43 circuits, each a polygon of our own design with rounded corners.
+"""Built-in circuits, each a polygon of our own design with rounded corners.
 
-``paddock`` is short and wide, for learning to drive; ``harbour`` is long and narrow, for the race.
-Driving order is the order of the corners; the start line is on the edge into the first corner.
+For 1:43 cars, ``paddock`` is short and wide, for learning to drive; ``harbour`` is long and narrow,
+for the race. For 1:10 cars, ``workshop`` is small and narrow, ``airfield`` large and wide. Driving
+order is the order of the corners; the start line is on the edge into the first corner.
 """
 
 from functools import cache
@@ -24,6 +25,8 @@ class _Design(NamedTuple):
     width_m: float
     start_m: float
     """How far before the first corner's arc the start line is."""
+    scale: float = 1.0
+    """Of the circuit's points and easing; 1 for a 1:43 car."""
 
 
 _DESIGNS: Final[dict[str, _Design]] = {
@@ -69,6 +72,43 @@ _DESIGNS: Final[dict[str, _Design]] = {
         width_m=0.37,
         start_m=1.2,
     ),
+    # 1:10, indoors. Driven anticlockwise: straight, right angle, S between two halls, hairpin.
+    "workshop": _Design(
+        corners=(
+            (4.9, -2.2, 0.9),
+            (4.9, 1.2, 1.0),
+            (2.4, 1.3, 0.85),
+            (1.6, -0.5, 0.85),
+            (-0.4, -0.5, 0.85),
+            (-0.9, 1.9, 1.0),
+            (-4.6, 1.9, 1.1),
+            (-4.6, -2.2, 1.1),
+        ),
+        width_m=1.0,
+        start_m=4.0,
+        scale=4.0,
+    ),
+    # 1:10, as wide as F1TENTH races have it. Driven clockwise: long straight, wide right, chicane,
+    # hairpin, esses, kink, last corner.
+    "airfield": _Design(
+        corners=(
+            (17.0, 9.0, 3.2),
+            (16.0, 1.0, 2.6),
+            (9.5, 2.0, 2.4),
+            (8.5, -5.5, 2.4),
+            (16.5, -7.0, 2.0),
+            (16.0, -11.0, 2.0),
+            (1.0, -10.5, 3.0),
+            (-2.5, -4.0, 3.2),
+            (-8.5, -9.5, 2.8),
+            (-16.0, -7.0, 3.6),
+            (-12.5, 1.5, 3.4),
+            (-17.5, 8.5, 2.8),
+        ),
+        width_m=2.2,
+        start_m=10.0,
+        scale=8.0,
+    ),
 }
 
 
@@ -83,7 +123,7 @@ def builtin_track(name: str) -> Track:
     design = _DESIGNS.get(name)
     if design is None:
         raise InputError(f"unknown track '{name}'; built in: {', '.join(builtin_tracks())}")
-    points = rounded_polygon(design.corners)
+    points = rounded_polygon(design.corners, 0.04 * design.scale, 0.05 * design.scale)
     if points is None:
         raise AssertionError(f"the corners of built-in track '{name}' overlap")
     spacing = float(np.linalg.norm(points[1] - points[0]))

@@ -1,5 +1,5 @@
-"""Cars as data (:mod:`.parameters`), their size-dependent numbers (:mod:`.tuning`) and TOML files
-(:mod:`.files`), and their models as expressions (:mod:`.models`, CasADi)."""
+"""Cars as data (:mod:`.parts`, :mod:`.parameters`), their size-dependent numbers (:mod:`.tuning`)
+and TOML files (:mod:`.files`), and their models as expressions (:mod:`.models`, CasADi)."""
 
 from bayesrace.vehicles.files import (
     DEFAULT_CAR,
@@ -12,14 +12,13 @@ from bayesrace.vehicles.files import (
     read_car,
     write_car,
 )
-from bayesrace.vehicles.parameters import CarParameters, Pacejka
+from bayesrace.vehicles.parameters import CarParameters
 from bayesrace.vehicles.tuning import Tuning
 
 __all__ = [
     "DEFAULT_CAR",
     "CarParameters",
     "CarSetting",
-    "Pacejka",
     "Tuning",
     "builtin_cars",
     "car_text",

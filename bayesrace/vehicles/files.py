@@ -1,8 +1,8 @@
 """Cars as TOML files, and the one way to any car: a built-in name or a file.
 
 The file's sections are those of :data:`SECTIONS`, besides ``[tyres]`` and ``[drive]``, whose
-``model`` says which values they hold, and ``[tuning.*]``, which a car needs none of. Numbers are
-in SI units; their names, bounds and meanings are those of
+``model`` says which values they hold (:mod:`.parts`), and ``[tuning.*]``, which a car needs none
+of. Numbers are in SI units; their names, bounds and meanings are those of
 :class:`~bayesrace.vehicles.parameters.CarParameters`.
 """
 
@@ -18,6 +18,7 @@ from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 from bayesrace.errors import InputError
 from bayesrace.files import read_text, write_whole
 from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parts import AccelerationDrive, DcMotor, LinearTyres, PacejkaTyres, Part
 from bayesrace.vehicles.tuning import Tuning
 
 __all__ = [
@@ -41,16 +42,17 @@ SECTIONS: Final[dict[str, tuple[str, ...]]] = {
         *("d_min", "d_max", "delta_max_rad", "delta_rate_max_radps"),
         *("friction", "brake_fade_mps"),
     ),
+    "tracks": ("train_track", "race_track"),
 }
 """Section of a car's file to the fields of CarParameters in it."""
 
-MODELS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
-    "tyres": {"pacejka": ("front", "rear")},
-    "drive": {"dc_motor": ("cm1", "cm2", "cr0", "cr2")},
+MODELS: Final[dict[str, dict[str, type[Part]]]] = {
+    "tyres": {"pacejka": PacejkaTyres, "linear": LinearTyres},
+    "drive": {"dc_motor": DcMotor, "acceleration": AccelerationDrive},
 }
-"""Section with a ``model`` to the fields of CarParameters that each model has."""
+"""Section with a ``model``, a field of CarParameters as a whole, to what each model holds."""
 
-_ORDER: Final = ("geometry", "tyres", "drive", "limits")
+_ORDER: Final = ("geometry", "tyres", "drive", "limits", "tracks")
 
 _FOLDER: Final = Path(__file__).resolve().parents[1] / "cars"
 
@@ -153,16 +155,16 @@ def _flat(content: Mapping[str, Any]) -> dict[str, Any]:
         given = content.get(section, {})
         if not isinstance(given, dict):
             raise InputError(f"{section} = {given!r} is no section; write [{section}]")
-        names, model = _fields(section, given)
-        _only(given, (*model, *names), section)
-        values |= {name: given[name] for name in names if name in given}
+        if section in MODELS:
+            _check_model(section, given)
+            values[section] = given
+        else:
+            _only(given, SECTIONS[section], section)
+            values |= given
     return values
 
 
-def _fields(section: str, given: Mapping[str, Any]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Fields of CarParameters in a section, and ``model`` where the section has one."""
-    if section in SECTIONS:
-        return SECTIONS[section], ()
+def _check_model(section: str, given: Mapping[str, Any]) -> None:
     models, chosen = MODELS[section], given.get("model")
     if not isinstance(chosen, str) or chosen not in models:
         found = "is missing" if chosen is None else f"= {chosen!r} is unknown"
@@ -170,7 +172,7 @@ def _fields(section: str, given: Mapping[str, Any]) -> tuple[tuple[str, ...], tu
             f"{section}.model {found}; write model = "
             f"{' or '.join(repr(name) for name in models)} in [{section}]"
         )
-    return models[chosen], ("model",)
+    _only(given, tuple(models[chosen].model_fields), section)
 
 
 def _only(given: Mapping[str, Any], names: tuple[str, ...], section: str) -> None:
@@ -190,10 +192,11 @@ def _faults(error: ValidationError) -> str:
 
 
 def _fault(one: Any) -> str:
-    loc = [str(part) for part in one["loc"]]
-    section = next((name for name, fields in _every_section().items() if loc[0] in fields), "")
+    full = [str(part) for part in one["loc"]]
+    loc = [full[0], *full[2:]] if full[0] in MODELS else full  # without the name of the model
+    section = next((name for name, fields in SECTIONS.items() if loc[0] in fields), "")
     place = ".".join([*([section] if section else []), *loc])
-    field = _field(loc)
+    field = _field(full)
     text = (field.description or "") if field is not None else ""
     unit = re.search(r" \[([^]]*)\]$", text)
     meaning = text[: unit.start()] if unit else text
@@ -204,18 +207,13 @@ def _fault(one: Any) -> str:
         in_unit = f" in {units.strip()}" if units else ""
         return f"{place} is missing: {meaning}; add {loc[-1]} = NUMBER{in_unit} to {where}"
     if one["type"] == "extra_forbidden":
-        known = _field(loc[:-1]) if len(loc) > 1 else None
+        known = _field(full[:-1]) if len(full) > 1 else None
         form: Any = known.annotation if known is not None else None
         names = ", ".join(form.model_fields) if _is_model(form) else ""
         return f"{place} = {str(one['input'])[:40]} is unknown; {where} has {names}"
     message = str(one["msg"])[:1].lower() + str(one["msg"])[1:]
     value = str(one["input"])[:40]
     return f"{place} = {value}{units}: {message}; correct it in {where} ({meaning})"
-
-
-def _every_section() -> dict[str, tuple[str, ...]]:
-    models = {section: sum(one.values(), ()) for section, one in MODELS.items()}
-    return SECTIONS | models
 
 
 def _is_model(form: Any) -> bool:
@@ -226,6 +224,8 @@ def _field(loc: list[str]) -> Any:
     """The field of CarParameters, or below it, at a place; None for one that it does not have."""
     form: Any = CarParameters
     field = None
+    if loc[0] in MODELS and len(loc) > 1:
+        form, loc = MODELS[loc[0]].get(loc[1]), loc[2:]
     for part in loc:
         if not _is_model(form) or part not in form.model_fields:
             return None
@@ -240,11 +240,11 @@ def write_car(path: Path | str, car: CarParameters) -> None:
     for section in _ORDER:
         lines += ["", f"[{section}]"]
         if section in MODELS:
-            model, names = next(iter(MODELS[section].items()))
-            lines.append(f'model = "{model}"')
+            part = getattr(car, section)
+            lines.append(f'model = "{part.model}"')
+            lines += [_line(part, name) for name in type(part).model_fields if name != "model"]
         else:
-            names = SECTIONS[section]
-        lines += [_line(car, name) for name in names]
+            lines += [_line(car, name) for name in SECTIONS[section]]
     for name in Tuning.model_fields:
         part = getattr(car.tuning, name)
         lines += ["", f"[tuning.{name}]"]
@@ -257,6 +257,8 @@ def _line(model: BaseModel, name: str) -> str:
     if isinstance(value, BaseModel):
         text = ", ".join(f"{key} = {number!r}" for key, number in value)
         text = f"{{ {text} }}"
+    elif isinstance(value, str):
+        text = f'"{value}"'
     else:
         text = repr(value)
     return f"{name} = {text}  # {type(model).model_fields[name].description}"

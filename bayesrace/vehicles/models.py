@@ -7,43 +7,45 @@ has ``x = [x, y, psi, v, delta]`` and ``u = [a, delta_rate]``.
 The equations hold exactly as printed for vx above :data:`BLEND_SPEED_MPS`. Below it, slip angles
 and rolling resistance go to zero with the speed through twice continuously differentiable
 polynomials (drag, cr2 vx |vx|, once), so that a standing car stays where it is and no solver meets
-a division by zero.
+a division by zero. A car on linear tyres rolls without slip at low speed, as CommonRoad's does.
+d is the command of the car's drive: duty cycle, or acceleration in m/s^2.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
 import casadi as ca
 
-from bayesrace.vehicles.parameters import CarParameters, Pacejka
+from bayesrace.vehicles.parameters import BODY, CarParameters
+from bayesrace.vehicles.parts import (
+    GRAVITY_MPS2,
+    AccelerationDrive,
+    DcMotor,
+    LinearTyres,
+    Pacejka,
+    PacejkaTyres,
+    Part,
+)
 
 __all__ = [
     "BLEND_SPEED_MPS",
-    "DYNAMIC_PARAMETERS",
     "INPUTS",
     "MODELS",
     "ROLL_SPEED_MPS",
     "STATES",
     "Model",
-    "car_value",
     "dynamic",
     "dynamic_with_parameters",
     "e_kinematic",
     "kinematic",
     "longitudinal_force",
     "motor_force",
+    "top_command",
 ]
 
 STATES: Final = ("x", "y", "psi", "vx", "vy", "omega", "delta")
 INPUTS: Final = ("d", "delta_rate")
-
-DYNAMIC_PARAMETERS: Final = (
-    *("lf_m", "lr_m", "mass_kg", "inertia_kgm2"),
-    *("front_b", "front_c", "front_d", "rear_b", "rear_c", "rear_d"),
-    *("cm1", "cm2", "cr0", "cr2"),
-)
-"""What the dynamic model depends on; ``front_b`` is ``car.front.b``."""
 
 BLEND_SPEED_MPS: Final = 0.1
 """Slip angles are those of the paper above this speed and fade with the speed below it."""
@@ -80,19 +82,41 @@ def _smooth_sign(v: Any, corner: float) -> Any:
     return z * (15 - 10 * z**2 + 3 * z**4) / 8
 
 
+def _smooth_step(v: Any) -> Any:
+    """0 for v <= 0, 1 for v >= 1, a C2 polynomial in between."""
+    z = ca.fmin(ca.fmax(v, 0), 1)
+    return z**3 * (10 - 15 * z + 6 * z**2)
+
+
 def motor_force(car: CarParameters, vx: Any, d: Any) -> Any:
-    """Longitudinal force of the DC motor, (Cm1 - Cm2 vx) d [N]; section 3 of the paper."""
-    return (car.cm1 - car.cm2 * vx) * d
+    """Longitudinal force of the drive without resistances [N].
 
-
-def _rolling_resistance(car: CarParameters, vx: Any) -> Any:
-    """Cr + Cd vx^2, opposed to the motion: it stops a car and cannot push it backwards [N]."""
-    return car.cr0 * _smooth_sign(vx, ROLL_SPEED_MPS) + car.cr2 * vx * ca.fabs(vx)
+    Of the DC motor (Cm1 - Cm2 vx) d, section 3 of the paper; else mass times the acceleration d.
+    """
+    drive = car.drive
+    return (drive.cm1 - drive.cm2 * vx) * d if isinstance(drive, DcMotor) else car.mass_kg * d
 
 
 def longitudinal_force(car: CarParameters, vx: Any, d: Any) -> Any:
-    """F_r,x of the true car: motor less rolling and drag resistance [N]; section 3 of the paper."""
-    return motor_force(car, vx, d) - _rolling_resistance(car, vx)
+    """F_r,x of the true car: drive less rolling and drag resistance [N]; section 3 of the paper.
+
+    Rolling resistance Cr + Cd vx^2 is opposed to the motion: it stops a car and cannot push it
+    backwards. An acceleration that is commanded has the resistances in it.
+    """
+    drive, force = car.drive, motor_force(car, vx, d)
+    if not isinstance(drive, DcMotor):
+        return force
+    return force - (drive.cr0 * _smooth_sign(vx, ROLL_SPEED_MPS) + drive.cr2 * vx * ca.fabs(vx))
+
+
+def top_command(car: CarParameters, v: Any, d_max: Any) -> Any:
+    """Highest drive command that acts at a speed v; the plant's guard has it in numbers."""
+    drive = car.drive
+    if not isinstance(drive, AccelerationDrive):
+        return d_max
+    fade = (drive.speed_max_mps - v) / (0.05 * drive.speed_max_mps)
+    share = drive.power_speed_mps / ca.fmax(v, drive.power_speed_mps)
+    return d_max * share * ca.fmin(ca.fmax(fade, 0), 1)
 
 
 def _lateral_force(tyre: Pacejka, alpha: Any) -> Any:
@@ -128,51 +152,133 @@ def _function(name: str, x: Any, u: Any, xdot: list[Any]) -> ca.Function:
 
 
 def dynamic(car: CarParameters) -> Model:
-    """Dynamic bicycle model with Pacejka tyres and DC motor (paper table 1, middle column)."""
-    x, u = ca.SX.sym("x", 7), ca.SX.sym("u", 2)
-    ode = _function("dynamic", x, u, _dynamic_rates(car, x, u))
-    parameters = tuple(car_value(car, name) for name in DYNAMIC_PARAMETERS)
-    return Model("dynamic", car, ode, any_car=dynamic_with_parameters(), parameters=parameters)
+    """Single-track model of the true car (paper table 1, middle column).
 
-
-def car_value(car: CarParameters, name: str) -> float:
-    """A number of a car by its flat name, as in :data:`DYNAMIC_PARAMETERS`."""
-    axle, _, coefficient = name.partition("_")
-    if axle in ("front", "rear"):
-        return float(getattr(getattr(car, axle), coefficient))
-    return float(getattr(car, name))
-
-
-def dynamic_with_parameters() -> ca.Function:
-    """The dynamic model for any car: (x, u, p) -> xdot with p as :data:`DYNAMIC_PARAMETERS`.
-
-    With the numbers of a car it is :func:`dynamic` but for the rounding of folded constants.
+    Pacejka tyres are the paper's; linear ones are those of CommonRoad's single-track model.
     """
     x, u = ca.SX.sym("x", 7), ca.SX.sym("u", 2)
-    p = ca.SX.sym("p", len(DYNAMIC_PARAMETERS))
-    symbol: dict[str, Any] = dict(zip(DYNAMIC_PARAMETERS, ca.vertsplit(p), strict=True))
-    tyres: dict[str, Any] = {
-        axle: Pacejka.model_construct(**{c: symbol.pop(f"{axle}_{c}") for c in ("b", "c", "d")})
-        for axle in ("front", "rear")
-    }
-    car = CarParameters.model_construct(name="any", **tyres, **symbol)
-    xdot = ca.vertcat(*_dynamic_rates(car, x, u))
+    ode = _function("dynamic", x, u, _dynamic_rates(car, x, u))
+    parameters = tuple(car.equation_numbers.values())
+    return Model("dynamic", car, ode, any_car=dynamic_with_parameters(car), parameters=parameters)
+
+
+def dynamic_with_parameters(like: CarParameters) -> ca.Function:
+    """The dynamic model for any car with such tyres and drive: (x, u, p) -> xdot.
+
+    p is as :attr:`CarParameters.equation_numbers`. With the numbers of a car it is :func:`dynamic`
+    but for the rounding of folded constants.
+    """
+    x, u = ca.SX.sym("x", 7), ca.SX.sym("u", 2)
+    p = ca.SX.sym("p", len(like.equation_numbers))
+    symbols = iter(ca.vertsplit(p))
+    xdot = ca.vertcat(*_dynamic_rates(_symbolic(like, symbols), x, u))
     return ca.Function("dynamic", [x, u, p], [xdot], ["x", "u", "p"], ["xdot"])
+
+
+def _symbolic(like: CarParameters, symbols: Iterator[Any]) -> CarParameters:
+    """A car whose numbers are symbols, in the order of :attr:`CarParameters.equation_numbers`."""
+
+    def of(value: Any) -> Any:
+        if isinstance(value, Part):
+            return value.model_copy(update={n: of(v) for n, v in value if n != "model"})
+        return next(symbols)
+
+    values = {name: next(symbols) for name in BODY} | {"tyres": of(like.tyres)}
+    drive = like.drive if like.drive.guarded else of(like.drive)
+    return like.model_copy(update=values | {"drive": drive})
 
 
 def _dynamic_rates(car: CarParameters, x: Any, u: Any) -> list[Any]:
     """The equations; the car's values may be numbers or symbols."""
+    tyres = car.tyres
+    if isinstance(tyres, LinearTyres):
+        return [*_pose_rates(x), *_linear_rates(car, tyres, x, u), u[1]]
+    return [*_pose_rates(x), *_pacejka_rates(car, tyres, x, u), u[1]]
+
+
+def _pacejka_rates(car: CarParameters, tyres: PacejkaTyres, x: Any, u: Any) -> list[Any]:
+    """Of vx, vy, omega."""
     vx, vy, omega, delta = x[3], x[4], x[5], x[6]
     alpha_f, alpha_r = _slip_angles(car, x)
-    f_front, f_rear = _lateral_force(car.front, alpha_f), _lateral_force(car.rear, alpha_r)
+    f_front, f_rear = _lateral_force(tyres.front, alpha_f), _lateral_force(tyres.rear, alpha_r)
     f_drive = longitudinal_force(car, vx, u[0])
     m = car.mass_kg
     return [
-        *_pose_rates(x),
         (f_drive - f_front * ca.sin(delta) + m * vy * omega) / m,
         (f_rear + f_front * ca.cos(delta) - m * vx * omega) / m,
         (f_front * car.lf_m * ca.cos(delta) - f_rear * car.lr_m) / car.inertia_kgm2,
-        u[1],
+    ]
+
+
+def _linear_rates(car: CarParameters, tyres: LinearTyres, x: Any, u: Any) -> list[Any]:
+    """Of vx, vy, omega: CommonRoad's single-track model, kinematic at low speed.
+
+    Above ``switch_mps`` these are its equations for v = |(vx, vy)| and beta = atan2(vy, vx) by the
+    chain rule, below half of it those of the kinematic model; in between the share of the former
+    grows twice continuously differentiably.
+    """
+    a = longitudinal_force(car, x[3], u[0]) / car.mass_kg
+    low = tyres.switch_mps / 2
+    squared = x[3] ** 2 + x[4] ** 2
+    share = _smooth_step((squared - low**2) / (3 * low**2))
+    moving = squared > low**2
+    fast = _single_track_rates(
+        car, tyres, ca.if_else(moving, x[3], low), ca.if_else(moving, x[4], 0), x, a
+    )
+    slow = _rolling_rates(car, tyres, x, u[1], a)
+    return [share * one + (1 - share) * other for one, other in zip(fast, slow, strict=True)]
+
+
+def _single_track_rates(
+    car: CarParameters, tyres: LinearTyres, vx: Any, vy: Any, x: Any, a: Any
+) -> list[Any]:
+    """Of vx, vy, omega on linear tyres; ``a`` [m/s^2] is along the velocity.
+
+    Beyond 60 degrees of slip, where CommonRoad's equations mean nothing, ``a`` turns round towards
+    that of a car that slides backwards: throttle slows it.
+    """
+    omega, delta = x[5], x[6]
+    lf, lr, wheelbase = car.lf_m, car.lr_m, car.wheelbase_m
+    v, beta = ca.sqrt(vx**2 + vy**2), ca.atan2(vy, vx)
+    along = a * (1 - 2 * _smooth_step((0.5 - vx / v) / 1.5))
+    front = tyres.front_stiffness * (GRAVITY_MPS2 * lr - a * tyres.height_m)
+    rear = tyres.rear_stiffness * (GRAVITY_MPS2 * lf + a * tyres.height_m)
+    turn = lr * rear - lf * front
+    beta_rate = (
+        (tyres.mu / (v**2 * wheelbase) * turn - 1) * omega
+        - tyres.mu / (v * wheelbase) * (rear + front) * beta
+        + tyres.mu / (v * wheelbase) * front * delta
+    )
+    damping = (lf**2 * front + lr**2 * rear) / v
+    stiffness = tyres.mu * car.mass_kg / (car.inertia_kgm2 * wheelbase)
+    return [
+        along * vx / v - vy * beta_rate,
+        along * vy / v + vx * beta_rate,
+        stiffness * (lf * front * delta + turn * beta - damping * omega),
+    ]
+
+
+def _rolling_rates(
+    car: CarParameters, tyres: LinearTyres, x: Any, delta_rate: Any, a: Any
+) -> list[Any]:
+    """Of vx, vy, omega of a car that rolls without slip; ``a`` is along the velocity.
+
+    What slip there is fades as fast as it does on the tyres at ``switch_mps``.
+    """
+    vx, vy, omega, delta = x[3], x[4], x[5], x[6]
+    share, slope = car.lr_m / car.wheelbase_m, ca.tan(delta)
+    slope_rate = (1 + slope**2) * delta_rate
+    aside = share * slope  # tan(beta)
+    beta_rate = share * slope_rate / (1 + aside**2)
+    vx_rate = a / ca.sqrt(1 + aside**2) - vx * aside * beta_rate
+    turn, turn_rate = vx * slope, vx_rate * slope + vx * slope_rate
+    fading = (tyres.rear_stiffness * car.lf_m + tyres.front_stiffness * car.lr_m) * (
+        tyres.mu * GRAVITY_MPS2 / (tyres.switch_mps * car.wheelbase_m)
+    )
+    return [
+        vx_rate,
+        share * turn_rate - fading * (vy - share * turn),
+        (turn_rate / car.wheelbase_m) - fading * (omega - turn / car.wheelbase_m),
     ]
 
 

@@ -11,10 +11,12 @@ import hashlib
 from collections.abc import Mapping
 from typing import Any, Final
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic import Field, ValidationInfo, field_validator
+from pydantic_core import to_json
 
+from bayesrace.errors import InputError
+from bayesrace.vehicles.parts import GRAVITY_MPS2, Drive, LinearTyres, Part, Tyres
 from bayesrace.vehicles.tuning import (
-    GRAVITY_MPS2,
     REFERENCE_ACCELERATION_MPS2,
     REFERENCE_WHEELBASE_M,
     SPEED,
@@ -23,22 +25,14 @@ from bayesrace.vehicles.tuning import (
     scaled,
 )
 
-__all__ = ["GRAVITY_MPS2", "CarParameters", "Pacejka"]
+__all__ = ["ACTUATORS", "BODY", "CarParameters"]
+
+BODY: Final = ("lf_m", "lr_m", "mass_kg", "inertia_kgm2")
+ACTUATORS: Final = ("d_min", "d_max", "delta_max_rad", "delta_rate_max_radps")
+"""Limits of the inputs and of the steering angle."""
 
 _BRAKE_FADE_MPS: Final = 0.1
 """Of the reference car."""
-
-
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class Pacejka(_Frozen):
-    """Lateral tyre force F = D sin(C atan(B alpha)), paper table 1."""
-
-    b: float = Field(gt=0, description="stiffness factor B [1/rad]")
-    c: float = Field(gt=0, description="shape factor C [-]")
-    d: float = Field(gt=0, description="peak force D [N]")
 
 
 def _scales(known: Mapping[str, Any]) -> Scales:
@@ -46,12 +40,17 @@ def _scales(known: Mapping[str, Any]) -> Scales:
     try:
         wheelbase_m = known["lf_m"] + known["lr_m"]
         acceleration_mps2 = known["friction"] * GRAVITY_MPS2
+        command = known["drive"].command_size(acceleration_mps2)
     except KeyError:
-        return 1.0, 1.0
-    return wheelbase_m / REFERENCE_WHEELBASE_M, acceleration_mps2 / REFERENCE_ACCELERATION_MPS2
+        return Scales()
+    return Scales(
+        wheelbase_m / REFERENCE_WHEELBASE_M,
+        acceleration_mps2 / REFERENCE_ACCELERATION_MPS2,
+        command,
+    )
 
 
-class CarParameters(_Frozen):
+class CarParameters(Part):
     """One car; symbols as in docs/equations.md."""
 
     name: str = Field(
@@ -61,14 +60,10 @@ class CarParameters(_Frozen):
     lr_m: float = Field(gt=0, description="centre of gravity to rear axle [m]")
     mass_kg: float = Field(gt=0, description="mass [kg]")
     inertia_kgm2: float = Field(gt=0, description="yaw moment of inertia Iz [kg m^2]")
-    front: Pacejka = Field(description="lateral force of the front tyres together")
-    rear: Pacejka = Field(description="lateral force of the rear tyres together")
-    cm1: float = Field(gt=0, description="motor force per duty cycle at standstill [N]")
-    cm2: float = Field(ge=0, description="motor back-EMF coefficient [N s/m]")
-    cr0: float = Field(ge=0, description="rolling resistance [N]")
-    cr2: float = Field(ge=0, description="drag coefficient Cd [N s^2/m^2]")
-    d_min: float = Field(lt=0, description="lowest duty cycle (brake) [-]")
-    d_max: float = Field(gt=0, description="highest duty cycle [-]")
+    tyres: Tyres = Field(description="the tyres, by their model")
+    drive: Drive = Field(description="the drive, by its model")
+    d_min: float = Field(lt=0, description="lowest drive command, which brakes [command]")
+    d_max: float = Field(gt=0, description="highest drive command [command]")
     delta_max_rad: float = Field(gt=0, description="steering angle limit, both sides [rad]")
     delta_rate_max_radps: float = Field(gt=0, description="steering rate limit, both sides [rad/s]")
     friction: float = Field(
@@ -83,6 +78,12 @@ class CarParameters(_Frozen):
         gt=0,
         description="below this speed braking fades linearly to none, so that a car stops and "
         "stays: brakes do not drive a car back [m/s]",
+    )
+    train_track: str = Field(
+        "paddock", min_length=1, description="track of training drives where none is named [-]"
+    )
+    race_track: str = Field(
+        "harbour", min_length=1, description="track of races where none is named [-]"
     )
     tuning: Tuning = Field(
         default_factory=dict,
@@ -100,11 +101,40 @@ class CarParameters(_Frozen):
         """Distance between the axles, lf + lr."""
         return self.lf_m + self.lr_m
 
+    @property
+    def equation_numbers(self) -> dict[str, float]:
+        """What the dynamic model depends on, by flat name; ``front_b`` is ``tyres.front.b``."""
+        drive = {} if self.drive.guarded else self.drive.numbers()
+        return {name: float(getattr(self, name)) for name in BODY} | self.tyres.numbers() | drive
+
+    @property
+    def guard_numbers(self) -> dict[str, float]:
+        """What the plant's guard depends on, by name."""
+        drive = self.drive.numbers() if self.drive.guarded else {}
+        return {name: float(getattr(self, name)) for name in ACTUATORS} | drive
+
+    def on_tyres(self, model: str) -> "CarParameters":
+        """The same car on tyres of this model: its own, or saturating ones in place of linear ones.
+
+        InputError for linear tyres in place of others.
+        """
+        if self.tyres.model == model:
+            return self
+        if not isinstance(self.tyres, LinearTyres):
+            raise InputError(
+                f"the car '{self.name}' has {self.tyres.model} tyres: write a car's file with the "
+                f"numbers of {model} ones"
+            )
+        tyres = self.tyres.saturating(self.lf_m, self.lr_m, self.mass_kg)
+        return self.model_copy(update={"tyres": tyres})
+
     def digest(self) -> str:
         """Short identity of the values that shape the models (not name, outline, grip, tuning)."""
-        apart = {"name", "friction", "width_m", "length_m", "brake_fade_mps", "tuning"}
-        shape = self.model_dump_json(exclude=apart)
-        return hashlib.sha256(shape.encode()).hexdigest()[:12]
+        shape: dict[str, Any] = {name: getattr(self, name) for name in BODY}
+        for part in (self.tyres, self.drive):
+            shape |= part.model_dump(exclude={"model"})
+        shape |= {name: getattr(self, name) for name in ACTUATORS}
+        return hashlib.sha256(to_json(shape)).hexdigest()[:12]
 
     @property
     def identity(self) -> str:

@@ -3,15 +3,20 @@
 Each number belongs to a reference car of wheelbase L0 = 0.062 m and friction 0.75. For a car of
 wheelbase L and usable acceleration a = friction g it is scaled by dimensional analysis,
 
-    value = reference (L / L0)^p (a / a0)^q
+    value = reference (L / L0)^p (a / a0)^q c^r
 
 with (p, q) = (1, 0) for lengths, (1/2, 1/2) for speeds, (1/2, -1/2) for times, (0, 1) for
-accelerations, (-1/2, 1/2) for yaw rates. A new car needs none of them in its file.
+accelerations, (-1/2, 1/2) for yaw rates. r counts the drive commands in the number's unit; c is 1
+for a duty cycle, as the reference car has it, and a in m/s^2 for a car whose command is an
+acceleration: full throttle of the reference car is about its usable acceleration. A new car needs
+none of them in its file.
 """
 
-from typing import Any, Final, Self
+from typing import Any, Final, NamedTuple, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from bayesrace.vehicles.parts import GRAVITY_MPS2, Part
 
 __all__ = [
     "REFERENCE_ACCELERATION_MPS2",
@@ -30,51 +35,56 @@ __all__ = [
     "scaled",
 ]
 
-GRAVITY_MPS2: Final = 9.81
-
 REFERENCE_WHEELBASE_M: Final = 0.029 + 0.033
 REFERENCE_ACCELERATION_MPS2: Final = 0.75 * GRAVITY_MPS2
 
-LENGTH: Final = (1.0, 0.0)
-SPEED: Final = (0.5, 0.5)
-TIME: Final = (0.5, -0.5)
-ACCELERATION: Final = (0.0, 1.0)
-YAW_RATE: Final = (-0.5, 0.5)
-YAW_ACCELERATION: Final = (-1.0, 1.0)
-PER_SPEED: Final = (-0.5, -0.5)
-NONE: Final = (0.0, 0.0)
+Dimension = tuple[float, float, float]
+"""Exponents of wheelbase, acceleration and command."""
 
-Scales = tuple[float, float]
-"""Wheelbase and usable acceleration of a car, as multiples of the reference car's."""
-
-
-def scaled(reference: float, dimension: tuple[float, float], scales: Scales) -> float:
-    """The reference car's number for a car of these scales; exactly the same for (1, 1)."""
-    return float(reference * scales[0] ** dimension[0] * scales[1] ** dimension[1])
+LENGTH: Final = (1.0, 0.0, 0.0)
+SPEED: Final = (0.5, 0.5, 0.0)
+TIME: Final = (0.5, -0.5, 0.0)
+ACCELERATION: Final = (0.0, 1.0, 0.0)
+YAW_RATE: Final = (-0.5, 0.5, 0.0)
+YAW_ACCELERATION: Final = (-1.0, 1.0, 0.0)
+COMMAND_PER_SPEED: Final = (-0.5, -0.5, 1.0)
+COMMAND: Final = (0.0, 0.0, 1.0)
+NONE: Final = (0.0, 0.0, 0.0)
 
 
-def _number(reference: float, dimension: tuple[float, float], text: str, **bounds: float) -> Any:
-    length, acceleration = dimension
-    extra: dict[str, Any] = {
-        "reference": reference, "length": length, "acceleration": acceleration
-    }  # fmt: skip
+class Scales(NamedTuple):
+    """Of a car, as multiples of the reference car's."""
+
+    wheelbase: float = 1.0
+    acceleration: float = 1.0
+    """Usable: friction g."""
+    command: float = 1.0
+    """Drive command."""
+
+
+def scaled(reference: float, dimension: Dimension, scales: Scales) -> float:
+    """The reference car's number for a car of these scales; exactly the same for ones."""
+    value = reference
+    for scale, exponent in zip(scales, dimension, strict=True):
+        value *= scale**exponent
+    return float(value)
+
+
+def _number(reference: float, dimension: Dimension, text: str, **bounds: float) -> Any:
     limits: dict[str, Any] = {**bounds} or {"gt": 0}
+    extra: dict[str, Any] = {"reference": reference, "dimension": list(dimension)}
     return Field(description=text, json_schema_extra=extra, **limits)
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
+class _Section(Part):
     @classmethod
     def defaults(cls, scales: Scales) -> dict[str, Any]:
         """Every number of the section for a car of these scales, by name."""
         values: dict[str, Any] = {}
         for name, field in cls.model_fields.items():
-            extra = field.json_schema_extra
-            if isinstance(extra, dict):
-                numbers = [extra[key] for key in ("reference", "length", "acceleration")]
-                reference, length, acceleration = (float(str(number)) for number in numbers)
-                values[name] = scaled(reference, (length, acceleration), scales)
+            extra: Any = field.json_schema_extra
+            if extra:
+                values[name] = scaled(extra["reference"], tuple(extra["dimension"]), scales)
         return values
 
 
@@ -88,11 +98,11 @@ class RacelineTuning(_Section):
     )
     rate_weight: float = _number(
         1e-6,
-        (1.5, -2.5),
+        (1.5, -2.5, 0.0),
         "cost of the squared slope of acceleration over the way, against chatter [s^5/m]",
     )
     curvature_weight: float = _number(
-        1e-6, (3.5, -0.5), "cost of the squared slope of curvature over the way [s m^3]"
+        1e-6, (3.5, -0.5, 0.0), "cost of the squared slope of curvature over the way [s m^3]"
     )
     tolerance_m: float = _number(
         5e-4, LENGTH, "by which the line may pass the margin between stations [m]"
@@ -138,7 +148,9 @@ class TurnTuning(_Section):
     pace_mps: float = _number(0.5, SPEED, "speed of a turn [m/s]")
     stop_mps: float = _number(0.05, SPEED, "a speed limit below this is a stop [m/s]")
     too_fast_mps: float = _number(1.0, SPEED, "a faster car is not turning round [m/s]")
-    throttle_spm: float = _number(2.0, PER_SPEED, "duty cycle per speed below the pace [s/m]")
+    throttle_spm: float = _number(
+        2.0, COMMAND_PER_SPEED, "drive command per speed below the pace [command s/m]"
+    )
 
 
 class PlausibleTuning(_Section):
@@ -164,10 +176,12 @@ class ScaleTuning(_Section):
 class ObjectiveTuning(_Section):
     """Weights, margin and stages of the OCP, where its settings state none."""
 
-    q_position: float = _number(1.0, (-2.0, 0.0), "Q: squared position error [1/m^2]")
-    r_duty: float = _number(0.002, NONE, "R: squared change of the duty cycle [1]")
-    r_delta_rate: float = _number(3e-5, (1.0, -1.0), "R: squared steering rate [s^2/rad^2]")
-    s_slack: float = _number(100.0, (-2.0, 0.0), "S: squared track violation [1/m^2]")
+    q_position: float = _number(1.0, (-2.0, 0.0, 0.0), "Q: squared position error [1/m^2]")
+    r_duty: float = _number(
+        0.002, (0.0, 0.0, -2.0), "R: squared change of the drive command [1/command^2]"
+    )
+    r_delta_rate: float = _number(3e-5, (1.0, -1.0, 0.0), "R: squared steering rate [s^2/rad^2]")
+    s_slack: float = _number(100.0, (-2.0, 0.0, 0.0), "S: squared track violation [1/m^2]")
     margin_m: float = _number(0.01, LENGTH, "distance kept from the track edges [m]")
     horizon: int = _number(20, NONE, "stages that the OCP looks ahead [-]", ge=2, le=100)
 
@@ -177,7 +191,12 @@ class PursuitTuning(_Section):
 
     lookahead_m: float = _number(0.16, LENGTH, "distance of the target at standstill [m]")
     lookahead_s: float = _number(0.05, TIME, "distance added per speed [s]")
-    speed_gain_spm: float = _number(0.9, PER_SPEED, "duty cycle per speed error [s/m]")
+    speed_gain_spm: float = _number(
+        0.9, COMMAND_PER_SPEED, "drive command per speed error [command s/m]"
+    )
+    excite_d: float = _number(
+        0.1, COMMAND, "standard deviation of the disturbance of the drive command [command]"
+    )
     speed_min_mps: float = _number(0.4, SPEED, "target speed is never below [m/s]")
     window_m: float = _number(0.4, LENGTH, "way ahead in which the nearest point is sought [m]")
     lost_m: float = _number(0.5, LENGTH, "farther from it, the whole line is searched [m]")

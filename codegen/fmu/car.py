@@ -15,15 +15,13 @@ import casadi as ca
 from bayesrace.errors import InputError
 from bayesrace.integrators import PLANT_SCHEME, PLANT_SUBSTEP_HZ, SCHEMES
 from bayesrace.vehicles import models
-from bayesrace.vehicles.models import DYNAMIC_PARAMETERS, INPUTS, STATES
-from bayesrace.vehicles.parameters import CarParameters, Pacejka
+from bayesrace.vehicles.models import INPUTS, STATES
+from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parts import LinearTyres, Pacejka, Part
 from codegen.fmu.definition import FmuDefinition, Variable
 from codegen.fmu.sources import NATIVE
 
-__all__ = ["LIMITS", "STATE", "car_fmu", "car_values"]
-
-LIMITS: Final = ("d_min", "d_max", "delta_max_rad", "delta_rate_max_radps")
-"""Parameters of the guard, Co-Simulation only; the others are models.DYNAMIC_PARAMETERS."""
+__all__ = ["STATE", "car_fmu"]
 
 STATE: Final = {
     "x": ("m", "position, x"),
@@ -37,51 +35,105 @@ STATE: Final = {
 """Unit and meaning of each state."""
 
 _PAGE: Final = """
-<p>The dynamic bicycle model with Pacejka tyres and a DC motor by which BayesRace simulates the car
-'{car}': state x = [x, y, psi, vx, vy, omega, delta], input u = [d, delta_rate], SI units. The start
-state is the start value of the outputs; any parameter can be set before initialisation ends.</p>
+<p>{title}, by which BayesRace simulates the car '{car}': state x = [x, y, psi, vx, vy, omega,
+delta], input u = [d, delta_rate], SI units. The start state is the start value of the outputs; any
+parameter can be set before initialisation ends.</p>
 <pre>
 der(x)     = vx cos(psi) - vy sin(psi)
 der(y)     = vx sin(psi) + vy cos(psi)
 der(psi)   = omega
-der(vx)    = (F_x - F_fy sin(delta)) / mass_kg + vy omega
-der(vy)    = (F_ry + F_fy cos(delta)) / mass_kg - vx omega
-der(omega) = (F_fy lf_m cos(delta) - F_ry lr_m) / inertia_kgm2
+{rates}
 der(delta) = delta_rate
 
-F_x  = (cm1 - cm2 vx) d - cr0 - cr2 vx^2
-F_fy = front_d sin(front_c atan(front_b alpha_f))    alpha_f = delta - atan((omega lf_m + vy) / vx)
-F_ry = rear_d sin(rear_c atan(rear_b alpha_r))       alpha_r = atan((omega lr_m - vy) / vx)
+{forces}
 </pre>
-<p>Below 0.1 m/s, slip angles and rolling resistance fade smoothly to none at standstill. {kind}</p>
+<p>{slow} {kind}</p>
 """
+
+_PACEJKA: Final = """der(vx)    = (F_x - F_fy sin(delta)) / mass_kg + vy omega
+der(vy)    = (F_ry + F_fy cos(delta)) / mass_kg - vx omega
+der(omega) = (F_fy lf_m cos(delta) - F_ry lr_m) / inertia_kgm2"""
+
+_PACEJKA_FORCES: Final = """
+F_fy = front_d sin(front_c atan(front_b alpha_f))    alpha_f = delta - atan((omega lf_m + vy) / vx)
+F_ry = rear_d sin(rear_c atan(rear_b alpha_r))       alpha_r = atan((omega lr_m - vy) / vx)"""
+
+_LINEAR: Final = """der(v)     = F_x / mass_kg    v = sqrt(vx^2 + vy^2)
+der(beta)  = (mu / (v^2 L) (lr_m C_r - lf_m C_f) - 1) omega - mu / (v L) (C_r + C_f) beta
+             + mu / (v L) C_f delta    beta = atan2(vy, vx)
+der(omega) = mu mass_kg / (inertia_kgm2 L) ((lr_m C_r - lf_m C_f) beta + lf_m C_f delta
+             - (lf_m^2 C_f + lr_m^2 C_r) omega / v)"""
+
+_LINEAR_FORCES: Final = """    L = lf_m + lr_m    a = der(v)
+C_f  = front_stiffness (9.81 lr_m - height_m a)    C_r = rear_stiffness (9.81 lf_m + height_m a)"""
 
 _KIND: Final = {
     "cs": "A communication step has any length and is divided into equal Runge-Kutta steps of at "
-    "most 1 ms, with the inputs held. Duty cycle, steering rate and steering angle stay within the "
-    "limits; an input that is not finite brakes the car with the steering held. d_applied and "
+    "most 1 ms, with the inputs held. Drive command, steering rate and steering angle stay within "
+    "the limits; an input that is not finite brakes the car with the steering held. d_applied and "
     "delta_rate_applied say what acted.",
     "me": "No limit is applied to an input or to the steering angle. Directional and adjoint "
     "derivatives are exact, with respect to states, inputs and parameters.",
 }
 
 
-def car_values(car: CarParameters) -> dict[str, float]:
-    """Every FMU parameter of a car by name; ``front_b`` is ``car.front.b``."""
-    return {name: models.car_value(car, name) for name in (*DYNAMIC_PARAMETERS, *LIMITS)}
+def _tyres(car: CarParameters) -> str:
+    return "linear" if isinstance(car.tyres, LinearTyres) else "Pacejka"
 
 
-def _parameter(name: str, value: float) -> Variable:
-    """With bounds, unit and description of the car's own data model."""
-    axle, _, coefficient = name.partition("_")
-    of_tyre = axle in ("front", "rear")
-    schema = (Pacejka if of_tyre else CarParameters).model_json_schema()["properties"]
-    field = schema[coefficient if of_tyre else name]
+def _title(car: CarParameters) -> str:
+    drive = "an acceleration as drive command" if car.drive.guarded else "DC motor"
+    return f"dynamic bicycle model with {_tyres(car)} tyres and {drive}"
+
+
+def _page(car: CarParameters, kind: str) -> str:
+    linear = isinstance(car.tyres, LinearTyres)
+    force = "mass_kg d" if car.drive.guarded else "(cm1 - cm2 vx) d - cr0 - cr2 vx^2"
+    slow = "Below 0.1 m/s, slip angles and rolling resistance fade smoothly to none at standstill."
+    if linear:
+        slow = "Below switch_mps this passes smoothly into rolling without slip."
+    return _PAGE.format(
+        title=f"The {_title(car)}",
+        car=car.name,
+        rates=_LINEAR if linear else _PACEJKA,
+        forces=f"F_x  = {force}{_LINEAR_FORCES if linear else _PACEJKA_FORCES}",
+        slow=slow,
+        kind=_KIND[kind],
+    )
+
+
+def _meanings(car: CarParameters) -> dict[str, tuple[str, dict[str, Any]]]:
+    """Flat name of each number to the axle it is of, if any, and its field's schema."""
+    found: dict[str, tuple[str, dict[str, Any]]] = {}
+    for part in (car.tyres, car.drive):
+        for name, value in part:
+            form: type[Part] = type(value) if isinstance(value, Part) else type(part)
+            fields = form.model_json_schema()["properties"]
+            if isinstance(value, Pacejka):
+                found |= {f"{name}_{inner}": (name, fields[inner]) for inner in fields}
+            else:
+                found[name] = "", fields[name]
+    return {
+        name: ("", field) for name, field in CarParameters.model_json_schema()["properties"].items()
+    } | found
+
+
+def _parameters(car: CarParameters, kind: str) -> list[Variable]:
+    """With bounds, unit and description of the car's own data model; limits for the guard only."""
+    values = car.equation_numbers | (car.guard_numbers if kind == "cs" else {})
+    meanings = _meanings(car)
+    return [_parameter(name, value, *meanings[name], car) for name, value in values.items()]
+
+
+def _parameter(
+    name: str, value: float, axle: str, field: dict[str, Any], car: CarParameters
+) -> Variable:
     text, unit = re.fullmatch(r"(.*) \[([^]]*)\]", field["description"]).groups()  # type: ignore[union-attr]
+    unit = car.drive.unit if unit == "command" else unit
     return Variable(
         name,
         "parameter",
-        f"{axle} tyre: {text}" if of_tyre else text,
+        f"{axle} tyre: {text}" if axle else text,
         unit="1" if unit == "-" else unit.replace(" ", ".").replace("^", ""),
         start=value,
         min=field.get("minimum", field.get("exclusiveMinimum", -inf)),
@@ -102,29 +154,28 @@ def _variables(car: CarParameters, kind: str) -> list[Variable]:
         )
         for name, (unit, text) in STATE.items()
     ]  # fmt: skip
-    duty = f"duty cycle of the motor{held}"
+    command, unit = car.drive.command, car.drive.unit
+    end = 1.0 if unit == "1" else inf
     variables += [
-        Variable("d", "input", duty, unit="1", start=0.0, min=-1, max=1),
+        Variable(
+            "d", "input", f"{command} of the drive{held}", unit=unit, start=0.0, min=-end, max=end
+        ),
         Variable("delta_rate", "input", f"steering rate{held}", unit="rad/s", start=0.0),
-    ]
-    variables += [
-        _parameter(name, value)
-        for name, value in car_values(car).items()
-        if sampled or name not in LIMITS
+        *_parameters(car, kind),
     ]
     if not sampled:
-        return variables + _derivatives()
+        return variables + _derivatives(car)
     acted = "that acted in the last step"
     return [
         *variables,
-        Variable("d_applied", "output", f"duty cycle {acted}", unit="1"),
+        Variable("d_applied", "output", f"{command} {acted}", unit=unit),
         Variable("delta_rate_applied", "output", f"steering rate {acted}", unit="rad/s"),
     ]
 
 
-def _derivatives() -> list[Variable]:
+def _derivatives(car: CarParameters) -> list[Variable]:
     """Their direct dependencies on states and inputs are those of the equations."""
-    sparsity = _rates().sparsity_jac(0, 0)
+    sparsity = _rates(car).sparsity_jac(0, 0)
     names = (*STATES, *INPUTS)
     return [
         Variable(
@@ -139,27 +190,27 @@ def _derivatives() -> list[Variable]:
     ]
 
 
-def _rates() -> Any:
+def _rates(car: CarParameters) -> Any:
     """The equations as a function of states, inputs and parameters in one vector."""
-    ode = models.dynamic_with_parameters()
+    ode = models.dynamic_with_parameters(car)
     n, m, k = (ode.size1_in(i) for i in range(3))
     known = ca.SX.sym("known", n + m + k)
     return ca.Function("car_rates", [known], [ode(*ca.vertsplit(known, [0, n, n + m, n + m + k]))])
 
 
-def _substep() -> Any:
+def _substep(car: CarParameters) -> Any:
     """One integration step of Co-Simulation: (x, u, p, h) -> x_next."""
-    ode = models.dynamic_with_parameters()
+    ode = models.dynamic_with_parameters(car)
     x, u, p = (ca.SX.sym(name, ode.size1_in(i)) for i, name in enumerate("xup"))
     h: Any = ca.SX.sym("h")  # the schemes take a symbol as well
     _, advance = SCHEMES[PLANT_SCHEME]
     return ca.Function("car_substep", [x, u, p, h], [advance(lambda s: ode(s, u, p), x, h)])
 
 
-def _functions(kind: str) -> list[Any]:
+def _functions(car: CarParameters, kind: str) -> list[Any]:
     if kind == "cs":
-        return [_substep()]
-    rates = _rates()
+        return [_substep(car)]
+    rates = _rates(car)
     known, weights = ca.SX.sym("known", rates.size1_in(0)), ca.SX.sym("w", rates.size1_out(0))
     seed, xdot = ca.SX.sym("seed", known.size1()), rates(known)
     forward = ca.densify(ca.jtimes(xdot, known, seed))
@@ -171,10 +222,10 @@ def _functions(kind: str) -> list[Any]:
     ]
 
 
-def _sources(kind: str) -> dict[str, bytes]:
+def _sources(car: CarParameters, kind: str) -> dict[str, bytes]:
     options: dict[str, Any] = {"with_header": True, "casadi_int": "int", "with_export": False}
     generator = ca.CodeGenerator("car_model.c", options)
-    for function in _functions(kind):
+    for function in _functions(car, kind):
         generator.add(function)
     with tempfile.TemporaryDirectory() as folder:
         generator.generate(f"{folder}/")
@@ -191,14 +242,15 @@ def car_fmu(
     """
     if version == 2 and kind == "me":
         raise InputError("Model Exchange is exported for FMI 3.0 only: use --version 3")
-    constants = {"BRAKE_FADE_MPS": car.brake_fade_mps, "SUBSTEP_HZ": float(PLANT_SUBSTEP_HZ)}
+    constants = {"ACCELERATION_DRIVE": 1.0} if car.drive.guarded else {}
+    constants |= {"BRAKE_FADE_MPS": car.brake_fade_mps, "SUBSTEP_HZ": float(PLANT_SUBSTEP_HZ)}
     return FmuDefinition(
         name=f"BayesRace {car.name}",
         identifier=re.sub(r"[^A-Za-z0-9_]", "_", f"bayesrace_{car.name}"),
-        description=f"Race car '{car.name}': dynamic bicycle model with Pacejka tyres and DC motor",
+        description=f"Race car '{car.name}': {_title(car)}",
         version=version,
         variables=tuple(_variables(car, kind)),
-        sources=_sources(kind),
+        sources=_sources(car, kind),
         constants=constants if kind == "cs" else {},
-        documentation=_PAGE.format(car=car.name, kind=_KIND[kind]),
+        documentation=_page(car, kind),
     )

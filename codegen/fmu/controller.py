@@ -16,6 +16,7 @@ from bayesrace.gp.weights import GpWeights
 from bayesrace.manifest import Manifest, read_manifest
 from bayesrace.native_interface import NO_STEP, SOLVER, STATUSES
 from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parts import Drive
 from codegen.build import HOST
 from codegen.compiler import FLAGS
 from codegen.fmu.car import STATE
@@ -79,7 +80,7 @@ def controller_fmu(
         identifier="bayesrace_controller",
         description=f"GP-MPC racing controller for the car '{car.name}', {manifest.model} model",
         version=version,
-        variables=tuple(_variables(manifest, settings, fallback)),
+        variables=tuple(_variables(manifest, car.drive, settings, fallback)),
         sources=_sources(artefact),
         flags=_flags(cpu),
         constants={"NO_SPEED_LIMIT": _NO_LIMIT_MPS},
@@ -118,10 +119,13 @@ def _value(values: Mapping[str, float], name: str) -> float:
 
 
 def _variables(
-    manifest: Manifest, settings: Mapping[str, float], fallback: Mapping[str, float]
+    manifest: Manifest, drive: Drive, settings: Mapping[str, float], fallback: Mapping[str, float]
 ) -> list[Variable]:
     """In the order that controller.c relies on: the state together, the outputs last."""
-    acts = "duty cycle that acts now, read if d_applied_connected; else taken to be the last output"
+    acts = (
+        f"{drive.command} that acts now, read if d_applied_connected; else taken to be the last "
+        "output"
+    )
     limit = f"the reference moves along the racing line no faster; {_NO_LIMIT_MPS:g}: no limit"
     rate = "by how much the limit falls along the horizon, for a stop on the line"
     return [
@@ -129,11 +133,11 @@ def _variables(
             Variable(name, "input", f"measured: {text}", unit=unit, start=0.0)
             for name, (unit, text) in STATE.items()
         ),
-        Variable("d_applied", "input", acts, unit="1", start=0.0),
+        Variable("d_applied", "input", acts, unit=drive.unit, start=0.0),
         Variable("speed_limit", "input", limit, unit="m/s", start=_NO_LIMIT_MPS),
         Variable("speed_limit_rate", "input", rate, unit="m/s2", start=0.0),
         *_parameters(manifest, settings, fallback),
-        *_outputs(),
+        *_outputs(drive),
     ]
 
 
@@ -169,12 +173,12 @@ def _parameters(
     ]  # fmt: skip
 
 
-def _outputs() -> list[Variable]:
+def _outputs(drive: Drive) -> list[Variable]:
     def output(name: str, text: str, **others: Any) -> Variable:
         return Variable(name, "output", text, dependencies=None, **others)
 
     return [
-        output("d", "duty cycle", unit="1"),
+        output("d", drive.command, unit=drive.unit),
         output("delta_rate", "steering rate", unit="rad/s"),
         output("status", f"of the step: {', '.join(_STATUSES)}", kind="integer"),
         output("usable", "the step's solution may be driven", kind="boolean"),

@@ -5,20 +5,21 @@
     d_min <= d <= d_max,  |delta_rate| <= delta_rate_max
 
 The normals n_k have unit length. delta_0 is measured, so it is not constrained. Below
-the car's ``brake_fade_mps`` d_min fades to 0: brakes do not drive a car backwards.
+the car's ``brake_fade_mps`` d_min fades to 0: brakes do not drive a car backwards. Above the speed
+of its power limit d_max falls; both by the measured speed.
 """
 
 import casadi as ca
 
 from bayesrace.integrators import Discretisation
-from bayesrace.vehicles.models import STATES, Model
+from bayesrace.vehicles.models import STATES, Model, top_command
+from bayesrace.vehicles.parameters import CarParameters
 from bayesrace.vehicles.tuning import Tuning
 from codegen.problems.problem import Input, Parameter, Problem, Row, State, Symbols
 from codegen.stage import advance_function, linearise_function
 
 __all__ = ["tracking"]
 
-_INPUTS = (Input("d", "1", limit=1e3), Input("delta_rate", "rad/s", held=False, limit=1e3))
 _REFERENCE = (
     Parameter("x", "m"),
     Parameter("y", "m"),
@@ -27,17 +28,31 @@ _REFERENCE = (
     Parameter("lower", "m", "the track is lower <= normal . p <= upper"),
     Parameter("upper", "m"),
 )
-_PARAMETERS = (
-    Parameter("q_position", "1/m2", "weight of the squared position error", positive=True),
-    Parameter("r_duty", "1", "weight of the squared change of the duty cycle", positive=True),
-    Parameter("r_delta_rate", "s2/rad2", "weight of the squared steering rate", positive=True),
-    Parameter("s_slack", "1/m2", "weight of the squared track violation; 0: no track", low=0),
-    Parameter("margin_m", "m", "distance kept from the track edges", low=0),
-    Parameter("d_min", "1", "lowest duty cycle (full brake)", high=0),
-    Parameter("d_max", "1", "highest duty cycle", low=0),
-    Parameter("delta_max_rad", "rad", "limit of the steering angle", positive=True),
-    Parameter("delta_rate_max_radps", "rad/s", "limit of the steering rate", positive=True),
-)
+
+
+def _inputs(car: CarParameters) -> tuple[Input, ...]:
+    return (
+        Input("d", car.drive.unit, limit=1e3),
+        Input("delta_rate", "rad/s", held=False, limit=1e3),
+    )
+
+
+def _parameters(car: CarParameters) -> tuple[Parameter, ...]:
+    command, unit = car.drive.command, car.drive.unit
+    per_square = car.drive.unit_per_square
+    return (
+        Parameter("q_position", "1/m2", "weight of the squared position error", positive=True),
+        Parameter(
+            "r_duty", per_square, f"weight of the squared change of the {command}", positive=True
+        ),
+        Parameter("r_delta_rate", "s2/rad2", "weight of the squared steering rate", positive=True),
+        Parameter("s_slack", "1/m2", "weight of the squared track violation; 0: no track", low=0),
+        Parameter("margin_m", "m", "distance kept from the track edges", low=0),
+        Parameter("d_min", unit, f"lowest {command} (full brake)", high=0),
+        Parameter("d_max", unit, f"highest {command}", low=0),
+        Parameter("delta_max_rad", "rad", "limit of the steering angle", positive=True),
+        Parameter("delta_rate_max_radps", "rad/s", "limit of the steering rate", positive=True),
+    )
 
 
 def _states(tuning: Tuning) -> tuple[State, ...]:
@@ -61,12 +76,13 @@ def _planner(tuning: Tuning) -> dict[str, float]:
 
 
 def tracking(model: Model, discretisation: Discretisation) -> Problem:
-    """The problem with one prediction model (seven states, duty cycle and steering rate)."""
+    """The problem with one prediction model (seven states, drive command and steering rate)."""
     car = model.car
-    s = Symbols.of(len(STATES), len(_INPUTS), len(_REFERENCE), len(_PARAMETERS))
+    inputs, parameters = _inputs(car), _parameters(car)
+    s = Symbols.of(len(STATES), len(inputs), len(_REFERENCE), len(parameters))
     x_ref, y_ref, normal_x, normal_y, lower, upper = ca.vertsplit(s.p)
     q, r_d, r_delta, slack, margin, d_min, d_max, delta_max, rate_max = ca.vertsplit(s.theta)
-    x, y, _, vx, _, _, delta = ca.vertsplit(s.x)
+    x, y, _, vx, vy, _, delta = ca.vertsplit(s.x)
     d, rate = ca.vertsplit(s.u)
     error = (x - x_ref) ** 2 + (y - y_ref) ** 2
     cost = q * error + r_d * (d - s.u_before[0]) ** 2 + r_delta * rate**2
@@ -79,9 +95,9 @@ def tracking(model: Model, discretisation: Discretisation) -> Problem:
     return Problem(
         name="tracking",
         states=_states(car.tuning),
-        inputs=_INPUTS,
+        inputs=inputs,
         stage_parameters=_REFERENCE,
-        parameters=_PARAMETERS,
+        parameters=parameters,
         features=("vx", "vy", "omega", "delta", "d", "delta_rate"),
         outputs=3,
         symbols=s,
@@ -94,7 +110,7 @@ def tracking(model: Model, discretisation: Discretisation) -> Problem:
             Row("track", along, lower + margin, upper - margin, penalty=slack),
         ),
         u_lower=ca.vertcat(brake, -rate_max),
-        u_upper=ca.vertcat(d_max, rate_max),
+        u_upper=ca.vertcat(top_command(car, ca.sqrt(vx**2 + vy**2), d_max), rate_max),
         guess=ca.vertcat(ca.fmin(ca.fmax(s.u_before[0], s.share * d_max), d_max), 0),
         acting=ca.vertcat(
             ca.fmin(ca.fmax(d, d_min), d_max), ca.fmin(ca.fmax(within, -rate_max), rate_max)

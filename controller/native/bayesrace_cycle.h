@@ -11,7 +11,7 @@
  *
  * Times are the plant's unless they say otherwise. As with br_mpc, a cycle lives in memory of the
  * caller's, allocates nothing, and is for one thread. It is for problems that follow a path, whose
- * roles (codegen/problems) name the duty cycle, the steering rate and the speed.
+ * roles (codegen/problems) name the drive command, the steering rate and the speed.
  */
 #ifndef BAYESRACE_CYCLE_H
 #define BAYESRACE_CYCLE_H

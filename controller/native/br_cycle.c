@@ -217,7 +217,7 @@ static void halt(br_cycle *cycle, double acting_s) {
     cycle->counters.phase = cycle->halted;
 }
 
-/* How fast the car may still be: by the model, braking since it was last seen. A duty cycle that
+/* How fast the car may still be: by the model, braking since it was last seen. A drive command that
  * brakes a rolling car drives a standing one backwards. What the model cannot follow leaves the
  * speed as it was last known. */
 static void reckon(br_cycle *cycle, double decided_at_s) {

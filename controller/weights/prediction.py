@@ -11,6 +11,7 @@ from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
 from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parts import GRAVITY_MPS2
 from controller.native_step import NativeStep
 from controller.settings import MpcSettings
 
@@ -107,16 +108,19 @@ class OneStepModel:
         return np.where(np.isfinite(errors), errors, np.inf)
 
 
+_MOST: Final = 15.0
+"""Times its usable acceleration, no car corners: more than the 1:43 car at full lock and speed."""
+
+
 def plausible_samples(car: CarParameters, step_s: float, count: int) -> list[Sample]:
     """States and inputs over the whole range of the car, always the same ones."""
     vx, slip, turn, steer, push, rate = np.random.default_rng(5).uniform(-1, 1, (count, 6)).T
-    # The car is fastest where drive and resistance are equal: (cm1 - cm2 v) d = cr0 + cr2 v^2.
-    d_max = car.d_max
-    fastest = np.roots([car.cr2, car.cm2 * d_max, car.cr0 - car.cm1 * d_max])
-    vx = 0.5 * (vx + 1) * max((v for v in fastest.real if v > 0), default=1.0)
-    omega = turn * vx * np.tan(car.delta_max_rad) / car.wheelbase_m
+    vx = 0.5 * (vx + 1) * car.drive.top_speed_mps(car.d_max)
+    sharpest = vx * np.tan(car.delta_max_rad) / car.wheelbase_m
+    with np.errstate(divide="ignore"):
+        omega = turn * np.minimum(sharpest, _MOST * car.friction * GRAVITY_MPS2 / vx)
     pose, delta = np.zeros((count, 3)), steer * car.delta_max_rad
     x = np.column_stack([pose, vx, 0.3 * slip * vx, omega, delta])
-    d = car.d_min + 0.5 * (push + 1) * (d_max - car.d_min)
+    d = car.d_min + 0.5 * (push + 1) * (car.d_max - car.d_min)
     u = np.column_stack([d, rate * car.delta_rate_max_radps])
     return [Sample(0, step_s, x[k], u[k], x[k]) for k in range(count)]

@@ -44,6 +44,23 @@ class Trajectory:
         return np.array([one.time_s for one in self.truth], dtype=np.float64)
 
     @cached_property
+    def slip_rad(self) -> Floats:
+        """Angle of the velocity to the left of the car's axis, shape (n,); 0 for a car that is
+        slower than a hundredth of its largest speed."""
+        vx, vy = self.x[:, 3], self.x[:, 4]
+        speed = np.hypot(vx, vy)
+        return np.where(speed > 0.01 * np.max(speed, initial=0.0), np.arctan2(vy, vx), 0.0)
+
+    @cached_property
+    def lateral_mps2(self) -> Floats:
+        """Acceleration across the way, to the left, shape (n,): the mean over the period that
+        begins; the last state keeps the one before."""
+        turned = np.diff(np.unwrap(self.x[:, 2] + self.slip_rad))
+        speed = np.hypot(self.x[:, 3], self.x[:, 4])
+        across = (speed[1:] + speed[:-1]) / 2 * turned / np.diff(self.time_s)
+        return np.append(across, across[-1:]) if len(across) else np.zeros(len(self.x))
+
+    @cached_property
     def lap(self) -> NDArray[np.int64]:
         """Start-line crossings up to each state, shape (n,)."""
         return np.array([one.lap for one in self.truth], dtype=np.int64)

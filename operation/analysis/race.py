@@ -131,6 +131,8 @@ class DrivenRun:
             off_track_max_m=max(float(np.max(depth, initial=0.0)), 0.0),
             deviation_mean_m=float(deviation.mean()) if len(deviation) else None,
             deviation_max_m=float(deviation.max()) if len(deviation) else None,
+            lateral_max_mps2=self._largest(self.record.lateral_mps2),
+            slip_max_rad=self._largest(self.record.slip_rad),
             solve_us=_percentiles(self.record.solve_us),
             fallbacks=self.record.fallbacks,
             weights_version=self.record.weights_version,
@@ -138,6 +140,11 @@ class DrivenRun:
             samples=len(self.record.truth),
             ended=self.ended,
         )
+
+    def _largest(self, values: Floats) -> float | None:
+        """Of the counted samples."""
+        counted = np.abs(values[self.counted])
+        return float(counted.max()) if len(counted) else None
 
 
 def _percentiles(values: Floats) -> Percentiles | None:
@@ -217,6 +224,8 @@ def _summary(recording: Recording) -> SettingsSummary:
     mpc = settings.get("mpc")
     return SettingsSummary(
         car=recording.car.name,
+        tyres=recording.car.tyres.model,
+        friction=recording.line.made_for.friction if recording.line.made_for else None,
         track=name("track"),
         train_track=name("train_track"),
         mode=str(settings.get("mode", "")),

@@ -45,6 +45,14 @@ class LapResult(_Frozen):
     off_track_max_m: float = Field(description="deepest excursion, 0 without any")
     deviation_mean_m: float | None = Field(description="mean distance from the racing line")
     deviation_max_m: float | None = Field(description="largest distance from the racing line")
+    lateral_max_mps2: float | None = Field(
+        None,
+        description="largest acceleration across the way; beyond friction times 9.81: tyres "
+        "that do not saturate",
+    )
+    slip_max_rad: float | None = Field(
+        None, description="largest angle between the car's axis and its velocity"
+    )
     solve_us: Percentiles | None = Field(description="null without telemetry")
     fallbacks: int = Field(description="cycles that the fallback drove")
     weights_version: str = Field(description="of the weights that drove; empty without any")
@@ -76,6 +84,8 @@ class SettingsSummary(_Frozen):
     seed: int
     laps: int
     constraints: bool
+    tyres: str = Field("", description="model of the car's tyres: pacejka or linear")
+    friction: float | None = Field(None, description="acceleration over g that the line assumes")
     fmu: str = Field("", description="FMU that simulated the car; empty for the built-in equations")
 
 

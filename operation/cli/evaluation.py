@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from bayesrace.files import write_whole
-from bayesrace.tracks import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK
 from bayesrace.vehicles import DEFAULT_CAR
 from operation.cli.options import (
     Car,
@@ -18,6 +17,7 @@ from operation.cli.options import (
     FmuMap,
     Seed,
     TrackName,
+    Tyres,
     connect_to,
     writable,
 )
@@ -40,10 +40,14 @@ TimeMode = Annotated[
 
 def race(
     car: Car = DEFAULT_CAR,
-    track: TrackName = DEFAULT_RACE_TRACK,
+    tyres: Tyres = None,
+    track: TrackName = "",
     train_track: Annotated[
-        str, typer.Option(metavar="TRACK", help="Track of the training drive.")
-    ] = DEFAULT_TRAINING_TRACK,
+        str,
+        typer.Option(
+            metavar="TRACK", show_default="the car's", help="Track of the training drive."
+        ),
+    ] = "",
     laps: Annotated[
         int,
         typer.Option(metavar="N", min=1, max=100, help="Laps per controller, the first from rest."),
@@ -79,8 +83,9 @@ def race(
     from operation.terminal.race_table import print_table
     from operation.terminal.terminal import Terminal
 
+    driven = get_car(car) if tyres is None else get_car(car).on_tyres(tyres)
     settings = RaceSettings(
-        car=get_car(car), track=track, train_track=train_track, laps=laps, mode=mode.value,
+        car=driven, track=track, train_track=train_track, laps=laps, mode=mode.value,
         seed=seed, fmu=fmu, fmu_map=fmu_map,
     )  # fmt: skip
     mpc = settings.mpc.model_copy(update={"constraints": not no_constraints})
@@ -118,7 +123,7 @@ def report(
 
 
 def drive(
-    track: TrackName = DEFAULT_RACE_TRACK,
+    track: TrackName = "",
     laps: Annotated[
         int, typer.Option(metavar="N", min=1, help="Laps to drive, the first from rest.")
     ] = 2,
@@ -142,7 +147,7 @@ def drive(
     from operation.drive import RunPlan, execute
 
     parameters = get_car(car)
-    course = load_track(track, parameters.width_m)
+    course = load_track(track or parameters.race_track, parameters.width_m)
     name = name or parameters.name
     about = {"drive": {"car": car_text(parameters), "track": course.name}}
     with (

@@ -8,7 +8,6 @@ import typer
 
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
-from bayesrace.tracks import DEFAULT_RACE_TRACK
 from bayesrace.vehicles import DEFAULT_CAR
 from operation.cli.options import Car, OutFile, path_on, writable
 
@@ -67,9 +66,7 @@ def export(
     ] = False,
     track: Annotated[
         str | None,
-        typer.Option(
-            metavar="TRACK", show_default=DEFAULT_RACE_TRACK, help="Controller: its track."
-        ),
+        typer.Option(metavar="TRACK", show_default="the car's", help="Controller: its track."),
     ] = None,
     raceline: Annotated[
         Path | None,
@@ -115,7 +112,7 @@ def export(
         raise InputError("a controller is sampled, not continuous: export it with --kind cs")
     else:
         definition = _controller(
-            parameters, track or DEFAULT_RACE_TRACK, raceline=raceline, weights=weights,
+            parameters, track or parameters.race_track, raceline=raceline, weights=weights,
             settings=settings, artefact=artefact, version=number, cpu=cpu,
         )  # fmt: skip
     pack(definition, out, platform)

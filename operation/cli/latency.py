@@ -103,7 +103,6 @@ def latency(
         raise InputError("--log is of a run that is over: leave out --attach and --load")
 
     from bayesrace.realtime import RealtimeSettings
-    from bayesrace.tracks import DEFAULT_RACE_TRACK
     from bayesrace.vehicles import get_car
     from operation.terminal.progress import stages_on
     from operation.terminal.terminal import Terminal
@@ -111,11 +110,11 @@ def latency(
     from studies.latency.report import print_report
     from studies.latency.settings import LatencySettings
 
-    here = not (attach or log)
+    here, parameters = not (attach or log), get_car(car)
     settings = LatencySettings(
-        car=get_car(car), name=name, rate_hz=rate, load=load,
+        car=parameters, name=name, rate_hz=rate, load=load,
         duration_s=duration or (1e9 if log else 20.0), warm_up_s=0.0 if attach else 3.0,
-        track=track if track is not None else DEFAULT_RACE_TRACK if here else "",
+        track=track if track is not None else parameters.race_track if here else "",
         realtime=RealtimeSettings(fifo=fifo, lock_memory=lock_memory),
         weights=weights, artefact=artefact, raceline=raceline, log=log,
         attach=connect_to(endpoint).connect if attach else (),

@@ -1,5 +1,6 @@
 """Options that several subcommands share."""
 
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -24,10 +25,19 @@ __all__ = [
     "RaceLineFile",
     "Seed",
     "TrackName",
+    "Tyres",
     "connect_to",
     "path_on",
     "writable",
 ]
+
+
+class TyreModel(StrEnum):
+    """Models of tyres that a car can be put on."""
+
+    pacejka = "pacejka"
+    linear = "linear"
+
 
 Car = Annotated[str, typer.Option(metavar="CAR", help="Car: built-in name or TOML file.")]
 CarName = Annotated[
@@ -39,6 +49,14 @@ CarName = Annotated[
         help="Name of the car in the network.",
     ),
 ]
+Tyres = Annotated[
+    TyreModel | None,
+    typer.Option(
+        metavar="TYRES",
+        show_default="the car's",
+        help="pacejka: of the same stiffness as the car's linear tyres, saturating.",
+    ),
+]
 Seed = Annotated[
     int,
     typer.Option(
@@ -46,7 +64,12 @@ Seed = Annotated[
     ),
 ]
 TrackName = Annotated[
-    str, typer.Option(metavar="TRACK", help="Built-in name, random:SEED or CSV file.")
+    str,
+    typer.Option(
+        metavar="TRACK",
+        show_default="the car's",
+        help="Built-in name, random:SEED or CSV file.",
+    ),
 ]
 RaceLineFile = Annotated[
     Path,

@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from bayesrace.errors import InputError
-from bayesrace.tracks import DEFAULT_RACE_TRACK
 from bayesrace.vehicles import DEFAULT_CAR
 from operation.cli.options import (
     Car,
@@ -19,6 +18,7 @@ from operation.cli.options import (
     RaceLineFile,
     Seed,
     TrackName,
+    Tyres,
     path_on,
     writable,
 )
@@ -99,6 +99,7 @@ def cars(
             help="Write the car as TOML, tuning included.",
         ),
     ] = None,
+    tyres: Tyres = None,
 ) -> None:
     """List the built-in cars, check a car's file, or write a car to a file with all its values."""
     from rich.table import Table
@@ -109,7 +110,8 @@ def cars(
     if out is not None and car is None:
         raise InputError("--out needs the name of the car to write")
     table = Table("car", "wheelbase m", "width m", "mass kg", "friction", "identity")
-    for one in [get_car(car)] if car is not None else builtin_cars().values():
+    cars = [get_car(car)] if car is not None else builtin_cars().values()
+    for one in cars if tyres is None else [one.on_tyres(tyres) for one in cars]:
         table.add_row(
             one.name, f"{one.wheelbase_m:.4g}", f"{one.width_m:.4g}", f"{one.mass_kg:.4g}",
             f"{one.friction:.4g}", one.identity,
@@ -338,7 +340,7 @@ def build(
 
 def export(
     out: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write into.")],
-    track: TrackName = DEFAULT_RACE_TRACK,
+    track: TrackName = "",
     raceline: Annotated[
         Path | None, typer.Option(metavar="FILE", show_default="computed", help="Racing line.")
     ] = None,
@@ -368,6 +370,7 @@ def export(
     from controller.settings import MpcSettings
 
     parameters, process = get_car(car), ControllerSettings()
+    track = track or parameters.race_track
     table = path_on(track, raceline, parameters)
     values = read_settings(settings, MpcSettings).parameters(parameters) | cycle_values(
         parameters, process.fallback, process.compensation, process.stale_s

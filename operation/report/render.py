@@ -21,7 +21,13 @@ from operation.report.gp import gp_figures
 from operation.report.maps import LapMaps
 from operation.report.style import figure_style, look
 from operation.report.timing import solve_figure
-from operation.report.traces import deviation_figures, input_figures, speed_figures, time_figures
+from operation.report.traces import (
+    cornering_figures,
+    deviation_figures,
+    input_figures,
+    speed_figures,
+    time_figures,
+)
 from operation.terminal.notation import UNCERTAIN
 from operation.terminal.race_table import COLUMNS, GP_COLUMNS, gp_cells
 
@@ -58,7 +64,7 @@ def render_report(run_dir: Path, result: RaceResult, analysis: RaceAnalysis | No
         best=result.lap("bestcase"),
         facts=_facts(analysis, result),
         versions=_versions(run_dir),
-        figures=_figures(analysis, run_dir / PICTURE),
+        figures=_figures(analysis, result, run_dir / PICTURE),
         uncertain=_uncertain(analysis),
         period_us=round(analysis.recording.discretisation.step_s * 1e6),
         limit_sigma=UNCERTAIN,
@@ -123,7 +129,7 @@ def _uncertain(analysis: RaceAnalysis) -> list[tuple[str, int, int]]:
     ]
 
 
-def _figures(analysis: RaceAnalysis, picture: Path) -> dict[str, list[str]]:
+def _figures(analysis: RaceAnalysis, result: RaceResult, picture: Path) -> dict[str, list[str]]:
     """Name to panels as SVG; what has nothing to show is left out."""
     runs, track, line = analysis.runs, analysis.track, analysis.line
     driven = [run for run in runs if len(run.record.truth) > 1]
@@ -136,6 +142,7 @@ def _figures(analysis: RaceAnalysis, picture: Path) -> dict[str, list[str]]:
             figures["time"] = time_figures(driven, track)
             figures["speed"] = speed_figures(driven, track, line)
             figures["inputs"] = input_figures(driven, track, analysis.recording.car)
+            figures["cornering"] = cornering_figures(driven, track, result.settings.friction)
             figures["deviation"] = deviation_figures(driven, track)
         data = analysis.best_case
         if data is not None and analysis.validations:

@@ -11,12 +11,19 @@ from bayesrace.arrays import Floats
 from bayesrace.raceline import RaceLine
 from bayesrace.tracks import Track
 from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles.parts import GRAVITY_MPS2
 from operation.analysis.race import DrivenRun
 from operation.report.canvas import panel
 from operation.report.laps import Lap, first_laps, flying_laps, reference_of
 from operation.report.style import INK, MUTED, look
 
-__all__ = ["deviation_figures", "input_figures", "speed_figures", "time_figures"]
+__all__ = [
+    "cornering_figures",
+    "deviation_figures",
+    "input_figures",
+    "speed_figures",
+    "time_figures",
+]
 
 
 _LEAP_M: Final = 1.0
@@ -90,13 +97,19 @@ def speed_figures(runs: Sequence[DrivenRun], track: Track, line: RaceLine) -> li
 
 
 def input_figures(runs: Sequence[DrivenRun], track: Track, car: CarParameters) -> list[Figure]:
-    """Duty cycle and steering on the first lap, with the car's limits."""
-    steering, turning = car.delta_max_rad, car.delta_rate_max_radps
+    """Drive command and steering on the first lap, with the car's limits."""
+    command, unit = car.drive.command, {"1": "–", "m/s2": "m/s²"}[car.drive.unit]
     rows: list[tuple[str, str, tuple[float, float], Callable[[DrivenRun], Floats]]] = [
-        ("duty cycle", "d [–]", (car.d_min, car.d_max), lambda run: _held(run.record.u[:, 0])),
-        ("steering angle", "δ [rad]", (-steering, steering), lambda run: run.record.x[:, 6]),
-        ("steering rate", "dδ/dt [rad/s]", (-turning, turning),
-         lambda run: _held(run.record.u[:, 1])),
+        (command, f"d [{unit}]", (car.d_min, car.d_max), lambda run: _held(run.record.u[:, 0])),
+        (
+            "steering angle", "δ [rad]", (-car.delta_max_rad, car.delta_max_rad),
+            lambda run: run.record.x[:, 6],
+        ),
+        (
+            "steering rate", "dδ/dt [rad/s]",
+            (-car.delta_rate_max_radps, car.delta_rate_max_radps),
+            lambda run: _held(run.record.u[:, 1]),
+        ),
     ]  # fmt: skip
     figures = []
     for title, label, limits, values in rows:
@@ -104,6 +117,29 @@ def input_figures(runs: Sequence[DrivenRun], track: Track, car: CarParameters) -
         for limit in limits:
             axes.axhline(limit, color=INK, linewidth=0.6, linestyle=(0, (1, 2)))
         for lap in first_laps(runs, track):
+            _plot(axes, lap, values(lap.run)[lap.rows])
+        figures.append(figure)
+    return figures
+
+
+def cornering_figures(
+    runs: Sequence[DrivenRun], track: Track, friction: float | None
+) -> list[Figure]:
+    """Lateral acceleration, with what the friction would allow, and slip on the flying lap."""
+    laps = flying_laps(runs, track) or first_laps(runs, track)
+    rows: list[tuple[str, str, Callable[[DrivenRun], Floats], float | None]] = [
+        (
+            "acceleration across the way", "to the left [g]",
+            lambda run: run.record.lateral_mps2 / GRAVITY_MPS2, friction,
+        ),
+        ("slip of the body", "β [°]", lambda run: np.degrees(run.record.slip_rad), None),
+    ]  # fmt: skip
+    figures = []
+    for title, label, values, limit in rows:
+        figure, axes = _panel(track, title, label)
+        for side in () if limit is None else (-limit, limit):
+            axes.axhline(side, color=INK, linewidth=0.6, linestyle=(0, (1, 2)))
+        for lap in laps:
             _plot(axes, lap, values(lap.run)[lap.rows])
         figures.append(figure)
     return figures

@@ -1,5 +1,6 @@
 """The result of a race on the terminal, legible from 80 columns on."""
 
+import math
 import re
 from collections.abc import Callable
 from typing import Final, NamedTuple
@@ -9,11 +10,16 @@ from rich.table import Table
 from rich.text import Text
 
 from bayesrace.gp.weights import UNITS
+from bayesrace.vehicles.parts import GRAVITY_MPS2
 from operation.analysis.published import SOURCE, compare_gp, compare_laps
 from operation.analysis.results import GpMetrics, LapResult, RaceResult
 from operation.terminal.terminal import plain_table
 
 __all__ = ["COLUMNS", "GP_COLUMNS", "Column", "gp_cells", "print_table"]
+
+
+_BEYOND: Final = 1.1
+"""Of the friction: measured accelerations err by some per cent."""
 
 
 class Column(NamedTuple):
@@ -24,6 +30,8 @@ class Column(NamedTuple):
     cell: Callable[[LapResult], str]
     meaning: str
     number: bool = True
+    narrow: bool = True
+    """Shown on the terminal, too, where there are 80 columns."""
 
 
 def _decimals(value: float | None, count: int) -> str:
@@ -38,8 +46,20 @@ def _solve(name: str) -> Callable[[LapResult], str]:
     return lambda lap: _decimals(getattr(lap.solve_us, name, None), 0)
 
 
+def _metres(value: float | None) -> str:
+    return _decimals(value, 3 if value is None or value < 10 else 0)
+
+
 def _excursion(lap: LapResult) -> str:
-    return _decimals(lap.off_track_max_m, 3) if lap.off_track_samples else "–"
+    return _metres(lap.off_track_max_m) if lap.off_track_samples else "–"
+
+
+def _lateral(lap: LapResult) -> str:
+    return "–" if lap.lateral_max_mps2 is None else f"{lap.lateral_max_mps2 / GRAVITY_MPS2:.2f}"
+
+
+def _slip(lap: LapResult) -> str:
+    return "–" if lap.slip_max_rad is None else f"{math.degrees(lap.slip_max_rad):.0f}"
 
 
 COLUMNS: Final = (
@@ -52,12 +72,20 @@ COLUMNS: Final = (
     ),
     Column("deepest", "m", _excursion, "largest distance off the track"),
     Column(
-        "dev mean", "m", lambda lap: _decimals(lap.deviation_mean_m, 3),
+        "dev mean", "m", lambda lap: _metres(lap.deviation_mean_m),
         "mean distance from the racing line",
     ),
     Column(
-        "dev max", "m", lambda lap: _decimals(lap.deviation_max_m, 3),
+        "dev max", "m", lambda lap: _metres(lap.deviation_max_m),
         "largest distance from the racing line",
+    ),
+    Column(
+        "lateral", "g", _lateral, "largest acceleration across the way",
+        narrow=False,
+    ),
+    Column(
+        "slip", "°", _slip, "largest angle between the car's axis and its velocity",
+        narrow=False,
     ),
     Column("step p50", "µs", _solve("p50"), "median execution time of the control step"),
     Column("step p99", "µs", _solve("p99"), "99th percentile of the same"),
@@ -66,6 +94,7 @@ COLUMNS: Final = (
     Column(
         "weights", "", lambda lap: lap.weights_version or "–",
         "version of the residual's weights", number=False,
+        narrow=False,
     ),
 )  # fmt: skip
 """The result table's columns; the report shows the same cells."""
@@ -105,7 +134,7 @@ def print_table(result: RaceResult, console: Console) -> None:
             style="bold",
         )
     )
-    columns = [column for column in COLUMNS if column.title != "weights"]
+    columns = [column for column in COLUMNS if column.narrow]
     heads = ("\n".join([*re.split("(?<=-)| ", c.title), c.unit]).rstrip() for c in columns)
     table = plain_table(*heads, padding=0)
     for lap in result.laps:
@@ -122,7 +151,28 @@ def print_table(result: RaceResult, console: Console) -> None:
     for lap in result.laps:
         if lap.weights_version:
             console.print(Text(f"{lap.controller}: weights {lap.weights_version}"))
+    _print_cornering(result, console)
     _print_notes(result, console)
+
+
+def _print_cornering(result: RaceResult, console: Console) -> None:
+    """Lateral acceleration and slip of each lap beyond the friction that the line assumes."""
+    friction = result.settings.friction
+    beyond = [
+        lap
+        for lap in result.laps
+        if friction is not None
+        and lap.finished
+        and (lap.lateral_max_mps2 or 0.0) > _BEYOND * friction * GRAVITY_MPS2
+    ]
+    if not beyond:
+        return
+    console.print(Text(f"beyond the friction of {friction:g} g that the line assumes:"))
+    for lap in beyond:
+        text = f"  {lap.controller}: {_lateral(lap)} g across the way, {_slip(lap)}° of slip"
+        console.print(Text(text, style="yellow"))
+    if result.settings.tyres == "linear":
+        console.print(Text("  (linear tyres never saturate; 'race --tyres pacejka' does)"))
 
 
 def _print_published(result: RaceResult, console: Console) -> None:

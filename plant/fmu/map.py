@@ -24,7 +24,7 @@ _HINTS: Final = {
 }
 
 _NEEDED: Final = (
-    (("d",), {"d", "throttle"}, "the duty cycle d [1] or its part `throttle`"),
+    (("d",), {"d", "throttle"}, "the drive command d or its part `throttle`"),
     (
         ("delta_rate", "delta"),
         {"delta_rate", "delta"},
@@ -34,8 +34,10 @@ _NEEDED: Final = (
 """Our own names for an input, the quantities of which one must drive an input, and words."""
 
 
-def wire(fmu: FmuDescription, map_: FmuMap | None = None) -> Wiring:
+def wire(fmu: FmuDescription, map_: FmuMap | None = None, unit: str = "1") -> Wiring:
     """The wiring of an FMU by a map; for what the map leaves out, our own names are taken.
+
+    ``unit``: of the car's drive command.
 
     Raises InputError with all that is missing or wrong, and what to put into the map.
     """
@@ -45,7 +47,7 @@ def wire(fmu: FmuDescription, map_: FmuMap | None = None) -> Wiring:
         raise InputError(
             f"the FMU '{name}' has {has} only; export it for Co-Simulation to drive it"
         )
-    matching = _Matching(fmu, map_ or FmuMap())
+    matching = _Matching(fmu, map_ or FmuMap(), unit)
     matching.match()
     if not matching.problems:
         return matching.wiring()
@@ -61,7 +63,8 @@ def wire(fmu: FmuDescription, map_: FmuMap | None = None) -> Wiring:
 class _Matching:
     """One pass over a map: each entry becomes a link or a constant, or else a problem."""
 
-    def __init__(self, fmu: FmuDescription, map_: FmuMap) -> None:
+    def __init__(self, fmu: FmuDescription, map_: FmuMap, unit: str) -> None:
+        self._commands = COMMANDS | dict.fromkeys(("d", "throttle", "brake"), unit)
         self._map = map_
         self._variables = {variable.name: variable for variable in fmu.variables}
         self._inputs: list[Link] = []
@@ -148,7 +151,7 @@ class _Matching:
             remedy = " it goes into [parameters]" if variable.causality == "parameter" else ""
             raise InputError(f"'{name}' is {a(variable.causality)}, not an input;{remedy}")
         if isinstance(entry, Driven):
-            self._inputs.append(self._link(name, entry, COMMANDS))
+            self._inputs.append(self._link(name, entry, self._commands))
         else:
             self._fixed[name] = constant(variable, entry)
 

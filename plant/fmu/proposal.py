@@ -59,7 +59,7 @@ _DRIVEN: Final = {
 """Names of an input that takes this command."""
 
 _NEEDED: Final = {
-    ("d", "throttle"): 'the duty cycle or throttle, as: name = { from = "d", unit = "1" }',
+    ("d", "throttle"): 'the drive command or throttle, as: name = { from = "d", unit = "1" }',
     ("delta_rate", "delta"): 'the steering, as: name = { from = "delta_rate", unit = "rad/s" }, or '
     'the angle: { from = "delta", unit = "rad" }',
 }

@@ -116,11 +116,11 @@ class FmuSimulator:
 
     def _hold(self, u: Sequence[float] | None, count: int) -> tuple[float, float]:
         """Holds a command for ``count`` communication steps; what acted."""
-        vx, delta = float(self.x[3]), float(self.x[6])
+        delta = float(self.x[6])
         guard, wiring, part_s = self.guard, self._wiring, self._part_s
         # Whole periods are the period itself, to the bit.
         duration_s = self.step_s if count == self.substeps else count * part_s
-        applied = guard.brake(vx) if u is None else guard.apply(u, vx, delta, duration_s)
+        applied = guard.apply(u, self.x, duration_s)
         if self._any_size and not wiring.follows_angle:
             part_s, count = duration_s, 1
         times_s = [k * part_s for k in range(1, (count if wiring.follows_angle else 1) + 1)]
@@ -152,7 +152,7 @@ def open_fmu(
     raw = read_description(path)
     description = describe(raw)
     map_ = None if map_path is None else read_map(Path(map_path))
-    wiring = wire(description, map_)
+    wiring = wire(description, map_, car.drive.unit)
     section = (map_ or FmuMap()).fmu
     part_s = communication_step(description, section.step_s, period_s)
     # A step size that the map asks for is kept, whatever else the FMU could do.

@@ -34,8 +34,9 @@ STATES: Final = {
 COMMANDS: Final = {
     "d": "1", "delta_rate": "rad/s", "delta": "rad", "throttle": "1", "brake": "1",
 }  # fmt: skip
-"""What can drive an FMU's input, with units: the duty cycle or its positive and (turned positive)
-negative part, and the steering rate or the steering angle at the end of the hold."""
+"""What can drive an FMU's input, with units: the drive command or its positive and (turned
+positive) negative part, in the unit of the car's drive, here that of a duty cycle; and the steering
+rate or the steering angle at the end of the hold."""
 
 _QUATERNION: Final = dict.fromkeys(("qw", "qx", "qy", "qz"), "1")
 _POLAR: Final = {"speed": "m/s", "slip": "rad"}

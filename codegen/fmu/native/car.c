@@ -44,16 +44,36 @@ static double clipped(double value, double low, double high) {
     return least(most(value, low), high);
 }
 
+/* The drive commands that act at a speed: AccelerationDrive and DcMotor in
+ * bayesrace/vehicles/parts.py. */
+#ifdef ACCELERATION_DRIVE
+static double highest(const double *v) {
+    const double power = v[FMU_V_power_speed_mps], top = v[FMU_V_speed_max_mps];
+    const double vx = v[FMU_V_vx], vy = v[FMU_V_vy], speed = sqrt(vx * vx + vy * vy);
+    const double fade = (top - speed) / (0.05 * top);
+    return v[FMU_V_d_max] * (power / most(speed, power) * clipped(fade, 0.0, 1.0));
+}
+
+static double lowest(const double *v, double duration) {
+    return most(v[FMU_V_d_min], -most(v[FMU_V_vx], 0.0) / duration);
+}
+#else
+static double highest(const double *v) { return v[FMU_V_d_max]; }
+
+static double lowest(const double *v, double duration) { return v[FMU_V_d_min]; }
+#endif
+
 static void guard(const double *v, double duration, double u[2]) {
     const double angle = v[FMU_V_delta_max_rad], fastest = v[FMU_V_delta_rate_max_radps];
     double rate = v[FMU_V_delta_rate];
     if (!(isfinite(v[FMU_V_d]) && isfinite(rate))) { /* brake, less when slow; hold the steering */
-        u[0] = v[FMU_V_d_min] * clipped(v[FMU_V_vx] / BRAKE_FADE_MPS, 0.0, 1.0);
+        const double brake = v[FMU_V_d_min] * clipped(v[FMU_V_vx] / BRAKE_FADE_MPS, 0.0, 1.0);
+        u[0] = most(brake, lowest(v, duration));
         u[1] = 0.0;
         return;
     }
     rate = clipped(rate, (-angle - v[FMU_V_delta]) / duration, (angle - v[FMU_V_delta]) / duration);
-    u[0] = clipped(v[FMU_V_d], v[FMU_V_d_min], v[FMU_V_d_max]);
+    u[0] = clipped(v[FMU_V_d], lowest(v, duration), highest(v));
     u[1] = clipped(rate, -fastest, fastest);
 }
 

@@ -1,0 +1,104 @@
+"""The 1:10 car through all parts: FMU, a lap that was learned, the whole comparison."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fmpy.validation import validate_fmu
+
+from bayesrace.arrays import Floats
+from bayesrace.integrators import PREDICTION
+from bayesrace.raceline.cached import racing_line
+from bayesrace.tracks import load_track
+from bayesrace.vehicles import get_car
+from bayesrace.vehicles.models import dynamic
+from codegen.build import build
+from codegen.fmu import car_fmu, pack
+from codegen.settings import BuildSettings
+from controller.pure_pursuit import PurePursuit
+from controller.python_controller import PythonController
+from learning.training import TrainingSettings, train
+from operation.analysis.results import read_result
+from operation.closed_loop import ClosedLoop, drive_compiled
+from operation.settings import RaceSettings
+from plant.simulator import Simulator
+from plant.vehicle import Vehicle, open_vehicle
+from tests.programs import Race
+
+CAR = get_car("f1tenth")
+SMALL = "workshop"
+
+
+def driven(vehicle: Vehicle, start: list[float], commands: list[tuple[float, float]]) -> Floats:
+    """States and inputs that acted, a row a period."""
+    vehicle.reset(start)
+    rows = []
+    for command in commands:
+        vehicle.step(command)
+        rows.append([*vehicle.x, *vehicle.u_applied])
+    return np.array(rows)
+
+
+def test_its_fmu_is_the_plant_to_the_bit_limits_of_the_drive_included(tmp_path: Path) -> None:
+    """From standstill to a speed where power limits the drive, and braking from there to a stop."""
+    fmu = pack(car_fmu(CAR), tmp_path / "car.fmu", None)
+    assert validate_fmu(str(fmu)) == []
+    random = np.random.default_rng(3)
+    commands = [(99.0, float(rate)) for rate in random.uniform(-0.1, 0.1, 60)]
+    commands += [(np.nan, 0.0)] * 3 + [(-4.0, 0.0)] * 150
+    commands += [(float(d), float(r)) for d, r in random.uniform([-9, -5], [9, 5], (200, 2))]
+    start = [0, 0, 0.3, 0.1, 0, 0, 0.0]
+    ours = driven(Simulator(dynamic(CAR)), start, commands)
+    with open_vehicle(CAR, fmu) as theirs:
+        np.testing.assert_array_equal(driven(theirs, start, commands), ours)
+    assert ours[:, 3].max() > 9.0
+    assert np.ptp(ours[213:, 6]) > CAR.delta_max_rad
+    assert 4.0 < ours[59, 7] < 0.9 * CAR.d_max
+    assert 0 <= ours[212, 3] < 0.01
+
+
+def test_it_exports_for_model_exchange_and_on_saturating_tyres(tmp_path: Path) -> None:
+    for car, kind in ((CAR, "me"), (CAR.on_tyres("pacejka"), "cs")):
+        fmu = pack(car_fmu(car, 3, kind), tmp_path / f"{kind}.fmu", None)  # type: ignore[arg-type]
+        assert validate_fmu(str(fmu)) == []
+
+
+def test_the_car_names_the_tracks_that_are_driven_where_none_is_named() -> None:
+    settings = RaceSettings(car=CAR)
+    assert (settings.track, settings.train_track) == (CAR.race_track, CAR.train_track)
+    assert RaceSettings(car=CAR, track="harbour").track == "harbour"
+    assert RaceSettings().track == "harbour"
+
+
+def test_a_lap_that_was_learned_from_pure_pursuit_stays_on_the_small_track() -> None:
+    """And corners beyond what tyres of its friction could hold, which the trajectory shows."""
+    track = load_track(SMALL, CAR.width_m)
+    line, artefact = racing_line(track, CAR), build(BuildSettings(car=CAR))[0]
+    pursuit = PurePursuit(CAR, line.x_m, line.y_m, line.vx_mps)
+    loop = ClosedLoop(CAR, track, line, PythonController(artefact, pursuit))
+    samples = loop.drive(0, CAR.tuning.pursuit.drive_s).samples()
+    settings = TrainingSettings(kernels=("matern25",), restarts=0, hyper_points=200)
+    weights = train(samples, PREDICTION, settings)
+    run = drive_compiled(artefact, track, line, weights, car=CAR)
+    assert len(run.laps_s) == 2
+    assert not (run.off_track_m > 0).any()
+    assert run.laps_s[1] < 1.02 * line.lap_time_s
+    assert np.abs(run.lateral_mps2).max() > CAR.friction * 9.81
+    assert 0.1 < np.abs(run.slip_rad).max() < 0.6
+
+
+@pytest.mark.check
+@pytest.mark.unmeasured
+def test_the_papers_comparison_on_its_own_small_track(tmp_path: Path) -> None:
+    race = Race.running(tmp_path / "race", "--car", "f1tenth")()
+    result = read_result(race.out / "result.json")
+    laps = {lap.controller: lap for lap in result.laps}
+    assert result.settings.track == SMALL
+    assert laps["worstcase"].off_track_samples > 0
+    best = laps["bestcase"].flying_lap_time_s
+    for name in ("bayesrace", "bayesrace-updated", "bestcase"):
+        assert laps[name].off_track_samples == 0
+        assert laps[name].fallbacks == 0
+    updated = laps["bayesrace-updated"].flying_lap_time_s
+    assert best is not None
+    assert updated == pytest.approx(best, rel=0.005)
