@@ -14,7 +14,16 @@ from pydantic import ValidationError
 from bayesrace import __version__
 from bayesrace.errors import InputError, faults_in
 from bayesrace.interrupts import remembering_interrupts
-from operation.cli import evaluation, fmu, latency, learning, operation, parts, preparation
+from operation.cli import (
+    evaluation,
+    fmu,
+    latency,
+    learning,
+    operation,
+    parts,
+    preparation,
+    raceline,
+)
 
 __all__ = ["app", "main"]
 
@@ -31,7 +40,7 @@ _RACE_PACKAGES: Final = (
 _TASKS: Final[dict[str, tuple[Callable[..., None], ...]]] = {
     "Race": (evaluation.race, evaluation.report),
     "Prepare": (
-        preparation.tracks, preparation.cars, preparation.raceline, preparation.collect,
+        preparation.tracks, preparation.cars, raceline.raceline, preparation.collect,
         preparation.train, learning.validate, preparation.build,
     ),
     "Drive": (
