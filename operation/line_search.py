@@ -37,6 +37,10 @@ __all__ = [
     "write_curve",
 ]
 
+_LIMIT: Final = 1.5
+"""A drive ends at this multiple of the line's time ..."""
+_START_S: Final = 2.0
+"""... and so much more for the start."""
 _CURVES: Final = (".csv", ".svg", ".png")
 
 Lap = Callable[[RaceLine], float]
@@ -71,7 +75,7 @@ def ideal_lap(line: RaceLine) -> float:
 
 def driven_lap(artefact: Path, weights: Path, track: Track, car: CarParameters) -> Lap:
     """The flying lap that the controller drives in simulation along a line, after one lap from
-    standstill; infinite where it does not finish or leaves the track.
+    standstill; infinite where it does not finish in good time or leaves the track.
 
     Raises InputError if artefact, weights and car do not fit together.
     """
@@ -80,7 +84,8 @@ def driven_lap(artefact: Path, weights: Path, track: Track, car: CarParameters) 
 
     def drive(line: RaceLine) -> float:
         controller = compiled_controller(artefact, car, track, line, learned)
-        driven = ClosedLoop(car, track, line, controller, vehicle).drive(laps=2)
+        limit_s = _LIMIT * 2 * line.lap_time_s + _START_S
+        driven = ClosedLoop(car, track, line, controller, vehicle).drive(2, limit_s)
         finished = len(driven.laps_s) == 2 and float(driven.off_track_m.max()) <= 0
         return driven.laps_s[1] if finished else math.inf
 
