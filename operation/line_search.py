@@ -73,13 +73,14 @@ def ideal_lap(line: RaceLine) -> float:
     return line.lap_time_s
 
 
-def driven_lap(artefact: Path, weights: Path, track: Track, car: CarParameters) -> Lap:
+def driven_lap(artefact: Path, weights: Path | None, track: Track, car: CarParameters) -> Lap:
     """The flying lap that the controller drives in simulation along a line, after one lap from
     standstill; infinite where it does not finish in good time or leaves the track.
 
-    Raises InputError if artefact, weights and car do not fit together.
+    Without ``weights`` by the uncorrected model. Raises InputError if artefact, weights and car do
+    not fit together.
     """
-    learned = read_weights(weights)
+    learned = None if weights is None else read_weights(weights)
     vehicle = Simulator(dynamic(car), compiled=compiled)
 
     def drive(line: RaceLine) -> float:

@@ -122,6 +122,8 @@ def raceline(
 
     if curve is not None:
         check_curve(curve)
+        if curve.with_suffix(".csv") == out:
+            raise InputError(f"--curve {curve} writes {out}, too: give --out another name")
     if weights is not None and objective is not LapKind.driven:
         raise InputError("--weights needs --objective driven")
     how = BayesianSettings(
