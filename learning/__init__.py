@@ -11,4 +11,5 @@ In the order of use:
    :mod:`.target` and :mod:`.assessment` rate kernels and choices of samples.
 5. :mod:`.training` puts these together; :mod:`.pool` and :mod:`.worker` repeat it lap by lap.
 6. :mod:`.validation` compares weights with another drive.
+7. :mod:`.search` is apart: it finds the minimum of a costly function, such as a lap by its line.
 """

@@ -1,5 +1,6 @@
-"""First guess of the optimisation: the fastest drivable speeds along a given path."""
+"""The fastest speeds along a given path: first guess of the optimisation, lap of a fixed line."""
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -19,33 +20,39 @@ def speed_profile(
     brake: Callable[[Floats], Floats],
     v_min: float,
     v_max: float,
+    start_mps: float | None = None,
 ) -> Floats:
     """Speeds (n,) on a closed path of curvature ``kappa`` (n,), ``step`` (n,) to the next point.
 
     Forward-backward pass within the friction circle ``grip_mps2`` and the acceleration limits
-    ``drive(v) >= a >= brake(v)``, starting at the slowest point so that the lap closes.
+    ``drive(v) >= a >= brake(v)``, starting at the slowest point so that the lap closes. With
+    ``start_mps`` the path is open and begins at this speed; the last step is not used.
     """
     v = np.linspace(0.0, v_max, _TABLE)
-    highest, lowest = drive(v), brake(v)
+    per_mps = (_TABLE - 1) / v_max
+    highest, lowest = drive(v).tolist(), (-brake(v)).tolist()
     cap = np.clip(grip_mps2 / np.maximum(np.abs(kappa), 1e-6), v_min**2, v_max**2)
-    start = int(np.argmin(cap))
-    energy = np.roll(cap, -start)
-    bend = np.roll(np.abs(kappa), -start)
-    length = np.roll(step, -start)
-    count = len(energy)
-    for k in range(count):
-        room = _along(grip_mps2, bend[k] * energy[k])
-        push = min(float(np.interp(np.sqrt(energy[k]), v, highest)), room)
-        following = (k + 1) % count
-        energy[following] = min(energy[following], energy[k] + 2 * length[k] * max(push, 0.0))
-    for k in range(count - 1, -1, -1):
-        following = (k + 1) % count
-        room = _along(grip_mps2, bend[following] * energy[following])
-        pull = min(-float(np.interp(np.sqrt(energy[following]), v, lowest)), room)
-        energy[k] = min(energy[k], energy[following] + 2 * length[k] * max(pull, 0.0))
+    start = int(np.argmin(cap)) if start_mps is None else 0
+    energy: list[float] = np.roll(cap, -start).tolist()
+    bend: list[float] = np.roll(np.abs(kappa), -start).tolist()
+    length: list[float] = np.roll(step, -start).tolist()
+    last = len(energy)
+    if start_mps is not None:
+        energy[0] = start_mps**2
+        last -= 1
+
+    def gained(k: int, limit: list[float]) -> float:
+        """Most that the squared speed at k changes over a metre, by this table of speeds."""
+        place = math.sqrt(energy[k]) * per_mps
+        i = min(int(place), _TABLE - 2)
+        along = grip_mps2**2 - (bend[k] * energy[k]) ** 2
+        push = limit[i] + (place - i) * (limit[i + 1] - limit[i])
+        return 2 * max(min(push, math.sqrt(max(along, 0.0))), 0.0)
+
+    for k in range(last):
+        following = (k + 1) % len(energy)
+        energy[following] = min(energy[following], energy[k] + length[k] * gained(k, highest))
+    for k in range(last - 1, -1, -1):
+        following = (k + 1) % len(energy)
+        energy[k] = min(energy[k], energy[following] + length[k] * gained(following, lowest))
     return np.asarray(np.sqrt(np.roll(energy, start)))
-
-
-def _along(grip: float, across: float) -> float:
-    """What the friction circle leaves along the path beside the acceleration across it."""
-    return float(np.sqrt(max(grip**2 - across**2, 0.0)))

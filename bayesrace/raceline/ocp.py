@@ -36,7 +36,7 @@ from bayesrace.vehicles.models import longitudinal_force, top_command
 from bayesrace.vehicles.parameters import CarParameters
 from bayesrace.vehicles.parts import GRAVITY_MPS2
 
-__all__ = ["CarLimits", "car_limits", "solve"]
+__all__ = ["CarLimits", "car_limits", "solve", "top_speed"]
 
 _XI_MAX_RAD: Final = 1.2
 _ROUNDS: Final = 3
@@ -218,7 +218,7 @@ def _optimise(name: str, frame: Frame, limits: CarLimits, settings: RaceLineSett
     }
     nlp = {"x": problem.x, "f": problem.f, "g": problem.g}
     solver = ca.nlpsol("raceline", "ipopt", nlp, options)
-    v_max = _top_speed(limits)
+    v_max = top_speed(limits)
     low, high = _bounds(frame, limits, v_max)
     start = _guess(frame, limits, v_max)
     with deferred_interrupt():
@@ -243,7 +243,7 @@ def _optimise(name: str, frame: Frame, limits: CarLimits, settings: RaceLineSett
     )
 
 
-def _top_speed(limits: CarLimits) -> float:
+def top_speed(limits: CarLimits) -> float:
     """Speed at which full drive only balances the resistances [m/s]."""
     highest_mps = limits.car.tuning.raceline.speed_bound_mps
     v = np.linspace(0.0, highest_mps, 3001)

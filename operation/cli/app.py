@@ -23,6 +23,7 @@ from operation.cli import (
     operation,
     parts,
     preparation,
+    raceline,
 )
 
 __all__ = ["app", "main"]
@@ -41,7 +42,7 @@ _CAMPAIGN_PACKAGES: Final = ("bokeh", "dask", "distributed", "optuna", "pyarrow"
 _TASKS: Final[dict[str, tuple[Callable[..., None], ...]]] = {
     "Race": (evaluation.race, evaluation.report),
     "Prepare": (
-        preparation.tracks, preparation.cars, preparation.raceline, preparation.collect,
+        preparation.tracks, preparation.cars, raceline.raceline, preparation.collect,
         preparation.train, learning.validate, preparation.build,
     ),
     "Drive": (

@@ -23,7 +23,7 @@ from operation.cli.options import (
     writable,
 )
 
-__all__ = ["build", "cars", "collect", "export", "raceline", "tracks", "train"]
+__all__ = ["build", "cars", "collect", "export", "tracks", "train"]
 
 
 class PredictionModel(StrEnum):
@@ -119,38 +119,6 @@ def cars(
         if out is not None:
             write_car(out, one)
     Terminal().print(table)
-
-
-def raceline(
-    track: Annotated[
-        str, typer.Argument(metavar="TRACK", help="Built-in name, random:SEED or CSV file.")
-    ],
-    out: OutFile = Path("raceline.csv"),
-    car: Car = DEFAULT_CAR,
-    friction: Annotated[
-        float | None,
-        typer.Option(metavar="MU", show_default="the car's", help="Usable acceleration over g."),
-    ] = None,
-    margin: Annotated[
-        float | None,
-        typer.Option(
-            metavar="M",
-            show_default="by the car's width",
-            help="Least distance of the centre of gravity from the track's edge [m].",
-        ),
-    ] = None,
-) -> None:
-    """Compute the minimum-time racing line of a track."""
-    from bayesrace.raceline import RaceLineSettings, write_raceline
-    from bayesrace.raceline.cached import racing_line
-    from bayesrace.tracks import load_track
-    from bayesrace.vehicles import get_car
-
-    parameters = get_car(car)
-    settings = RaceLineSettings(friction=friction, margin_m=margin)
-    line = racing_line(load_track(track, parameters.width_m), parameters, settings)
-    write_raceline(out, line)
-    typer.echo(f"{line.length_m:.2f} m in {line.lap_time_s:.3f} s: {out}")
 
 
 def collect(

@@ -1,0 +1,159 @@
+"""Bayesian optimisation of the racing line under the published objective, and the direct method.
+
+    python -m benchmarks.bayesian_line TRACKS [--trials 3] [--evaluations 110]
+
+TRACKS: folder with ethz.csv and ethzmobil.csv, the paper's tracks. The objective is that of Jain
+and Morari (2020) as their program has it: nodes at their points of the centreline, offsets over
+95 % of the width, the path from the start point, at rest and on the centreline, past the end of the
+lap to the first node, on the centreline; friction 1, drive force mu m g lf / (lf + lr). Speeds are
+computed every centimetre, where theirs have 100 points in all: the published line of ETHZ takes
+7.046 s with theirs, 7.08 s here. docs/equations.md holds the results.
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from bayesrace.arrays import Floats
+from bayesrace.raceline import RaceLineSettings, compute_raceline
+from bayesrace.raceline.guess import speed_profile
+from bayesrace.raceline.nodes import roughness
+from bayesrace.tracks import load_track
+from bayesrace.vehicles import get_car
+from bayesrace.vehicles.parameters import GRAVITY_MPS2
+from learning.search import SearchSettings, search
+
+_STEP_M: Final = 0.01
+_SHARE: Final = 0.95
+_COUNTS: Final = 20, 30, 40, 50, 110
+
+
+class Published(NamedTuple):
+    """Nodes as points of the track's file, and lap times after 110 evaluations, mean / best [s]."""
+
+    nodes: tuple[int, ...]
+    random: str
+    improvement: str
+    noisy: str
+
+
+PUBLISHED: Final = {
+    "ethz": Published(
+        (33, 67, 116, 166, 203, 239, 274, 309, 344, 362, 382, 407, 434, 448, 470, 514, 550, 586,
+         622, 657, 665),
+        "7.750 / 7.576", "7.033 / 6.967", "7.052 / 6.946",
+    ),
+    "ethzmobil": Published(
+        (7, 21, 37, 52, 66, 81, 97, 111, 136, 160, 175, 191, 205, 220, 236, 250, 275, 299, 337,
+         376),
+        "5.744 / 5.582", "5.014 / 4.910", "4.871 / 4.668",
+    ),
+}  # fmt: skip
+
+
+def path_time(points: Floats) -> float:
+    """Least time from standstill along the natural cubic spline through ``points`` (n, 2)."""
+    car = get_car("orca")
+    drive = GRAVITY_MPS2 * car.lf_m / car.wheelbase_m
+    knots = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    spline = CubicSpline(knots, points, bc_type="natural")
+    at = np.linspace(0.0, knots[-1], int(knots[-1] / _STEP_M))
+    first, second = spline(at, 1), spline(at, 2)
+    kappa = (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / np.linalg.norm(
+        first, axis=1
+    ) ** 3
+    step = np.linalg.norm(np.diff(spline(at), axis=0), axis=1)
+    v = speed_profile(
+        kappa,
+        np.append(step, 0.0),
+        GRAVITY_MPS2,
+        lambda v: np.full_like(v, drive),
+        lambda v: np.full_like(v, -GRAVITY_MPS2),
+        1e-3,
+        20.0,
+        start_mps=0.0,
+    )
+    return float(np.sum(2 * step / (v[1:] + v[:-1])))
+
+
+def objective(folder: Path, name: str) -> Callable[[Floats], float]:
+    """Time by the places of the nodes, from 0 on the right to 1 on the left."""
+    track = load_track(str(folder / f"{name}.csv"))
+    nodes = list(PUBLISHED[name].nodes)
+    width = float(track.width_left_m[0] + track.width_right_m[0])
+    s = track.s_m[nodes]
+    reach = track.length_m / (5 * len(nodes))
+    along = track.position(s + reach) - track.position(s - reach)
+    along /= np.linalg.norm(along, axis=1)[:, None]
+    left = np.column_stack([-along[:, 1], along[:, 0]])
+    middle, ends = track.position(s), track.position(np.array([0.0, s[0]]))
+
+    def of(shares: Floats) -> float:
+        offset = (shares - 0.5) * _SHARE * width
+        return path_time(np.vstack([ends[:1], middle + offset[:, None] * left, ends[1:]]))
+
+    return of
+
+
+def direct(folder: Path, name: str) -> tuple[float, float]:
+    """Time along the minimum-time line over the same way, and seconds of computing.
+
+    The line keeps the same distance from the edges at every point, and is for a car that can do
+    what the objective allows and steers as fast and as far as it has to. It begins and ends beside
+    the points on the centreline.
+    """
+    track, orca = load_track(str(folder / f"{name}.csv")), get_car("orca")
+    car = orca.model_copy(
+        update={
+            "cm1": orca.mass_kg * GRAVITY_MPS2, "cm2": 0.0, "cr0": 0.0, "cr2": 0.0, "d_min": -1.0,
+            "d_max": orca.lf_m / orca.wheelbase_m, "delta_rate_max_radps": 50.0,
+            "delta_max_rad": 0.7, "friction": 1.0,
+        }
+    )  # fmt: skip
+    width = float(track.width_left_m[0] + track.width_right_m[0])
+    started = time.process_time()
+    line = compute_raceline(track, car, RaceLineSettings(margin_m=(1 - _SHARE) / 2 * width))
+    taken = time.process_time() - started
+    beyond = track.project_path(line.xy_m).s_m
+    last = float(track.s_m[PUBLISHED[name].nodes[0]])
+    count = int(np.argmax(beyond > last))
+    return path_time(np.vstack([line.xy_m, line.xy_m[: count + 1]])), taken
+
+
+def main() -> None:
+    """Prints, for each track, best laps against evaluations, mean / best of the trials."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("tracks", type=Path)
+    parser.add_argument("--trials", type=int, default=3)
+    parser.add_argument("--evaluations", type=int, default=110)
+    options = parser.parse_args()
+    for name, published in PUBLISHED.items():
+        function, count = objective(options.tracks, name), len(published.nodes)
+        print(f"{name}: published after 110: random {published.random}, ", end="")
+        print(f"EI {published.improvement}, noisy EI {published.noisy}")
+        for method, initial in (("random", options.evaluations), ("EI", 10)):
+            started, laps = time.process_time(), []
+            for seed in range(options.trials):
+                settings = SearchSettings(
+                    evaluations=options.evaluations, initial=initial, seed=seed
+                )
+                laps.append(search(function, count, settings, roughness(count)).best)
+            table = np.array(laps)
+            taken = (time.process_time() - started) / options.trials
+            rows = [
+                f"{k}: {table[:, k - 1].mean():.3f} / {table[:, k - 1].min():.3f}"
+                for k in _COUNTS
+                if k <= options.evaluations
+            ]
+            print(f"  {method:7}", "  ".join(rows), f"  ({taken:.1f} s of processor)", flush=True)
+        best, taken = direct(options.tracks, name)
+        print(f"  minimum-time line {best:.3f} s ({taken:.1f} s of processor)", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,176 @@
+"""Racing lines by Bayesian optimisation: for the ideal lap, or for the lap that is driven."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final, Literal
+
+import numpy as np
+from pydantic import Field
+
+from bayesrace.arrays import Floats
+from bayesrace.errors import InputError
+from bayesrace.files import write_whole
+from bayesrace.gp.weights import read_weights
+from bayesrace.raceline import RaceLine, RaceLineSettings
+from bayesrace.raceline.identity import line_identity
+from bayesrace.raceline.nodes import NodeLines, roughness
+from bayesrace.tracks import Track
+from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles.models import dynamic
+from codegen.compiled import compiled
+from controller.assembly import compiled_controller
+from learning.search import Search, SearchSettings, search
+from operation.closed_loop import ClosedLoop
+from operation.terminal.progress import Stages
+from plant.simulator import Simulator
+
+__all__ = [
+    "BayesianSettings",
+    "Comparison",
+    "Lap",
+    "check_curve",
+    "driven_lap",
+    "ideal_lap",
+    "search_lines",
+    "write_curve",
+]
+
+_LIMIT: Final = 1.5
+"""A drive ends at this multiple of the line's time ..."""
+_START_S: Final = 2.0
+"""... and so much more for the start."""
+_CURVES: Final = (".csv", ".svg", ".png")
+
+Lap = Callable[[RaceLine], float]
+"""Lap time along a line [s]; infinite where there is none."""
+
+
+class BayesianSettings(RaceLineSettings):
+    """Everything that a line found by :func:`search_lines` depends on, but for weights."""
+
+    nodes: int = Field(21, ge=6, le=60, description="nodes of the line, the search's dimension")
+    objective: Literal["ideal", "driven"] = Field("ideal", description="lap time to minimise")
+    search: SearchSettings = SearchSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """The searches of some seeds, and as many random ones."""
+
+    line: RaceLine
+    """The best line of all."""
+    lap_s: float
+    """Its objective."""
+    bayesian: tuple[Search, ...]
+    random: tuple[Search, ...]
+    """Empty unless asked for."""
+
+
+def ideal_lap(line: RaceLine) -> float:
+    """Flying lap at the line's own speeds, the fastest that friction and drive allow on it."""
+    return line.lap_time_s
+
+
+def driven_lap(artefact: Path, weights: Path | None, track: Track, car: CarParameters) -> Lap:
+    """The flying lap that the controller drives in simulation along a line, after one lap from
+    standstill; infinite where it does not finish in good time or leaves the track.
+
+    Without ``weights`` by the uncorrected model. Raises InputError if artefact, weights and car do
+    not fit together.
+    """
+    learned = None if weights is None else read_weights(weights)
+    vehicle = Simulator(dynamic(car), compiled=compiled)
+
+    def drive(line: RaceLine) -> float:
+        controller = compiled_controller(artefact, car, track, line, learned)
+        limit_s = _LIMIT * 2 * line.lap_time_s + _START_S
+        driven = ClosedLoop(car, track, line, controller, vehicle).drive(2, limit_s)
+        finished = len(driven.laps_s) == 2 and float(driven.off_track_m.max()) <= 0
+        return driven.laps_s[1] if finished else math.inf
+
+    return drive
+
+
+def search_lines(
+    track: Track,
+    car: CarParameters,
+    settings: BayesianSettings,
+    lap: Lap,
+    stages: Stages,
+    trials: int = 1,
+    compare: bool = False,
+) -> Comparison:
+    """The best line of ``trials`` searches from one seed after the other.
+
+    ``compare``: random search from the same seeds as well. Raises InputError if the margin leaves
+    no room, or no random line keeps it.
+    """
+    lines = NodeLines(track, car, settings, settings.nodes)
+    features = roughness(settings.nodes)
+
+    def cost(shares: Floats) -> float:
+        line = lines.line(shares)
+        return math.inf if line is None else lap(line)
+
+    found: dict[str, list[Search]] = {"bayesian": [], "random": []}
+    for trial in range(trials):
+        own = settings.search.model_copy(update={"seed": settings.search.seed + trial})
+        every = own.model_copy(update={"initial": own.evaluations, "patience": None})
+        for method, how in (("bayesian", own), ("random", every))[: 1 + compare]:
+            with stages.stage(f"{method} search, seed {own.seed}") as stage:
+                found[method].append(
+                    search(cost, settings.nodes, how, features, progress=stage.update)
+                )
+    best = min(found["bayesian"], key=lambda one: float(one.y.min()))
+    line = lines.line(best.point)
+    if line is None or not math.isfinite(best.y.min()):
+        raise InputError(
+            f"no line through {settings.nodes} nodes on track '{track.name}' was driven or keeps "
+            "the margin: choose more --nodes, another --seed or a smaller --margin"
+        )
+    made = replace(line, made_for=line_identity(track, car, settings))
+    return Comparison(made, float(best.y.min()), tuple(found["bayesian"]), tuple(found["random"]))
+
+
+def write_curve(path: Path, comparison: Comparison, direct_s: float) -> None:
+    """Best lap against evaluations: a CSV, and a figure (SVG, PNG) where ``path`` names one.
+
+    ``direct_s``: the same lap along the minimum-time line. Raises InputError for other suffixes.
+    """
+    check_curve(path)
+    columns = {
+        f"{name}_{k}": one.best
+        for name, searches in (("bayesian", comparison.bayesian), ("random", comparison.random))
+        for k, one in enumerate(searches)
+    }
+    table = _padded(list(columns.values()))
+    rows = [",".join(["evaluation", *columns])]
+    rows += [",".join([str(k + 1), *map(repr, row)]) for k, row in enumerate(table.T.tolist())]
+    write_whole(path.with_suffix(".csv"), "\n".join(rows) + "\n")
+    if path.suffix == ".csv":
+        return
+    from operation.report.canvas import inline_svg, write_png
+    from operation.report.curve import curve_figure
+    from operation.report.style import figure_style
+
+    count = len(comparison.bayesian)
+    with figure_style():
+        figure = curve_figure(table[:count], table[count:], direct_s)
+        if path.suffix == ".png":
+            write_png(figure, path)
+        else:
+            write_whole(path, inline_svg(figure))
+
+
+def check_curve(path: Path) -> None:
+    """InputError, before the work, for a file that :func:`write_curve` does not write."""
+    if path.suffix not in _CURVES:
+        raise InputError(f"cannot write a curve to {path}: name a file in {', '.join(_CURVES)}")
+
+
+def _padded(curves: Sequence[Floats]) -> Floats:
+    """As rows of one length: a search that stopped early keeps its best value."""
+    longest = max(len(curve) for curve in curves)
+    return np.stack([np.pad(curve, (0, longest - len(curve)), "edge") for curve in curves])

@@ -1,0 +1,189 @@
+"""Racing lines by Bayesian optimisation: speeds, expected improvement, searches, the command."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from bayesrace.arrays import Floats
+from bayesrace.errors import InputError
+from bayesrace.raceline import RaceLineSettings, read_raceline_for
+from bayesrace.raceline.guess import speed_profile
+from bayesrace.raceline.nodes import NodeLines, roughness
+from bayesrace.tracks import StartLine, load_track
+from bayesrace.vehicles import get_car
+from benchmarks.bayesian_line import PUBLISHED, direct, objective
+from learning.search import Search, SearchSettings, Surrogate, search
+from operation.line_search import Comparison, check_curve, driven_lap, write_curve
+from tests.command_line import Cli, refused
+from tests.reference import reference_file
+
+CAR = get_car("orca")
+PADDOCK = load_track("paddock")
+QUICK = SearchSettings(evaluations=25, initial=8)
+
+
+def bowl(x: Floats) -> float:
+    return float(np.sum((x - np.array([0.3, 0.6, 0.8])) ** 2) + 1)
+
+
+def test_speeds_along_an_open_path_are_the_optimum_of_the_convex_program() -> None:
+    """Minimum time over a fixed path (Lipp and Boyd 2014), from standstill, solved by IPOPT."""
+    s = np.linspace(0, 6, 400)
+    step, grip, drive = s[1] - s[0], 7.0, 3.0
+    kappa = 2.5 * np.sin(1.7 * s) * np.sin(0.6 * s)
+    v = speed_profile(
+        kappa,
+        np.full(len(s), step),
+        grip,
+        lambda v: np.full_like(v, drive),
+        lambda v: np.full_like(v, -20.0),
+        0.1,
+        9.0,
+        start_mps=0.0,
+    )
+    energy = ca.MX.sym("E", len(s))
+    a = (energy[1:] - energy[:-1]) / (2 * step)
+    across = (kappa[1:] + kappa[:-1]) / 2 * (energy[1:] + energy[:-1]) / 2
+    speed = ca.sqrt(energy + 1e-9)
+    time = ca.sum1(2 * step / (speed[1:] + speed[:-1]))
+    programme = {"x": energy, "f": time, "g": ca.vertcat(a**2 + across**2, a)}
+    solver = ca.nlpsol("path", "ipopt", programme, {"print_time": 0, "ipopt.print_level": 0})
+    high = np.full(len(s), 81.0)
+    high[0] = 0.0
+    limits = np.concatenate([np.full(len(s) - 1, grip**2), np.full(len(s) - 1, drive)])
+    best = float(solver(x0=0.5 * v**2, lbx=0, ubx=high, lbg=-np.inf, ubg=limits)["f"])
+    assert solver.stats()["success"]
+    ours = float(np.sum(2 * step / (v[1:] + v[:-1])))
+    assert ours == pytest.approx(best, rel=5e-3)
+
+
+def test_expected_improvement_and_its_gradient() -> None:
+    """Against the mean over samples of the prediction, and finite differences."""
+    rng = np.random.default_rng(1)
+    x, features = rng.random((30, 3)), roughness(3)
+    y = np.array([bowl(one) for one in x])
+    surrogate = Surrogate(x, y, features)
+    for point in rng.random((5, 3)):
+        mean, sigma = surrogate._process.predict(point[None] @ features, return_std=True)
+        noise = surrogate.kernel.k2.noise_level
+        spread = math.sqrt(sigma[0] ** 2 - noise)
+        scaled = (y - y.mean()) / y.std()
+        z = (scaled.min() - mean[0]) / spread
+        normal = math.exp(-(z**2) / 2) / math.sqrt(2 * math.pi)
+        improvement = spread * (normal + z * (1 + math.erf(z / math.sqrt(2))) / 2)
+        if improvement > 1e-9:
+            value = surrogate.log_improvement(point[None])[0]
+            assert value == pytest.approx(math.log(improvement), rel=1e-3)
+        near = 1e-5 * np.eye(3)
+        above, below = (surrogate.log_improvement(point + sign * near) for sign in (1, -1))
+        np.testing.assert_allclose(surrogate.gradient(point), (above - below) / 2e-5, rtol=1e-3)
+
+
+def test_a_search_finds_the_minimum_and_is_one_of_its_seed() -> None:
+    first, again = search(bowl, 3, QUICK), search(bowl, 3, QUICK)
+    np.testing.assert_array_equal(first.x, again.x)
+    random = search(bowl, 3, QUICK.model_copy(update={"initial": 25}))
+    assert first.y.min() < 1.001 < random.y.min()
+    np.testing.assert_array_equal(first.best, np.minimum.accumulate(first.y))
+    assert bowl(first.point) == first.y.min()
+
+
+def test_a_search_ends_early_without_gain_and_learns_from_what_fails() -> None:
+    def half(x: Floats) -> float:
+        return bowl(x) if x[0] < 0.5 else math.inf
+
+    settings = QUICK.model_copy(update={"evaluations": 100, "patience": 8})
+    found = search(half, 3, settings)
+    assert 20 < len(found.y) < 60
+    assert found.y.min() < 1.01
+    with pytest.raises(InputError, match="none of the first 8 evaluations"):
+        search(lambda x: math.inf, 3, QUICK)
+
+
+@pytest.mark.parametrize("name", ["paddock", "harbour"])
+def test_lines_through_nodes_keep_the_margin_and_begin_on_the_start_line(name: str) -> None:
+    track = load_track(name)
+    lines = NodeLines(track, CAR, RaceLineSettings(), 21)
+    rng = np.random.default_rng(0)
+    found = [line for line in (lines.line(rng.random(21)) for _ in range(6)) if line is not None]
+    assert len(found) >= 3
+    for line in found:
+        beyond = track.project_points(line.xy_m).off_track_m + CAR.width_m / 2
+        assert beyond.max() <= CAR.tuning.raceline.tolerance_m
+        start = StartLine(track).signed_distance(line.x_m[0], line.y_m[0])
+        assert start == pytest.approx(0.0, abs=1e-9)
+        across = line.kappa_radpm * line.vx_mps**2
+        assert np.abs(across).max() <= CAR.friction * 9.81 + 1e-6
+        assert np.hypot(across, line.ax_mps2).max() <= 1.05 * CAR.friction * 9.81
+
+
+def test_a_margin_without_room_is_refused() -> None:
+    with pytest.raises(InputError, match=r"'paddock' is too narrow for a margin of 0.3 m"):
+        NodeLines(PADDOCK, CAR, RaceLineSettings(margin_m=0.3), 12)
+
+
+def test_command(cli: Cli, tmp_path: Path) -> None:
+    """The file is that of its seed and says what it was made for; the curve has its form."""
+    how = ("--method", "bayesian", "--evaluations", "12", "--nodes", "14")
+    done = cli("raceline", "paddock", *how, "--out", "a.csv", "--curve", "curve.svg")
+    assert done.code == 0, done.err
+    assert "ideal lap; along the minimum-time line" in done.out
+    cli("raceline", "paddock", *how, "--out", "b.csv")
+    assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
+    cli("raceline", "paddock", *how, "--out", "c.csv", "--seed", "3")
+    lines = [read_raceline_for(tmp_path / f"{one}.csv", PADDOCK, CAR) for one in "ac"]
+    assert lines[0].made_for != lines[1].made_for
+    assert (tmp_path / "curve.svg").read_text().startswith("<svg")
+    rows = (tmp_path / "curve.csv").read_text().splitlines()
+    assert rows[0] == "evaluation,bayesian_0,random_0"
+    assert len(rows) == 13
+
+
+def test_refusals(cli: Cli) -> None:
+    refused(cli("raceline", "paddock", "--curve", "x.svg"), "--method bayesian")
+    refused(cli("raceline", "paddock", "--nodes", "12"), "--nodes needs --method bayesian")
+    bayesian = ("raceline", "paddock", "--method", "bayesian")
+    refused(cli(*bayesian, "--curve", "x.pdf"), "x.pdf", ".svg")
+    refused(cli(*bayesian, "--curve", "x.svg", "--out", "x.csv"), "x.csv", "another name")
+    refused(cli(*bayesian, "--nodes", "3"), "--nodes")
+    refused(cli(*bayesian, "--weights", "w.bin"), "--objective driven")
+
+
+def test_the_driven_lap_is_the_objective(dynamic_artefact: Path) -> None:
+    """The controller drives a line through nodes; a lap that it does not finish has no time."""
+    lap = driven_lap(dynamic_artefact, None, PADDOCK, CAR)
+    line = NodeLines(PADDOCK, CAR, RaceLineSettings(friction=0.5), 16).line(np.full(16, 0.5))
+    assert line is not None
+    assert 0.8 * line.lap_time_s < lap(line) < 1.5 * line.lap_time_s
+    hurried = replace(line, vx_mps=10 * line.vx_mps)
+    assert math.isinf(lap(hurried))
+
+
+def test_curve_as_picture(tmp_path: Path) -> None:
+    one = Search(np.zeros((3, 2)), np.array([math.inf, 2.0, 3.0]))
+    line = NodeLines(PADDOCK, CAR, RaceLineSettings(), 16).line(np.full(16, 0.5))
+    assert line is not None
+    compared = Comparison(line, 2.0, (one, Search(one.x[:2], one.y[1:])), ())
+    write_curve(tmp_path / "curve.png", compared, 1.5)
+    assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "curve.csv").read_text().splitlines()[-1] == "3,2.0,2.0"
+    with pytest.raises(InputError, match=r"curve.pdf: name a file in .csv, .svg, .png"):
+        check_curve(tmp_path / "curve.pdf")
+
+
+@pytest.mark.check
+@pytest.mark.parametrize(("name", "published_s"), [("ethz", 7.033), ("ethzmobil", 4.871)])
+def test_fifty_evaluations_beat_the_published_mean_of_110(name: str, published_s: float) -> None:
+    """reference/README.md, its better method; the objective is the published one."""
+    folder = reference_file(f"tracks/{name}.csv").parent
+    function, count = objective(folder, name), len(PUBLISHED[name].nodes)
+    laps = [
+        search(function, count, SearchSettings(evaluations=50, seed=seed), roughness(count)).y.min()
+        for seed in range(3)
+    ]
+    assert np.mean(laps) < published_s
+    assert direct(folder, name)[0] < min(laps)
