@@ -25,7 +25,7 @@ from bayesrace.raceline.guess import speed_profile
 from bayesrace.raceline.nodes import roughness
 from bayesrace.tracks import load_track
 from bayesrace.vehicles import get_car
-from bayesrace.vehicles.parameters import GRAVITY_MPS2
+from bayesrace.vehicles.parts import GRAVITY_MPS2, DcMotor
 from learning.search import SearchSettings, search
 
 _STEP_M: Final = 0.01
@@ -108,10 +108,11 @@ def direct(folder: Path, name: str) -> tuple[float, float]:
     the points on the centreline.
     """
     track, orca = load_track(str(folder / f"{name}.csv")), get_car("orca")
+    force = orca.mass_kg * GRAVITY_MPS2
+    drive = DcMotor(model="dc_motor", cm1=force, cm2=0.0, cr0=0.0, cr2=0.0)
     car = orca.model_copy(
         update={
-            "cm1": orca.mass_kg * GRAVITY_MPS2, "cm2": 0.0, "cr0": 0.0, "cr2": 0.0, "d_min": -1.0,
-            "d_max": orca.lf_m / orca.wheelbase_m, "delta_rate_max_radps": 50.0,
+            "drive": drive, "d_min": -1.0, "d_max": orca.lf_m / orca.wheelbase_m, "delta_rate_max_radps": 50.0,
             "delta_max_rad": 0.7, "friction": 1.0,
         }
     )  # fmt: skip
