@@ -112,8 +112,8 @@ def direct(folder: Path, name: str) -> tuple[float, float]:
     drive = DcMotor(model="dc_motor", cm1=force, cm2=0.0, cr0=0.0, cr2=0.0)
     car = orca.model_copy(
         update={
-            "drive": drive, "d_min": -1.0, "d_max": orca.lf_m / orca.wheelbase_m, "delta_rate_max_radps": 50.0,
-            "delta_max_rad": 0.7, "friction": 1.0,
+            "drive": drive, "d_min": -1.0, "d_max": orca.lf_m / orca.wheelbase_m,
+            "delta_rate_max_radps": 50.0, "delta_max_rad": 0.7, "friction": 1.0,
         }
     )  # fmt: skip
     width = float(track.width_left_m[0] + track.width_right_m[0])
