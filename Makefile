@@ -25,12 +25,12 @@ PROJECT := --no-build-isolation --editable
 START := $(shell date +%s)
 TOOK = echo "make $@: $$(($$(date +%s) - $(START))) s"
 
-.PHONY: help race test check tools rest lint coverage native-coverage nothing bench clean
+.PHONY: help race test check tools rest lint coverage bench clean
 
 help:
 	@echo "make race    set up, and drive the whole comparison; leaves runs/DATE-TIME"
 	@echo "make test    set up for testing, and run most tests, in a few minutes"
-	@echo "make check   everything: all tests, lint, coverage; names the tools that it needs"
+	@echo "make check   everything: lint, all tests, coverage; names the tools that it needs"
 	@echo "make lint    ruff, clang-format, mypy, import contracts"
 	@echo "make bench   time the compiled step beside CasADi + IPOPT"
 	@echo "make clean   remove the virtual environment and all caches in this folder"
@@ -48,18 +48,12 @@ RUNNER = $(BIN)/python -m
 TIER = not check
 # Pairs of processes in real time that run at once.
 PAIRS = 3
-# Beside those, which leave half of two processors idle, 'make check' runs this target with the
-# lowest priority; its output follows theirs.
-BESIDE = nothing
 PYTEST = $(RUNNER) pytest --dist worksteal
 define RUN_TESTS
 	@$(PYTEST) --numprocesses auto --maxprocesses 8 $(ARGS) -m "($(TIER)) and not wall_clock"; \
-	computing=$$?; mkdir -p build; \
-	nice -n 19 $(MAKE) --no-print-directory $(BESIDE) >build/$(BESIDE).txt 2>&1 & \
-	$(PYTEST) --numprocesses $(PAIRS) $(ARGS) -m "($(TIER)) and wall_clock"; meeting=$$?; \
-	wait $$!; beside=$$?; cat build/$(BESIDE).txt; $(TOOK); \
-	for code in $$computing $$meeting $$beside; do \
-		[ $$code -eq 0 ] || [ $$code -eq 5 ] || exit $$code; done; \
+	computing=$$?; \
+	$(PYTEST) --numprocesses $(PAIRS) $(ARGS) -m "($(TIER)) and wall_clock"; meeting=$$?; $(TOOK); \
+	for code in $$computing $$meeting; do [ $$code -eq 0 ] || [ $$code -eq 5 ] || exit $$code; done; \
 	[ $$computing -ne 5 ] || [ $$meeting -ne 5 ] || { echo "ARGS selects no test" >&2; exit 5; }
 endef
 
@@ -71,8 +65,9 @@ check: RUNNER = $(BIN)/coverage run -m
 check: export TEST_SESSION = $(CURDIR)/build/session
 check: tools $(VENV)/.ready-dev
 	@rm -rf build/coverage build/session
-	@$(MAKE) --no-print-directory test RUNNER='$(RUNNER)' BESIDE=lint
-	@$(MAKE) --no-print-directory rest RUNNER='$(RUNNER)' BESIDE=native-coverage
+	@$(MAKE) --no-print-directory lint
+	@$(MAKE) --no-print-directory test RUNNER='$(RUNNER)'
+	@$(MAKE) --no-print-directory rest RUNNER='$(RUNNER)'
 	@$(MAKE) --no-print-directory coverage
 	@$(TOOK)
 
@@ -88,12 +83,7 @@ coverage: $(VENV)/.ready-dev
 	find build/coverage -name 'data.*' -empty -delete # of processes that tests have killed
 	$(BIN)/coverage combine --quiet
 	$(BIN)/coverage report --skip-covered
-
-native-coverage: $(VENV)/.ready-dev
 	$(BIN)/python -m tests.native_coverage
-
-nothing:
-	@:
 
 lint: $(VENV)/.ready-dev
 	$(BIN)/ruff check .

@@ -290,7 +290,7 @@ def test_a_running_system_is_measured_and_left_running(files: Prepared, tmp_path
     assert set(result["legs_us"]) == set(LEGS)
     assert result["rss_growth_bytes"] is None
     assert result["off_track_samples"] is None
-    assert result["ticks"] > 50
+    assert result["ticks"] > 10  # of a hundred on a machine that keeps up
 
 
 def test_nothing_to_attach_to_is_an_error(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
