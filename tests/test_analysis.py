@@ -270,6 +270,9 @@ def test_reading_what_is_no_result_is_refused(tmp_path: Path) -> None:
 
 def test_the_table_shows_the_results_numbers_within_80_columns(tmp_path: Path) -> None:
     result = analyse(race(tmp_path))
+    wide = {"rmse": 0.000123, "uncorrected_rmse": 0.000123, "r2": -10.1234, "log_density": -123.45}
+    metrics = {output: one.model_copy(update=wide) for output, one in result.gp_updated.items()}
+    result = result.model_copy(update={"gp": metrics, "gp_updated": metrics})
     text = io.StringIO()
     print_table(result, Console(file=text, width=80))
     lines = text.getvalue().splitlines()

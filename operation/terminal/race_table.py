@@ -112,7 +112,8 @@ def gp_cells(one: GpMetrics) -> list[str]:
 
 def _gp_table(result: RaceResult) -> Table:
     """One row an output and weights."""
-    table = plain_table("output", "GP of", *GP_COLUMNS, left=2)
+    heads = ("\n".join(title.rsplit(" ", 1)) for title in GP_COLUMNS)
+    table = plain_table("output", "GP of", *heads, left=2)
     for output in result.gp or result.gp_updated:
         name = f"{output} {UNITS[output]}"
         for weights, metrics in (("bayesrace", result.gp), ("updated", result.gp_updated)):
