@@ -51,7 +51,7 @@ from plant.lockstep import CarRun, End, drive_lockstep
 from plant.simulator import Simulator
 from plant.vehicle import Vehicle
 
-__all__ = ["ClosedLoop", "Driven", "drive_compiled"]
+__all__ = ["ClosedLoop", "Driven", "built_in_car", "drive_compiled"]
 
 
 _EPOCH: Final = 1
@@ -127,6 +127,11 @@ class Driven(Trajectory):
         return text + (f", {self.fallbacks} fallbacks" if self.fallbacks else "")
 
 
+def built_in_car(car: CarParameters) -> Simulator:
+    """The car by the built-in equations, compiled; several loops in turn may drive it."""
+    return Simulator(dynamic(car), compiled=compiled)
+
+
 class ClosedLoop:
     """A car on a track with its controller; each :meth:`drive` is a run from the start line."""
 
@@ -144,7 +149,7 @@ class ClosedLoop:
         messages that a race records. ``settings``: of the controller process, as far as they
         concern lockstep."""
         self._car, self._track, self._line = car, track, line
-        self._vehicle = vehicle or Simulator(dynamic(car), compiled=compiled)
+        self._vehicle = vehicle or built_in_car(car)
         self._cycle = Cycle(controller, car, settings or ControllerSettings(car=car))
         self._controller = controller
         self._log = None if log is None else _Messages(log, car.name)

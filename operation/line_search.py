@@ -18,13 +18,10 @@ from bayesrace.raceline.identity import line_identity
 from bayesrace.raceline.nodes import NodeLines, roughness
 from bayesrace.tracks import Track
 from bayesrace.vehicles import CarParameters
-from bayesrace.vehicles.models import dynamic
-from codegen.compiled import compiled
 from controller.assembly import compiled_controller
 from learning.search import Search, SearchSettings, search
-from operation.closed_loop import ClosedLoop
+from operation.closed_loop import ClosedLoop, built_in_car
 from operation.terminal.progress import Stages
-from plant.simulator import Simulator
 
 __all__ = [
     "BayesianSettings",
@@ -81,7 +78,7 @@ def driven_lap(artefact: Path, weights: Path | None, track: Track, car: CarParam
     not fit together.
     """
     learned = None if weights is None else read_weights(weights)
-    vehicle = Simulator(dynamic(car), compiled=compiled)
+    vehicle = built_in_car(car)
 
     def drive(line: RaceLine) -> float:
         controller = compiled_controller(artefact, car, track, line, learned)

@@ -272,8 +272,8 @@ def test_in_real_time_it_drives_too_and_a_second_race_prepares_nothing(
     driven: Race, short: ShortRace
 ) -> None:
     race = short("realtime", "--laps", "1", "--mode", "realtime")()
-    told = race.process.stdout.splitlines()
-    found = [line.removesuffix(": from the cache") for line in told if line.endswith("the cache")]
+    lines = race.process.stdout.splitlines()
+    found = [line.removesuffix(": from the cache") for line in lines if line.endswith("the cache")]
     assert found == [
         "racing line, peanut",
         "racing line, peanut",

@@ -19,13 +19,11 @@ from bayesrace.arrays import Floats
 from bayesrace.cpu import cpu_digest
 from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.vehicles import CarParameters
-from bayesrace.vehicles.models import dynamic
-from codegen.compiled import compiled
 from controller.assembly import compiled_controller
 from controller.path_table import PathTable, make_path_table
 from learning.dataset import concatenate
 from operation.analysis.laps import trajectory_digest
-from operation.closed_loop import ClosedLoop, Driven
+from operation.closed_loop import ClosedLoop, Driven, built_in_car
 from operation.preparation import (
     PredictionModel,
     Prepared,
@@ -108,7 +106,7 @@ def _table(track: PreparedTrack, spacing_m: float) -> PathTable:
 @lru_cache(maxsize=8)
 def _vehicle(car: str) -> Simulator:
     """To make its equations takes longer than to drive some laps by them."""
-    return Simulator(dynamic(CarParameters.model_validate_json(car)), compiled=compiled)
+    return built_in_car(CarParameters.model_validate_json(car))
 
 
 class _Runs:
