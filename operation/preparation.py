@@ -27,7 +27,7 @@ from codegen.compiler import find_compiler
 from codegen.settings import BuildSettings
 from learning.dataset import Dataset
 from learning.logs import dataset_from_messages, fallback_cycles
-from learning.training import Progress, TrainingSettings, train
+from learning.settings import Progress, TrainingSettings
 from operation.collect import collect
 from operation.settings import PreparationSettings
 from operation.terminal.progress import Stages
@@ -260,6 +260,9 @@ def trained_weights(
     path = cache_folder() / f"weights-{identity}.bin"
 
     def make(partial: Path) -> None:
+        # Imported here: it takes a second, and most commands find their weights in the cache.
+        from learning.training import train
+
         weights = train(samples, discretisation, settings, initial, progress)
         write_weights(partial, weights)
 

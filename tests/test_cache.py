@@ -16,7 +16,7 @@ from bayesrace.raceline import RaceLine, RaceLineSettings, cached
 from bayesrace.tracks import load_track
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
-from learning.training import TrainingSettings
+from learning.settings import TrainingSettings
 from operation import preparation
 from tests.conftest import mirrored_weights, offset_line
 from tests.driven import CAR, drive

@@ -17,7 +17,8 @@ from codegen.fmu import car_fmu, pack
 from codegen.settings import BuildSettings
 from controller.pure_pursuit import PurePursuit
 from controller.python_controller import PythonController
-from learning.training import TrainingSettings, train
+from learning.settings import TrainingSettings
+from learning.training import train
 from operation.analysis.results import read_result
 from operation.closed_loop import ClosedLoop, drive_compiled
 from operation.settings import RaceSettings

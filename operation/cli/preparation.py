@@ -222,8 +222,9 @@ def train(
     from bayesrace.vehicles import get_car
     from learning.dataset import left_out
     from learning.residual import discretisation_of
+    from learning.settings import TrainingSettings
     from learning.sources import read_samples
-    from learning.training import TrainingSettings, fit
+    from learning.training import fit
     from operation.terminal.learning_table import print_choices, print_kernels
     from operation.terminal.progress import stages_on
     from operation.terminal.terminal import Terminal
