@@ -194,7 +194,8 @@ def training_drive(
             car.model_dump_json(),
             settings.true_car.model_dump_json(),
             pursuit.model_dump_json(),
-            f"{settings.drive_s!r} {settings.start_speed_mps!r} {len(files)}",
+            settings.noise.model_dump_json(),
+            f"{settings.delay_s!r} {settings.drive_s!r} {settings.start_speed_mps!r} {len(files)}",
             *(read_whole(path, "the FMU or its map", _LARGEST_FMU) for path in files),
             cpu_identity(),
             *software(_DRIVE_SOURCES, ("casadi", "mcap", "numpy")),
@@ -207,7 +208,7 @@ def training_drive(
         with open_vehicle(true_car, *files, 1 / PLANT.step_s, compiled) as vehicle:
             collect(
                 track, prepared.line, car, artefact, partial, settings.drive_s, pursuit,
-                settings.start_speed_mps, vehicle,
+                settings.start_speed_mps, vehicle, settings.noise, settings.delay_s,
             )  # fmt: skip
 
     def read(log: Path) -> Dataset:

@@ -122,8 +122,14 @@ class _Race:
     @property
     def plant_options(self) -> list[str]:
         """Of ``bayesrace plant``."""
+        settings = self.settings
         files = zip(("--fmu", "--map"), self.fmu_files, strict=True)
-        return ["--car", self.car_file, *(str(one) for pair in files if pair[1] for one in pair)]
+        noise = [("--noise", f"{name}={value!r}") for name, value in settings.noise if value]
+        pairs = [
+            ("--car", self.car_file), *(pair for pair in files if pair[1]), *noise,
+            ("--delay", 1e3 * settings.delay_s), ("--seed", settings.seed),
+        ]  # fmt: skip
+        return [str(one) for pair in pairs for one in pair]
 
     @property
     def both_options(self) -> list[str]:

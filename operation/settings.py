@@ -11,6 +11,7 @@ from bayesrace.vehicles import CarParameters, CarSetting, default_car
 from controller.pure_pursuit import PurePursuitSettings
 from controller.settings import MpcSettings
 from learning.kernels import DEFAULT_KERNELS, Kernel
+from plant.sensors import SensorNoise
 from plant.simulator import PLANT
 
 __all__ = ["PreparationSettings", "RaceSettings"]
@@ -36,7 +37,13 @@ class PreparationSettings(BaseModel):
         description="tyre forces of the simulated car, as a multiple of those in its file, "
         "which all controllers but BestCase assume",
     )
-    seed: int = Field(0, ge=0, description="of the training drive and of the GP's starts")
+    delay_s: float = Field(
+        0.0, ge=0, le=1, description="delay put on states and on actuations each [s]"
+    )
+    noise: SensorNoise = SensorNoise()
+    seed: int = Field(
+        0, ge=0, description="of the training drive, the GP's starts and the sensors' noise"
+    )
     start_speed_mps: float = Field(0.1, ge=0, le=5, description="speed at the start line")
     collect_s: float | None = Field(
         None, ge=1, le=3600, description="length of the training drive [s]; None: the car's tuning"

@@ -47,6 +47,7 @@ from bayesrace.vehicles import CarSetting, default_car
 from plant.fmu.faults import FmuFault
 from plant.lockstep import End
 from plant.run import Run, RunCounters
+from plant.sensors import SensorNoise, Sensors
 from plant.simulator import Compile
 from plant.vehicle import Vehicle, open_vehicle
 
@@ -77,8 +78,10 @@ class PlantSettings(BaseModel):
         default=0.0,
         ge=0,
         le=1,
-        description="delay put on states and actuations each, in real time",
+        description="delay put on states and on actuations each",
     )
+    noise: SensorNoise = SensorNoise()
+    seed: int = Field(0, ge=0, description="of the sensors' noise, which is the same in each run")
     fmu: Path | None = Field(
         None,
         description="Co-Simulation FMU that simulates the car, instead of the built-in equations",
@@ -189,6 +192,7 @@ class PlantProcess:
                 beat=self._beat,
                 epoch=self._epoch,
                 delay_s=self._settings.delay_s,
+                sensors=Sensors(self._settings.noise, self._settings.seed),
             )
         except (InputError, FmuFault) as error:
             return str(error)

@@ -39,7 +39,7 @@ def preparing(
         return offset_line(track, 0.01, 5.0, 2.5)
 
     monkeypatch.setattr(cached, "compute_raceline", compute)
-    monkeypatch.setattr(preparation, "train", lambda *_: weights)
+    monkeypatch.setattr("learning.training.train", lambda *_: weights)
 
     def run(**changes: object) -> tuple[Prepared, list[str]]:
         console = Console(file=io.StringIO(), width=200)
