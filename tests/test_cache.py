@@ -114,7 +114,7 @@ def test_weights_are_kept_for_their_samples_settings_and_beginning(
         trained.append(arguments)
         return replace(weights, version=f"{len(trained)}")
 
-    monkeypatch.setattr(preparation, "train", train)
+    monkeypatch.setattr("learning.training.train", train)
     samples, settings = drive(dynamic(CAR), 30, seed=1), TrainingSettings()
 
     def version(*changes: object) -> str:

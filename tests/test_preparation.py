@@ -73,7 +73,7 @@ def test_a_second_preparation_computes_nothing_and_says_so(
 
     for module, name in ((cached, "compute_raceline"), (preparation, "collect")):
         monkeypatch.setattr(module, name, never)
-    monkeypatch.setattr(preparation, "train", never)
+    monkeypatch.setattr("learning.training.train", never)
     again, stages = preparing()
     assert stages == STAGES
     assert again.arguments == first.arguments
