@@ -8,6 +8,7 @@ from fmpy.validation import validate_fmu
 
 from bayesrace.arrays import Floats
 from bayesrace.integrators import PREDICTION
+from bayesrace.raceline import RaceLine, read_raceline_for
 from bayesrace.raceline.cached import racing_line
 from bayesrace.tracks import load_track
 from bayesrace.vehicles import get_car
@@ -70,10 +71,21 @@ def test_the_car_names_the_tracks_that_are_driven_where_none_is_named() -> None:
     assert RaceSettings().track == "harbour"
 
 
-def test_a_lap_that_was_learned_from_pure_pursuit_stays_on_the_small_track() -> None:
-    """And corners beyond what tyres of its friction could hold, which the trajectory shows."""
+def in_the_form_of_others(line: RaceLine, path: Path) -> Path:
+    """As the F1TENTH community writes racing lines: few digits, headings that wrap, no origin."""
+    heading = np.angle(np.exp(1j * line.psi_rad))
+    columns = (line.s_m, line.x_m, line.y_m, heading, line.kappa_radpm, line.vx_mps, line.ax_mps2)
+    names = "s_m; x_m; y_m; psi_rad; kappa_radpm; vx_mps; ax_mps2"
+    np.savetxt(path, np.column_stack(columns), "%.7f", ";", header=f"17b4de0d\n{names}")
+    return path
+
+
+def test_a_lap_that_was_learned_from_pure_pursuit_stays_on_the_small_track(tmp_path: Path) -> None:
+    """On a line from a file of others' form; it corners beyond what tyres of its friction could
+    hold, which the trajectory shows."""
     track = load_track(SMALL, CAR.width_m)
-    line, artefact = racing_line(track, CAR), build(BuildSettings(car=CAR))[0]
+    path = in_the_form_of_others(racing_line(track, CAR), tmp_path / "line.csv")
+    line, artefact = read_raceline_for(path, track, CAR), build(BuildSettings(car=CAR))[0]
     pursuit = PurePursuit(CAR, line.x_m, line.y_m, line.vx_mps)
     loop = ClosedLoop(CAR, track, line, PythonController(artefact, pursuit))
     samples = loop.drive(0, CAR.tuning.pursuit.drive_s).samples()

@@ -33,8 +33,8 @@ _OUR_OWN: Final = ("bayesrace", "codegen", "operation", "plant", "studies")
 
 _FMU_PACKAGES: Final = ("fmpy", "pint")
 _RACE_PACKAGES: Final = (
-    "casadi", "hdrh", "jinja2", "lz4", "matplotlib", "mcap", "rich", "scipy", "sklearn",
-    "threadpoolctl", "zstandard",
+    "PIL", "casadi", "contourpy", "hdrh", "jinja2", "lz4", "matplotlib", "mcap", "rich", "scipy",
+    "sklearn", "threadpoolctl", "yaml", "zstandard",
 )  # fmt: skip
 _CAMPAIGN_PACKAGES: Final = ("bokeh", "dask", "distributed", "optuna", "pyarrow")
 """Modules that the extras ``fmu``, ``race`` and ``campaign`` of pyproject.toml install."""
