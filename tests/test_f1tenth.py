@@ -16,6 +16,7 @@ from bayesrace.vehicles.models import dynamic
 from codegen.build import build
 from codegen.fmu import car_fmu, pack
 from codegen.settings import BuildSettings
+from controller.cycle_settings import FallbackSettings
 from controller.pure_pursuit import PurePursuit
 from controller.python_controller import PythonController
 from learning.training import TrainingSettings, train
@@ -24,6 +25,7 @@ from operation.closed_loop import ClosedLoop, drive_compiled
 from operation.settings import RaceSettings
 from plant.simulator import Simulator
 from plant.vehicle import Vehicle, open_vehicle
+from tests.cycle_rig import STEP_S, ScriptedLaw, scripted_driver, state
 from tests.programs import Race
 
 CAR = get_car("f1tenth")
@@ -97,6 +99,53 @@ def test_a_lap_that_was_learned_from_pure_pursuit_stays_on_the_small_track(tmp_p
     assert run.laps_s[1] < 1.02 * line.lap_time_s
     assert np.abs(run.lateral_mps2).max() > CAR.friction * 9.81
     assert 0.1 < np.abs(run.slip_rad).max() < 0.6
+
+
+def braked_by_fallback(x0: Floats) -> tuple[Floats, list[int]]:
+    """States until the car stands, no step usable any more; how many cycles each level drove."""
+    artefact = build(BuildSettings(car=CAR))[0]
+    driver = scripted_driver(artefact, ScriptedLaw(), FallbackSettings(), car=CAR)
+    simulator = Simulator(dynamic(CAR))
+    simulator.reset(x0.tolist())
+    rows = [x0]
+    while rows[-1][3] > 0.02:
+        seq, x = len(rows), tuple(rows[-1].tolist())
+        assert len(rows) < 500
+        assert driver.observe(state(seq, time_s=seq * STEP_S, x=x, lockstep=True))
+        decision = driver.decide(seq * STEP_S, 0.0, 0.0)
+        simulator.step((decision.d, decision.delta_rate))
+        rows.append(simulator.x.copy())
+        without = simulator.guard.apply(None, rows[-2], STEP_S)[0]
+        assert simulator.u_applied[0] == without  # the plant brakes as the controller does
+    return np.array(rows), driver.levels
+
+
+@pytest.mark.parametrize(("across_mps2", "slip_rad"), [(0.0, 0.05), (2.0, 0.2), (5.0, 0.3)])
+def test_braking_by_the_fallback_is_braking_that_the_car_can_hold(
+    across_mps2: float, slip_rad: float
+) -> None:
+    """On a straight and in bends, with a shove. A full brake spins it: load goes to the front."""
+    v_mps = 10.0
+    steady = Simulator(dynamic(CAR))
+    delta = across_mps2 / v_mps**2 * CAR.wheelbase_m
+    steady.reset([0.0, 0.0, 0.0, v_mps, 0.0, across_mps2 / v_mps, delta])
+    for _ in range(50):
+        steady.step((5.0 * (v_mps - steady.x[3]), 0.0))
+    x0 = steady.x.copy()
+    x0[5] += 0.3
+    x, levels = braked_by_fallback(x0)
+    moving = x[x[:, 3] > CAR.brake_fade_mps]
+    assert np.abs(np.arctan2(moving[:, 4], moving[:, 3])).max() < slip_rad
+    assert np.abs(x[:, 5]).max() < across_mps2 / 5 + 0.4
+    assert np.all(np.diff(x[:, 3]) < 1e-9)
+    assert levels[0] == levels[1] == 0
+    assert levels[2] > 20
+    way = np.linalg.norm(np.diff(x[:, :2], axis=0), axis=1).sum()
+    assert way < 18.0  # at 1.6 m/s^2 all the way it is 31 m
+    steady.reset(x0.tolist())
+    for _ in range(40):
+        steady.step((CAR.d_min, 0.0))
+    assert abs(np.arctan2(steady.x[4], steady.x[3])) > 1.0
 
 
 @pytest.mark.check

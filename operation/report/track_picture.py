@@ -57,9 +57,9 @@ def write_picture(path: Path, track: Track, grid: RosMap | None = None) -> None:
 
 
 def _draw_map(axes: Axes, grid: RosMap) -> None:
-    shade = np.full(grid.free.shape, _SHADES["unknown"], dtype=np.uint8)
-    shade[grid.free], shade[grid.occupied] = _SHADES["free"], _SHADES["occupied"]
-    rows, columns = shade.shape
+    known = np.where(grid.occupied, _SHADES["occupied"], _SHADES["unknown"])
+    shade = np.where(grid.free, _SHADES["free"], known)
+    rows, columns = len(shade), len(shade[0])
     x, y, yaw = grid.origin
     placed = Affine2D().scale(grid.resolution_m).rotate(yaw).translate(x, y)
     image = axes.imshow(
