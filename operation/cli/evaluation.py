@@ -16,6 +16,7 @@ from operation.cli.options import (
     FmuFile,
     FmuMap,
     Seed,
+    Simulator,
     TrackName,
     Tyres,
     connect_to,
@@ -65,6 +66,7 @@ def race(
     seed: Seed = 0,
     fmu: FmuFile = None,
     fmu_map: FmuMap = None,
+    simulator: Simulator = "equations",
 ) -> None:
     """Drive the paper's comparison: WorstCase, BayesRace, BayesRace-updated, BestCase.
 
@@ -86,7 +88,7 @@ def race(
     driven = get_car(car) if tyres is None else get_car(car).on_tyres(tyres)
     settings = RaceSettings(
         car=driven, track=track, train_track=train_track, laps=laps, mode=mode.value,
-        seed=seed, fmu=fmu, fmu_map=fmu_map,
+        seed=seed, fmu=fmu, fmu_map=fmu_map, simulator=simulator,
     )  # fmt: skip
     mpc = settings.mpc.model_copy(update={"constraints": not no_constraints})
     settings = settings.model_copy(update={"mpc": mpc})

@@ -16,6 +16,7 @@ from operation.cli.options import (
     LowLatency,
     ParentPid,
     RaceLineFile,
+    Simulator,
     TrackName,
 )
 
@@ -52,6 +53,7 @@ def plant(
     rate: Rate = 50.0,
     fmu: FmuFile = None,
     fmu_map: FmuMap = None,
+    simulator: Simulator = "equations",
     delay: Annotated[
         float,
         typer.Option(
@@ -85,6 +87,7 @@ def plant(
         delay_s=delay * 1e-3,
         fmu=fmu,
         fmu_map=fmu_map,
+        simulator=simulator,
         realtime=RealtimeSettings(cpu=cpu, fifo=fifo, lock_memory=lock_memory),
         parent_pid=parent_pid,
     )

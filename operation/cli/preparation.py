@@ -18,6 +18,7 @@ from operation.cli.options import (
     OutFile,
     RaceLineFile,
     Seed,
+    Simulator,
     TrackName,
     Tyres,
     path_on,
@@ -185,6 +186,7 @@ def collect(
     seed: Seed = 0,
     fmu: FmuFile = None,
     fmu_map: FmuMap = None,
+    simulator: Simulator = "equations",
     car: Car = DEFAULT_CAR,
 ) -> None:
     """Drive a track by pure pursuit and log the drive as training data."""
@@ -202,7 +204,8 @@ def collect(
     parameters = get_car(car)
     course = load_track(track, parameters.width_m)
     line = read_raceline_for(raceline, course, parameters)
-    with open_vehicle(parameters, fmu, fmu_map, compiled=compiled) as vehicle:
+    vehicles = open_vehicle(parameters, fmu, fmu_map, compiled=compiled, simulator=simulator)
+    with vehicles as vehicle:
         duration_s = duration or parameters.tuning.pursuit.drive_s
         artefact, _ = build(BuildSettings(car=parameters))
         samples = drive(
