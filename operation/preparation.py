@@ -182,6 +182,7 @@ def training_drive(
     """
     pursuit = settings.pursuit.model_copy(update={"seed": settings.seed})
     files = [path for path in (settings.fmu, settings.fmu_map) if path is not None]
+    others = [] if settings.simulator == "equations" else [settings.simulator]
     columns = "s_m", "x_m", "y_m", "vx_mps"
     track = prepared.track
     identity = digest(
@@ -198,14 +199,17 @@ def training_drive(
             f"{settings.delay_s!r} {settings.drive_s!r} {settings.start_speed_mps!r} {len(files)}",
             *(read_whole(path, "the FMU or its map", _LARGEST_FMU) for path in files),
             cpu_identity(),
-            *software(_DRIVE_SOURCES, ("casadi", "mcap", "numpy")),
+            *software(_DRIVE_SOURCES, ("casadi", "mcap", "numpy", *others)),
         ]
     )
     path = cache_folder() / f"drive-{identity}.mcap"
 
     def make(partial: Path) -> None:
         true_car, files = settings.true_car, (settings.fmu, settings.fmu_map)
-        with open_vehicle(true_car, *files, 1 / PLANT.step_s, compiled) as vehicle:
+        vehicles = open_vehicle(
+            true_car, *files, 1 / PLANT.step_s, compiled, simulator=settings.simulator
+        )
+        with vehicles as vehicle:
             collect(
                 track, prepared.line, car, artefact, partial, settings.drive_s, pursuit,
                 settings.start_speed_mps, vehicle, settings.noise, settings.delay_s,

@@ -13,6 +13,7 @@ from controller.settings import MpcSettings
 from learning.kernels import DEFAULT_KERNELS, Kernel
 from plant.sensors import SensorNoise
 from plant.simulator import PLANT
+from plant.vehicle import SimulatorName
 
 __all__ = ["PreparationSettings", "RaceSettings"]
 
@@ -30,6 +31,9 @@ class PreparationSettings(BaseModel):
         None, description="FMU that simulates the car; the built-in car without"
     )
     fmu_map: Path | None = Field(None, description="how the FMU's variables are ours (TOML)")
+    simulator: SimulatorName = Field(
+        "equations", description="what simulates the car without an FMU"
+    )
     true_grip: float = Field(
         1.0,
         gt=0,
@@ -84,10 +88,13 @@ class PreparationSettings(BaseModel):
 
     @model_validator(mode="after")
     def _simulated(self) -> Self:
-        """An FMU has its own tyres."""
-        if self.fmu is not None and self.true_grip != 1:
+        """One simulator; one that is not the built-in equations has its own tyres."""
+        if self.fmu is not None and self.simulator != "equations":
+            raise ValueError(f"{self.simulator} and {self.fmu}: only one can simulate the car")
+        other = self.fmu or (None if self.simulator == "equations" else self.simulator)
+        if other is not None and self.true_grip != 1:
             raise ValueError(
-                f"true_grip {self.true_grip:g} is for the built-in car, and {self.fmu} simulates "
+                f"true_grip {self.true_grip:g} is for the built-in car, and {other} simulates "
                 "the car: leave one of them out"
             )
         return self

@@ -111,11 +111,13 @@ const br_counters *br_cycle_counters(const br_cycle *cycle) {
 
 br_mpc_error br_cycle_set_driving(br_cycle *cycle, const br_driving *s) {
     if (!cycle || !s) return BR_ERROR_NULL;
-    const double positive[] = {s->brake_fade_mps, s->stop_mps2, s->longest_s, s->stale_s};
-    const double others[] = {s->standing_mps, s->shifted_s, s->limit_tolerance, s->delay_s};
+    const double positive[] = {s->brake_fade_mps, s->brake_d, s->stop_mps2, s->longest_s,
+                               s->stale_s};
+    const double others[] = {s->brake_slow, s->standing_mps, s->shifted_s, s->limit_tolerance,
+                             s->delay_s};
     int valid = s->recover_cycles >= 1 && s->compensation >= BR_COMPENSATION_OFF &&
                 s->compensation <= BR_COMPENSATION_FIXED && s->longest_s <= BR_PREDICT_MAX_S;
-    for (int i = 0; i < 4; ++i)
+    for (int i = 0; i < 5; ++i)
         valid &= isfinite(positive[i]) && positive[i] > 0 && isfinite(others[i]) && others[i] >= 0;
     for (int i = 0; i < BR_NU; ++i)
         valid &= isfinite(s->u_low[i]) && isfinite(s->u_high[i]) && s->u_low[i] < s->u_high[i];

@@ -18,6 +18,7 @@ from operation.cli.options import (
     FmuMap,
     Noise,
     Seed,
+    Simulator,
     TrackName,
     Tyres,
     connect_to,
@@ -68,6 +69,7 @@ def race(
     seed: Seed = 0,
     fmu: FmuFile = None,
     fmu_map: FmuMap = None,
+    simulator: Simulator = "equations",
     delay: Delay = 0.0,
     noise: Noise = None,
 ) -> None:
@@ -91,7 +93,8 @@ def race(
     driven = get_car(car) if tyres is None else get_car(car).on_tyres(tyres)
     settings = RaceSettings(
         car=driven, track=track, train_track=train_track, laps=laps, mode=mode.value,
-        seed=seed, fmu=fmu, fmu_map=fmu_map, delay_s=1e-3 * delay, noise=sensor_noise(noise),
+        seed=seed, fmu=fmu, fmu_map=fmu_map, simulator=simulator, delay_s=1e-3 * delay,
+        noise=sensor_noise(noise),
     )  # fmt: skip
     mpc = settings.mpc.model_copy(update={"constraints": not no_constraints})
     settings = settings.model_copy(update={"mpc": mpc})

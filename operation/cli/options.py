@@ -2,7 +2,7 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -27,6 +27,7 @@ __all__ = [
     "ParentPid",
     "RaceLineFile",
     "Seed",
+    "Simulator",
     "TrackName",
     "Tyres",
     "connect_to",
@@ -169,6 +170,10 @@ FmuMap = Annotated[
         metavar="FILE",
         help="Meaning of the FMU's variables (TOML); 'bayesrace fmu inspect' writes one to edit.",
     ),
+]
+Simulator = Annotated[
+    Literal["equations", "slipx"],
+    typer.Option(metavar="NAME", help="equations, or slipx, whose reference car is --car slipx."),
 ]
 LowLatency = Annotated[
     bool,

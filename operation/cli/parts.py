@@ -18,6 +18,7 @@ from operation.cli.options import (
     Noise,
     ParentPid,
     RaceLineFile,
+    Simulator,
     TrackName,
     sensor_noise,
 )
@@ -55,6 +56,7 @@ def plant(
     rate: Rate = 50.0,
     fmu: FmuFile = None,
     fmu_map: FmuMap = None,
+    simulator: Simulator = "equations",
     delay: Delay = 0.0,
     noise: Noise = None,
     seed: Annotated[int, typer.Option(metavar="N", min=0, help="Seed of the noise.")] = 0,
@@ -84,6 +86,7 @@ def plant(
         seed=seed,
         fmu=fmu,
         fmu_map=fmu_map,
+        simulator=simulator,
         realtime=RealtimeSettings(cpu=cpu, fifo=fifo, lock_memory=lock_memory),
         parent_pid=parent_pid,
     )
