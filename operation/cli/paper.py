@@ -53,5 +53,7 @@ def paper(
     with stages_on(console) as stages:
         page, sections = make_paper(settings, out, stages)
     for finding in (one for section in sections for one in section.findings):
-        console.print(f"{finding.verdict}: {finding.what}: {finding.ours}", highlight=False)
+        console.print(
+            f"{finding.verdict}: {finding.what}: {finding.ours}", highlight=False, soft_wrap=True
+        )
     console.print(f"{page}", highlight=False, soft_wrap=True)

@@ -7,6 +7,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
+
 from bayesrace.cache import cache_folder, digest, kept, software
 from bayesrace.cpu import cpu_identity
 from bayesrace.errors import InputError
@@ -52,7 +54,10 @@ class Experiment:
         self, controller: str, weights: GpWeights | None = None, constraints: bool = True,
         speed: float = 1.0,
     ) -> DrivenRun:  # fmt: skip
-        """A lap from standstill; ``speed``: share of the racing line's that is planned."""
+        """A lap from standstill, or up to where the car is farther off than the track is wide.
+
+        ``speed``: share of the racing line's that is planned.
+        """
         line = replace(self._line, vx_mps=speed * self._line.vx_mps)
         artefact = self._artefacts[controller == "bestcase"]
         mpc = MpcSettings(constraints=constraints)
@@ -65,7 +70,12 @@ class Experiment:
             log.close()
             for entry in LogReader(path).messages((STATE, TRUTH, TELEMETRY, EVENT)):
                 record.add(entry.message)
-        return DrivenRun(record, self.track, line)
+        run = DrivenRun(record, self.track, line)
+        width_m = float(np.max(self.track.width_left_m + self.track.width_right_m))
+        lost = np.flatnonzero(run.on_track.off_track_m > width_m)
+        if not len(lost):
+            return run
+        return DrivenRun(replace(record, truth=record.truth[: lost[0] + 1]), self.track, line)
 
     def samples(self, run: DrivenRun) -> Dataset:
         """What can be learned from a lap."""

@@ -33,13 +33,13 @@ _LARGEST_M: Final = 0.122
 _FASTER_S: Final = 0.5
 """Published: the correction shortens the lap by more."""
 _ETHZ_M: Final = 17.84
-_STEERING: Final = {
-    True: ("the same pattern, drifting with time", 0.2),
-    False: ("nearly the same", 0.02),
+_STAGES: Final = {
+    True: ("before", "section 4.3", "on", "the same pattern, drifting with time", 0.2),
+    False: ("after", "section 4.4", "off, as in the paper", "nearly the same", 0.02),
 }
-"""Statement of the paper, and share of the largest angle that is taken for it."""
-_PLACES: Final = {True: "section 4.3", False: "section 4.4"}
-_LAPS: Final = "over 0.5 s shorter (its code run again: 7.792 and 8.694 s)"
+"""Where laps with and without track constraints are compared, what the paper says of the inputs,
+and the share of the largest steering angle that is taken for it."""
+_LAPS: Final = "over 0.5 s shorter (its code run again: 8.694 and 7.792 s)"
 _GAIN: Final = "the corrected lap is more than 0.5 s shorter, or the only one"
 _HALF: Final = "ours is at least half of the published factor"
 _LIMITS: Final = "our training drive keeps to the car's limits and visits fewer states"
@@ -77,12 +77,13 @@ def _mismatch(laps: Laps, one: Experiment) -> Section:
     worst_s, corrected_s = (run.result().lap_time_s for run in runs.values())
     gain = corrected_s is not None and (worst_s is None or worst_s - corrected_s > _FASTER_S)
     largest_m = float(apart_m["bayesrace"].max())
+    texts = "; ".join(lap_text(run) for run in runs.values())
     at_end = "mismatch at the end of the horizon, with correction"
     findings = [
         at_most(f"mean {at_end}", _MEAN_M, mean_m, "m", _LIMITS, same),
         at_most(f"largest {at_end}", _LARGEST_M, largest_m, "m", _LIMITS, same),
         Finding("the correction divides the mean by", "6.5", f"{factor:.1f}", _HALF, factor > 3.25),
-        Finding("laps with and without correction", _LAPS, _times(*runs.values()), _GAIN, gain),
+        Finding("laps without and with correction", _LAPS, texts, _GAIN, gain),
     ]
     return Section("Prediction against the car", "section 4.3", _TEXT, figures, findings)
 
@@ -116,19 +117,15 @@ def _comparison(laps: Laps, one: Experiment, controller: str, constraints: bool)
         None if None in pair else abs(np.subtract(*pair)) for pair in zip(*times, strict=True)
     )
     findings.append(at_most("both laps apart", theirs or 0.0, ours, "s"))
-    text, limit = _STEERING[constraints]
-    apart, limit_rad = _unlike(run, best), limit * one.car.delta_max_rad
+    stage, place, on, statement, limit = _STAGES[constraints]
+    apart_rad, limit_rad = _unlike(run, best), limit * one.car.delta_max_rad
     what = "steering apart at the same place (RMS)"
-    criterion = f"it is less than {limit:.0%} of the largest angle"
-    findings.append(Finding(what, text, f"{apart:.4f} rad", criterion, apart < limit_rad))
-    stage = "before" if constraints else "after"
-    text = "Position and inputs on the lap from standstill; track constraints " + (
-        "on." if constraints else "off, as the paper relaxes them for this comparison."
-    )
+    criterion = f"it is less than {100 * limit:g} % of the largest angle"
+    ours_text, holds = f"{apart_rad:.4f} rad", apart_rad < limit_rad
+    findings.append(Finding(what, statement, ours_text, criterion, holds))
+    text = f"Position and inputs on the lap from standstill; track constraints {on}."
     title = f"BayesRace against BestCase, {stage} the update"
-    return Section(
-        title, _PLACES[constraints], text, lap_figures(stage, [run, best], one), findings
-    )
+    return Section(title, place, text, lap_figures(stage, [run, best], one), findings)
 
 
 def _unlike(run: DrivenRun, best: DrivenRun) -> float:
@@ -169,10 +166,6 @@ def lap_text(run: DrivenRun) -> str:
     """Time and excursions."""
     time_s, off = run.result().lap_time_s, run.result().off_track_samples
     return f"{'no lap' if time_s is None else f'{time_s:.3f} s'}, {off} samples off track"
-
-
-def _times(without: DrivenRun, corrected: DrivenRun) -> str:
-    return f"{lap_text(corrected)}; {lap_text(without)}"
 
 
 def _is_ethz(track: Track) -> bool:

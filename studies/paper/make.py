@@ -5,10 +5,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Any, Final
-
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from pydantic import BaseModel, ConfigDict, Field
+from typing import Any, Final, NamedTuple
 
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
@@ -16,11 +13,10 @@ from bayesrace.integrators import PREDICTION
 from bayesrace.raceline import RaceLineSettings
 from bayesrace.vehicles import get_car
 from learning.arrays import dataset_from_npz
-from learning.kernels import DEFAULT_KERNELS, Kernel
-from learning.training import TrainingSettings
-from operation import report
 from operation.analysis.published import SOURCE
+from operation.preparation import training_settings
 from operation.report.canvas import inline_svg, write_pdf
+from operation.report.render import template
 from operation.report.style import figure_style
 from operation.settings import PreparationSettings
 from operation.terminal.progress import Stages
@@ -49,15 +45,16 @@ _PAGE: Final = "paper.html"
 _FIGURES: Final = "figures"
 
 
-class PaperSettings(BaseModel):
-    """Settings of ``bayesrace paper``; InputError for a folder without its files."""
+class PaperSettings(NamedTuple):
+    """Folders of tracks and published drives, if there are any; InputError for missing files.
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    ``quick``: fewer kernels, points, seeds and problems. ``seed``: of training drives and GPs.
+    """
 
-    tracks: Path | None = Field(None, description="folder of the paper's tracks; None: built-in")
-    data: Path | None = Field(None, description="folder of the published drives; None: left out")
-    quick: bool = Field(False, description="fewer kernels, samples, seeds and problems")
-    seed: int = Field(0, ge=0, description="of training drives and GPs")
+    tracks: Path | None = None
+    data: Path | None = None
+    quick: bool = False
+    seed: int = 0
 
     @property
     def drives(self) -> tuple[Path, ...]:
@@ -78,20 +75,15 @@ class PaperSettings(BaseModel):
         There the racing line assumes a friction of 1, as published.
         """
         car = get_car("f1tenth")
-        race = None if self.tracks is None else self.tracks / _TENTH_TRACK
-        if race is None or not race.is_file():
+        race = (self.tracks or Path()) / _TENTH_TRACK
+        if self.tracks is None or not race.is_file():
             return self._of(car=car), car.race_track
         line = RaceLineSettings(friction=1.0)
         return self._of(car=car, train_track=str(race), raceline=line), str(race)
 
-    @property
-    def kernels(self) -> tuple[Kernel, ...]:
-        """Candidates of the GPs."""
-        return ("matern25",) if self.quick else DEFAULT_KERNELS
-
     def _of(self, **others: Any) -> PreparationSettings:
-        points = 150 if self.quick else 400
-        return PreparationSettings(seed=self.seed, kernels=self.kernels, points=points, **others)
+        fewer: Any = {"kernels": ("matern25",), "points": 150} if self.quick else {}
+        return PreparationSettings(seed=self.seed, **fewer, **others)
 
 
 def _files(folder: Path | None, names: Iterable[str], option: str) -> tuple[Path, ...]:
@@ -122,7 +114,7 @@ def make_paper(settings: PaperSettings, out: Path, stages: Stages) -> tuple[Path
     every = [Learned("our", one.training, test, tracks, (one.weights, after))]
     if drives:
         arrays = [dataset_from_npz(path, one.car, PREDICTION.step_s) for path in drives]
-        own = TrainingSettings(kernels=settings.kernels, seed=settings.seed)
+        own = training_settings(orca).model_copy(update={"capacity": 2 * _SAMPLES})
         shown = (None, None) if settings.tracks is None else tracks
         every.append(learned([x.select(slice(_SAMPLES)) for x in arrays], own, shown, stages))
     points, seeds, problems, peers = (100, 2, 60, 3) if settings.quick else (320, 5, 300, 15)
@@ -144,11 +136,8 @@ def make_paper(settings: PaperSettings, out: Path, stages: Stages) -> tuple[Path
             tenth_section(small),
             _solving(BenchResult.model_validate(solved)),
         ]
-        facts = {
-            "tracks": f"{one.train_track.name}, {one.track.name}",
-            "published data": "compared" if drives else "not given (--data)",
-            "how": f"{'quick' if settings.quick else 'in full'}, seed {settings.seed}",
-        }
+        how = f"{'quick' if settings.quick else 'in full'}, seed {settings.seed}"
+        facts = {"tracks": f"{one.train_track.name}, {one.track.name}", "how": how}
         return _write(out, sections, facts), sections
 
 
@@ -190,15 +179,7 @@ def _write(out: Path, sections: Sequence[Section], facts: dict[str, str]) -> Pat
     write_whole(out / "numbers.json", json.dumps(rows, indent=1, ensure_ascii=False) + "\n")
     counts = Counter(row["verdict"] for row in rows)
     facts |= {verdict: f"{count} findings" for verdict, count in counts.most_common()}
-    environment = Environment(
-        loader=FileSystemLoader([Path(__file__).parent, *map(Path, report.__path__)]),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    page = environment.get_template(f"{_PAGE}.j2").render(
-        sections=sections, drawn=drawn, facts=facts, source=SOURCE, folder=_FIGURES
-    )
-    write_whole(out / _PAGE, page)
+    page = template(f"{_PAGE}.j2", Path(__file__).parent)
+    shown = {"sections": sections, "drawn": drawn, "facts": facts, "folder": _FIGURES}
+    write_whole(out / _PAGE, page.render(source=SOURCE, **shown))
     return out / _PAGE

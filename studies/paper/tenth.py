@@ -28,7 +28,7 @@ def tenth_section(one: Experiment) -> Section:
     own, failed = corrected.result(), plain.result()
     same = abs(one.track.length_m - _MAP2_M) < 0.1
     fast, slow = own.lap_time_s, slowed.result().lap_time_s
-    what = "without correction at the full speed of the racing line"
+    what = "without correction, at the full speed of the racing line"
     criterion = "it leaves the track, or finishes no lap"
     holds = failed.off_track_samples > 0 or not plain.finished
     gain = f"it is more than {_FASTER_S:g} s shorter, or the only one"
