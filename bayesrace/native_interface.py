@@ -182,6 +182,8 @@ DRIVING: Final = (
     ("u_low", "inputs", "what no input is below"),
     ("u_high", "inputs", "what no input is above"),
     ("brake_fade_mps", "double", "speed below which braking fades to none at standstill"),
+    ("brake_d", "double", "drive command of braking, turned positive"),
+    ("brake_slow", "double", "what is added to it, times the squared speed"),
     ("standing_mps", "double", "a car that is not faster stands"),
     ("stop_mps2", "double", "deceleration of a stop on command"),
     ("shifted_s", "double", "how long after its first input a plan may be driven"),

@@ -25,8 +25,9 @@ from bayesrace.gp.weights import OUTPUTS
 from bayesrace.integrators import PREDICTION
 from learning.hyperparameters import BOUNDS, starts
 from learning.residual import residual
+from learning.settings import TrainingSettings
 from learning.target import Target
-from learning.training import TrainingSettings, fit
+from learning.training import fit
 from operation.preparation import training_samples
 from operation.settings import PreparationSettings
 

@@ -55,7 +55,7 @@ def cycle_values(
 ) -> dict[str, float]:
     """The numbers of :data:`bayesrace.native_interface.DRIVING` by name, limits left out."""
     return {
-        "brake_fade_mps": car.brake_fade_mps,
+        **car.brake_numbers,
         "standing_mps": car.tuning.driving.standing_mps,
         "stop_mps2": car.tuning.driving.stop_mps2,
         "shifted_s": fallback.shifted_s,

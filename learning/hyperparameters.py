@@ -23,14 +23,12 @@ from bayesrace.arrays import Floats
 from bayesrace.gp.weights import FEATURES
 from learning.likelihood import MarginalLikelihood, PairDistances
 from learning.posterior import Covariance
+from learning.settings import TOLERANCE
 
-__all__ = ["BOUNDS", "TOLERANCE", "Fit", "maximise", "starts"]
+__all__ = ["BOUNDS", "Fit", "maximise", "starts"]
 
 BOUNDS: Final = np.log([(1e-2, 25.0)] + [(1e-1, 1e2)] * len(FEATURES) + [(1e-6, 1.0)])
 """Lower and upper bound of theta, (8, 2)."""
-
-TOLERANCE: Final = 1e-7
-"""Relative gain of the likelihood per iteration at which the optimiser stops."""
 
 _ARD: Final = np.eye(len(BOUNDS))
 _ISOTROPIC: Final = np.zeros((len(BOUNDS), 3))

@@ -11,17 +11,18 @@ A fold B of the training samples, predicted from all others (section 5.4.2, bloc
 """
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
-from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
 
 from bayesrace.arrays import Floats, Rows
 from bayesrace.errors import InputError
 from bayesrace.gp.expression import kernel_matrix
 from learning.scores import PredictionErrors
+
+if TYPE_CHECKING:
+    from sklearn.gaussian_process import GaussianProcessRegressor
 
 __all__ = ["Covariance", "Posterior", "regressor"]
 
@@ -53,11 +54,15 @@ class Covariance:
         return self.signal * kernel_matrix(self.kind, a, b, self.lengths)
 
 
-def regressor(covariance: Covariance, z: Floats, y: Floats) -> GaussianProcessRegressor:
+def regressor(covariance: Covariance, z: Floats, y: Floats) -> "GaussianProcessRegressor":
     """scikit-learn's GP with these hyperparameters, fitted to ``z`` (n, 6) and ``y`` (n,).
 
     The weights of a controller come from it. InputError if the covariance is singular.
     """
+    # Imported here: it takes a second, and only training needs it.
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
+
     kind, lengths = covariance.kind, covariance.lengths
     correlation: Any = RBF(lengths) if kind == "rbf" else Matern(lengths, nu=_NU[kind])
     kernel = ConstantKernel(covariance.signal) * correlation + WhiteKernel(covariance.noise)

@@ -20,13 +20,12 @@ choice of samples depend on all stretches.
 import hashlib
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 from threadpoolctl import threadpool_limits
 
 from bayesrace import __version__
@@ -37,58 +36,21 @@ from bayesrace.integrators import Discretisation
 from learning.assessment import ChoiceScore, KernelScore, choice_scores, choose_kernel
 from learning.dataset import Dataset, left_out
 from learning.folds import spans, stretches
-from learning.hyperparameters import TOLERANCE, Fit, maximise, starts
-from learning.kernels import DEFAULT_KERNELS, Kernel
+from learning.hyperparameters import Fit, maximise, starts
 from learning.likelihood import PairDistances
 from learning.posterior import regressor
 from learning.residual import identity, residual
+from learning.settings import MIN_SAMPLES, Progress, TrainingSettings
 from learning.subset import evenly, most_informative
 from learning.target import Target
 
-__all__ = [
-    "MAX_SAMPLES",
-    "MIN_SAMPLES",
-    "Progress",
-    "Training",
-    "TrainingSettings",
-    "fit",
-    "train",
-]
+__all__ = ["MAX_SAMPLES", "Training", "fit", "train"]
 
-Progress = Callable[[float, str], None]
-"""Called from the training's own thread with the share done (0 to 1) and what was done."""
-
-MIN_SAMPLES: Final = 20
 MAX_SAMPLES: Final = 100_000
 """Choosing among more would take gigabytes."""
 
 _CONSTANT: Final = 1e-9
 """A column whose standard deviation is below this share of its size never changes."""
-
-
-class TrainingSettings(BaseModel):
-    """How to train; the defaults use training samples alone to decide."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-    kernels: tuple[Kernel, ...] = Field(
-        DEFAULT_KERNELS, min_length=1, description="candidates; held-out log density decides"
-    )
-    restarts: int = Field(2, ge=0, le=100, description="further seeded starts per kernel")
-    seed: int = Field(0, ge=0)
-    capacity: int = Field(1024, ge=1, description="training points per output at most")
-    hyper_points: int = Field(
-        400, ge=MIN_SAMPLES, description="samples that hyperparameters are found with at most"
-    )
-    tolerance: float = Field(
-        TOLERANCE, gt=0, lt=1, description="relative gain at which the optimiser stops"
-    )
-    iterations: int = Field(100, ge=1, description="optimiser iterations per start")
-    warm_iterations: int = Field(30, ge=1, description="the same, starting from given weights")
-    folds: int = Field(
-        10, ge=2, description="parts of the drive, or of the track, each held out in turn"
-    )
-    threads: int = Field(0, ge=0, description="parallel fits; 0 is one per core")
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,8 @@ from bayesrace.integrators import Discretisation
 from bayesrace.interpreter import RUN_MODULE
 from learning.dataset import Dataset, concatenate
 from learning.pool import bounded
-from learning.training import TrainingSettings, train
+from learning.settings import TrainingSettings
+from learning.training import train
 
 __all__ = ["NICE", "Outcome", "Task", "Trainer", "main", "perform"]
 

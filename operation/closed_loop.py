@@ -48,6 +48,7 @@ from learning.logs import dataset_from_messages
 from operation.analysis.laps import LapTimes, Trajectory, time_laps
 from operation.drive import RunPlan, announcement, run_request
 from plant.lockstep import CarRun, End, drive_lockstep
+from plant.sensors import SensorNoise, Sensors
 from plant.simulator import Simulator
 from plant.vehicle import Vehicle
 
@@ -144,15 +145,20 @@ class ClosedLoop:
         vehicle: Vehicle | None = None,
         log: LogWriter | None = None,
         settings: ControllerSettings | None = None,
+        noise: SensorNoise | None = None,
+        seed: int = 0,
+        delay_s: float = 0.0,
     ) -> None:
         """``vehicle``: what plays the car; the built-in equations without. ``log``: gets the
         messages that a race records. ``settings``: of the controller process, as far as they
-        concern lockstep."""
+        concern lockstep. ``noise`` of the sensors with its ``seed``, and ``delay_s`` of states
+        and of actuations each: those of the plant process."""
         self._car, self._track, self._line = car, track, line
         self._vehicle = vehicle or built_in_car(car)
         self._cycle = Cycle(controller, car, settings or ControllerSettings(car=car))
         self._controller = controller
         self._log = None if log is None else _Messages(log, car.name)
+        self._noise, self._seed, self._delay_s = noise, seed, delay_s
         self._run = self._seq = 0
         self._answer = (0.0, 0.0)
 
@@ -178,7 +184,8 @@ class ClosedLoop:
         request = run_request(self._track, plan)
         if x0 is not None:
             request = replace(request, x0=tuple(map(float, x0)))
-        run = CarRun(request, self._vehicle, _EPOCH)
+        sensors = Sensors(self._noise, self._seed)
+        run = CarRun(request, self._vehicle, _EPOCH, sensors, 2 * self._delay_s)
         self._states: list[State] = []
         self._truth: list[Truth] = []
         self._decided: list[tuple[int, int]] = []

@@ -10,6 +10,7 @@ from controller.pure_pursuit import PurePursuit, PurePursuitSettings
 from controller.python_controller import PythonController
 from operation.closed_loop import ClosedLoop
 from plant.fmu.faults import FmuFault
+from plant.sensors import SensorNoise
 from plant.vehicle import Vehicle
 
 __all__ = ["collect"]
@@ -25,8 +26,12 @@ def collect(
     settings: PurePursuitSettings,
     start_speed_mps: float = 0.1,
     vehicle: Vehicle | None = None,
+    noise: SensorNoise | None = None,
+    delay_s: float = 0.0,
 ) -> int:
     """Drives for ``duration_s`` and logs the run at ``path``; returns the number of samples.
+
+    ``noise``, ``delay_s``: as in :class:`ClosedLoop`, the seed is that of ``settings``.
 
     The same settings give the same drive to the bit. ``artefact``: a controller built for the car,
     whose control cycle drives. ``vehicle``: what simulates the car; the built-in equations without.
@@ -35,7 +40,10 @@ def collect(
     pursuit = PurePursuit(car, line.x_m, line.y_m, line.vx_mps, settings)
     log = LogWriter(path, {"collect": {"track": track.name, "car": car_text(car)}})
     try:
-        loop = ClosedLoop(car, track, line, PythonController(artefact, pursuit), vehicle, log)
+        loop = ClosedLoop(
+            car, track, line, PythonController(artefact, pursuit), vehicle, log,
+            noise=noise, seed=settings.seed, delay_s=delay_s,
+        )  # fmt: skip
         driven = loop.drive(0, duration_s, start_speed_mps, name="pure-pursuit")
     finally:
         log.close()

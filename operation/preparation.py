@@ -27,7 +27,7 @@ from codegen.compiler import find_compiler
 from codegen.settings import BuildSettings
 from learning.dataset import Dataset
 from learning.logs import dataset_from_messages, fallback_cycles
-from learning.training import Progress, TrainingSettings, train
+from learning.settings import Progress, TrainingSettings
 from operation.collect import collect
 from operation.settings import PreparationSettings
 from operation.terminal.progress import Stages
@@ -182,6 +182,7 @@ def training_drive(
     """
     pursuit = settings.pursuit.model_copy(update={"seed": settings.seed})
     files = [path for path in (settings.fmu, settings.fmu_map) if path is not None]
+    others = [] if settings.simulator == "equations" else [settings.simulator]
     columns = "s_m", "x_m", "y_m", "vx_mps"
     track = prepared.track
     identity = digest(
@@ -194,20 +195,24 @@ def training_drive(
             car.model_dump_json(),
             settings.true_car.model_dump_json(),
             pursuit.model_dump_json(),
-            f"{settings.drive_s!r} {settings.start_speed_mps!r} {len(files)}",
+            settings.noise.model_dump_json(),
+            f"{settings.delay_s!r} {settings.drive_s!r} {settings.start_speed_mps!r} {len(files)}",
             *(read_whole(path, "the FMU or its map", _LARGEST_FMU) for path in files),
             cpu_identity(),
-            *software(_DRIVE_SOURCES, ("casadi", "mcap", "numpy")),
+            *software(_DRIVE_SOURCES, ("casadi", "mcap", "numpy", *others)),
         ]
     )
     path = cache_folder() / f"drive-{identity}.mcap"
 
     def make(partial: Path) -> None:
         true_car, files = settings.true_car, (settings.fmu, settings.fmu_map)
-        with open_vehicle(true_car, *files, 1 / PLANT.step_s, compiled) as vehicle:
+        vehicles = open_vehicle(
+            true_car, *files, 1 / PLANT.step_s, compiled, simulator=settings.simulator
+        )
+        with vehicles as vehicle:
             collect(
                 track, prepared.line, car, artefact, partial, settings.drive_s, pursuit,
-                settings.start_speed_mps, vehicle,
+                settings.start_speed_mps, vehicle, settings.noise, settings.delay_s,
             )  # fmt: skip
 
     def read(log: Path) -> Dataset:
@@ -260,6 +265,9 @@ def trained_weights(
     path = cache_folder() / f"weights-{identity}.bin"
 
     def make(partial: Path) -> None:
+        # Imported here: it takes a second, and most commands find their weights in the cache.
+        from learning.training import train
+
         weights = train(samples, discretisation, settings, initial, progress)
         write_weights(partial, weights)
 

@@ -79,12 +79,12 @@ class _Race:
         fmu, fmu_map = self.fmu_files
         settings = self.settings.model_copy(update={"fmu": fmu, "fmu_map": fmu_map})
         with _faults_named():
-            prepared = prepare(settings, (settings.track,), self.stages, _MODELS)
+            prepared = prepare(settings, (settings.track,), self.stages, self.models)
         if prepared.training is not None:
             self._keep_files(prepared.training.driven_on, "train")
             shutil.copyfile(prepared.training.log, self.out / FILES.collect_log)
         kept = self._keep_files(prepared.first, "race")
-        for model, folder in zip(_MODELS, prepared.artefacts, strict=True):
+        for model, folder in zip(self.models, prepared.artefacts, strict=True):
             shutil.copyfile(folder / MANIFEST, self.out / f"manifest-{model}.json")
         shutil.copyfile(prepared.weights, self.out / FILES.weights)
         return replace(prepared, tracks=(kept,), weights=self.out / FILES.weights)
@@ -102,8 +102,12 @@ class _Race:
             if source is not None and target is not None:
                 shutil.copyfile(source, target)
         # An FMU that cannot be the car is reported now, not in half a minute.
-        with _faults_named(), open_vehicle(self.car, *self.fmu_files, 1 / PLANT.step_s):
-            pass
+        with _faults_named():
+            tried = open_vehicle(
+                self.car, *self.fmu_files, 1 / PLANT.step_s, simulator=settings.simulator
+            )
+            with tried:
+                pass
 
     @property
     def car_file(self) -> str:
@@ -122,8 +126,20 @@ class _Race:
     @property
     def plant_options(self) -> list[str]:
         """Of ``bayesrace plant``."""
+        settings = self.settings
         files = zip(("--fmu", "--map"), self.fmu_files, strict=True)
-        return ["--car", self.car_file, *(str(one) for pair in files if pair[1] for one in pair)]
+        noise = [("--noise", f"{name}={value!r}") for name, value in settings.noise if value]
+        pairs = [
+            ("--car", self.car_file), ("--simulator", settings.simulator),
+            *(pair for pair in files if pair[1]), *noise,
+            ("--delay", 1e3 * settings.delay_s), ("--seed", settings.seed),
+        ]  # fmt: skip
+        return [str(one) for pair in pairs for one in pair]
+
+    @property
+    def models(self) -> tuple[PredictionModel, ...]:
+        """Of the controllers: nothing predicts with what is inside another simulator."""
+        return _MODELS if self.settings.simulator == "equations" else _MODELS[:1]
 
     @property
     def both_options(self) -> list[str]:
@@ -201,7 +217,9 @@ class _Drives:
 
 
 def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
-    """Drives WorstCase, BayesRace, BayesRace-updated and BestCase; leaves everything in ``out``.
+    """Drives WorstCase, BayesRace, BayesRace-updated and, where the true model is known, BestCase.
+
+    Leaves everything in ``out``.
 
     Raises InputError for unusable settings, RaceError when a process is lost (the log stays
     readable), KeyboardInterrupt on Ctrl-C; no process outlives the call.
@@ -222,7 +240,7 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
     write_car(this.car_file, this.car)
     write_whole(out / FILES.settings, settings.model_dump_json(indent=1) + "\n")
     prepared = this.prepare()
-    artefact, perfect = prepared.artefacts
+    artefact, *perfect = prepared.artefacts
     about = {"race": {"settings": settings.model_dump_json()}}
     with (
         started_system(this.car.name, out, this.plant_options, this.both_options) as system,
@@ -239,5 +257,6 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
                 updated = this.update(prepared, drives.samples(driven), stage)
             with stages.stage("drive BayesRace-updated"):
                 drives.drive("bayesrace-updated", updated)
-        with drives.controller(perfect, "bestcase"), stages.stage("drive BestCase"):
-            drives.drive("bestcase")
+        for best in perfect:
+            with drives.controller(best, "bestcase"), stages.stage("drive BestCase"):
+                drives.drive("bestcase")

@@ -11,7 +11,9 @@ from bayesrace.vehicles import CarParameters, CarSetting, default_car
 from controller.pure_pursuit import PurePursuitSettings
 from controller.settings import MpcSettings
 from learning.kernels import DEFAULT_KERNELS, Kernel
+from plant.sensors import SensorNoise
 from plant.simulator import PLANT
+from plant.vehicle import SimulatorName
 
 __all__ = ["PreparationSettings", "RaceSettings"]
 
@@ -29,6 +31,9 @@ class PreparationSettings(BaseModel):
         None, description="FMU that simulates the car; the built-in car without"
     )
     fmu_map: Path | None = Field(None, description="how the FMU's variables are ours (TOML)")
+    simulator: SimulatorName = Field(
+        "equations", description="what simulates the car without an FMU"
+    )
     true_grip: float = Field(
         1.0,
         gt=0,
@@ -36,7 +41,13 @@ class PreparationSettings(BaseModel):
         description="tyre forces of the simulated car, as a multiple of those in its file, "
         "which all controllers but BestCase assume",
     )
-    seed: int = Field(0, ge=0, description="of the training drive and of the GP's starts")
+    delay_s: float = Field(
+        0.0, ge=0, le=1, description="delay put on states and on actuations each [s]"
+    )
+    noise: SensorNoise = SensorNoise()
+    seed: int = Field(
+        0, ge=0, description="of the training drive, the GP's starts and the sensors' noise"
+    )
     start_speed_mps: float = Field(0.1, ge=0, le=5, description="speed at the start line")
     collect_s: float | None = Field(
         None, ge=1, le=3600, description="length of the training drive [s]; None: the car's tuning"
@@ -77,10 +88,13 @@ class PreparationSettings(BaseModel):
 
     @model_validator(mode="after")
     def _simulated(self) -> Self:
-        """An FMU has its own tyres."""
-        if self.fmu is not None and self.true_grip != 1:
+        """One simulator; one that is not the built-in equations has its own tyres."""
+        if self.fmu is not None and self.simulator != "equations":
+            raise ValueError(f"{self.simulator} and {self.fmu}: only one can simulate the car")
+        other = self.fmu or (None if self.simulator == "equations" else self.simulator)
+        if other is not None and self.true_grip != 1:
             raise ValueError(
-                f"true_grip {self.true_grip:g} is for the built-in car, and {self.fmu} simulates "
+                f"true_grip {self.true_grip:g} is for the built-in car, and {other} simulates "
                 "the car: leave one of them out"
             )
         return self

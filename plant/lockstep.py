@@ -6,6 +6,7 @@ the bit.
 """
 
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
@@ -13,7 +14,7 @@ from typing import Final
 from bayesrace.messages import RunRequest, State, Truth
 from plant.fmu.faults import FmuFault
 from plant.laps import LineCounter
-from plant.sensors import measure
+from plant.sensors import Sensors
 from plant.vehicle import Vehicle
 
 __all__ = ["CarRun", "End", "drive_lockstep", "fault_end"]
@@ -40,10 +41,28 @@ class CarRun:
     Raises InputError if the car cannot be in the start state, FmuFault if it fails at that.
     """
 
-    def __init__(self, request: RunRequest, vehicle: Vehicle, epoch: int) -> None:
-        """``epoch``: of the plant, as its states carry it."""
+    def __init__(
+        self,
+        request: RunRequest,
+        vehicle: Vehicle,
+        epoch: int,
+        sensors: Sensors | None = None,
+        delay_s: float = 0.0,
+    ) -> None:
+        """``epoch``: of the plant, as its states carry it. ``sensors``: exact without.
+
+        ``delay_s``: in lockstep, from a state until the input that answers it acts; rounded to
+        parts of a period (:attr:`Vehicle.substeps`).
+        """
         self.request, self.vehicle = request, vehicle
         self._epoch = epoch
+        self._sensors = sensors or Sensors()
+        self._delay = round(delay_s / vehicle.step_s * vehicle.substeps)
+        self._period = 0
+        self._sent: deque[tuple[int, int, tuple[float, ...]]] = deque()
+        """From which substep of the run on an input acts, the state it answers, the input."""
+        self._held: tuple[float, ...] | None = None
+        self._delays: tuple[float, ...] = ()
         self._line = LineCounter(
             request.line_x_m,
             request.line_y_m,
@@ -79,7 +98,27 @@ class CarRun:
             u_applied=vehicle.u_applied,
             lap=self._line.crossings,
         )
-        return measure(truth, request.lockstep, actuation_delays, final), truth
+        delays = actuation_delays or self._delays
+        return self._sensors.measure(truth, request.lockstep, delays, final), truth
+
+    def step(self, u: tuple[float, ...], seq: int) -> None:
+        """One period of lockstep, from the sample ``seq`` that ``u`` answers. FmuFault."""
+        vehicle, begin = self.vehicle, self._period * self.vehicle.substeps
+        self._period += 1
+        if not self._delay:
+            vehicle.step(u)
+            return
+        self._sent.append((begin + self._delay, seq, u))
+        commands: list[tuple[int, tuple[float, ...] | None]] = []
+        delay_s = self._delay * vehicle.step_s / vehicle.substeps
+        done, self._delays = 0, ()
+        while self._sent and (at := self._sent[0][0] - begin) < vehicle.substeps:
+            commands.append((at - done, self._held))
+            _, answered, self._held = self._sent.popleft()
+            self._delays += (float(answered), delay_s, delay_s)
+            done = at
+        commands.append((vehicle.substeps - done, self._held))
+        vehicle.step_switched(commands)
 
     def finished(self) -> End | None:
         """Counts laps in the state that has just been reached; what ends the run, if anything."""
@@ -118,7 +157,7 @@ def drive_lockstep(
         if (end := beat()) is not None:
             continue
         try:
-            car.vehicle.step(answer)
+            car.step(answer, seq - 1)
         except FmuFault as fault:
             end = fault_end(fault)  # the state before is the last there is: once more, as final
             continue

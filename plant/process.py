@@ -47,8 +47,9 @@ from bayesrace.vehicles import CarSetting, default_car
 from plant.fmu.faults import FmuFault
 from plant.lockstep import End
 from plant.run import Run, RunCounters
+from plant.sensors import SensorNoise, Sensors
 from plant.simulator import Compile
-from plant.vehicle import Vehicle, open_vehicle
+from plant.vehicle import SimulatorName, Vehicle, open_vehicle
 
 __all__ = ["PlantProcess", "PlantSettings", "main"]
 
@@ -77,14 +78,19 @@ class PlantSettings(BaseModel):
         default=0.0,
         ge=0,
         le=1,
-        description="delay put on states and actuations each, in real time",
+        description="delay put on states and on actuations each",
     )
+    noise: SensorNoise = SensorNoise()
+    seed: int = Field(0, ge=0, description="of the sensors' noise, which is the same in each run")
     fmu: Path | None = Field(
         None,
         description="Co-Simulation FMU that simulates the car, instead of the built-in equations",
     )
     fmu_map: Path | None = Field(
         None, description="TOML file that names the FMU's variables; none: they have our names"
+    )
+    simulator: SimulatorName = Field(
+        "equations", description="what simulates the car without an FMU"
     )
     realtime: RealtimeSettings = RealtimeSettings()
     controller_wait_s: float = Field(
@@ -189,6 +195,7 @@ class PlantProcess:
                 beat=self._beat,
                 epoch=self._epoch,
                 delay_s=self._settings.delay_s,
+                sensors=Sensors(self._settings.noise, self._settings.seed),
             )
         except (InputError, FmuFault) as error:
             return str(error)
@@ -322,7 +329,9 @@ class PlantProcess:
 
 
 def _simulated_by(settings: PlantSettings) -> str:
-    return "the built-in car" if settings.fmu is None else f"FMU {settings.fmu.name}"
+    if settings.fmu is not None:
+        return f"FMU {settings.fmu.name}"
+    return "the built-in car" if settings.simulator == "equations" else settings.simulator
 
 
 def main(settings: PlantSettings, compiled: Compile | None = None) -> int:
@@ -333,8 +342,9 @@ def main(settings: PlantSettings, compiled: Compile | None = None) -> int:
     """
     die_with_parent(settings.parent_pid)
     vehicles = open_vehicle(
-        settings.car, settings.fmu, settings.fmu_map, settings.rate_hz, compiled
-    )
+        settings.car, settings.fmu, settings.fmu_map, settings.rate_hz, compiled,
+        simulator=settings.simulator,
+    )  # fmt: skip
     with vehicles as vehicle, open_session(settings.endpoints, "plant") as session:
         process = PlantProcess(session, settings, vehicle)
         for refusal in prepare_thread(settings.realtime):

@@ -12,6 +12,7 @@ from bayesrace.messages import Actuation, Decoder, RunRequest, State, Truth
 from bayesrace.transport import LOCKSTEP_SPIN_S, Inbox, Item, Kind, Numbering, Publisher
 from plant.fmu.faults import FmuFault
 from plant.lockstep import CarRun, End, drive_lockstep, fault_end
+from plant.sensors import Sensors
 from plant.vehicle import Vehicle
 
 __all__ = ["Run", "RunCounters"]
@@ -66,10 +67,11 @@ class Run:
         beat: Callable[[], End | None],
         epoch: int,
         delay_s: float = 0.0,
+        sensors: Sensors | None = None,
     ) -> None:
-        """``delay_s``: added to states and actuations alike in real time."""
+        """``delay_s``: added to states and actuations alike. ``sensors``: exact without."""
         self.request = request
-        self._car = CarRun(request, simulator, epoch)
+        self._car = CarRun(request, simulator, epoch, sensors, 2 * delay_s)
         self._epoch = epoch
         self._delay_ns = round(delay_s * 1e9)
         self._simulator = simulator

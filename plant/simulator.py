@@ -56,6 +56,9 @@ PLANT: Final = plant_discretisation()
 _CLIP_TOLERANCE: Final = 1e-9
 """Excess that is rounding of the sender's arithmetic: corrected, not counted as clipped."""
 
+_SLOWEST: Final = 1e-6
+"""Squared speed by which is divided."""
+
 
 @dataclass(slots=True)
 class GuardCounters:
@@ -76,7 +79,7 @@ class PlantGuard:
         self._d_min, self._d_max, self._drive = car.d_min, car.d_max, car.drive
         self._rate_max = car.delta_rate_max_radps
         self._delta_max = car.delta_max_rad
-        self._brake_fade_mps = car.brake_fade_mps
+        self._brake_fade_mps, self._brake_d, self._brake_slow = car.brake_numbers.values()
         self.counters = GuardCounters()
 
     def apply(self, u: Sequence[float] | None, x: Floats, duration_s: float) -> tuple[float, float]:
@@ -98,9 +101,11 @@ class PlantGuard:
         return d_safe, rate_safe
 
     def _brake(self, vx_mps: float, lowest: float) -> tuple[float, float]:
-        """Full brake while rolling forward, fading to none at standstill; steering held."""
+        """What the car can hold while it rolls, fading to none at standstill; steering held."""
         self.counters.braked += 1
-        return max(self._d_min * min(max(vx_mps / self._brake_fade_mps, 0.0), 1.0), lowest), 0.0
+        held = self._brake_d + self._brake_slow / max(vx_mps * vx_mps, _SLOWEST)
+        share = min(max(vx_mps / self._brake_fade_mps, 0.0), 1.0)
+        return max(max(self._d_min, -held) * share, lowest), 0.0
 
     def _steerable(self, rate: float, delta_rad: float, duration_s: float) -> float:
         """The nearest rate within its limit that leaves the angle within its own at the end."""

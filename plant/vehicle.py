@@ -1,9 +1,9 @@
-"""What a run drives: the built-in equations or an FMU, behind one interface."""
+"""What a run drives: the built-in equations, an FMU or slipx, behind one interface."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol
+from typing import Literal, Protocol
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
@@ -11,7 +11,10 @@ from bayesrace.vehicles.models import dynamic
 from bayesrace.vehicles.parameters import CarParameters
 from plant.simulator import Compile, PlantGuard, Simulator, plant_discretisation
 
-__all__ = ["Vehicle", "open_vehicle"]
+__all__ = ["SimulatorName", "Vehicle", "open_vehicle"]
+
+SimulatorName = Literal["equations", "slipx"]
+"""What simulates the car where no FMU does."""
 
 
 class Vehicle(Protocol):
@@ -60,19 +63,28 @@ def open_vehicle(
     fmu_map: Path | None = None,
     rate_hz: float = 50.0,
     compiled: Compile | None = None,
+    *,
+    simulator: SimulatorName = "equations",
 ) -> Iterator[Vehicle]:
-    """The car by the built-in equations, or by an FMU and the map of its variables.
+    """The car by the built-in equations, by slipx, or by an FMU and the map of its variables.
 
     ``compiled``: of the equations, see :class:`plant.simulator.Simulator`.
 
-    Raises InputError if the FMU, the map or the rate cannot be used.
+    Raises InputError if the FMU, the map, the rate or the car cannot be used.
     """
     if fmu is None:
         if fmu_map is not None:
             raise InputError(f"map {fmu_map} without an FMU to apply it to: add --fmu")
+        if simulator == "slipx":
+            from plant.slipx_car import SlipxSimulator
+
+            yield SlipxSimulator(car, rate_hz)
+            return
         yield Simulator(dynamic(car), plant_discretisation(rate_hz), compiled)
         return
+    if simulator != "equations":
+        raise InputError(f"--simulator {simulator} and --fmu {fmu}: only one can be the car")
     from plant.fmu.simulator import open_fmu  # the built-in car does not wait for fmpy
 
-    with open_fmu(car, fmu, fmu_map, rate_hz) as simulator:
-        yield simulator
+    with open_fmu(car, fmu, fmu_map, rate_hz) as vehicle:
+        yield vehicle

@@ -29,9 +29,10 @@ from controller.native_step import NativeStep
 from controller.path_table import PathTable, make_path_table
 from controller.settings import MpcSettings
 from tests.command_line import cli
+from tests.peanut_race import peanut_race, peanut_track
 from tests.zig import ziglang
 
-__all__ = ["cli", "ziglang"]  # fixtures for all tests
+__all__ = ["cli", "peanut_race", "peanut_track", "ziglang"]  # fixtures for all tests
 
 
 # the components that change sign in a mirror at the x axis

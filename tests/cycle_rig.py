@@ -6,7 +6,7 @@ from typing import Any
 
 from bayesrace.arrays import Floats
 from bayesrace.messages import State
-from bayesrace.vehicles import default_car
+from bayesrace.vehicles import CarParameters, default_car
 from controller.cycle_settings import CompensationSettings, FallbackSettings
 from controller.driver import Driver
 from controller.interface import Environment, StepOutput
@@ -51,12 +51,13 @@ def scripted_driver(
     fallback: FallbackSettings | None = None,
     compensation: CompensationSettings | None = None,
     stale_s: float = 1e3,
+    car: CarParameters | None = None,
 ) -> Driver:
-    """The default car's, driven by the law."""
+    """The car's, by default the default car's, driven by the law."""
     controller = PythonController(artefact, law)
     return Driver(
         controller,
-        default_car(),
+        car or default_car(),
         fallback or FallbackSettings(),
         compensation or CompensationSettings(),
         stale_s,

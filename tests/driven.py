@@ -14,7 +14,7 @@ from bayesrace.messages import Message, State, Telemetry, Truth, encode
 from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import Model
 from learning.dataset import Dataset, dataset_from_arrays
-from learning.training import TrainingSettings
+from learning.settings import TrainingSettings
 
 __all__ = ["CAR", "QUICK", "STEP_S", "blank", "drive", "logged", "state", "telemetry", "write_log"]
 

@@ -16,7 +16,7 @@ from bayesrace.raceline import RaceLine, RaceLineSettings, cached
 from bayesrace.tracks import load_track
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
-from learning.training import TrainingSettings
+from learning.settings import TrainingSettings
 from operation import preparation
 from tests.conftest import mirrored_weights, offset_line
 from tests.driven import CAR, drive
@@ -114,7 +114,7 @@ def test_weights_are_kept_for_their_samples_settings_and_beginning(
         trained.append(arguments)
         return replace(weights, version=f"{len(trained)}")
 
-    monkeypatch.setattr(preparation, "train", train)
+    monkeypatch.setattr("learning.training.train", train)
     samples, settings = drive(dynamic(CAR), 30, seed=1), TrainingSettings()
 
     def version(*changes: object) -> str:

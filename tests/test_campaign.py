@@ -5,11 +5,12 @@ tests, because ``make test`` imports this module without them.
 """
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ import pytest
 from bayesrace.gp.weights import GpWeights, write_weights
 from tests.command_line import Cli, refused
 from tests.programs import Race, finish, peanut, run, start, until
+from tests.shared import session_folder
 
 pytestmark = [pytest.mark.check, pytest.mark.unmeasured]
 
@@ -52,12 +54,16 @@ def folder(tmp_path_factory: pytest.TempPathFactory, weights: GpWeights) -> Path
 
 
 @pytest.fixture(scope="module")
-def whole(folder: Path) -> Path:
-    """The campaign computed by one worker, without a disturbance."""
-    done = run("campaign", folder / "plan.toml", "--out", folder / "whole", "--workers", "1")
-    assert done.returncode == 0, done.stderr
-    assert f"{CASES} cases; computed now: {LAPS} laps" in done.stdout
-    return folder / "whole"
+def whole(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The campaign computed by one worker without a disturbance, once for all tests."""
+
+    def make(shared: Path) -> None:
+        out = shared / "whole"
+        done = run("campaign", folder / "plan.toml", "--out", out, "--workers", "1")
+        assert done.returncode == 0, done.stderr
+        assert f"{CASES} cases; computed now: {LAPS} laps" in done.stdout
+
+    return session_folder(tmp_path_factory, "campaign", make) / "whole"
 
 
 def rows(folder: Path) -> list[dict[str, Any]]:
@@ -92,61 +98,50 @@ def parts(folder: Path) -> list[Path]:
     return list((folder / "parts").glob("[0-9]*.parquet"))
 
 
-def test_three_workers_compute_the_same_bits_and_nothing_twice(folder: Path, whole: Path) -> None:
+def test_three_workers_of_which_one_is_killed_compute_the_same_bits_and_nothing_twice(
+    folder: Path, whole: Path, cli: Cli
+) -> None:
     out = folder / "three"
-    assert run("campaign", folder / "plan.toml", "--out", out, "--workers", "3").returncode == 0
-    assert len(rows(whole)) == LAPS
-    assert rows(out) == rows(whole)
-    assert not parts(out)
-    before = (out / "laps.parquet").read_bytes()
-    again = run("campaign", folder / "plan.toml", "--out", out)
-    assert f"{CASES} of {CASES} cases are there already" in again.stdout
-    assert (out / "laps.parquet").read_bytes() == before
-
-
-def test_a_killed_worker_loses_no_row(folder: Path, whole: Path) -> None:
-    out = folder / "worker"
-    campaign = start("campaign", folder / "plan.toml", "--out", out, "--workers", "2")
+    campaign = start("campaign", folder / "plan.toml", "--out", out, "--workers", "3")
     until(lambda: parts(out), "a first row")
     os.kill(children(campaign.pid)[0], signal.SIGKILL)
     done = finish(campaign)
     assert done.returncode == 0, done.stderr
+    assert len(rows(whole)) == LAPS
     assert rows(out) == rows(whole)
+    assert not parts(out)
+    before = (out / "laps.parquet").read_bytes()
+    again = cli("campaign", folder / "plan.toml", "--out", out)
+    assert f"{CASES} of {CASES} cases are there already" in again.out
+    assert (out / "laps.parquet").read_bytes() == before
 
 
-def test_a_killed_campaign_leaves_no_process_and_goes_on(folder: Path, whole: Path) -> None:
-    out = folder / "killed"
-    campaign = start("campaign", folder / "plan.toml", "--out", out, "--workers", "1")
-    until(lambda: parts(out), "a first row")
-    workers = children(campaign.pid)
-    campaign.kill()
-    finish(campaign)
-    until(lambda: not any(map(state, workers)), "the workers' end")
-    kept = rows(out)
-    assert kept
-    done = run("campaign", folder / "plan.toml", "--out", out)
-    assert done.returncode == 0, done.stderr
-    cases = len({row["key"] for row in kept})
-    assert f"{cases} of {CASES} cases are there already" in done.stdout or not cases
-    assert rows(out) == rows(whole)
-
-
-def test_ctrl_c_keeps_what_is_there_and_a_second_writer_is_refused(
-    folder: Path, whole: Path
-) -> None:
+def test_after_ctrl_c_and_a_kill_a_campaign_goes_on(folder: Path, whole: Path, cli: Cli) -> None:
+    """What is computed is kept, no process is left, and a second writer is refused meanwhile."""
     out = folder / "interrupted"
-    campaign = start("campaign", folder / "plan.toml", "--out", out, "--workers", "1")
+    command = ("campaign", folder / "plan.toml", "--out", out, "--workers", "1")
+    campaign = start(*command)
     until(lambda: parts(out), "a first row")
-    second = run("campaign", folder / "plan.toml", "--out", out)
-    assert second.returncode == 2
-    assert "another campaign writes into" in second.stderr
+    refused(cli(*command), "another campaign writes into")
     campaign.send_signal(signal.SIGINT)
     done = finish(campaign)
     assert done.returncode == 130
     assert done.stderr.strip() == "bayesrace: interrupted"
     kept = rows(out)
     assert 0 < len(kept) < LAPS
-    assert all(row in rows(whole) for row in kept)
+    campaign = start(*command)
+    until(lambda: parts(out), "one more row")
+    workers = children(campaign.pid)
+    campaign.kill()
+    finish(campaign)
+    until(lambda: not any(map(state, workers)), "the workers' end")
+    assert len(rows(out)) > len(kept)
+    kept = rows(out)
+    done = run(*command)
+    assert done.returncode == 0, done.stderr
+    cases = len({row["key"] for row in kept})
+    assert f"{cases} of {CASES} cases are there already" in done.stdout
+    assert rows(out) == rows(whole)
 
 
 @contextmanager
@@ -177,13 +172,14 @@ def test_workers_elsewhere_compute_for_a_scheduler(folder: Path, whole: Path) ->
     assert rows(out) == rows(whole)
 
 
-def test_a_failed_case_says_why_and_is_computed_again_when_asked(folder: Path) -> None:
+def test_a_failed_case_says_why_and_is_computed_again_when_asked(folder: Path, cli: Cli) -> None:
     (folder / "failing.toml").write_text(FAILING)
     out = folder / "failing"
-    done = run("campaign", folder / "failing.toml", "--out", out, "--workers", "1")
-    assert done.returncode == 0, done.stderr
-    assert "3 cases" in done.stdout
-    assert "2 failed" in done.stdout
+    command = ("campaign", folder / "failing.toml", "--out", out, "--workers", "1")
+    done = cli(*command)
+    assert done.code == 0, done.err
+    assert "3 cases" in done.out
+    assert "2 failed" in done.out
     before = rows(out)
     failed = [row for row in before if row["ended"] == "failed"]
     assert [row["controller"] for row in failed] == ["bayesrace", "worstcase"] * 2
@@ -191,22 +187,23 @@ def test_a_failed_case_says_why_and_is_computed_again_when_asked(folder: Path) -
     page = (out / "report.html").read_text()
     assert "2 × worstcase" in page
     assert page.count("RaceLine") + page.count("InputError") == 1
-    once_more = run("campaign", folder / "failing.toml", "--out", out, "--workers", "1", "--again")
-    assert "1 of 3 cases are there already" in once_more.stdout
-    assert "2 failed" in once_more.stdout
+    once_more = cli(*command, "--again")
+    assert "1 of 3 cases are there already" in once_more.out
+    assert "2 failed" in once_more.out
     assert rows(out) == before
 
 
-def test_the_report_is_made_of_the_parquet_files(whole: Path, cli: Cli) -> None:
-    page = whole / "report.html"
+def test_the_report_is_made_of_the_parquet_files(whole: Path, cli: Cli, tmp_path: Path) -> None:
+    own = shutil.copytree(whole, tmp_path / "whole")
+    page = own / "report.html"
     text = page.read_text()
     page.unlink()
-    assert cli("campaign-report", whole).out.strip() == str(page)
+    assert cli("campaign-report", own).out.strip() == str(page)
     assert page.read_text() == text
     for word in ("mpc.margin_m", "true_grip", "BayesRace", "95 % interval"):
         assert word in text
     assert text.count("<svg") == 2 * 2 + 2
-    refused(cli("campaign-report", whole.parent), "holds no results", "bayesrace campaign")
+    refused(cli("campaign-report", tmp_path), "holds no results", "bayesrace campaign")
 
 
 def test_a_case_whose_workers_die_is_a_failed_row_and_reported(tmp_path: Path) -> None:
@@ -233,18 +230,15 @@ def test_a_case_whose_workers_die_is_a_failed_row_and_reported(tmp_path: Path) -
         rows_of(Lost(ModuleNotFoundError("No module named 'plant'")), None)
 
 
-def test_rows_are_those_of_a_race_over_zenoh(folder: Path, tmp_path: Path) -> None:
-    track = folder / "peanut.csv"
-    race: Callable[[], Race] = Race.running(
-        tmp_path / "race", "--track", track, "--train-track", track
-    )
-    result = race().result
-    text = '[grid]\ntrack = "peanut.csv"\ntrain_track = "peanut.csv"\n'
-    (folder / "race.toml").write_text(text)
-    done = run("campaign", folder / "race.toml", "--out", tmp_path / "out", "--workers", "1")
+def test_rows_are_those_of_a_race_over_zenoh(
+    peanut_race: Race, peanut_track: Path, tmp_path: Path
+) -> None:
+    plan = tmp_path / "race.toml"
+    plan.write_text(f'[grid]\ntrack = "{peanut_track}"\ntrain_track = "{peanut_track}"\n')
+    done = run("campaign", plan, "--out", tmp_path / "out", "--workers", "1")
     assert done.returncode == 0, done.stderr
     found = rows(tmp_path / "out")
-    for lap in result["laps"]:
+    for lap in peanut_race.result["laps"]:
         own = [row for row in found if row["controller"] == lap["controller"]]
         assert [row["lap_time_s"] for row in own if row["lap_time_s"]] == lap["lap_times_s"]
         assert {row["trajectory_sha256"] for row in own} == {lap["trajectory_sha256"]}

@@ -141,6 +141,7 @@ def test_a_key_changes_with_all_that_shapes_a_row(
 def test_every_factor_does_something(car: CarParameters, tmp_path: Path) -> None:
     """What a plan may name reaches the car, the controllers or the training."""
     names = set(factors())
+    assert names >= {"delay_s", "noise.position_m"}
     assert names >= {"true_grip", "horizon", "points", "kernels", "raceline.friction", "seed"}
     settings = RaceSettings(true_grip=0.5)
     tyres, true = car.tyres, settings.true_car.tyres

@@ -27,6 +27,7 @@ from operation.closed_loop import ClosedLoop
 from operation.collect import collect
 from operation.drive import RunPlan, execute
 from plant.fmu.faults import FmuFault
+from plant.sensors import SensorNoise
 from plant.simulator import Simulator
 from tests.conftest import Circuit
 from tests.network.cars import gentle_course, start_controller, start_plant
@@ -63,14 +64,28 @@ def told(log: Path) -> list[dict[str, Any]]:
     return rows + ends
 
 
+NOISE = ("--noise", "position_m=0.002", "--noise", "speed_mps=0.02", "--seed", "3")
+
+
+@pytest.mark.parametrize(
+    ("options", "disturbances"),
+    [
+        ((), {}),
+        (
+            ("--delay", "7", *NOISE),
+            {"delay_s": 0.007, "seed": 3, "noise": SensorNoise(position_m=0.002, speed_mps=0.02)},
+        ),
+    ],
+    ids=["exact", "noise and delay"],
+)
 def test_a_run_is_that_of_two_processes_over_zenoh_to_the_bit(
-    tmp_path: Path, car: CarParameters
+    tmp_path: Path, car: CarParameters, options: tuple[str, ...], disturbances: dict[str, Any]
 ) -> None:
     course = gentle_course(tmp_path, speed_mps=2.5)
     track, line = load_track(course.track_file, car.width_m), read_raceline(course.line_file)
     at_plant, at_controller = free_endpoint(), free_endpoint()
     with (
-        start_plant(tmp_path, at_plant, "--low-latency") as plant,
+        start_plant(tmp_path, at_plant, "--low-latency", *options) as plant,
         start_controller(tmp_path, course, at_plant, at_controller, "--low-latency") as controller,
         open_session(Endpoints(connect=(at_plant, at_controller))) as session,
         Recorder(session, "orca", tmp_path / "zenoh.mcap") as recorder,
@@ -86,7 +101,7 @@ def test_a_run_is_that_of_two_processes_over_zenoh_to_the_bit(
     weights = read_weights(course.weights_file)
     compiled = compiled_controller(course.artefact, car, track, line, weights)
     log = LogWriter(tmp_path / "own.mcap")
-    loop = ClosedLoop(car, track, line, compiled, log=log)
+    loop = ClosedLoop(car, track, line, compiled, log=log, **disturbances)
     driven = [
         loop.drive(plan.laps, plan.max_time_s, plan.start_speed_mps, name=plan.controller)
         for plan in PLANS
@@ -101,6 +116,8 @@ def test_a_run_is_that_of_two_processes_over_zenoh_to_the_bit(
     assert second.x.shape == (51, 7)
     assert second.u.shape == (*second.levels.shape, 2) == (50, 2)
     assert not second.statuses.any()
+    measured = np.array([state.x for state in second.states])
+    assert np.array_equal(measured, second.x) == (not disturbances)
     truth = LogReader(tmp_path / "own.mcap").select(TRUTH)
     assert len(truth) == len(LogReader(tmp_path / "own.mcap").select(STATE))
     for run, one in enumerate(driven, 1):

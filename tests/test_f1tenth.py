@@ -8,6 +8,7 @@ from fmpy.validation import validate_fmu
 
 from bayesrace.arrays import Floats
 from bayesrace.integrators import PREDICTION
+from bayesrace.raceline import RaceLine, read_raceline_for
 from bayesrace.raceline.cached import racing_line
 from bayesrace.tracks import load_track
 from bayesrace.vehicles import get_car
@@ -15,14 +16,17 @@ from bayesrace.vehicles.models import dynamic
 from codegen.build import build
 from codegen.fmu import car_fmu, pack
 from codegen.settings import BuildSettings
+from controller.cycle_settings import FallbackSettings
 from controller.pure_pursuit import PurePursuit
 from controller.python_controller import PythonController
-from learning.training import TrainingSettings, train
+from learning.settings import TrainingSettings
+from learning.training import train
 from operation.analysis.results import read_result
 from operation.closed_loop import ClosedLoop, drive_compiled
 from operation.settings import RaceSettings
 from plant.simulator import Simulator
 from plant.vehicle import Vehicle, open_vehicle
+from tests.cycle_rig import STEP_S, ScriptedLaw, scripted_driver, state
 from tests.programs import Race
 
 CAR = get_car("f1tenth")
@@ -70,10 +74,21 @@ def test_the_car_names_the_tracks_that_are_driven_where_none_is_named() -> None:
     assert RaceSettings().track == "harbour"
 
 
-def test_a_lap_that_was_learned_from_pure_pursuit_stays_on_the_small_track() -> None:
-    """And corners beyond what tyres of its friction could hold, which the trajectory shows."""
+def in_the_form_of_others(line: RaceLine, path: Path) -> Path:
+    """As the F1TENTH community writes racing lines: few digits, headings that wrap, no origin."""
+    heading = np.angle(np.exp(1j * line.psi_rad))
+    columns = (line.s_m, line.x_m, line.y_m, heading, line.kappa_radpm, line.vx_mps, line.ax_mps2)
+    names = "s_m; x_m; y_m; psi_rad; kappa_radpm; vx_mps; ax_mps2"
+    np.savetxt(path, np.column_stack(columns), "%.7f", ";", header=f"17b4de0d\n{names}")
+    return path
+
+
+def test_a_lap_that_was_learned_from_pure_pursuit_stays_on_the_small_track(tmp_path: Path) -> None:
+    """On a line from a file of others' form; it corners beyond what tyres of its friction could
+    hold, which the trajectory shows."""
     track = load_track(SMALL, CAR.width_m)
-    line, artefact = racing_line(track, CAR), build(BuildSettings(car=CAR))[0]
+    path = in_the_form_of_others(racing_line(track, CAR), tmp_path / "line.csv")
+    line, artefact = read_raceline_for(path, track, CAR), build(BuildSettings(car=CAR))[0]
     pursuit = PurePursuit(CAR, line.x_m, line.y_m, line.vx_mps)
     loop = ClosedLoop(CAR, track, line, PythonController(artefact, pursuit))
     samples = loop.drive(0, CAR.tuning.pursuit.drive_s).samples()
@@ -85,6 +100,53 @@ def test_a_lap_that_was_learned_from_pure_pursuit_stays_on_the_small_track() -> 
     assert run.laps_s[1] < 1.02 * line.lap_time_s
     assert np.abs(run.lateral_mps2).max() > CAR.friction * 9.81
     assert 0.1 < np.abs(run.slip_rad).max() < 0.6
+
+
+def braked_by_fallback(x0: Floats) -> tuple[Floats, list[int]]:
+    """States until the car stands, no step usable any more; how many cycles each level drove."""
+    artefact = build(BuildSettings(car=CAR))[0]
+    driver = scripted_driver(artefact, ScriptedLaw(), FallbackSettings(), car=CAR)
+    simulator = Simulator(dynamic(CAR))
+    simulator.reset(x0.tolist())
+    rows = [x0]
+    while rows[-1][3] > 0.02:
+        seq, x = len(rows), tuple(rows[-1].tolist())
+        assert len(rows) < 500
+        assert driver.observe(state(seq, time_s=seq * STEP_S, x=x, lockstep=True))
+        decision = driver.decide(seq * STEP_S, 0.0, 0.0)
+        simulator.step((decision.d, decision.delta_rate))
+        rows.append(simulator.x.copy())
+        without = simulator.guard.apply(None, rows[-2], STEP_S)[0]
+        assert simulator.u_applied[0] == without  # the plant brakes as the controller does
+    return np.array(rows), driver.levels
+
+
+@pytest.mark.parametrize(("across_mps2", "slip_rad"), [(0.0, 0.05), (2.0, 0.2), (5.0, 0.3)])
+def test_braking_by_the_fallback_is_braking_that_the_car_can_hold(
+    across_mps2: float, slip_rad: float
+) -> None:
+    """On a straight and in bends, with a shove. A full brake spins it: load goes to the front."""
+    v_mps = 10.0
+    steady = Simulator(dynamic(CAR))
+    delta = across_mps2 / v_mps**2 * CAR.wheelbase_m
+    steady.reset([0.0, 0.0, 0.0, v_mps, 0.0, across_mps2 / v_mps, delta])
+    for _ in range(50):
+        steady.step((5.0 * (v_mps - steady.x[3]), 0.0))
+    x0 = steady.x.copy()
+    x0[5] += 0.3
+    x, levels = braked_by_fallback(x0)
+    moving = x[x[:, 3] > CAR.brake_fade_mps]
+    assert np.abs(np.arctan2(moving[:, 4], moving[:, 3])).max() < slip_rad
+    assert np.abs(x[:, 5]).max() < across_mps2 / 5 + 0.4
+    assert np.all(np.diff(x[:, 3]) < 1e-9)
+    assert levels[0] == levels[1] == 0
+    assert levels[2] > 20
+    way = np.linalg.norm(np.diff(x[:, :2], axis=0), axis=1).sum()
+    assert way < 18.0  # at 1.6 m/s^2 all the way it is 31 m
+    steady.reset(x0.tolist())
+    for _ in range(40):
+        steady.step((CAR.d_min, 0.0))
+    assert abs(np.arctan2(steady.x[4], steady.x[3])) > 1.0
 
 
 @pytest.mark.check

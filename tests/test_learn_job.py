@@ -16,7 +16,7 @@ from bayesrace.gp.weights import decode_weights, zero_weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.messages import Event, Reply, Scalar
 from bayesrace.vehicles.models import dynamic
-from learning.training import TrainingSettings
+from learning.settings import TrainingSettings
 from learning.worker import NICE, Outcome, Task, Trainer
 from operation.learn import publishing
 from operation.learn.journal import Journal

@@ -21,8 +21,9 @@ from learning.likelihood import MarginalLikelihood, PairDistances
 from learning.logs import dataset_from_log, dataset_from_messages, fallback_cycles
 from learning.posterior import Covariance, Posterior
 from learning.residual import identity, residual
+from learning.settings import TrainingSettings
 from learning.subset import evenly, most_informative
-from learning.training import TrainingSettings, train
+from learning.training import train
 from learning.validation import predictive_sigma, validate
 from tests.driven import CAR, QUICK, STEP_S, drive, logged, telemetry
 from tests.programs import ROOT

@@ -14,7 +14,8 @@ from bayesrace.vehicles.models import dynamic
 from learning.dataset import Dataset, concatenate
 from learning.pool import MOST_NEW, bounded, recalled
 from learning.residual import residual
-from learning.training import TrainingSettings, train
+from learning.settings import TrainingSettings
+from learning.training import train
 from learning.worker import Task, perform
 from tests.driven import CAR, QUICK, drive
 

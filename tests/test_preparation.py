@@ -39,7 +39,7 @@ def preparing(
         return offset_line(track, 0.01, 5.0, 2.5)
 
     monkeypatch.setattr(cached, "compute_raceline", compute)
-    monkeypatch.setattr(preparation, "train", lambda *_: weights)
+    monkeypatch.setattr("learning.training.train", lambda *_: weights)
 
     def run(**changes: object) -> tuple[Prepared, list[str]]:
         console = Console(file=io.StringIO(), width=200)
@@ -73,7 +73,7 @@ def test_a_second_preparation_computes_nothing_and_says_so(
 
     for module, name in ((cached, "compute_raceline"), (preparation, "collect")):
         monkeypatch.setattr(module, name, never)
-    monkeypatch.setattr(preparation, "train", never)
+    monkeypatch.setattr("learning.training.train", never)
     again, stages = preparing()
     assert stages == STAGES
     assert again.arguments == first.arguments

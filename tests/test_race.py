@@ -5,7 +5,6 @@ Most tests look at one race on the shortest track.
 
 import re
 import shutil
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,9 +17,8 @@ from operation.analysis.results import RaceResult, read_result
 from tests.car_fmu import packed_car
 from tests.command_line import Cli, refused
 from tests.foreign_fmu import FOREIGN_MAP, build_foreign_fmu
-from tests.programs import Race, leftovers, peanut
+from tests.programs import Race, leftovers
 from tests.reference import reference_file
-from tests.shared import session_folder
 
 pytestmark = pytest.mark.unmeasured
 
@@ -45,13 +43,6 @@ ShortRace = Callable[..., Callable[[], Race]]
 
 
 @pytest.fixture(scope="module")
-def peanut_track(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """File of the shortest track."""
-    folder = session_folder(tmp_path_factory, "track", lambda path: peanut(path / "peanut.csv"))
-    return folder / "peanut.csv"
-
-
-@pytest.fixture(scope="module")
 def short(peanut_track: Path, tmp_path_factory: pytest.TempPathFactory) -> ShortRace:
     """Starts a race on the shortest track; ``options`` are those of the command line."""
     folder = tmp_path_factory.mktemp("race")
@@ -61,21 +52,6 @@ def short(peanut_track: Path, tmp_path_factory: pytest.TempPathFactory) -> Short
         return Race.running(folder / name, *tracks, *options, **environment)
 
     return begin
-
-
-@pytest.fixture(scope="module")
-def driven(short: ShortRace, tmp_path_factory: pytest.TempPathFactory) -> Race:
-    """The race that most tests look at, driven once for all workers."""
-
-    def make(folder: Path) -> None:
-        race = short("driven")()
-        assert leftovers(race.pid) == {}
-        shutil.copytree(race.out, folder / "run")
-        (folder / "stdout").write_text(race.process.stdout)
-
-    folder = session_folder(tmp_path_factory, "race", make)
-    text = (folder / "stdout").read_text()
-    return Race(folder / "run", 0, subprocess.CompletedProcess([], 0, text, ""))
 
 
 def assert_order(race: Race) -> None:
@@ -91,8 +67,8 @@ def assert_order(race: Race) -> None:
     assert updated["off_track_max_m"] == 0.0
 
 
-def test_the_order_is_that_of_the_paper(driven: Race) -> None:
-    assert_order(driven)
+def test_the_order_is_that_of_the_paper(peanut_race: Race) -> None:
+    assert_order(peanut_race)
 
 
 @pytest.mark.check
@@ -107,7 +83,7 @@ def test_the_published_race_is_won_as_the_paper_says_and_faster(tmp_path: Path) 
 
 @pytest.mark.check
 def test_another_car_seed_and_problem_are_driven_and_reported(
-    driven: Race, short: ShortRace, cli: Cli, tmp_path: Path
+    peanut_race: Race, short: ShortRace, cli: Cli, tmp_path: Path
 ) -> None:
     """A car from a file, which the report does without; no track constraints."""
     mine = default_car().model_copy(update={"name": "mine", "mass_kg": 0.043})
@@ -117,9 +93,9 @@ def test_another_car_seed_and_problem_are_driven_and_reported(
     (tmp_path / "mine.toml").unlink()
     assert read_car(race.out / "car.toml") == mine
     assert race.lap("bayesrace-updated")["finished"]
-    assert (race.result["settings"]["seed"], driven.result["settings"]["seed"]) == (1, 0)
+    assert (race.result["settings"]["seed"], peanut_race.result["settings"]["seed"]) == (1, 0)
     assert race.result["settings"]["constraints"] is False
-    assert driven.result["settings"]["constraints"] is True
+    assert peanut_race.result["settings"]["constraints"] is True
     assert "constraints off" in race.process.stdout
     text = (race.out / "result.json").read_text()
     assert cli("report", race.out).code == 0
@@ -132,8 +108,8 @@ def test_on_the_builtin_tracks_the_order_is_the_same(tmp_path: Path) -> None:
     assert_order(Race.running(tmp_path / "builtin")())
 
 
-def test_result_has_the_promised_form(driven: Race) -> None:
-    result = driven.result
+def test_result_has_the_promised_form(peanut_race: Race) -> None:
+    result = peanut_race.result
     assert [lap["controller"] for lap in result["laps"]] == CONTROLLERS
     for lap in result["laps"]:
         for key, kind in LAP_FORM.items():
@@ -153,18 +129,18 @@ def test_result_has_the_promised_form(driven: Race) -> None:
     assert result["gaps"] == 0
 
 
-def test_the_weights_are_swapped_in_the_running_controller(driven: Race) -> None:
-    versions = [driven.lap(name)["weights_version"] for name in CONTROLLERS]
+def test_the_weights_are_swapped_in_the_running_controller(peanut_race: Race) -> None:
+    versions = [peanut_race.lap(name)["weights_version"] for name in CONTROLLERS]
     assert versions[0] == versions[3] == ""
     assert versions[1]
     assert versions[2]
     assert versions[1] != versions[2]
     # one process drove all three: its log has one start
-    assert (driven.out / "controller-bayesrace.log").read_text().count("plant at") == 1
+    assert (peanut_race.out / "controller-bayesrace.log").read_text().count("plant at") == 1
 
 
-def test_the_run_directory_is_whole(driven: Race) -> None:
-    names = {path.name for path in driven.out.iterdir()}
+def test_the_run_directory_is_whole(peanut_race: Race) -> None:
+    names = {path.name for path in peanut_race.out.iterdir()}
     wanted = {"settings.json", "run.mcap", "result.json", "report.html", "collect.mcap"}
     assert wanted <= names
     assert {"manifest-e_kinematic.json", "manifest-dynamic.json"} <= names
@@ -172,29 +148,33 @@ def test_the_run_directory_is_whole(driven: Race) -> None:
 
 
 @pytest.mark.check
-def test_one_seed_gives_one_race_to_the_bit(driven: Race, short: ShortRace, tmp_path: Path) -> None:
+def test_one_seed_gives_one_race_to_the_bit(
+    peanut_race: Race, short: ShortRace, tmp_path: Path
+) -> None:
     """Prepared anew, too: lines and weights do not come from the cache, as controllers do."""
     for settings in (BuildSettings(), BuildSettings.best_case()):
         artefact = build(settings)[0]
         shutil.copytree(artefact, tmp_path / artefact.name)
     again = short("again", BAYESRACE_CACHE=str(tmp_path))()
     for name in CONTROLLERS:
-        mine, other = driven.lap(name), again.lap(name)
+        mine, other = peanut_race.lap(name), again.lap(name)
         for volatile in ("solve_us",):
             del mine[volatile], other[volatile]
         assert mine == other
-    assert driven.result["gp_updated"] == again.result["gp_updated"]
+    assert peanut_race.result["gp_updated"] == again.result["gp_updated"]
     for name in ("race.csv", "race_raceline.csv", "settings.json"):
-        assert (driven.out / name).read_bytes() == (again.out / name).read_bytes()
+        assert (peanut_race.out / name).read_bytes() == (again.out / name).read_bytes()
 
 
 @pytest.mark.check
-def test_the_car_as_an_fmu_gives_the_same_race_to_the_bit(driven: Race, short: ShortRace) -> None:
+def test_the_car_as_an_fmu_gives_the_same_race_to_the_bit(
+    peanut_race: Race, short: ShortRace
+) -> None:
     """FMI 3.0; test_fmu_export.py has the same bits by FMI 2.0, benchmarks/fmu.py on ETHZ, too."""
     fmu = packed_car()
     race = short("fmu", "--fmu", fmu)()
     for name in CONTROLLERS:
-        mine, other = driven.lap(name), race.lap(name)
+        mine, other = peanut_race.lap(name), race.lap(name)
         assert mine["trajectory_sha256"] == other["trajectory_sha256"]
         assert mine["weights_version"] == other["weights_version"]
     assert race.result["settings"]["fmu"] == fmu.name
@@ -204,7 +184,9 @@ def test_the_car_as_an_fmu_gives_the_same_race_to_the_bit(driven: Race, short: S
 
 
 @pytest.mark.check
-def test_a_foreign_fmu_laps_through_a_map(driven: Race, short: ShortRace, tmp_path: Path) -> None:
+def test_a_foreign_fmu_laps_through_a_map(
+    peanut_race: Race, short: ShortRace, tmp_path: Path
+) -> None:
     """Percent, degrees to the right, compass headings, km/h and cm, from another tool."""
     fmu, fmu_map = build_foreign_fmu(tmp_path), tmp_path / "map.toml"
     fmu_map.write_text(FOREIGN_MAP)
@@ -213,7 +195,7 @@ def test_a_foreign_fmu_laps_through_a_map(driven: Race, short: ShortRace, tmp_pa
     for name in ("bayesrace", "bayesrace-updated", "bestcase"):
         lap = race.lap(name)
         assert lap["finished"], lap
-        assert abs(lap["lap_time_s"] - driven.lap(name)["lap_time_s"]) < 0.3
+        assert abs(lap["lap_time_s"] - peanut_race.lap(name)["lap_time_s"]) < 0.3
 
 
 def test_a_map_without_an_fmu_is_refused_at_once(cli: Cli, tmp_path: Path) -> None:
@@ -221,12 +203,12 @@ def test_a_map_without_an_fmu_is_refused_at_once(cli: Cli, tmp_path: Path) -> No
     assert not (tmp_path / "out").exists()
 
 
-def test_table_report_and_result_say_the_same(driven: Race) -> None:
-    html = (driven.out / "report.html").read_text()
-    for lap in driven.result["laps"]:
+def test_table_report_and_result_say_the_same(peanut_race: Race) -> None:
+    html = (peanut_race.out / "report.html").read_text()
+    for lap in peanut_race.result["laps"]:
         row = next(
             line.split()
-            for line in driven.process.stdout.splitlines()
+            for line in peanut_race.process.stdout.splitlines()
             if line.split()[:1] == [lap["controller"]] and "finish" not in line
         )
         time_s, flying_s, solve = lap["lap_time_s"], lap["flying_lap_time_s"], lap["solve_us"]
@@ -242,34 +224,36 @@ def test_table_report_and_result_say_the_same(driven: Race) -> None:
         ]
         assert row == [lap["controller"], *cells]
         assert all(cell in html for cell in [*row, lap["weights_version"]])
-        assert lap["weights_version"] in driven.process.stdout
+        assert lap["weights_version"] in peanut_race.process.stdout
 
 
-def test_report_makes_the_same_again_from_the_log(driven: Race, cli: Cli, tmp_path: Path) -> None:
+def test_report_makes_the_same_again_from_the_log(
+    peanut_race: Race, cli: Cli, tmp_path: Path
+) -> None:
     copy = tmp_path / "copy"
-    shutil.copytree(driven.out, copy)
+    shutil.copytree(peanut_race.out, copy)
     (copy / "result.json").unlink()
     (copy / "report.html").unlink()
     done = cli("report", copy)
     assert done.code == 0, done.err
-    assert (copy / "result.json").read_bytes() == (driven.out / "result.json").read_bytes()
+    assert (copy / "result.json").read_bytes() == (peanut_race.out / "result.json").read_bytes()
     assert isinstance(read_result(copy / "result.json"), RaceResult)
-    assert (copy / "report.html").read_text() == (driven.out / "report.html").read_text()
+    assert (copy / "report.html").read_text() == (peanut_race.out / "report.html").read_text()
     table = [line for line in done.out.splitlines() if line.split()[:1] == ["bestcase"]]
     assert table
-    assert table[0] in driven.process.stdout
+    assert table[0] in peanut_race.process.stdout
 
 
-def test_a_run_directory_is_never_overwritten(driven: Race, cli: Cli) -> None:
-    before = (driven.out / "run.mcap").stat().st_size
-    refused(cli("race", "--out", driven.out), str(driven.out))
-    assert (driven.out / "run.mcap").stat().st_size == before
+def test_a_run_directory_is_never_overwritten(peanut_race: Race, cli: Cli) -> None:
+    before = (peanut_race.out / "run.mcap").stat().st_size
+    refused(cli("race", "--out", peanut_race.out), str(peanut_race.out))
+    assert (peanut_race.out / "run.mcap").stat().st_size == before
 
 
 @pytest.mark.check
 @pytest.mark.wall_clock
 def test_in_real_time_it_drives_too_and_a_second_race_prepares_nothing(
-    driven: Race, short: ShortRace
+    peanut_race: Race, short: ShortRace
 ) -> None:
     race = short("realtime", "--laps", "1", "--mode", "realtime")()
     lines = race.process.stdout.splitlines()

@@ -227,6 +227,35 @@ def test_lines_of_others_without_the_repeated_point_are_read(tmp_path: Path) -> 
     assert line.lap_time_s == pytest.approx(np.pi, rel=1e-3)
 
 
+@pytest.mark.parametrize("turned", [0.0, -np.pi / 2])
+def test_headings_of_others_become_continuous_and_count_from_the_x_axis(
+    tmp_path: Path, turned: float
+) -> None:
+    """TUM's planner counts them from the y axis. Both wrap. No other number moves."""
+    path, again, here = tmp_path / "ring.csv", tmp_path / "again.csv", ring()
+    write_raceline(path, replace(here, psi_rad=np.angle(np.exp(1j * (here.psi_rad + turned)))))
+    line = read_raceline(path)
+    np.testing.assert_allclose(line.psi_rad - line.psi_rad[0], here.psi_rad - here.psi_rad[0])
+    assert np.cos(line.psi_rad[0] - here.psi_rad[0]) == pytest.approx(1)
+    write_raceline(again, line)
+    for field in fields(RaceLine)[1:]:
+        there = getattr(read_raceline(again), field.name)
+        np.testing.assert_array_equal(getattr(line, field.name), there)
+    np.testing.assert_array_equal(line.xy_m, here.xy_m)
+    np.testing.assert_array_equal(line.vx_mps, here.vx_mps)
+
+
+def test_a_published_line_is_read_number_by_number() -> None:
+    path = reference_file("tracks/spielberg_map/Spielberg_raceline.csv")
+    table, line = np.loadtxt(path, delimiter=";", comments="#"), read_raceline(path)
+    for column, name in enumerate(("s_m", "x_m", "y_m", "psi_rad", "kappa_radpm", "vx_mps")):
+        if name != "psi_rad":
+            np.testing.assert_array_equal(getattr(line, name), table[:-1, column])
+    np.testing.assert_allclose(np.cos(line.psi_rad - table[:-1, 3]), 1)
+    assert line.length_m == table[-1, 0] - table[0, 0]
+    assert np.ptp(line.psi_rad) > 6.0
+
+
 def test_a_line_says_what_it_was_made_for(tmp_path: Path) -> None:
     line, path = line_on("paddock"), tmp_path / "line.csv"
     write_raceline(path, line)

@@ -222,3 +222,36 @@ def test_saturating_tyres_have_the_stiffness_at_rest_and_the_friction() -> None:
         stiffness = q[f"{axle}_b"] * q[f"{axle}_c"] * q[f"{axle}_d"]
         assert stiffness == pytest.approx(p["mu"] * p[f"{axle}_stiffness"] * load)
         assert q[f"{axle}_d"] == pytest.approx(1.0489 * load)
+
+
+def growth(v_mps: float, command_mps2: float) -> float:
+    """Rate [1/s] at which slip angle and yaw rate grow straight ahead; above 0 the car spins."""
+    x, u = ca.SX.sym("x", 7), ca.SX.sym("u", 2)
+    lateral = dynamic(get_car("f1tenth")).ode(x, u)[4:6]
+    rates = ca.Function("rates", [x, u], [ca.jacobian(lateral, x[4:6])])
+    matrix = np.array(rates([0, 0, 0, v_mps, 0, 0, 0], [command_mps2, 0]))
+    matrix[0, 0] -= command_mps2 / v_mps  # of vy / v: it grows as v falls
+    return float(np.linalg.eigvals(matrix).real.max())
+
+
+def test_the_brake_without_a_controller_is_stable_and_near_the_hardest_that_is() -> None:
+    """By the equations' own linearisation, at every speed at which the tyres slide."""
+    car = get_car("f1tenth")
+    _, least, slow = car.brake_numbers.values()
+    assert least == pytest.approx(1.58, abs=0.01)
+    for v_mps in np.linspace(1.05, car.drive.top_speed_mps(car.d_max), 40):
+        brake = min(least + slow / v_mps**2, -car.d_min)
+        assert growth(v_mps, -brake) < 0
+        if brake < -car.d_min:
+            assert growth(v_mps, -1.36 * brake) > 0
+
+
+def test_a_car_that_braking_cannot_spin_is_braked_fully() -> None:
+    """Without height no load moves; what oversteers at rest is not mended by braking less."""
+    car = get_car("f1tenth")
+    assert isinstance(car.tyres, LinearTyres)
+    for changes in ({"height_m": 0.0}, {"front_stiffness": 2 * car.tyres.rear_stiffness}):
+        other = car.model_copy(update={"tyres": car.tyres.model_copy(update=changes)})
+        assert other.brake_numbers["brake_d"] > 10 * -car.d_min
+    assert car.on_tyres("pacejka").brake_numbers["brake_d"] > 10 * -car.d_min
+    assert get_car("orca").brake_numbers["brake_d"] > 10 * -get_car("orca").d_min

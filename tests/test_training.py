@@ -23,8 +23,9 @@ from learning.hyperparameters import BOUNDS, Fit, maximise, starts
 from learning.likelihood import MarginalLikelihood, PairDistances
 from learning.posterior import Covariance, Posterior
 from learning.residual import discretisation_of, identity, residual
+from learning.settings import TrainingSettings
 from learning.target import Target
-from learning.training import MAX_SAMPLES, Training, TrainingSettings, fit, train
+from learning.training import MAX_SAMPLES, Training, fit, train
 from learning.validation import predictive_sigma
 from tests.driven import CAR, QUICK, drive
 from tests.scikit import correlation

@@ -22,19 +22,20 @@ from operation.analysis.race import analyse, read_race
 from operation.analysis.results import RaceResult
 from operation.analysis.validation import validate_weights
 from operation.closed_loop import ClosedLoop, Driven
-from plant import sensors
+from plant.sensors import Sensors
 from tests.conftest import Circuit
 from tests.driven import CAR, STEP_S, drive, write_log
 from tests.synthetic_race import LAP_S, Drive, circle, write_race
 
 ERROR = np.array([0.0, 0.0, 0.0, 0.0, 0.1, 0.2, 0.0])
 """Of vy and omega, which pure pursuit does not look at: the car drives on as it did."""
+exactly = Sensors.measure
 TWO_LAPS = np.array([2 * np.pi * k * STEP_S / LAP_S for k in range(137)])
 
 
-def erring(*arguments: Any) -> State:
+def erring(_: Sensors, *arguments: Any) -> State:
     """Adds :data:`ERROR`, and has counted no lap."""
-    exact = sensors.measure(*arguments)
+    exact = exactly(Sensors(), *arguments)
     return replace(exact, x=tuple(np.array(exact.x) + ERROR), lap=0)
 
 
@@ -75,7 +76,7 @@ def test_a_sensor_that_errs_misleads_the_controller_and_learning_alone(
 ) -> None:
     exact, spy = drives(tmp_path / "exact.mcap")
     assert np.array_equal(exact.x[:-1], spy.given)
-    monkeypatch.setattr("plant.lockstep.measure", erring)
+    monkeypatch.setattr(Sensors, "measure", erring)
     erred, spy = drives(tmp_path / "erred.mcap")
     # The car, its laps and its excursions are the same, and so is the end by the plant's count.
     assert np.array_equal(erred.x, exact.x)

@@ -29,7 +29,7 @@ def test_a_study_finds_judges_writes_a_car_and_goes_on(tmp_path: Path) -> None:
     assert read_car(tmp_path / "tuned.toml") == quick  # the first trial is the defaults
     assert "held-out tracks: +0.00 % faster" in done.stdout
     assert "the defaults win" in done.stdout
-    done = run("tune", *options, "--trials", "4")
+    done = run("tune", *options, "--trials", "3")
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "tuned.sqlite").exists()
     tuned = read_car(tmp_path / "tuned.toml")

@@ -1,7 +1,8 @@
 """A racing line as data, and its file form. No optimiser is needed to read or use one.
 
-Columns ``s_m; x_m; y_m; psi_rad; kappa_radpm; vx_mps; ax_mps2``; lines with # are comments. Those
-of the form ``# key: value`` say what the line was made for (:class:`LineIdentity`).
+Columns ``s_m; x_m; y_m; psi_rad; kappa_radpm; vx_mps; ax_mps2``, as the TUM and F1TENTH communities
+have them; lines with # are comments. Those of the form ``# key: value`` say what the line was made
+for (:class:`LineIdentity`). Every number that is written reads back as the same double.
 """
 
 import math
@@ -21,6 +22,8 @@ __all__ = ["RACELINE_COLUMNS", "LineIdentity", "RaceLine", "read_raceline", "wri
 
 RACELINE_COLUMNS: Final = ("s_m", "x_m", "y_m", "psi_rad", "kappa_radpm", "vx_mps", "ax_mps2")
 _MIN_POINTS: Final = 8
+_HEADINGS_DIFFER: Final = 0.3
+"""Mean distance on the unit circle within which two headings are the same."""
 _KEY: Final = re.compile(r"#\s*(\w+):\s*(\S+)\s*")
 
 
@@ -130,7 +133,16 @@ def read_raceline(path: Path | str, track_name: str | None = None) -> RaceLine:
         )
     name = path.stem if track_name is None else track_name
     s, x, y, psi, kappa, v, a = np.ascontiguousarray(table.T)
+    psi = _continuous(psi, table[:, 1:3])
     return RaceLine(name, s, x, y, psi, kappa, v, a, length, _made_for(path))
+
+
+def _continuous(psi: Floats, xy: Floats) -> Floats:
+    """Headings without jumps, from the x axis; those of TUM's planner count from the y axis."""
+    chord = np.roll(xy, -1, axis=0) - np.roll(xy, 1, axis=0)
+    off = np.mean(np.exp(1j * (psi - np.arctan2(chord[:, 1], chord[:, 0]))))
+    from_y_axis = abs(off + 1j) < _HEADINGS_DIFFER
+    return np.asarray(np.unwrap(psi + np.pi / 2 if from_y_axis else psi))
 
 
 def _made_for(path: Path) -> LineIdentity | None:

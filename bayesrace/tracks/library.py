@@ -11,6 +11,7 @@ from bayesrace.tracks.track import Track
 __all__ = ["load_track"]
 
 _RANDOM = "random:"
+_MAPS = (".yaml", ".yml")
 _SEED_DIGITS = 18
 
 
@@ -30,6 +31,11 @@ def load_track(name_or_path: str | Path, car_width_m: float | None = None) -> Tr
         raise InputError(
             f"no track '{text}': neither a file nor built in; "
             f"built in: {', '.join(builtin_tracks())}, random:SEED"
+        )
+    if path.suffix in _MAPS:
+        raise InputError(
+            f"{text} is a map: 'bayesrace tracks {text} --out track.csv --picture track.svg' makes "
+            "a track of it, and a picture to check it by"
         )
     return read_track(path, car_width_m)
 

@@ -210,6 +210,23 @@ class Track:
         name = f"{self.name}-mirrored"
         return Track._from_checked(name, points, self.width_left_m, self.width_right_m)
 
+    def driven_from(
+        self, start_m: tuple[float, float] | None = None, reverse: bool = False
+    ) -> "Track":
+        """The same track, its start line at the node nearest to a point [m], or driven backwards.
+
+        ``start_m`` None: the start line stays.
+        """
+        points = np.column_stack([self.x_m, self.y_m])
+        first = 0
+        if start_m is not None:
+            first = int(np.argmin(np.linalg.norm(points - start_m, axis=1)))
+        order = (first + np.arange(len(points)) * (-1 if reverse else 1)) % len(points)
+        right, left = self.width_right_m[order], self.width_left_m[order]
+        if reverse:
+            right, left = left, right
+        return Track._from_checked(self.name, points[order], right, left)
+
     def _projected(self, points: Floats, s: Floats) -> PathProjection:
         n = self._offsets(points, s)
         progress = np.unwrap(s, period=self.length_m)

@@ -113,6 +113,21 @@ class CarParameters(Part):
         drive = self.drive.numbers() if self.drive.guarded else {}
         return {name: float(getattr(self, name)) for name in ACTUATORS} | drive
 
+    @property
+    def brake_numbers(self) -> dict[str, float]:
+        """How a car is braked without a controller, its steering held.
+
+        Drive command: -(brake_d + brake_slow / vx^2), but not below d_min, and fading to none below
+        brake_fade_mps. The tyres give the first two: a car that brakes harder may spin.
+        """
+        command = self.drive.command_for(1.0, self.mass_kg)
+        steady, slow = self.tyres.steady_braking(self.lf_m, self.lr_m, -self.d_min / command)
+        return {
+            "brake_fade_mps": self.brake_fade_mps,
+            "brake_d": steady * command,
+            "brake_slow": slow * command,
+        }
+
     def on_tyres(self, model: str) -> "CarParameters":
         """The same car on tyres of this model: its own, or saturating ones in place of linear ones.
 

@@ -29,6 +29,9 @@ _PEAK: Final = 1.0489
 """Pacejka's C, and the friction, of tyres that saturate in place of linear ones: the friction of
 f1tenth_gym. The mu of linear tyres is a factor of their stiffness alone."""
 
+_ANY_MPS2: Final = 1e3
+"""Braking beyond that of any car."""
+
 
 class Part(BaseModel):
     """Part of a car: immutable, without unknown values."""
@@ -68,6 +71,10 @@ class PacejkaTyres(Part):
         )
         return self.model_copy(update={"front": front, "rear": rear})
 
+    def steady_braking(self, lf_m: float, lr_m: float, hardest_mps2: float) -> tuple[float, float]:
+        """Any: braking moves no load; see :meth:`LinearTyres.steady_braking`."""
+        return _ANY_MPS2, 0.0
+
 
 class LinearTyres(Part):
     """Tyres of CommonRoad's single-track model: F = mu C_S F_z alpha, with load transfer.
@@ -91,6 +98,30 @@ class LinearTyres(Part):
     def with_grip(self, multiple: float) -> "LinearTyres":
         """The same tyres with so many times the force."""
         return self.model_copy(update={"mu": multiple * self.mu})
+
+    def steady_braking(self, lf_m: float, lr_m: float, hardest_mps2: float) -> tuple[float, float]:
+        """Braking that leaves a car stable with its steering held.
+
+        (b, c): up to b + c / v^2 [m/s^2] at a speed v. Beyond b, so much load is on the front axle
+        that the car oversteers; it is still stable below its critical speed,
+        v^2 < mu L C_f C_r / (lf C_f - lr C_r) with the stiffness C = C_S F_z / m of the axles. Of
+        all braking up to ``hardest_mps2`` the least product C_f C_r gives c. Any, where the height
+        is zero, or where the car oversteers at rest, which no braking mends.
+        """
+        front, rear = self.front_stiffness, self.rear_stiffness
+        balance = GRAVITY_MPS2 * lf_m * lr_m * (rear - front)  # lr C_r - lf C_f at rest
+        moved = self.height_m * (lr_m * rear + lf_m * front)  # what braking takes off it
+        if moved <= 0 or balance <= 0:
+            return _ANY_MPS2, 0.0
+
+        def product(braking: float) -> float:
+            load = self.height_m * braking
+            unloaded = max(GRAVITY_MPS2 * lf_m - load, 0.0)
+            return front * (GRAVITY_MPS2 * lr_m + load) * rear * unloaded
+
+        neutral = balance / moved
+        least = min(product(neutral), product(max(hardest_mps2, neutral)))
+        return neutral, self.mu * (lf_m + lr_m) * least / moved
 
     def saturating(self, lf_m: float, lr_m: float, mass_kg: float) -> PacejkaTyres:
         """Pacejka tyres of the same cornering stiffness at rest, with a peak."""
@@ -123,6 +154,10 @@ class DcMotor(Part):
     def command_size(self, acceleration_mps2: float) -> float:
         """Commands of this car as multiples of the reference car's: both are duty cycles."""
         return 1.0
+
+    def command_for(self, acceleration_mps2: float, mass_kg: float) -> float:
+        """Command that accelerates by so much at standstill; at speed it does less."""
+        return mass_kg * acceleration_mps2 / self.cm1
 
     def available(self, vx_mps: float, vy_mps: float) -> float:
         """Share of the highest command that the drive gives at a velocity: all of it."""
@@ -165,6 +200,10 @@ class AccelerationDrive(Part):
 
     def command_size(self, acceleration_mps2: float) -> float:
         """Commands of this car as multiples of the reference car's duty cycle."""
+        return acceleration_mps2
+
+    def command_for(self, acceleration_mps2: float, mass_kg: float) -> float:
+        """Command that accelerates by so much: the acceleration."""
         return acceleration_mps2
 
     def available(self, vx_mps: float, vy_mps: float) -> float:

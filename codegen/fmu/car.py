@@ -243,7 +243,8 @@ def car_fmu(
     if version == 2 and kind == "me":
         raise InputError("Model Exchange is exported for FMI 3.0 only: use --version 3")
     constants = {"ACCELERATION_DRIVE": 1.0} if car.drive.guarded else {}
-    constants |= {"BRAKE_FADE_MPS": car.brake_fade_mps, "SUBSTEP_HZ": float(PLANT_SUBSTEP_HZ)}
+    constants |= {name.upper(): number for name, number in car.brake_numbers.items()}
+    constants |= {"SUBSTEP_HZ": float(PLANT_SUBSTEP_HZ)}
     return FmuDefinition(
         name=f"BayesRace {car.name}",
         identifier=re.sub(r"[^A-Za-z0-9_]", "_", f"bayesrace_{car.name}"),

@@ -83,7 +83,11 @@ def controller_fmu(
         variables=tuple(_variables(manifest, car.drive, settings, fallback)),
         sources=_sources(artefact),
         flags=_flags(cpu),
-        constants={"NO_SPEED_LIMIT": _NO_LIMIT_MPS},
+        constants={
+            "NO_SPEED_LIMIT": _NO_LIMIT_MPS,
+            "BRAKE_D": car.brake_numbers["brake_d"],
+            "BRAKE_SLOW": car.brake_numbers["brake_slow"],
+        },
         resources={
             PATH_FILE: path_file(rows, spacing_m),
             WEIGHTS_FILE: weights_file(weights, manifest.discretisation, manifest.gp_capacity),

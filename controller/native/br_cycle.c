@@ -111,11 +111,13 @@ const br_counters *br_cycle_counters(const br_cycle *cycle) {
 
 br_mpc_error br_cycle_set_driving(br_cycle *cycle, const br_driving *s) {
     if (!cycle || !s) return BR_ERROR_NULL;
-    const double positive[] = {s->brake_fade_mps, s->stop_mps2, s->longest_s, s->stale_s};
-    const double others[] = {s->standing_mps, s->shifted_s, s->limit_tolerance, s->delay_s};
+    const double positive[] = {s->brake_fade_mps, s->brake_d, s->stop_mps2, s->longest_s,
+                               s->stale_s};
+    const double others[] = {s->brake_slow, s->standing_mps, s->shifted_s, s->limit_tolerance,
+                             s->delay_s};
     int valid = s->recover_cycles >= 1 && s->compensation >= BR_COMPENSATION_OFF &&
                 s->compensation <= BR_COMPENSATION_FIXED && s->longest_s <= BR_PREDICT_MAX_S;
-    for (int i = 0; i < 4; ++i)
+    for (int i = 0; i < 5; ++i)
         valid &= isfinite(positive[i]) && positive[i] > 0 && isfinite(others[i]) && others[i] >= 0;
     for (int i = 0; i < BR_NU; ++i)
         valid &= isfinite(s->u_low[i]) && isfinite(s->u_high[i]) && s->u_low[i] < s->u_high[i];
@@ -136,6 +138,13 @@ br_mpc_error br_cycle_set_clock(br_cycle *cycle, br_mpc_clock clock, void *conte
 
 /* --- states, runs, commands --- */
 
+static void forget_delay(br_cycle *cycle) {
+    const br_driving *settings = &cycle->settings;
+    cycle->delay.delays = cycle->delay.next_delay = 0;
+    cycle->counters.delay_s =
+        settings->compensation == BR_COMPENSATION_FIXED ? settings->delay_s : 0;
+}
+
 br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state) {
     if (!cycle || !state) return BR_STATE_FOREIGN;
     if (!isfinite(state->time_s)) {
@@ -150,11 +159,11 @@ br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state) {
     if (begins) {
         memset(&cycle->fallback, 0, sizeof cycle->fallback); /* the plan is of another run */
         cycle->delay.count = 0; /* no input is on its way; the delay is still the best guess */
+        if (state->lockstep) forget_delay(cycle); /* but for simulated time, which reports its own */
         cycle->controller.reset(cycle->controller.self);
         cycle->stepped = cycle->stopping = cycle->reckoned = 0;
     }
-    if (!state->lockstep)
-        br_delay_observe(&cycle->delay, &cycle->settings, state, &cycle->counters.delay_s);
+    br_delay_observe(&cycle->delay, &cycle->settings, state, &cycle->counters.delay_s);
     return BR_STATE_NEW;
 }
 
@@ -250,13 +259,9 @@ static int step(br_cycle *cycle, const br_environment *environment, double actin
     const br_measured *newest = &cycle->stream.newest;
     const br_controller *controller = &cycle->controller;
     double x[BR_NX], u[BR_NU];
-    if (newest->lockstep) {
-        memcpy(x, newest->x, sizeof x);
-        memcpy(u, newest->u_applied, sizeof u);
-    } else if (br_delay_at_acting(&cycle->delay, &cycle->settings, controller, newest,
-                                  cycle->decision.decided_at_s, cycle->counters.delay_s, x, u)) {
+    if (br_delay_at_acting(&cycle->delay, &cycle->settings, controller, newest,
+                           cycle->decision.decided_at_s, cycle->counters.delay_s, x, u))
         return BR_UNPREDICTABLE;
-    }
     /* Where the delay measured has fallen, the moment of acting may even go back. */
     const double elapsed_s = cycle->stepped ? fmax(acting_s - cycle->stepped_s, 0) : 0;
     cycle->stepped = 1;
@@ -311,7 +316,7 @@ br_mpc_error br_cycle_decide(br_cycle *cycle, const br_environment *environment,
     decision->run = newest->run;
     decision->seq = newest->seq;
     decision->decided_at_s = decided_at_s;
-    decision->delay_s = newest->lockstep ? 0 : cycle->counters.delay_s;
+    decision->delay_s = cycle->counters.delay_s;
     decision->stepped = decision->error = 0;
     decision->step_us = decision->late_s = 0;
     const double acting_s = decided_at_s + decision->delay_s;

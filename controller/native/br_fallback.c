@@ -13,6 +13,7 @@
 #if BR_HAS_PATH
 
 #define ROUNDING 1e-6 /* of a time, or of a row */
+#define SLOWEST 1e-6  /* squared speed by which is divided */
 
 static void limited(const br_driving *s, const double u[BR_NU], double safe[BR_NU]) {
     for (int i = 0; i < BR_NU; ++i) {
@@ -53,7 +54,10 @@ br_level br_fallback_brake(const br_fallback *fallback, const br_driving *s, dou
     const double nothing[BR_NU] = {0};
     limited(s, rolling && row < fallback->rows ? fallback->plan[row] : nothing, u);
     const double share = fmin(fmax(vx_mps / s->brake_fade_mps, 0), 1);
-    u[BR_INDEX_DUTY] = isfinite(vx_mps) ? s->u_low[BR_INDEX_DUTY] * share : 0;
+    /* What the car can hold without a controller. */
+    const double held = s->brake_d + s->brake_slow / fmax(vx_mps * vx_mps, SLOWEST);
+    const double brake = fmax(s->u_low[BR_INDEX_DUTY], -held);
+    u[BR_INDEX_DUTY] = isfinite(vx_mps) ? brake * share : 0;
     return rolling ? BR_BRAKE : BR_STOP;
 }
 

@@ -221,7 +221,8 @@ def _summary(recording: Recording) -> SettingsSummary:
     def name(key: str) -> str:
         return Path(str(settings.get(key, ""))).stem
 
-    mpc = settings.get("mpc")
+    mpc, simulator = settings.get("mpc"), str(settings.get("simulator", "equations"))
+    other = "" if simulator == "equations" else simulator
     return SettingsSummary(
         car=recording.car.name,
         tyres=recording.car.tyres.model,
@@ -232,7 +233,7 @@ def _summary(recording: Recording) -> SettingsSummary:
         seed=int(settings.get("seed", 0)),
         laps=int(settings.get("laps", 0)),
         constraints=bool(mpc.get("constraints", True)) if isinstance(mpc, dict) else True,
-        fmu=Path(str(settings.get("fmu") or "")).name,
+        fmu=Path(str(settings.get("fmu") or other)).name,
     )
 
 

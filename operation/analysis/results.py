@@ -86,7 +86,7 @@ class SettingsSummary(_Frozen):
     constraints: bool
     tyres: str = Field("", description="model of the car's tyres: pacejka or linear")
     friction: float | None = Field(None, description="acceleration over g that the line assumes")
-    fmu: str = Field("", description="FMU that simulated the car; empty for the built-in equations")
+    fmu: str = Field("", description="what simulated the car; empty: the built-in equations")
 
 
 class RaceResult(_Frozen):

@@ -34,11 +34,12 @@ _OUR_OWN: Final = ("bayesrace", "codegen", "operation", "plant", "studies")
 
 _FMU_PACKAGES: Final = ("fmpy", "pint")
 _RACE_PACKAGES: Final = (
-    "casadi", "hdrh", "jinja2", "lz4", "matplotlib", "mcap", "rich", "scipy", "sklearn",
-    "threadpoolctl", "zstandard",
+    "PIL", "casadi", "contourpy", "hdrh", "jinja2", "lz4", "matplotlib", "mcap", "rich", "scipy",
+    "sklearn", "threadpoolctl", "yaml", "zstandard",
 )  # fmt: skip
+_SLIPX_PACKAGES: Final = ("slipx",)
 _CAMPAIGN_PACKAGES: Final = ("bokeh", "dask", "distributed", "optuna", "pyarrow")
-"""Modules that the extras ``fmu``, ``race`` and ``campaign`` of pyproject.toml install."""
+"""Modules that the extras of pyproject.toml install."""
 
 _TASKS: Final[dict[str, tuple[Callable[..., None], ...]]] = {
     "Race": (evaluation.race, evaluation.report),
@@ -142,7 +143,10 @@ def _in_words(error: Exception) -> str | None:
 
 def _missing(package: str) -> str | None:
     """What to install for a package; None if no extra brings it."""
-    extras = {"fmu": _FMU_PACKAGES, "race": _RACE_PACKAGES, "campaign": _CAMPAIGN_PACKAGES}
+    extras = {
+        "fmu": _FMU_PACKAGES, "race": _RACE_PACKAGES, "campaign": _CAMPAIGN_PACKAGES,
+        "slipx": _SLIPX_PACKAGES,
+    }  # fmt: skip
     extra = next((name for name, packages in extras.items() if package in packages), None)
     if extra is None:
         return None

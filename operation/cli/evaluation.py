@@ -12,13 +12,17 @@ from bayesrace.vehicles import DEFAULT_CAR
 from operation.cli.options import (
     Car,
     CarName,
+    Delay,
     Endpoint,
     FmuFile,
     FmuMap,
+    Noise,
     Seed,
+    Simulator,
     TrackName,
     Tyres,
     connect_to,
+    sensor_noise,
     writable,
 )
 
@@ -65,6 +69,9 @@ def race(
     seed: Seed = 0,
     fmu: FmuFile = None,
     fmu_map: FmuMap = None,
+    simulator: Simulator = "equations",
+    delay: Delay = 0.0,
+    noise: Noise = None,
 ) -> None:
     """Drive the paper's comparison: WorstCase, BayesRace, BayesRace-updated, BestCase.
 
@@ -86,7 +93,8 @@ def race(
     driven = get_car(car) if tyres is None else get_car(car).on_tyres(tyres)
     settings = RaceSettings(
         car=driven, track=track, train_track=train_track, laps=laps, mode=mode.value,
-        seed=seed, fmu=fmu, fmu_map=fmu_map,
+        seed=seed, fmu=fmu, fmu_map=fmu_map, simulator=simulator, delay_s=1e-3 * delay,
+        noise=sensor_noise(noise),
     )  # fmt: skip
     mpc = settings.mpc.model_copy(update={"constraints": not no_constraints})
     settings = settings.model_copy(update={"mpc": mpc})

@@ -2,33 +2,38 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from bayesrace.errors import InputError
+from bayesrace.errors import InputError, faults_in
 
 if TYPE_CHECKING:
     from bayesrace.transport import Endpoints
     from bayesrace.vehicles import CarParameters
     from controller.path_table import PathTable
+    from plant.sensors import SensorNoise
 
 __all__ = [
     "AllSamples",
     "Car",
     "CarName",
+    "Delay",
     "Endpoint",
     "FmuFile",
     "FmuMap",
     "LowLatency",
+    "Noise",
     "OutFile",
     "ParentPid",
     "RaceLineFile",
     "Seed",
+    "Simulator",
     "TrackName",
     "Tyres",
     "connect_to",
     "path_on",
+    "sensor_noise",
     "writable",
 ]
 
@@ -129,6 +134,39 @@ OutFile = Annotated[
     Path,
     typer.Option("--out", "-o", metavar="FILE", callback=writable, help="File to write."),
 ]
+Noise = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME=STD",
+        show_default="exact",
+        help="Standard deviation of a sensor: position_m, heading_rad, speed_mps, yaw_rate_radps, "
+        "steering_rad; repeatable.",
+    ),
+]
+Delay = Annotated[
+    float,
+    typer.Option(
+        metavar="MS", min=0, max=1000, help="Delay of states and of actuations each [ms]."
+    ),
+]
+
+
+def sensor_noise(given: list[str] | None) -> "SensorNoise":
+    """The noise of the options ``NAME=STD``; InputError naming one that cannot be."""
+    from pydantic import ValidationError
+
+    from plant.sensors import SensorNoise
+
+    pairs = dict(one.partition("=")[::2] for one in given or ())
+    try:
+        return SensorNoise.model_validate(pairs)
+    except ValidationError as error:
+        names = ", ".join(SensorNoise.model_fields)
+        raise InputError(
+            f"--noise: {faults_in(error, 'the noise')}; give NAME=STD, where NAME is one of {names}"
+        ) from None
+
+
 FmuFile = Annotated[
     Path | None,
     typer.Option(metavar="FILE", help="Co-Simulation FMU (2.0, 3.0) that simulates the car."),
@@ -140,6 +178,10 @@ FmuMap = Annotated[
         metavar="FILE",
         help="Meaning of the FMU's variables (TOML); 'bayesrace fmu inspect' writes one to edit.",
     ),
+]
+Simulator = Annotated[
+    Literal["equations", "slipx"],
+    typer.Option(metavar="NAME", help="equations, or slipx, whose reference car is --car slipx."),
 ]
 LowLatency = Annotated[
     bool,

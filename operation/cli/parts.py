@@ -11,12 +11,16 @@ from bayesrace.vehicles import DEFAULT_CAR
 from operation.cli.options import (
     Car,
     CarName,
+    Delay,
     FmuFile,
     FmuMap,
     LowLatency,
+    Noise,
     ParentPid,
     RaceLineFile,
+    Simulator,
     TrackName,
+    sensor_noise,
 )
 
 __all__ = ["controller", "plant"]
@@ -52,15 +56,10 @@ def plant(
     rate: Rate = 50.0,
     fmu: FmuFile = None,
     fmu_map: FmuMap = None,
-    delay: Annotated[
-        float,
-        typer.Option(
-            metavar="MS",
-            min=0,
-            max=1000,
-            help="Delay of states and of actuations each, in real time [ms].",
-        ),
-    ] = 0.0,
+    simulator: Simulator = "equations",
+    delay: Delay = 0.0,
+    noise: Noise = None,
+    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Seed of the noise.")] = 0,
     cpu: Cpu = None,
     fifo: Fifo = None,
     lock_memory: LockMemory = False,
@@ -83,8 +82,11 @@ def plant(
         ),
         rate_hz=rate,
         delay_s=delay * 1e-3,
+        noise=sensor_noise(noise),
+        seed=seed,
         fmu=fmu,
         fmu_map=fmu_map,
+        simulator=simulator,
         realtime=RealtimeSettings(cpu=cpu, fifo=fifo, lock_memory=lock_memory),
         parent_pid=parent_pid,
     )

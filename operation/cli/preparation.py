@@ -1,5 +1,6 @@
 """``tracks`` to ``export``: preparation of a drive, each command with files in and out."""
 
+import math
 import shutil
 from enum import StrEnum
 from pathlib import Path
@@ -18,6 +19,7 @@ from operation.cli.options import (
     OutFile,
     RaceLineFile,
     Seed,
+    Simulator,
     TrackName,
     Tyres,
     path_on,
@@ -50,7 +52,7 @@ def tracks(
         typer.Argument(
             metavar="TRACK",
             show_default="all built in",
-            help="Built-in name, random:SEED or CSV file.",
+            help="Built-in name, random:SEED, CSV file or ROS map (YAML).",
         ),
     ] = None,
     out: Annotated[
@@ -59,19 +61,50 @@ def tracks(
             "--out", "-o", metavar="FILE", callback=writable, help="Write the track as CSV."
         ),
     ] = None,
+    picture: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", callback=writable, help="Draw the track (SVG, PNG)."),
+    ] = None,
+    reverse: Annotated[bool, typer.Option("--reverse", help="Drive it the other way.")] = False,
+    start: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y",
+            show_default="as it is; of a map: 0,0",
+            help="Start line at the node nearest to this point [m].",
+        ),
+    ] = None,
+    car: Annotated[
+        str, typer.Option(metavar="CAR", show_default="of any", help="Car whose scale to check.")
+    ] = "",
 ) -> None:
-    """List the built-in tracks, check a track file, or write a track to a file."""
+    """List the built-in tracks, check a track, turn a ROS map into one, write or draw it."""
     import numpy as np
     from rich.table import Table
 
     from bayesrace.tracks import builtin_tracks, load_track, write_track
+    from bayesrace.vehicles import get_car
     from operation.terminal.terminal import Terminal
 
-    if out is not None and name is None:
-        raise InputError("--out needs the name of the track to write")
+    if name is None and (out or picture or start or reverse):
+        raise InputError("--out, --picture, --start and --reverse need the name of the track")
+    if picture is not None:
+        from operation.report.track_picture import check_picture, write_picture
+
+        check_picture(picture)
+    place, grid = _point(start), None
+    car_width_m = get_car(car).width_m if car else None
     table = Table("track", "length m", "width m", "tightest radius m", "points")
     for one in [name] if name else builtin_tracks():
-        track = load_track(one)
+        if Path(one).suffix in (".yaml", ".yml"):
+            from bayesrace.tracks.maps import read_map, track_of_map
+
+            grid = read_map(one)
+            track = track_of_map(grid, car_width_m)
+        else:
+            track = load_track(one, car_width_m)
+        if place is not None or reverse:
+            track = track.driven_from(place, reverse)
         width = track.width_left_m + track.width_right_m
         bend = np.abs(track.curvature(np.arange(0, track.length_m, 0.01))).max()
         table.add_row(
@@ -80,7 +113,22 @@ def tracks(
         )  # fmt: skip
         if out is not None:
             write_track(out, track)
+        if picture is not None:
+            write_picture(picture, track, grid)
     Terminal().print(table)
+
+
+def _point(text: str | None) -> tuple[float, float] | None:
+    """The two numbers of an option."""
+    if text is None:
+        return None
+    try:
+        x, y = (float(part) for part in text.split(","))
+    except ValueError:
+        x = y = math.nan
+    if not (math.isfinite(x) and math.isfinite(y)):
+        raise InputError(f"--start {text}: give x and y in metres, as 1.5,-2")
+    return x, y
 
 
 def cars(
@@ -139,6 +187,7 @@ def collect(
     seed: Seed = 0,
     fmu: FmuFile = None,
     fmu_map: FmuMap = None,
+    simulator: Simulator = "equations",
     car: Car = DEFAULT_CAR,
 ) -> None:
     """Drive a track by pure pursuit and log the drive as training data."""
@@ -156,7 +205,8 @@ def collect(
     parameters = get_car(car)
     course = load_track(track, parameters.width_m)
     line = read_raceline_for(raceline, course, parameters)
-    with open_vehicle(parameters, fmu, fmu_map, compiled=compiled) as vehicle:
+    vehicles = open_vehicle(parameters, fmu, fmu_map, compiled=compiled, simulator=simulator)
+    with vehicles as vehicle:
         duration_s = duration or parameters.tuning.pursuit.drive_s
         artefact, _ = build(BuildSettings(car=parameters))
         samples = drive(
@@ -224,8 +274,9 @@ def train(
     from bayesrace.vehicles import get_car
     from learning.dataset import left_out
     from learning.residual import discretisation_of
+    from learning.settings import TrainingSettings
     from learning.sources import read_samples
-    from learning.training import TrainingSettings, fit
+    from learning.training import fit
     from operation.terminal.learning_table import print_choices, print_kernels
     from operation.terminal.progress import stages_on
     from operation.terminal.terminal import Terminal

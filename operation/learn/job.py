@@ -21,8 +21,8 @@ from bayesrace.tracks import Track, load_track
 from bayesrace.transport import NEWEST, Endpoints, Inbox, Item, Kind, open_session
 from learning.pool import recalled
 from learning.residual import discretisation_of
+from learning.settings import TrainingSettings
 from learning.sources import read_samples
-from learning.training import TrainingSettings
 from learning.worker import Task, Trainer
 from operation.learn.collector import Collector, Stretch
 from operation.learn.journal import Journal, resumable_settings

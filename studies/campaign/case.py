@@ -31,11 +31,14 @@ Controller = Literal["worstcase", "bayesrace", "bayesrace-updated", "bestcase"]
 CONTROLLERS: Final[tuple[Controller, ...]] = get_args(Controller)
 
 _FIXED: Final = (
-    *("mode", "fmu", "fmu_map", "threads"),
+    *("mode", "fmu", "fmu_map", "simulator", "threads"),
     *("discretisation.step_s", "pursuit.step_s", "pursuit.seed"),
 )
 """Settings that a campaign does not vary: it drives the built-in car in lockstep, in the plant's
 period, and ``seed`` is the one seed."""
+
+_LEFT_OUT: Final = {"car", "threads", "fmu", "fmu_map", "simulator"}
+"""Settings that a row has in other columns, or that no campaign has."""
 
 _SOURCES: Final = (
     "bayesrace", "bayesrace/gp", "bayesrace/messages", "bayesrace/raceline", "bayesrace/tracks",
@@ -123,7 +126,7 @@ class Case:
             "key": self.key,
             **flat(settings),
             "car_identity": car_identity(settings.car),
-            "settings": settings.model_dump_json(exclude={"car", "threads", "fmu", "fmu_map"}),
+            "settings": settings.model_dump_json(exclude=_LEFT_OUT),
         }
 
     def task(self) -> str:

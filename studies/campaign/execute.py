@@ -169,6 +169,7 @@ class _Runs:
                 settings.mpc, table=_table(track, car.tuning.path.spacing_m),
             ),
             _vehicle(settings.true_car.model_dump_json()),
+            noise=settings.noise, seed=settings.seed, delay_s=settings.delay_s,
         )  # fmt: skip
         limit_s = settings.limit_s(track.line.lap_time_s)
         return loop.drive(settings.laps, limit_s, settings.start_speed_mps, name=controller)

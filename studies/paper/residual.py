@@ -11,7 +11,7 @@ from bayesrace.gp.weights import OUTPUTS, UNITS, GpWeights, read_weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.tracks import Track
 from learning.dataset import Dataset, concatenate
-from learning.training import TrainingSettings
+from learning.settings import TrainingSettings
 from learning.validation import Validation, validate
 from operation.analysis.published import GP
 from operation.preparation import trained_weights

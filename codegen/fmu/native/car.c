@@ -10,6 +10,7 @@
 #include "fmu.h"
 
 #define NX 7
+#define SLOWEST 1e-6 /* squared speed by which is divided */
 
 /* Calls a generated function, which cannot fail, on its arguments and its one result. */
 #define EVALUATE(function, result, ...)                                    \
@@ -67,7 +68,8 @@ static void guard(const double *v, double duration, double u[2]) {
     const double angle = v[FMU_V_delta_max_rad], fastest = v[FMU_V_delta_rate_max_radps];
     double rate = v[FMU_V_delta_rate];
     if (!(isfinite(v[FMU_V_d]) && isfinite(rate))) { /* brake, less when slow; hold the steering */
-        const double brake = v[FMU_V_d_min] * clipped(v[FMU_V_vx] / BRAKE_FADE_MPS, 0.0, 1.0);
+        const double vx = v[FMU_V_vx], held = BRAKE_D + BRAKE_SLOW / most(vx * vx, SLOWEST);
+        const double brake = most(v[FMU_V_d_min], -held) * clipped(vx / BRAKE_FADE_MPS, 0.0, 1.0);
         u[0] = most(brake, lowest(v, duration));
         u[1] = 0.0;
         return;

@@ -51,6 +51,8 @@ static br_mpc_error use_parameters(controller *c, const double *v) {
         .u_low = {parameters.d_min, -parameters.delta_rate_max_radps},
         .u_high = {parameters.d_max, parameters.delta_rate_max_radps},
         .brake_fade_mps = v[FMU_V_brake_fade_mps],
+        .brake_d = BRAKE_D,
+        .brake_slow = BRAKE_SLOW,
         .standing_mps = v[FMU_V_brake_fade_mps],
         .stop_mps2 = 1, /* an FMU has no command to stop */
         .shifted_s = v[FMU_V_shifted_s],

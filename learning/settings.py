@@ -1,0 +1,43 @@
+"""What training may be given; kept apart from it, which takes a second to import."""
+
+from collections.abc import Callable
+from typing import Final
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from learning.kernels import DEFAULT_KERNELS, Kernel
+
+__all__ = ["MIN_SAMPLES", "TOLERANCE", "Progress", "TrainingSettings"]
+
+Progress = Callable[[float, str], None]
+"""Called from the training's own thread with the share done (0 to 1) and what was done."""
+
+MIN_SAMPLES: Final = 20
+
+TOLERANCE: Final = 1e-7
+"""Relative gain of the likelihood per iteration at which the optimiser stops."""
+
+
+class TrainingSettings(BaseModel):
+    """How to train; the defaults use training samples alone to decide."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    kernels: tuple[Kernel, ...] = Field(
+        DEFAULT_KERNELS, min_length=1, description="candidates; held-out log density decides"
+    )
+    restarts: int = Field(2, ge=0, le=100, description="further seeded starts per kernel")
+    seed: int = Field(0, ge=0)
+    capacity: int = Field(1024, ge=1, description="training points per output at most")
+    hyper_points: int = Field(
+        400, ge=MIN_SAMPLES, description="samples that hyperparameters are found with at most"
+    )
+    tolerance: float = Field(
+        TOLERANCE, gt=0, lt=1, description="relative gain at which the optimiser stops"
+    )
+    iterations: int = Field(100, ge=1, description="optimiser iterations per start")
+    warm_iterations: int = Field(30, ge=1, description="the same, starting from given weights")
+    folds: int = Field(
+        10, ge=2, description="parts of the drive, or of the track, each held out in turn"
+    )
+    threads: int = Field(0, ge=0, description="parallel fits; 0 is one per core")

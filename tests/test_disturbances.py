@@ -1,0 +1,98 @@
+"""Noise of the sensors, and delays in lockstep: what acts when, and how the controller copes."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bayesrace.gp.weights import GpWeights
+from bayesrace.messages import RunRequest, Truth
+from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles.models import dynamic
+from controller.assembly import compiled_controller
+from controller.cycle_settings import CompensationSettings
+from controller.process_settings import ControllerSettings
+from operation.closed_loop import ClosedLoop, Driven
+from plant.lockstep import CarRun
+from plant.sensors import SensorNoise, Sensors
+from plant.simulator import Simulator
+from tests.command_line import Cli, refused
+from tests.conftest import Circuit
+from tests.driven import blank
+
+START = (0.0, 0.0, 0.3, 1.0, 0.0, 0.0, 0.05)
+
+
+def measured(noise: SensorNoise, seed: int, count: int = 2000) -> Any:
+    """What the sensors add to one truth, (count, 7)."""
+    sensors, truth = Sensors(noise, seed), blank(Truth, x=START, u_applied=(0.0, 0.0))
+    states = [sensors.measure(truth, True, (), False) for _ in range(count)]
+    return np.array([state.x for state in states]) - START
+
+
+def test_noise_has_the_deviations_that_are_asked_for_and_is_the_seeds() -> None:
+    noise = SensorNoise(position_m=0.01, heading_rad=0.02, yaw_rate_radps=0.3)
+    added = measured(noise, 1)
+    np.testing.assert_allclose(added.std(axis=0), noise.deviations, rtol=0.1)
+    assert abs(np.corrcoef(added[:, 0], added[:, 1])[0, 1]) < 0.1
+    assert np.array_equal(added, measured(noise, 1))
+    assert not np.array_equal(added, measured(noise, 2))
+    assert not measured(SensorNoise(), 1).any()
+
+
+@pytest.mark.parametrize("delay_ms", [3, 20, 47])
+def test_an_input_acts_after_its_delay_and_the_state_reports_it(
+    car: CarParameters, delay_ms: int
+) -> None:
+    """Against the same inputs, each held from its own moment on, a millisecond at a time."""
+    inputs = [(0.4, 0.5), (0.9, -1.0), (0.2, 2.0), (0.6, 0.0), (0.3, -0.5), (0.5, 0.1)]
+    request = blank(
+        RunRequest, lockstep=True, x0=START, line_x_m=9.0, max_time_s=9.0, laps=1, line_left_m=0.1
+    )
+    run = CarRun(request, Simulator(dynamic(car)), 1, delay_s=delay_ms * 1e-3)
+    reports: list[float] = []
+    for seq, u in enumerate(inputs):
+        run.step(u, seq)
+        reports += run.sample(seq + 1)[0].actuation_delays
+    expected = Simulator(dynamic(car))
+    expected.reset(START)
+    acting: list[Any] = [None] * delay_ms + [u for u in inputs for _ in range(20)]
+    for period in range(len(inputs)):
+        expected.step_switched([(1, u) for u in acting[20 * period : 20 * period + 20]])
+    np.testing.assert_allclose(run.vehicle.x, expected.x, atol=1e-9)
+    rows = np.reshape(reports, (-1, 3))
+    assert rows[:, 0].tolist() == list(range(len(rows)))
+    assert len(rows) >= len(inputs) - 1 - delay_ms // 20
+    np.testing.assert_allclose(rows[:, 1:], delay_ms * 1e-3)
+
+
+def test_a_delay_is_measured_and_compensated_in_lockstep_too(
+    circuit: Circuit, car: CarParameters, kinematic_artefact: Path, weights: GpWeights
+) -> None:
+    """20 ms each way: nearly the lap without a delay; uncompensated far from it."""
+
+    def driven(delay_s: float, compensation: CompensationSettings | None = None) -> Driven:
+        how = compensation or CompensationSettings()
+        settings = ControllerSettings(car=car, compensation=how)
+        controller = compiled_controller(
+            kinematic_artefact, car, circuit.track, circuit.line, weights
+        )
+        loop = ClosedLoop(
+            car, circuit.track, circuit.line, controller, settings=settings, delay_s=delay_s
+        )
+        return loop.drive(1, 30.0)
+
+    at_once, late = driven(0.0), driven(0.02)
+    fixed = driven(0.02, CompensationSettings(mode="fixed", delay_s=0.04))
+    ignored = driven(0.02, CompensationSettings(mode="off"))
+    lap_s = at_once.laps_s[0]
+    assert late.laps_s[0] == pytest.approx(lap_s, abs=0.1)
+    assert fixed.laps_s[0] == pytest.approx(lap_s, abs=0.1)
+    assert not ignored.laps_s or ignored.laps_s[0] > 1.2 * lap_s
+
+
+def test_noise_that_cannot_be_is_refused(cli: Cli) -> None:
+    refused(cli("race", "--noise", "speed=1"), "--noise", "speed", "speed_mps")
+    refused(cli("plant", "--noise", "speed_mps=-1"), "--noise", "speed_mps", "greater than")
+    refused(cli("race", "--noise", "speed_mps"), "--noise", "speed_mps", "NAME=STD")
