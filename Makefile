@@ -25,10 +25,11 @@ PROJECT := --no-build-isolation --editable
 START := $(shell date +%s)
 TOOK = echo "make $@: $$(($$(date +%s) - $(START))) s"
 
-.PHONY: help race test check tools rest lint coverage bench clean
+.PHONY: help race paper test check tools rest lint coverage bench clean
 
 help:
 	@echo "make race    set up, and drive the whole comparison; leaves runs/DATE-TIME"
+	@echo "make paper   every figure and number of the paper on one page: runs/paper/paper.html"
 	@echo "make test    set up for testing, and run most tests, in a few minutes"
 	@echo "make check   everything: lint, all tests, coverage; names the tools that it needs"
 	@echo "make lint    ruff, clang-format, mypy, import contracts"
@@ -37,6 +38,9 @@ help:
 
 race: $(VENV)/.ready
 	$(BIN)/bayesrace race $(ARGS)
+
+paper: $(VENV)/.ready
+	$(BIN)/bayesrace paper $(ARGS)
 
 bench: $(VENV)/.ready
 	$(BIN)/bayesrace bench $(ARGS)

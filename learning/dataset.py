@@ -127,11 +127,11 @@ def tolerances(car: CarParameters) -> dict[str, float]:
     return {"vx": car.tuning.gate.moving_mps, **rounding}
 
 
-def filter_dataset(dataset: Dataset) -> Dataset:
+def filter_dataset(dataset: Dataset, *, limits: bool = True) -> Dataset:
     """Leaves out standstill, samples outside the car's limits, and steering that does not add up.
 
     Each within its tolerance, :func:`tolerances`. The last means delta_{k+1} != delta_k + step *
-    delta_rate.
+    delta_rate. Without ``limits``, samples outside the car's limits stay.
     """
     car, slack = dataset.car, tolerances(dataset.car)
     kept = dataset.select(dataset.x[:, 3] >= slack["vx"], "standstill")
@@ -143,6 +143,7 @@ def filter_dataset(dataset: Dataset) -> Dataset:
         & (np.abs(rate) <= car.delta_rate_max_radps + slack["delta_rate"])
         & (angle <= car.delta_max_rad + slack["delta"])
     )
-    kept = kept.select(within, "outside limits")
+    if limits:
+        kept = kept.select(within, "outside limits")
     drift = kept.x_next[:, 6] - kept.x[:, 6] - kept.step_s * kept.u[:, 1]
     return kept.select(np.abs(drift) <= slack["delta change"], "steering does not match its rate")

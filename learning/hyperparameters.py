@@ -30,6 +30,12 @@ __all__ = ["BOUNDS", "Fit", "maximise", "starts"]
 BOUNDS: Final = np.log([(1e-2, 25.0)] + [(1e-1, 1e2)] * len(FEATURES) + [(1e-6, 1.0)])
 """Lower and upper bound of theta, (8, 2)."""
 
+_ARD: Final = np.eye(len(BOUNDS))
+_ISOTROPIC: Final = np.zeros((len(BOUNDS), 3))
+_ISOTROPIC[0, 0] = _ISOTROPIC[-1, 2] = 1.0
+_ISOTROPIC[1:-1, 1] = 1.0
+"""theta as a function of what is searched: all of it, or one length scale for all features."""
+
 _FIRST: Final = np.log([10.0] + [3.0] * len(FEATURES) + [1e-3])
 _WORST: Final = 1e25
 """Objective where the covariance is singular; L-BFGS then shortens its step."""
@@ -64,24 +70,31 @@ def maximise(
     start: Floats,
     iterations: int,
     tolerance: float = TOLERANCE,
+    *,
+    isotropic: bool = False,
 ) -> Fit:
-    """L-BFGS-B from ``start`` within :data:`BOUNDS`, at most ``iterations`` iterations."""
+    """L-BFGS-B from ``start`` within :data:`BOUNDS`, at most ``iterations`` iterations.
+
+    ``isotropic``: all features share one length scale, at the start the first one's.
+    """
     likelihood = MarginalLikelihood(kind, pairs, y)
+    spread = _ISOTROPIC if isotropic else _ARD
+    searched = spread.argmax(axis=0)
     # Per sample, so that the optimiser's tolerances do not depend on how many there are.
     scale = 1.0 / len(y)
 
-    def objective(theta: Floats) -> tuple[float, Floats]:
-        value, gradient = likelihood(theta)
+    def objective(point: Floats) -> tuple[float, Floats]:
+        value, gradient = likelihood(spread @ point)
         if not math.isfinite(value):
-            return _WORST, np.zeros_like(theta)
-        return -scale * value, -scale * gradient
+            return _WORST, np.zeros_like(point)
+        return -scale * value, -scale * (gradient @ spread)
 
     result = minimize(
         objective,
-        np.clip(start, *BOUNDS.T),
+        np.clip(start, *BOUNDS.T)[searched],
         jac=True,
-        bounds=BOUNDS,
+        bounds=BOUNDS[searched],
         method="L-BFGS-B",
         options={"maxiter": iterations, "ftol": tolerance, "gtol": 1e-5},
     )
-    return Fit(kind, np.asarray(result.x), float(-result.fun / scale))
+    return Fit(kind, spread @ result.x, float(-result.fun / scale))

@@ -71,13 +71,15 @@ def dataset_from_messages(
     car: CarParameters,
     step_s: float,
     runs: Collection[int] | None = None,
+    *,
+    limits: bool = True,
 ) -> Dataset:
     """Filtered samples from consecutive states of the same run (all runs, or those named).
 
     ``states``: the measured ones to learn from, the true ones to judge by. ``fallback``: run and
     number of the states whose cycles are left out, :func:`fallback_cycles`. The input of sample k
     is ``u_applied`` of the state after it, which acted, not the requested one. A missing state is
-    counted as "gap".
+    counted as "gap". ``limits``: as of :func:`~learning.dataset.filter_dataset`.
     """
     slack_s = tolerances(car)["time"]
     wanted = [state for state in states if runs is None or state.run in runs]
@@ -113,7 +115,7 @@ def dataset_from_messages(
         dropped=gaps,
     )
     driven = [(now.run, now.seq) not in fallback for now, _ in found]
-    return filter_dataset(samples.select(driven, "fallback"))
+    return filter_dataset(samples.select(driven, "fallback"), limits=limits)
 
 
 def dataset_from_log(
@@ -123,6 +125,8 @@ def dataset_from_log(
     runs: Collection[int] | None = None,
     name: str = "",
     truth: bool = False,
+    *,
+    limits: bool = True,
 ) -> Dataset:
     """Filtered samples of ``car`` from a run's MCAP log; see :func:`dataset_from_messages`.
 
@@ -141,6 +145,6 @@ def dataset_from_log(
         else:
             fallback |= fallback_cycles([entry.message])
     try:
-        return dataset_from_messages(states, fallback, car, step_s, runs)
+        return dataset_from_messages(states, fallback, car, step_s, runs, limits=limits)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error

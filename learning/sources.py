@@ -32,14 +32,17 @@ def read_samples(
     discretisation: Discretisation | None = None,
     runs: Collection[int] | None = None,
     truth: bool = False,
+    *,
+    limits: bool = True,
 ) -> Samples:
     """All samples of logs (MCAP) and arrays (``.npz``), filtered, in the order given.
 
     ``car``: the driven one, where the files do not name it; ``name``: its name in the network,
     where a log holds several; ``discretisation``: for the residual, by default the one that the
     logs name, or ``PREDICTION``; ``runs``: the wanted runs of the logs, by default all; ``truth``:
-    the true states in place of the measured ones, of the logs that hold them. InputError if cars,
-    discretisations or steps differ, or if two files hold the same samples.
+    the true states in place of the measured ones, of the logs that hold them; ``limits``: leave out
+    samples outside the car's limits. InputError if cars, discretisations or steps differ, or if two
+    files hold the same samples.
     """
     if not paths:
         raise InputError("no samples given; name at least one log, or --data FILE.npz")
@@ -62,9 +65,11 @@ def read_samples(
     for path in paths:
         if path in logs:
             true = truth and drivers[path] in logs[path].true
-            samples = dataset_from_log(path, driven, used.step_s, runs, drivers[path], true)
+            samples = dataset_from_log(
+                path, driven, used.step_s, runs, drivers[path], true, limits=limits
+            )
         else:
-            samples = filter_dataset(dataset_from_npz(path, driven, used.step_s))
+            samples = filter_dataset(dataset_from_npz(path, driven, used.step_s), limits=limits)
         digest = samples.digest()
         if digest in seen and len(samples):
             raise InputError(f"{path} holds the same samples as {seen[digest]}; give them once")

@@ -33,7 +33,7 @@ SUBCOMMANDS = (
     "plant", "controller", "status", "stop", "go", "router", "latency",
     "fmu export", "fmu inspect", "fmu weights",
     "validate", "publish", "rollback", "learn",
-    "campaign", "campaign-report", "campaign-worker", "tune",
+    "campaign", "campaign-report", "campaign-worker", "tune", "paper",
 )  # fmt: skip
 
 

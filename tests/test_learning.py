@@ -75,6 +75,8 @@ def test_filter_counts_what_it_leaves_out(driven: Dataset) -> None:
         "outside limits": 3,
         "steering does not match its rate": 1,
     }
+    every = filter_dataset(Dataset(CAR, STEP_S, x, u, x_next), limits=False)
+    assert dict(every.dropped) == {"standstill": 1, "steering does not match its rate": 3}
 
 
 @pytest.mark.parametrize("share", [0.9, 1.1])

@@ -5,6 +5,9 @@ to 54 rad/s); all its samples are used here, and only here, to compare like with
 variance are chosen from training samples alone.
 """
 
+import json
+from pathlib import Path
+
 import pytest
 
 from bayesrace.integrators import PREDICTION
@@ -13,6 +16,7 @@ from learning.arrays import dataset_from_npz
 from learning.dataset import Dataset, concatenate, filter_dataset
 from learning.training import train
 from learning.validation import Validation, validate
+from tests.command_line import Cli
 from tests.reference import reference_file
 
 POINTS = 400
@@ -68,3 +72,17 @@ def test_published_drive_is_outside_the_cars_limits() -> None:
     kept = filter_dataset(training)
     assert kept.dropped["outside limits"] > 50
     assert len(kept) + sum(kept.dropped.values()) == len(training)
+
+
+def test_the_published_table_from_the_command_line(cli: Cli) -> None:
+    """``--all-samples`` keeps what exceeds the car's limits: most of the published drive."""
+    drive, test = (reference_file(f"data/{n}.npz") for n in ("DYN-PP-ETHZMobil", "DYN-NMPC-ETHZ"))
+    trained = cli("train", "--data", drive, "--car", "orca", "--all-samples")
+    assert trained.code == 0, trained.err
+    assert "outside limits" not in trained.out
+    judged = cli("validate", "weights.bin", "--on", test, "--all-samples", "--json", "numbers.json")
+    assert judged.code == 0, judged.err
+    numbers = json.loads(Path("numbers.json").read_text())
+    for output, published in PUBLISHED_RMSE.items():
+        assert numbers[output]["rmse"] <= published
+        assert numbers[output]["coverage"] >= 0.90

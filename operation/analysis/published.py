@@ -9,7 +9,18 @@ from typing import Final, NamedTuple
 
 from operation.analysis.results import RaceResult
 
-__all__ = ["LIMIT", "SOURCE", "Comparison", "GpComparison", "compare_gp", "compare_laps"]
+__all__ = [
+    "GP",
+    "LAPS_OFF",
+    "LAPS_ON",
+    "LIMIT",
+    "SOURCE",
+    "Comparison",
+    "GpComparison",
+    "Lap",
+    "compare_gp",
+    "compare_laps",
+]
 
 SOURCE: Final = (
     "A. Jain, M. O'Kelly, P. Chaudhari, M. Morari: BayesRace: Learning to race autonomously using "
@@ -24,23 +35,25 @@ LIMIT: Final = (
 _TRACK: Final = "ethz"
 
 
-class _Lap(NamedTuple):
+class Lap(NamedTuple):
+    """From standstill on ETHZ; None where no lap was finished."""
+
     time_s: float | None
     off_samples: int | None
     off_max_m: float | None
 
 
-_LAPS_ON: Final = {
-    "worstcase": _Lap(None, None, None),
-    "bayesrace": _Lap(7.988, 9, 0.015),
-    "bayesrace-updated": _Lap(7.932, 11, 0.015),
-    "bestcase": _Lap(7.797, 12, 0.010),
+LAPS_ON: Final = {  # track constraints on
+    "worstcase": Lap(None, None, None),
+    "bayesrace": Lap(7.988, 9, 0.015),
+    "bayesrace-updated": Lap(7.932, 11, 0.015),
+    "bestcase": Lap(7.797, 12, 0.010),
 }
-_LAPS_OFF: Final = {
-    "worstcase": _Lap(8.694, 24, 0.110),
-    "bayesrace": _Lap(7.792, 17, 0.024),
-    "bayesrace-updated": _Lap(7.692, 17, 0.028),
-    "bestcase": _Lap(7.681, 14, 0.028),
+LAPS_OFF: Final = {  # … and off
+    "worstcase": Lap(8.694, 24, 0.110),
+    "bayesrace": Lap(7.792, 17, 0.024),
+    "bayesrace-updated": Lap(7.692, 17, 0.028),
+    "bestcase": Lap(7.681, 14, 0.028),
 }
 _SOLVE_MS: Final = {
     "worstcase": (8.4, 19.0, 21.0),
@@ -48,7 +61,7 @@ _SOLVE_MS: Final = {
     "bayesrace-updated": (280.0, 401.0, 493.0),
     "bestcase": (7.9, 13.6, 17.0),
 }
-_GP: Final = {  # RMSE without the GP, RMSE and R² before, RMSE and R² after the update
+GP: Final = {  # RMSE without the GP, RMSE and R² before, RMSE and R² after the update
     "vx": (0.0570, 0.00555, 0.932, 0.00065, 0.999),
     "vy": (0.0519, 0.0219, 0.820, 0.00039, 0.9999),
     "omega": (0.384, 0.176, 0.790, 0.142, 0.864),
@@ -82,7 +95,7 @@ def compare_laps(result: RaceResult) -> list[Comparison]:
     """Rows for the controllers that drove; none on any other track than the paper's."""
     if result.settings.track.lower() != _TRACK:
         return []
-    published = _LAPS_ON if result.settings.constraints else _LAPS_OFF
+    published = LAPS_ON if result.settings.constraints else LAPS_OFF
     rows = []
     for lap in result.laps:
         paper = published.get(lap.controller)
@@ -112,7 +125,7 @@ def compare_gp(result: RaceResult) -> list[GpComparison]:
     if result.settings.track.lower() != _TRACK:
         return []
     rows = []
-    for output, (plain, before, r2_before, after, r2_after) in _GP.items():
+    for output, (plain, before, r2_before, after, r2_after) in GP.items():
         ours, updated = result.gp.get(output), result.gp_updated.get(output)
         if ours is not None:
             rows.append(

@@ -113,18 +113,20 @@ def validate_weights(
     runs: tuple[int, ...] | None = None,
     threshold: float = UNCERTAIN,
     car: CarParameters | None = None,
+    *,
+    limits: bool = True,
 ) -> Validated:
     """Judges weights on logs (MCAP) or arrays (``.npz``), filtered as for training.
 
     They are judged by what was true; by what was measured, if that is all that a log holds, as that
     of a real car. The discretisation is the one that the weights were learned with. ``car``:
-    theirs, needed where it is not built in. InputError for drives of another car or step, or
-    without samples.
+    theirs, needed where it is not built in. ``limits``: leave out samples outside its limits.
+    InputError for drives of another car or step, or without samples.
     """
     car = car or get_car(weights.car)
     discretisation = discretisation_of(weights.discretisation, car)
     measured, data = (
-        read_samples(drives, car, name, discretisation, runs, truth).dataset
+        read_samples(drives, car, name, discretisation, runs, truth, limits=limits).dataset
         for truth in (False, True)
     )
     if len(data) == 0:

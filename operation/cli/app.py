@@ -21,6 +21,7 @@ from operation.cli import (
     latency,
     learning,
     operation,
+    paper,
     parts,
     preparation,
     raceline,
@@ -51,7 +52,7 @@ _TASKS: Final[dict[str, tuple[Callable[..., None], ...]]] = {
         operation.go, operation.router,
     ),
     "Learn while driving": (learning.learn, learning.publish, learning.rollback),
-    "Measure": (evaluation.bench, latency.latency),
+    "Measure": (evaluation.bench, latency.latency, paper.paper),
     "Many laps": (
         campaign.campaign, campaign.campaign_report, campaign.campaign_worker, campaign.tune,
     ),

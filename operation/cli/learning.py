@@ -8,7 +8,15 @@ import typer
 
 from bayesrace.files import write_whole
 from bayesrace.vehicles import DEFAULT_CAR
-from operation.cli.options import Car, CarName, Endpoint, Seed, connect_to, writable
+from operation.cli.options import (
+    AllSamples,
+    Car,
+    CarName,
+    Endpoint,
+    Seed,
+    connect_to,
+    writable,
+)
 from operation.terminal.notation import UNCERTAIN
 
 if TYPE_CHECKING:
@@ -83,10 +91,12 @@ def validate(
         typer.Option(metavar="CAR", help="TOML file of the weights' car if it is not built in."),
     ] = "",
     name: CarName = "",
+    all_samples: AllSamples = False,
 ) -> None:
     """Validate weights on a drive: error, coverage, and drift over one step and the horizon.
 
-    Use drives that the weights were not trained on. The filters of the training apply here, too.
+    Use drives that the weights were not trained on. The filters of the training apply here, too;
+    --all-samples keeps samples beyond the car's limits.
     """
 
     from bayesrace.gp.weights import read_weights
@@ -99,7 +109,9 @@ def validate(
     parameters = get_car(car) if car else None
     course = None if track is None else load_track(track)
     runs = tuple(run) if run else None
-    judged = validate_weights(read_weights(weights), on, name, runs, threshold, parameters)
+    judged = validate_weights(
+        read_weights(weights), on, name, runs, threshold, parameters, limits=not all_samples
+    )
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
     text = judged.result.model_dump_json(indent=1) + "\n"

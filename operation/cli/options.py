@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from plant.sensors import SensorNoise
 
 __all__ = [
+    "AllSamples",
     "Car",
     "CarName",
     "Delay",
@@ -60,6 +61,13 @@ Tyres = Annotated[
         metavar="TYRES",
         show_default="the car's",
         help="pacejka: of the same stiffness as the car's linear tyres, saturating.",
+    ),
+]
+AllSamples = Annotated[
+    bool,
+    typer.Option(
+        "--all-samples",
+        help="Keep samples beyond the car's limits, as the paper's published drives have them.",
     ),
 ]
 Seed = Annotated[

@@ -11,6 +11,7 @@ import typer
 from bayesrace.errors import InputError
 from bayesrace.vehicles import DEFAULT_CAR
 from operation.cli.options import (
+    AllSamples,
     Car,
     CarName,
     FmuFile,
@@ -260,6 +261,7 @@ def train(
         typer.Option(metavar="CAR", show_default="named by the files", help="Car that drove."),
     ] = "",
     name: CarName = "",
+    all_samples: AllSamples = False,
 ) -> None:
     """Train the three GPs on the residual in run logs or plain arrays.
 
@@ -285,7 +287,8 @@ def train(
         parameters = parameters or get_car(manifest.car)
         wanted = discretisation_of(manifest.discretisation, parameters)
         manifest.check_points(points)
-    samples = read_samples([*(logs or []), *(data or [])], parameters, name, wanted)
+    files = [*(logs or []), *(data or [])]
+    samples = read_samples(files, parameters, name, wanted, limits=not all_samples)
     console = Terminal()
     every = tuple(one.value for one in KernelChoice if one is not KernelChoice.auto)
     settings = TrainingSettings(

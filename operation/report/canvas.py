@@ -1,4 +1,4 @@
-"""Figures of one panel; figures to SVG to be embedded in a page, and to PNG."""
+"""Figures of one panel; figures to SVG to be embedded in a page, to PDF and to PNG."""
 
 import io
 import re
@@ -7,12 +7,13 @@ from typing import Final
 
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from bayesrace.files import replacing
 
-__all__ = ["PANEL_WIDTH", "inline_svg", "panel", "write_png"]
+__all__ = ["PANEL_WIDTH", "inline_svg", "panel", "write_pdf", "write_png"]
 
 PANEL_WIDTH: Final = 5.2
 """Of a panel [inch]: legible on a telephone, and two beside each other on a wide page."""
@@ -52,6 +53,13 @@ def inline_svg(figure: Figure) -> str:
     text = _SIZE.sub("", _DROPPED.sub("", buffer.getvalue()), count=2)
     # A hundredth of a point is enough for lines; texts keep their digits.
     return _PATH.sub(lambda match: _LONG.sub(r"\1", match.group()), text)
+
+
+def write_pdf(figure: Figure, path: Path) -> None:
+    """Writes the figure as a PDF file, whole or not at all; the same figure gives the same file."""
+    FigureCanvasPdf(figure)
+    with replacing(path) as partial:
+        figure.savefig(partial, metadata={"CreationDate": None})
 
 
 def write_png(figure: Figure, path: Path, dpi: int = 120) -> None:

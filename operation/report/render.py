@@ -7,7 +7,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from matplotlib.figure import Figure
 from pydantic import ValidationError
 
@@ -31,7 +31,7 @@ from operation.report.traces import (
 from operation.terminal.notation import UNCERTAIN
 from operation.terminal.race_table import COLUMNS, GP_COLUMNS, gp_cells
 
-__all__ = ["PICTURE", "REPORT", "render_report"]
+__all__ = ["PICTURE", "REPORT", "render_report", "template"]
 
 REPORT: Final = "report.html"
 PICTURE: Final = "lap.png"
@@ -48,14 +48,7 @@ def render_report(run_dir: Path, result: RaceResult, analysis: RaceAnalysis | No
     """
     run_dir = Path(run_dir)
     analysis = analysis or read_race(run_dir)
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    page = environment.get_template(_TEMPLATE).render(
+    page = template(_TEMPLATE).render(
         result=result,
         columns=COLUMNS,
         gp_columns=GP_COLUMNS,
@@ -77,6 +70,19 @@ def render_report(run_dir: Path, result: RaceResult, analysis: RaceAnalysis | No
     path = run_dir / REPORT
     write_whole(path, page)
     return path
+
+
+def template(name: str, folder: Path | None = None) -> Template:
+    """The template of a page, in this folder or another one; it can include the style."""
+    here = Path(__file__).parent
+    environment = Environment(
+        loader=FileSystemLoader([folder or here, here]),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(name)
 
 
 def _facts(analysis: RaceAnalysis, result: RaceResult) -> list[tuple[str, str]]:

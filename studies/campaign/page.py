@@ -3,11 +3,9 @@
 from pathlib import Path
 from typing import Final
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
 from bayesrace.files import write_whole
-from operation import report
 from operation.report.canvas import inline_svg
+from operation.report.render import template
 from operation.report.style import figure_style, look
 from studies.campaign.figures import factor_figures, pair_figures
 from studies.campaign.summary import read_laps
@@ -36,15 +34,7 @@ def render_campaign(folder: Path) -> Path:
             )
             for first, second in laps.pairs()
         ]
-    folders = [Path(__file__).parent, *map(Path, report.__path__)]
-    environment = Environment(
-        loader=FileSystemLoader(folders),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    page = environment.get_template(_TEMPLATE).render(
+    page = template(_TEMPLATE, Path(__file__).parent).render(
         title=folder.resolve().name,
         facts=laps.facts(),
         summaries=laps.summaries(),

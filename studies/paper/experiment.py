@@ -1,0 +1,108 @@
+"""A car with everything that its drives need, and its laps; results that are kept."""
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from bayesrace.cache import cache_folder, digest, kept, software
+from bayesrace.cpu import cpu_identity
+from bayesrace.errors import InputError
+from bayesrace.files import read_text
+from bayesrace.gp.weights import GpWeights, read_weights
+from bayesrace.log import LogReader, LogWriter
+from bayesrace.messages import EVENT, STATE, TELEMETRY, TRUTH
+from controller.assembly import compiled_controller
+from controller.settings import MpcSettings
+from learning.dataset import Dataset, concatenate
+from learning.logs import dataset_from_messages, fallback_cycles
+from operation.analysis.race import DrivenRun
+from operation.analysis.recording import PlannedRun, RunRecord
+from operation.closed_loop import ClosedLoop, built_in_car
+from operation.preparation import PredictionModel, prepare, trained_weights, training_settings
+from operation.settings import PreparationSettings
+from operation.terminal.progress import Stages
+from studies.campaign.case import software_identity
+
+__all__ = ["Experiment", "stored"]
+
+
+class Experiment:
+    """One car on one track: training drive, weights, and laps from standstill."""
+
+    def __init__(
+        self, settings: PreparationSettings, track: str, stages: Stages,
+        models: Sequence[PredictionModel] = ("e_kinematic", "dynamic"),
+    ) -> None:  # fmt: skip
+        """``models``: that laps are predicted by. Raises as
+        :func:`~operation.preparation.prepare`."""
+        self.settings, self.car = settings, settings.driven_car
+        prepared = prepare(settings, (track,), stages, models)
+        if prepared.training is None:
+            raise RuntimeError("without given weights there is a training drive")
+        self.track, self._line = prepared.first.track, prepared.first.line
+        self.train_track = prepared.training.driven_on.track
+        self.training = prepared.training.samples
+        self.weights, self._artefacts = read_weights(prepared.weights), prepared.artefacts
+        self._vehicle = built_in_car(self.car)
+
+    def drive(
+        self, controller: str, weights: GpWeights | None = None, constraints: bool = True,
+        speed: float = 1.0,
+    ) -> DrivenRun:  # fmt: skip
+        """A lap from standstill, or up to where the car is farther off than the track is wide.
+
+        ``speed``: share of the racing line's that is planned.
+        """
+        line = replace(self._line, vx_mps=speed * self._line.vx_mps)
+        artefact = self._artefacts[controller == "bestcase"]
+        mpc = MpcSettings(constraints=constraints)
+        law = compiled_controller(artefact, self.car, self.track, line, weights, mpc)
+        record = RunRecord(PlannedRun(1, controller, law.weights_version))
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "lap.mcap"
+            log = LogWriter(path)
+            ClosedLoop(self.car, self.track, line, law, self._vehicle, log).drive(1)
+            log.close()
+            for entry in LogReader(path).messages((STATE, TRUTH, TELEMETRY, EVENT)):
+                record.add(entry.message)
+        run = DrivenRun(record, self.track, line)
+        width_m = float(np.max(self.track.width_left_m + self.track.width_right_m))
+        lost = np.flatnonzero(run.on_track.off_track_m > width_m)
+        if not len(lost):
+            return run
+        return DrivenRun(replace(record, truth=record.truth[: lost[0] + 1]), self.track, line)
+
+    def samples(self, run: DrivenRun) -> Dataset:
+        """What can be learned from a lap."""
+        record, step_s = run.record, self.settings.discretisation.step_s
+        fallback = fallback_cycles(record.telemetry)
+        return dataset_from_messages(record.states, fallback, self.car, step_s)
+
+    def updated(self, lap: DrivenRun) -> GpWeights:
+        """Learned from training drive and lap, beginning with the weights before."""
+        samples, settings = concatenate([self.training, self.samples(lap)]), self.settings
+        learned = training_settings(settings)
+        path = trained_weights(samples, settings.discretisation, learned, self.weights)
+        return read_weights(path)
+
+
+def stored(name: str, parts: Iterable[str], make: Callable[[], Any]) -> Any:
+    """What ``make`` returned for these parts, this software and this machine, as JSON."""
+    own = software(("studies/paper/kernels.py", "studies/bench.py"), ())
+    key = digest((*parts, *own, software_identity(), cpu_identity()))
+
+    def read(path: Path) -> Any:
+        try:
+            return json.loads(read_text(path, "a kept result"))
+        except ValueError as error:
+            raise InputError(f"{path}: {error}") from error
+
+    def write(path: Path) -> None:
+        path.write_text(json.dumps(make()))
+
+    return kept(cache_folder() / f"{name}-{key}.json", write, read)

@@ -1,0 +1,172 @@
+"""Laps: prediction against the plant, and BayesRace against BestCase (sections 4.3 and 4.4)."""
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from bayesrace.arrays import Floats
+from bayesrace.tracks import Track
+from bayesrace.vehicles.models import dynamic
+from operation.analysis.published import LAPS_OFF, LAPS_ON
+from operation.analysis.race import DrivenRun
+from operation.report.canvas import panel
+from operation.report.maps import draw_edges, show_all
+from operation.report.style import MUTED, WARNING, look
+from operation.report.traces import input_figures
+from plant.simulator import PLANT
+from studies.paper.experiment import Experiment
+from studies.paper.finding import Figures, Finding, Section, at_most
+
+__all__ = ["Laps", "course", "lap_figures", "lap_text", "loop_sections"]
+
+Laps = Mapping[tuple[str, bool], DrivenRun]
+"""By controller, and whether with track constraints."""
+
+_EVERY_S: Final = 0.5
+_GREEN: Final = "#009E73"
+_MEAN_M: Final = 0.034
+_LARGEST_M: Final = 0.122
+"""Published: position at the horizon's end, prediction against plant, with correction."""
+_FASTER_S: Final = 0.5
+"""Published: the correction shortens the lap by more."""
+_ETHZ_M: Final = 17.84
+_STAGES: Final = {
+    True: ("before", "section 4.3", "on", "the same pattern, drifting with time", 0.2),
+    False: ("after", "section 4.4", "off, as in the paper", "nearly the same", 0.02),
+}
+"""Where laps with and without track constraints are compared, what the paper says of the inputs,
+and the share of the largest steering angle that is taken for it."""
+_LAPS: Final = "over 0.5 s shorter (its code run again: 8.694 and 7.792 s)"
+_GAIN: Final = "the corrected lap is more than 0.5 s shorter, or the only one"
+_HALF: Final = "ours is at least half of the published factor"
+_LIMITS: Final = "our training drive keeps to the car's limits and visits fewer states"
+_TEXT: Final = (
+    f"Every {_EVERY_S:g} s the controller's plan (red) and where the car goes by the planned "
+    "inputs (green), without correction and with it; track constraints off, as the published "
+    "WorstCase finishes no lap with them. A horizon is 0.4 s."
+)
+
+
+def loop_sections(laps: Laps, one: Experiment) -> list[Section]:
+    """Mismatch; before the update; after the update."""
+    return [
+        _mismatch(laps, one),
+        _comparison(laps, one, "bayesrace", True),
+        _comparison(laps, one, "bayesrace-updated", False),
+    ]
+
+
+def _mismatch(laps: Laps, one: Experiment) -> Section:
+    figures: Figures = {}
+    apart_m: dict[str, Floats] = {}
+    runs = {name: laps[name, False] for name in ("worstcase", "bayesrace")}
+    for name, run in runs.items():
+        time_s, predicted, driven = _horizons(run, one)
+        apart_m[name] = np.linalg.norm(predicted[:, -1] - driven[:, -1], axis=1)
+        figure, axes = course(one.track, run.record.x[:, :2], look(name).name)
+        axes.plot(*run.record.x[run.shown(), :2].T, color=MUTED, linewidth=0.8)
+        shown = np.flatnonzero(np.diff(time_s // _EVERY_S, prepend=-1.0) > 0)
+        for paths, colour in ((driven, _GREEN), (predicted, WARNING)):
+            axes.plot(*paths[shown].transpose(2, 1, 0), color=colour, linewidth=1.4)
+        figures[f"mismatch-{name}"] = figure
+    plain_m, mean_m = (float(one.mean()) for one in apart_m.values())
+    factor, same = plain_m / mean_m, _is_ethz(one.track)
+    worst_s, corrected_s = (run.result().lap_time_s for run in runs.values())
+    gain = corrected_s is not None and (worst_s is None or worst_s - corrected_s > _FASTER_S)
+    largest_m = float(apart_m["bayesrace"].max())
+    texts = "; ".join(lap_text(run) for run in runs.values())
+    at_end = "mismatch at the end of the horizon, with correction"
+    findings = [
+        at_most(f"mean {at_end}", _MEAN_M, mean_m, "m", _LIMITS, same),
+        at_most(f"largest {at_end}", _LARGEST_M, largest_m, "m", _LIMITS, same),
+        Finding("the correction divides the mean by", "6.5", f"{factor:.1f}", _HALF, factor > 3.25),
+        Finding("laps without and with correction", _LAPS, texts, _GAIN, gain),
+    ]
+    return Section("Prediction against the car", "section 4.3", _TEXT, figures, findings)
+
+
+def _horizons(run: DrivenRun, one: Experiment) -> tuple[Floats, Floats, Floats]:
+    """Time of each plan of the lap (m,), its positions, and those that the car reaches by its
+    inputs, (m, N + 1, 2)."""
+    shown = {truth.seq: truth.time_s for truth in run.record.truth[run.shown()]}
+    plans = [plan for plan in run.record.telemetry if plan.plan_x and plan.state_seq in shown]
+    x = np.array([plan.plan_x for plan in plans]).reshape(len(plans), -1, 7)
+    u = np.array([plan.plan_u for plan in plans]).reshape(len(plans), -1, 2)
+    step, state, driven = PLANT.discretise(dynamic(one.car)), x[:, 0].T, [x[:, 0, :2]]
+    for k in range(u.shape[1]):
+        state = np.asarray(step(state, u[:, k].T))
+        driven.append(state[:2].T)
+    time_s = np.array([shown[plan.state_seq] for plan in plans])
+    return time_s, x[..., :2], np.stack(driven, axis=1)
+
+
+def _comparison(laps: Laps, one: Experiment, controller: str, constraints: bool) -> Section:
+    run, best = laps[controller, constraints], laps["bestcase", constraints]
+    paper, same = LAPS_ON if constraints else LAPS_OFF, _is_ethz(one.track)
+    findings, times = [], []
+    for lap in (run, best):
+        name, (time_s, off, _), own = look(lap.controller).name, paper[lap.controller], lap.result()
+        left = own.off_track_samples
+        findings.append(at_most(f"lap of {name}", time_s or 0, own.lap_time_s, "s", "", same))
+        findings.append(at_most(f"samples off track, {name}", off or 0, left, "", "", same))
+        times.append((time_s, own.lap_time_s))
+    theirs, ours = (
+        None if None in pair else abs(np.subtract(*pair)) for pair in zip(*times, strict=True)
+    )
+    findings.append(at_most("both laps apart", theirs or 0.0, ours, "s"))
+    stage, place, on, statement, limit = _STAGES[constraints]
+    apart_rad, limit_rad = _unlike(run, best), limit * one.car.delta_max_rad
+    what = "steering apart at the same place (RMS)"
+    criterion = f"it is less than {100 * limit:g} % of the largest angle"
+    ours_text, holds = f"{apart_rad:.4f} rad", apart_rad < limit_rad
+    findings.append(Finding(what, statement, ours_text, criterion, holds))
+    text = f"Position and inputs on the lap from standstill; track constraints {on}."
+    title = f"BayesRace against BestCase, {stage} the update"
+    return Section(title, place, text, lap_figures(stage, [run, best], one), findings)
+
+
+def _unlike(run: DrivenRun, best: DrivenRun) -> float:
+    """RMS difference of the steering angle along the track [rad]."""
+    s = np.linspace(0.0, float(best.on_track.progress_m[best.shown()].max()), 500)
+    angles = []
+    for one in (run, best):
+        way = np.maximum.accumulate(one.on_track.progress_m[one.shown()])
+        angles.append(np.interp(s, way, one.record.x[one.shown(), 6]))
+    return float(np.sqrt(np.mean((angles[0] - angles[1]) ** 2)))
+
+
+def lap_figures(name: str, runs: Sequence[DrivenRun], one: Experiment) -> Figures:
+    """Position and inputs of first laps."""
+    figure, axes = course(one.track, runs[0].record.x[:, :2], "position")
+    for run, dashes in zip(runs, ("solid", (0, (4, 2))), strict=True):
+        xy, appearance = run.record.x[run.shown(), :2], look(run.controller)
+        axes.plot(*xy.T, color=appearance.colour, linestyle=dashes, label=appearance.name)
+    axes.legend(loc="best")
+    inputs = zip(("drive", "angle", "rate"), input_figures(runs, one.track, one.car), strict=True)
+    return {f"position-{name}": figure} | {f"{key}-{name}": drawn for key, drawn in inputs}
+
+
+def course(track: Track | None, xy: Floats, title: str) -> tuple[Figure, Axes]:
+    """Axes with the track, or with room for the points (n, 2) where it is not known."""
+    edges = [] if track is None else [*track.boundaries(0.04)]
+    corners = np.concatenate(edges or [xy])
+    width, height = np.ptp(corners, axis=0)
+    figure, axes = panel(min(max(4.3 * height / width + 0.8, 2.6), 6.0))
+    if edges:
+        draw_edges(axes, *edges)
+    show_all(axes, corners)
+    axes.set(xlabel="x [m]", ylabel="y [m]", title=title)
+    return figure, axes
+
+
+def lap_text(run: DrivenRun) -> str:
+    """Time and excursions."""
+    time_s, off = run.result().lap_time_s, run.result().off_track_samples
+    return f"{'no lap' if time_s is None else f'{time_s:.3f} s'}, {off} samples off track"
+
+
+def _is_ethz(track: Track) -> bool:
+    return abs(track.length_m - _ETHZ_M) < 0.1

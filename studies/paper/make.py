@@ -1,0 +1,185 @@
+"""What is asked for, all sections in order, and the page."""
+
+import json
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from itertools import product
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from bayesrace.errors import InputError
+from bayesrace.files import write_whole
+from bayesrace.integrators import PREDICTION
+from bayesrace.raceline import RaceLineSettings
+from bayesrace.vehicles import get_car
+from learning.arrays import dataset_from_npz
+from operation.analysis.published import SOURCE
+from operation.preparation import training_settings
+from operation.report.canvas import inline_svg, write_pdf
+from operation.report.render import template
+from operation.report.style import figure_style
+from operation.settings import PreparationSettings
+from operation.terminal.progress import Stages
+from studies.bench import BenchResult, BenchSettings, run_bench
+from studies.paper.experiment import Experiment, stored
+from studies.paper.finding import Finding, Section
+from studies.paper.kernels import kernel_section, smoothness
+from studies.paper.loop import loop_sections
+from studies.paper.models import model_section
+from studies.paper.residual import Learned, learned, learning_sections
+from studies.paper.tenth import tenth_section
+
+__all__ = ["DRIVES", "PaperSettings", "make_paper"]
+
+_TRACKS: Final = "ethzmobil.csv", "ethz.csv"
+"""Training and race track of the paper's 1:43 car."""
+_TENTH_TRACK: Final = "f110_map2.csv"
+"""Track of appendix B, which may be missing."""
+DRIVES: Final = "DYN-PP-ETHZMobil.npz", "DYN-GPMPC-ETHZ.npz", "DYN-NMPC-ETHZ.npz"
+"""Published drives: pure pursuit, BayesRace's lap, BestCase's lap."""
+_SAMPLES: Final = 400
+"""Of each published drive, as the paper uses them."""
+_PAPER_MS: Final = 260.0, 100.0
+"""Published solve time, mean and standard deviation."""
+_PAGE: Final = "paper.html"
+_FIGURES: Final = "figures"
+
+
+class PaperSettings(NamedTuple):
+    """Folders of tracks and published drives, if there are any; InputError for missing files.
+
+    ``quick``: fewer kernels, points, seeds and problems. ``seed``: of training drives and GPs.
+    """
+
+    tracks: Path | None = None
+    data: Path | None = None
+    quick: bool = False
+    seed: int = 0
+
+    @property
+    def drives(self) -> tuple[Path, ...]:
+        """Files of the published drives; none without them."""
+        return _files(self.data, DRIVES, "--data")
+
+    @property
+    def orca(self) -> tuple[PreparationSettings, str]:
+        """Of the 1:43 car, and its race track."""
+        train, race = _files(self.tracks, _TRACKS, "--tracks") or ("", "")
+        car = get_car("orca")
+        return self._of(car=car, train_track=str(train)), str(race) or car.race_track
+
+    @property
+    def tenth(self) -> tuple[PreparationSettings, str]:
+        """Of the 1:10 car, and its race track; the paper's is trained on, too.
+
+        There the racing line assumes a friction of 1, as published.
+        """
+        car = get_car("f1tenth")
+        race = (self.tracks or Path()) / _TENTH_TRACK
+        if self.tracks is None or not race.is_file():
+            return self._of(car=car), car.race_track
+        line = RaceLineSettings(friction=1.0)
+        return self._of(car=car, train_track=str(race), raceline=line), str(race)
+
+    def _of(self, **others: Any) -> PreparationSettings:
+        fewer: Any = {"kernels": ("matern25",), "points": 150} if self.quick else {}
+        return PreparationSettings(seed=self.seed, **fewer, **others)
+
+
+def _files(folder: Path | None, names: Iterable[str], option: str) -> tuple[Path, ...]:
+    """These files of the folder, none without a folder; InputError naming missing ones."""
+    files = () if folder is None else tuple(folder / name for name in names)
+    missing = ", ".join(path.name for path in files if not path.is_file())
+    if missing:
+        raise InputError(f"{option} {folder}: no {missing} there; docs/paper.md lists the files")
+    return files
+
+
+def make_paper(settings: PaperSettings, out: Path, stages: Stages) -> tuple[Path, list[Section]]:
+    """Writes the page into the folder; its path, and what is on it.
+
+    Raises InputError for missing files, and as :func:`~operation.preparation.prepare`.
+    """
+    (orca, race), tenth, drives = settings.orca, settings.tenth, settings.drives
+    out.mkdir(parents=True, exist_ok=True)
+    one = Experiment(orca, race, stages)
+    weights = {"bayesrace": one.weights, "worstcase": None, "bestcase": None}
+    with stages.stage("drive the laps"):
+        pairs = product(weights, (True, False))
+        laps = {pair: one.drive(pair[0], weights[pair[0]], pair[1]) for pair in pairs}
+    with stages.stage("update the residual, drive again"):
+        after, updated = one.updated(laps["bayesrace", True]), "bayesrace-updated"
+        laps |= {(updated, on): one.drive(updated, after, on) for on in (True, False)}
+    tracks, test = (one.train_track, one.track), one.samples(laps["bestcase", True])
+    every = [Learned("our", one.training, test, tracks, (one.weights, after))]
+    if drives:
+        arrays = [dataset_from_npz(path, one.car, PREDICTION.step_s) for path in drives]
+        own = training_settings(orca).model_copy(update={"capacity": 2 * _SAMPLES})
+        shown = (None, None) if settings.tracks is None else tracks
+        every.append(learned([x.select(slice(_SAMPLES)) for x in arrays], own, shown, stages))
+    points, seeds, problems, peers = (100, 2, 60, 3) if settings.quick else (320, 5, 300, 15)
+    smooth = []
+    for data in every:
+        with stages.stage(f"smoothness of the kernel, {data.name} data") as stage:
+            smooth.append(smoothness(*data[:3], points, seeds, stage))
+    bench = BenchSettings(**dict(orca), tracks=(race,), problems=problems, peers=peers)
+    with stages.stage("solve times"):
+        key = bench.model_dump_json()
+        solved = stored("bench", [key], lambda: run_bench(bench, stages).model_dump())
+    small = Experiment(*tenth, stages, ("e_kinematic",))
+    with figure_style(), stages.stage("figures and page"):
+        sections = [
+            model_section(one.car),
+            *learning_sections(every),
+            *loop_sections(laps, one),
+            kernel_section(smooth, points),
+            tenth_section(small),
+            _solving(BenchResult.model_validate(solved)),
+        ]
+        how = f"{'quick' if settings.quick else 'in full'}, seed {settings.seed}"
+        facts = {"tracks": f"{one.train_track.name}, {one.track.name}", "how": how}
+        return _write(out, sections, facts), sections
+
+
+def _solving(result: BenchResult) -> Section:
+    """The paper's solver there and here, and the compiled step."""
+    (mean, spread), ipopt, step = _PAPER_MS, result.ipopt_us, result.step_us
+    text = (
+        f"One step of the GP-MPC with {result.gp_points} points per GP, by bayesrace bench on this "
+        f"machine: {result.problems} problems of a lap, of which IPOPT solves {result.peers}. The "
+        "paper's machine is a 2.9 GHz dual-core Core i5."
+    )
+    paper, what = f"{mean:.0f} ± {spread:.0f} ms", "the paper's formulation in CasADi and IPOPT"
+    ours = f"{ipopt.p50 / 1e3:.0f} ms at the median, at most {ipopt.max / 1e3:.0f} ms"
+    near, reason = "our median is within the published deviation", "the machine is another one"
+    fast = f"{result.speedup_p50:.0f} times as fast: p50 {step.p50:.0f}, p99 {step.p99:.0f} µs"
+    ten = "the compiled step is at least ten times as fast"
+    expected = "an order of magnitude is expected of FORCES PRO"
+    findings = [
+        Finding(what, paper, ours, near, abs(ipopt.p50 / 1e3 - mean) <= spread, reason),
+        Finding("a faster solver", expected, fast, ten, result.speedup_p50 >= 10),
+    ]
+    return Section("Time to solve", "appendix B", text, {}, findings)
+
+
+def _write(out: Path, sections: Sequence[Section], facts: dict[str, str]) -> Path:
+    """Writes page, numbers and figures into the folder; returns the page's path."""
+    folder = out / _FIGURES
+    folder.mkdir(parents=True, exist_ok=True)
+    drawn = {}
+    for name, figure in (pair for section in sections for pair in section.figures.items()):
+        drawn[name] = inline_svg(figure)
+        write_whole(folder / f"{name}.svg", drawn[name])
+        write_pdf(figure, folder / f"{name}.pdf")
+    rows = [
+        {"section": section.title, "verdict": one.verdict, **one._asdict()}
+        for section in sections
+        for one in section.findings
+    ]
+    write_whole(out / "numbers.json", json.dumps(rows, indent=1, ensure_ascii=False) + "\n")
+    counts = Counter(row["verdict"] for row in rows)
+    facts |= {verdict: f"{count} findings" for verdict, count in counts.most_common()}
+    page = template(f"{_PAGE}.j2", Path(__file__).parent)
+    shown = {"sections": sections, "drawn": drawn, "facts": facts, "folder": _FIGURES}
+    write_whole(out / _PAGE, page.render(source=SOURCE, **shown))
+    return out / _PAGE

@@ -1,0 +1,156 @@
+"""What is learned: data, GP errors with their bands, before and after the update (section 4)."""
+
+from collections.abc import Iterator, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+from threadpoolctl import threadpool_limits
+
+from bayesrace.gp.weights import OUTPUTS, UNITS, GpWeights, read_weights
+from bayesrace.integrators import PREDICTION
+from bayesrace.tracks import Track
+from learning.dataset import Dataset, concatenate
+from learning.settings import TrainingSettings
+from learning.validation import Validation, validate
+from operation.analysis.published import GP
+from operation.preparation import trained_weights
+from operation.report.gp import gp_figures
+from operation.report.style import INK, WARNING
+from operation.terminal.notation import SYMBOLS, UNCERTAIN
+from operation.terminal.progress import Stages
+from studies.paper.finding import Figures, Finding, Section, at_most
+from studies.paper.loop import course
+
+__all__ = ["Learned", "learned", "learning_sections"]
+
+_STAGES: Final = {"before": "bayesrace", "after": "bayesrace-updated"}
+_UNCERTAIN: Final = {"before": 90 / 400, "after": 2 / 400}
+"""Published share of uncertain samples."""
+_NEAR: Final = 0.05
+_COVERAGE: Final = {"vx": 0.50, "vy": 0.75, "omega": 0.92}
+"""Of the published 95 % intervals, before the update."""
+_CORNERS: Final = "mostly in fast corners, and while braking before corners"
+_LIMITS: Final = "our training drive keeps to the car's limits and visits fewer states"
+_HELD: Final = "the published drive holds the steering angle during a step, our model turns it"
+_DATA_TEXT: Final = (
+    "The training drive by pure pursuit, and BestCase's lap, which no GP was trained on: red where "
+    f"the largest of the three standard deviations is above {UNCERTAIN:g}. The published training "
+    "drive exceeds the car's limits; ours does not."
+)
+_ERROR_TEXT: Final = (
+    "Error of one step on BestCase's lap that the correction leaves, and the 95 % band that the "
+    "GPs predict: first before the update, then after it; red ticks as above."
+)
+
+
+class Learned(NamedTuple):
+    """Weights before and after the update, and the drives that they are about."""
+
+    name: str
+    training: Dataset
+    test: Dataset
+    tracks: tuple[Track | None, Track | None]
+    """Of both drives."""
+    weights: tuple[GpWeights, GpWeights]
+
+
+def learned(
+    drives: Sequence[Dataset], settings: TrainingSettings,
+    tracks: tuple[Track | None, Track | None], stages: Stages,
+) -> Learned:  # fmt: skip
+    """From the published drives: pure pursuit, BayesRace's lap, BestCase's."""
+    training, lap, test = drives
+    with stages.stage("train on the published drive") as stage:
+        path = trained_weights(training, PREDICTION, settings, None, stage.update)
+    both, before = concatenate([training, lap]), read_weights(path)
+    with stages.stage("update with the published lap") as stage:
+        path = trained_weights(both, PREDICTION, settings, before, stage.update)
+    return Learned("published", training, test, tracks, (before, read_weights(path)))
+
+
+def learning_sections(every: Sequence[Learned]) -> list[Section]:
+    """Data, and errors before and after the update."""
+    maps: Figures = {}
+    errors: dict[str, Figures] = {stage: {} for stage in _STAGES}
+    where: list[Finding] = []
+    numbers: list[Finding] = []
+    for one in every:
+        name, test = one.name, one.test
+        maps[f"training-{name}"] = _map(one.training, one.tracks[0], f"{name} training drive")
+        step_m = np.linalg.norm(test.x_next[:, :2] - test.x[:, :2], axis=1)
+        found = {}
+        for (stage, controller), weights in zip(_STAGES.items(), one.weights, strict=True):
+            # On a busy machine the threads of BLAS wait for each other longer than they work.
+            with threadpool_limits(1):
+                found[stage] = judged = validate(weights, test, PREDICTION)
+            title = f"{name} BestCase lap, {stage} the update"
+            maps[f"validation-{stage}-{name}"] = _map(test, one.tracks[1], title, judged)
+            drawn = gp_figures({controller: judged}, np.cumsum(step_m), float(step_m.sum()))
+            names = (f"error-{output}-{stage}-{name}" for output in OUTPUTS)
+            errors[stage] |= zip(names, drawn, strict=True)
+        where += _uncertain(one, found)
+        numbers += _numbers(name, found)
+    drawn_errors = errors["before"] | errors["after"]
+    place = "sections 4.2 and 4.4"
+    return [
+        Section("Data collection and validation", "section 4.1 to 4.4", _DATA_TEXT, maps, where),
+        Section("Errors and 95 % bands of the GPs", place, _ERROR_TEXT, drawn_errors, numbers),
+    ]
+
+
+def _map(
+    data: Dataset, track: Track | None, title: str, judged: Validation | None = None
+) -> Figure:
+    """Where the car was, in red where the GPs are uncertain."""
+    xy = data.x[:, :2]
+    figure, axes = course(track, xy, title)
+    axes.plot(*xy.T, color=INK, linewidth=0.9)
+    if judged is not None:
+        red = judged.uncertain(UNCERTAIN)
+        axes.plot(*np.where(red[:, None], xy, np.nan).T, ".-", color=WARNING, linewidth=2.4)
+        axes.set_title(f"{int(red.sum())} of {len(xy)}", loc="right", color=WARNING)
+    return figure
+
+
+def _uncertain(one: Learned, found: dict[str, Validation]) -> Iterator[Finding]:
+    """How many samples, and where."""
+    few = f"ours are fewer, or more by at most {100 * _NEAR:g} % of all samples"
+    for stage, share in _UNCERTAIN.items():
+        ours = float(found[stage].uncertain(UNCERTAIN).mean())
+        what = f"uncertain samples {stage} the update, {one.name} data"
+        paper, own = f"{100 * share:.1f} %", f"{100 * ours:.1f} %"
+        yield Finding(what, paper, own, few, ours <= share + _NEAR, _LIMITS)
+    red = found["before"].uncertain(UNCERTAIN)
+    corner = np.abs(one.test.x[:, 3] * one.test.x[:, 5])
+    if red.any() and not red.all():
+        hard, other = float(corner[red].mean()), float(corner[~red].mean())
+        own = f"lateral acceleration {hard:.2f} m/s² there, {other:.2f} elsewhere"
+        criterion = "uncertain samples corner harder than the others"
+        what = f"where samples are uncertain before the update, {one.name} data"
+        yield Finding(what, _CORNERS, own, criterion, hard > other)
+
+
+def _numbers(name: str, found: dict[str, Validation]) -> Iterator[Finding]:
+    """The published table on the published data; on ours, what correction and update gain."""
+    for output, (plain, before, _, after, _) in GP.items():
+        first, new = (found[stage].metrics[output] for stage in _STAGES)
+        symbol, unit, theirs = SYMBOLS[output], UNITS[output], _COVERAGE[output]
+        if name == "published":
+            what = f"RMSE of {symbol} before the update, published data"
+            yield at_most(what, before, first["rmse"], unit, _HELD)
+            what = f"RMSE of {symbol} after the update, published data"
+            yield at_most(what, after, new["rmse"], unit, _HELD)
+        else:
+            for step, paper, gain in (
+                ("correction", plain / before, first["uncorrected_rmse"] / first["rmse"]),
+                ("update", before / after, first["rmse"] / new["rmse"]),
+            ):
+                what = f"the {step} divides the RMSE of {symbol} by, {name} data"
+                half = "ours is at least half of the published factor"
+                yield Finding(what, f"{paper:.1f}", f"{gain:.1f}", half, gain >= paper / 2, _LIMITS)
+        ours = first["coverage"]
+        criterion = "ours is at least 0.9, or nearer to 0.95 than the published one"
+        holds = ours >= 0.9 or abs(ours - 0.95) < abs(theirs - 0.95)
+        what = f"coverage of the 95 % band of {symbol} before the update, {name} data"
+        yield Finding(what, f"{theirs:.2f}", f"{ours:.2f}", criterion, holds, _LIMITS)

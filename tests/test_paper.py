@@ -1,0 +1,138 @@
+"""``bayesrace paper``: verdicts follow from numbers, nothing is made twice, the page is whole."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.progress import TaskID
+
+from bayesrace.errors import InputError
+from bayesrace.integrators import PREDICTION
+from bayesrace.vehicles.models import dynamic
+from learning.hyperparameters import maximise, starts
+from learning.likelihood import PairDistances
+from learning.residual import residual
+from operation.terminal.progress import Stage
+from studies.paper import kernels
+from studies.paper.finding import Finding, at_most
+from studies.paper.kernels import kernel_section, smoothness
+from studies.paper.make import DRIVES, PaperSettings
+from studies.paper.models import model_section
+from tests.command_line import Cli, refused
+from tests.driven import CAR, drive
+from tests.programs import peanut
+
+QUIET = Stage(None, TaskID(0))
+
+
+# Verdicts ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("ours", "word"), [(0.9, "agrees"), (1.0, "agrees"), (1.1, "differs"), (np.nan, "differs")]
+)
+def test_a_verdict_follows_from_the_numbers(ours: float, word: str) -> None:
+    found = at_most("RMSE", 1.0, ours, "m/s", "the track is another one")
+    assert found.verdict == word
+    assert found.sentence.startswith("Agrees: " if word == "agrees" else "Differs: ")
+    assert ("another one" in found.sentence) == (word == "differs")
+    assert found.criterion in found.sentence
+
+
+def test_without_anything_to_compare_with_the_sentence_says_why() -> None:
+    found = Finding("lap", "7.797 s", "6.972 s", "ours is shorter", None, "another track")
+    assert (found.verdict, found.sentence) == ("not compared", "Not compared: another track.")
+
+
+def test_the_models_diverge_as_in_the_paper() -> None:
+    section = model_section(CAR)
+    assert [one.holds for one in section.findings] == [True, True]
+
+
+# Kernels -------------------------------------------------------------------------------------
+
+
+def test_an_isotropic_kernel_has_one_length_scale_and_less_likelihood() -> None:
+    data = drive(dynamic(CAR), 80, seed=1)
+    z = data.features / data.features.std(axis=0)
+    y = residual(data, PREDICTION)[:, 0]
+    y = (y - y.mean()) / y.std()
+    (start,) = starts(0, 0)
+    pairs = PairDistances(z)
+    one, six = (maximise("rbf", pairs, y, start, 60, isotropic=flag) for flag in (True, False))
+    assert np.ptp(one.covariance.lengths) == 0
+    assert np.ptp(six.covariance.lengths) > 0
+    assert one.log_likelihood < six.log_likelihood
+
+
+def test_what_was_computed_before_an_interruption_is_not_computed_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("BAYESRACE_CACHE", str(tmp_path))
+    training, test = drive(dynamic(CAR), 60, seed=1), drive(dynamic(CAR), 40, seed=2)
+    computed: list[tuple[str, bool]] = []
+
+    def errors(kind: str, isotropic: bool, *_: object) -> object:
+        if len(computed) == 3:
+            raise KeyboardInterrupt
+        computed.append((kind, isotropic))
+        return [0.1 * len(computed)] * 6
+
+    monkeypatch.setattr(kernels, "_errors", errors)
+    with pytest.raises(KeyboardInterrupt):
+        smoothness("our", training, test, 30, 2, QUIET)
+    before, computed[:] = [*computed], []
+    monkeypatch.setattr(kernels, "_errors", lambda *_: [1.0] * 6)
+    found = smoothness("our", training, test, 30, 2, QUIET)
+    assert len(before) == 3
+    assert found.rmse.shape == (2, 4, 2, 3)
+    assert found.rmse[0, :, 0, 0] == pytest.approx([0.1, 0.2, 0.3, 1.0])
+    verdicts = [one.verdict for one in kernel_section([found], 30).findings]
+    assert verdicts == ["differs"] * 3
+
+
+# Input ---------------------------------------------------------------------------------------
+
+
+def test_a_folder_without_the_files_is_refused(cli: Cli, tmp_path: Path) -> None:
+    refused(cli("paper", "--tracks", tmp_path), "ethz.csv", "ethzmobil.csv", str(tmp_path))
+    refused(cli("paper", "--data", tmp_path / "none"), *DRIVES, "docs/paper.md")
+    with pytest.raises(InputError, match=re.escape(DRIVES[0])):
+        _ = PaperSettings(data=tmp_path).drives
+
+
+def test_the_tenth_car_takes_the_papers_track_where_there_is_one(tmp_path: Path) -> None:
+    for name in ("ethz", "ethzmobil"):
+        peanut(tmp_path / f"{name}.csv")
+    assert PaperSettings(tracks=tmp_path).tenth[1] == "workshop"
+    (tmp_path / "f110_map2.csv").touch()
+    settings, race = PaperSettings(tracks=tmp_path).tenth
+    assert settings.train_track == race == str(tmp_path / "f110_map2.csv")
+    assert settings.driven_car.friction == 1.0
+
+
+# The page ------------------------------------------------------------------------------------
+
+
+@pytest.mark.check
+@pytest.mark.unmeasured
+def test_the_quick_page_is_whole(cli: Cli, tmp_path: Path) -> None:
+    for name in ("ethz", "ethzmobil"):
+        peanut(tmp_path / f"{name}.csv")
+    out = tmp_path / "out"
+    made = cli("paper", "--quick", "--tracks", tmp_path, "--out", out)
+    assert made.code == 0, made.err
+    page, findings = (
+        (out / "paper.html").read_text(),
+        json.loads((out / "numbers.json").read_text()),
+    )
+    for one in findings:
+        assert (one["verdict"] == "not compared") == (one["holds"] is None)
+        assert one["reason"] or one["holds"] is not None
+        assert f"{one['verdict']}: {one['what']}" in made.out
+    drawn = [sorted(path.stem for path in out.glob(f"figures/*.{kind}")) for kind in ("svg", "pdf")]
+    assert drawn[0] == drawn[1]
+    assert page.count("<svg") == len(drawn[0]) >= 20
+    assert page.count('<td class="who">') == len(findings) >= 30
