@@ -40,6 +40,11 @@ __all__ = ["CarLimits", "car_limits", "solve", "top_speed"]
 
 _XI_MAX_RAD: Final = 1.2
 _ROUNDS: Final = 3
+_FIRST_ITERATIONS: Final = 100
+"""Short tracks need 30. On a long one the guess, at the car's limits, may lead nowhere; then the
+second try begins with ..."""
+_SLOWER: Final = 0.4
+"""... so much of its squared speeds and accelerations."""
 
 
 @dataclass(frozen=True)
@@ -205,25 +210,14 @@ def _guess(frame: Frame, limits: CarLimits, v_max: float) -> Floats:
 
 def _optimise(name: str, frame: Frame, limits: CarLimits, settings: RaceLineSettings) -> Clothoids:
     problem = _problem(frame, limits)
-    options: dict[str, Any] = {
-        "print_time": False,
-        "error_on_fail": False,
-        "ipopt": {
-            "print_level": 0,
-            "sb": "yes",
-            "tol": 1e-6,
-            "acceptable_iter": 0,
-            "max_iter": settings.max_iterations,
-        },
-    }
-    nlp = {"x": problem.x, "f": problem.f, "g": problem.g}
-    solver = ca.nlpsol("raceline", "ipopt", nlp, options)
     v_max = top_speed(limits)
-    low, high = _bounds(frame, limits, v_max)
     start = _guess(frame, limits, v_max)
-    with deferred_interrupt():
-        result = solver(x0=start, lbx=low, ubx=high, lbg=problem.g_min, ubg=0.0)
-    stats = solver.stats()
+    slow = start * np.repeat([1.0, 1.0, _SLOWER, 1.0, _SLOWER], len(start) // 5)
+    few = min(_FIRST_ITERATIONS, settings.max_iterations)
+    result, stats = _solved(problem, _bounds(frame, limits, v_max), start, few)
+    if not stats["success"]:
+        most = settings.max_iterations
+        result, stats = _solved(problem, _bounds(frame, limits, v_max), slow, most)
     if not stats["success"]:
         raise RaceLineError(
             f"no racing line for track '{name}': IPOPT ended with {stats['return_status']} after "
@@ -241,6 +235,28 @@ def _optimise(name: str, frame: Frame, limits: CarLimits, settings: RaceLineSett
         step_m=np.asarray(lengths).ravel(),
         turn_rad=float(frame.turn_rad.sum()),
     )
+
+
+def _solved(
+    problem: _Problem, bounds: tuple[Floats, Floats], start: Floats, iterations: int
+) -> tuple[Any, dict[str, Any]]:
+    """IPOPT's result and statistics, whether it has converged or not."""
+    options: dict[str, Any] = {
+        "print_time": False,
+        "error_on_fail": False,
+        "ipopt": {
+            "print_level": 0,
+            "sb": "yes",
+            "tol": 1e-6,
+            "acceptable_iter": 0,
+            "max_iter": iterations,
+        },
+    }
+    nlp = {"x": problem.x, "f": problem.f, "g": problem.g}
+    solver = ca.nlpsol("raceline", "ipopt", nlp, options)
+    with deferred_interrupt():
+        result = solver(x0=start, lbx=bounds[0], ubx=bounds[1], lbg=problem.g_min, ubg=0.0)
+    return result, solver.stats()
 
 
 def top_speed(limits: CarLimits) -> float:
