@@ -97,10 +97,11 @@ def solve(track: Track, car: CarParameters, settings: RaceLineSettings) -> RaceL
     """
     margin = car.width_m / 2 if settings.margin_m is None else settings.margin_m
     limits, tuning = car_limits(car, settings), car.tuning.raceline
-    extra = 0.0
+    extra, shares = 0.0, [1.0, _SLOWER]
     for _ in range(_ROUNDS):
         frame = build_frame(track, tuning, margin + extra)
-        line = sample_line(track, _optimise(track.name, frame, limits, settings), tuning.spacing_m)
+        path = _optimise(track.name, frame, limits, settings, shares)
+        line = sample_line(track, path, tuning.spacing_m)
         excess = float(np.max(track.project_path(line.xy_m).off_track_m)) + margin
         if excess <= tuning.tolerance_m:
             return replace(line, made_for=line_identity(track, car, settings))
@@ -208,16 +209,22 @@ def _guess(frame: Frame, limits: CarLimits, v_max: float) -> Floats:
     return np.concatenate([n, np.zeros(count), v**2, kappa, a])
 
 
-def _optimise(name: str, frame: Frame, limits: CarLimits, settings: RaceLineSettings) -> Clothoids:
+def _optimise(
+    name: str, frame: Frame, limits: CarLimits, settings: RaceLineSettings, shares: list[float]
+) -> Clothoids:
+    """The fastest path. ``shares`` of the guess's squared speeds and accelerations are tried in
+    turn; one that fails is dropped, but for the last."""
     problem = _problem(frame, limits)
     v_max = top_speed(limits)
-    start = _guess(frame, limits, v_max)
-    slow = start * np.repeat([1.0, 1.0, _SLOWER, 1.0, _SLOWER], len(start) // 5)
-    few = min(_FIRST_ITERATIONS, settings.max_iterations)
-    result, stats = _solved(problem, _bounds(frame, limits, v_max), start, few)
-    if not stats["success"]:
+    bounds, guess = _bounds(frame, limits, v_max), _guess(frame, limits, v_max)
+    while True:
+        start = guess * np.repeat([1.0, 1.0, shares[0], 1.0, shares[0]], len(guess) // 5)
         most = settings.max_iterations
-        result, stats = _solved(problem, _bounds(frame, limits, v_max), slow, most)
+        iterations = min(_FIRST_ITERATIONS, most) if len(shares) > 1 else most
+        result, stats = _solved(problem, bounds, start, iterations)
+        if stats["success"] or len(shares) == 1:
+            break
+        shares.pop(0)
     if not stats["success"]:
         raise RaceLineError(
             f"no racing line for track '{name}': IPOPT ended with {stats['return_status']} after "
