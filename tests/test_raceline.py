@@ -347,3 +347,13 @@ def test_reading_a_line_imports_no_optimiser(tmp_path: Path) -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
+
+
+def test_a_second_try_from_lower_speeds_finds_the_same_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """On the 343 m of Spielberg the first, from the car's limits, does not converge."""
+    monkeypatch.setattr("bayesrace.raceline.ocp._FIRST_ITERATIONS", 3)
+    again, line = compute_raceline(track_called("paddock"), CAR), line_on("paddock")
+    assert again.lap_time_s == pytest.approx(line.lap_time_s, rel=1e-6)
+    np.testing.assert_allclose(again.xy_m, line.xy_m, atol=1e-4)

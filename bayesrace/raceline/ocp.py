@@ -40,6 +40,11 @@ __all__ = ["CarLimits", "car_limits", "solve", "top_speed"]
 
 _XI_MAX_RAD: Final = 1.2
 _ROUNDS: Final = 3
+_FIRST_ITERATIONS: Final = 100
+"""Short tracks need 30. On a long one the guess, at the car's limits, may lead nowhere; then the
+second try begins with ..."""
+_SLOWER: Final = 0.4
+"""... so much of its squared speeds and accelerations."""
 
 
 @dataclass(frozen=True)
@@ -92,10 +97,11 @@ def solve(track: Track, car: CarParameters, settings: RaceLineSettings) -> RaceL
     """
     margin = car.width_m / 2 if settings.margin_m is None else settings.margin_m
     limits, tuning = car_limits(car, settings), car.tuning.raceline
-    extra = 0.0
+    extra, shares = 0.0, [1.0, _SLOWER]
     for _ in range(_ROUNDS):
         frame = build_frame(track, tuning, margin + extra)
-        line = sample_line(track, _optimise(track.name, frame, limits, settings), tuning.spacing_m)
+        path = _optimise(track.name, frame, limits, settings, shares)
+        line = sample_line(track, path, tuning.spacing_m)
         excess = float(np.max(track.project_path(line.xy_m).off_track_m)) + margin
         if excess <= tuning.tolerance_m:
             return replace(line, made_for=line_identity(track, car, settings))
@@ -203,27 +209,22 @@ def _guess(frame: Frame, limits: CarLimits, v_max: float) -> Floats:
     return np.concatenate([n, np.zeros(count), v**2, kappa, a])
 
 
-def _optimise(name: str, frame: Frame, limits: CarLimits, settings: RaceLineSettings) -> Clothoids:
+def _optimise(
+    name: str, frame: Frame, limits: CarLimits, settings: RaceLineSettings, shares: list[float]
+) -> Clothoids:
+    """The fastest path. ``shares`` of the guess's squared speeds and accelerations are tried in
+    turn; one that fails is dropped, but for the last."""
     problem = _problem(frame, limits)
-    options: dict[str, Any] = {
-        "print_time": False,
-        "error_on_fail": False,
-        "ipopt": {
-            "print_level": 0,
-            "sb": "yes",
-            "tol": 1e-6,
-            "acceptable_iter": 0,
-            "max_iter": settings.max_iterations,
-        },
-    }
-    nlp = {"x": problem.x, "f": problem.f, "g": problem.g}
-    solver = ca.nlpsol("raceline", "ipopt", nlp, options)
     v_max = top_speed(limits)
-    low, high = _bounds(frame, limits, v_max)
-    start = _guess(frame, limits, v_max)
-    with deferred_interrupt():
-        result = solver(x0=start, lbx=low, ubx=high, lbg=problem.g_min, ubg=0.0)
-    stats = solver.stats()
+    bounds, guess = _bounds(frame, limits, v_max), _guess(frame, limits, v_max)
+    while True:
+        start = guess * np.repeat([1.0, 1.0, shares[0], 1.0, shares[0]], len(guess) // 5)
+        most = settings.max_iterations
+        iterations = min(_FIRST_ITERATIONS, most) if len(shares) > 1 else most
+        result, stats = _solved(problem, bounds, start, iterations)
+        if stats["success"] or len(shares) == 1:
+            break
+        shares.pop(0)
     if not stats["success"]:
         raise RaceLineError(
             f"no racing line for track '{name}': IPOPT ended with {stats['return_status']} after "
@@ -241,6 +242,28 @@ def _optimise(name: str, frame: Frame, limits: CarLimits, settings: RaceLineSett
         step_m=np.asarray(lengths).ravel(),
         turn_rad=float(frame.turn_rad.sum()),
     )
+
+
+def _solved(
+    problem: _Problem, bounds: tuple[Floats, Floats], start: Floats, iterations: int
+) -> tuple[Any, dict[str, Any]]:
+    """IPOPT's result and statistics, whether it has converged or not."""
+    options: dict[str, Any] = {
+        "print_time": False,
+        "error_on_fail": False,
+        "ipopt": {
+            "print_level": 0,
+            "sb": "yes",
+            "tol": 1e-6,
+            "acceptable_iter": 0,
+            "max_iter": iterations,
+        },
+    }
+    nlp = {"x": problem.x, "f": problem.f, "g": problem.g}
+    solver = ca.nlpsol("raceline", "ipopt", nlp, options)
+    with deferred_interrupt():
+        result = solver(x0=start, lbx=bounds[0], ubx=bounds[1], lbg=problem.g_min, ubg=0.0)
+    return result, solver.stats()
 
 
 def top_speed(limits: CarLimits) -> float:
