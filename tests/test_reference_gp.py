@@ -74,6 +74,7 @@ def test_published_drive_is_outside_the_cars_limits() -> None:
     assert len(kept) + sum(kept.dropped.values()) == len(training)
 
 
+@pytest.mark.check
 def test_the_published_table_from_the_command_line(cli: Cli) -> None:
     """``--all-samples`` keeps what exceeds the car's limits: most of the published drive."""
     drive, test = (reference_file(f"data/{n}.npz") for n in ("DYN-PP-ETHZMobil", "DYN-NMPC-ETHZ"))

@@ -159,7 +159,8 @@ br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state) {
     if (begins) {
         memset(&cycle->fallback, 0, sizeof cycle->fallback); /* the plan is of another run */
         cycle->delay.count = 0; /* no input is on its way; the delay is still the best guess */
-        if (state->lockstep) forget_delay(cycle); /* but for simulated time, which reports its own */
+        if (state->lockstep)
+            forget_delay(cycle); /* but for simulated time, which reports its own */
         cycle->controller.reset(cycle->controller.self);
         cycle->stepped = cycle->stopping = cycle->reckoned = 0;
     }
