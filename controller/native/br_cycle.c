@@ -260,9 +260,13 @@ static int step(br_cycle *cycle, const br_environment *environment, double actin
     const br_measured *newest = &cycle->stream.newest;
     const br_controller *controller = &cycle->controller;
     double x[BR_NX], u[BR_NU];
-    if (br_delay_at_acting(&cycle->delay, &cycle->settings, controller, newest,
-                           cycle->decision.decided_at_s, cycle->counters.delay_s, x, u))
+    if (newest->lockstep && cycle->counters.delay_s == 0) { /* it acts at once */
+        memcpy(x, newest->x, sizeof x);
+        memcpy(u, newest->u_applied, sizeof u);
+    } else if (br_delay_at_acting(&cycle->delay, &cycle->settings, controller, newest,
+                                  cycle->decision.decided_at_s, cycle->counters.delay_s, x, u)) {
         return BR_UNPREDICTABLE;
+    }
     /* Where the delay measured has fallen, the moment of acting may even go back. */
     const double elapsed_s = cycle->stepped ? fmax(acting_s - cycle->stepped_s, 0) : 0;
     cycle->stepped = 1;

@@ -56,8 +56,7 @@ int br_delay_at_acting(br_delay *delay, const br_driving *settings, const br_con
     const double end_s = fmin(decided_at_s + delay_s, now_s + settings->longest_s);
     memcpy(x, state->x, sizeof state->x);
     memcpy(u, state->u_applied, sizeof state->u_applied);
-    /* In lockstep without a delay the input acts at once, on the state as it is measured. */
-    if (settings->compensation == BR_COMPENSATION_OFF || end_s <= now_s) return 0;
+    if (settings->compensation == BR_COMPENSATION_OFF) return 0;
     while (delay->count > 1 && sent(delay, 1)->decided_at_s + delay_s <= now_s)
         drop_first(delay); /* has stopped acting */
     for (int i = 0; i < delay->count; ++i) {
