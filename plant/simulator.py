@@ -133,23 +133,29 @@ def checked_start(x0: Sequence[float], car: CarParameters) -> Floats:
 
 
 def hold_in_turn(
+    x: Floats,
     commands: Sequence[tuple[int, Sequence[float] | None]],
     substeps: int,
     hold: Callable[[Sequence[float] | None, int], tuple[float, float]],
 ) -> tuple[float, float]:
     """One period of (substeps, command) in order of time; the mean of what acted.
 
-    ``hold`` applies one command for a number of substeps and says what acted.
+    ``hold`` applies one command for a number of substeps to the state ``x`` and says what acted. If
+    it fails within the period, ``x`` is that before the period again.
     """
     if sum(count for count, _ in commands) != substeps:
         raise ValueError(f"the commands must last {substeps} substeps together")
-    d_sum = rate_sum = 0.0
-    for count, u in commands:
-        if count == 0:
-            continue
-        d, rate = hold(u, count)
-        d_sum += count * d
-        rate_sum += count * rate
+    before, d_sum, rate_sum = x.copy(), 0.0, 0.0
+    try:
+        for count, u in commands:
+            if count == 0:
+                continue
+            d, rate = hold(u, count)
+            d_sum += count * d
+            rate_sum += count * rate
+    except Exception:
+        x[:] = before
+        raise
     return d_sum / substeps, rate_sum / substeps
 
 
@@ -236,7 +242,7 @@ class Simulator:
         if len(commands) == 1 and commands[0][0] == self.substeps:
             self.step(commands[0][1])
             return
-        self.u_applied = hold_in_turn(commands, self.substeps, self._hold)
+        self.u_applied = hold_in_turn(self.x, commands, self.substeps, self._hold)
         self.steps += 1
 
     def _hold(self, u: Sequence[float] | None, count: int) -> tuple[float, float]:

@@ -92,12 +92,7 @@ class SlipxSimulator:
 
     def step_switched(self, commands: Sequence[tuple[int, Sequence[float] | None]]) -> None:
         """One period in which the command changes: (substeps, command) in order of time."""
-        before = self.x.copy()
-        try:
-            self.u_applied = hold_in_turn(commands, self.substeps, self._hold)
-        except FmuFault:
-            self.x[:] = before
-            raise
+        self.u_applied = hold_in_turn(self.x, commands, self.substeps, self._hold)
         self.steps += 1
 
     def _hold(self, u: Sequence[float] | None, count: int) -> tuple[float, float]:

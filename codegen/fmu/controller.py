@@ -75,6 +75,7 @@ def controller_fmu(
     """
     manifest = read_manifest(artefact)
     manifest.check_car(car, artefact)
+    brake = car.brake_numbers
     return FmuDefinition(
         name=f"BayesRace controller ({car.name}, {manifest.model})",
         identifier="bayesrace_controller",
@@ -85,8 +86,7 @@ def controller_fmu(
         flags=_flags(cpu),
         constants={
             "NO_SPEED_LIMIT": _NO_LIMIT_MPS,
-            "BRAKE_D": car.brake_numbers["brake_d"],
-            "BRAKE_SLOW": car.brake_numbers["brake_slow"],
+            **{name.upper(): brake[name] for name in ("brake_d", "brake_slow")},
         },
         resources={
             PATH_FILE: path_file(rows, spacing_m),

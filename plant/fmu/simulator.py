@@ -12,7 +12,6 @@ from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.vehicles.models import STATES
 from bayesrace.vehicles.parameters import CarParameters
-from plant.fmu.faults import FmuFault
 from plant.fmu.host import FmuHost
 from plant.fmu.inspection import FmuDescription, describe
 from plant.fmu.map import wire
@@ -106,12 +105,7 @@ class FmuSimulator:
 
     def step_switched(self, commands: Sequence[tuple[int, Sequence[float] | None]]) -> None:
         """One period in which the command changes: (substeps, command) in order of time."""
-        before = self.x.copy()
-        try:
-            self.u_applied = hold_in_turn(commands, self.substeps, self._hold)
-        except FmuFault:
-            self.x[:] = before
-            raise
+        self.u_applied = hold_in_turn(self.x, commands, self.substeps, self._hold)
         self.steps += 1
 
     def _hold(self, u: Sequence[float] | None, count: int) -> tuple[float, float]:
