@@ -25,7 +25,7 @@ from codegen.build import build
 from codegen.compiled import compiled
 from codegen.compiler import find_compiler
 from codegen.settings import BuildSettings
-from learning.dataset import Dataset
+from learning.dataset import Dataset, concatenate
 from learning.logs import dataset_from_messages, fallback_cycles
 from learning.settings import Progress, TrainingSettings
 from operation.collect import collect
@@ -43,6 +43,7 @@ __all__ = [
     "training_drive",
     "training_samples",
     "training_settings",
+    "updated_weights",
 ]
 
 _WEIGHTS_SOURCES: Final = (
@@ -273,6 +274,17 @@ def trained_weights(
 
     kept(path, make, read_weights)
     return path
+
+
+def updated_weights(
+    samples: Sequence[Dataset],
+    settings: PreparationSettings,
+    first: GpWeights,
+    progress: Progress | None = None,
+) -> Path:
+    """File of the weights learned from all samples, beginning with ``first``."""
+    learned = training_settings(settings)
+    return trained_weights(concatenate(samples), settings.discretisation, learned, first, progress)
 
 
 def _artefact(settings: PreparationSettings, model: PredictionModel) -> Path:

@@ -19,7 +19,7 @@ from bayesrace.recorder import Recorder
 from bayesrace.tracks import load_track
 from bayesrace.vehicles import write_car
 from codegen.compiler import find_compiler
-from learning.dataset import Dataset, concatenate
+from learning.dataset import Dataset
 from learning.logs import dataset_from_log
 from operation.drive import RunPlan
 from operation.preparation import (
@@ -27,8 +27,7 @@ from operation.preparation import (
     Prepared,
     PreparedTrack,
     prepare,
-    trained_weights,
-    training_settings,
+    updated_weights,
 )
 from operation.settings import RaceSettings
 from operation.system import System, started_system
@@ -148,15 +147,9 @@ class _Race:
 
     def update(self, prepared: Prepared, lap: Dataset, stage: Stage) -> Path:
         """Weights learned from training drive and lap, beginning with those of the lap."""
-        settings = self.settings
         samples = [lap] if prepared.training is None else [prepared.training.samples, lap]
-        weights = trained_weights(
-            concatenate(samples),
-            settings.discretisation,
-            training_settings(settings),
-            read_weights(prepared.weights),
-            stage.update,
-        )
+        first = read_weights(prepared.weights)
+        weights = updated_weights(samples, self.settings, first, stage.update)
         return Path(shutil.copyfile(weights, self.out / FILES.weights_updated))
 
     # Driving -----------------------------------------------------------------------------------

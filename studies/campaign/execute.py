@@ -21,7 +21,6 @@ from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.vehicles import CarParameters
 from controller.assembly import compiled_controller
 from controller.path_table import PathTable, make_path_table
-from learning.dataset import concatenate
 from operation.analysis.laps import trajectory_digest
 from operation.closed_loop import ClosedLoop, Driven, built_in_car
 from operation.preparation import (
@@ -29,8 +28,7 @@ from operation.preparation import (
     Prepared,
     PreparedTrack,
     prepare,
-    trained_weights,
-    training_settings,
+    updated_weights,
 )
 from operation.settings import PreparationSettings
 from operation.terminal.progress import stages_on
@@ -151,10 +149,9 @@ class _Runs:
         training = self._files.training
         if self._first is None or training is None:
             raise RuntimeError("there are no laps of 'bayesrace' to learn from")
-        samples = concatenate([training.samples, self._first.samples()])
-        learned = training_settings(self._settings)
+        samples = [training.samples, self._first.samples()]
         first = read_weights(self._files.weights)
-        return read_weights(trained_weights(samples, self._settings.discretisation, learned, first))
+        return read_weights(updated_weights(samples, self._settings, first))
 
     def _driven(self, controller: Controller, weights: GpWeights | None) -> Driven:
         settings, files = self._settings, self._files

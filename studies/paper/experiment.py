@@ -18,12 +18,12 @@ from bayesrace.log import LogReader, LogWriter
 from bayesrace.messages import EVENT, STATE, TELEMETRY, TRUTH
 from controller.assembly import compiled_controller
 from controller.settings import MpcSettings
-from learning.dataset import Dataset, concatenate
+from learning.dataset import Dataset
 from learning.logs import dataset_from_messages, fallback_cycles
 from operation.analysis.race import DrivenRun
 from operation.analysis.recording import PlannedRun, RunRecord
 from operation.closed_loop import ClosedLoop, built_in_car
-from operation.preparation import PredictionModel, prepare, trained_weights, training_settings
+from operation.preparation import PredictionModel, prepare, updated_weights
 from operation.settings import PreparationSettings
 from operation.terminal.progress import Stages
 from studies.campaign.case import software_identity
@@ -85,10 +85,8 @@ class Experiment:
 
     def updated(self, lap: DrivenRun) -> GpWeights:
         """Learned from training drive and lap, beginning with the weights before."""
-        samples, settings = concatenate([self.training, self.samples(lap)]), self.settings
-        learned = training_settings(settings)
-        path = trained_weights(samples, settings.discretisation, learned, self.weights)
-        return read_weights(path)
+        samples = [self.training, self.samples(lap)]
+        return read_weights(updated_weights(samples, self.settings, self.weights))
 
 
 def stored(name: str, parts: Iterable[str], make: Callable[[], Any]) -> Any:
