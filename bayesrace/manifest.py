@@ -31,6 +31,8 @@ _ROOT: Final = 0
 
 LIBRARY: Final = "libmpc.so"
 MANIFEST: Final = "manifest.json"
+DRIVING_PROBLEMS: Final = ("tracking", "progress")
+"""Control problems that drive a car; see ``codegen/problems``."""
 
 
 class ParameterInfo(BaseModel):
@@ -83,7 +85,7 @@ class Manifest(BaseModel):
 
     def check_car(self, car: CarParameters, artefact: Path) -> None:
         """InputError if this artefact was built for another car, or solves another problem."""
-        if self.problem.name != "tracking":
+        if self.problem.name not in DRIVING_PROBLEMS:
             raise InputError(
                 f"{artefact} solves the problem '{self.problem.name}', which drives no car: run "
                 "'bayesrace build'"

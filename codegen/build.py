@@ -94,9 +94,11 @@ def _identity_of(problem: "Problem | None") -> list[str]:
 def problem_of(settings: BuildSettings) -> "Problem":
     """The control problem that these settings name."""
     from bayesrace.vehicles.models import MODELS
+    from codegen.problems.progress import progress
     from codegen.problems.tracking import tracking
 
-    return tracking(MODELS[settings.model](get_car(settings.car)), settings.discretisation)
+    make = {"tracking": tracking, "progress": progress}[settings.problem]
+    return make(MODELS[settings.model](get_car(settings.car)), settings.discretisation)
 
 
 def generate(problem: "Problem", settings: BuildSettings, folder: Path) -> None:
@@ -162,12 +164,14 @@ def build(
 ) -> tuple[Path, Manifest]:
     """Artefact folder and manifest of the controller; from the cache if it is there.
 
-    ``problem``: one of your own, with the step of ``settings.discretisation``; tracking without.
+    ``problem``: one of your own, with the step of ``settings.discretisation``; that of the
+    settings without.
     Raises CompileError with the compiler's own words, InputError if there is no compiler.
     """
     compiler = find_compiler()
     identity = build_hash(settings, compiler, problem)
-    target = cache_folder() / f"{problem.name if problem else settings.model}-{identity}"
+    name = problem.name if problem else f"{settings.problem}-{settings.model}"
+    target = cache_folder() / f"{name}-{identity}"
 
     def built() -> tuple[Path, Manifest] | None:
         """What the cache has; None if it is absent, damaged, or another user's."""
@@ -176,7 +180,7 @@ def build(
             check_library(target, manifest)
         except InputError:
             return None
-        progress(f"{settings.model}: cached")
+        progress(f"{name}: cached")
         note_use(made=False)
         return target, manifest
 
@@ -185,7 +189,7 @@ def build(
     with locked(target):
         if found := built():  # by another process, meanwhile
             return found
-        progress(f"{settings.model}: generating and compiling")
+        progress(f"{name}: generating and compiling")
         _clear(target)
         with tempfile.TemporaryDirectory(dir=target.parent, prefix=_partial(target)) as temporary:
             folder = Path(temporary) / "artefact"

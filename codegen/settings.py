@@ -7,7 +7,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from bayesrace.integrators import PERFECT, PREDICTION, Discretisation
 from bayesrace.vehicles import DEFAULT_CAR, CarParameters, CarSetting, default_car, get_car
 
-__all__ = ["BuildSettings"]
+__all__ = ["BuildSettings", "ProblemName"]
+
+ProblemName = Literal["tracking", "progress"]
 
 
 class BuildSettings(BaseModel):
@@ -19,6 +21,7 @@ class BuildSettings(BaseModel):
     model: Literal["e_kinematic", "dynamic"] = Field(
         "e_kinematic", description="model the OCP predicts with; dynamic is BestCase"
     )
+    problem: ProblemName = Field("tracking", description="control problem: tracking or progress")
     discretisation: Discretisation = Field(PREDICTION, description="scheme, step, sub-steps")
     horizon: int | None = Field(
         None, ge=2, le=100, description="stages N; the car's, from its tuning, without"
@@ -28,16 +31,22 @@ class BuildSettings(BaseModel):
     @property
     def stages(self) -> int:
         """The horizon, resolved."""
-        return self.horizon or self.car.tuning.objective.horizon
+        tuning = self.car.tuning
+        own = tuning.progress if self.problem == "progress" else tuning.objective
+        return self.horizon or own.horizon
 
     @classmethod
     def best_case(
-        cls, car: str | CarParameters = DEFAULT_CAR, horizon: int | None = None
+        cls,
+        car: str | CarParameters = DEFAULT_CAR,
+        horizon: int | None = None,
+        problem: ProblemName = "tracking",
     ) -> "BuildSettings":
         """The controller with the perfect model, for comparison and validation only."""
         return cls(
             car=get_car(car),
             model="dynamic",
+            problem=problem,
             discretisation=PERFECT,
             horizon=horizon,
             gp_capacity=8,

@@ -1,4 +1,4 @@
-"""The compiled tracking problem of one car: its limits, its path, its weights."""
+"""The compiled control problem of one car: its limits, its path, its weights."""
 
 import ctypes as ct
 from pathlib import Path
@@ -19,7 +19,7 @@ __all__ = [
 
 
 class NativeStep(NativeProblem):
-    """The control step of a car that tracks a racing line."""
+    """The control step of a car that follows a racing line."""
 
     def __init__(self, artefact: Path, car: CarParameters, settings: MpcSettings) -> None:
         """InputError if it was built for another car."""
@@ -29,7 +29,7 @@ class NativeStep(NativeProblem):
 
     def set_parameters(self, car: CarParameters, settings: MpcSettings) -> None:
         """Weights, limits and tolerances of the OCP; effective from the next step."""
-        self.set_values(settings.parameters(car))
+        self.set_values(settings.parameters(car, self.manifest.problem.name))
 
     def set_path(self, table: PathTable) -> None:
         """Racing line and track; copied."""

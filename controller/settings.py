@@ -21,6 +21,8 @@ class MpcSettings(BaseModel):
     q_position: float | None = _objective("Q: squared position error [1/m^2]")
     r_duty: float | None = _objective("R: squared change of the drive command")
     r_delta_rate: float | None = _objective("R: squared steering rate [s^2/rad^2]")
+    q_contour: float | None = _objective("progress: squared distance to the line [1/m^2]")
+    gain: float | None = _objective("progress: reward of it [1/s]")
     s_slack: float | None = _objective("S: squared track violation [1/m^2]")
     constraints: bool = Field(True, description="track constraints (8d) on or off")
     margin_m: float | None = Field(
@@ -51,10 +53,15 @@ class MpcSettings(BaseModel):
         description="the same after a reset; with a time budget the larger limits every step",
     )
 
-    def parameters(self, car: CarParameters) -> dict[str, float]:
-        """Run-time parameters of the tracking problem and settings of its solver, by name."""
-        values = car.tuning.objective.model_dump(exclude={"horizon"})
-        values |= self.model_dump(exclude={"constraints"}, exclude_none=True)
+    def parameters(self, car: CarParameters, problem: str = "tracking") -> dict[str, float]:
+        """Run-time parameters of the problem and settings of its solver, by name."""
+        tuning = car.tuning.objective.model_dump(exclude={"horizon"})
+        if problem == "progress":
+            tuning |= car.tuning.progress.run_time
+        own = {name: getattr(self, name) for name in type(self).model_fields}
+        solver = {"tolerance", "defect_max", "early_stop_tol", "iterations", "iterations_cold"}
+        stated = {n: v for n, v in own.items() if v is not None and (n in tuning or n in solver)}
+        values = tuning | stated
         if not self.constraints:
             values["s_slack"] = 0.0
         limits = ("d_min", "d_max", "delta_max_rad", "delta_rate_max_radps")

@@ -26,6 +26,7 @@ __all__ = [
     "ObjectiveTuning",
     "PathTuning",
     "PlausibleTuning",
+    "ProgressTuning",
     "PursuitTuning",
     "RacelineTuning",
     "Scales",
@@ -186,6 +187,33 @@ class ObjectiveTuning(_Section):
     horizon: int = _number(20, NONE, "stages that the OCP looks ahead [-]", ge=2, le=100)
 
 
+class ProgressTuning(_Section):
+    """The same for the OCP that maximises progress."""
+
+    q_contour: float = _number(0.1, (-2.0, 0.0, 0.0), "squared distance to the line [1/m^2]")
+    gain: float = _number(
+        2.5, (-0.5, 0.5, 0.0), "reward of the time that the line takes for the progress [1/s]"
+    )
+    r_duty: float = _number(
+        2e-4, (0.0, 0.0, -2.0), "R: squared change of the drive command [1/command^2]"
+    )
+    r_delta_rate: float = _number(1e-6, (1.0, -1.0, 0.0), "R: squared steering rate [s^2/rad^2]")
+    proximal_duty: float = _number(
+        0.02, (0.0, 0.0, -2.0), "of a drive command's change in one QP [1/command^2]", ge=0
+    )
+    proximal_delta_rate: float = _number(
+        1e-3, (1.0, -1.0, 0.0), "of a steering rate's change in one QP [s^2/rad^2]", ge=0
+    )
+    s_slack: float = _number(1000.0, (-2.0, 0.0, 0.0), "S: squared track violation [1/m^2]")
+    margin_m: float = _number(0.01, LENGTH, "distance kept from the track edges [m]")
+    horizon: int = _number(40, NONE, "stages that the OCP looks ahead [-]", ge=2, le=100)
+
+    @property
+    def run_time(self) -> dict[str, float]:
+        """The numbers that can change between two steps, by the names of the OCP's parameters."""
+        return self.model_dump(exclude={"horizon", "proximal_duty", "proximal_delta_rate"})
+
+
 class PursuitTuning(_Section):
     """Pure pursuit, which drives for training data."""
 
@@ -259,6 +287,7 @@ class Tuning(_Section):
     plausible: PlausibleTuning
     scale: ScaleTuning
     objective: ObjectiveTuning
+    progress: ProgressTuning
     pursuit: PursuitTuning
     gate: GateTuning
     driving: DrivingTuning

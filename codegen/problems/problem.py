@@ -45,6 +45,9 @@ class Input:
     """Beyond the end of a plan that is shifted: held, or zero."""
     limit: float = 1e6
     """A larger absolute value is no input of this system."""
+    proximal: float = 0.0
+    """Weight of half the squared change of this input in one QP. Not part of the cost: the plan
+    that the iterations converge to is the same. For a cost that is linear in much of the plan."""
 
 
 @dataclass(frozen=True)
@@ -144,6 +147,10 @@ class Problem:
     path: Mapping[str, str] = field(default_factory=dict)
     """Roles (x, y, psi, vx, vy, delta; duty, delta_rate) to names, for a planner that follows a
     path; empty: there is none, and the stage parameters are always the caller's."""
+
+    follows_plan: bool = False
+    """Whether the planner takes the stage parameters from where the plan itself is on the path, and
+    not from where a car on the path would be. The first parameter beyond those is ``follows``."""
 
     constants: Mapping[str, float] = field(default_factory=dict)
     """Numbers that C is compiled with, as ``BR_NAME``: those of the planner for a path."""

@@ -152,6 +152,8 @@ struct br_mpc {
     double u_lower[BR_NU], u_upper[BR_NU];
     double x0[BR_NX];
     br_mpc_reference reference[BR_N];
+    int follows;  /* the reference is where the plan is on the line, not points to track, ... */
+    int followed; /* ... and belongs to the plan at hand */
     double turn; /* the side that the car turns round to, 1 left, -1 right; 0: it does not */
     double turn_u[BR_N][BR_NU]; /* inputs that the reference of a turn has been made with */
     /* the plan, primal and dual */
@@ -191,8 +193,13 @@ void br_weights_init(br_mpc *mpc);
 
 /* br_planner.c */
 br_mpc_error br_path_load(br_path *path, const double *table, int n, double spacing);
-void br_path_plan(br_path *path, const double x[BR_NX], br_mpc_reference reference[BR_N],
-                  double *lateral);
+void br_path_plan(const br_path *path, br_mpc_reference reference[BR_N]);
+void br_path_project(br_path *path, const double x[BR_NX], double *lateral);
+#if BR_FOLLOWS_PLAN
+void br_path_follow(br_mpc *mpc);
+#else
+static inline void br_path_follow(br_mpc *mpc) { (void)mpc; }
+#endif
 void br_path_ahead(const br_path *path, double distance, double point[2]);
 
 /* br_turnaround.c */

@@ -127,8 +127,8 @@ void br_path_ahead(const br_path *path, double distance, double point[2]) {
     point[1] = row[Y];
 }
 
-void br_path_plan(br_path *path, const double x[BR_NX], br_mpc_reference reference[BR_N],
-                  double *lateral) {
+/* Where the car is on the line: path->s, and its distance to the left. */
+void br_path_project(br_path *path, const double x[BR_NX], double *lateral) {
     double s, row[BR_PATH_COLUMNS];
     const double moved = path->age * hypot(x[BR_INDEX_VX], x[BR_INDEX_VY]);
     if (moved > 0.8 * BR_PATH_WINDOW_AHEAD_M) path->known = 0; /* may have left the window */
@@ -140,21 +140,85 @@ void br_path_plan(br_path *path, const double x[BR_NX], br_mpc_reference referen
         project(path, nearest_anywhere(path, x), x, &s, lateral);
     path->s = s;
     path->known = 1;
+}
+
+static br_mpc_reference stage_at(const double row[BR_PATH_COLUMNS]) {
+    const double norm = hypot(row[NORMAL_X], row[NORMAL_Y]);
+    return (br_mpc_reference){
+        .x = row[X],
+        .y = row[Y],
+        .normal_x = row[NORMAL_X] / norm,
+        .normal_y = row[NORMAL_Y] / norm,
+        .lower = row[LOWER] / norm,
+        .upper = row[UPPER] / norm,
+    };
+}
+
+/* Points to track: the recursion in the line's speed, from the car's projection on. */
+void br_path_plan(const br_path *path, br_mpc_reference reference[BR_N]) {
+    double s = path->s, row[BR_PATH_COLUMNS];
     for (int k = 0; k < BR_N; ++k) {
         path_at(path, s, row);
         const double limit = path->speed_limit - k * BR_TS * path->speed_limit_rate;
         s += BR_TS * fmax(fmin(row[SPEED], limit), 0);
         path_at(path, s, row);
-        const double norm = hypot(row[NORMAL_X], row[NORMAL_Y]);
-        reference[k] = (br_mpc_reference){
-            .x = row[X],
-            .y = row[Y],
-            .normal_x = row[NORMAL_X] / norm,
-            .normal_y = row[NORMAL_Y] / norm,
-            .lower = row[LOWER] / norm,
-            .upper = row[UPPER] / norm,
-        };
+        reference[k] = stage_at(row);
     }
 }
+
+#if BR_FOLLOWS_PLAN
+
+/* Row nearest to the state, downhill from row i. */
+static int nearest_from(const br_path *path, int i, const double x[BR_NX]) {
+    double here = squared_distance(path->table[i], x);
+    for (int way = 1; way >= -1; way -= 2)
+        for (int moved = 0; moved < path->n; ++moved) {
+            const int j = wrap_index(i + way, path->n);
+            const double there = squared_distance(path->table[j], x);
+            if (!(there < here)) break;
+            here = there;
+            i = j;
+        }
+    return i;
+}
+
+/* Direction of the line at arc length s, and its curvature. */
+static double direction_at(const br_path *path, double s, double tangent[2]) {
+    double a[BR_PATH_COLUMNS], b[BR_PATH_COLUMNS], c[BR_PATH_COLUMNS];
+    const double h = path->spacing;
+    path_at(path, s - h, a);
+    path_at(path, s, b);
+    path_at(path, s + h, c);
+    const double dx = c[X] - a[X], dy = c[Y] - a[Y], length = hypot(dx, dy);
+    tangent[0] = dx / length;
+    tangent[1] = dy / length;
+    const double ddx = c[X] - 2 * b[X] + a[X], ddy = c[Y] - 2 * b[Y] + a[Y];
+    return (tangent[0] * ddy - tangent[1] * ddx) / (h * h);
+}
+
+/* The stages where the plan itself is on the line. */
+void br_path_follow(br_mpc *mpc) {
+    const br_path *path = &mpc->path;
+    if (!mpc->follows || mpc->followed) return;
+    mpc->followed = 1;
+    mpc->qp.factorised = mpc->qp.evaluated = 0;
+    int i = (int)(wrap_length(path->s, path->length) / path->spacing) % path->n;
+    for (int k = 0; k < BR_N; ++k) {
+        const double *x = mpc->plan.x[k + 1];
+        double s, lateral, row[BR_PATH_COLUMNS], tangent[2];
+        i = nearest_from(path, i, x);
+        project(path, i, x, &s, &lateral);
+        path_at(path, s, row);
+        const double curvature = direction_at(path, s, tangent);
+        br_mpc_reference *stage = &mpc->reference[k];
+        *stage = stage_at(row);
+        stage->follows = 1;
+        const double pace = 1 / (fmax(1 - curvature * lateral, 0.2) * row[SPEED]);
+        stage->pace_x = pace * tangent[0];
+        stage->pace_y = pace * tangent[1];
+    }
+}
+
+#endif
 
 #endif

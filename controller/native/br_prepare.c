@@ -28,7 +28,7 @@ void br_undo_preparation(br_mpc *mpc) {
     if (mpc->ahead) {
         mpc->plan = mpc->kept;
         memcpy(mpc->qp.sense, mpc->kept_sense, sizeof mpc->kept_sense);
-        mpc->linearised = mpc->qp.factorised = mpc->qp.evaluated = 0;
+        mpc->linearised = mpc->qp.factorised = mpc->qp.evaluated = mpc->followed = 0;
     }
     mpc->ahead = 0;
 }
@@ -89,6 +89,7 @@ br_mpc_error br_mpc_prepare(br_mpc *mpc, double elapsed_s, double budget_s) {
         memcpy(mpc->kept_sense, mpc->qp.sense, sizeof mpc->kept_sense);
     }
     br_align(mpc, br_shifts_due(&lag));
+    br_path_follow(mpc);
     if (!mpc->qp.factorised) br_qp_factorise(mpc);
     mpc->prepared = mpc->qp.factorised;
     return BR_OK;
@@ -98,6 +99,7 @@ br_mpc_error br_mpc_rehearse(br_mpc *mpc) {
     if (!mpc) return BR_ERROR_NULL;
     if (!mpc->prepared || !mpc->qp.factorised) return BR_OK;
     br_sqp_linearise(mpc);
+    br_path_follow(mpc);
     br_qp_factorise(mpc);
     return BR_OK;
 }

@@ -190,6 +190,7 @@ static void condense_hessian(br_mpc *mpc, double tau) {
         hessian_rows(mpc, k, tau, qp->costate[side], qp->costate[!side]);
     for (int k = 0; k < BR_N; ++k) {
         const int i = BR_NU * k;
+        for (int a = 0; a < BR_NU; ++a) qp->h[i + a][i + a] += BR_INPUT_PROXIMAL[a];
         for (int a = 0; a < BR_NU; ++a)
             for (int b = 0; b < BR_NU; ++b) {
                 const double later =
@@ -360,7 +361,7 @@ void br_qp_factorise(br_mpc *mpc) {
 br_mpc_status br_qp_condense(br_mpc *mpc) {
     br_qp *qp = &mpc->qp;
     br_evaluate_terms(mpc);
-    if (!qp->factorised || BR_CURVATURE_LATE) br_qp_factorise(mpc);
+    if (!qp->factorised || (BR_CURVATURE_LATE && !mpc->follows)) br_qp_factorise(mpc);
     if (!qp->factorised) return BR_NOT_FINITE; /* a convex cost alone is positive definite */
     propagate_state(mpc);
     condense_gradient(mpc, qp->curvature);

@@ -10,7 +10,7 @@
 #include "br_internal.h"
 
 static void linearise(br_mpc *mpc, int first) {
-    mpc->qp.factorised = mpc->qp.evaluated = 0;
+    mpc->qp.factorised = mpc->qp.evaluated = mpc->followed = 0;
     mpc->linearised = 1;
     for (int k = first; k < BR_N; ++k)
         br_stage_linearise(&mpc->gp[mpc->gp_in_use], mpc->plan.x[k], mpc->plan.u[k],
@@ -42,7 +42,7 @@ void br_sqp_roll_out(br_mpc *mpc, const double u[BR_NU]) {
     }
     br_qp_forget_working_set(&mpc->qp);
     mpc->linearised = 1;
-    mpc->qp.factorised = mpc->qp.evaluated = 0;
+    mpc->qp.factorised = mpc->qp.evaluated = mpc->followed = 0;
 }
 
 /* By one stage. */
@@ -163,6 +163,7 @@ static void line_search(br_mpc *mpc, int first_of_warm) {
 br_mpc_status br_sqp_iterate(br_mpc *mpc, int warm, int first_of_warm) {
     br_timer *timer = &mpc->timer;
     const double begin = br_timer_now(timer);
+    br_path_follow(mpc);
     br_mpc_status status = br_qp_condense(mpc);
     if (status == BR_CONVERGED) status = br_qp_solve(mpc, warm);
     if (status == BR_CONVERGED) {

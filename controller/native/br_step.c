@@ -23,6 +23,7 @@ static void begin_plan(br_mpc *mpc) {
         mpc->info.shifts = -1;
     }
     mpc->ahead = mpc->prepared = 0;
+    br_path_follow(mpc);
 }
 
 /* Another iteration would change little that matters until the next step, or, where the Hessian is
@@ -67,9 +68,10 @@ static br_mpc_status iterate(br_mpc *mpc, int warm, int most) {
 /* Signs that the plan from before is on its way to another local minimum, often a bad one: the
  * exact Hessian is indefinite, or Newton's steps had to be shortened. Typically the horizon has
  * reached a bend for which the plan is too fast: the tyres slide, and neither more nor less
- * steering helps. Such a plan satisfies every residual and costs more with each step. */
+ * steering helps. Such a plan satisfies every residual and costs more with each step. A plan that
+ * maximises progress is always near that, and no sign of anything. */
 static int doubtful(const br_mpc *mpc, br_mpc_status status) {
-    return mpc->qp.regularised || mpc->info.shortened || !br_usable(status);
+    return ((mpc->qp.regularised || mpc->info.shortened) && !mpc->follows) || !br_usable(status);
 }
 
 /* Whether to try: where nothing has been better for long, as with a model that is wrong all over,
@@ -180,6 +182,22 @@ static int take_environment(br_mpc *mpc, const br_environment *environment) {
     return 0;
 }
 
+#if BR_HAS_PATH
+/* Points to track. Where the problem takes its reference from the plan instead, only a stop and a
+ * turn need them, and a slow car, which a turn may begin with. */
+static void plan_reference(br_mpc *mpc) {
+#if BR_FOLLOWS_PLAN
+    const int follows = !isfinite(mpc->path.speed_limit), before = mpc->follows;
+    mpc->follows = follows;
+    if (follows && before && fabs(mpc->x0[BR_INDEX_VX]) >= BR_TURN_SLOW_MPS) return;
+    mpc->followed = 0;
+#endif
+    br_path_plan(&mpc->path, mpc->reference);
+    br_turnaround(mpc);
+    if (mpc->turn) mpc->follows = 0;
+}
+#endif
+
 br_mpc_error br_mpc_step(br_mpc *mpc, const double x[BR_NX], const double u_before[BR_NU],
                          const br_environment *environment, double elapsed_s, double budget_s,
                          double u[BR_NU], br_mpc_status *status, br_mpc_info *info) {
@@ -191,8 +209,8 @@ br_mpc_error br_mpc_step(br_mpc *mpc, const double x[BR_NX], const double u_befo
     if (take_environment(mpc, environment)) return BR_ERROR_PARAMETERS;
     if (!plausible) return BR_OK;
 #if BR_HAS_PATH
-    br_path_plan(&mpc->path, x, mpc->reference, &mpc->info.lateral_m);
-    br_turnaround(mpc);
+    br_path_project(&mpc->path, x, &mpc->info.lateral_m);
+    plan_reference(mpc);
     mpc->info.s_ref_m = mpc->path.s;
 #endif
     solve(mpc, u, status, info);
@@ -208,7 +226,7 @@ br_mpc_error br_mpc_solve(br_mpc *mpc, const double x[BR_NX], const double u_bef
     const br_mpc_error error = begin(mpc, &r, &plausible);
     if (error || !plausible) return error;
     memcpy(mpc->reference, reference, sizeof mpc->reference);
-    mpc->turn = 0;
+    mpc->turn = mpc->follows = 0;
     solve(mpc, u, status, info);
     return BR_OK;
 }

@@ -13,6 +13,10 @@
 
 #if BR_HAS_PATH
 
+/* A reward of progress along the line leads a car back that points aside, but not one that points
+ * the other way. */
+#define BEGIN_RAD (BR_FOLLOWS_PLAN ? BR_TURN_BEHIND_RAD : BR_TURN_AWAY_RAD)
+
 /* Angle to the point, seen from the car; positive left. */
 static double bearing(const double x[BR_NX], const double to[2]) {
     return remainder(atan2(to[1] - x[BR_INDEX_Y], to[0] - x[BR_INDEX_X]) - x[BR_INDEX_PSI],
@@ -53,9 +57,8 @@ static void decide(br_mpc *mpc, const double target[2]) {
         mpc->turn = 0;
     } else if (mpc->turn) {
         if (remaining(mpc->turn, away) < BR_TURN_FACED_RAD) mpc->turn = 0;
-    } else if (fabs(away) > BR_TURN_AWAY_RAD &&
-               fabs(remainder(away - bearing_on_line(&mpc->path, target), 2 * M_PI)) >
-                   BR_TURN_AWAY_RAD) {
+    } else if (fabs(away) > BEGIN_RAD &&
+               fabs(remainder(away - bearing_on_line(&mpc->path, target), 2 * M_PI)) > BEGIN_RAD) {
         mpc->turn = side(x, away, &mpc->reference[0]);
         mpc->warm = 0;
     }
