@@ -11,7 +11,7 @@ from collections.abc import Callable
 from bayesrace.messages import Actuation, State, Telemetry
 from bayesrace.vehicles.parameters import CarParameters
 from controller.driver import Decision, Driver
-from controller.interface import Controller
+from controller.interface import Controller, Environment
 from controller.process_settings import ControllerSettings
 from controller.telemetry import Timing, telemetry_of
 
@@ -36,16 +36,27 @@ class Cycle:
         self.timing = Timing()
         self._controller = controller
 
-    def answer(self, state: State, send: Callable[[State, Decision], None]) -> None:
+    def answer(
+        self,
+        state: State,
+        send: Callable[[State, Decision], None],
+        environment: Environment | None = None,
+    ) -> None:
         """Answers a state of a lockstep run, then prepares for the next one."""
         self.timing.released_ns = time.monotonic_ns()
-        send(state, self.decide(state.time_s))
+        send(state, self.decide(state.time_s, environment=environment))
         self.prepare(self.driver.interval_s, 0.0)
 
-    def decide(self, decided_at_s: float, budget_s: float = 0.0, spent_s: float = 0.0) -> Decision:
+    def decide(
+        self,
+        decided_at_s: float,
+        budget_s: float = 0.0,
+        spent_s: float = 0.0,
+        environment: Environment | None = None,
+    ) -> Decision:
         """:meth:`Driver.decide`, timed."""
         begin_ns = time.perf_counter_ns()
-        decision = self.driver.decide(decided_at_s, budget_s, spent_s)
+        decision = self.driver.decide(decided_at_s, budget_s, spent_s, environment)
         self.timing.solve_us = (time.perf_counter_ns() - begin_ns) * 1e-3
         return decision
 

@@ -36,7 +36,7 @@ from bayesrace.transport import (
 )
 from controller.cycle import Cycle
 from controller.driver import Decision
-from controller.interface import Controller
+from controller.interface import Controller, Environment
 from controller.process_settings import ControllerSettings
 from controller.schedule import Schedule
 from controller.service import Service
@@ -185,7 +185,7 @@ class ControllerProcess:
             if state is not None:
                 if state.final or not state.lockstep:
                     break
-                self._cycle.answer(state, self._send_in_lockstep)
+                self._cycle.answer(state, self._send_in_lockstep, self._limits(state))
             elif self._silent() or not self._service.plant_there:
                 break
             self._service.beat()
@@ -232,7 +232,8 @@ class ControllerProcess:
         # not the time since this state's own arrival.
         decided_at_s = max(schedule.plant_time_s(timing.released_ns), state.time_s)
         spent_s = (time.monotonic_ns() - schedule.release_ns) * 1e-9
-        decision = self._cycle.decide(decided_at_s, budget_s, spent_s)
+        limits = self._limits(state)
+        decision = self._cycle.decide(decided_at_s, budget_s, spent_s, limits)
         timing.overruns += time.monotonic_ns() > schedule.release_ns + 1e9 * budget_s
         self._send(state, decision)
         timing.missed = time.monotonic_ns() > schedule.deadline_ns
@@ -309,6 +310,10 @@ class ControllerProcess:
         timing.encode_us = (time.perf_counter_ns() - begin_ns) * 1e-3
         message = self._cycle.telemetry(self._telemetry.next_seq, state, decision, self._arrived_ns)
         self._telemetry.put(message, lockstep=state.lockstep)
+
+    def _limits(self, state: State) -> Environment | None:
+        """What limits the car in this cycle."""
+        return None if self._adoption is None else self._adoption.limits(state.x[3])
 
     def _actuation(self, state: State, decision: Decision) -> Actuation:
         return self._cycle.actuation(self._actuations.next_seq, state, decision)

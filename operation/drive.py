@@ -58,13 +58,17 @@ def run_request(track: Track, plan: RunPlan) -> RunRequest:
     )
 
 
-def announcement(plan: RunPlan, seq: int, weights_version: str) -> Event:
-    """The event in the log before a run, which names its controller."""
-    text = f"run {plan.run}: {plan.controller}"
+def announcement(plan: RunPlan, seq: int, weights_version: str, refused: str = "") -> Event:
+    """The event in the log before a run, which names its controller.
+
+    ``refused``: why the controller refuses its weights, so that no run follows.
+    """
+    text = f"run {plan.run}: {plan.controller}" + (", weights refused" if refused else "")
     data: dict[str, Scalar] = {
         "run": plan.run,
         "controller": plan.controller,
         "weights_version": weights_version,
+        "refused": refused,
     }
     return Event(
         seq=seq,

@@ -17,6 +17,7 @@ from bayesrace.gp.weights import read_weights
 from bayesrace.manifest import MANIFEST
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import load_track
+from bayesrace.transport import RefusedError
 from bayesrace.vehicles import write_car
 from codegen.compiler import find_compiler
 from learning.dataset import Dataset
@@ -194,13 +195,21 @@ class _Drives:
         ]  # fmt: skip
         return self._system.controller(options, f"controller-{name}.log")
 
-    def drive(self, controller: str, weights: Path | None = None) -> RunPlan:
-        """One run, with new weights first if there are any; InputError if it broke off."""
-        if weights is not None:
-            self._system.director.send_weights(weights.read_bytes())
+    def drive(self, controller: str) -> RunPlan:
+        """One run; InputError if it broke off."""
         plan = self._race.plan(controller, self._track)
         self._system.drive(self._track.track, plan, self._recorder)
         return plan
+
+    def drive_with(self, weights: Path, controller: str) -> RunPlan | None:
+        """One run with new weights; None, and the reason in the log, if they are refused."""
+        try:
+            self._system.director.send_weights(weights.read_bytes())
+        except RefusedError as refusal:
+            plan = self._race.plan(controller, self._track)
+            self._system.refused(plan, refusal.reply.text)
+            return None
+        return self.drive(controller)
 
     def samples(self, plan: RunPlan) -> Dataset:
         """What can be learned from a run, from the log."""
@@ -212,7 +221,9 @@ class _Drives:
 def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
     """Drives WorstCase, BayesRace, BayesRace-updated and, where the true model is known, BestCase.
 
-    Leaves everything in ``out``.
+    Leaves everything in ``out``. Weights that the controller refuses are no error: their run is
+    left out, and the log has the reason. Where the first ones are refused, the update learns from
+    the run of WorstCase in place of BayesRace's.
 
     Raises InputError for unusable settings, RaceError when a process is lost (the log stays
     readable), KeyboardInterrupt on Ctrl-C; no process outlives the call.
@@ -243,13 +254,13 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
         drives = _Drives(this, prepared.first, system, recorder)
         with drives.controller(artefact, "bayesrace"):
             with stages.stage("drive WorstCase"):
-                drives.drive("worstcase")
+                driven = drives.drive("worstcase")
             with stages.stage("drive BayesRace"):
-                driven = drives.drive("bayesrace", prepared.weights)
+                driven = drives.drive_with(prepared.weights, "bayesrace") or driven
             with stages.stage("update the residual") as stage:
                 updated = this.update(prepared, drives.samples(driven), stage)
             with stages.stage("drive BayesRace-updated"):
-                drives.drive("bayesrace-updated", updated)
+                drives.drive_with(updated, "bayesrace-updated")
         for best in perfect:
             with drives.controller(best, "bestcase"), stages.stage("drive BestCase"):
                 drives.drive("bestcase")

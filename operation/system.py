@@ -12,7 +12,7 @@ from bayesrace.messages import EVENT, Event
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import Track
 from bayesrace.transport import Director, Endpoints, Publisher, free_endpoint, open_session
-from operation.drive import RunPlan, execute
+from operation.drive import RunPlan, announcement, execute
 from operation.processes import Child, child, endings
 
 __all__ = ["System", "started_system"]
@@ -68,6 +68,11 @@ class System:
     def drive(self, track: Track, plan: RunPlan, recorder: Recorder | None = None) -> Event:
         """Drives one run to its end; see :func:`operation.drive.execute`."""
         return execute(self.director, self._events, track, plan, recorder)
+
+    def refused(self, plan: RunPlan, reason: str) -> None:
+        """Records that a run is not driven, because the controller refuses its weights."""
+        event = announcement(plan, self._events.next_seq, "", reason)
+        self._events.put(event, lockstep=True)
 
     def _wait_for_both(self) -> None:
         """Waits as long as the processes live; InputError if they are not there in time."""

@@ -71,6 +71,8 @@ class Drive:
     fallback_cycles: tuple[int, ...] = ()
     weights: str = ""
     ended: str | None = "2 lap(s) done"
+    refused: str = ""
+    """Why the controller refused its weights."""
     lockstep: bool = True
     drop: tuple[int, ...] = ()
     """Samples that are missing in the log."""
@@ -100,6 +102,7 @@ class _Log:
     def drive(self, run: int, drive: Drive) -> None:
         data: dict[str, object] = {
             "run": run, "controller": drive.controller, "weights_version": drive.weights,
+            "refused": drive.refused,
         }  # fmt: skip
         self.event(run, "race", "run", f"run {run}", data)
         measured = drive.x if drive.measured is None else drive.measured

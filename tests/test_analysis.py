@@ -17,6 +17,7 @@ from bayesrace.vehicles import default_car
 from operation.analysis.laps import Trajectory, time_laps
 from operation.analysis.race import analyse, read_race, read_result, write_result
 from operation.analysis.results import LapResult, RaceResult
+from operation.report import render_report
 from operation.terminal.race_table import COLUMNS, print_table
 from tests.synthetic_race import LAP_S, LINE_M, STEP_S, Drive, circle, track, write_race
 
@@ -187,6 +188,24 @@ def test_a_run_that_never_started_is_reported(tmp_path: Path) -> None:
     assert not lap.finished
     assert lap.ended == "the run never started"
     assert (lap.deviation_mean_m, lap.deviation_max_m, lap.solve_us) == (None, None, None)
+
+
+def test_refused_weights_are_a_row_with_the_reason(tmp_path: Path) -> None:
+    refused = Drive(
+        "bayesrace-updated", np.zeros((0, 7)), ended=None, refused="absurd over the car's range"
+    )
+    result = analyse(write_race(tmp_path, [refused, Drive("bestcase", circle(TWO_LAPS, 1.0))]))
+    lap = result.laps[0]
+    assert (lap.refused, lap.finished, lap.samples) == ("absurd over the car's range", False, 0)
+    assert (result.complete, result.laps[1].finished, result.laps[1].refused) == (True, True, "")
+    text = io.StringIO()
+    print_table(result, Console(file=text, width=80))
+    rows = [line.split() for line in text.getvalue().splitlines()]
+    assert ["bayesrace-updated", "refused", "–"] in [row[:3] for row in rows]
+    assert "bayesrace-updated: refused: absurd over the car's range" in text.getvalue()
+    page = render_report(tmp_path, result).read_text()
+    assert '<div class="time">refused</div>' in page
+    assert "absurd over the car&#39;s range" in page
 
 
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.8, 0.999])

@@ -6,14 +6,23 @@ Most tests look at one race on the shortest track.
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
+from rich.console import Console
 
+from bayesrace.gp.weights import read_weights, write_weights
 from bayesrace.vehicles import default_car, read_car, write_car
 from codegen.build import build
 from codegen.settings import BuildSettings
+from operation import race as driving
+from operation.analysis.race import analyse
 from operation.analysis.results import RaceResult, read_result
+from operation.preparation import updated_weights
+from operation.settings import RaceSettings
+from operation.terminal.progress import stages_on
 from tests.car_fmu import packed_car
 from tests.command_line import Cli, refused
 from tests.foreign_fmu import FOREIGN_MAP, build_foreign_fmu
@@ -137,6 +146,30 @@ def test_the_weights_are_swapped_in_the_running_controller(peanut_race: Race) ->
     assert versions[1] != versions[2]
     # one process drove all three: its log has one start
     assert (peanut_race.out / "controller-bayesrace.log").read_text().count("plant at") == 1
+
+
+def test_a_refusal_is_a_row_and_the_race_goes_on(
+    peanut_track: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The update has learned something absurd."""
+
+    def learn(*arguments: Any) -> Path:
+        vx, vy, omega = (weights := read_weights(updated_weights(*arguments))).outputs
+        absurd = replace(omega, alpha=1e4 * omega.alpha)
+        path = tmp_path / "absurd.bin"
+        write_weights(path, replace(weights, outputs=(vx, vy, absurd)))
+        return path
+
+    monkeypatch.setattr(driving, "updated_weights", learn)
+    track = str(peanut_track)
+    settings = RaceSettings(track=track, train_track=track, laps=1)
+    with stages_on(Console(quiet=True)) as stages:
+        driving.race(settings, tmp_path / "out", stages)
+    laps = {lap.controller: lap for lap in analyse(tmp_path / "out").laps}
+    assert list(laps) == CONTROLLERS
+    assert "absurd" in laps["bayesrace-updated"].refused
+    assert laps["bayesrace"].finished
+    assert laps["bestcase"].finished
 
 
 def test_the_run_directory_is_whole(peanut_race: Race) -> None:

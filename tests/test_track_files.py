@@ -1,6 +1,7 @@
 """Track files: the communities' variants are read, broken ones are refused with row and remedy."""
 
 import contextlib
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 
 from bayesrace.errors import InputError
 from bayesrace.tracks import builtin_tracks, load_track, read_track, write_track
+from tests.command_line import Cli, refused
 from tests.reference import reference_file
 
 HEADER = "# x_m,y_m,w_tr_right_m,w_tr_left_m"
@@ -134,6 +136,7 @@ def test_the_car_decides_how_wide_a_track_must_be(tmp_path: Path) -> None:
         ((100, None), 0.05, "50 m wide, 1000 times the car", "in centimetres; divide them by"),
         ((1000, None), None, "m long and 500 m wide", "in millimetres or centimetres; give"),
         ((100, None), None, "1861 m long and 50 m wide", "in centimetres; give them in metres"),
+        ((100, 1), 0.05, "0.5 m wide", "x, y and the widths probably have different units"),
         ((20000, 1), 0.05, "0.5 m wide", "x, y and the widths probably have different units"),
     ],
 )
@@ -148,6 +151,58 @@ def test_a_track_in_another_unit_is_refused_with_its_likely_unit(
     with pytest.raises(InputError, match=f"{size}; .*{unit}"):
         read_track(path, car_width_m)
     read_track(path, car_width_m=0.0)
+
+
+def test_a_track_far_from_the_origin_is_refused_with_the_remedy(tmp_path: Path) -> None:
+    circle = np.array([row.split(",") for row in scaled(1.0)], dtype=float)
+
+    def moved(by_m: float) -> Path:
+        moved = circle + np.array([by_m, 0, 0, 0])
+        return written(tmp_path, [",".join(map(str, row)) for row in moved.tolist()])
+
+    message = refusal(moved(1e5))
+    assert "the track is 1e+05 m from the origin and 0.5 m wide; subtract the coord" in message
+    read_track(moved(1e3))
+
+
+def noisy(noise_m: float, count: int) -> list[str]:
+    """A kidney of some 8 m, measured with noise; .2 m to the right and .3 m to the left."""
+    angle = np.arange(count) * (2 * np.pi / count)
+    radius = 1 + 0.3 * np.cos(2 * angle)
+    xy = np.column_stack([1.2 * radius * np.cos(angle), radius * np.sin(angle)])
+    xy += noise_m * np.random.default_rng(3).standard_normal(xy.shape)
+    return [f"{x:.6f},{y:.6f},0.2,0.3" for x, y in xy]
+
+
+@pytest.mark.parametrize(("noise_m", "count"), [(0.003, 1500), (0.01, 800), (0.01, 3000)])
+def test_a_measured_centreline_is_smoothed_and_its_deviation_shown(
+    tmp_path: Path, cli: Cli, noise_m: float, count: int
+) -> None:
+    path, smooth = written(tmp_path, noisy(noise_m, count)), tmp_path / "smooth.csv"
+    assert "turns back on itself; give the points in driving order; if they are" in refusal(path)
+    done = cli("tracks", path, "--smooth", "--out", smooth)
+    assert done.code == 0, done.err
+    found = re.search(r"(\d+) points are ([\d.]+) mm \(RMS\) and at most ([\d.]+) mm", done.out)
+    assert found is not None
+    assert int(found[1]) == count
+    assert 0.8e3 * noise_m < float(found[2]) < 1.2e3 * noise_m
+    assert float(found[3]) < 6e3 * noise_m
+    (tmp_path / "loop.csv").write_text("\n".join(noisy(0.0, count)))
+    true = read_track(tmp_path / "loop.csv")
+    measured = read_track(smooth)
+    s = np.linspace(0, measured.length_m, 500)
+    away = true.project_points(measured.position(s)).n_m
+    assert float(np.abs(away).max()) < noise_m
+    assert float(np.abs(measured.curvature(s)).max()) < 1.5 * float(np.abs(true.curvature(s)).max())
+    np.testing.assert_allclose(measured.width_left_m, 0.3)
+
+
+def test_what_no_smoothing_mends_is_refused(tmp_path: Path, cli: Cli) -> None:
+    path = written(tmp_path, rows()[:7])
+    refused(cli("tracks", path, "--smooth"), "too few points (7)")
+    path = written(tmp_path, [HEADER, *scaled(1000)])
+    refused(cli("tracks", path, "--smooth"), "millimetres")
+    refused(cli("tracks", "--smooth"), "need the name of the track")
 
 
 def test_tracks_of_all_scales_are_plausible(tmp_path: Path) -> None:

@@ -8,7 +8,15 @@ import numpy.typing as npt
 
 from bayesrace.arrays import Floats
 
-__all__ = ["MIN_POINTS", "Fault", "clearance_m", "find_crossing", "find_fault", "find_scale_fault"]
+__all__ = [
+    "MIN_POINTS",
+    "Fault",
+    "clearance_m",
+    "find_crossing",
+    "find_fault",
+    "find_scale_fault",
+    "find_value_fault",
+]
 
 MIN_POINTS = 8
 """Fewer points don't describe a circuit: the spline through them would be a guess."""
@@ -20,8 +28,14 @@ _MOST_CARS, _USUAL_CARS = 100.0, 7.0
 """Cars side by side on the widest plausible track, and on a usual one of any scale."""
 _WIDEST_M, _NARROWEST_M = 25.0, 0.15
 """Plausible widths of tracks, from 1:43 to full scale."""
-_MOST_WIDTHS = 10_000.0
+_MOST_WIDTHS = 2_500.0
 """Length of the longest plausible track over its width; the Nordschleife has 2,300."""
+_FARTHEST_WIDTHS = 10_000.0
+"""Largest coordinate over the track's width: controllers count positions from the origin."""
+_IN_ORDER = (
+    "give the points in driving order; if they are measured and lie closer than their noise, "
+    "smooth them ('bayesrace tracks FILE --smooth --out smooth.csv')"
+)
 _UNITS = {"millimetres": 1e3, "centimetres": 1e2}
 _CHUNK = 512
 
@@ -47,6 +61,13 @@ def find_fault(points: Floats, right: Floats, left: Floats, min_width_m: float) 
 
     ``min_width_m``: the least width, right plus left, normally that of the car.
     """
+    return find_value_fault(points, right, left, min_width_m) or _find_shape_fault(points)
+
+
+def find_value_fault(
+    points: Floats, right: Floats, left: Floats, min_width_m: float
+) -> Fault | None:
+    """:func:`find_fault`, but for the shape: what no smoothing mends."""
     if len(points) < MIN_POINTS:
         return Fault(
             None,
@@ -60,7 +81,7 @@ def find_fault(points: Floats, right: Floats, left: Floats, min_width_m: float) 
             "a value is not finite",
             "give every coordinate and width as a finite number in metres",
         )
-    return _find_width_fault(right, left, min_width_m) or _find_shape_fault(points)
+    return _find_width_fault(right, left, min_width_m)
 
 
 def _find_width_fault(right: Floats, left: Floats, min_width_m: float) -> Fault | None:
@@ -103,14 +124,14 @@ def _find_shape_fault(points: Floats) -> Fault | None:
         return Fault(
             int(np.argmax(cosine < -0.999)),
             "the centreline turns back on itself",
-            "give the points in driving order",
+            _IN_ORDER,
         )
     crossing = find_crossing(points)
     if crossing is not None:
         return Fault(
             crossing[1],
             "the centreline crosses itself: the edge from here meets the one from",
-            "give the points in driving order; bridges are not supported",
+            f"{_IN_ORDER}; bridges are not supported",
             other=crossing[0],
         )
     return None
@@ -129,6 +150,13 @@ def find_scale_fault(
     if length_m > _MOST_WIDTHS * width_m:
         remedy = "x, y and the widths probably have different units; give all of them in metres"
         return Fault(None, size, remedy)
+    farthest_m = float(np.abs(points).max())
+    if farthest_m > _FARTHEST_WIDTHS * width_m:
+        return Fault(
+            None,
+            f"the track is {farthest_m:.3g} m from the origin and {width_m:.3g} m wide",
+            "subtract the coordinates of its first point from all x and y",
+        )
     if width_m <= (_WIDEST_M if car_width_m is None else _MOST_CARS * car_width_m):
         return None
     if car_width_m is None:

@@ -13,10 +13,11 @@ import numpy as np
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.files import read_text, write_whole
-from bayesrace.tracks.checks import find_fault, find_scale_fault
+from bayesrace.tracks.checks import Fault, find_fault, find_scale_fault, find_value_fault
+from bayesrace.tracks.smoothing import smooth
 from bayesrace.tracks.track import Track, drop_repeated
 
-__all__ = ["read_table", "read_track", "write_track"]
+__all__ = ["read_smoothed", "read_table", "read_track", "write_track"]
 
 _MOST_POINTS: Final = 20_000
 """Rows of a file: a point each centimetre of a track ten times as long as any here."""
@@ -34,14 +35,40 @@ def read_track(path: Path | str, car_width_m: float | None = None) -> Track:
     InputError naming file, row (line number in the file) and remedy.
     """
     path = Path(path)
+    points, right, left, rows = _read_points(path)
+    _refuse(path, rows, find_fault(points, right, left, default_car_width_m(car_width_m)))
+    if car_width_m != 0:
+        _refuse(path, rows, find_scale_fault(points, right, left, car_width_m))
+    return Track._from_checked(path.stem, points, right, left)
+
+
+def read_smoothed(path: Path | str, car_width_m: float | None = None) -> tuple[Track, Floats]:
+    """The track in a CSV file of points that were measured with noise, which is taken off; and how
+    far each point is from the smooth centreline, (n,) [m].
+
+    Raises InputError like :func:`read_track`, and where the smooth centreline is no track.
+    """
+    path = Path(path)
+    points, right, left, rows = _read_points(path)
+    least_m = default_car_width_m(car_width_m)
+    fault = find_value_fault(points, right, left, least_m)
+    _refuse(path, rows, fault or find_scale_fault(points, right, left, car_width_m))
+    try:
+        track = Track.from_points(path.stem, *smooth(points, right, left), least_m)
+    except InputError as error:
+        raise InputError(f"{path}, smoothed: {error}") from None
+    return track, np.abs(track.project_points(points).n_m)
+
+
+def _read_points(path: Path) -> tuple[Floats, Floats, Floats, list[int]]:
+    """Points (n, 2), widths to the right and to the left (n,), number of each row."""
     table, rows = read_table(path, COLUMNS)
-    points, right, left = drop_repeated(table[:, :2], table[:, 2], table[:, 3])
-    fault = find_fault(points, right, left, default_car_width_m(car_width_m))
-    if fault is None and car_width_m != 0:
-        fault = find_scale_fault(points, right, left, car_width_m)
+    return *drop_repeated(table[:, :2], table[:, 2], table[:, 3]), rows
+
+
+def _refuse(path: Path, rows: list[int], fault: Fault | None) -> None:
     if fault is not None:
         raise InputError(fault.text(str(path), "row", rows))
-    return Track._from_checked(path.stem, points, right, left)
 
 
 def write_track(path: Path | str, track: Track) -> None:

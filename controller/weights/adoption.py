@@ -15,6 +15,7 @@ from typing import Final
 from bayesrace.errors import InputError
 from bayesrace.messages import State
 from bayesrace.vehicles import CarParameters
+from controller.interface import Environment
 from controller.native_step import NativeStep
 from controller.weights.prediction import StateRecord
 from controller.weights.store import History, Store
@@ -45,6 +46,8 @@ class Offer:
     """Staged weights; the control thread fills in the result of their adoption."""
 
     version: str
+    keeps_limit: bool = False
+    """The speed limit, if there is one, goes on: nothing better is known."""
     done: bool = False
     error: str = ""
     """Why they could not be adopted; else empty."""
@@ -71,6 +74,9 @@ class Adoption:
         """A validator works; set by the manager."""
         self.allowed = math.inf
         """Number of states up to which the watch lets lockstep go on; set by the manager."""
+        self.slow: Environment | None = None
+        """Largest speed with the weights in use, and how fast to slow down to it; set by the
+        manager. None: no limit."""
         self.awaited_s = -math.inf
         """Monotonic clock when lockstep has waited for the watch."""
         self.longest_us = 0.0
@@ -83,6 +89,15 @@ class Adoption:
         record = StateRecord(*head, state.x, state.u_applied, state.lockstep, fallen_back)
         self._states[self.recorded % RECORDED] = record
         self.recorded += 1
+
+    def limits(self, vx_mps: float) -> Environment | None:
+        """What limits the car in the next cycle: a faster one slows down from its own speed."""
+        slow = self.slow
+        if slow is None:
+            return None
+        if vx_mps > slow.speed_limit_mps:
+            return slow._replace(speed_limit_mps=vx_mps)
+        return slow._replace(speed_limit_rate_mps2=0.0)
 
     def states(self, begin: int, most: int) -> list[StateRecord]:
         """For the manager: at most so many states from number ``begin`` on, or the oldest kept."""
@@ -107,6 +122,7 @@ class Adoption:
         try:
             self._adopt(offer.version)
             self.allowed = -1
+            self.slow = self.slow if offer.keeps_limit else None
         except InputError as error:
             offer.error = str(error)
         offer.cycle, offer.states = cycle, self.recorded

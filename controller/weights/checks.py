@@ -19,7 +19,7 @@ from controller.native_step import pack_weights
 from controller.weights.prediction import OneStepModel, Sample, plausible_samples
 from controller.weights.settings import GateSettings
 
-__all__ = ["Checks", "Comparison", "Verdict", "Watch"]
+__all__ = ["Checks", "Comparison", "Ruling", "Verdict", "Watch"]
 
 _CLOCKS_APART_S: Final = 3600.0
 """By which the clock of the training host may be ahead."""
@@ -35,6 +35,15 @@ class Comparison(NamedTuple):
     text: str
     data: dict[str, Scalar]
     """The number of ``samples``, and errors such as ``error_new_vx``."""
+
+
+class Ruling(NamedTuple):
+    """What the watch demands."""
+
+    action: str
+    """"back": to the proven weights. "slow": down, as those predict other outputs worse."""
+    text: str
+    data: dict[str, Scalar]
 
 
 class Verdict(NamedTuple):
@@ -166,6 +175,7 @@ class Watch:
         self._checks, self._settings = checks, checks.settings
         self._models = (checks.in_use, checks.reference, checks.nominal)
         self._errors: deque[Floats] = deque(maxlen=self._settings.watch_window)
+        self._slowed, self._fastest_mps = False, 0.0
         self._needed = round(self._settings.watch_s / checks.step_s)
         self._driven = self._cycles = self._fallen_back = 0
         for sample in before[-self._settings.watch_window :]:
@@ -182,8 +192,12 @@ class Watch:
         counts = (self._driven, self._cycles, self._fallen_back)
         return dict(zip(("driven", "cycles", "fallen_back"), counts, strict=True))
 
-    def add(self, fallen_back: bool | None, sample: Sample | None) -> Comparison | None:
-        """A cycle, with the sample that its state completes; the reason to roll back, if any."""
+    def add(self, fallen_back: bool | None, sample: Sample | None) -> Ruling | None:
+        """A cycle, with the sample that its state completes; what is to be done, if anything.
+
+        The car goes back only to weights that predict no output worse over the same samples. After
+        a demand to slow down the watch goes on, with samples from then on.
+        """
         settings = self._settings
         if fallen_back is not None:
             self._cycles += 1
@@ -191,7 +205,7 @@ class Watch:
         hopeless = self._fallen_back > _HOPELESS * self._cycles
         if hopeless and self._cycles >= settings.watch_cycles:
             text = f"found no solution in {self._fallen_back} of {self._cycles} cycles"
-            return Comparison("all", text, self.data)
+            return Ruling("back", text, self.data)
         if sample is None:
             return None
         self._append(sample)
@@ -200,8 +214,19 @@ class Watch:
             return None
         new, reference, nominal = np.array(self._errors).transpose(1, 0, 2)
         found = self._checks.compare(new, [reference], nominal)
-        text = f"predicted {found.worse} worse: {found.text}"
-        return Comparison(found.worse, text, self.data | found.data) if found.worse else None
+        if not found.worse:
+            return None
+        data = self.data | found.data
+        if not (others := self._checks.compare(reference, [new], nominal).worse):
+            return Ruling("back", f"predicted {found.worse} worse: {found.text}", data)
+        if self._slowed:
+            return None
+        self._slowed = True
+        self._errors.clear()
+        data["fastest_mps"] = self._fastest_mps
+        text = f"predicted {found.worse} worse, and the proven ones {others}: {found.text}"
+        return Ruling("slow", text, data)
 
     def _append(self, sample: Sample) -> None:
+        self._fastest_mps = max(self._fastest_mps, float(sample.x[3]))
         self._errors.append(np.array([model.errors([sample])[0] for model in self._models]))

@@ -18,6 +18,8 @@ from bayesrace.errors import InputError
 from bayesrace.messages import ROLLBACK, WEIGHTS, Reply, Scalar
 from bayesrace.transport import Request, declare_service, decode_request
 from bayesrace.vehicles import car_text
+from bayesrace.vehicles.parts import GRAVITY_MPS2
+from controller.interface import Environment
 from controller.native_step import unpack_weights
 from controller.weights.adoption import Adoption, Offer, WeightsPort
 from controller.weights.settings import GateSettings
@@ -44,6 +46,9 @@ _PING_S: Final = 1.0
 """From an answer of the validator to the next message at the latest."""
 _CHUNK: Final = 64
 """States in a message: packing them takes 0.1 ms of the interpreter's lock."""
+
+_BEND: Final = 5.0
+"""Wheelbases: radius of the bend that a car still takes at its limit where it is slowed down."""
 
 _MOST_WAITING: Final = 32
 """Requests; each may hold a file."""
@@ -119,6 +124,7 @@ class WeightUpdateManager:
             **{f"weights_{name}": count for name, count in self._counts.items()},
             "weights_number": self._history.in_use.number,
             "weights_watched": not self._history.in_use.proven,
+            "weights_slowed": self.adoption.slow is not None,
             "validator": self._supervisor.ready,
             "validator_starts": self._supervisor.starts,
             "adoption_us": self._adopted.us,
@@ -297,10 +303,11 @@ class WeightUpdateManager:
         """Acts on an answer, unless it is about weights that are not in use any more."""
         if not answer:  # the validator has just started
             self._next, self._stale, self.adoption.allowed = 0, True, -1
-        elif not self._stale and answer["watch"] is not None:
-            self._end_watch(*answer["watch"])
         elif not self._stale:
-            self.adoption.allowed = math.inf if answer["seen"] is None else answer["seen"]
+            if (ruling := answer["watch"]) is not None:
+                self._rule(*ruling)
+            if ruling is None or ruling[0] == "slow":
+                self.adoption.allowed = math.inf if answer["seen"] is None else answer["seen"]
         sent = self._sent.get("check")
         if sent is not None and sent is self._check and not self._stale:
             self._check, self._verdict = None, answer["verdict"]
@@ -311,14 +318,19 @@ class WeightUpdateManager:
         lockstep = time.monotonic() < self.adoption.awaited_s + _LOCKSTEP_S
         return _LOCKSTEP_POLL_S if lockstep else _POLL_S
 
-    def _end_watch(self, worse: str, data: _Data) -> None:
-        """The watch has a result: the weights in use are proven, or ``worse``."""
-        if not worse:
-            new = self._history.prove()
-            text = f"weights {new.version} (number {new.number}) are proven"
-            self._announce("weights_proven", text, {"version": new.version, "number": new.number})
+    def _rule(self, action: str, why: str, data: _Data) -> None:
+        """The watch has a result: the weights in use are proven, or see :class:`.checks.Ruling`."""
+        in_use = self._history.in_use
+        known: _Data = {"version": in_use.version, "number": in_use.number}
+        if action == "slow":
+            self._slow_down(f"{in_use.version} {why}", {**data, **known})
+            return
+        if not action:
+            self._history.prove()
+            text = f"weights {in_use.version} (number {in_use.number}) are proven"
+            self._announce("weights_proven", text, known)
         else:
-            why = f"{self._history.in_use.version} {worse}"
+            why = f"{in_use.version} {why}"
             try:
                 self._roll_back(self._history.reference, "watch", why, math.inf, data)
             except InputError as refusal:  # the next validator comes to the same result
@@ -327,11 +339,23 @@ class WeightUpdateManager:
             self._rolled_back_s = time.monotonic()
         self._keep()
 
+    def _slow_down(self, why: str, data: _Data) -> None:
+        """Limits the speed until other weights are in use: going back would be no better."""
+        if self.adoption.slow is not None:  # by a validator that has ended meanwhile
+            return
+        car, fastest_mps = self._port.car, float(data["fastest_mps"])
+        bend_m = _BEND * car.wheelbase_m
+        least_mps = math.sqrt(car.friction * GRAVITY_MPS2 * bend_m)
+        limit_mps = max(self._settings.slow_share * fastest_mps, least_mps)
+        self.adoption.slow = Environment(limit_mps, car.tuning.driving.stop_mps2)
+        text = f"at most {limit_mps:.2f} m/s until other weights are in use; {why}"
+        self._announce("weights_slowed", text, {**data, "speed_limit_mps": limit_mps})
+
     # Adoption and store --------------------------------------------------------------------------
 
-    def _adopt(self, packed: bytes, version: str, due_s: float) -> Offer:
+    def _adopt(self, packed: bytes, version: str, due_s: float, keeps_limit: bool = False) -> Offer:
         """Stages weights and waits until the control thread has adopted them."""
-        offer = Offer(version)
+        offer = Offer(version, keeps_limit)
         self._port.step.stage_weights(unpack_weights(packed))
         self.adoption.offers.append(offer)
         until_s = min(time.monotonic() + _ADOPT_S, due_s)
@@ -352,7 +376,7 @@ class WeightUpdateManager:
     ) -> _Answer:
         """Returns to earlier weights."""
         left = self._history.in_use
-        offer = self._adopt(target.packed, target.version, due_s)
+        offer = self._adopt(target.packed, target.version, due_s, keeps_limit=by == "watch")
         self._history.roll_back(target, withdraw=by == "watch")
         self._counts["rolled_back"] += 1
         what = target.version or "no weights, as at the start"

@@ -42,6 +42,10 @@ class GateSettings(BaseModel):
         25, ge=1, le=5000, description="cycles, nearly all of them without a solution, after which "
         "weights are rolled back: a car that stands has no error to compare",
     )  # fmt: skip
+    slow_share: float = Field(
+        0.7, gt=0, le=1, description="of the fastest speed that was watched: the limit where going "
+        "back would be no better",
+    )  # fmt: skip
     watch_window: int = Field(
         100, ge=1, le=5000, description="newest samples that the watch compares on, at first from "
         "before the adoption: in one fast bend good weights can be worse than none",

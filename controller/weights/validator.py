@@ -21,7 +21,7 @@ import msgpack
 
 from bayesrace.vehicles import described_car
 from controller.weights.adoption import RECORDED
-from controller.weights.checks import Checks, Watch
+from controller.weights.checks import Checks, Ruling, Watch
 from controller.weights.prediction import Sample, Sampler, StateRecord
 from controller.weights.settings import GateSettings
 
@@ -40,8 +40,8 @@ class Validator:
     An empty message says that it has started. A message of the controller has any of ``states``,
     ``context`` (what is in use, once all states before its adoption have been sent) and ``check``
     (a weights file). The answer has ``seen``, the number of the next state, or None if nothing is
-    watched; ``watch``, when the watch ends: why weights have to be rolled back (empty: they are
-    proven), with data; and the ``verdict`` on the file.
+    watched; ``watch``, when the watch has a result: the fields of a :class:`.checks.Ruling`, whose
+    action is empty where the weights are proven; and the ``verdict`` on the file.
     """
 
     def __init__(self, connection: Connection, checks: Checks, moving_mps: float) -> None:
@@ -86,16 +86,19 @@ class Validator:
         oldest_ns = time.monotonic_ns() - round(self._checks.settings.recent_s * 1e9)
         return [sample for _, sample in driven if sample and sample.recorded_ns > oldest_ns]
 
-    def _follow(self, driven: Iterable[_Driven]) -> tuple[str, Mapping[str, Any]] | None:
+    def _follow(self, driven: Iterable[_Driven]) -> Ruling | None:
         """Continues the watch; its result depends on the states alone, not on when they come."""
         if (watch := self._watch) is None:
             return None
+        slow: Ruling | None = None
         for state, sample in driven:
-            reason = watch.add(state.fallen_back, sample)
-            if reason is not None or watch.over:
+            ruling = watch.add(state.fallen_back, sample)
+            if ruling is not None and ruling.action == "slow":
+                slow = ruling
+            elif ruling is not None or watch.over:
                 self._watch = None
-                return (reason.text, reason.data) if reason else ("", {})
-        return None
+                return ruling or Ruling("", "", {})
+        return slow
 
 
 def main(arguments: list[str]) -> int:

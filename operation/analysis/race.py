@@ -139,6 +139,8 @@ class DrivenRun:
             trajectory_sha256=self.digest(),
             samples=len(self.record.truth),
             ended=self.ended,
+            refused=self.record.plan.refused,
+            remarks=self.record.remarks,
         )
 
     def _largest(self, values: Floats) -> float | None:

@@ -38,6 +38,9 @@ RUN_EVENT: Final = "run"
 """Kind of the event that announces a run of a race before it starts."""
 
 
+_REMARKS: Final = ("weights_rolled_back", "weights_slowed")
+
+
 @dataclass(frozen=True)
 class PlannedRun:
     """The controller of a run: the data of a ``kind="run"`` event from the race."""
@@ -45,6 +48,8 @@ class PlannedRun:
     run: int
     controller: str
     weights_version: str
+    refused: str = ""
+    """Why the controller has refused its weights, so that it was not driven; else empty."""
 
     @classmethod
     def from_event(cls, event: Event) -> "PlannedRun | None":
@@ -54,7 +59,8 @@ class PlannedRun:
         run, controller = event.data.get("run"), event.data.get("controller")
         if type(run) is not int or type(controller) is not str:
             return None
-        return cls(run, controller, str(event.data.get("weights_version", "")))
+        words = (str(event.data.get(name, "")) for name in ("weights_version", "refused"))
+        return cls(run, controller, *words)
 
 
 @dataclass(eq=False)
@@ -112,11 +118,19 @@ class RunRecord(Trajectory):
         return missing
 
     @property
+    def remarks(self) -> list[str]:
+        """What the controller has reported of its weights in mid-run, in order."""
+        own = (event for event in self.events if event.source == "controller")
+        return [event.text for event in own if event.kind in _REMARKS]
+
+    @property
     def ended(self) -> str:
         """Why the run ended: the text of the plant's event, or where the log ends without one."""
         for event in reversed(self.events):
             if event.source == "plant" and event.kind == "run_ended":
                 return event.text
+        if self.plan.refused:
+            return f"the controller has refused its weights: {self.plan.refused}"
         if not self.states:
             return "the run never started"
         return (

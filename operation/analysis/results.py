@@ -62,6 +62,13 @@ class LapResult(_Frozen):
     )
     samples: int = Field(description="states of the run in the log")
     ended: str = Field(description="why the run ended")
+    refused: str = Field(
+        "",
+        description="why the controller refused its weights, so that it was not driven; or empty",
+    )
+    remarks: list[str] = Field(
+        [], description="of the controller in mid-run: weights rolled back, speed limited"
+    )
 
 
 class GpMetrics(_Frozen):

@@ -74,6 +74,9 @@ def tracks(
             help="Start line at the node nearest to this point [m].",
         ),
     ] = None,
+    smooth: Annotated[
+        bool, typer.Option("--smooth", help="Take the noise off the points of a measured CSV file.")
+    ] = False,
     car: Annotated[
         str, typer.Option(metavar="CAR", show_default="of any", help="Car whose scale to check.")
     ] = "",
@@ -82,18 +85,20 @@ def tracks(
     import numpy as np
     from rich.table import Table
 
-    from bayesrace.tracks import builtin_tracks, load_track, write_track
+    from bayesrace.tracks import builtin_tracks, load_track, read_smoothed, write_track
     from bayesrace.vehicles import get_car
     from operation.terminal.terminal import Terminal
 
-    if name is None and (out or picture or start or reverse):
-        raise InputError("--out, --picture, --start and --reverse need the name of the track")
+    if name is None and (out or picture or start or reverse or smooth):
+        text = "--out, --picture, --start, --reverse and --smooth need the name of the track"
+        raise InputError(text)
     if picture is not None:
         from operation.report.track_picture import check_picture, write_picture
 
         check_picture(picture)
     place, grid = _point(start), None
     car_width_m = get_car(car).width_m if car else None
+    moved = ""
     table = Table("track", "length m", "width m", "tightest radius m", "points")
     for one in [name] if name else builtin_tracks():
         if Path(one).suffix in (".yaml", ".yml"):
@@ -101,6 +106,13 @@ def tracks(
 
             grid = read_map(one)
             track = track_of_map(grid, car_width_m)
+        elif smooth:
+            track, away_m = read_smoothed(one, car_width_m)
+            rms_m, largest_m = float(np.sqrt(np.mean(away_m**2))), float(away_m.max())
+            moved = (
+                f"{len(away_m)} points are {1e3 * rms_m:.1f} mm (RMS) and at most "
+                f"{1e3 * largest_m:.1f} mm away from the smooth centreline"
+            )
         else:
             track = load_track(one, car_width_m)
         if place is not None or reverse:
@@ -116,6 +128,8 @@ def tracks(
         if picture is not None:
             write_picture(picture, track, grid)
     Terminal().print(table)
+    if moved:
+        typer.echo(moved)
 
 
 def _point(text: str | None) -> tuple[float, float] | None:

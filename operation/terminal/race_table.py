@@ -39,7 +39,7 @@ def _decimals(value: float | None, count: int) -> str:
 
 
 def _first_lap(lap: LapResult) -> str:
-    return _decimals(lap.lap_time_s, 3) if lap.finished else "DNF"
+    return _decimals(lap.lap_time_s, 3) if lap.finished else "refused" if lap.refused else "DNF"
 
 
 def _solve(name: str) -> Callable[[LapResult], str]:
@@ -64,7 +64,8 @@ def _slip(lap: LapResult) -> str:
 
 COLUMNS: Final = (
     Column("controller", "", lambda lap: lap.controller, "name of the controller", number=False),
-    Column("lap", "s", _first_lap, "first lap, from standstill; DNF: did not finish one"),
+    Column("lap", "s", _first_lap, "first lap, from standstill; DNF: did not finish one; "
+        "refused: the controller refused its weights, and was not driven"),
     Column("flying", "s", lambda lap: _decimals(lap.flying_lap_time_s, 3), "best later lap"),
     Column(
         "off track", "", lambda lap: str(lap.off_track_samples),
@@ -205,7 +206,11 @@ def _print_notes(result: RaceResult, console: Console) -> None:
     if result.real_time_factor is not None:
         console.print(Text(f"lockstep at {result.real_time_factor:.1f} × real time"))
     for lap in result.laps:
-        if not lap.finished:
+        for remark in lap.remarks:
+            console.print(Text(f"{lap.controller}: {remark}", style="yellow"))
+        if lap.refused:
+            console.print(Text(f"{lap.controller}: refused: {lap.refused}", style="red"))
+        elif not lap.finished:
             console.print(Text(f"{lap.controller} did not finish: {lap.ended}", style="red"))
         elif (count := len(lap.lap_times_s)) < result.settings.laps:
             text = f"{lap.controller} finished {count} of {result.settings.laps} laps: {lap.ended}"

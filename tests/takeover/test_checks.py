@@ -240,6 +240,25 @@ def test_the_watch_rolls_spoilt_weights_back(
     assert 5 <= count <= LIMIT_SAMPLES
 
 
+def test_the_watch_goes_back_only_to_what_is_no_worse(
+    checks: Checks, honest: GpWeights, again: GpWeights, drive: list[Sample]
+) -> None:
+    """Wrong in vx alone, weights are still better than none: the car slows down, once."""
+    bad = spoilt(again, "flip vx")
+    for reference, actions in ((None, ["slow"]), (honest, ["back"])):
+        checks.use(file(bad), 2**62, file(reference))
+        watch, rulings = Watch(checks, []), []
+        for sample in drive:
+            if (ruling := watch.add(False, sample)) is not None:
+                rulings.append(ruling)
+            if watch.over or (ruling is not None and ruling.action == "back"):
+                break
+        assert [ruling.action for ruling in rulings] == actions
+        assert "predicted vx worse" in rulings[0].text
+        assert watch.over is (reference is None)
+    assert int(rulings[0].data["samples"]) <= 100
+
+
 def test_the_watch_rolls_back_what_leaves_no_solution(checks: Checks, honest: GpWeights) -> None:
     """A car that stands has no error by which weights could be judged."""
     checks.use(file(honest), 2**62, b"")

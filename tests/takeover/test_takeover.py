@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bayesrace.gp.weights import GpWeights, encode_weights
+from bayesrace.gp.weights import GpWeights, encode_weights, write_weights, zero_weights
 from bayesrace.messages import ACTUATION, TELEMETRY
 from bayesrace.transport import Director, RefusedError
 from tests.network.cars import Course
@@ -72,6 +72,32 @@ def test_inputs_jump_by_what_the_new_model_explains(
     np.testing.assert_allclose(inputs, with_takeover, rtol=0, atol=1e-9)
     np.testing.assert_allclose(inputs[:first], without[:first], rtol=0, atol=1e-9)
     assert np.abs(inputs[first] - without[first]).max() > 1e-3  # or there is nothing to explain
+
+
+def test_where_going_back_is_no_better_the_car_slows_down_and_says_so(
+    tmp_path: Path, course: Course, good: GpWeights
+) -> None:
+    """At speed, no correction, as at the start, is worse than one that errs in vx alone."""
+    start, gate = tmp_path / "none.bin", tmp_path / "gate.json"
+    write_weights(start, zero_weights("orca", good.discretisation))
+    gate.write_text('{"watch_least": 60}')
+    at_start = replace(course, weights_file=start)
+    with rigged(tmp_path, at_start, "--gate", str(gate)) as rig:
+        rig.send(spoilt(good, "flip vx"))
+        rig.drive(1)
+        (slowed,) = rig.events("weights_slowed")
+        assert "predicted vx worse, and the proven ones" in slowed.text
+        limit_mps = float(slowed.data["speed_limit_mps"])
+        speeds = [state.x[3] for state in rig.states(1)]
+        assert max(speeds) > limit_mps + 0.2
+        assert max(speeds[-50:]) < limit_mps + 0.1
+        assert rig.off_track_m(1) < 0.0
+        # At the lower speed no weights are no worse: the watch goes back, and the limit stays.
+        (back,) = rig.events("weights_rolled_back")
+        assert back.seq > slowed.seq
+        assert rig.counters()["weights_slowed"] is True
+        rig.send(good)
+        assert rig.counters()["weights_slowed"] is False
 
 
 QUICK = ("flip all", "swap vy omega")
