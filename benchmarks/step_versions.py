@@ -72,14 +72,14 @@ def record(problems: int, seed: int) -> dict[str, Any]:
     settings = BenchSettings(seed=seed)
     car = settings.driven_car
     with stages_on(Console(stderr=True)) as stages:
-        prepared = prepare(settings, settings.tracks, stages)
+        prepared = prepare(settings, settings.driven_on, stages)
     weights = read_weights(prepared.weights)
     rows: dict[str, list[Any]] = {name: [] for name in ("x", "d", "reference", "first")}
     for one in prepared.tracks:
         controller = compiled_controller(prepared.artefacts[0], car, one.track, one.line, weights)
         step, simulator = controller.native, Simulator(dynamic(car))
         simulator.reset([*one.track.start_pose(), 1.0, 0.0, 0.0, 0.0])
-        for k in range(problems // len(settings.tracks)):
+        for k in range(problems // len(settings.driven_on)):
             x, d = simulator.x.copy(), simulator.u_applied[0]
             status = step.step(x, d)
             for key, value in zip(rows, (x, d, step.read_reference(), k == 0), strict=True):

@@ -16,21 +16,29 @@ def linearised(f: ca.Function) -> ca.Function:
     """``(x, u, e, lambda) -> (F, J', H)`` of any f(x, u, e), as :func:`linearise_function`."""
     nx, nu, ne = (f.size1_in(i) for i in range(3))
     nv = nx + nu
-    w, lam = ca.SX.sym("w", nv + ne), ca.SX.sym("lambda", nx)
-    x_next = f(w[:nx], w[nx:nv], w[nv:])
-    jacobian = ca.jacobian(x_next, w)
-    hessian, _ = ca.hessian(ca.dot(lam, x_next), w)
-    outputs = [x_next, ca.densify(jacobian), ca.densify(hessian)]
-    return _with_arguments(
-        ca.Function("br_derivatives", [w, lam], outputs, {"cse": True}), nx, nu, ne
+    w = ca.SX.sym("w", nv + ne)
+    return _with_arguments(*_derivatives(w, f(w[:nx], w[nx:nv], w[nv:]), ""), nx, nu, ne)
+
+
+def _derivatives(v: ca.SX, x_next: ca.SX, suffix: str) -> tuple[ca.Function, ca.Function]:
+    """``v -> (x_next, J)`` and ``(v, lambda) -> H``: apart, because H is often not needed."""
+    lam = ca.SX.sym("lambda", x_next.numel())
+    jacobian = ca.densify(ca.jacobian(x_next, v))
+    hessian = ca.densify(ca.hessian(ca.dot(lam, x_next), v)[0])
+    options = {"cse": True}
+    return (
+        ca.Function(f"br_forward{suffix}", [v], [x_next, jacobian], options),
+        ca.Function(f"br_second{suffix}", [v, lam], [hessian], options),
     )
 
 
-def _with_arguments(derivatives: ca.Function, nx: int, nu: int, ne: int) -> ca.Function:
+def _with_arguments(
+    forward: ca.Function, second: ca.Function, nx: int, nu: int, ne: int
+) -> ca.Function:
     """The same with x, u and e apart, and the Jacobian transposed."""
     x, u, e = ca.MX.sym("x", nx), ca.MX.sym("u", nu), ca.MX.sym("e", ne)
-    lam = ca.MX.sym("lambda", nx)
-    x_next, jacobian, hessian = derivatives(ca.vertcat(x, u, e), lam)
+    lam, w = ca.MX.sym("lambda", nx), ca.vertcat(x, u, e)
+    (x_next, jacobian), hessian = forward(w), second(w, lam)
     return ca.Function(
         "br_linearise",
         [x, u, e, lam],
@@ -40,24 +48,11 @@ def _with_arguments(derivatives: ca.Function, nx: int, nu: int, ne: int) -> ca.F
     )
 
 
-def _substep_functions(f: ca.Function) -> tuple[ca.Function, ca.Function]:
-    """``(v, lambda) -> (x_next, J, H)`` and ``v -> (x_next, J)`` of f(x, u), v = [x; u]."""
-    v, lam = ca.SX.sym("v", _NV), ca.SX.sym("lambda", _NX)
-    x_next = f(v[:_NX], v[_NX:])
-    jacobian = ca.densify(ca.jacobian(x_next, v))
-    hessian, _ = ca.hessian(ca.dot(lam, x_next), v)
-    outputs = [x_next, jacobian, ca.densify(hessian)]
-    options = {"cse": True}
-    return (
-        ca.Function("br_substep", [v, lam], outputs, options),
-        ca.Function("br_substep_forward", [v], outputs[:2], options),
-    )
+def _composed(model: Model, discretisation: Discretisation) -> tuple[ca.Function, ca.Function]:
+    """``w -> (F, J)`` and ``(w, lambda) -> H`` for many sub-steps.
 
-
-def _composed(model: Model, discretisation: Discretisation) -> ca.Function:
-    """The same for many sub-steps, by the chain rule, so that code grows by calls.
-
-    With S_i = d [x_i; u] / d [x; u] and lambda_i the costate of sub-step i:
+    By the chain rule, so that code grows by calls. With S_i = d [x_i; u] / d [x; u] and lambda_i
+    the costate of sub-step i:
 
         J = d x_n / d v,    H = sum_i S_i' H_i(lambda_i) S_i,    lambda_i = A_i' lambda_{i+1}
 
@@ -65,33 +60,34 @@ def _composed(model: Model, discretisation: Discretisation) -> ca.Function:
     """
     n = discretisation.substeps
     one = discretisation.model_copy(update={"step_s": discretisation.step_s / n, "substeps": 1})
-    substep, forward = _substep_functions(one.discretise(model))
+    v = ca.SX.sym("v", _NV)
+    forward, second = _derivatives(v, one.discretise(model)(v[:_NX], v[_NX:]), "_substep")
     w, lam = ca.MX.sym("w", _NW), ca.MX.sym("lambda", _NX)
     u = w[_NX:_NV]
     states, jacobians = [w[:_NX]], []
-    for _ in range(n - 1):
+    for _ in range(n):
         x_next, jacobian = forward(ca.vertcat(states[-1], u))
         states.append(x_next)
         jacobians.append(jacobian)
-    x_next, jacobian, curvature = substep(ca.vertcat(states[-1], u), lam)
-    states.append(x_next)
-    jacobians.append(jacobian)
     hold_u = ca.horzcat(ca.MX.zeros(2, _NX), ca.MX.eye(2))
     sensitivities = [ca.MX.eye(_NV)]
     for jacobian in jacobians:
         sensitivities.append(ca.vertcat(jacobian @ sensitivities[-1], hold_u))
     costate = lam
-    hessian = sensitivities[n - 1].T @ curvature @ sensitivities[n - 1]
-    for i in reversed(range(n - 1)):
-        costate = jacobians[i + 1][:, :_NX].T @ costate
-        _, _, curvature = substep(ca.vertcat(states[i], u), costate)
+    hessian = ca.MX(_NV, _NV)
+    for i in reversed(range(n)):
+        curvature = second(ca.vertcat(states[i], u), costate)
         hessian += sensitivities[i].T @ curvature @ sensitivities[i]
+        costate = jacobians[i][:, :_NX].T @ costate
     enters = ca.vertcat(ca.DM.zeros(3, _NE), ca.DM.eye(_NE), ca.DM.zeros(1, _NE))
     jacobian = ca.horzcat(sensitivities[n][:_NX, :], enters)
     hessian = ca.diagcat(hessian, ca.DM.zeros(_NE, _NE))
     x_next = states[-1] + enters @ w[_NV:]
-    outputs = [x_next, ca.densify(jacobian), ca.densify(hessian)]
-    return ca.Function("br_composed", [w, lam], outputs, {"cse": True})
+    options = {"cse": True}
+    return (
+        ca.Function("br_composed", [w], [x_next, ca.densify(jacobian)], options),
+        ca.Function("br_composed_second", [w, lam], [ca.densify(hessian)], options),
+    )
 
 
 def linearise_function(model: Model, discretisation: Discretisation) -> ca.Function:
@@ -103,7 +99,7 @@ def linearise_function(model: Model, discretisation: Discretisation) -> ca.Funct
     natively (controller/native/br_stage.c).
     """
     if discretisation.substeps > 1 and discretisation.pose == "integrated":
-        return _with_arguments(_composed(model, discretisation), _NX, _NV - _NX, _NE)
+        return _with_arguments(*_composed(model, discretisation), _NX, _NV - _NX, _NE)
     return linearised(discretisation.corrected(model))
 
 

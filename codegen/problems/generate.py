@@ -15,7 +15,20 @@ __all__ = ["c_header", "functions"]
 
 def functions(problem: Problem) -> list[ca.Function]:
     """Everything that the runtime calls, named ``br_...``."""
-    return [problem.linearise, problem.advance, *_parts(problem)]
+    return [*_derivatives(problem.linearise), problem.advance, *_parts(problem)]
+
+
+def _derivatives(linearise: ca.Function) -> list[ca.Function]:
+    """Value with Jacobian, and the Hessian alone, which the runtime makes later."""
+    kind = ca.SX if linearise.is_a("SXFunction") else ca.MX
+    names = ["x", "u", "e", "lambda"]
+    x, u, e, lam = (kind.sym(name, linearise.size1_in(i)) for i, name in enumerate(names))
+    f, jacobian, _ = linearise.call([x, u, e, kind(ca.DM.zeros(lam.shape))], True, False)
+    hessian = linearise.call([x, u, e, lam], True, False)[2]
+    return [
+        ca.Function("br_linearise", [x, u, e], [f, jacobian], names[:3], ["f", "jacobian"]),
+        ca.Function("br_hessian", [x, u, e, lam], [hessian], names, ["hessian"]),
+    ]
 
 
 def _parts(problem: Problem) -> list[ca.Function]:

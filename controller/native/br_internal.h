@@ -28,15 +28,22 @@
 #define BR_LINE_SEARCH_TRIALS 5
 #define BR_FUTILE 8 /* second starts in vain from which they are made only each so many steps */
 #define BR_DEFECT_FINE 0.01 /* of BR_STATE_SCALE: not worth another iteration */
-#define BR_GP_PADDED (((BR_GP_CAPACITY + 7) / 8) * 8)
+#define BR_GP_BLOCK 128     /* training points that are taken at a time: in the first-level cache */
+#define BR_GP_BLOCKS ((BR_GP_CAPACITY + BR_GP_BLOCK - 1) / BR_GP_BLOCK)
+#define BR_GP_PADDED (BR_GP_BLOCKS * BR_GP_BLOCK)
+#define BR_GP_FIRST ((1 + BR_NZ + 7) / 8) /* groups of eight columns for 1 and the inputs ... */
+#define BR_GP_SECOND ((BR_NZ * (BR_NZ + 1) / 2 + 7) / 8) /* ... and for their products */
 
 /* One output of the residual as the kernel wants it: scaled features, structure of arrays. */
 typedef struct {
     int kernel, n_padded;
     double offset;
-    double inverse_scale[BR_NZ];
+    double inverse_scale[BR_NZ], middle[BR_NZ]; /* z * inverse_scale - middle is what is in ... */
     BR_ALIGNED double inputs[BR_NZ][BR_GP_PADDED];
-    BR_ALIGNED double alpha[BR_GP_PADDED]; /* signal scale folded in */
+    BR_ALIGNED double alpha[BR_GP_PADDED];   /* signal scale folded in */
+    double reach;                            /* length of the longest input */
+    BR_ALIGNED double squares[BR_GP_PADDED]; /* of the length of the inputs, times -log2(e) / 2 */
+    BR_ALIGNED double columns[BR_GP_FIRST + BR_GP_SECOND][BR_GP_PADDED][8];
 } br_gp_output;
 
 typedef struct {
@@ -58,11 +65,23 @@ typedef struct {
     double uu[2 * BR_NU][2 * BR_NU];                         /* of [u; u_before] */
 } br_stage_curvature;
 
+/* Weights of one block of training points. */
+typedef double br_gp_row[BR_GP_BLOCK];
+
+/* The residual at one stage. */
+typedef struct {
+    double mean[BR_NE], gradient[BR_NE][BR_NZ];
+    double sums[BR_NE][8 * BR_GP_FIRST]; /* for br_gp_curvature */
+} br_correction;
+
 /* Linearisation of the corrected model at one stage. */
 typedef struct {
     double f[BR_NX];
     double jacobian[BR_NX][BR_NV];
-    double hessian[BR_NV][BR_NV]; /* weighted with the costate of the stage's end */
+    double hessian[BR_NV][BR_NV]; /* weighted with the costate of the stage's end; made later */
+    double in_e[BR_NX][BR_NE];    /* the nominal model's Jacobian in the residual */
+    br_correction residual;
+    int slot; /* where the weights of its kernels are kept */
 } br_stage;
 
 typedef struct {
@@ -158,7 +177,8 @@ struct br_mpc {
     double turn_u[BR_N][BR_NU]; /* inputs that the reference of a turn has been made with */
     /* the plan, primal and dual */
     int warm;          /* a plan from the step before is there */
-    int linearised;    /* stage[] belongs to the plan and the weights in use */
+    int linearised;    /* stage[] belongs to the plan and the weights in use, ... */
+    int curved;        /* ... and so do its Hessians */
     unsigned attempts; /* steps without a usable plan since the last warm start that gave one */
     int unfinished;    /* iterations that BR_TIME_LIMIT has left without a usable plan */
     double lag;        /* of the plan, without what br_mpc_prepare shifted, behind the last state */
@@ -176,6 +196,7 @@ struct br_mpc {
     double answer_x[BR_N + 1][BR_NX], answer_u[BR_N][BR_NU]; /* plan of the last step */
     br_timer timer;
     br_stage stage[BR_N];
+    BR_ALIGNED br_gp_row kernels[BR_NE * BR_GP_BLOCKS * BR_N]; /* see br_gp_evaluate */
     br_qp qp;
     double penalty; /* on the sum of the plan's defects ... */
     double merit;   /* ... beside its cost */
@@ -184,8 +205,15 @@ struct br_mpc {
 };
 
 /* br_gp.c */
-void br_gp_evaluate(const br_gp *gp, const double z[BR_NZ], double mean[BR_NE],
-                    double gradient[BR_NE][BR_NZ], double hessian[BR_NE][BR_NZ][BR_NZ]);
+/* Mean and gradient of several stages, at most BR_N. Their weights for br_gp_curvature go into
+ * kept, which has room for those of so many stages: (output, block, stage), row by row. */
+void br_gp_evaluate(const br_gp *gp, int stages, double (*z)[BR_NZ], br_gp_row *kept, int room,
+                    br_correction *out);
+/* Of all stages that kept has room for, out[s] = sum_j weight[s][j] d^2 mu_j / d z^2. */
+void br_gp_curvature(const br_gp *gp, int stages, double (*z)[BR_NZ], br_gp_row *kept,
+                     const br_correction *const values[], double (*weight)[BR_NE],
+                     double (*out)[BR_NZ][BR_NZ]);
+void br_gp_mean(const br_gp *gp, const double z[BR_NZ], double mean[BR_NE]);
 br_mpc_error br_gp_load(br_gp *gp, const br_mpc_gp outputs[BR_NE]);
 
 /* br_weights.c */
@@ -206,8 +234,15 @@ void br_path_ahead(const br_path *path, double distance, double point[2]);
 void br_turnaround(br_mpc *mpc);
 
 /* br_stage.c */
-void br_stage_linearise(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
-                        const double lambda[BR_NX], br_stage *stage);
+/* Values and Jacobians of several stages, which take the slots from the given one on of kernels,
+ * with room for so many. */
+void br_stages_linearise(const br_gp *gp, int stages, double (*x)[BR_NX], double (*u)[BR_NU],
+                         br_gp_row *kernels, int room, int slot, br_stage *stage);
+/* Hessians of all linearised stages, at the same x and u; of each slot there is one. */
+void br_stages_curve(const br_gp *gp, int stages, double (*x)[BR_NX], double (*u)[BR_NU],
+                     double (*lambda)[BR_NX], br_gp_row *kernels, br_stage *stage);
+void br_stage_next(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
+                   double x_next[BR_NX]);
 void br_stage_advance(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
                       double duration, double x_next[BR_NX]);
 
@@ -246,6 +281,7 @@ void br_timer_note(const br_timer *timer, double begin, double *longest);
 
 /* br_sqp.c: the plan's start, shift and iteration */
 void br_sqp_linearise(br_mpc *mpc);
+void br_sqp_curve(br_mpc *mpc);
 void br_sqp_cold_start(br_mpc *mpc);
 void br_sqp_roll_out(br_mpc *mpc, const double u[BR_NU]);
 void br_sqp_shift(br_mpc *mpc);

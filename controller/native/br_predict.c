@@ -8,7 +8,6 @@
 
 /* x <- the state after a duration of at most a stage. */
 static void advance(const br_mpc *mpc, double x[BR_NX], const double u[BR_NU], double duration) {
-    static const double none[BR_NX] = {0};
     const double *theta = br_theta(&mpc->parameters);
     const br_gp *gp = &mpc->gp[mpc->gp_in_use];
     double acting[BR_NU], unlimited[BR_NX];
@@ -18,9 +17,7 @@ static void advance(const br_mpc *mpc, double x[BR_NX], const double u[BR_NU], d
     casadi_real w[br_acting_SZ_W + br_reached_SZ_W + 1];
     br_acting(arg, res, iw, w, 0);
     if (duration == BR_TS) {
-        br_stage stage;
-        br_stage_linearise(gp, x, acting, none, &stage);
-        memcpy(unlimited, stage.f, sizeof stage.f);
+        br_stage_next(gp, x, acting, unlimited);
     } else {
         br_stage_advance(gp, x, acting, duration, unlimited);
     }

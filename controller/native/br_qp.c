@@ -239,23 +239,27 @@ static void condense_gradient(br_mpc *mpc, double tau) {
     }
 }
 
-/* In-place Cholesky of the lower triangle; 0 if a pivot is not safely positive. */
+/* Cholesky factor L' of the lower triangle, into the upper one: there, rows are eliminated in whole
+ * vectors, and the lower triangle is overwritten as far as vectors reach. 0 if a pivot is not
+ * safely positive. */
 static int cholesky(br_qp *qp) {
     double largest = 0;
-    for (int i = 0; i < BR_M; ++i) largest = fmax(largest, fabs(qp->h[i][i]));
+    for (int i = 0; i < BR_M; ++i) {
+        largest = fmax(largest, fabs(qp->h[i][i]));
+        for (int j = 0; j < i; ++j) qp->h[j][i] = qp->h[i][j];
+    }
     for (int j = 0; j < BR_M; ++j) {
         double *restrict row = qp->h[j];
-        for (int k = 0; k < j; ++k) {
-            const double *restrict other = qp->h[k];
-            double sum = row[k];
-            for (int c = 0; c < k; ++c) sum -= row[c] * other[c];
-            row[k] = sum * qp->diagonal[k];
+        if (!(row[j] > POSITIVE_DEFINITE * largest)) return 0;
+        qp->diagonal[j] = 1.0 / sqrt(row[j]);
+        for (int c = j / BR_LANES * BR_LANES; c < BR_MP; c += BR_LANES)
+            br_store(&row[c], qp->diagonal[j] * br_load(&row[c]));
+        for (int i = j + 1; i < BR_M; ++i) {
+            double *restrict below = qp->h[i];
+            const double factor = row[i];
+            for (int c = i / BR_LANES * BR_LANES; c < BR_MP; c += BR_LANES)
+                br_store(&below[c], br_load(&below[c]) - factor * br_load(&row[c]));
         }
-        double pivot = row[j];
-        for (int c = 0; c < j; ++c) pivot -= row[c] * row[c];
-        if (!(pivot > POSITIVE_DEFINITE * largest)) return 0;
-        row[j] = sqrt(pivot);
-        qp->diagonal[j] = 1.0 / row[j];
     }
     return 1;
 }
@@ -266,7 +270,7 @@ static inline __attribute__((always_inline)) void substitute(br_qp *qp, const in
     for (int r = 0; r < BR_M; ++r) {
         double *restrict y = qp->y[r];
         for (int c = 0; c < r; ++c) {
-            const double l = qp->h[r][c];
+            const double l = qp->h[c][r];
             const double *restrict solved = qp->y[c];
             for (int i = first; i < last; ++i) y[i] -= l * solved[i];
         }
@@ -345,6 +349,7 @@ void br_qp_factorise(br_mpc *mpc) {
     static const double curvature[] = {1.0, 0.5, 0.25, 0.0};
     br_qp *qp = &mpc->qp;
     qp->factorised = 0;
+    br_sqp_curve(mpc);
     br_evaluate_curvature(mpc);
     for (int k = 0; k < BR_N; ++k) propagate_sensitivity(qp->g[k + 1], qp->g[k], &mpc->stage[k], k);
     for (int attempt = 0; attempt < 4; ++attempt) {
@@ -429,7 +434,7 @@ static int run_daqp(br_qp *qp) {
 static void recover(br_qp *qp) {
     for (int r = BR_M - 1; r >= 0; --r) {
         double sum = qp->u[r] - qp->y[r][BR_ROWS];
-        for (int c = r + 1; c < BR_M; ++c) sum -= qp->h[c][r] * qp->delta_u[c];
+        for (int c = r + 1; c < BR_M; ++c) sum -= qp->h[r][c] * qp->delta_u[c];
         qp->delta_u[r] = sum * qp->diagonal[r];
     }
     memset(qp->multiplier, 0, sizeof qp->multiplier);

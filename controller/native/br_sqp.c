@@ -3,21 +3,31 @@
  * An iteration solves the QP at the linearisation in store, takes a step (the full one unless the
  * plan gets worse) and linearises at the new plan. That linearisation gives the residuals from
  * which the status is derived, and, shifted by a stage, it is what the next control step starts
- * from: only its last stage is new.
+ * from: only its last stage is new. Residuals need no second derivatives. These are made when a QP
+ * does: after the last iteration of a step, by br_mpc_prepare.
  */
 #include <math.h>
 
 #include "br_internal.h"
 
-static void linearise(br_mpc *mpc, int first) {
-    mpc->qp.factorised = mpc->qp.evaluated = mpc->followed = 0;
+/* So many stages from one on; their kernels go into the slots from the given one on. */
+static void linearise(br_mpc *mpc, int first, int stages, int slot) {
+    mpc->qp.factorised = mpc->qp.evaluated = mpc->curved = mpc->followed = 0;
     mpc->linearised = 1;
-    for (int k = first; k < BR_N; ++k)
-        br_stage_linearise(&mpc->gp[mpc->gp_in_use], mpc->plan.x[k], mpc->plan.u[k],
-                           mpc->plan.costate[k + 1], &mpc->stage[k]);
+    br_stages_linearise(&mpc->gp[mpc->gp_in_use], stages, &mpc->plan.x[first], &mpc->plan.u[first],
+                        mpc->kernels, BR_N, slot, &mpc->stage[first]);
 }
 
-void br_sqp_linearise(br_mpc *mpc) { linearise(mpc, 0); }
+void br_sqp_linearise(br_mpc *mpc) { linearise(mpc, 0, BR_N, 0); }
+
+/* The second derivatives of the linearised stages, for a QP: the last linearisation of a step
+ * has none before its plan has been sent. */
+void br_sqp_curve(br_mpc *mpc) {
+    if (mpc->curved) return;
+    mpc->curved = 1;
+    br_stages_curve(&mpc->gp[mpc->gp_in_use], BR_N, mpc->plan.x, mpc->plan.u, mpc->plan.costate + 1,
+                    mpc->kernels, mpc->stage);
+}
 
 /* Without a plan from before: the problem's guess, see where that leads; or turn. Where that has
  * led to no plan time and again, Newton's steps may go round in circles: then, but for a turn,
@@ -36,18 +46,15 @@ void br_sqp_roll_out(br_mpc *mpc, const double u[BR_NU]) {
     memset(mpc->plan.multiplier, 0, sizeof mpc->plan.multiplier);
     for (int k = 0; k < BR_N; ++k) {
         memcpy(mpc->plan.u[k], mpc->turn ? mpc->turn_u[k] : u, sizeof mpc->plan.u[k]);
-        br_stage_linearise(&mpc->gp[mpc->gp_in_use], mpc->plan.x[k], mpc->plan.u[k],
-                           mpc->plan.costate[k + 1], &mpc->stage[k]);
+        linearise(mpc, k, 1, k);
         memcpy(mpc->plan.x[k + 1], mpc->stage[k].f, sizeof mpc->plan.x[k + 1]);
     }
     br_qp_forget_working_set(&mpc->qp);
-    mpc->linearised = 1;
-    mpc->qp.factorised = mpc->qp.evaluated = mpc->followed = 0;
 }
 
 /* By one stage. */
 void br_sqp_shift(br_mpc *mpc) {
-    const int last = BR_N - 1;
+    const int last = BR_N - 1, free_slot = mpc->stage[0].slot;
     memmove(mpc->plan.x, mpc->plan.x + 1, BR_N * sizeof mpc->plan.x[0]);
     memmove(mpc->plan.u, mpc->plan.u + 1, last * sizeof mpc->plan.u[0]);
     memmove(mpc->plan.costate, mpc->plan.costate + 1, BR_N * sizeof mpc->plan.costate[0]);
@@ -56,7 +63,10 @@ void br_sqp_shift(br_mpc *mpc) {
     br_qp_shift_rows(mpc->qp.sense, sizeof mpc->qp.sense[0]);
     for (int c = 0; c < BR_NU; ++c)
         if (!BR_INPUT_HELD[c]) mpc->plan.u[last][c] = 0;
-    linearise(mpc, mpc->linearised ? last : 0);
+    if (mpc->linearised)
+        linearise(mpc, last, 1, free_slot);
+    else
+        br_sqp_linearise(mpc);
     memcpy(mpc->plan.x[BR_N], mpc->stage[last].f, sizeof mpc->plan.x[BR_N]);
 }
 
@@ -110,7 +120,7 @@ static void blend(double *out, const double *from, const double *to, double t, i
     for (int i = 0; i < n; ++i) out[i] = from[i] + t * (to[i] - from[i]);
 }
 
-/* The plan at a fraction t of the step from mpc->before, linearised. */
+/* The plan at a fraction t of the step from mpc->before, linearised (all but the Hessians). */
 static void move(br_mpc *mpc, double t) {
     const br_plan *from = &mpc->before;
     const br_qp *qp = &mpc->qp;
@@ -120,7 +130,7 @@ static void move(br_mpc *mpc, double t) {
     for (int i = 0; i < BR_M; ++i) u[i] = u_from[i] + t * qp->delta_u[i];
     blend(mpc->plan.costate[1], from->costate[1], qp->costate_next[1], t, BR_N * BR_NX);
     blend(mpc->plan.multiplier, from->multiplier, qp->multiplier, t, BR_ROWS);
-    linearise(mpc, 0);
+    br_sqp_linearise(mpc);
 }
 
 /* Exact penalty: above every costate that prices a defect. */

@@ -9,27 +9,37 @@
 
 enum { NW = BR_NV + BR_NE }; /* columns of w */
 
+/* F, and its Jacobian if that is not NULL. */
 static void nominal(const double x[BR_NX], const double u[BR_NU], const double e[BR_NE],
-                    const double lambda[BR_NX], double f[BR_NX], double jacobian[BR_NX][NW],
-                    double hessian[NW][NW]) {
-    const casadi_real *arg[br_linearise_SZ_ARG] = {x, u, e, lambda};
-    casadi_real *res[br_linearise_SZ_RES] = {f, &jacobian[0][0], &hessian[0][0]};
+                    double f[BR_NX], double *jacobian) {
+    const casadi_real *arg[br_linearise_SZ_ARG] = {x, u, e};
+    casadi_real *res[br_linearise_SZ_RES] = {f, jacobian};
     casadi_int iw[br_linearise_SZ_IW + 1];
     casadi_real w[br_linearise_SZ_W + 1];
     br_linearise(arg, res, iw, w, 0);
 }
 
+static void nominal_hessian(const double x[BR_NX], const double u[BR_NU], const double e[BR_NE],
+                            const double lambda[BR_NX], double hessian[NW][NW]) {
+    const casadi_real *arg[br_hessian_SZ_ARG] = {x, u, e, lambda};
+    casadi_real *res[br_hessian_SZ_RES] = {hessian[0]};
+    casadi_int iw[br_hessian_SZ_IW + 1];
+    casadi_real w[br_hessian_SZ_W + 1];
+    br_hessian(arg, res, iw, w, 0);
+}
+
 /* J += F_e M, columns of the features. */
-static void chain_jacobian(br_stage *stage, double jacobian[BR_NX][NW],
-                           double gradient[BR_NE][BR_NZ]) {
+static void chain_jacobian(br_stage *stage) {
     for (int i = 0; i < BR_NX; ++i)
         for (int j = 0; j < BR_NE; ++j)
             for (int a = 0; a < BR_NZ; ++a)
-                stage->jacobian[i][BR_FEATURE[a]] += jacobian[i][BR_NV + j] * gradient[j][a];
+                stage->jacobian[i][BR_FEATURE[a]] +=
+                    stage->in_e[i][j] * stage->residual.gradient[j][a];
 }
 
-static void chain_hessian(br_stage *stage, double hessian[NW][NW], const double lambda_e[BR_NE],
-                          double gradient[BR_NE][BR_NZ], double curvature[BR_NE][BR_NZ][BR_NZ]) {
+/* bend: the last sum of the formula above. */
+static void chain_hessian(br_stage *stage, double hessian[NW][NW], double bend[BR_NZ][BR_NZ]) {
+    double (*gradient)[BR_NZ] = stage->residual.gradient;
     for (int i = 0; i < BR_NV; ++i)
         for (int a = 0; a < BR_NZ; ++a) {
             double cross = 0;
@@ -45,46 +55,88 @@ static void chain_hessian(br_stage *stage, double hessian[NW][NW], const double 
                 weighted[j][b] += hessian[BR_NV + j][BR_NV + l] * gradient[l][b];
         }
     for (int a = 0; a < BR_NZ; ++a)
-        for (int b = 0; b < BR_NZ; ++b)
-            for (int j = 0; j < BR_NE; ++j)
-                stage->hessian[BR_FEATURE[a]][BR_FEATURE[b]] +=
-                    gradient[j][a] * weighted[j][b] + lambda_e[j] * curvature[j][a][b];
+        for (int b = 0; b < BR_NZ; ++b) {
+            double sum = bend[a][b];
+            for (int j = 0; j < BR_NE; ++j) sum += gradient[j][a] * weighted[j][b];
+            stage->hessian[BR_FEATURE[a]][BR_FEATURE[b]] += sum;
+        }
 }
 
-static void correction(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
-                       double mean[BR_NE], double gradient[BR_NE][BR_NZ],
-                       double curvature[BR_NE][BR_NZ][BR_NZ]) {
-    if (!gp->any) return;
-    double z[BR_NZ];
+static void features(const double x[BR_NX], const double u[BR_NU], double z[BR_NZ]) {
     for (int a = 0; a < BR_NZ; ++a)
         z[a] = BR_FEATURE[a] < BR_NX ? x[BR_FEATURE[a]] : u[BR_FEATURE[a] - BR_NX];
-    br_gp_evaluate(gp, z, mean, gradient, curvature);
 }
 
-void br_stage_linearise(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
-                        const double lambda[BR_NX], br_stage *stage) {
-    double mean[BR_NE] = {0}, gradient[BR_NE][BR_NZ], curvature[BR_NE][BR_NZ][BR_NZ];
-    correction(gp, x, u, mean, gradient, curvature);
-    double jacobian[BR_NX][NW], hessian[NW][NW];
-    nominal(x, u, mean, lambda, stage->f, jacobian, hessian);
-    for (int i = 0; i < BR_NX; ++i)
-        memcpy(stage->jacobian[i], jacobian[i], sizeof stage->jacobian[i]);
-    for (int i = 0; i < BR_NV; ++i) memcpy(stage->hessian[i], hessian[i], sizeof stage->hessian[i]);
-    if (!gp->any) return;
+void br_stages_linearise(const br_gp *gp, int stages, double (*x)[BR_NX], double (*u)[BR_NU],
+                         br_gp_row *kernels, int room, int slot, br_stage *stage) {
+    double z[BR_N][BR_NZ];
+    br_correction residual[BR_N];
+    if (gp->any) {
+        for (int k = 0; k < stages; ++k) features(x[k], u[k], z[k]);
+        br_gp_evaluate(gp, stages, z, kernels + slot, room, residual);
+    } else {
+        memset(residual, 0, stages * sizeof residual[0]);
+    }
+    for (int k = 0; k < stages; ++k) {
+        double jacobian[BR_NX][NW];
+        br_stage *one = &stage[k];
+        one->slot = slot + k;
+        one->residual = residual[k];
+        nominal(x[k], u[k], residual[k].mean, one->f, jacobian[0]);
+        for (int i = 0; i < BR_NX; ++i) {
+            memcpy(one->jacobian[i], jacobian[i], sizeof one->jacobian[i]);
+            memcpy(one->in_e[i], jacobian[i] + BR_NV, sizeof one->in_e[i]);
+        }
+        if (gp->any) chain_jacobian(one);
+    }
+}
 
-    double lambda_e[BR_NE] = {0};
-    for (int j = 0; j < BR_NE; ++j)
-        for (int i = 0; i < BR_NX; ++i) lambda_e[j] += jacobian[i][BR_NV + j] * lambda[i];
-    chain_jacobian(stage, jacobian, gradient);
-    chain_hessian(stage, hessian, lambda_e, gradient, curvature);
+/* sum_j (F_e' lambda)_j d^2 mu_j / d z^2 of all stages, by slot. */
+static void residual_curvature(const br_gp *gp, int stages, double (*x)[BR_NX], double (*u)[BR_NU],
+                               double (*lambda)[BR_NX], br_gp_row *kernels, const br_stage *stage,
+                               double bend[BR_N][BR_NZ][BR_NZ]) {
+    double z[BR_N][BR_NZ], weight[BR_N][BR_NE];
+    const br_correction *residual[BR_N];
+    for (int k = 0; k < stages; ++k) {
+        const int slot = stage[k].slot;
+        features(x[k], u[k], z[slot]);
+        residual[slot] = &stage[k].residual;
+        for (int j = 0; j < BR_NE; ++j) {
+            weight[slot][j] = 0;
+            for (int i = 0; i < BR_NX; ++i) weight[slot][j] += stage[k].in_e[i][j] * lambda[k][i];
+        }
+    }
+    br_gp_curvature(gp, stages, z, kernels, residual, weight, bend);
+}
+
+void br_stages_curve(const br_gp *gp, int stages, double (*x)[BR_NX], double (*u)[BR_NU],
+                     double (*lambda)[BR_NX], br_gp_row *kernels, br_stage *stage) {
+    double bend[BR_N][BR_NZ][BR_NZ];
+    if (gp->any) residual_curvature(gp, stages, x, u, lambda, kernels, stage, bend);
+    for (int k = 0; k < stages; ++k) {
+        double hessian[NW][NW];
+        br_stage *one = &stage[k];
+        nominal_hessian(x[k], u[k], one->residual.mean, lambda[k], hessian);
+        for (int i = 0; i < BR_NV; ++i) memcpy(one->hessian[i], hessian[i], sizeof one->hessian[i]);
+        if (gp->any) chain_hessian(one, hessian, bend[one->slot]);
+    }
+}
+
+void br_stage_next(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
+                   double x_next[BR_NX]) {
+    double z[BR_NZ], mean[BR_NE] = {0};
+    features(x, u, z);
+    if (gp->any) br_gp_mean(gp, z, mean);
+    nominal(x, u, mean, x_next, NULL);
 }
 
 /* Over part of a stage: the same scheme with the shorter step. The residual was learned per stage;
  * to first order that part of it has come about. */
 void br_stage_advance(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
                       double duration, double x_next[BR_NX]) {
-    double mean[BR_NE] = {0}, gradient[BR_NE][BR_NZ], curvature[BR_NE][BR_NZ][BR_NZ];
-    correction(gp, x, u, mean, gradient, curvature);
+    double z[BR_NZ], mean[BR_NE] = {0};
+    features(x, u, z);
+    if (gp->any) br_gp_mean(gp, z, mean);
     for (int j = 0; j < BR_NE; ++j) mean[j] *= duration / BR_TS;
     const casadi_real *arg[br_advance_SZ_ARG] = {x, u, mean, &duration};
     casadi_real *res[br_advance_SZ_RES] = {x_next};

@@ -46,30 +46,37 @@ static inline br_vec br_select(br_ivec mask, br_vec a, br_vec b) {
     return a;
 }
 
-/* exp(x) for x <= 0, below 1 ulp + 2e-16 relative; arguments under -700 give about 1e-304.
- * 2^n * e^r with |r| <= ln(2)/2; degree 12 leaves r^13/13! < 2e-16. */
-static inline br_vec br_exp_negative(br_vec x) {
-    const br_vec magic = br_splat(6755399441055744.0); /* 1.5 * 2^52: rounds to integer */
-    const br_vec floor_ = br_splat(-700.0);
-    x = br_select(x < floor_, floor_, x);
-    const br_vec shifted = x * 1.4426950408889634 + magic;
-    const br_vec n = shifted - magic;
-    br_vec r = x - n * 6.93147180369123816490e-01;
-    r = r - n * 1.90821492927058770002e-10;
+#define BR_LOG2_E 1.4426950408889634
+
+/* 2^x for -1000 <= x <= 0 with a relative error of 1e-15 at most.
+ * 2^n 2^r with |r| <= 1/2; the polynomial of degree 10 is the one whose largest relative error is
+ * the smallest (3e-16, by Remez' exchange). */
+static inline br_vec br_exp2_near(br_vec x) {
+    /* 1.5 * 2^52 rounds to integer; with 1023 more, the lowest bits are the exponent of 2^n */
+    const br_vec magic = br_splat(6755399441055744.0 + 1023.0);
+    const br_vec shifted = x + magic;
+    const br_vec r = x - (shifted - magic);
     /* Estrin's scheme: the dependency chain, not the number of operations, sets the time. */
-    const br_vec r2 = r * r, r4 = r2 * r2, r8 = r4 * r4;
-    const br_vec p01 = 1.0 + r, p23 = 0.5 + r * (1.0 / 6);
-    const br_vec p45 = 1.0 / 24 + r * (1.0 / 120), p67 = 1.0 / 720 + r * (1.0 / 5040);
-    const br_vec p89 = 1.0 / 40320 + r * (1.0 / 362880);
-    const br_vec p1011 = 1.0 / 3628800 + r * (1.0 / 39916800);
-    const br_vec low = (p01 + p23 * r2) + (p45 + p67 * r2) * r4;
-    const br_vec p = low + ((p89 + p1011 * r2) + r4 * (1.0 / 479001600)) * r8;
+    const br_vec r2 = r * r, r4 = r2 * r2;
+    const br_vec p01 = 1.0 + r * 0.6931471805599497;
+    const br_vec p23 = 0.24022650695908768 + r * 0.05550410866445855;
+    const br_vec p45 = 0.009618129108034914 + r * 0.0013333558228610482;
+    const br_vec p67 = 0.00015403529960876947 + r * 1.5252658086425337e-05;
+    const br_vec p89 = 1.3215662902191042e-06 + r * 1.0208543973079219e-07;
+    const br_vec high = p89 + r2 * 7.037276005624955e-09;
+    const br_vec p = (p01 + p23 * r2) + ((p45 + p67 * r2) + high * r4) * r4;
     br_ivec bits;
     memcpy(&bits, &shifted, sizeof bits);
-    const br_ivec exponent = (bits << 52) + ((int64_t)1023 << 52);
+    const br_ivec exponent = bits << 52;
     br_vec power;
     memcpy(&power, &exponent, sizeof power);
     return p * power;
+}
+
+/* The same for any x <= 0; arguments under -1000 give about 1e-301. */
+static inline br_vec br_exp2_negative(br_vec x) {
+    const br_vec floor_ = br_splat(-1000.0);
+    return br_exp2_near(br_select(x < floor_, floor_, x));
 }
 
 #endif
