@@ -5,8 +5,9 @@ from typing import Annotated
 
 import typer
 
+from bayesrace.clock import die_with_parent
 from bayesrace.vehicles import DEFAULT_CAR
-from operation.cli.options import Car, Tyres, writable
+from operation.cli.options import Car, ParentPid, Tyres, writable
 
 __all__ = ["limit"]
 
@@ -18,7 +19,7 @@ def limit(
     car: Car = DEFAULT_CAR,
     tyres: Tyres = None,
     standing: Annotated[
-        bool, typer.Option("--standing", help="From the start pose at 0.1 m/s; flying without.")
+        bool, typer.Option("--standing", help="From the start pose; flying without.")
     ] = False,
     margin: Annotated[
         float,
@@ -29,18 +30,24 @@ def limit(
     body: Annotated[
         bool, typer.Option("--body", help="The car's outline keeps the margin.")
     ] = False,
+    start_speed: Annotated[
+        float,
+        typer.Option(metavar="V", min=0, max=5, help="Speed at the start of a standing lap [m/s]."),
+    ] = 0.1,
     out: Annotated[
         Path | None,
         typer.Option(
             "--out", "-o", metavar="FILE", callback=writable, help="Write the lap as CSV."
         ),
     ] = None,
+    parent_pid: ParentPid = None,
 ) -> None:
     """Compute the fastest lap of the true car: minimum-time optimal control.
 
     The dynamic model with tyres and actuator limits as the plant has them. The lap is computed
     again with half the intervals; it may not change by 0.1 %.
     """
+    die_with_parent(parent_pid)
     from bayesrace.limit import LimitSettings, write_limit
     from bayesrace.limit.cached import limit as cached_limit
     from bayesrace.tracks import load_track
@@ -49,7 +56,8 @@ def limit(
     parameters = get_car(car)
     if tyres is not None:
         parameters = parameters.on_tyres(tyres.value)
-    settings = LimitSettings(standing=standing, margin_m=margin, body=body)
+    speed = {"start_speed_mps": start_speed} if standing else {}
+    settings = LimitSettings(standing=standing, margin_m=margin, body=body, **speed)
     lap = cached_limit(load_track(track, parameters.width_m), parameters, settings)
     typer.echo(
         f"{'standing' if standing else 'flying'} lap {lap.lap_s:.3f} s, "
