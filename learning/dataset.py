@@ -22,6 +22,10 @@ __all__ = [
     "tolerances",
 ]
 
+_SPIN_RAD: Final = 0.8
+"""Slip angle of the body beyond which a car spins. No controller plans to be there, and samples far
+from all others would take the place of those that count."""
+
 _ROUNDING: Final = 1e-6
 """Larger than the error of a plant in single precision: 2.4e-7 at 5 rad/s."""
 
@@ -128,10 +132,11 @@ def tolerances(car: CarParameters) -> dict[str, float]:
 
 
 def filter_dataset(dataset: Dataset, *, limits: bool = True) -> Dataset:
-    """Leaves out standstill, samples outside the car's limits, and steering that does not add up.
+    """Leaves out standstill, samples outside the car's limits, those of a spin, and steering that
+    does not add up.
 
     Each within its tolerance, :func:`tolerances`. The last means delta_{k+1} != delta_k + step *
-    delta_rate. Without ``limits``, samples outside the car's limits stay.
+    delta_rate. Without ``limits``, samples outside the car's limits and those of a spin stay.
     """
     car, slack = dataset.car, tolerances(dataset.car)
     kept = dataset.select(dataset.x[:, 3] >= slack["vx"], "standstill")
@@ -145,5 +150,7 @@ def filter_dataset(dataset: Dataset, *, limits: bool = True) -> Dataset:
     )
     if limits:
         kept = kept.select(within, "outside limits")
+        vx, vy = kept.x[:, 3:5].T
+        kept = kept.select(np.abs(np.arctan2(vy, vx)) <= _SPIN_RAD, "spinning")
     drift = kept.x_next[:, 6] - kept.x[:, 6] - kept.step_s * kept.u[:, 1]
     return kept.select(np.abs(drift) <= slack["delta change"], "steering does not match its rate")

@@ -23,6 +23,7 @@ from codegen.compiler import find_compiler
 from learning.dataset import Dataset
 from learning.logs import dataset_from_log
 from operation.drive import RunPlan
+from operation.limits import limits_beside
 from operation.preparation import (
     PredictionModel,
     Prepared,
@@ -243,7 +244,13 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
     this.keep_fmu()
     write_car(this.car_file, this.car)
     write_whole(out / FILES.settings, settings.model_dump_json(indent=1) + "\n")
-    prepared = this.prepare()
+    if settings.limit and settings.built_in:
+        with limits_beside(settings, this.car_file, out) as wait:
+            prepared = this.prepare()
+            with stages.stage(f"limit, {prepared.first.track.name}"):
+                wait()
+    else:
+        prepared = this.prepare()
     artefact, *perfect = prepared.artefacts
     about = {"race": {"settings": settings.model_dump_json()}}
     with (

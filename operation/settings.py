@@ -100,6 +100,11 @@ class PreparationSettings(BaseModel):
         return self
 
     @property
+    def built_in(self) -> bool:
+        """Whether the built-in equations simulate the car."""
+        return self.fmu is None and self.simulator == "equations"
+
+    @property
     def drive_s(self) -> float:
         """Length of the training drive."""
         return self.collect_s or self.car.tuning.pursuit.drive_s
@@ -119,6 +124,9 @@ class RaceSettings(PreparationSettings):
         3.0, gt=1, description="a run ends at this multiple of the racing line's time"
     )
     mpc: MpcSettings = MpcSettings()
+    limit: bool = Field(
+        True, description="compare the laps of the built-in car with the fastest it can drive"
+    )
 
     def limit_s(self, line_lap_s: float) -> float:
         """When a run ends at the latest, on a line whose flying lap takes ``line_lap_s``."""

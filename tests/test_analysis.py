@@ -3,6 +3,7 @@
 import hashlib
 import io
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,13 +13,17 @@ from rich.console import Console
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
+from bayesrace.limit import LimitLap, write_limit
 from bayesrace.messages import Truth
 from bayesrace.vehicles import default_car
+from bayesrace.vehicles.models import dynamic
+from operation.analysis.between import positions_between
 from operation.analysis.laps import Trajectory, time_laps
 from operation.analysis.race import analyse, read_race, read_result, write_result
 from operation.analysis.results import LapResult, RaceResult
 from operation.report import render_report
 from operation.terminal.race_table import COLUMNS, print_table
+from plant.simulator import Simulator, plant_discretisation
 from tests.synthetic_race import LAP_S, LINE_M, STEP_S, Drive, circle, track, write_race
 
 TWO_LAPS: Floats = np.asarray(
@@ -92,6 +97,68 @@ def test_off_track_counts_all_samples_without_a_lap(tmp_path: Path) -> None:
     assert (lap.finished, lap.lap_time_s, lap.lap_times_s) == (False, None, [])
     assert lap.off_track_samples == 50
     assert lap.off_track_max_m == pytest.approx(0.1, abs=1e-5)
+
+
+def driven(
+    start: Sequence[float], commands: Sequence[tuple[float, float]]
+) -> tuple[Floats, Floats]:
+    """States each 20 ms (n + 1, 7) and positions each millisecond (n, 20, 2) of the plant."""
+    coarse = Simulator(dynamic(default_car()))
+    fine = Simulator(dynamic(default_car()), plant_discretisation(1000))
+    coarse.reset(start)
+    states, between = [coarse.x.copy()], []
+    for command in commands:
+        fine.reset(coarse.x.tolist())
+        coarse.step(command)
+        for _ in range(20):
+            fine.step(coarse.u_applied)
+            between.append(fine.x[:2].copy())
+        states.append(coarse.x.copy())
+    return np.array(states), np.array(between).reshape(-1, 20, 2)
+
+
+def test_between_the_samples_the_car_is_where_the_plant_had_it(tmp_path: Path) -> None:
+    """A car that turns at the outer edge is off the track for less than a period."""
+    commands = [(0.5, 0.0)] * 20
+    start = [0.0, -1.19896, 0.11, 2.0, -0.3, 2.5, 0.25]
+    states, between = driven(start, commands)
+    depth = np.linalg.norm(between.reshape(-1, 2), axis=1) - 1.2
+    assert 0 < (depth > 0).sum() < 20
+    assert np.linalg.norm(states[:, :2], axis=1).max() < 1.2
+    path = write_race(tmp_path, [Drive("bayesrace", states)])
+    lap = only_lap(path)
+    assert lap.off_track_ms == (depth > 0).sum()
+    assert lap.off_track_ms_max_m == pytest.approx(depth.max(), abs=2e-5)
+    places = positions_between(read_race(path).recording.runs[0], default_car())
+    np.testing.assert_array_equal(places, between)
+
+
+@pytest.mark.parametrize("cause", ["equations", "settings", "truth"])
+def test_between_the_samples_of_another_car_nothing_is_known(tmp_path: Path, cause: str) -> None:
+    states, _ = driven([1.0, 0.0, np.pi / 2, 1.0, 0.0, 0.0, 0.0], [(0.5, 0.0)] * 10)
+    states = circle(TWO_LAPS, 1.25) if cause == "equations" else states
+    path = write_race(tmp_path, [Drive("bayesrace", states)], truth=cause != "truth")
+    if cause == "settings":
+        settings = json.loads((path / "settings.json").read_text())
+        (path / "settings.json").write_text(json.dumps(settings | {"simulator": "slipx"}))
+    lap = only_lap(path)
+    assert (lap.off_track_ms, lap.off_track_ms_max_m) == (None, None)
+
+
+def test_laps_are_compared_with_the_limits_of_their_kinds(tmp_path: Path) -> None:
+    path = write_race(tmp_path, [Drive("bayesrace", circle(TWO_LAPS, 1.1))])
+    assert only_lap(path).limit_ratios is None
+    for kind, time_s in (("standing", 1.25), ("flying", 1.2)):
+        one = np.zeros((1, 9))
+        lap = LimitLap("orca", "circle", time_s, 1, 0.0, 0.0, one[0, :1], one[:, :7], one[:, :2])
+        write_limit(path / f"limit-{kind}.csv", lap)
+    result = analyse(path)
+    assert result.limit_s == {"standing": 1.25, "flying": 1.2}
+    assert result.laps[0].limit_ratios == pytest.approx([LAP_S / 1.25, LAP_S / 1.2], abs=1e-4)
+    text = io.StringIO()
+    print_table(result, Console(file=text, width=80))
+    assert "standing 1.250 s, flying 1.200 s" in text.getvalue()
+    assert "1.048 1.092" in text.getvalue()
 
 
 def test_the_fingerprint_ends_with_the_sample_after_the_last_lap(tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ from tests.programs import environment, finish, peanut, run, start, until
 
 SUBCOMMANDS = (
     "race", "drive", "report", "bench", "tracks", "cars", "raceline", "collect", "train", "build",
-    "export",
+    "export", "limit",
     "plant", "controller", "status", "stop", "go", "router", "latency",
     "fmu export", "fmu inspect", "fmu weights",
     "validate", "publish", "rollback", "learn",

@@ -138,6 +138,15 @@ def test_result_has_the_promised_form(peanut_race: Race) -> None:
     assert result["gaps"] == 0
 
 
+def test_no_lap_is_faster_than_the_limit(peanut_race: Race) -> None:
+    assert sorted(peanut_race.result["limit_s"]) == ["flying", "standing"]
+    for lap in peanut_race.result["laps"]:
+        assert lap["off_track_ms"] >= 19 * lap["off_track_samples"] - 20
+        if lap["finished"] and lap["off_track_ms"] == 0:
+            assert min(lap["limit_ratios"]) > 1
+    assert peanut_race.lap("bayesrace-updated")["limit_ratios"][0] < 1.2
+
+
 def test_the_weights_are_swapped_in_the_running_controller(peanut_race: Race) -> None:
     versions = [peanut_race.lap(name)["weights_version"] for name in CONTROLLERS]
     assert versions[0] == versions[3] == ""

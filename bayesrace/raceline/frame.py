@@ -13,10 +13,10 @@ from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.tracks import Track
 from bayesrace.tracks.shapes import resample_closed, smooth_closed
-from bayesrace.tracks.spline import fit_arc_length
+from bayesrace.tracks.spline import PlaneSpline, fit_arc_length
 from bayesrace.vehicles.tuning import RacelineTuning
 
-__all__ = ["Frame", "build_frame"]
+__all__ = ["Frame", "build_frame", "frame_at", "smooth_centreline"]
 
 _FOLD: Final = 0.85
 """Largest n * kappa: beyond 1 neighbouring normals cross and stations lose their order."""
@@ -45,14 +45,34 @@ def build_frame(track: Track, tuning: RacelineTuning, margin_m: float) -> Frame:
 
     Raises InputError if the margin leaves no room somewhere.
     """
-    room = track.width_left_m + track.width_right_m - 2 * margin_m
-    _check_room(track, track.s_m, room, margin_m, tuning.room_m)
+    curve = smooth_centreline(track, tuning)
     count = max(24, round(track.length_m / tuning.step_m))
-    dense = count * _OVERSAMPLING
+    station = np.arange(count, dtype=np.float64) * (curve.period / count)
+    return frame_at(station, curve, track, tuning, margin_m)
+
+
+def smooth_centreline(track: Track, tuning: RacelineTuning) -> PlaneSpline:
+    """The centreline without the noise of its points; it begins near the start line."""
+    dense = max(24, round(track.length_m / tuning.step_m)) * _OVERSAMPLING
     points = track.position(np.arange(dense) * (track.length_m / dense))
     smooth = smooth_closed(points, tuning.smoothing_m * dense / track.length_m)
-    curve = fit_arc_length(resample_closed(smooth, track.length_m / dense))
-    station = np.arange(count, dtype=np.float64) * (curve.period / count)
+    return fit_arc_length(resample_closed(smooth, track.length_m / dense))
+
+
+def frame_at(
+    station: Floats,
+    curve: PlaneSpline,
+    track: Track,
+    tuning: RacelineTuning,
+    margin_m: float,
+    fold: float = _FOLD,
+) -> Frame:
+    """Stations at ascending arc lengths (N,) of the curve; offsets up to ``fold`` times the radius.
+
+    Raises InputError if the margin leaves no room somewhere.
+    """
+    room = track.width_left_m + track.width_right_m - 2 * margin_m
+    _check_room(track, track.s_m, room, margin_m, tuning.room_m)
     xy, first, second = curve.derivatives(station)
     tangent = first / np.linalg.norm(first, axis=1, keepdims=True)
     normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
@@ -63,9 +83,9 @@ def build_frame(track: Track, tuning: RacelineTuning, margin_m: float) -> Frame:
     n_max = _room(track, xy, normal, margin_m)
     n_min = -_room(track, xy, -normal, margin_m)
     with np.errstate(divide="ignore"):
-        fold = _FOLD / np.abs(kappa)
-    n_max = np.where(kappa > 0, np.minimum(n_max, fold), n_max)
-    n_min = np.where(kappa < 0, np.maximum(n_min, -fold), n_min)
+        reach = fold / np.abs(kappa)
+    n_max = np.where(kappa > 0, np.minimum(n_max, reach), n_max)
+    n_min = np.where(kappa < 0, np.maximum(n_min, -reach), n_min)
     _check_room(track, station, n_max - n_min, margin_m, tuning.room_m)
     return Frame(xy, normal, heading, turn, kappa, n_min, n_max, curve.period)
 

@@ -35,6 +35,7 @@ __all__ = [
     "ROLL_SPEED_MPS",
     "STATES",
     "Model",
+    "command_limits",
     "dynamic",
     "dynamic_with_parameters",
     "e_kinematic",
@@ -117,6 +118,19 @@ def top_command(car: CarParameters, v: Any, d_max: Any) -> Any:
     fade = (drive.speed_max_mps - v) / (0.05 * drive.speed_max_mps)
     share = drive.power_speed_mps / ca.fmax(v, drive.power_speed_mps)
     return d_max * share * ca.fmin(ca.fmax(fade, 0), 1)
+
+
+def command_limits(car: CarParameters, v: Any, d: Any) -> list[Any]:
+    """Smooth expressions, over d_max; none is above 0 where d is within :func:`top_command`.
+
+    For optimisers, which end badly at the bends of a minimum: there is one for each of its parts.
+    """
+    drive = car.drive
+    if not isinstance(drive, AccelerationDrive):
+        return [d / car.d_max - 1]
+    share, power = d / car.d_max, v / drive.power_speed_mps
+    fade = (drive.speed_max_mps - v) / (0.05 * drive.speed_max_mps)
+    return [share - 1, share - fade, share * power - 1, share * power - fade]
 
 
 def _lateral_force(tyre: Pacejka, alpha: Any) -> Any:

@@ -4,7 +4,7 @@ Everything is computed from the messages in ``run.mcap`` and from the track, rac
 beside it; nothing is taken over from the processes that were running.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Final
@@ -20,9 +20,11 @@ from bayesrace.raceline import RaceLine
 from bayesrace.tracks import PathProjection, Track
 from bayesrace.tracks.projection import CentrelineSearch
 from bayesrace.tracks.spline import PlaneSpline
+from bayesrace.vehicles import CarParameters
 from learning.dataset import Dataset
 from learning.logs import dataset_from_messages, fallback_cycles
 from learning.validation import Validation, validate
+from operation.analysis.between import positions_between
 from operation.analysis.laps import time_laps, trajectory_digest
 from operation.analysis.recording import PlannedRun, Recording, RunRecord, read_recording
 from operation.analysis.results import (
@@ -34,6 +36,7 @@ from operation.analysis.results import (
     read_result,
     write_result,
 )
+from operation.limits import limits_in
 
 __all__ = [
     "DrivenRun",
@@ -70,8 +73,11 @@ def line_offset(line: RaceLine, xy: Floats, reach_m: float) -> Floats:
 class DrivenRun:
     """One run on its track: where the car was and how long its laps took."""
 
-    def __init__(self, record: RunRecord, track: Track, line: RaceLine) -> None:
-        self.record = record
+    def __init__(
+        self, record: RunRecord, track: Track, line: RaceLine, car: CarParameters | None = None
+    ) -> None:
+        """``car``: what the built-in equations simulated; None if something else was driven."""
+        self.record, self._track, self._car = record, track, car
         self.controller = record.plan.controller
         xy = record.x[:, :2]
         self.on_track: PathProjection = track.project_path(xy)
@@ -103,6 +109,18 @@ class DrivenRun:
         """Which of the counted samples are off the track."""
         return np.asarray(self.on_track.off_track_m[self.counted] > 0)
 
+    def off_track_between(self) -> Floats | None:
+        """Distances off the track of all counted sub-steps that are off it; None if not known."""
+        counted = self.counted.stop
+        places = None if self._car is None else positions_between(self.record, self._car)
+        if places is None:
+            return None
+        moved = np.linalg.norm(places - self.record.x[:-1, None, :2], axis=2).max(axis=1)
+        near = self.on_track.off_track_m[:-1] + moved > 0
+        near[counted:] = False
+        depth = self._track.project_path(places[near].reshape(-1, 2)).off_track_m
+        return np.asarray(depth[depth > 0])
+
     @property
     def ended(self) -> str:
         """Why the run ended."""
@@ -115,9 +133,10 @@ class DrivenRun:
         """sha256 of the trajectory up to the first sample after the last counted crossing."""
         return trajectory_digest(self.record.x, self.laps)
 
-    def result(self) -> LapResult:
-        """The run in numbers."""
+    def result(self, limit_s: Mapping[str, float] | None = None) -> LapResult:
+        """The run in numbers; ``limit_s``: the limits of a standing and of a flying lap."""
         depth = self.on_track.off_track_m[self.counted]
+        between = self.off_track_between()
         deviation = np.abs(self.offset_m[self.counted])
         times = self.laps.times_s
         return LapResult(
@@ -127,8 +146,11 @@ class DrivenRun:
             lap_time_s=times[0] if times else None,
             flying_lap_time_s=min(times[1:], default=None),
             lap_times_s=list(times),
+            limit_ratios=_ratios(times, limit_s or {}),
             off_track_samples=int(self.off_track.sum()),
             off_track_max_m=max(float(np.max(depth, initial=0.0)), 0.0),
+            off_track_ms=None if between is None else len(between),
+            off_track_ms_max_m=None if between is None else float(np.max(between, initial=0.0)),
             deviation_mean_m=float(deviation.mean()) if len(deviation) else None,
             deviation_max_m=float(deviation.max()) if len(deviation) else None,
             lateral_max_mps2=self._largest(self.record.lateral_mps2),
@@ -149,6 +171,14 @@ class DrivenRun:
         return float(counted.max()) if len(counted) else None
 
 
+def _ratios(times_s: Sequence[float], limit_s: Mapping[str, float]) -> list[float] | None:
+    """Of the laps to the limits of their kinds."""
+    kinds = ["standing", *["flying"] * (len(times_s) - 1)]
+    if not set(kinds) <= set(limit_s):
+        return None
+    return [time / limit_s[kind] for time, kind in zip(times_s, kinds, strict=False)]
+
+
 def _percentiles(values: Floats) -> Percentiles | None:
     if not len(values):
         return None
@@ -162,7 +192,8 @@ class RaceAnalysis:
     def __init__(self, recording: Recording) -> None:
         self.recording = recording
         self.track, self.line = recording.track, recording.line
-        self.runs = [DrivenRun(run, self.track, self.line) for run in recording.runs]
+        car = recording.car if recording.built_in else None
+        self.runs = [DrivenRun(run, self.track, self.line, car) for run in recording.runs]
 
     @cached_property
     def best_case(self) -> Dataset | None:
@@ -196,9 +227,11 @@ class RaceAnalysis:
         """The race in numbers."""
         gaps = sum(run.record.gaps for run in self.runs)
         recording = self.recording
+        limit_s = limits_in(recording.directory)
         return RaceResult(
             settings=_summary(recording),
-            laps=[run.result() for run in self.runs],
+            laps=[run.result(limit_s) for run in self.runs],
+            limit_s=limit_s,
             gp=self._metrics("bayesrace"),
             gp_updated=self._metrics("bayesrace-updated"),
             real_time_factor=_real_time_factor(recording.runs),

@@ -174,6 +174,12 @@ class Recording:
             raise InputError(f"settings.json, car: {error}") from None
 
     @property
+    def built_in(self) -> bool:
+        """Whether the log is that of the built-in equations: the truth, of no other simulator."""
+        other = self.settings.get("fmu") or self.settings.get("simulator", "equations")
+        return self.truth and other == "equations"
+
+    @property
     def discretisation(self) -> Discretisation:
         """The discretisation of the controller's prediction and of the residual."""
         given = self.settings.get("discretisation")

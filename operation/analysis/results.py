@@ -41,8 +41,18 @@ class LapResult(_Frozen):
     lap_time_s: float | None = Field(description="first lap, from standstill")
     flying_lap_time_s: float | None = Field(description="best of the laps after the first")
     lap_times_s: list[float] = Field(description="all laps in order")
+    limit_ratios: list[float] | None = Field(
+        None,
+        description="each lap over the fastest that the car can drive: the first over that from "
+        "standstill, the others over a flying one; null if these are not known",
+    )
     off_track_samples: int = Field(description="samples with the centre of gravity off the track")
     off_track_max_m: float = Field(description="deepest excursion, 0 without any")
+    off_track_ms: int | None = Field(
+        None,
+        description="the same each millisecond; null where the built-in equations are not the car",
+    )
+    off_track_ms_max_m: float | None = Field(None, description="deepest of these, 0 without any")
     deviation_mean_m: float | None = Field(description="mean distance from the racing line")
     deviation_max_m: float | None = Field(description="largest distance from the racing line")
     lateral_max_mps2: float | None = Field(
@@ -106,6 +116,11 @@ class RaceResult(_Frozen):
         "empty without these weights or without that run"
     )
     gp_updated: dict[str, GpMetrics] = Field(description="the same for the updated weights")
+    limit_s: dict[str, float] = Field(
+        default_factory=dict,
+        description="the fastest laps that the car can drive, standing and flying, by "
+        "'bayesrace limit'; empty if not known",
+    )
     real_time_factor: float | None = Field(
         description="simulated seconds per second of the lockstep runs; null without any"
     )

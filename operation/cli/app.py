@@ -20,6 +20,7 @@ from operation.cli import (
     fmu,
     latency,
     learning,
+    limit,
     operation,
     paper,
     parts,
@@ -52,7 +53,7 @@ _TASKS: Final[dict[str, tuple[Callable[..., None], ...]]] = {
         operation.go, operation.router,
     ),
     "Learn while driving": (learning.learn, learning.publish, learning.rollback),
-    "Measure": (evaluation.bench, latency.latency, paper.paper),
+    "Measure": (limit.limit, evaluation.bench, latency.latency, paper.paper),
     "Many laps": (
         campaign.campaign, campaign.campaign_report, campaign.campaign_worker, campaign.tune,
     ),

@@ -72,6 +72,9 @@ def race(
     simulator: Simulator = "equations",
     delay: Delay = 0.0,
     noise: Noise = None,
+    no_limit: Annotated[
+        bool, typer.Option("--no-limit", help="Do not compare the laps with the limit.")
+    ] = False,
 ) -> None:
     """Drive the paper's comparison: WorstCase, BayesRace, BayesRace-updated, BestCase.
 
@@ -94,7 +97,7 @@ def race(
     settings = RaceSettings(
         car=driven, track=track, train_track=train_track, laps=laps, mode=mode.value,
         seed=seed, fmu=fmu, fmu_map=fmu_map, simulator=simulator, delay_s=1e-3 * delay,
-        noise=sensor_noise(noise),
+        noise=sensor_noise(noise), limit=not no_limit,
     )  # fmt: skip
     mpc = settings.mpc.model_copy(update={"constraints": not no_constraints})
     settings = settings.model_copy(update={"mpc": mpc})

@@ -97,6 +97,7 @@ def _facts(analysis: RaceAnalysis, result: RaceResult) -> list[tuple[str, str]]:
         ("track constraints", "on" if summary.constraints else "off"),
         ("racing line, flying", f"{line.lap_time_s:.3f} s"),
         ("judged by", result.judged_by),
+        *((f"fastest possible, {kind}", f"{time:.3f} s") for kind, time in result.limit_s.items()),
     ]
     if result.real_time_factor is not None:
         facts.append(("lockstep at", f"{result.real_time_factor:.1f} × real time"))

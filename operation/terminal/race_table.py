@@ -54,6 +54,19 @@ def _excursion(lap: LapResult) -> str:
     return _metres(lap.off_track_max_m) if lap.off_track_samples else "–"
 
 
+def _off_track_ms(lap: LapResult) -> str:
+    return _decimals(lap.off_track_ms, 0)
+
+
+def _ratio(lap: LapResult, number: int) -> str:
+    ratios = lap.limit_ratios or []
+    return _decimals(ratios[number] if number < len(ratios) else None, 3)
+
+
+def _flying_ratio(lap: LapResult) -> str:
+    return _decimals(min((lap.limit_ratios or [])[1:], default=None), 3)
+
+
 def _lateral(lap: LapResult) -> str:
     return "–" if lap.lateral_max_mps2 is None else f"{lap.lateral_max_mps2 / GRAVITY_MPS2:.2f}"
 
@@ -68,8 +81,21 @@ COLUMNS: Final = (
         "refused: the controller refused its weights, and was not driven"),
     Column("flying", "s", lambda lap: _decimals(lap.flying_lap_time_s, 3), "best later lap"),
     Column(
+        "lap / limit", "", lambda lap: _ratio(lap, 0),
+        "first lap over the fastest that the car can drive from standstill", narrow=False,
+    ),
+    Column(
+        "flying / limit", "", _flying_ratio,
+        "best later lap over the fastest that the car can drive", narrow=False,
+    ),
+    Column(
         "off track", "", lambda lap: str(lap.off_track_samples),
         "samples with the centre of gravity off the track",
+    ),
+    Column(
+        "off track", "ms", _off_track_ms,
+        "the same each millisecond, between the samples; –: not the built-in car",
+        narrow=False,
     ),
     Column("deepest", "m", _excursion, "largest distance off the track"),
     Column(
@@ -153,8 +179,24 @@ def print_table(result: RaceResult, console: Console) -> None:
     for lap in result.laps:
         if lap.weights_version:
             console.print(Text(f"{lap.controller}: weights {lap.weights_version}"))
+    _print_limit(result, console)
     _print_cornering(result, console)
     _print_notes(result, console)
+
+
+def _print_limit(result: RaceResult, console: Console) -> None:
+    """Each lap over the limit, and where the car was between the samples."""
+    known = ", ".join(f"{kind} {time_s:.3f} s" for kind, time_s in result.limit_s.items())
+    if not known and all(lap.off_track_ms is None for lap in result.laps):
+        return
+    console.print(Text(f"\nThe fastest that the car can drive: {known or 'not known'}"))
+    heads = "controller", "each lap over it", "off track\nms", "deepest\nm"
+    table = plain_table(*heads, left=2)
+    for lap in result.laps:
+        ratios = " ".join(f"{ratio:.3f}" for ratio in lap.limit_ratios or ()) or "–"
+        deepest = _metres(lap.off_track_ms_max_m) if lap.off_track_ms else "–"
+        table.add_row(lap.controller, ratios, _off_track_ms(lap), deepest)
+    console.print(table)
 
 
 def _print_cornering(result: RaceResult, console: Console) -> None:

@@ -1,0 +1,28 @@
+"""The limit: the fastest lap that a car can drive on a track, by minimum-time optimal control.
+
+With the true model, tyres and actuators' limits as the plant has them. Order: ``gates`` across the
+track (gates.py), the racing line as the first guess (guess.py), the nonlinear programme over them
+(ocp.py, of pieces as programme.py has them; outline.py for the car's outline), solved on meshes
+twice as fine each (solve.py), and the lap as a file (lap.py), kept in the cache (cached.py).
+
+CasADi is imported on the first call of :func:`compute_limit`, not with this package.
+"""
+
+from bayesrace.limit.lap import LimitLap, read_limit, write_limit
+from bayesrace.limit.settings import LimitSettings
+from bayesrace.tracks import Track
+from bayesrace.vehicles.parameters import CarParameters
+
+__all__ = ["LimitLap", "LimitSettings", "compute_limit", "read_limit", "write_limit"]
+
+
+def compute_limit(
+    track: Track, car: CarParameters, settings: LimitSettings | None = None
+) -> LimitLap:
+    """The fastest lap of ``car`` on ``track``; see :mod:`bayesrace.limit.solve`.
+
+    Raises InputError when the margin leaves no room or no lap is found.
+    """
+    from bayesrace.limit.solve import solve
+
+    return solve(track, car, settings or LimitSettings())

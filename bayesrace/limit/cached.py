@@ -1,0 +1,51 @@
+"""Limits that were computed before, from the cache."""
+
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+from bayesrace.cache import cache_folder, digest, kept, software
+from bayesrace.cpu import cpu_identity
+from bayesrace.errors import InputError
+from bayesrace.limit import compute_limit
+from bayesrace.limit.lap import LimitLap, read_limit, write_limit
+from bayesrace.limit.settings import LimitSettings
+from bayesrace.tracks import Track
+from bayesrace.vehicles.parameters import CarParameters
+
+__all__ = ["known_limit", "limit"]
+
+_SOURCES: Final = (
+    "bayesrace/vehicles", "bayesrace/tracks", "bayesrace/raceline", "bayesrace/limit",
+)  # fmt: skip
+
+
+def limit(track: Track, car: CarParameters, settings: LimitSettings | None = None) -> LimitLap:
+    """:func:`compute_limit`, or what it returned for the same track, car and settings before."""
+    settings = settings or LimitSettings()
+    return kept(
+        _file(track, car, settings),
+        lambda path: write_limit(path, compute_limit(track, car, settings)),
+        read_limit,
+    )
+
+
+def known_limit(track: Track, car: CarParameters, settings: LimitSettings) -> LimitLap | None:
+    """The limit if it was computed before."""
+    with suppress(InputError):
+        return read_limit(_file(track, car, settings))
+    return None
+
+
+def _file(track: Track, car: CarParameters, settings: LimitSettings) -> Path:
+    """Named after car, track, settings and code."""
+    identity = digest(
+        [
+            car.model_dump_json(),
+            settings.model_dump_json(),
+            track.identity,
+            cpu_identity(),  # on which the last bits depend
+            *software(_SOURCES, ("casadi", "numpy")),
+        ]
+    )
+    return cache_folder() / f"limit-{identity}.csv"
