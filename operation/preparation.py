@@ -39,6 +39,7 @@ __all__ = [
     "PreparedTrack",
     "Training",
     "prepare",
+    "progress_artefact",
     "trained_weights",
     "training_drive",
     "training_samples",
@@ -290,10 +291,18 @@ def updated_weights(
 def _artefact(settings: PreparationSettings, model: PredictionModel) -> Path:
     """Folder of the controller that predicts with this model."""
     if model == "dynamic":
-        return build(BuildSettings.best_case(settings.true_car, settings.horizon))[0]
+        best = BuildSettings.best_case(settings.true_car, settings.horizon, settings.problem)
+        return build(best)[0]
     wanted = BuildSettings(
         car=settings.driven_car,
+        problem=settings.problem,
         discretisation=settings.discretisation,
         horizon=settings.horizon,
     )
     return build(wanted)[0]
+
+
+def progress_artefact(settings: PreparationSettings) -> Path:
+    """Folder of the controller that maximises progress, as ``bayesrace-limit`` does."""
+    wanted = settings.model_copy(update={"problem": "progress", "horizon": None})
+    return _artefact(wanted, "e_kinematic")

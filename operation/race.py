@@ -5,7 +5,7 @@ directs, records every message on the network, and hands over weights.
 """
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,6 +29,7 @@ from operation.preparation import (
     Prepared,
     PreparedTrack,
     prepare,
+    progress_artefact,
     updated_weights,
 )
 from operation.settings import RaceSettings
@@ -59,6 +60,7 @@ class _Files:
     result: str = "result.json"
     weights: str = "weights-bayesrace.bin"
     weights_updated: str = "weights-updated.bin"
+    weights_limit: str = "weights-limit.bin"
     mpc: str = "mpc.json"
     fmu: str = "car.fmu"
     fmu_map: str = "car-map.toml"
@@ -147,12 +149,11 @@ class _Race:
         """Of plant and controller: a link in lockstep needs no priorities."""
         return ["--low-latency"] if self.settings.mode == "lockstep" else []
 
-    def update(self, prepared: Prepared, lap: Dataset, stage: Stage) -> Path:
-        """Weights learned from training drive and lap, beginning with those of the lap."""
-        samples = [lap] if prepared.training is None else [prepared.training.samples, lap]
-        first = read_weights(prepared.weights)
-        weights = updated_weights(samples, self.settings, first, stage.update)
-        return Path(shutil.copyfile(weights, self.out / FILES.weights_updated))
+    def update(self, samples: Sequence[Dataset], weights: Path, name: str, stage: Stage) -> Path:
+        """Weights learned from all samples, beginning with ``weights``, as that file."""
+        first = read_weights(weights)
+        learned = updated_weights(samples, self.settings, first, stage.update)
+        return Path(shutil.copyfile(learned, self.out / name))
 
     # Driving -----------------------------------------------------------------------------------
 
@@ -220,7 +221,8 @@ class _Drives:
 
 
 def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
-    """Drives WorstCase, BayesRace, BayesRace-updated and, where the true model is known, BestCase.
+    """Drives WorstCase, BayesRace, BayesRace-updated, BayesRace-limit and, where the true model is
+    known, BestCase.
 
     Leaves everything in ``out``. Weights that the controller refuses are no error: their run is
     left out, and the log has the reason. Where the first ones are refused, the update learns from
@@ -252,6 +254,10 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
     else:
         prepared = this.prepare()
     artefact, *perfect = prepared.artefacts
+    progress = None
+    if settings.progress_drives:
+        with stages.stage("build the controller that maximises progress"):
+            progress = progress_artefact(settings)
     about = {"race": {"settings": settings.model_dump_json()}}
     with (
         started_system(this.car.name, out, this.plant_options, this.both_options) as system,
@@ -259,15 +265,34 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
         _faults_named(InputError),
     ):
         drives = _Drives(this, prepared.first, system, recorder)
+        samples = [] if prepared.training is None else [prepared.training.samples]
         with drives.controller(artefact, "bayesrace"):
             with stages.stage("drive WorstCase"):
                 driven = drives.drive("worstcase")
             with stages.stage("drive BayesRace"):
                 driven = drives.drive_with(prepared.weights, "bayesrace") or driven
+            samples.append(drives.samples(driven))
             with stages.stage("update the residual") as stage:
-                updated = this.update(prepared, drives.samples(driven), stage)
+                updated = this.update(samples, prepared.weights, FILES.weights_updated, stage)
             with stages.stage("drive BayesRace-updated"):
                 drives.drive_with(updated, "bayesrace-updated")
+        if progress is not None:
+            with drives.controller(progress, "bayesrace-limit"):
+                _approach_limit(this, drives, samples, updated)
         for best in perfect:
             with drives.controller(best, "bestcase"), stages.stage("drive BestCase"):
                 drives.drive("bestcase")
+
+
+def _approach_limit(this: _Race, drives: _Drives, samples: list[Dataset], weights: Path) -> None:
+    """The runs that maximise progress, with an update before each but the first; ends where the
+    controller refuses an update."""
+    for number in range(this.settings.progress_drives):
+        if number:
+            with this.stages.stage(f"update the residual, {number + 1}") as stage:
+                weights = this.update(samples, weights, FILES.weights_limit, stage)
+        with this.stages.stage(f"drive BayesRace-limit, {number + 1}"):
+            driven = drives.drive_with(weights, "bayesrace-limit")
+        if driven is None:
+            return
+        samples.append(drives.samples(driven))

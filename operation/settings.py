@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.raceline import RaceLineSettings
 from bayesrace.vehicles import CarParameters, CarSetting, default_car
+from codegen.settings import ProblemName
 from controller.pure_pursuit import PurePursuitSettings
 from controller.settings import MpcSettings
 from learning.kernels import DEFAULT_KERNELS, Kernel
@@ -58,6 +59,9 @@ class PreparationSettings(BaseModel):
     )
     threads: int = Field(
         0, ge=0, description="of the training, which they do not change; 0: one per core"
+    )
+    problem: ProblemName = Field(
+        "tracking", description="control problem: tracking the line, or progress along it"
     )
     horizon: int | None = Field(
         None, ge=2, le=100, description="stages of the OCP; None: the car's, from its tuning"
@@ -118,6 +122,13 @@ class RaceSettings(PreparationSettings):
     )
     laps: int = Field(
         2, ge=1, le=100, description="laps a controller drives: one from standstill, then flying"
+    )
+    progress_drives: int = Field(
+        3,
+        ge=0,
+        le=20,
+        description="runs of bayesrace-limit, which maximises progress, each after the first with "
+        "weights learned from all before; 0: none",
     )
     mode: Literal["lockstep", "realtime"] = Field("lockstep", description="time mode of the runs")
     time_limit: float = Field(

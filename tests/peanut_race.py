@@ -25,7 +25,7 @@ def peanut_race(peanut_track: Path, tmp_path_factory: pytest.TempPathFactory) ->
 
     def make(folder: Path) -> None:
         out = tmp_path_factory.mktemp("race") / "driven"
-        tracks = ("--track", peanut_track, "--train-track", peanut_track)
+        tracks = ("--track", peanut_track, "--train-track", peanut_track, "--progress-drives", "2")
         race = Race.running(out, *tracks)()
         assert leftovers(race.pid) == {}
         shutil.copytree(race.out, folder / "run")

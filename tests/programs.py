@@ -126,8 +126,17 @@ class Race:
 
     @classmethod
     def running(cls, out: Path, *arguments: str | Path, **variables: str) -> Callable[[], "Race"]:
-        """Starts a race, with these variables in its environment; call the result to wait."""
-        process = start("race", "--out", out, *arguments, env={**environment(), **variables})
+        """Starts a race, with these variables in its environment; call the result to wait. It
+        drives no bayesrace-limit unless that is asked for."""
+        process = start(
+            "race",
+            "--out",
+            out,
+            "--progress-drives",
+            "0",
+            *arguments,
+            env={**environment(), **variables},
+        )
 
         def wait() -> Race:
             done = finish(process)

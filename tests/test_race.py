@@ -32,6 +32,7 @@ from tests.reference import reference_file
 pytestmark = pytest.mark.unmeasured
 
 CONTROLLERS = ["worstcase", "bayesrace", "bayesrace-updated", "bestcase"]
+LIMIT = "bayesrace-limit"
 LAP_FORM: dict[str, type | tuple[type, ...]] = {
     "controller": str,
     "finished": bool,

@@ -90,7 +90,17 @@ def racing(tmp_path: Path) -> Iterator[Racing]:
     track = peanut(tmp_path / "peanut.csv")
     out = tmp_path / "out"
     tracks = ("--track", track, "--train-track", track)
-    process = start("race", "--out", out, *tracks, "--laps", "100", start_new_session=True)
+    process = start(
+        "race",
+        "--progress-drives",
+        "0",
+        "--out",
+        out,
+        *tracks,
+        "--laps",
+        "100",
+        start_new_session=True,
+    )
 
     def driving() -> bool:
         assert process.poll() is None, process.communicate()
@@ -169,7 +179,17 @@ def test_a_killed_race_takes_its_processes_along(racing: Racing) -> None:
 @pytest.mark.unmeasured  # an interrupt in the middle of measuring may never end
 def test_an_interrupt_before_the_first_lap(tmp_path: Path) -> None:
     track = peanut(tmp_path / "peanut.csv")
-    process = start("race", "--out", tmp_path / "out", "--track", track, "--train-track", track)
+    process = start(
+        "race",
+        "--progress-drives",
+        "0",
+        "--out",
+        tmp_path / "out",
+        "--track",
+        track,
+        "--train-track",
+        track,
+    )
     until(lambda: (tmp_path / "out" / "settings.json").exists(), "the race at work")
     process.send_signal(signal.SIGINT)
     done = finish(process)
@@ -188,7 +208,9 @@ def test_a_full_disk_ends_the_race_at_once_and_the_file_is_named(tmp_path: Path)
 
     track = peanut(tmp_path / "peanut.csv")
     arguments = ("--track", track, "--train-track", track, "--out", tmp_path / "race")
-    process = start("race", *arguments, "--laps", "100", preexec_fn=limited)
+    process = start(
+        "race", "--progress-drives", "0", *arguments, "--laps", "100", preexec_fn=limited
+    )
     done = finish(process)
     assert done.returncode == 2
     assert f"cannot write the log {tmp_path / 'race' / 'run.mcap'}: File too large" in done.stderr
@@ -201,7 +223,7 @@ def test_a_pause_of_three_seconds_ends_nothing(tmp_path: Path) -> None:
     """A host that stalls, a laptop that is closed for a moment."""
     track = peanut(tmp_path / "peanut.csv")
     arguments = ("--track", track, "--train-track", track, "--out", tmp_path / "race")
-    process = start("race", *arguments, "--laps", "1")
+    process = start("race", "--progress-drives", "0", *arguments, "--laps", "1")
     log = tmp_path / "race" / "run.mcap"
     for name in ("plant", "controller"):
         driven = len(states_of(log))

@@ -1,6 +1,7 @@
 """Progress along a line in the least time, within the track.
 
-    l_states = q_contour |p_k - p_foot,k|^2,  at the last stage  - gain tau'_N t_N . (p_N - p_foot,N)
+    l_states = q_contour |p_k - p_foot,k|^2
+    at the last stage besides:  - gain tau'_N t_N . (p_N - p_foot,N)
 
 p_foot,k is the foot on the line, at arc length theta_k, of where the plan itself is; the planner
 finds it anew before each QP. So the problem needs no virtual state for theta and no lag error, as

@@ -18,7 +18,5 @@ def tracking(model: Model, discretisation: Discretisation) -> Problem:
     return driving_problem("tracking", model, discretisation, _position_error)
 
 
-def _position_error(
-    x: ca.SX, p: dict[str, ca.SX], theta: dict[str, ca.SX], _last: ca.SX
-) -> ca.SX:
+def _position_error(x: ca.SX, p: dict[str, ca.SX], theta: dict[str, ca.SX], _last: ca.SX) -> ca.SX:
     return theta["q_position"] * ((x[0] - p["x"]) ** 2 + (x[1] - p["y"]) ** 2)

@@ -12,11 +12,13 @@ from bayesrace.vehicles import DEFAULT_CAR
 from operation.cli.options import (
     Car,
     CarName,
+    ControlProblem,
     Delay,
     Endpoint,
     FmuFile,
     FmuMap,
     Noise,
+    ProblemChoice,
     Seed,
     Simulator,
     TrackName,
@@ -56,6 +58,16 @@ def race(
         int,
         typer.Option(metavar="N", min=1, max=100, help="Laps per controller, the first from rest."),
     ] = 2,
+    problem: ControlProblem = ProblemChoice.tracking,
+    progress_drives: Annotated[
+        int,
+        typer.Option(
+            metavar="N",
+            min=0,
+            max=20,
+            help="Runs of bayesrace-limit, which maximises progress, with an update between them.",
+        ),
+    ] = 3,
     mode: TimeMode = Mode.lockstep,
     no_constraints: Annotated[
         bool, typer.Option("--no-constraints", help="OCP without track constraints.")
@@ -76,7 +88,8 @@ def race(
         bool, typer.Option("--no-limit", help="Do not compare the laps with the limit.")
     ] = False,
 ) -> None:
-    """Drive the paper's comparison: WorstCase, BayesRace, BayesRace-updated, BestCase.
+    """Drive the paper's comparison: WorstCase, BayesRace, BayesRace-updated, BestCase; and
+    BayesRace-limit, which maximises progress in place of tracking the line.
 
     Computes racing lines, drives the training track by pure pursuit, trains the GPs, builds the
     controllers, and drives them as two processes over Zenoh. Leaves a run directory with the log,
@@ -97,7 +110,8 @@ def race(
     settings = RaceSettings(
         car=driven, track=track, train_track=train_track, laps=laps, mode=mode.value,
         seed=seed, fmu=fmu, fmu_map=fmu_map, simulator=simulator, delay_s=1e-3 * delay,
-        noise=sensor_noise(noise), limit=not no_limit,
+        noise=sensor_noise(noise), limit=not no_limit, problem=problem.value,
+        progress_drives=progress_drives,
     )  # fmt: skip
     mpc = settings.mpc.model_copy(update={"constraints": not no_constraints})
     settings = settings.model_copy(update={"mpc": mpc})

@@ -137,6 +137,7 @@ def _controller(
     cpu: str,
 ) -> "FmuDefinition":
     from bayesrace.gp.weights import read_weights
+    from bayesrace.manifest import read_manifest
     from codegen.build import build
     from codegen.fmu import controller_fmu
     from codegen.settings import BuildSettings
@@ -145,12 +146,14 @@ def _controller(
     from controller.settings import MpcSettings
 
     table = path_on(track, raceline, car)
+    folder = artefact or build(BuildSettings(car=car))[0]
+    problem = read_manifest(folder).problem.name
     return controller_fmu(
-        artefact or build(BuildSettings(car=car))[0],
+        folder,
         car,
         rows=table.rows,
         spacing_m=table.spacing_m,
-        settings=read_settings(settings, MpcSettings).parameters(car),
+        settings=read_settings(settings, MpcSettings).parameters(car, problem),
         fallback=FallbackSettings().model_dump() | {"brake_fade_mps": car.brake_fade_mps},
         weights=None if weights is None else read_weights(weights),
         version=version,

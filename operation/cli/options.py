@@ -27,6 +27,8 @@ __all__ = [
     "OutFile",
     "ParentPid",
     "RaceLineFile",
+    "ControlProblem",
+    "ProblemChoice",
     "Seed",
     "Simulator",
     "TrackName",
@@ -70,6 +72,22 @@ AllSamples = Annotated[
         help="Keep samples beyond the car's limits, as the paper's published drives have them.",
     ),
 ]
+
+
+class ProblemChoice(StrEnum):
+    """Control problem."""
+
+    tracking = "tracking"
+    progress = "progress"
+
+
+ControlProblem = Annotated[
+    ProblemChoice,
+    typer.Option(
+        metavar="PROBLEM", help="tracking: follow the line in its speed; progress: be fast."
+    ),
+]
+
 Seed = Annotated[
     int,
     typer.Option(

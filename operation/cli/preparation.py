@@ -14,9 +14,11 @@ from operation.cli.options import (
     AllSamples,
     Car,
     CarName,
+    ControlProblem,
     FmuFile,
     FmuMap,
     OutFile,
+    ProblemChoice,
     RaceLineFile,
     Seed,
     Simulator,
@@ -340,6 +342,7 @@ def build(
         PredictionModel,
         typer.Option(metavar="MODEL", help="Prediction model: e_kinematic or dynamic."),
     ] = PredictionModel.e_kinematic,
+    problem: ControlProblem = ProblemChoice.tracking,
     horizon: Annotated[
         int | None,
         typer.Option(
@@ -363,6 +366,7 @@ def build(
     settings = BuildSettings(
         car=get_car(car),
         model=model.value,
+        problem=problem.value,
         discretisation=PERFECT if model is PredictionModel.dynamic else PREDICTION,
         horizon=horizon,
         gp_capacity=gp_capacity,
@@ -408,12 +412,11 @@ def export(
     parameters, process = get_car(car), ControllerSettings()
     track = track or parameters.race_track
     table = path_on(track, raceline, parameters)
-    values = read_settings(settings, MpcSettings).parameters(parameters) | cycle_values(
-        parameters, process.fallback, process.compensation, process.stale_s
-    )
     folder = artefact or make(BuildSettings(car=parameters))[0]
     manifest = read_manifest(folder)
     manifest.check_car(parameters, folder)
+    mpc = read_settings(settings, MpcSettings).parameters(parameters, manifest.problem.name)
+    values = mpc | cycle_values(parameters, process.fallback, process.compensation, process.stale_s)
     learned = None if weights is None else read_weights(weights)
     write(out, manifest, table.rows, table.spacing_m, values, learned)
     typer.echo(f"{track}, {parameters.name}: {out}")

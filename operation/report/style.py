@@ -44,6 +44,9 @@ _LOOKS: Final[Mapping[str, Look]] = {
     "bayesrace-updated": Look(
         "BayesRace updated", "#009E73", "GPs updated with BayesRace's own laps"
     ),
+    "bayesrace-limit": Look(
+        "BayesRace at the limit", "#E69F00", "maximises progress, GPs updated after each run"
+    ),
     "bestcase": Look("BestCase", "#3d3d3a", "the true model, for comparison"),
     "purepursuit": Look("Pure pursuit", "#CC79A7", "controller of the training laps"),
 }

@@ -17,6 +17,7 @@ from operation.settings import RaceSettings
 
 __all__ = [
     "CONTROLLERS",
+    "PAPER",
     "Case",
     "Controller",
     "Files",
@@ -27,11 +28,12 @@ __all__ = [
     "software_identity",
 ]
 
-Controller = Literal["worstcase", "bayesrace", "bayesrace-updated", "bestcase"]
+Controller = Literal["worstcase", "bayesrace", "bayesrace-updated", "bayesrace-limit", "bestcase"]
 CONTROLLERS: Final[tuple[Controller, ...]] = get_args(Controller)
+PAPER: Final[tuple[Controller, ...]] = ("worstcase", "bayesrace", "bayesrace-updated", "bestcase")
 
 _FIXED: Final = (
-    *("mode", "fmu", "fmu_map", "simulator", "threads"),
+    *("mode", "fmu", "fmu_map", "simulator", "threads", "limit"),
     *("discretisation.step_s", "pursuit.step_s", "pursuit.seed"),
 )
 """Settings that a campaign does not vary: it drives the built-in car in lockstep, in the plant's
@@ -108,7 +110,7 @@ class Case:
     """Settings and controllers; files by their names in :data:`Files`."""
 
     settings: RaceSettings
-    controllers: tuple[Controller, ...] = CONTROLLERS
+    controllers: tuple[Controller, ...] = PAPER
     weights: str = ""
     """Weights that are driven with in place of learned ones; empty without."""
 

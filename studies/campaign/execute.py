@@ -21,6 +21,7 @@ from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.vehicles import CarParameters
 from controller.assembly import compiled_controller
 from controller.path_table import PathTable, make_path_table
+from learning.dataset import Dataset
 from operation.analysis.laps import trajectory_digest
 from operation.closed_loop import ClosedLoop, Driven, built_in_car
 from operation.preparation import (
@@ -28,9 +29,10 @@ from operation.preparation import (
     Prepared,
     PreparedTrack,
     prepare,
+    progress_artefact,
     updated_weights,
 )
-from operation.settings import PreparationSettings
+from operation.settings import PreparationSettings, RaceSettings
 from operation.terminal.progress import stages_on
 from plant.simulator import Simulator
 from studies.campaign.case import Case, Controller, Files, software_identity
@@ -97,6 +99,12 @@ def _prepared(
 
 
 @lru_cache(maxsize=64)
+def _progress_artefact(settings: str) -> Path:
+    """The controller of ``bayesrace-limit``."""
+    return progress_artefact(RaceSettings.model_validate_json(settings))
+
+
+@lru_cache(maxsize=64)
 def _table(track: PreparedTrack, spacing_m: float) -> PathTable:
     return make_path_table(track.track, track.line, spacing_m)
 
@@ -112,15 +120,20 @@ class _Runs:
 
     def __init__(self, case: Case) -> None:
         self._case, self._settings = case, case.settings
-        self._first: Driven | None = None
+        self._samples: list[Dataset] = []
 
     def drive(self, controller: Controller) -> list[Row]:
-        """The rows of the controller's laps."""
+        """The rows of the controller's laps; of ``bayesrace-limit``, those of its last run."""
         weights = self._weights(controller)
         begun = time.perf_counter()
         driven = self._driven(controller, weights)
         if controller == "bayesrace":
-            self._first = driven
+            self._samples = [*self._trained_on, driven.samples()]
+        if controller == "bayesrace-limit" and weights is not None:
+            for _ in range(self._settings.progress_drives - 1):
+                self._samples.append(driven.samples())
+                weights = self._learned(weights)
+                driven = self._driven(controller, weights)
         run = {
             "controller": controller,
             "weights": "" if weights is None else weights.version,
@@ -142,16 +155,28 @@ class _Runs:
     def _weights(self, controller: Controller) -> GpWeights | None:
         if controller == "bayesrace":
             return read_weights(self._files.weights)
-        return self._updated() if controller == "bayesrace-updated" else None
+        return self._updated if controller in ("bayesrace-updated", "bayesrace-limit") else None
 
+    @property
+    def _trained_on(self) -> list[Dataset]:
+        training = self._files.training
+        return [] if training is None else [training.samples]
+
+    @cached_property
     def _updated(self) -> GpWeights:
         """Learned from training drive and laps, beginning with the weights of the laps."""
-        training = self._files.training
-        if self._first is None or training is None:
+        if not self._samples or self._files.training is None:
             raise RuntimeError("there are no laps of 'bayesrace' to learn from")
-        samples = [training.samples, self._first.samples()]
-        first = read_weights(self._files.weights)
-        return read_weights(updated_weights(samples, self._settings, first))
+        return self._learned(read_weights(self._files.weights))
+
+    def _learned(self, before: GpWeights) -> GpWeights:
+        """From all samples so far."""
+        return read_weights(updated_weights(self._samples, self._settings, before))
+
+    def _artefact(self, controller: Controller) -> Path:
+        if controller == "bayesrace-limit":
+            return _progress_artefact(self._settings.model_dump_json())
+        return self._files.artefacts[1 if controller == "bestcase" else 0]
 
     def _driven(self, controller: Controller, weights: GpWeights | None) -> Driven:
         settings, files = self._settings, self._files
@@ -162,7 +187,7 @@ class _Runs:
             track.track,
             track.line,
             compiled_controller(
-                files.artefacts[1 if best else 0], car, track.track, track.line, weights,
+                self._artefact(controller), car, track.track, track.line, weights,
                 settings.mpc, table=_table(track, car.tuning.path.spacing_m),
             ),
             _vehicle(settings.true_car.model_dump_json()),

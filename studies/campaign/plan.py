@@ -35,6 +35,7 @@ from bayesrace.vehicles import CarParameters, get_car
 from operation.settings import RaceSettings
 from studies.campaign.case import (
     CONTROLLERS,
+    PAPER,
     Case,
     Controller,
     Files,
@@ -80,7 +81,7 @@ class _Plan(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     controllers: tuple[Controller, ...] = Field(
-        CONTROLLERS, min_length=1, description=f"who drives: some of {', '.join(CONTROLLERS)}"
+        PAPER, min_length=1, description=f"who drives: some of {', '.join(CONTROLLERS)}"
     )
     weights: Path | None = Field(
         None, description="weights to drive with, in place of those that each case learns"

@@ -1,0 +1,155 @@
+"""The problem that maximises progress: IPOPT's solution, its reference, stops, starts, and bits."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bayesrace.arrays import Floats
+from bayesrace.gp.corrected import corrected_function
+from bayesrace.gp.weights import GpWeights
+from bayesrace.integrators import PREDICTION
+from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles.models import dynamic, e_kinematic
+from codegen.build import build, problem_of
+from codegen.ocp import OcpNlp
+from codegen.settings import BuildSettings
+from controller.interface import Environment
+from controller.native_step import NativeStep, StepStatus
+from controller.path_table import PathTable
+from controller.settings import MpcSettings
+from tests.conftest import SETTINGS, Circuit, discrete, drive
+from tests.test_native_planner import nearest
+from tests.test_native_prepare import result
+from tests.test_native_step import EXACT, FROM_OUR_PLAN, TIGHT_IPOPT
+
+HORIZON = 20
+PROGRESS = BuildSettings(problem="progress", horizon=HORIZON)
+
+
+@pytest.fixture(scope="module")
+def artefact() -> Path:
+    return build(PROGRESS)[0]
+
+
+def ready(
+    artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit, settings: MpcSettings
+) -> NativeStep:
+    step = NativeStep(artefact, car, settings)
+    step.set_weights(weights)
+    step.set_path(circuit.table)
+    return step
+
+
+@pytest.fixture
+def step(artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit) -> NativeStep:
+    return ready(artefact, car, weights, circuit, MpcSettings())
+
+
+def test_the_converged_step_is_the_solution_of_ipopt(
+    step: NativeStep, car: CarParameters, weights: GpWeights, circuit: Circuit
+) -> None:
+    """From the plan that drives; the proximal term makes the last digits slow."""
+    exact = EXACT.model_copy(update={"iterations": 300, "tolerance": 1e-8})
+    f = corrected_function(e_kinematic(car), PREDICTION, weights)
+    ocp = OcpNlp(problem_of(PROGRESS), f, HORIZON, options=TIGHT_IPOPT | FROM_OUR_PLAN)
+    plant, values = discrete(dynamic(car)), exact.parameters(car, "progress")
+    x, d, compared = circuit.start(), 0.0, 0
+    for k in range(120):
+        assert step.step(x, d).usable
+        u = step.u.copy()
+        if k % 20 == 10:
+            reference = step.read_reference()
+            step.set_parameters(car, exact)
+            status = step.solve(x, d, reference, elapsed_s=0.0)
+            assert status.usable
+            if status is StepStatus.CONVERGED:
+                compared += 1
+                plan = step.read_plan()
+                oracle = ocp.solve(x, d, reference, values, plan)
+                assert oracle.success, oracle.status
+                np.testing.assert_allclose(plan[1], oracle.u, rtol=0, atol=1e-3)
+                assert step.info.cost == pytest.approx(oracle.cost, rel=1e-6, abs=1e-8)
+            step.set_parameters(car, MpcSettings())
+        d, x = float(u[0]), plant(x, u)
+    assert compared >= 4
+
+
+def time_on_line(table: PathTable, xy: Floats) -> float:
+    """What the line takes from its first row to the foot of a point."""
+    s, _ = nearest(table, xy)
+    speed = np.append(table.rows[:, 2], table.rows[0, 2])
+    at = np.arange(len(speed)) * table.spacing_m
+    slope = np.diff(speed) / table.spacing_m
+    time = table.spacing_m / speed[:-1]
+    curved = np.abs(slope) > 1e-12
+    time[curved] = np.log(speed[1:][curved] / speed[:-1][curved]) / slope[curved]
+    return float(np.interp(s, at, np.append(0, np.cumsum(time))))
+
+
+def test_the_reference_is_where_the_plan_is_on_the_line(
+    artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit
+) -> None:
+    """Once converged, the feet are those of the plan that is returned."""
+    many = SETTINGS.model_copy(update={"iterations": 200, "iterations_cold": 200})
+    step = ready(artefact, car, weights, circuit, many)
+    table, names = circuit.table, step.manifest.problem.stage_parameters
+    x, d = circuit.start(v_mps=1.0), 0.0
+    for _ in range(5):
+        assert step.step(x, d).usable
+    reference = {name: step.read_reference()[:, i] for i, name in enumerate(names)}
+    plan = step.read_plan()[0][1:]
+    assert (reference["follows"] == 1).all()
+    for k in range(0, HORIZON, 3):
+        s, _ = nearest(table, plan[k, :2])
+        foot = nearest(table, np.array([reference["x"][k], reference["y"][k]]))
+        assert abs(foot[1]) < 1e-4
+        assert foot[0] == pytest.approx(s, abs=5e-3)
+        pace = np.array([reference["pace_x"][k], reference["pace_y"][k]])
+        for way in np.eye(2):
+            ahead, behind = (
+                time_on_line(table, plan[k, :2] + sign * 0.01 * way) for sign in (1, -1)
+            )
+            assert pace @ way == pytest.approx((ahead - behind) / 0.02, abs=0.06 * np.hypot(*pace))
+
+
+def test_prepared_steps_are_the_same_to_the_bit(
+    artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit
+) -> None:
+    prepared, plain = (ready(artefact, car, weights, circuit, MpcSettings()) for _ in range(2))
+    plant = discrete(dynamic(car))
+    x, d = circuit.start(), 0.0
+    for _ in range(100):
+        assert prepared.step(x, d) is plain.step(x, d)
+        assert result(prepared) == result(plain)
+        prepared.prepare()
+        d, x = float(plain.u[0]), plant(x, plain.u)
+
+
+def test_a_stop_brakes_to_standstill(
+    step: NativeStep, car: CarParameters, circuit: Circuit
+) -> None:
+    plant = discrete(dynamic(car))
+    x, d, limit = circuit.start(v_mps=1.5), 0.0, math.inf
+    for k in range(150):
+        limit = math.inf if k < 30 else max(0.0, min(limit, float(x[3])) - 1.5 * 0.02)
+        environment = Environment(speed_limit_mps=limit, speed_limit_rate_mps2=1.5)
+        assert step.step(x, d, environment=environment).usable
+        d, x = float(step.u[0]), plant(x, step.u)
+        if k == 29:
+            assert x[3] > 1.0
+    assert x[3] < 0.15
+
+
+def test_a_car_that_points_aside_sets_off_at_once(
+    step: NativeStep, car: CarParameters, circuit: Circuit
+) -> None:
+    """Tracking turns it round at a walking pace first."""
+    plant = discrete(dynamic(car))
+    x, d = circuit.start(v_mps=0.1), 0.0
+    x[2] += 1.2
+    for _ in range(25):
+        assert step.step(x, d).usable
+        d, x = float(step.u[0]), plant(x, step.u)
+    assert x[3] > 0.8
