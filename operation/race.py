@@ -275,10 +275,11 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
             with stages.stage("update the residual") as stage:
                 updated = this.update(samples, prepared.weights, FILES.weights_updated, stage)
             with stages.stage("drive BayesRace-updated"):
-                drives.drive_with(updated, "bayesrace-updated")
+                accepted = drives.drive_with(updated, "bayesrace-updated") is not None
         if progress is not None:
+            weights = updated if accepted else prepared.weights
             with drives.controller(progress, "bayesrace-limit"):
-                _approach_limit(this, drives, samples, updated)
+                _approach_limit(this, drives, samples, weights)
         for best in perfect:
             with drives.controller(best, "bestcase"), stages.stage("drive BestCase"):
                 drives.drive("bestcase")

@@ -77,6 +77,20 @@ def assert_order(race: Race) -> None:
     assert updated["off_track_max_m"] == 0.0
 
 
+def runs_of_limit(race: Race) -> list[dict[str, Any]]:
+    return [lap for lap in race.result["laps"] if lap["controller"] == LIMIT]
+
+
+def test_progress_is_faster_than_the_line_and_stays_on_the_track(peanut_race: Race) -> None:
+    """Each run after the first with weights learned from those before."""
+    updated = peanut_race.lap("bayesrace-updated")
+    first, last = runs_of_limit(peanut_race)
+    assert first["weights_version"] == updated["weights_version"] != last["weights_version"]
+    assert last["lap_time_s"] < updated["lap_time_s"]
+    assert last["flying_lap_time_s"] < 0.99 * updated["flying_lap_time_s"]
+    assert last["off_track_samples"] == 0
+
+
 def test_the_order_is_that_of_the_paper(peanut_race: Race) -> None:
     assert_order(peanut_race)
 
@@ -85,10 +99,14 @@ def test_the_order_is_that_of_the_paper(peanut_race: Race) -> None:
 def test_the_published_race_is_won_as_the_paper_says_and_faster(tmp_path: Path) -> None:
     """The paper's tracks, everything else by default."""
     tracks = [reference_file(f"tracks/{name}.csv") for name in ("ethz", "ethzmobil")]
-    options = ("--track", tracks[0], "--train-track", tracks[1])
+    options = ("--track", tracks[0], "--train-track", tracks[1], "--progress-drives", "3")
     race = Race.running(tmp_path / "published", *options)()
     assert_order(race)
     assert race.lap("bayesrace-updated")["lap_time_s"] <= 7.7
+    fastest = runs_of_limit(race)[-1]
+    assert fastest["lap_time_s"] <= 7.32
+    assert fastest["flying_lap_time_s"] <= 7.12
+    assert fastest["off_track_samples"] == 0
 
 
 @pytest.mark.check
@@ -120,7 +138,8 @@ def test_on_the_builtin_tracks_the_order_is_the_same(tmp_path: Path) -> None:
 
 def test_result_has_the_promised_form(peanut_race: Race) -> None:
     result = peanut_race.result
-    assert [lap["controller"] for lap in result["laps"]] == CONTROLLERS
+    *first, best = CONTROLLERS
+    assert [lap["controller"] for lap in result["laps"]] == [*first, LIMIT, LIMIT, best]
     for lap in result["laps"]:
         for key, kind in LAP_FORM.items():
             assert isinstance(lap[key], kind), (key, lap[key])
@@ -172,13 +191,16 @@ def test_a_refusal_is_a_row_and_the_race_goes_on(
 
     monkeypatch.setattr(driving, "updated_weights", learn)
     track = str(peanut_track)
-    settings = RaceSettings(track=track, train_track=track, laps=1)
+    settings = RaceSettings(track=track, train_track=track, laps=1, progress_drives=1)
     with stages_on(Console(quiet=True)) as stages:
         driving.race(settings, tmp_path / "out", stages)
     laps = {lap.controller: lap for lap in analyse(tmp_path / "out").laps}
-    assert list(laps) == CONTROLLERS
+    *first, best = CONTROLLERS
+    assert list(laps) == [*first, LIMIT, best]
     assert "absurd" in laps["bayesrace-updated"].refused
     assert laps["bayesrace"].finished
+    # It begins with the weights that were accepted.
+    assert laps[LIMIT].weights_version == laps["bayesrace"].weights_version
     assert laps["bestcase"].finished
 
 
@@ -195,10 +217,11 @@ def test_one_seed_gives_one_race_to_the_bit(
     peanut_race: Race, short: ShortRace, tmp_path: Path
 ) -> None:
     """Prepared anew, too: lines and weights do not come from the cache, as controllers do."""
-    for settings in (BuildSettings(), BuildSettings.best_case()):
+    kinds = BuildSettings(), BuildSettings(problem="progress"), BuildSettings.best_case()
+    for settings in kinds:
         artefact = build(settings)[0]
         shutil.copytree(artefact, tmp_path / artefact.name)
-    again = short("again", BAYESRACE_CACHE=str(tmp_path))()
+    again = short("again", "--progress-drives", "2", BAYESRACE_CACHE=str(tmp_path))()
     for name in CONTROLLERS:
         mine, other = peanut_race.lap(name), again.lap(name)
         for volatile in ("solve_us",):
@@ -248,12 +271,9 @@ def test_a_map_without_an_fmu_is_refused_at_once(cli: Cli, tmp_path: Path) -> No
 
 def test_table_report_and_result_say_the_same(peanut_race: Race) -> None:
     html = (peanut_race.out / "report.html").read_text()
-    for lap in peanut_race.result["laps"]:
-        row = next(
-            line.split()
-            for line in peanut_race.process.stdout.splitlines()
-            if line.split()[:1] == [lap["controller"]] and "finish" not in line
-        )
+    lines = [line.split() for line in peanut_race.process.stdout.splitlines()]
+    rows = [line for line in lines if line[:1] and len(line) == 11]
+    for lap, row in zip(peanut_race.result["laps"], rows, strict=False):
         time_s, flying_s, solve = lap["lap_time_s"], lap["flying_lap_time_s"], lap["solve_us"]
         cells = [
             f"{time_s:.3f}" if lap["finished"] else "DNF",
