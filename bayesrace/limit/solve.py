@@ -43,7 +43,7 @@ _ROUNDS: Final = 10
 _TOUCHING: Final = 0.002
 """Over the car's width, by which its outline may pass the margin."""
 
-_WARM: Final = {"mu_init": 1e-4, "bound_push": 1e-6, "bound_frac": 1e-6}
+_WARM: Final = {"mu_init": 1e-3, "bound_push": 1e-4, "bound_frac": 1e-4}
 """IPOPT's, for a guess that is nearly the solution."""
 
 
