@@ -25,7 +25,7 @@ __all__ = ["limits_beside", "limits_in"]
 _FILES: Final = {"standing": "limit-standing.csv", "flying": "limit-flying.csv"}
 """Names in a run directory."""
 
-_PATIENCE_S: Final = 300.0
+_PATIENCE_S: Final = 60.0
 _LOWEST: Final = 19
 
 
@@ -33,7 +33,7 @@ _LOWEST: Final = 19
 def limits_beside(settings: RaceSettings, car_file: str, out: Path) -> Iterator[Callable[[], None]]:
     """Computes the limits of a race beside the block, into its run directory ``out``.
 
-    Yields what waits for them, at most some minutes. A limit that is not found is left out; the
+    Yields what waits for them, at most a minute. A limit that is not found is left out; the
     reason is in a log named after it. ``car_file``: the race's car.
     """
     track = load_track(settings.track, settings.driven_car.width_m)

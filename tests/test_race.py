@@ -272,7 +272,7 @@ def test_a_map_without_an_fmu_is_refused_at_once(cli: Cli, tmp_path: Path) -> No
 def test_table_report_and_result_say_the_same(peanut_race: Race) -> None:
     html = (peanut_race.out / "report.html").read_text()
     lines = [line.split() for line in peanut_race.process.stdout.splitlines()]
-    rows = [line for line in lines if line[:1] and len(line) == 11]
+    rows = [line for line in lines if len(line) == 11 and line[0] != "controller"]
     for lap, row in zip(peanut_race.result["laps"], rows, strict=False):
         time_s, flying_s, solve = lap["lap_time_s"], lap["flying_lap_time_s"], lap["solve_us"]
         cells = [

@@ -28,7 +28,7 @@ _SLOWEST: Final = 0.01
 
 
 class Guess:
-    """A racing line over the arc length of the smoothed centreline; it has its period."""
+    """A racing line as a function of the place on the smoothed centreline."""
 
     def __init__(
         self, line: RaceLine, curve: PlaneSpline, car: CarParameters, start_mps: float | None
@@ -57,9 +57,10 @@ class Guess:
         return np.minimum(v, np.sqrt(self._start_mps**2 + 2 * launch * places))
 
     def mesh(self, interval_m: float, interval_s: float, refined: int) -> Floats:
-        """Ascending places from 0 to the period, at most so far apart.
+        """Ascending places (M + 1,) from 0 to the period.
 
-        Both in way and in time at the guess's speeds; there are ``refined`` times as many.
+        Neighbours are at most so far apart, in way and in time at the guess's speeds, over
+        ``refined``.
         """
         count = max(24, round(self._curve.period / interval_m)) * _OVERSAMPLING
         s = np.arange(count + 1) * (self._curve.period / count)

@@ -1,4 +1,4 @@
-"""The limit on one mesh after the other, each with twice the intervals, until the lap stays."""
+"""The limit on meshes with twice the intervals each, until the lap changes by less than 0.1 %."""
 
 import time
 from typing import Any, Final
@@ -43,16 +43,16 @@ _ROUNDS: Final = 10
 _TOUCHING: Final = 0.002
 """Over the car's width, by which its outline may pass the margin."""
 
-_WARM: Final = {"mu_init": 1e-4, "bound_push": 1e-6, "bound_frac": 1e-6}
+_WARM: Final = {"mu_init": 1e-3, "bound_push": 1e-4, "bound_frac": 1e-4}
 """IPOPT's, for a guess that is nearly the solution."""
 
 
 class _NoLapError(InputError):
-    """From this guess."""
+    """No lap was found from this guess."""
 
 
 class _Limit:
-    """One problem on its meshes."""
+    """The optimisation of one lap, on any mesh."""
 
     def __init__(self, track: Track, model: Model, settings: LimitSettings, line: RaceLine) -> None:
         car = model.car
@@ -75,7 +75,7 @@ class _Limit:
         return make(self._track, self._curve, places, self._tuning, self._margin_m)
 
     def first(self, gates: Gates) -> Lap:
-        """The fastest lap from the racing line, begun again until two ends are the same."""
+        """The best of laps from the racing line at several speeds, until two are the same."""
         laps: list[Lap] = []
         for share in _SPEEDS:
             try:
@@ -100,7 +100,7 @@ class _Limit:
         return self._fastest(gates, Lap(states, durations), _WARM)
 
     def _fastest(self, gates: Gates, guess: Lap, options: dict[str, Any]) -> Lap:
-        """With the outline, again and again until it is where its edges were taken from."""
+        """The fastest lap; with an outline, repeated until this keeps the margin."""
         lap = self._optimised(gates, guess, options)
         if self._outline is None:
             return lap

@@ -55,6 +55,10 @@ __all__ = [
 ]
 
 
+_SURELY: Final = 1.5
+"""The distance from the edge changes by less than so much of the way, as wide as the track may
+become."""
+
 WEIGHTS_FILES: Final = {
     "bayesrace": "weights-bayesrace.bin",
     "bayesrace-updated": "weights-updated.bin",
@@ -109,17 +113,22 @@ class DrivenRun:
         """Which of the counted samples are off the track."""
         return np.asarray(self.on_track.off_track_m[self.counted] > 0)
 
-    def off_track_between(self) -> Floats | None:
-        """Distances off the track of all counted sub-steps that are off it; None if not known."""
-        counted = self.counted.stop
+    def off_track_between(self) -> tuple[int, float] | None:
+        """Counted milliseconds off the track, and the deepest of them; None if not known."""
         places = None if self._car is None else positions_between(self.record, self._car)
         if places is None:
             return None
+        at = self.on_track.off_track_m[:-1]
         moved = np.linalg.norm(places - self.record.x[:-1, None, :2], axis=2).max(axis=1)
-        near = self.on_track.off_track_m[:-1] + moved > 0
-        near[counted:] = False
-        depth = self._track.project_path(places[near].reshape(-1, 2)).off_track_m
-        return np.asarray(depth[depth > 0])
+        nearest, farthest = at - _SURELY * moved, at + _SURELY * moved
+        counts = np.arange(len(at)) < self.counted.stop
+        deepest = max(float(np.max(at[counts], initial=0.0)), 0.0)
+        # Off the track for the whole period, the car is not sought again, but where it is farthest.
+        whole = counts & (nearest > 0) & (farthest < deepest)
+        sought = counts & (farthest > 0) & ~whole
+        depth = self._track.project_path(places[sought].reshape(-1, 2)).off_track_m
+        off = depth[depth > 0]
+        return int(whole.sum()) * places.shape[1] + len(off), float(np.max(off, initial=0.0))
 
     @property
     def ended(self) -> str:
@@ -149,8 +158,8 @@ class DrivenRun:
             limit_ratios=_ratios(times, limit_s or {}),
             off_track_samples=int(self.off_track.sum()),
             off_track_max_m=max(float(np.max(depth, initial=0.0)), 0.0),
-            off_track_ms=None if between is None else len(between),
-            off_track_ms_max_m=None if between is None else float(np.max(between, initial=0.0)),
+            off_track_ms=None if between is None else between[0],
+            off_track_ms_max_m=None if between is None else between[1],
             deviation_mean_m=float(deviation.mean()) if len(deviation) else None,
             deviation_max_m=float(deviation.max()) if len(deviation) else None,
             lateral_max_mps2=self._largest(self.record.lateral_mps2),
