@@ -130,7 +130,7 @@ class BenchResult(BaseModel):
         for name in ("solver", "problems", "p50 us", "p90 us", "p99 us", "max us"):
             table.add_column(name, justify="left" if name == "solver" else "right")
         rows = (("compiled step", self.problems, self.step_us),
-                ("after preparation: state to input", self.problems, self.feedback_us),
+                ("after preparation", self.problems, self.feedback_us),
                 ("CasADi + IPOPT, expanded, cold", self.peers, self.ipopt_us))  # fmt: skip
         for name, count, t in rows:
             times = (f"{us:.0f}" for us in (t.p50, t.p90, t.p99, t.max))

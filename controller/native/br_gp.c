@@ -38,16 +38,16 @@ typedef struct {
 /* Of a Matern kernel. */
 INLINE kernel_value kernel(const int kind, br_vec r2) {
     kernel_value v;
-    const br_vec r = br_sqrt(r2);
+    const br_vec inverse = br_inverse_root(r2), r = r2 * inverse;
     if (kind == BR_KERNEL_MATERN05) {
         v.k = br_exp2_negative(-BR_LOG2_E * r);
-        v.g1 = br_select(r > NEAR, -v.k / r, br_splat(0.0));
+        v.g1 = br_select(r > NEAR, -v.k * inverse, br_splat(0.0));
         v.g2 = br_splat(0.0);
     } else if (kind == BR_KERNEL_MATERN15) {
         const br_vec e = br_exp2_negative(-SQRT3 * BR_LOG2_E * r);
         v.k = (1.0 + SQRT3 * r) * e;
         v.g1 = -3.0 * e;
-        v.g2 = br_select(r > NEAR, 3.0 * SQRT3 * e / r, br_splat(0.0));
+        v.g2 = br_select(r > NEAR, 3.0 * SQRT3 * e * inverse, br_splat(0.0));
     } else {
         const br_vec e = br_exp2_negative(-SQRT5 * BR_LOG2_E * r);
         v.k = (1.0 + SQRT5 * r + (5.0 / 3.0) * r2) * e;
