@@ -1,12 +1,15 @@
-"""Step time and first-input error of two checkouts, interleaved over the same recorded problems.
+"""Step times and first-input errors of two checkouts, interleaved over the same recorded problems.
 
     python -m benchmarks.step_versions OTHER_CHECKOUT [--passes 10] [--json FILE]
 
 Records drives of the present step on three tracks (those of ``bayesrace bench``), gives all
 problems, with their references, to a process of each checkout, and lets both solve them in turn,
-pass by pass. A problem's time is the lower quintile of its passes, so that a stall of the machine
-does not count. Where memory happens to lie makes some percent of difference from process to
-process: ratios, of this checkout over the other one, are medians over several pairs.
+pass by pass: the whole step, and, in passes between, the feedback (the step after its preparation)
+and the preparation. Times are CPU times of the thread, so that other processes do not count, though
+a busy hyperthread beside does. A problem's time is the lower quintile of its passes, so that a
+stall of the machine does not count either. Where memory happens to lie makes some percent of
+difference from process to process: ratios, of this checkout over the other one, are medians over
+several pairs.
 """
 
 import argparse
@@ -29,6 +32,8 @@ from plant.simulator import Simulator
 from studies.bench import BenchSettings
 
 ROOT = Path(__file__).resolve().parents[1]
+TIMES = ("step_us", "feedback_us", "prepare_us")
+PERCENTILES = (50, 90, 99)
 
 # Runs in either checkout, so it may use only what both have.
 WORKER = """
@@ -48,22 +53,27 @@ def make(settings):
     step = NativeStep(build(BuildSettings(car=car.name))[0], car, settings)
     step.set_weights(decode_weights(data["weights"].tobytes()))
     return step
-def solve(step):
-    times, inputs, good = [], [], []
+now = time.thread_time_ns
+def solve(step, prepared=False):
+    times, preparation, inputs, good = [], [], [], []
     for x, d, reference, first in zip(data["x"], data["d"], data["reference"], data["first"]):
         if first:
             step.reset()
-        begin = time.perf_counter_ns()
+        if prepared:
+            begin = now()
+            step.prepare()
+            preparation.append((now() - begin) * 1e-3)
+        begin = now()
         status = step.solve(x, d, reference)
-        times.append((time.perf_counter_ns() - begin) * 1e-3)
+        times.append((now() - begin) * 1e-3)
         inputs.append(step.u.tolist())
         good.append(int(status))
-    return times, inputs, good
+    return times, preparation, inputs, good
 fast = make(MpcSettings())
 solve(fast)
-print(json.dumps(solve(make(exact))[1:]), flush=True)
+print(json.dumps(solve(make(exact))[2:]), flush=True)
 for line in sys.stdin:
-    print(json.dumps(solve(fast)), flush=True)
+    print(json.dumps(solve(fast, line == "prepared\\n")), flush=True)
 """
 
 
@@ -99,13 +109,13 @@ class _Worker:
         )
         self.inputs, self.converged = self._read()
 
-    def solve(self) -> tuple[list[float], list[list[float]], list[int]]:
-        """One pass: times [us], first inputs, statuses."""
+    def solve(self, how: str) -> tuple[list[float], list[float], list[list[float]], list[int]]:
+        """One pass, "whole" or "prepared": times and preparation [us], first inputs, statuses."""
         assert self._process.stdin is not None
-        self._process.stdin.write("go\n")
+        self._process.stdin.write(f"{how}\n")
         self._process.stdin.flush()
-        times, inputs, good = self._read()
-        return times, inputs, good
+        times, preparation, inputs, good = self._read()
+        return times, preparation, inputs, good
 
     def close(self) -> None:
         """Ends the process."""
@@ -119,39 +129,52 @@ class _Worker:
         return json.loads(line)
 
 
-def measure(other: Path, problems: Path, passes: int) -> dict[str, Any]:
-    """Percentiles of step time and error of both, and their ratios."""
-    workers = {"this": _Worker(ROOT, problems), "other": _Worker(other, problems)}
-    times: dict[str, list[list[float]]] = {name: [] for name in workers}
-    last: dict[str, Any] = {}
+def _passes(workers: dict[str, _Worker], passes: int) -> dict[str, Any]:
+    """Of each checkout, the times by name (passes, problems), and the first inputs that it gives
+    with their statuses, from the last pass."""
+    found: dict[str, Any] = {name: {kind: [] for kind in TIMES} for name in workers}
     for number in range(passes):
-        order = list(workers) if number % 2 else list(workers)[::-1]
-        for name in order:
-            took, inputs, good = workers[name].solve()
-            times[name].append(took)
-            last[name] = np.array(inputs), np.array(good) <= 1
-    result: dict[str, Any] = {"problems": len(took), "passes": passes}
+        for name in list(workers)[:: 1 if number % 2 else -1]:
+            step, _, inputs, good = workers[name].solve("whole")
+            feedback, prepare, *prepared = workers[name].solve("prepared")
+            assert prepared == [inputs, good], "the preparation has changed a step"
+            for kind, took in zip(TIMES, (step, feedback, prepare), strict=True):
+                found[name][kind].append(took)
+            found[name]["answers"] = np.array(inputs), np.array(good) <= 1
+    return found
+
+
+def measure(other: Path, problems: Path, passes: int) -> dict[str, Any]:
+    """Percentiles of times and error of both, and their ratios."""
+    workers = {"this": _Worker(ROOT, problems), "other": _Worker(other, problems)}
+    found = _passes(workers, passes)
     exact = {name: np.array(worker.inputs) for name, worker in workers.items()}
     both = np.all([np.array(worker.converged) == 0 for worker in workers.values()], axis=0)
-    result["exact_difference"] = np.abs(exact["this"] - exact["other"])[both].max(axis=0).tolist()
-    same = both & (np.abs(exact["this"] - exact["other"]).max(axis=1) < 1e-3)
-    result["same_minimum"] = int(same.sum())
-    result["exact_difference_same_minimum"] = float(
-        np.abs(exact["this"] - exact["other"])[same].max()
-    )
+    apart = np.abs(exact["this"] - exact["other"])
+    same = both & (apart.max(axis=1) < 1e-3)
+    result: dict[str, Any] = {
+        "problems": len(both),
+        "passes": passes,
+        "exact_difference": apart[both].max(axis=0).tolist(),
+        "same_minimum": int(same.sum()),
+        "exact_difference_same_minimum": float(apart[same].max()),
+    }
+    answers = {name: found[name]["answers"][0] for name in workers}
+    result["u0_difference"] = np.abs(answers["this"] - answers["other"]).max(axis=0).tolist()
     for name in workers:
-        us = np.percentile(times[name], 20, axis=0)
-        inputs, good = last[name]
+        inputs, good = found[name]["answers"]
         error = np.abs(inputs - exact[name])[same & good]
         result[name] = {
-            "step_us": {f"p{q}": float(np.percentile(us, q)) for q in (50, 90, 99)},
             "u0_error": {f"p{q}": np.percentile(error, q, axis=0).tolist() for q in (95, 99)},
             "usable": int(good.sum()),
         }
+        for kind in TIMES:
+            us = np.percentile(found[name][kind], 20, axis=0)
+            result[name][kind] = {f"p{q}": float(np.percentile(us, q)) for q in PERCENTILES}
         workers[name].close()
     result["ratio"] = {
-        q: result["this"]["step_us"][q] / result["other"]["step_us"][q]
-        for q in ("p50", "p90", "p99")
+        kind: {q: us / result["other"][kind][q] for q, us in result["this"][kind].items()}
+        for kind in TIMES
     }
     return result
 
@@ -170,11 +193,12 @@ def main() -> None:
         problems = Path(folder) / "problems.npz"
         np.savez(problems, **record(given.problems, given.seed))
         pairs = [measure(given.other.resolve(), problems, given.passes) for _ in range(given.pairs)]
-    ratios = {q: [pair["ratio"][q] for pair in pairs] for q in ("p50", "p90", "p99")}
-    result = pairs[-1] | {
-        "ratio": {q: float(np.median(values)) for q, values in ratios.items()},
-        "ratio_p50_of_pairs": sorted(ratios["p50"]),
+    ratio = {
+        kind: {q: float(np.median([pair["ratio"][kind][q] for pair in pairs])) for q in one}
+        for kind, one in pairs[0]["ratio"].items()
     }
+    p50 = {kind: sorted(pair["ratio"][kind]["p50"] for pair in pairs) for kind in ratio}
+    result = pairs[-1] | {"ratio": ratio, "ratio_p50_of_pairs": p50}
     text = json.dumps(result, indent=1)
     print(text)
     if given.json:

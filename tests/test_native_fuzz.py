@@ -88,7 +88,7 @@ def test_no_input_breaks_a_promise(objects: dict[str, Path], tmp_path: Path) -> 
         ("br_planner", "spacing >= BR_PATH_SPACING_MIN_M", "spacing > 0"),
         ("br_predict", "return BR_ERROR_STATE;\n    memcpy", "{}\n    memcpy"),
     ],
-    ids=["too far ahead", "tiny spacing", "not finite"],
+    ids=["too far ahead", "tiny spacing", "not plausible"],
 )
 def test_a_guard_left_out_is_found(
     objects: dict[str, Path], small: Path, tmp_path: Path, file: str, guard: str, without: str

@@ -20,7 +20,7 @@ def functions(problem: Problem) -> list[ca.Function]:
 
 def _derivatives(linearise: ca.Function) -> list[ca.Function]:
     """Value with Jacobian, and the Hessian alone, which the runtime makes later."""
-    kind = ca.SX if linearise.is_a("SXFunction") else ca.MX
+    kind: Any = ca.SX if linearise.is_a("SXFunction") else ca.MX
     names = ["x", "u", "e", "lambda"]
     x, u, e, lam = (kind.sym(name, linearise.size1_in(i)) for i, name in enumerate(names))
     f, jacobian, _ = linearise.call([x, u, e, kind(ca.DM.zeros(lam.shape))], True, False)

@@ -76,7 +76,7 @@ BR_API br_mpc_error br_mpc_set_parameters(br_mpc *mpc, const br_mpc_parameters *
  * x, y, speed, left unit normal of the centreline (2), lower and upper bound of normal . p. */
 BR_API br_mpc_error br_mpc_set_path(br_mpc *mpc, const double *table, int n, double spacing_m);
 
-/* Copies the weights; the next step uses them. About 10 us per 400 points and output. What is
+/* Copies the weights; the next step uses them. About 30 us per 400 points and output. What is
  * staged is forgotten. BR_ERROR_BUSY while another thread stages. */
 BR_API br_mpc_error br_mpc_set_weights(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]);
 

@@ -38,16 +38,16 @@ typedef struct {
 /* Of a Matern kernel. */
 INLINE kernel_value kernel(const int kind, br_vec r2) {
     kernel_value v;
-    const br_vec r = br_sqrt(r2);
+    const br_vec inverse = br_inverse_root(r2), r = r2 * inverse;
     if (kind == BR_KERNEL_MATERN05) {
         v.k = br_exp2_negative(-BR_LOG2_E * r);
-        v.g1 = br_select(r > NEAR, -v.k / r, br_splat(0.0));
+        v.g1 = br_select(r > NEAR, -v.k * inverse, br_splat(0.0));
         v.g2 = br_splat(0.0);
     } else if (kind == BR_KERNEL_MATERN15) {
         const br_vec e = br_exp2_negative(-SQRT3 * BR_LOG2_E * r);
         v.k = (1.0 + SQRT3 * r) * e;
         v.g1 = -3.0 * e;
-        v.g2 = br_select(r > NEAR, 3.0 * SQRT3 * e / r, br_splat(0.0));
+        v.g2 = br_select(r > NEAR, 3.0 * SQRT3 * e * inverse, br_splat(0.0));
     } else {
         const br_vec e = br_exp2_negative(-SQRT5 * BR_LOG2_E * r);
         v.k = (1.0 + SQRT5 * r + (5.0 / 3.0) * r2) * e;
@@ -267,40 +267,45 @@ static int valid(const br_mpc_gp *in) {
     return br_all_finite(in->inputs, in->n * BR_NZ) && br_all_finite(in->alpha, in->n);
 }
 
-/* Inputs and weights of one output as the kernel wants them; 0 if they are not finite there. */
+/* A training point, whose scaled inputs are in store, among the columns of the sums. The square of
+ * the longest is left in reach. */
+static void fill_columns(br_gp_output *out, int i) {
+    double row[8 * (BR_GP_FIRST + BR_GP_SECOND)] = {1.0}, square = 0;
+    for (int a = 0, e = 8 * BR_GP_FIRST; a < BR_NZ; ++a) {
+        row[1 + a] = out->inputs[a][i];
+        square += row[1 + a] * row[1 + a];
+        for (int b = 0; b <= a; ++b, ++e) row[e] = row[1 + a] * row[1 + b];
+    }
+    for (int g = 0; g < BR_GP_FIRST + BR_GP_SECOND; ++g)
+        memcpy(out->columns[g][i], &row[8 * g], sizeof out->columns[g][i]);
+    out->squares[i] = -0.5 * BR_LOG2_E * square;
+    if (square > out->reach) out->reach = square;
+}
+
+/* Inputs and weights of one output as the kernel wants them; 0 if they are not finite there. What
+ * fills the last vector is the middle of the inputs, without weight. */
 static int load(br_gp_output *out, const br_mpc_gp *in) {
     out->kernel = in->kernel;
     out->offset = in->offset;
+    out->reach = 0;
     out->n_padded = (in->n + BR_LANES - 1) / BR_LANES * BR_LANES;
     for (int i = 0; i < out->n_padded; ++i)
         out->alpha[i] = i < in->n ? in->scale * in->alpha[i] : 0;
-    for (int g = 0; g < BR_GP_FIRST + BR_GP_SECOND; ++g)
-        memset(out->columns[g], 0, out->n_padded * sizeof out->columns[g][0]);
-    int finite = br_all_finite(out->alpha, out->n_padded);
-    for (int a = 0, e = 8 * BR_GP_FIRST; a < BR_NZ; ++a) {
+    for (int a = 0; a < BR_NZ; ++a) {
         const double inverse_scale = in->n ? 1.0 / in->length_scales[a] : 0.0;
         double middle = 0;
-        for (int i = 0; i < in->n; ++i) middle += in->inputs[i * BR_NZ + a] * inverse_scale / in->n;
+        for (int i = 0; i < in->n; ++i) middle += in->inputs[i * BR_NZ + a];
+        if (in->n) middle *= inverse_scale / in->n;
+        for (int i = 0; i < out->n_padded; ++i)
+            out->inputs[a][i] = i < in->n ? in->inputs[i * BR_NZ + a] * inverse_scale - middle : 0;
         out->inverse_scale[a] = inverse_scale;
         out->middle[a] = middle;
-        for (int i = 0; i < out->n_padded; ++i) {
-            const double p = i < in->n ? in->inputs[i * BR_NZ + a] * inverse_scale - middle : 0;
-            out->inputs[a][i] = p;
-            out->squares[i] = (a ? out->squares[i] : 0) - 0.5 * BR_LOG2_E * p * p;
-            out->columns[(1 + a) / 8][i][(1 + a) % 8] = p;
-        }
-        for (int b = 0; b <= a; ++b, ++e)
-            for (int i = 0; i < in->n; ++i)
-                out->columns[e / 8][i][e % 8] = out->inputs[a][i] * out->inputs[b][i];
     }
-    out->reach = 0;
-    for (int i = 0; i < in->n; ++i) {
-        out->columns[0][i][0] = 1;
-        out->reach = fmax(out->reach, sqrt(out->squares[i] / (-0.5 * BR_LOG2_E)));
-    }
-    for (int g = 0; g < BR_GP_FIRST + BR_GP_SECOND; ++g)
-        finite = finite && br_all_finite(out->columns[g][0], 8 * out->n_padded);
-    return finite && br_all_finite(out->inverse_scale, BR_NZ);
+    for (int i = 0; i < out->n_padded; ++i) fill_columns(out, i);
+    out->reach = sqrt(out->reach);
+    /* where the squares are finite, inputs and products are */
+    return br_all_finite(out->alpha, out->n_padded) && br_all_finite(out->squares, out->n_padded) &&
+           br_all_finite(out->inverse_scale, BR_NZ);
 }
 
 br_mpc_error br_gp_load(br_gp *gp, const br_mpc_gp outputs[BR_NE]) {
