@@ -19,7 +19,7 @@ from controller.interface import Environment
 from controller.native_step import NativeStep, StepStatus
 from controller.path_table import PathTable
 from controller.settings import MpcSettings
-from tests.conftest import SETTINGS, Circuit, discrete, drive
+from tests.conftest import SETTINGS, Circuit, discrete
 from tests.test_native_planner import nearest
 from tests.test_native_prepare import result
 from tests.test_native_step import EXACT, FROM_OUR_PLAN, TIGHT_IPOPT

@@ -173,7 +173,7 @@ struct br_mpc {
     br_mpc_reference reference[BR_N];
     int follows;  /* the reference is where the plan is on the line, not points to track, ... */
     int followed; /* ... and belongs to the plan at hand */
-    double turn; /* the side that the car turns round to, 1 left, -1 right; 0: it does not */
+    double turn;  /* the side that the car turns round to, 1 left, -1 right; 0: it does not */
     double turn_u[BR_N][BR_NU]; /* inputs that the reference of a turn has been made with */
     /* the plan, primal and dual */
     int warm;          /* a plan from the step before is there */
