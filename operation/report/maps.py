@@ -110,7 +110,9 @@ class LapMaps:
         bar.outline.set_visible(False)
         appearance = look(run.controller)
         time = f"{run.laps.times_s[0]:.3f} s" if run.finished else "did not finish"
-        axes.set_title(appearance.name, color=appearance.colour, fontweight="bold")
+        same = [one for one in self.runs if one.controller == run.controller]
+        number = f", {same.index(run) + 1}" if len(same) > 1 else ""
+        axes.set_title(appearance.name + number, color=appearance.colour, fontweight="bold")
         axes.set_title(f"{time} · {int(run.off_track.sum())} off track", loc="right", color=INK)
 
     def _draw_start(self, axes: Axes) -> None:
