@@ -54,7 +54,7 @@ def preparing(
 
 
 STAGES = [
-    "racing line, random",
+    "training line, random",
     "racing line, random",
     "build the controllers",
     "training drive (pure pursuit)",

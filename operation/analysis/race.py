@@ -70,8 +70,11 @@ def line_offset(line: RaceLine, xy: Floats, reach_m: float) -> Floats:
 class DrivenRun:
     """One run on its track: where the car was and how long its laps took."""
 
-    def __init__(self, record: RunRecord, track: Track, line: RaceLine) -> None:
-        self.record = record
+    def __init__(
+        self, record: RunRecord, track: Track, line: RaceLine, whole: bool = False
+    ) -> None:
+        """``whole``: all samples count, also after the last lap."""
+        self.record, self._whole = record, whole
         self.controller = record.plan.controller
         xy = record.x[:, :2]
         self.on_track: PathProjection = track.project_path(xy)
@@ -87,7 +90,8 @@ class DrivenRun:
     @property
     def counted(self) -> slice:
         """The samples that count: up to the last counted crossing, or all."""
-        return slice(0, self.laps.after[-1] if self.finished else len(self.record.truth))
+        ended = self.finished and not self._whole
+        return slice(0, self.laps.after[-1] if ended else len(self.record.truth))
 
     def lap(self, number: int) -> slice:
         """Samples of the lap with that number, from 0, with one beyond each end."""
@@ -133,6 +137,7 @@ class DrivenRun:
             deviation_max_m=float(deviation.max()) if len(deviation) else None,
             lateral_max_mps2=self._largest(self.record.lateral_mps2),
             slip_max_rad=self._largest(self.record.slip_rad),
+            speed_max_mps=self._largest(self.record.x[:, 3]),
             solve_us=_percentiles(self.record.solve_us),
             fallbacks=self.record.fallbacks,
             weights_version=self.record.weights_version,
@@ -163,6 +168,12 @@ class RaceAnalysis:
         self.recording = recording
         self.track, self.line = recording.track, recording.line
         self.runs = [DrivenRun(run, self.track, self.line) for run in recording.runs]
+
+    @cached_property
+    def training(self) -> DrivenRun | None:
+        """The training drive, all of it; None where weights were given."""
+        found = self.recording.training
+        return None if found is None else DrivenRun(found.run, found.track, found.line, whole=True)
 
     @cached_property
     def best_case(self) -> Dataset | None:
@@ -199,6 +210,7 @@ class RaceAnalysis:
         return RaceResult(
             settings=_summary(recording),
             laps=[run.result() for run in self.runs],
+            training=None if self.training is None else self.training.result(),
             gp=self._metrics("bayesrace"),
             gp_updated=self._metrics("bayesrace-updated"),
             real_time_factor=_real_time_factor(recording.runs),

@@ -29,6 +29,7 @@ __all__ = [
     "RaceLineFile",
     "Seed",
     "Simulator",
+    "Style",
     "TrackName",
     "Tyres",
     "connect_to",
@@ -182,6 +183,13 @@ FmuMap = Annotated[
 Simulator = Annotated[
     Literal["equations", "slipx"],
     typer.Option(metavar="NAME", help="equations, or slipx, whose reference car is --car slipx."),
+]
+Style = Annotated[
+    Literal["limit", "calm", "weave"],
+    typer.Option(
+        metavar="STYLE",
+        help="Of the training drive: limit (it slides), calm, weave (in waves about the line).",
+    ),
 ]
 LowLatency = Annotated[
     bool,

@@ -45,7 +45,7 @@ _LOOKS: Final[Mapping[str, Look]] = {
         "BayesRace updated", "#009E73", "GPs updated with BayesRace's own laps"
     ),
     "bestcase": Look("BestCase", "#3d3d3a", "the true model, for comparison"),
-    "purepursuit": Look("Pure pursuit", "#CC79A7", "controller of the training laps"),
+    "pure-pursuit": Look("Pure pursuit", "#CC79A7", "controller of the training laps"),
 }
 
 
