@@ -77,8 +77,8 @@ def test_a_drive_that_leaves_the_track_is_driven_again_slower(
 ) -> None:
     artefact, log = build(BuildSettings(car=CAR))[0], tmp_path / "drive.mcap"
     course = TRACK, at_the_edge(), CAR, artefact, log, 6.0
-    monkeypatch.setitem(pure_pursuit._SCALES, "limit", 1.9)
-    settings = PurePursuitSettings(), PurePursuitSettings(speed_scale=1.9)
+    monkeypatch.setitem(pure_pursuit._SCALES, "limit", 1.6)
+    settings = PurePursuitSettings(), PurePursuitSettings(speed_scale=1.6)
     kept, once = (collect(*course, one, vehicle=built_in_car(CAR)) for one in settings)
     assert off_track_m(kept).max() <= 0
     assert off_track_m(once).max() > 0, "a scale that is asked for is driven once"
