@@ -5,6 +5,7 @@ and is made only if it is not there. ``race``, ``bench`` and ``latency`` prepare
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal
@@ -17,7 +18,7 @@ from bayesrace.gp.weights import GpWeights, encode_weights, read_weights, write_
 from bayesrace.integrators import Discretisation
 from bayesrace.log import LogReader
 from bayesrace.messages import STATE, TELEMETRY
-from bayesrace.raceline import RaceLine, RaceLineSettings, read_raceline
+from bayesrace.raceline import RaceLine, RaceLineError, RaceLineSettings, read_raceline
 from bayesrace.raceline.cached import raceline_file, racing_line
 from bayesrace.tracks import Track, load_track, write_track
 from bayesrace.vehicles import CarParameters
@@ -73,6 +74,9 @@ _DRIVE_SOURCES: Final = (
 _TRACK: Final = "race.csv"
 
 _LARGEST_FMU: Final = 1 << 30
+
+_ROOM_SHARES: Final = (1.0, 0.7, 0.5)
+"""Of the margin wanted for a training drive: in the tightest bends there may be less room."""
 
 PredictionModel = Literal["e_kinematic", "dynamic"]
 
@@ -177,9 +181,13 @@ def _prepared_track(
 
 
 def _training_track(track: Track, car: CarParameters, settings: RaceLineSettings) -> PreparedTrack:
-    """With a racing line that leaves room for a training drive."""
+    """With a racing line that leaves room for a training drive, or as much as the track allows."""
     margin_m = training_margin_m(track, car, settings.margin_m)
-    return _prepared_track(track, car, settings.model_copy(update={"margin_m": margin_m}))
+    for share in _ROOM_SHARES:
+        roomy = settings.model_copy(update={"margin_m": share * margin_m})
+        with suppress(InputError, RaceLineError):
+            return _prepared_track(track, car, roomy)
+    return _prepared_track(track, car, settings)
 
 
 def training_drive(
