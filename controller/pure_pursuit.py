@@ -1,13 +1,14 @@
-"""Pure pursuit along a racing line: the driver that collects training data. Not tuned well.
+"""Pure pursuit along a line: the driver that collects training data, beyond the limit on purpose.
 
-Coulter, "Implementation of the pure pursuit path tracking algorithm", 1992: steer on the circle
-through the rear axle and a point ahead on the line, delta = atan(2 L sin(alpha) / l). The steering
-angle is a target that a rate within the car's limit pursues; the speed follows the line's (or
-less) by a proportional drive command. A seeded disturbance on both inputs makes the data worth
-learning from.
+Coulter, "Implementation of the pure pursuit path tracking algorithm", 1992, in the frame of the
+line: the car steers as the line bends, and on the circle through a point ahead that takes it back
+to the line. The speed follows the line's by its acceleration and a proportional drive command.
+A seeded disturbance on both inputs, and speeds at which the tyres slide, make the data worth
+learning from; beside the line both fade, so that the car stays on its track.
 """
 
 import math
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -17,7 +18,22 @@ from bayesrace.errors import InputError
 from bayesrace.vehicles.parameters import CarParameters
 from controller.interface import NO_LIMITS, Environment, StepOutput
 
-__all__ = ["PurePursuit", "PurePursuitSettings"]
+__all__ = ["DrivingStyle", "PurePursuit", "PurePursuitSettings"]
+
+DrivingStyle = Literal["limit", "calm", "weave"]
+"""limit: faster than the line allows, so that the car slides. calm: slower than the line. weave: in
+waves about the line, at its speed."""
+
+_SCALES: Final[dict[DrivingStyle, float]] = {"limit": 1.1, "calm": 0.9, "weave": 1.0}
+"""Mean speed of each style over the line's ..."""
+_SWAY: Final = 0.15
+"""... and how far it sways about that, so that each place is passed at several speeds."""
+_SLOWER: Final = 0.6
+"""Share of the speed that is taken off at the end of the room beside the line."""
+_SLIPPING: Final = 0.65
+"""What is aimed at the line: the car's axis, turned by this share of its slip angle."""
+_WINDOW: Final = 0.25
+"""Of the distance of the target: points before and behind by which the line's bends are found."""
 
 
 class PurePursuitSettings(BaseModel):
@@ -25,8 +41,15 @@ class PurePursuitSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    speed_scale: float = Field(
-        default=0.95, gt=0, le=1.5, description="fraction of the line's speed"
+    style: DrivingStyle = Field(
+        default="limit",
+        description="limit: sliding; calm: slower than the line; weave: in waves about the line",
+    )
+    speed_scale: float | None = Field(
+        default=None,
+        gt=0,
+        le=2,
+        description="mean fraction of the line's speed; None: by the style",
     )
     excite_d: float | None = Field(
         default=None,
@@ -40,6 +63,22 @@ class PurePursuitSettings(BaseModel):
     seed: int = Field(default=0, ge=0, description="of the disturbances")
     step_s: float = Field(default=0.02, gt=0, le=1, description="sampling time")
 
+    @property
+    def scale(self) -> float:
+        """Mean fraction of the line's speed."""
+        return self.speed_scale or _SCALES[self.style]
+
+
+class _Place(NamedTuple):
+    """Where the car is beside its line."""
+
+    nearest: int
+    """Index of the nearest point of the line."""
+    left_m: float
+    """Offset to the left of the line."""
+    aside: float
+    """Of the room on that side: 0 on the line, 1 at the end."""
+
 
 class PurePursuit:
     """See the module; a :class:`controller.interface.ControlLaw`."""
@@ -51,9 +90,12 @@ class PurePursuit:
         y_m: Floats,
         vx_mps: Floats,
         settings: PurePursuitSettings | None = None,
+        *,
+        room_m: tuple[Floats, Floats] | None = None,
     ) -> None:
         """``x_m``, ``y_m``, ``vx_mps``: a closed line's points in order of driving, (n,) each, the
-        last not repeated."""
+        last not repeated. ``room_m``: how far the car may be to the right and to the left of each
+        point, (n,) each; without, anywhere."""
         self._car = car
         self._settings = settings or PurePursuitSettings()
         self._points = np.column_stack([x_m, y_m]).astype(np.float64)
@@ -73,16 +115,34 @@ class PurePursuit:
         self._tuning = car.tuning.pursuit
         excite_d = self._settings.excite_d
         self._excite_d = self._tuning.excite_d if excite_d is None else excite_d
+        self._steps = 0
         self._spacing = float(self._lengths[-1]) / len(steps)
+        self._shape()
+        everywhere: Floats = np.full(len(steps), np.inf)
+        self._right_m, self._left_m = (everywhere, everywhere) if room_m is None else room_m
         self._nearest: int | None = None
         self._random = np.random.default_rng(self._settings.seed)
         self._noise = np.zeros(2)
         self._output = StepOutput(u=np.zeros(2))
         self._predicted = np.zeros(7)
 
+    def _shape(self) -> None:
+        """Directions, curvatures and accelerations of the line, (n,) each."""
+        reach = max(1, round(_WINDOW * self._tuning.lookahead_m / self._spacing))
+
+        def across(values: Floats) -> Floats:
+            return np.roll(values, -reach, axis=0) - np.roll(values, reach, axis=0)
+
+        chord = across(self._points)
+        length = 2 * reach * self._spacing
+        self._heading = np.arctan2(chord[:, 1], chord[:, 0])
+        turned = np.remainder(across(self._heading) + np.pi, 2 * np.pi) - np.pi
+        self._kappa = turned / length
+        self._acceleration = across(self._speeds**2) / (2 * length)
+
     def reset(self) -> None:
         """Search the whole line; begin the disturbance anew."""
-        self._nearest = None
+        self._nearest, self._steps = None, 0
         self._random = np.random.default_rng(self._settings.seed)
         self._noise[:] = 0.0
 
@@ -107,40 +167,61 @@ class PurePursuit:
         elapsed_s: float = 0.0,
         budget_s: float = 0.0,
     ) -> StepOutput:
-        """Steer towards the target point, hold the line's speed, or the limit's as it is now."""
+        """Steer along the line, hold its speed, or the limit's as it is now."""
         car, settings, output = self._car, self._settings, self._output
-        px, py, psi, vx, delta = (float(x[i]) for i in (0, 1, 2, 3, 6))
-        nearest = self._nearest = self._follow(px, py)
+        place, delta = self._place(float(x[0]), float(x[1])), float(x[6])
         self._excite()
-        target_speed, delta_target = self._targets(nearest, px, py, psi, vx)
-        target_speed = min(target_speed, environment.speed_limit_mps)
-        d = (
-            self._tuning.speed_gain_spm * (target_speed - vx)
-            + car.drive.hold(vx)
-            + float(self._noise[0])
-        )
-        rate = (delta_target + float(self._noise[1]) - delta) / settings.step_s
+        self._steps += 1
+        excited_d, excited_delta = (1 - place.aside) * self._noise
+        d = self._drive(place, float(x[3]), environment.speed_limit_mps) + float(excited_d)
+        delta_target = self._steer(place, x) + float(excited_delta)
+        rate = (delta_target - delta) / settings.step_s
         lowest = max(-car.delta_rate_max_radps, (-car.delta_max_rad - delta) / settings.step_s)
         highest = min(car.delta_rate_max_radps, (car.delta_max_rad - delta) / settings.step_s)
         output.u[0] = min(max(d, car.d_min), car.d_max)
         output.u[1] = min(max(rate, lowest), highest)
-        output.s_ref_m = float(self._lengths[nearest])
+        output.s_ref_m = float(self._lengths[place.nearest])
         return output
 
-    def _targets(
-        self, nearest: int, px: float, py: float, psi: float, vx: float
-    ) -> tuple[float, float]:
-        """Speed [m/s] and steering angle [rad] to aim for."""
-        car, settings, tuning = self._car, self._settings, self._tuning
-        reach = tuning.lookahead_m + tuning.lookahead_s * max(vx, 0.0)
-        ahead = (nearest + max(1, round(reach / self._spacing))) % len(self._points)
-        rear_x = px - car.lr_m * math.cos(psi)
-        rear_y = py - car.lr_m * math.sin(psi)
-        dx, dy = float(self._points[ahead, 0]) - rear_x, float(self._points[ahead, 1]) - rear_y
-        alpha = math.atan2(dy, dx) - psi
-        delta = math.atan2(2 * car.wheelbase_m * math.sin(alpha), math.hypot(dx, dy))
-        speed = max(settings.speed_scale * float(self._speeds[ahead]), tuning.speed_min_mps)
-        return speed, min(max(delta, -car.delta_max_rad), car.delta_max_rad)
+    def _place(self, px: float, py: float) -> _Place:
+        index = self._nearest = self._follow(px, py)
+        heading = float(self._heading[index])
+        dx, dy = px - float(self._points[index, 0]), py - float(self._points[index, 1])
+        left_m = dy * math.cos(heading) - dx * math.sin(heading)
+        room_m = float((self._left_m if left_m > 0 else self._right_m)[index])
+        return _Place(index, left_m, min(abs(left_m) / max(room_m, 1e-9), 1.0))
+
+    def _ahead(self, index: int, way_m: float) -> int:
+        """The point of the line so far ahead of another one."""
+        return (index + round(max(way_m, 0.0) / self._spacing)) % len(self._points)
+
+    def _drive(self, place: _Place, vx: float, limit_mps: float) -> float:
+        """Drive command for the line's speed a little ahead; less beside the line."""
+        car, tuning = self._car, self._tuning
+        ahead = self._ahead(place.nearest, vx * tuning.preview_s)
+        phase = 2 * math.pi * self._steps * self._settings.step_s / tuning.sway_s
+        scale = self._settings.scale * (1 + _SWAY * math.sin(phase))
+        wanted = scale * (1 - _SLOWER * place.aside) * float(self._speeds[ahead])
+        wanted = min(max(wanted, tuning.speed_min_mps), limit_mps)
+        acceleration = scale**2 * float(self._acceleration[ahead])
+        forward = car.drive.command_at(vx, acceleration, car.mass_kg)
+        return tuning.speed_gain_spm * (wanted - vx) + forward
+
+    def _steer(self, place: _Place, x: Floats) -> float:
+        """Steering angle to aim for [rad]: the line's bend, and back to it; what the tyres lose in
+        a bend is added, and a yaw rate beyond the line's is damped."""
+        car, tuning = self._car, self._tuning
+        vx, vy = float(x[3]), float(x[4])
+        slip = math.atan2(vy, max(vx, tuning.speed_min_mps))
+        axis = float(x[2]) + _SLIPPING * slip - float(self._heading[place.nearest])
+        reach_m = tuning.lookahead_m + tuning.lookahead_s * max(vx, 0.0)
+        sideways = math.asin(min(max(place.left_m / reach_m, -1.0), 1.0))
+        back = 2 * math.sin(math.remainder(-sideways - axis, 2 * math.pi)) / reach_m
+        ahead = self._ahead(place.nearest, vx * tuning.steering_s)
+        kappa = float(self._kappa[ahead]) + back
+        delta = math.atan(car.wheelbase_m * kappa) + tuning.understeer_s2pm * kappa * vx * vx
+        delta -= tuning.damping_s * (float(x[5]) - vx * float(self._kappa[place.nearest]))
+        return min(max(delta, -car.delta_max_rad), car.delta_max_rad)
 
     def _excite(self) -> None:
         """First-order low-pass noise (Ornstein-Uhlenbeck) of the set standard deviations."""

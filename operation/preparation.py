@@ -5,6 +5,7 @@ and is made only if it is not there. ``race``, ``bench`` and ``latency`` prepare
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal
@@ -17,7 +18,7 @@ from bayesrace.gp.weights import GpWeights, encode_weights, read_weights, write_
 from bayesrace.integrators import Discretisation
 from bayesrace.log import LogReader
 from bayesrace.messages import STATE, TELEMETRY
-from bayesrace.raceline import RaceLine, RaceLineSettings, read_raceline
+from bayesrace.raceline import RaceLine, RaceLineError, RaceLineSettings, read_raceline
 from bayesrace.raceline.cached import raceline_file, racing_line
 from bayesrace.tracks import Track, load_track, write_track
 from bayesrace.vehicles import CarParameters
@@ -31,6 +32,7 @@ from learning.settings import Progress, TrainingSettings
 from operation.collect import collect
 from operation.settings import PreparationSettings
 from operation.terminal.progress import Stages
+from operation.training_line import drive_length_s, training_margin_m
 from plant.simulator import PLANT
 from plant.vehicle import open_vehicle
 
@@ -58,6 +60,7 @@ _DRIVE_SOURCES: Final = (
     "bayesrace/integrators.py",
     "bayesrace/log.py",
     "bayesrace/messages",
+    "bayesrace/raceline",
     "bayesrace/tracks",
     "controller",
     "controller/native",
@@ -66,11 +69,15 @@ _DRIVE_SOURCES: Final = (
     "operation/closed_loop.py",
     "operation/collect.py",
     "operation/drive.py",
+    "operation/training_line.py",
 )
 
 _TRACK: Final = "race.csv"
 
 _LARGEST_FMU: Final = 1 << 30
+
+_ROOM_SHARES: Final = (1.0, 0.7, 0.5)
+"""Of the margin wanted for a training drive: in the tightest bends there may be less room."""
 
 PredictionModel = Literal["e_kinematic", "dynamic"]
 
@@ -142,8 +149,8 @@ def prepare(
     training = None
     if weights is None:
         train_track = load_track(settings.train_track, car.width_m)
-        with stages.stage(f"racing line, {train_track.name}"):
-            training_track = _prepared_track(train_track, car, settings.raceline)
+        with stages.stage(f"training line, {train_track.name}"):
+            training_track = _training_track(train_track, car, settings.raceline)
     prepared_tracks = []
     for track in driven_on:
         with stages.stage(f"racing line, {track.name}"):
@@ -174,6 +181,16 @@ def _prepared_track(
     return PreparedTrack(track, line, track_file, line_file or cached)
 
 
+def _training_track(track: Track, car: CarParameters, settings: RaceLineSettings) -> PreparedTrack:
+    """With a racing line that leaves room for a training drive, or as much as the track allows."""
+    margin_m = training_margin_m(track, car, settings.margin_m)
+    for share in _ROOM_SHARES:
+        roomy = settings.model_copy(update={"margin_m": share * margin_m})
+        with suppress(InputError, RaceLineError):
+            return _prepared_track(track, car, roomy)
+    return _prepared_track(track, car, settings)
+
+
 def training_drive(
     prepared: PreparedTrack, car: CarParameters, settings: PreparationSettings, artefact: Path
 ) -> Training:
@@ -187,6 +204,7 @@ def training_drive(
     others = [] if settings.simulator == "equations" else [settings.simulator]
     columns = "s_m", "x_m", "y_m", "vx_mps"
     track = prepared.track
+    duration_s = settings.collect_s or drive_length_s(car, prepared.line)
     identity = digest(
         [
             track.name,
@@ -198,7 +216,7 @@ def training_drive(
             settings.true_car.model_dump_json(),
             pursuit.model_dump_json(),
             settings.noise.model_dump_json(),
-            f"{settings.delay_s!r} {settings.drive_s!r} {settings.start_speed_mps!r} {len(files)}",
+            f"{settings.delay_s!r} {duration_s!r} {settings.start_speed_mps!r} {len(files)}",
             *(read_whole(path, "the FMU or its map", _LARGEST_FMU) for path in files),
             cpu_identity(),
             *software(_DRIVE_SOURCES, ("casadi", "mcap", "numpy", *others)),
@@ -213,7 +231,7 @@ def training_drive(
         )
         with vehicles as vehicle:
             collect(
-                track, prepared.line, car, artefact, partial, settings.drive_s, pursuit,
+                track, prepared.line, car, artefact, partial, duration_s, pursuit,
                 settings.start_speed_mps, vehicle, settings.noise, settings.delay_s,
             )  # fmt: skip
 
@@ -241,9 +259,10 @@ def training_settings(settings: PreparationSettings) -> TrainingSettings:
 def training_samples(settings: PreparationSettings) -> Dataset:
     """Those of the training drive alone."""
     car = settings.driven_car
-    track = _prepared_track(load_track(settings.train_track, car.width_m), car, settings.raceline)
+    track = load_track(settings.train_track, car.width_m)
+    driven_on = _training_track(track, car, settings.raceline)
     artefact = _artefact(settings, "e_kinematic")
-    return training_drive(track, car, settings, artefact).samples
+    return training_drive(driven_on, car, settings, artefact).samples
 
 
 def trained_weights(

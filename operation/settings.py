@@ -51,7 +51,10 @@ class PreparationSettings(BaseModel):
     )
     start_speed_mps: float = Field(0.1, ge=0, le=5, description="speed at the start line")
     collect_s: float | None = Field(
-        None, ge=1, le=3600, description="length of the training drive [s]; None: the car's tuning"
+        None,
+        ge=1,
+        le=3600,
+        description="length of the training drive [s]; None: the car's, and a lap at least",
     )
     points: int = Field(400, ge=20, le=1024, description="training points per output")
     kernels: tuple[Kernel, ...] = Field(
@@ -107,11 +110,6 @@ class PreparationSettings(BaseModel):
     def built_in(self) -> bool:
         """Whether the built-in equations simulate the car."""
         return self.fmu is None and self.simulator == "equations"
-
-    @property
-    def drive_s(self) -> float:
-        """Length of the training drive."""
-        return self.collect_s or self.car.tuning.pursuit.drive_s
 
 
 class RaceSettings(PreparationSettings):

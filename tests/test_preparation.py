@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
-from bayesrace.raceline import cached
+from bayesrace.raceline import RaceLineSettings, cached
 from bayesrace.tracks import Track
 from operation import preparation
 from operation.preparation import Prepared, prepare
@@ -54,7 +55,7 @@ def preparing(
 
 
 STAGES = [
-    "racing line, random",
+    "training line, random",
     "racing line, random",
     "build the controllers",
     "training drive (pure pursuit)",
@@ -101,6 +102,25 @@ def test_the_training_drive_is_kept_for_all_that_shapes_it(preparing: Preparing)
         assert prepared.training is not None
         logs.add(prepared.training.log)
     assert len(logs) == 8
+
+
+def test_a_track_without_the_room_is_trained_on_with_less(
+    preparing: Preparing, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    margins: list[float | None] = []
+
+    def compute(track: Track, _: object, settings: RaceLineSettings) -> object:
+        margins.append(settings.margin_m)
+        if (settings.margin_m or 0.0) > 0.09:
+            raise InputError("too narrow")
+        return offset_line(track, 0.01, 5.0, 2.5)
+
+    monkeypatch.setattr(cached, "compute_raceline", compute)
+    prepared, _ = preparing()
+    assert prepared.training is not None
+    asked = [margin for margin in margins if margin is not None]
+    assert len(asked) > 1
+    assert asked[-1] <= 0.09 < asked[0]
 
 
 def test_a_damaged_training_drive_is_driven_again(preparing: Preparing) -> None:

@@ -322,7 +322,7 @@ def test_in_real_time_it_drives_too_and_a_second_race_prepares_nothing(
     lines = race.process.stdout.splitlines()
     found = [line.removesuffix(": from the cache") for line in lines if line.endswith("the cache")]
     assert found == [
-        "racing line, peanut",
+        "training line, peanut",
         "racing line, peanut",
         "build the controllers",
         "training drive (pure pursuit)",

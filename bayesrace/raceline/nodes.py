@@ -18,7 +18,7 @@ from bayesrace.tracks import Track
 from bayesrace.tracks.spline import PlaneSpline, fit_arc_length
 from bayesrace.vehicles.parameters import CarParameters
 
-__all__ = ["NodeLines", "roughness"]
+__all__ = ["NodeLines", "roughness", "timed_line"]
 
 _BEND: Final = 2.0
 """Weight of second differences in :func:`roughness`."""
@@ -44,8 +44,7 @@ class NodeLines:
     ) -> None:
         """Raises InputError if the margin leaves no room at a node."""
         self._track, self._car = track, car
-        self._limits = car_limits(car, settings)
-        self._v_max = top_speed(self._limits)
+        self._settings = settings
         self._margin_m = car.width_m / 2 if settings.margin_m is None else settings.margin_m
         s = _places(track, count)
         right, left = track.widths(s)
@@ -67,11 +66,11 @@ class NodeLines:
         offset = self._low + shares * (self._high - self._low)
         for _ in range(_ROUNDS):
             path = fit_arc_length(self._xy + offset[:, None] * self._normal)
-            at = self._sampled(path)
+            at = _sampled(path, self._car)
             where = self._track.project_points(path(at))
             excess = where.off_track_m + self._margin_m
             if float(excess.max()) <= self._car.tuning.raceline.tolerance_m:
-                return self._timed(path, at)
+                return timed_line(self._track.name, path, self._car, self._settings)
             piece = np.searchsorted(path.knots, at, side="right") - 1
             for side, step in ((where.n_m > 0, -_BEYOND), (where.n_m < 0, _BEYOND)):
                 pull = np.zeros(len(offset))
@@ -81,32 +80,35 @@ class NodeLines:
                 offset = np.clip(offset + step * pull, self._low, self._high)
         return None
 
-    def _sampled(self, path: PlaneSpline) -> Floats:
-        count = max(24, round(path.period / self._car.tuning.raceline.spacing_m))
-        return np.arange(count, dtype=np.float64) * (path.period / count)
 
-    def _timed(self, path: PlaneSpline, at: Floats) -> RaceLine:
-        """The path with its speeds."""
-        xy, first, second = path.derivatives(at)
-        speed = np.linalg.norm(first, axis=1)
-        kappa = (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / speed**3
-        psi = np.unwrap(np.arctan2(first[:, 1], first[:, 0]))
-        chord = np.linalg.norm(np.roll(xy, -1, axis=0) - xy, axis=1)
-        step = chord * (1 + (kappa * chord) ** 2 / 24)
-        v = speed_profile(
-            kappa,
-            step,
-            self._limits.grip_mps2,
-            lambda v: self._limits.straight_values(v, self._car.d_max),
-            lambda v: self._limits.straight_values(v, self._car.d_min),
-            self._car.tuning.raceline.speed_min_mps,
-            self._v_max,
-        )
-        a = (np.roll(v, -1) ** 2 - v**2) / (2 * step)
-        s = np.concatenate([[0.0], np.cumsum(step[:-1])])
-        return RaceLine(
-            self._track.name, s, xy[:, 0], xy[:, 1], psi, kappa, v, a, float(step.sum())
-        )
+def timed_line(
+    name: str, path: PlaneSpline, car: CarParameters, settings: RaceLineSettings
+) -> RaceLine:
+    """A closed path, evenly sampled, with the fastest speeds of a flying lap along it."""
+    at, limits = _sampled(path, car), car_limits(car, settings)
+    xy, first, second = path.derivatives(at)
+    speed = np.linalg.norm(first, axis=1)
+    kappa = (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / speed**3
+    psi = np.unwrap(np.arctan2(first[:, 1], first[:, 0]))
+    chord = np.linalg.norm(np.roll(xy, -1, axis=0) - xy, axis=1)
+    step = chord * (1 + (kappa * chord) ** 2 / 24)
+    v = speed_profile(
+        kappa,
+        step,
+        limits.grip_mps2,
+        lambda v: limits.straight_values(v, car.d_max),
+        lambda v: limits.straight_values(v, car.d_min),
+        car.tuning.raceline.speed_min_mps,
+        top_speed(limits),
+    )
+    a = (np.roll(v, -1) ** 2 - v**2) / (2 * step)
+    s = np.concatenate([[0.0], np.cumsum(step[:-1])])
+    return RaceLine(name, s, xy[:, 0], xy[:, 1], psi, kappa, v, a, float(step.sum()))
+
+
+def _sampled(path: PlaneSpline, car: CarParameters) -> Floats:
+    count = max(24, round(path.period / car.tuning.raceline.spacing_m))
+    return np.arange(count, dtype=np.float64) * (path.period / count)
 
 
 def _places(track: Track, count: int) -> Floats:

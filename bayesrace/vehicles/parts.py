@@ -167,10 +167,10 @@ class DcMotor(Part):
         """Lowest command that acts: its rolling resistance keeps a braking car from reversing."""
         return d_min
 
-    def hold(self, vx_mps: float) -> float:
-        """Duty cycle that about balances the resistances at a speed."""
-        resistance = self.cr0 + self.cr2 * vx_mps * vx_mps
-        return resistance / max(self.cm1 - self.cm2 * vx_mps, 0.1 * self.cm1)
+    def command_at(self, vx_mps: float, acceleration_mps2: float, mass_kg: float) -> float:
+        """Duty cycle that about gives an acceleration at a speed, resistances included."""
+        force = mass_kg * acceleration_mps2 + self.cr0 + self.cr2 * vx_mps * vx_mps
+        return force / max(self.cm1 - self.cm2 * vx_mps, 0.1 * self.cm1)
 
     def top_speed_mps(self, d_max: float) -> float:
         """Where drive and resistance are equal: (cm1 - cm2 v) d_max = cr0 + cr2 v^2."""
@@ -216,9 +216,9 @@ class AccelerationDrive(Part):
         """Lowest acceleration that acts for so long: it stops a car and does not reverse it."""
         return max(d_min, -max(vx_mps, 0.0) / duration_s)
 
-    def hold(self, vx_mps: float) -> float:
-        """Acceleration that keeps a speed: none."""
-        return 0.0
+    def command_at(self, vx_mps: float, acceleration_mps2: float, mass_kg: float) -> float:
+        """Command that gives an acceleration at a speed: the acceleration."""
+        return acceleration_mps2
 
     def top_speed_mps(self, d_max: float) -> float:
         """That of the drive."""

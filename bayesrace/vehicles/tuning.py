@@ -220,12 +220,20 @@ class PursuitTuning(_Section):
     lookahead_m: float = _number(0.16, LENGTH, "distance of the target at standstill [m]")
     lookahead_s: float = _number(0.05, TIME, "distance added per speed [s]")
     speed_gain_spm: float = _number(
-        0.9, COMMAND_PER_SPEED, "drive command per speed error [command s/m]"
+        1.8, COMMAND_PER_SPEED, "drive command per speed error [command s/m]"
     )
     excite_d: float = _number(
         0.1, COMMAND, "standard deviation of the disturbance of the drive command [command]"
     )
+    sway_s: float = _number(3.7, TIME, "period in which the target speed rises and falls [s]")
     speed_min_mps: float = _number(0.4, SPEED, "target speed is never below [m/s]")
+    keep_m: float = _number(0.12, LENGTH, "distance of the driven line from the track's edges [m]")
+    preview_s: float = _number(0.12, TIME, "how far ahead the line's speed is taken [s]")
+    steering_s: float = _number(0.04, TIME, "how far ahead the line's curvature is taken [s]")
+    understeer_s2pm: float = _number(
+        0.008, (0.0, -1.0, 0.0), "steering angle added per acceleration in a bend [rad s^2/m]"
+    )
+    damping_s: float = _number(0.01, TIME, "steering angle per excess of the yaw rate [s]")
     window_m: float = _number(0.4, LENGTH, "way ahead in which the nearest point is sought [m]")
     lost_m: float = _number(0.5, LENGTH, "farther from it, the whole line is searched [m]")
     drive_s: float = _number(12.0, TIME, "length of a training drive [s]")

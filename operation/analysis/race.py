@@ -78,10 +78,17 @@ class DrivenRun:
     """One run on its track: where the car was and how long its laps took."""
 
     def __init__(
-        self, record: RunRecord, track: Track, line: RaceLine, car: CarParameters | None = None
+        self,
+        record: RunRecord,
+        track: Track,
+        line: RaceLine,
+        car: CarParameters | None = None,
+        *,
+        whole: bool = False,
     ) -> None:
-        """``car``: what the built-in equations simulated; None if something else was driven."""
-        self.record, self._track, self._car = record, track, car
+        """``car``: what the built-in equations simulated; None if something else was driven.
+        ``whole``: all samples count, also after the last lap."""
+        self.record, self._track, self._car, self._whole = record, track, car, whole
         self.controller = record.plan.controller
         xy = record.x[:, :2]
         self.on_track: PathProjection = track.project_path(xy)
@@ -97,7 +104,8 @@ class DrivenRun:
     @property
     def counted(self) -> slice:
         """The samples that count: up to the last counted crossing, or all."""
-        return slice(0, self.laps.after[-1] if self.finished else len(self.record.truth))
+        ended = self.finished and not self._whole
+        return slice(0, self.laps.after[-1] if ended else len(self.record.truth))
 
     def lap(self, number: int) -> slice:
         """Samples of the lap with that number, from 0, with one beyond each end."""
@@ -164,6 +172,7 @@ class DrivenRun:
             deviation_max_m=float(deviation.max()) if len(deviation) else None,
             lateral_max_mps2=self._largest(self.record.lateral_mps2),
             slip_max_rad=self._largest(self.record.slip_rad),
+            speed_max_mps=self._largest(self.record.x[:, 3]),
             solve_us=_percentiles(self.record.solve_us),
             fallbacks=self.record.fallbacks,
             weights_version=self.record.weights_version,
@@ -205,6 +214,12 @@ class RaceAnalysis:
         self.runs = [DrivenRun(run, self.track, self.line, car) for run in recording.runs]
 
     @cached_property
+    def training(self) -> DrivenRun | None:
+        """The training drive, all of it; None where weights were given."""
+        found = self.recording.training
+        return None if found is None else DrivenRun(found.run, found.track, found.line, whole=True)
+
+    @cached_property
     def best_case(self) -> Dataset | None:
         """The samples on which the GPs are validated: those of the BestCase run."""
         run = self.recording.run_of("bestcase")
@@ -241,6 +256,7 @@ class RaceAnalysis:
             settings=_summary(recording),
             laps=[run.result(limit_s) for run in self.runs],
             limit_s=limit_s,
+            training=None if self.training is None else self.training.result({}),
             gp=self._metrics("bayesrace"),
             gp_updated=self._metrics("bayesrace-updated"),
             real_time_factor=_real_time_factor(recording.runs),

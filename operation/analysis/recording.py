@@ -31,7 +31,14 @@ from bayesrace.transport import Numbering
 from bayesrace.vehicles import DEFAULT_CAR, CarParameters, described_car
 from operation.analysis.laps import Trajectory
 
-__all__ = ["RUN_EVENT", "PlannedRun", "Recording", "RunRecord", "read_recording"]
+__all__ = [
+    "RUN_EVENT",
+    "PlannedRun",
+    "Recording",
+    "RunRecord",
+    "TrainingRecord",
+    "read_recording",
+]
 
 
 RUN_EVENT: Final = "run"
@@ -147,6 +154,15 @@ def _missing(numbers: Iterable[int]) -> int:
     return numbering.lost
 
 
+@dataclass(frozen=True, eq=False)
+class TrainingRecord:
+    """The training drive of a race, with the track and the line that it was driven on."""
+
+    run: RunRecord
+    track: Track
+    line: RaceLine
+
+
 @dataclass(eq=False, kw_only=True)
 class Recording:
     """A run directory: settings, track, racing line, and each run's messages."""
@@ -160,6 +176,8 @@ class Recording:
     """The log holds the truth; without it, as of a real car, measurements take its place."""
     truncated: bool
     """The log ends without its end mark."""
+    training: "TrainingRecord | None"
+    """The training drive; None where weights were given."""
     refused: int
     """Messages of the log that could not be decoded."""
     started_ns: int | None
@@ -197,10 +215,37 @@ def read_recording(run_dir: Path) -> Recording:
     """Reads a run directory, also one whose race was cut short; InputError if it is none."""
     run_dir = Path(run_dir)
     settings = _read_settings(run_dir / "settings.json")
-    name = Path(str(settings.get("track", "race"))).stem
-    track = replace(read_track(run_dir / "race.csv", car_width_m=0.0), name=name)
-    line = read_raceline(run_dir / "race_raceline.csv", name)
+    track, line = _driven_on(run_dir, settings, "track", "race")
     reader = LogReader(run_dir / "run.mcap")
+    planned, started_ns = _runs(reader)
+    return Recording(
+        directory=run_dir, settings=settings, track=track, line=line, runs=planned,
+        truth=_with_truth(planned), training=_read_training(run_dir, settings),
+        truncated=reader.truncated, refused=reader.refused, started_ns=started_ns,
+    )  # fmt: skip
+
+
+def _driven_on(
+    run_dir: Path, settings: dict[str, Any], setting: str, label: str
+) -> tuple[Track, RaceLine]:
+    """A track of the run directory, named as in the settings, and its line."""
+    name = Path(str(settings.get(setting, label))).stem
+    track = replace(read_track(run_dir / f"{label}.csv", car_width_m=0.0), name=name)
+    return track, read_raceline(run_dir / f"{label}_raceline.csv", name)
+
+
+def _read_training(run_dir: Path, settings: dict[str, Any]) -> TrainingRecord | None:
+    log = run_dir / "collect.mcap"
+    if not log.is_file():
+        return None
+    planned, _ = _runs(LogReader(log))
+    _with_truth(planned)
+    track, line = _driven_on(run_dir, settings, "train_track", "train")
+    return TrainingRecord(planned[-1], track, line) if planned else None
+
+
+def _runs(reader: LogReader) -> tuple[list[RunRecord], int | None]:
+    """The runs of a log in order, and the calendar time of its first message [ns since 1970]."""
     runs: dict[int, RunRecord] = {}
     started_ns: int | None = None
     for entry in reader.messages([topic for topic in TOPICS if topic is not HEARTBEAT]):
@@ -213,15 +258,16 @@ def read_recording(run_dir: Path) -> Recording:
             record.add(message)
         else:  # a state can overtake it, since it comes from another process
             record.plan = plan
-    planned = [record for _, record in sorted(runs.items()) if record.plan.controller]
+    return [record for _, record in sorted(runs.items()) if record.plan.controller], started_ns
+
+
+def _with_truth(planned: Sequence[RunRecord]) -> bool:
+    """Whether the runs have a truth; measurements take its place where none has."""
     truth = any(record.truth for record in planned)
     for record in planned if not truth else ():
         names = [one.name for one in fields(Truth)]
         record.truth = [Truth(**{n: getattr(state, n) for n in names}) for state in record.states]
-    return Recording(
-        directory=run_dir, settings=settings, track=track, line=line, runs=planned, truth=truth,
-        truncated=reader.truncated, refused=reader.refused, started_ns=started_ns,
-    )  # fmt: skip
+    return truth
 
 
 def _read_settings(path: Path) -> dict[str, Any]:

@@ -63,6 +63,7 @@ class LapResult(_Frozen):
     slip_max_rad: float | None = Field(
         None, description="largest angle between the car's axis and its velocity"
     )
+    speed_max_mps: float | None = Field(None, description="largest speed along the car's axis")
     solve_us: Percentiles | None = Field(description="null without telemetry")
     fallbacks: int = Field(description="cycles that the fallback drove")
     weights_version: str = Field(description="of the weights that drove; empty without any")
@@ -111,6 +112,9 @@ class RaceResult(_Frozen):
 
     settings: SettingsSummary
     laps: list[LapResult]
+    training: LapResult | None = Field(
+        None, description="the training drive on its own track, all of its samples; null without"
+    )
     gp: dict[str, GpMetrics] = Field(
         description="output (vx, vy, omega) to metrics of the first weights on the BestCase run; "
         "empty without these weights or without that run"

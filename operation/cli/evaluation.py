@@ -21,6 +21,7 @@ from operation.cli.options import (
     ProblemChoice,
     Seed,
     Simulator,
+    Style,
     TrackName,
     Tyres,
     connect_to,
@@ -54,6 +55,17 @@ def race(
             metavar="TRACK", show_default="the car's", help="Track of the training drive."
         ),
     ] = "",
+    train_time: Annotated[
+        float | None,
+        typer.Option(
+            metavar="S",
+            min=1,
+            max=3600,
+            show_default="the car's, and a lap at least",
+            help="Length of the training drive [s].",
+        ),
+    ] = None,
+    style: Style = "limit",
     laps: Annotated[
         int,
         typer.Option(metavar="N", min=1, max=100, help="Laps per controller, the first from rest."),
@@ -97,6 +109,7 @@ def race(
     """
 
     from bayesrace.vehicles import get_car
+    from controller.pure_pursuit import PurePursuitSettings
     from operation.analysis.race import read_race, write_result
     from operation.race import FILES
     from operation.race import race as drive_all
@@ -109,6 +122,7 @@ def race(
     driven = get_car(car) if tyres is None else get_car(car).on_tyres(tyres)
     settings = RaceSettings(
         car=driven, track=track, train_track=train_track, laps=laps, mode=mode.value,
+        pursuit=PurePursuitSettings(style=style), collect_s=train_time,
         seed=seed, fmu=fmu, fmu_map=fmu_map, simulator=simulator, delay_s=1e-3 * delay,
         noise=sensor_noise(noise), limit=not no_limit, problem=problem.value,
         progress_drives=progress_drives,

@@ -31,6 +31,7 @@ __all__ = [
     "ProblemChoice",
     "Seed",
     "Simulator",
+    "Style",
     "TrackName",
     "Tyres",
     "connect_to",
@@ -200,6 +201,13 @@ FmuMap = Annotated[
 Simulator = Annotated[
     Literal["equations", "slipx"],
     typer.Option(metavar="NAME", help="equations, or slipx, whose reference car is --car slipx."),
+]
+Style = Annotated[
+    Literal["limit", "calm", "weave"],
+    typer.Option(
+        metavar="STYLE",
+        help="Of the training drive: limit (it slides), calm, weave (in waves about the line).",
+    ),
 ]
 LowLatency = Annotated[
     bool,

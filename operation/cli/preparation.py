@@ -22,6 +22,7 @@ from operation.cli.options import (
     RaceLineFile,
     Seed,
     Simulator,
+    Style,
     TrackName,
     Tyres,
     path_on,
@@ -196,10 +197,11 @@ def collect(
             metavar="S",
             min=1,
             max=3600,
-            show_default="by the car's tuning",
+            show_default="the car's, and a lap at least",
             help="Length of the drive [s].",
         ),
     ] = None,
+    style: Style = "limit",
     seed: Seed = 0,
     fmu: FmuFile = None,
     fmu_map: FmuMap = None,
@@ -215,20 +217,25 @@ def collect(
     from codegen.settings import BuildSettings
     from controller.pure_pursuit import PurePursuitSettings
     from operation.collect import collect as drive
+    from operation.training_line import drive_length_s
     from plant.vehicle import open_vehicle
 
-    settings = PurePursuitSettings(seed=seed)
+    settings = PurePursuitSettings(style=style, seed=seed)
     parameters = get_car(car)
     course = load_track(track, parameters.width_m)
     line = read_raceline_for(raceline, course, parameters)
     vehicles = open_vehicle(parameters, fmu, fmu_map, compiled=compiled, simulator=simulator)
     with vehicles as vehicle:
-        duration_s = duration or parameters.tuning.pursuit.drive_s
+        duration_s = duration or drive_length_s(parameters, line)
         artefact, _ = build(BuildSettings(car=parameters))
-        samples = drive(
+        driven = drive(
             course, line, parameters, artefact, out, duration_s, settings, vehicle=vehicle
         )
-    typer.echo(f"{samples} samples: {out}")
+    off_track_m = course.project_path(driven.x[:, :2]).off_track_m
+    typer.echo(
+        f"{len(driven.u)} samples, {int((off_track_m > 0).sum())} of them off the track, "
+        f"up to {float(driven.x[:, 3].max()):.2f} m/s: {out}"
+    )
 
 
 def train(

@@ -17,6 +17,7 @@ from operation.analysis.published import LIMIT, SOURCE, compare_gp, compare_laps
 from operation.analysis.race import RaceAnalysis, read_race
 from operation.analysis.results import RaceResult
 from operation.report.canvas import inline_svg, write_png
+from operation.report.coverage import coverage_figures
 from operation.report.gp import gp_figures
 from operation.report.maps import LapMaps
 from operation.report.style import figure_style, look
@@ -29,7 +30,7 @@ from operation.report.traces import (
     time_figures,
 )
 from operation.terminal.notation import UNCERTAIN
-from operation.terminal.race_table import COLUMNS, GP_COLUMNS, gp_cells
+from operation.terminal.race_table import COLUMNS, GP_COLUMNS, drive_text, gp_cells
 
 __all__ = ["PICTURE", "REPORT", "render_report", "template"]
 
@@ -53,6 +54,7 @@ def render_report(run_dir: Path, result: RaceResult, analysis: RaceAnalysis | No
         columns=COLUMNS,
         gp_columns=GP_COLUMNS,
         gp_cells=gp_cells,
+        drive_text=drive_text,
         look=look,
         best=result.lap("bestcase"),
         facts=_facts(analysis, result),
@@ -157,4 +159,10 @@ def _figures(analysis: RaceAnalysis, result: RaceResult, picture: Path) -> dict[
             figures["gp"] = gp_figures(analysis.validations, progress, track.length_m)
         if any(len(run.record.solve_us) for run in driven):
             figures["solve"] = [solve_figure(driven)]
+        if (found := analysis.recording.training) is not None and analysis.training is not None:
+            training = LapMaps([analysis.training], found.track, found.line)
+            figures["training"] = [
+                *training.figures(),
+                *coverage_figures(analysis.training, driven),
+            ]
         return {name: [inline_svg(one) for one in some] for name, some in figures.items() if some}

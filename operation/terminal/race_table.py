@@ -15,7 +15,7 @@ from operation.analysis.published import SOURCE, compare_gp, compare_laps
 from operation.analysis.results import GpMetrics, LapResult, RaceResult
 from operation.terminal.terminal import plain_table
 
-__all__ = ["COLUMNS", "GP_COLUMNS", "Column", "gp_cells", "print_table"]
+__all__ = ["COLUMNS", "GP_COLUMNS", "Column", "drive_text", "gp_cells", "print_table"]
 
 
 _BEYOND: Final = 1.1
@@ -179,6 +179,10 @@ def print_table(result: RaceResult, console: Console) -> None:
     for lap in result.laps:
         if lap.weights_version:
             console.print(Text(f"{lap.controller}: weights {lap.weights_version}"))
+    if (training := result.training) is not None:
+        style = "yellow" if training.off_track_samples else ""
+        text = f"training drive on {summary.train_track}: {drive_text(training)}"
+        console.print(Text(text, style=style))
     _print_limit(result, console)
     _print_cornering(result, console)
     _print_notes(result, console)
@@ -198,6 +202,18 @@ def _print_limit(result: RaceResult, console: Console) -> None:
         deepest = _metres(lap.off_track_ms_max_m) if lap.off_track_ms else "–"
         table.add_row(lap.controller, ratios, _off_track_ms(lap), deepest)
     console.print(table)
+
+
+def drive_text(drive: LapResult) -> str:
+    """A training drive in a line."""
+    laps = ", ".join(f"{time_s:.3f}" for time_s in drive.lap_times_s)
+    off = f"{drive.off_track_samples or 'none'} of {drive.samples} samples off the track"
+    if drive.off_track_samples:
+        off += f" by up to {_metres(drive.off_track_max_m)} m"
+    return (
+        f"{f'laps {laps} s' if laps else 'no lap'}, {off}, "
+        f"up to {_decimals(drive.speed_max_mps, 2)} m/s and {_slip(drive)}° of slip"
+    )
 
 
 def _print_cornering(result: RaceResult, console: Console) -> None:

@@ -47,7 +47,7 @@ _SOURCES: Final = (
     "bayesrace/vehicles", "codegen", "codegen/problems", "controller", "controller/native",
     "learning", "plant", "operation/analysis/laps.py", "operation/closed_loop.py",
     "operation/collect.py", "operation/drive.py", "operation/preparation.py",
-    "operation/settings.py", "studies/campaign/execute.py",
+    "operation/settings.py", "operation/training_line.py", "studies/campaign/execute.py",
 )  # fmt: skip
 _PACKAGES: Final = ("casadi", "mcap", "numpy", "scipy", "scikit-learn")
 

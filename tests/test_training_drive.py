@@ -1,0 +1,144 @@
+"""The training drive stays on its track, excites the car, lasts a lap, and is reported."""
+
+import io
+import json
+import shutil
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from bayesrace.arrays import Floats
+from bayesrace.raceline import RaceLine, write_raceline
+from bayesrace.tracks import Track, load_track, write_track
+from bayesrace.vehicles import get_car
+from codegen.build import build
+from codegen.settings import BuildSettings
+from controller import pure_pursuit
+from controller.pure_pursuit import DrivingStyle, PurePursuitSettings
+from operation.analysis.race import analyse
+from operation.closed_loop import Driven, built_in_car
+from operation.collect import collect
+from operation.report import render_report
+from operation.terminal.race_table import print_table
+from operation.training_line import drive_length_s, training_line, training_margin_m
+from tests.command_line import Cli
+from tests.conftest import offset_line
+from tests.synthetic_race import Drive, circle, write_race
+from tests.test_analysis import TWO_LAPS
+
+CAR = get_car("orca")
+TRACK = load_track("paddock")
+
+
+@cache
+def at_the_edge() -> RaceLine:
+    """A line whose distance from the edges is half a car's width on one side of the track."""
+    room_m = float(TRACK.width_left_m[0]) - CAR.width_m / 2
+    return offset_line(TRACK, room_m, 6.0, 3.0)
+
+
+def off_track_m(driven: Driven) -> Floats:
+    return TRACK.project_path(driven.x[:, :2]).off_track_m
+
+
+@pytest.fixture(scope="module")
+def driven(tmp_path_factory: pytest.TempPathFactory) -> dict[DrivingStyle, tuple[Driven, Path]]:
+    """A drive in each style along a line that is too near to the edge."""
+    folder, artefact = tmp_path_factory.mktemp("drives"), build(BuildSettings(car=CAR))[0]
+    styles: tuple[DrivingStyle, ...] = ("limit", "calm", "weave")
+    found: dict[DrivingStyle, tuple[Driven, Path]] = {}
+    for style in styles:
+        log, settings = folder / f"{style}.mcap", PurePursuitSettings(style=style)
+        arguments = TRACK, at_the_edge(), CAR, artefact, log, 12.0, settings
+        found[style] = collect(*arguments, vehicle=built_in_car(CAR)), log
+    return found
+
+
+def test_the_drive_stays_on_the_track_in_each_style_and_excites_the_car(
+    driven: dict[DrivingStyle, tuple[Driven, Path]],
+) -> None:
+    slip: dict[str, float] = {}
+    for style, (one, _) in driven.items():
+        assert len(one.u) == 600
+        assert off_track_m(one).max() <= 0
+        assert one.laps_s
+        assert np.ptp(one.x[200:, 3]) > 0.5
+        assert min(-one.x[:, 5].min(), one.x[:, 5].max()) > 2.0, "bends to both sides"
+        slip[style] = float(np.percentile(np.abs(one.slip_rad), 95))
+    assert slip["limit"] > 1.2 * slip["calm"]
+    assert slip["weave"] > slip["calm"]
+
+
+def test_a_drive_that_leaves_the_track_is_driven_again_slower(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    artefact, log = build(BuildSettings(car=CAR))[0], tmp_path / "drive.mcap"
+    course = TRACK, at_the_edge(), CAR, artefact, log, 6.0
+    monkeypatch.setitem(pure_pursuit._SCALES, "limit", 1.6)
+    settings = PurePursuitSettings(), PurePursuitSettings(speed_scale=1.6)
+    kept, once = (collect(*course, one, vehicle=built_in_car(CAR)) for one in settings)
+    assert off_track_m(kept).max() <= 0
+    assert off_track_m(once).max() > 0, "a scale that is asked for is driven once"
+
+
+def test_a_line_with_room_is_followed_as_it_is() -> None:
+    keep_m = training_margin_m(TRACK, CAR)
+    assert keep_m == pytest.approx(0.12)
+    inside = offset_line(TRACK, float(TRACK.width_left_m[0]) - keep_m, 6.0, 3.0)
+    assert training_line(TRACK, inside, CAR, "limit") is inside
+    moved = training_line(TRACK, at_the_edge(), CAR, "limit")
+    assert -TRACK.project_path(moved.xy_m).off_track_m.max() > 0.9 * keep_m
+    assert moved.vx_mps.max() <= at_the_edge().vx_mps.max() + 1e-9
+
+
+def test_a_drive_lasts_a_lap_at_least() -> None:
+    line = at_the_edge()
+    assert drive_length_s(CAR, line) == CAR.tuning.pursuit.drive_s
+    long = load_track("paddock")
+    big = Track.from_points(
+        "big",
+        6 * np.column_stack([long.x_m, long.y_m]),
+        6 * long.width_right_m,
+        6 * long.width_left_m,
+    )
+    slow = offset_line(big, 0.0, 6.0, 3.0)
+    assert drive_length_s(CAR, slow) == pytest.approx(1.5 * slow.lap_time_s)
+
+
+def test_collect_says_how_the_drive_went(tmp_path: Path, cli: Cli) -> None:
+    write_raceline(tmp_path / "line.csv", at_the_edge())
+    options = ("--track", "paddock", "--raceline", "line.csv", "--duration", "2")
+    done = cli("collect", *options, "--style", "calm")
+    assert done.code == 0, done.err
+    assert "100 samples, 0 of them off the track, up to " in done.out
+
+
+def test_a_race_reports_its_training_drive(
+    tmp_path: Path, driven: dict[DrivingStyle, tuple[Driven, Path]]
+) -> None:
+    """In result.json, table and report, all samples of it."""
+    run = write_race(tmp_path, [Drive("bayesrace", circle(TWO_LAPS, 1.0))])
+    assert analyse(run).training is None
+    one, log = driven["limit"]
+    shutil.copyfile(log, run / "collect.mcap")
+    write_track(run / "train.csv", TRACK)
+    write_raceline(run / "train_raceline.csv", at_the_edge())
+    result = analyse(run)
+    training = result.training
+    assert training is not None
+    assert (training.controller, training.samples) == ("pure-pursuit", 601)
+    assert training.off_track_samples == 0
+    assert training.speed_max_mps == pytest.approx(one.x[:, 3].max())
+    assert json.loads(result.model_dump_json())["training"]["lap_times_s"] == list(one.laps_s)
+    text = io.StringIO()
+    print_table(result, Console(file=text, width=200))
+    said = f"none of 601 samples off the track, up to {training.speed_max_mps:.2f} m/s"
+    assert f"training drive on paddock: laps {one.laps_s[0]:.3f}" in text.getvalue()
+    assert said in text.getvalue()
+    page = render_report(run, result).read_text()
+    assert said in page
+    section = page.split('<section id="training">')[1].split("</section>")[0]
+    assert section.count("<svg ") == 4  # the map, and three pictures of the states
