@@ -256,7 +256,7 @@ class RaceAnalysis:
             settings=_summary(recording),
             laps=[run.result(limit_s) for run in self.runs],
             limit_s=limit_s,
-            training=None if self.training is None else self.training.result({}),
+            training=None if self.training is None else self.training.result(),
             gp=self._metrics("bayesrace"),
             gp_updated=self._metrics("bayesrace-updated"),
             real_time_factor=_real_time_factor(recording.runs),
