@@ -22,10 +22,6 @@ __all__ = [
     "tolerances",
 ]
 
-_SPIN_RAD: Final = 0.8
-"""Slip angle of the body beyond which a car spins. No controller plans to be there, and samples far
-from all others would take the place of those that count."""
-
 _ROUNDING: Final = 1e-6
 """Larger than the error of a plant in single precision: 2.4e-7 at 5 rad/s."""
 
@@ -150,7 +146,8 @@ def filter_dataset(dataset: Dataset, *, limits: bool = True) -> Dataset:
     )
     if limits:
         kept = kept.select(within, "outside limits")
+        # No controller plans to spin, and samples far from all others would take their place.
         vx, vy = kept.x[:, 3:5].T
-        kept = kept.select(np.abs(np.arctan2(vy, vx)) <= _SPIN_RAD, "spinning")
+        kept = kept.select(np.abs(np.arctan2(vy, vx)) <= car.tuning.gate.spin_rad, "spinning")
     drift = kept.x_next[:, 6] - kept.x[:, 6] - kept.step_s * kept.u[:, 1]
     return kept.select(np.abs(drift) <= slack["delta change"], "steering does not match its rate")

@@ -186,8 +186,10 @@ class _Drives:
         self._race, self._track = race, track
         self._system, self._recorder = system, recorder
 
-    def controller(self, artefact: Path, name: str) -> AbstractContextManager[None]:
-        """A controller process for the block; ready for its first run."""
+    def controller(
+        self, artefact: Path, name: str, weights: Path | None = None
+    ) -> AbstractContextManager[None]:
+        """A controller process for the block; ready for its first run, with these weights."""
         race, track = self._race, self._track
         settings_file = race.out / FILES.mpc
         write_whole(settings_file, race.settings.mpc.model_dump_json(indent=1) + "\n")
@@ -195,6 +197,8 @@ class _Drives:
             "--car", race.car_file, "--artefact", str(artefact), "--track", str(track.track_file),
             "--raceline", str(track.line_file), "--settings", str(settings_file),
         ]  # fmt: skip
+        if weights is not None:
+            options += ["--weights", str(weights)]
         return self._system.controller(options, f"controller-{name}.log")
 
     def drive(self, controller: str) -> RunPlan:
@@ -255,7 +259,7 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
         prepared = this.prepare()
     artefact, *perfect = prepared.artefacts
     progress = None
-    if settings.progress_drives:
+    if settings.progress_runs:
         with stages.stage("build the controller that maximises progress"):
             progress = progress_artefact(settings)
     about = {"race": {"settings": settings.model_dump_json()}}
@@ -278,7 +282,7 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
                 accepted = drives.drive_with(updated, "bayesrace-updated") is not None
         if progress is not None:
             weights = updated if accepted else prepared.weights
-            with drives.controller(progress, "bayesrace-limit"):
+            with drives.controller(progress, "bayesrace-limit", weights):
                 _approach_limit(this, drives, samples, weights)
         for best in perfect:
             with drives.controller(best, "bestcase"), stages.stage("drive BestCase"):
@@ -286,14 +290,17 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
 
 
 def _approach_limit(this: _Race, drives: _Drives, samples: list[Dataset], weights: Path) -> None:
-    """The runs that maximise progress, with an update before each but the first; ends where the
-    controller refuses an update."""
-    for number in range(this.settings.progress_drives):
-        if number:
-            with this.stages.stage(f"update the residual, {number + 1}") as stage:
+    """The runs that maximise progress, the first with the weights that the controller has, with an
+    update before each other; ends where the controller refuses an update."""
+    for number in range(1, this.settings.progress_runs + 1):
+        if number > 1:
+            with this.stages.stage(f"update the residual, {number}") as stage:
                 weights = this.update(samples, weights, FILES.weights_limit, stage)
-        with this.stages.stage(f"drive BayesRace-limit, {number + 1}"):
-            driven = drives.drive_with(weights, "bayesrace-limit")
-        if driven is None:
-            return
+        with this.stages.stage(f"drive BayesRace-limit, {number}"):
+            if number == 1:
+                driven = drives.drive("bayesrace-limit")
+            elif (accepted := drives.drive_with(weights, "bayesrace-limit")) is None:
+                return
+            else:
+                driven = accepted
         samples.append(drives.samples(driven))

@@ -121,12 +121,12 @@ class RaceSettings(PreparationSettings):
     laps: int = Field(
         2, ge=1, le=100, description="laps a controller drives: one from standstill, then flying"
     )
-    progress_drives: int = Field(
-        3,
+    progress_drives: int | None = Field(
+        None,
         ge=0,
         le=20,
         description="runs of bayesrace-limit, which maximises progress, each after the first with "
-        "weights learned from all before; 0: none",
+        "weights learned from all before; None: 3, but none on linear tyres, which have no limit",
     )
     mode: Literal["lockstep", "realtime"] = Field("lockstep", description="time mode of the runs")
     time_limit: float = Field(
@@ -136,6 +136,11 @@ class RaceSettings(PreparationSettings):
     limit: bool = Field(
         True, description="compare the laps of the built-in car with the fastest it can drive"
     )
+
+    @property
+    def progress_runs(self) -> int:
+        """Of bayesrace-limit, resolved."""
+        return self.progress_drives or 0
 
     def limit_s(self, line_lap_s: float) -> float:
         """When a run ends at the latest, on a line whose flying lap takes ``line_lap_s``."""
@@ -152,4 +157,8 @@ class RaceSettings(PreparationSettings):
         seeded = self.pursuit.model_copy(update={"seed": self.seed})
         object.__setattr__(self, "pursuit", seeded)
         object.__setattr__(self, "track", self.track or self.car.race_track)
+        if self.progress_drives is None:
+            object.__setattr__(
+                self, "progress_drives", 0 if self.car.tyres.model == "linear" else 3
+            )
         return self

@@ -264,6 +264,12 @@ class GateTuning(_Section):
         0.05, SPEED, "slower, a car stands, and its samples are left out [m/s]"
     )
 
+    spin_rad: float = _number(
+        0.8,
+        NONE,
+        "slip angle of the body beyond which a car spins, and its samples are left out [rad]",
+    )
+
     @property
     def resolution(self) -> tuple[float, float, float]:
         """For vx, vy, omega."""

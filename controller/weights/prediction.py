@@ -1,5 +1,6 @@
 """What the compiled model predicts, and what the car did: one-step samples of recorded states."""
 
+import math
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -51,9 +52,10 @@ class Sample(NamedTuple):
 class Sampler:
     """Joins consecutive states until they are a sampling time apart; a gap begins anew."""
 
-    def __init__(self, step_s: float, moving_mps: float) -> None:
-        """Leaves out samples that begin slower than ``moving_mps``."""
-        self._step_s, self._moving_mps = step_s, moving_mps
+    def __init__(self, step_s: float, car: CarParameters) -> None:
+        """Leaves out samples that begin at standstill or in a spin: nothing is learned from them
+        either, so they do not tell one set of weights from another."""
+        self._step_s, self._gate = step_s, car.tuning.gate
         self._states: list[StateRecord] = []
         """Those of the sample that is not complete yet."""
 
@@ -70,7 +72,9 @@ class Sampler:
         if duration_s < self._step_s * (1 - 1e-6):
             return None
         self._states = [state]
-        if first.x[3] < self._moving_mps or duration_s > _LONGEST * self._step_s:
+        vx, vy = first.x[3:5]
+        spinning = abs(math.atan2(vy, vx)) > self._gate.spin_rad
+        if vx < self._gate.moving_mps or spinning or duration_s > _LONGEST * self._step_s:
             return None
         steps = ((b.time_s - a.time_s) * np.array(b.u_applied) for a, b in pairwise(states))
         u = sum(steps, np.zeros(2)) / duration_s

@@ -19,7 +19,7 @@ from typing import Any, Final
 
 import msgpack
 
-from bayesrace.vehicles import described_car
+from bayesrace.vehicles import CarParameters, described_car
 from controller.weights.adoption import RECORDED
 from controller.weights.checks import Checks, Ruling, Watch
 from controller.weights.prediction import Sample, Sampler, StateRecord
@@ -44,9 +44,9 @@ class Validator:
     action is empty where the weights are proven; and the ``verdict`` on the file.
     """
 
-    def __init__(self, connection: Connection, checks: Checks, moving_mps: float) -> None:
+    def __init__(self, connection: Connection, checks: Checks, car: CarParameters) -> None:
         self._connection, self._checks = connection, checks
-        self._sampler = Sampler(checks.step_s, moving_mps)
+        self._sampler = Sampler(checks.step_s, car)
         self._driven: deque[_Driven] = deque(maxlen=RECORDED)
         self._watch: Watch | None = None
         self._next = 0
@@ -108,7 +108,7 @@ def main(arguments: list[str]) -> int:
     car = described_car(text)
     checks = Checks(GateSettings.model_validate_json(settings), Path(artefact), car)
     with suppress(EOFError, ConnectionError):
-        Validator(Connection(int(socket)), checks, car.tuning.gate.moving_mps).serve()
+        Validator(Connection(int(socket)), checks, car).serve()
     return 0
 
 

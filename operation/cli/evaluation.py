@@ -72,14 +72,15 @@ def race(
     ] = 2,
     problem: ControlProblem = ProblemChoice.tracking,
     progress_drives: Annotated[
-        int,
+        int | None,
         typer.Option(
             metavar="N",
             min=0,
             max=20,
+            show_default="3; 0 on linear tyres",
             help="Runs of bayesrace-limit, which maximises progress, with an update between them.",
         ),
-    ] = 3,
+    ] = None,
     mode: TimeMode = Mode.lockstep,
     no_constraints: Annotated[
         bool, typer.Option("--no-constraints", help="OCP without track constraints.")

@@ -130,7 +130,7 @@ class _Runs:
         if controller == "bayesrace":
             self._samples = [*self._trained_on, driven.samples()]
         if controller == "bayesrace-limit" and weights is not None:
-            for _ in range(self._settings.progress_drives - 1):
+            for _ in range(self._settings.progress_runs - 1):
                 self._samples.append(driven.samples())
                 weights = self._learned(weights)
                 driven = self._driven(controller, weights)

@@ -15,7 +15,7 @@ import pytest
 
 from bayesrace.arrays import Floats
 from bayesrace.gp.weights import GpOutput, GpWeights, encode_weights
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import CarParameters, get_car
 from controller.weights.checks import Checks, Verdict, Watch
 from controller.weights.prediction import Sample, Sampler, StateRecord, plausible_samples
 from controller.weights.settings import GateSettings
@@ -39,7 +39,7 @@ def records(states: Floats, inputs: Floats, step_s: float = STEP_S) -> list[Stat
 
 def completed(states: Iterable[StateRecord]) -> list[Sample]:
     """The samples that a validator makes of them."""
-    sampler = Sampler(STEP_S, 0.05)
+    sampler = Sampler(STEP_S, get_car("orca"))
     return [sample for one in states if (sample := sampler.add(one)) is not None]
 
 
