@@ -14,7 +14,7 @@ pytestmark = pytest.mark.check
 def numbers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """A short bench; times are looked at for order only."""
     path = tmp_path_factory.mktemp("bench") / "bench.json"
-    done = run("bench", "--problems", "60", "--peers", "2", "--points", "120", "--json", path)
+    done = run("bench", "--problems", "60", "--peers", "2", "--points", "240", "--json", path)
     assert done.returncode == 0, done.stderr
     assert "CasADi + IPOPT" in done.stdout
     assert "after preparation" in done.stdout
@@ -35,7 +35,7 @@ def test_bench_writes_the_promised_form(numbers: dict[str, Any]) -> None:
         assert sorted(error) == ["p95", "p99"]
         assert 0 <= error["p95"] <= error["p99"]
     assert sorted(numbers["cost_gap"]) == ["p50", "p95"]
-    assert numbers["gp_points"] == 120
+    assert numbers["gp_points"] == 240
     assert (numbers["problems"], numbers["peers"]) == (60, 2)
 
 

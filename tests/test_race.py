@@ -327,6 +327,7 @@ def test_in_real_time_it_drives_too_and_a_second_race_prepares_nothing(
         "build the controllers",
         "training drive (pure pursuit)",
         "train the residual",
+        "limit, peanut",
     ]
     result = race.result
     assert [lap["controller"] for lap in result["laps"]] == CONTROLLERS
