@@ -4,6 +4,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from bayesrace.native_interface import SOLVER
 from bayesrace.vehicles import CarParameters
 
 __all__ = ["MpcSettings"]
@@ -58,9 +59,8 @@ class MpcSettings(BaseModel):
         tuning = car.tuning.objective.model_dump(exclude={"horizon"})
         if problem == "progress":
             tuning |= car.tuning.progress.run_time
-        own = {name: getattr(self, name) for name in type(self).model_fields}
-        solver = {"tolerance", "defect_max", "early_stop_tol", "iterations", "iterations_cold"}
-        stated = {n: v for n, v in own.items() if v is not None and (n in tuning or n in solver)}
+        known = {*tuning, *(name for name, *_ in SOLVER)}
+        stated = self.model_dump(include=known, exclude_none=True)
         values = tuning | stated
         if not self.constraints:
             values["s_slack"] = 0.0

@@ -297,10 +297,8 @@ def _approach_limit(this: _Race, drives: _Drives, samples: list[Dataset], weight
             with this.stages.stage(f"update the residual, {number}") as stage:
                 weights = this.update(samples, weights, FILES.weights_limit, stage)
         with this.stages.stage(f"drive BayesRace-limit, {number}"):
-            if number == 1:
-                driven = drives.drive("bayesrace-limit")
-            elif (accepted := drives.drive_with(weights, "bayesrace-limit")) is None:
-                return
-            else:
-                driven = accepted
+            name = "bayesrace-limit"
+            driven = drives.drive(name) if number == 1 else drives.drive_with(weights, name)
+        if driven is None:
+            return
         samples.append(drives.samples(driven))

@@ -1,7 +1,6 @@
 """The limit: against a closed form, the plant and published laps; mesh, outline, refusals."""
 
 from dataclasses import fields
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -13,26 +12,14 @@ from bayesrace.cache import uses
 from bayesrace.errors import InputError
 from bayesrace.limit import LimitLap, LimitSettings, compute_limit, read_limit, write_limit
 from bayesrace.limit.cached import limit
-from bayesrace.tracks import StartLine, Track, load_track
+from bayesrace.tracks import StartLine
 from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import command_limits, dynamic, top_command
 from plant.simulator import Simulator, plant_discretisation
 from tests.command_line import Cli
-from tests.reference import reference_file
+from tests.test_raceline import circle, track_called
 
 CAR = get_car("orca")
-PUBLISHED = ("ethz", "ethzmobil")
-
-
-def circle(radius: float, width: float, count: int = 120) -> Track:
-    angle = np.arange(count) * (2 * np.pi / count)
-    xy = radius * np.column_stack([np.cos(angle), np.sin(angle)])
-    return Track.from_points("circle", xy, width, width)
-
-
-@cache
-def track_called(name: str) -> Track:
-    return load_track(reference_file(f"tracks/{name}.csv") if name in PUBLISHED else name)
 
 
 def limit_on(name: str, car: CarParameters = CAR, **options: float) -> LimitLap:

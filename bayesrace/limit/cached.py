@@ -4,12 +4,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from bayesrace.cache import cache_folder, digest, kept, software
-from bayesrace.cpu import cpu_identity
+from bayesrace.cache import cache_folder, kept
 from bayesrace.errors import InputError
 from bayesrace.limit import compute_limit
 from bayesrace.limit.lap import LimitLap, read_limit, write_limit
 from bayesrace.limit.settings import LimitSettings
+from bayesrace.raceline.cached import optimised_identity
 from bayesrace.tracks import Track
 from bayesrace.vehicles.parameters import CarParameters
 
@@ -39,13 +39,5 @@ def known_limit(track: Track, car: CarParameters, settings: LimitSettings) -> Li
 
 def _file(track: Track, car: CarParameters, settings: LimitSettings) -> Path:
     """Named after car, track, settings and code."""
-    identity = digest(
-        [
-            car.model_dump_json(),
-            settings.model_dump_json(),
-            track.identity,
-            cpu_identity(),  # on which the last bits depend
-            *software(_SOURCES, ("casadi", "numpy")),
-        ]
-    )
+    identity = optimised_identity(track, car, settings, _SOURCES)
     return cache_folder() / f"limit-{identity}.csv"

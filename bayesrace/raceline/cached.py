@@ -1,7 +1,10 @@
 """Racing lines that were computed before, from the cache."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
+
+from pydantic import BaseModel
 
 from bayesrace.cache import cache_folder, digest, kept, software
 from bayesrace.cpu import cpu_identity
@@ -11,7 +14,7 @@ from bayesrace.raceline.settings import RaceLineSettings
 from bayesrace.tracks import Track
 from bayesrace.vehicles.parameters import CarParameters
 
-__all__ = ["raceline_file", "racing_line"]
+__all__ = ["optimised_identity", "raceline_file", "racing_line"]
 
 _SOURCES: Final = ("bayesrace/vehicles", "bayesrace/tracks", "bayesrace/raceline")
 
@@ -30,13 +33,20 @@ def racing_line(
 
 def raceline_file(track: Track, car: CarParameters, settings: RaceLineSettings) -> Path:
     """Where the line is kept, in a folder named after car, track, settings and code."""
-    identity = digest(
+    identity = optimised_identity(track, car, settings, _SOURCES)
+    return cache_folder() / f"line-{identity}" / "race_raceline.csv"
+
+
+def optimised_identity(
+    track: Track, car: CarParameters, settings: BaseModel, sources: Sequence[str]
+) -> str:
+    """Digest of all that shapes what CasADi finds for a car on a track by the code ``sources``."""
+    return digest(
         [
             car.model_dump_json(),
             settings.model_dump_json(),
             track.identity,
             cpu_identity(),  # on which the last bits depend
-            *software(_SOURCES, ("casadi", "numpy")),
+            *software(sources, ("casadi", "numpy")),
         ]
     )
-    return cache_folder() / f"line-{identity}" / "race_raceline.csv"

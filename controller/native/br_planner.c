@@ -1,5 +1,6 @@
 /* Motion planner: projection on the racing line, then the recursion in the line's speed
- * (paper section 4.3): theta_k = theta_{k-1} + Ts v_r(theta_{k-1}).
+ * (paper section 4.3): theta_k = theta_{k-1} + Ts v_r(theta_{k-1}). A problem that maximises
+ * progress has, in place of the recursion, the feet of the plan's own positions.
  *
  * The path is a table over the closed line's arc length; between rows everything is linear, which
  * at the default 5 mm costs less than .02 mm. The search starts where the car was a step ago and

@@ -26,6 +26,7 @@ from operation.cli import (
     parts,
     preparation,
     raceline,
+    tracks,
 )
 
 __all__ = ["app", "main"]
@@ -45,7 +46,7 @@ _CAMPAIGN_PACKAGES: Final = ("bokeh", "dask", "distributed", "optuna", "pyarrow"
 _TASKS: Final[dict[str, tuple[Callable[..., None], ...]]] = {
     "Race": (evaluation.race, evaluation.report),
     "Prepare": (
-        preparation.tracks, preparation.cars, raceline.raceline, preparation.collect,
+        tracks.tracks, preparation.cars, raceline.raceline, preparation.collect,
         preparation.train, learning.validate, preparation.build,
     ),
     "Drive": (

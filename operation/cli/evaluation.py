@@ -14,6 +14,7 @@ from operation.cli.options import (
     CarName,
     ControlProblem,
     Delay,
+    DriveTime,
     Endpoint,
     FmuFile,
     FmuMap,
@@ -55,16 +56,7 @@ def race(
             metavar="TRACK", show_default="the car's", help="Track of the training drive."
         ),
     ] = "",
-    train_time: Annotated[
-        float | None,
-        typer.Option(
-            metavar="S",
-            min=1,
-            max=3600,
-            show_default="the car's, and a lap at least",
-            help="Length of the training drive [s].",
-        ),
-    ] = None,
+    train_time: DriveTime = None,
     style: Style = "limit",
     laps: Annotated[
         int,

@@ -28,6 +28,7 @@ __all__ = [
     "ParentPid",
     "RaceLineFile",
     "ControlProblem",
+    "DriveTime",
     "ProblemChoice",
     "Seed",
     "Simulator",
@@ -71,6 +72,18 @@ AllSamples = Annotated[
     typer.Option(
         "--all-samples",
         help="Keep samples beyond the car's limits, as the paper's published drives have them.",
+    ),
+]
+
+
+DriveTime = Annotated[
+    float | None,
+    typer.Option(
+        metavar="S",
+        min=1,
+        max=3600,
+        show_default="the car's, and a lap at least",
+        help="Length of the training drive [s].",
     ),
 ]
 

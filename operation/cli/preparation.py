@@ -1,6 +1,5 @@
-"""``tracks`` to ``export``: preparation of a drive, each command with files in and out."""
+"""``cars`` to ``export``: preparation of a drive, each command with files in and out."""
 
-import math
 import shutil
 from enum import StrEnum
 from pathlib import Path
@@ -15,6 +14,7 @@ from operation.cli.options import (
     Car,
     CarName,
     ControlProblem,
+    DriveTime,
     FmuFile,
     FmuMap,
     OutFile,
@@ -29,7 +29,7 @@ from operation.cli.options import (
     writable,
 )
 
-__all__ = ["build", "cars", "collect", "export", "tracks", "train"]
+__all__ = ["build", "cars", "collect", "export", "train"]
 
 
 class PredictionModel(StrEnum):
@@ -47,105 +47,6 @@ class KernelChoice(StrEnum):
     matern15 = "matern15"
     matern25 = "matern25"
     auto = "auto"
-
-
-def tracks(
-    name: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="TRACK",
-            show_default="all built in",
-            help="Built-in name, random:SEED, CSV file or ROS map (YAML).",
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out", "-o", metavar="FILE", callback=writable, help="Write the track as CSV."
-        ),
-    ] = None,
-    picture: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", callback=writable, help="Draw the track (SVG, PNG)."),
-    ] = None,
-    reverse: Annotated[bool, typer.Option("--reverse", help="Drive it the other way.")] = False,
-    start: Annotated[
-        str | None,
-        typer.Option(
-            metavar="X,Y",
-            show_default="as it is; of a map: 0,0",
-            help="Start line at the node nearest to this point [m].",
-        ),
-    ] = None,
-    smooth: Annotated[
-        bool, typer.Option("--smooth", help="Take the noise off the points of a measured CSV file.")
-    ] = False,
-    car: Annotated[
-        str, typer.Option(metavar="CAR", show_default="of any", help="Car whose scale to check.")
-    ] = "",
-) -> None:
-    """List the built-in tracks, check a track, turn a ROS map into one, write or draw it."""
-    import numpy as np
-    from rich.table import Table
-
-    from bayesrace.tracks import builtin_tracks, load_track, read_smoothed, write_track
-    from bayesrace.vehicles import get_car
-    from operation.terminal.terminal import Terminal
-
-    if name is None and (out or picture or start or reverse or smooth):
-        text = "--out, --picture, --start, --reverse and --smooth need the name of the track"
-        raise InputError(text)
-    if picture is not None:
-        from operation.report.track_picture import check_picture, write_picture
-
-        check_picture(picture)
-    place, grid = _point(start), None
-    car_width_m = get_car(car).width_m if car else None
-    moved = ""
-    table = Table("track", "length m", "width m", "tightest radius m", "points")
-    for one in [name] if name else builtin_tracks():
-        if Path(one).suffix in (".yaml", ".yml"):
-            from bayesrace.tracks.maps import read_map, track_of_map
-
-            grid = read_map(one)
-            track = track_of_map(grid, car_width_m)
-        elif smooth:
-            track, away_m = read_smoothed(one, car_width_m)
-            rms_m, largest_m = float(np.sqrt(np.mean(away_m**2))), float(away_m.max())
-            moved = (
-                f"{len(away_m)} points are {1e3 * rms_m:.1f} mm (RMS) and at most "
-                f"{1e3 * largest_m:.1f} mm away from the smooth centreline"
-            )
-        else:
-            track = load_track(one, car_width_m)
-        if place is not None or reverse:
-            track = track.driven_from(place, reverse)
-        width = track.width_left_m + track.width_right_m
-        bend = np.abs(track.curvature(np.arange(0, track.length_m, 0.01))).max()
-        table.add_row(
-            track.name, f"{track.length_m:.2f}", f"{width.min():.2f}–{width.max():.2f}",
-            f"{1 / bend:.2f}", str(len(track.s_m)),
-        )  # fmt: skip
-        if out is not None:
-            write_track(out, track)
-        if picture is not None:
-            write_picture(picture, track, grid)
-    Terminal().print(table)
-    if moved:
-        typer.echo(moved)
-
-
-def _point(text: str | None) -> tuple[float, float] | None:
-    """The two numbers of an option."""
-    if text is None:
-        return None
-    try:
-        x, y = (float(part) for part in text.split(","))
-    except ValueError:
-        x = y = math.nan
-    if not (math.isfinite(x) and math.isfinite(y)):
-        raise InputError(f"--start {text}: give x and y in metres, as 1.5,-2")
-    return x, y
 
 
 def cars(
@@ -191,16 +92,7 @@ def collect(
     track: TrackName,
     raceline: RaceLineFile,
     out: OutFile = Path("collect.mcap"),
-    duration: Annotated[
-        float | None,
-        typer.Option(
-            metavar="S",
-            min=1,
-            max=3600,
-            show_default="the car's, and a lap at least",
-            help="Length of the drive [s].",
-        ),
-    ] = None,
+    duration: DriveTime = None,
     style: Style = "limit",
     seed: Seed = 0,
     fmu: FmuFile = None,
