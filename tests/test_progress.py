@@ -15,14 +15,15 @@ from bayesrace.vehicles.models import dynamic, e_kinematic
 from codegen.build import build, problem_of
 from codegen.ocp import OcpNlp
 from codegen.settings import BuildSettings
-from controller.interface import Environment
+from controller.interface import NO_LIMITS, Environment
 from controller.native_step import NativeStep, StepStatus
-from controller.path_table import PathTable
+from controller.path_table import PathTable, make_path_table
 from controller.settings import MpcSettings
-from tests.conftest import SETTINGS, Circuit, discrete
+from tests.conftest import SETTINGS, Circuit, discrete, offset_line
 from tests.test_native_planner import nearest
-from tests.test_native_prepare import result
+from tests.test_native_prepare import Between, change_weights, reset, result
 from tests.test_native_step import EXACT, FROM_OUR_PLAN, TIGHT_IPOPT
+from tests.test_native_time import Clock
 
 HORIZON = 20
 PROGRESS = BuildSettings(problem="progress", horizon=HORIZON)
@@ -114,17 +115,48 @@ def test_the_reference_is_where_the_plan_is_on_the_line(
             assert pace @ way == pytest.approx((ahead - behind) / 0.02, abs=0.06 * np.hypot(*pace))
 
 
+def nothing(step: NativeStep, circuit: Circuit, car: CarParameters) -> None:
+    """The drive goes on."""
+
+
+def another_path(step: NativeStep, circuit: Circuit, car: CarParameters) -> None:
+    line = offset_line(circuit.track, -0.05, 4.0, 2.0)
+    step.set_path(make_path_table(circuit.track, line, circuit.table.spacing_m))
+
+
+@pytest.mark.parametrize("between", [nothing, another_path, change_weights, reset])
 def test_prepared_steps_are_the_same_to_the_bit(
-    artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit
+    artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit, between: Between
 ) -> None:
+    """Whatever happens between a preparation and its step; a stop, too."""
     prepared, plain = (ready(artefact, car, weights, circuit, MpcSettings()) for _ in range(2))
     plant = discrete(dynamic(car))
     x, d = circuit.start(), 0.0
-    for _ in range(100):
-        assert prepared.step(x, d) is plain.step(x, d)
+    for k in range(60):
+        if k == 20:
+            between(prepared, circuit, car)
+            between(plain, circuit, car)
+        slow = Environment(1.0, 1.5) if 30 <= k < 40 else NO_LIMITS
+        assert prepared.step(x, d, environment=slow) is plain.step(x, d, environment=slow)
         assert result(prepared) == result(plain)
         prepared.prepare()
         d, x = float(plain.u[0]), plant(x, plain.u)
+
+
+def test_a_budget_looks_for_no_other_plan(
+    artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit
+) -> None:
+    """The costs of two plans do not compare: each counts from its own feet on the line."""
+    settings = MpcSettings(iterations=4, iterations_cold=4)
+    step, plant = ready(artefact, car, weights, circuit, settings), discrete(dynamic(car))
+    Clock(step, 1e-6)
+    x, d, iterations = circuit.start(), 0.0, []
+    for _ in range(40):
+        step.step(x, d, budget_s=1.0)
+        iterations.append(step.info.prepared_iterations)
+        step.prepare(budget_s=1.0)
+        d, x = float(step.u[0]), plant(x, step.u)
+    assert 0 < max(iterations) <= 4
 
 
 def test_a_stop_brakes_to_standstill(
@@ -152,4 +184,19 @@ def test_a_car_that_points_aside_sets_off_at_once(
     for _ in range(25):
         assert step.step(x, d).usable
         d, x = float(step.u[0]), plant(x, step.u)
+    assert x[3] > 0.8
+
+
+def test_a_car_that_points_back_turns_and_drives_on(
+    step: NativeStep, car: CarParameters, circuit: Circuit
+) -> None:
+    plant = discrete(dynamic(car))
+    x, d, turned = circuit.start(v_mps=0.1), 0.0, False
+    x[2] += math.pi
+    for _ in range(250):
+        assert step.step(x, d).usable
+        turned |= bool((step.read_reference()[:, 6] == 0).all())
+        d, x = float(step.u[0]), plant(x, step.u)
+    assert turned
+    assert (step.read_reference()[:, 6] == 1).all()
     assert x[3] > 0.8

@@ -35,6 +35,7 @@ br_mpc_error br_mpc_set_parameters(br_mpc *mpc, const br_mpc_parameters *paramet
 br_mpc_error br_mpc_set_path(br_mpc *mpc, const double *table, int n, double spacing_m) {
     if (!mpc || !table) return BR_ERROR_NULL;
 #if BR_HAS_PATH
+    mpc->followed = 0; /* what has been prepared is of the path before */
     return br_path_load(&mpc->path, table, n, spacing_m);
 #else
     (void)n, (void)spacing_m;

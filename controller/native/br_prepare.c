@@ -64,7 +64,8 @@ static int improve(br_mpc *mpc) {
  * that and for what follows. */
 static void look_elsewhere(br_mpc *mpc) {
     br_timer *timer = &mpc->timer;
-    if (mpc->turn) return; /* there is one way to turn */
+    if (mpc->turn) return;    /* there is one way to turn */
+    if (mpc->follows) return; /* costs from different feet on the line do not compare */
     timer->deadline -= 2 * timer->iteration;
     if (!br_timer_allows(timer, br_timer_now(timer), BR_SECOND_START_ITERATIONS * timer->iteration))
         return;
