@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 from itertools import product
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
@@ -38,10 +38,11 @@ class Comparison(NamedTuple):
 
 
 class Ruling(NamedTuple):
-    """What the watch demands."""
+    """What the watch has found."""
 
-    action: str
-    """"back": to the proven weights. "slow": down, as those predict other outputs worse."""
+    action: Literal["back", "slow", "proven"]
+    """Back to the proven weights; slow down, as those predict other outputs worse; or stay: the
+    watch is over."""
     text: str
     data: dict[str, Scalar]
 

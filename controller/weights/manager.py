@@ -304,9 +304,9 @@ class WeightUpdateManager:
         if not answer:  # the validator has just started
             self._next, self._stale, self.adoption.allowed = 0, True, -1
         elif not self._stale:
-            if (ruling := answer["watch"]) is not None:
+            for ruling in answer["watch"]:
                 self._rule(*ruling)
-            if ruling is None or ruling[0] == "slow":
+            if all(action == "slow" for action, *_ in answer["watch"]):  # the watch goes on
                 self.adoption.allowed = math.inf if answer["seen"] is None else answer["seen"]
         sent = self._sent.get("check")
         if sent is not None and sent is self._check and not self._stale:
@@ -319,13 +319,13 @@ class WeightUpdateManager:
         return _LOCKSTEP_POLL_S if lockstep else _POLL_S
 
     def _rule(self, action: str, why: str, data: _Data) -> None:
-        """The watch has a result: the weights in use are proven, or see :class:`.checks.Ruling`."""
+        """Acts on a :class:`.checks.Ruling` about the weights in use."""
         in_use = self._history.in_use
         known: _Data = {"version": in_use.version, "number": in_use.number}
         if action == "slow":
             self._slow_down(f"{in_use.version} {why}", {**data, **known})
             return
-        if not action:
+        if action == "proven":
             self._history.prove()
             text = f"weights {in_use.version} (number {in_use.number}) are proven"
             self._announce("weights_proven", text, known)

@@ -40,8 +40,8 @@ class Validator:
     An empty message says that it has started. A message of the controller has any of ``states``,
     ``context`` (what is in use, once all states before its adoption have been sent) and ``check``
     (a weights file). The answer has ``seen``, the number of the next state, or None if nothing is
-    watched; ``watch``, when the watch has a result: the fields of a :class:`.checks.Ruling`, whose
-    action is empty where the weights are proven; and the ``verdict`` on the file.
+    watched; ``watch``, what the watch has found in these states: the fields of each
+    :class:`.checks.Ruling`, in order; and the ``verdict`` on the file.
     """
 
     def __init__(self, connection: Connection, checks: Checks, car: CarParameters) -> None:
@@ -66,8 +66,8 @@ class Validator:
         self._next = states[-1].number + 1 if states else self._next
         if "context" in message:
             driven = self._use(message["context"])
-        result = self._follow(driven)
-        answer: dict[str, Any] = {"seen": self._next if self._watch else None, "watch": result}
+        rulings = self._follow(driven)
+        answer: dict[str, Any] = {"seen": self._next if self._watch else None, "watch": rulings}
         if "check" in message:
             verdict = self._checks.judge(message["check"], self._recent(self._driven))
             answer["verdict"] = verdict._asdict()
@@ -86,19 +86,21 @@ class Validator:
         oldest_ns = time.monotonic_ns() - round(self._checks.settings.recent_s * 1e9)
         return [sample for _, sample in driven if sample and sample.recorded_ns > oldest_ns]
 
-    def _follow(self, driven: Iterable[_Driven]) -> Ruling | None:
-        """Continues the watch; its result depends on the states alone, not on when they come."""
-        if (watch := self._watch) is None:
-            return None
-        slow: Ruling | None = None
+    def _follow(self, driven: Iterable[_Driven]) -> list[Ruling]:
+        """Continues the watch; what it finds depends on the states alone, not on when they come."""
+        rulings: list[Ruling] = []
         for state, sample in driven:
+            if (watch := self._watch) is None:
+                break
             ruling = watch.add(state.fallen_back, sample)
-            if ruling is not None and ruling.action == "slow":
-                slow = ruling
-            elif ruling is not None or watch.over:
+            if ruling is not None:
+                rulings.append(ruling)
+            if ruling is not None and ruling.action == "back":
                 self._watch = None
-                return ruling or Ruling("", "", {})
-        return slow
+            elif watch.over:
+                rulings.append(Ruling("proven", "", {}))
+                self._watch = None
+        return rulings
 
 
 def main(arguments: list[str]) -> int:

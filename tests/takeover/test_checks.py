@@ -7,9 +7,13 @@ watch rolls the former back within a second of driving and the latter never.
 
 import time
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import replace
+from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any, cast
 
+import msgpack
 import numpy as np
 import pytest
 
@@ -19,6 +23,7 @@ from bayesrace.vehicles import CarParameters, get_car
 from controller.weights.checks import Checks, Verdict, Watch
 from controller.weights.prediction import Sample, Sampler, StateRecord, plausible_samples
 from controller.weights.settings import GateSettings
+from controller.weights.validator import Validator
 from tests.conftest import fit_weights, smooth_drive
 from tests.takeover.rig import KINDS
 from tests.takeover.spoilt_weights import SPOILT, spoilt
@@ -257,6 +262,44 @@ def test_the_watch_goes_back_only_to_what_is_no_worse(
         assert "predicted vx worse" in rulings[0].text
         assert watch.over is (reference is None)
     assert int(rulings[0].data["samples"]) <= 100
+
+
+class Messages:
+    """A connection whose other end has sent all messages; keeps the answers."""
+
+    def __init__(self, messages: Iterable[dict[str, Any]]) -> None:
+        self._messages = iter(messages)
+        self.answers: list[dict[str, Any]] = []
+
+    def recv_bytes(self) -> bytes:
+        """The next message."""
+        for message in self._messages:
+            return bytes(msgpack.packb(message))
+        raise EOFError
+
+    def send_bytes(self, data: bytes) -> None:
+        """Keeps an answer."""
+        self.answers.append(msgpack.unpackb(data))
+
+
+@pytest.mark.parametrize("chunk", [1, 64, 600])
+def test_what_the_watch_finds_does_not_depend_on_when_states_come(
+    checks: Checks, again: GpWeights, car: CarParameters, chunk: int
+) -> None:
+    """Slow down, and later that the weights are proven, may be found in one message."""
+    states = records(*smooth_drive(car, 601, seed=7))
+    context = {
+        "in_use": file(spoilt(again, "flip vx")), "accepted_utc_ns": 2**62, "reference": b"",
+        "watched": True, "begin": 0,
+    }  # fmt: skip
+    parts = [states[first : first + chunk] for first in range(0, len(states), chunk)]
+    connection = Messages([{"context": context}, *({"states": part} for part in parts)])
+    with suppress(EOFError):
+        Validator(cast(Connection, connection), checks, car).serve()
+    found = [ruling for answer in connection.answers[1:] for ruling in answer["watch"]]
+    assert [action for action, *_ in found] == ["slow", "proven"]
+    assert found[0][2]["driven"] == 5
+    assert connection.answers[-1]["seen"] is None
 
 
 def test_the_watch_rolls_back_what_leaves_no_solution(checks: Checks, honest: GpWeights) -> None:
