@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bayesrace.errors import InputError
-from bayesrace.tracks import builtin_tracks, load_track, read_track, write_track
+from bayesrace.tracks import builtin_tracks, load_track, read_smoothed, read_track, write_track
 from tests.command_line import Cli, refused
 from tests.reference import reference_file
 
@@ -203,6 +203,30 @@ def test_what_no_smoothing_mends_is_refused(tmp_path: Path, cli: Cli) -> None:
     path = written(tmp_path, [HEADER, *scaled(1000)])
     refused(cli("tracks", path, "--smooth"), "millimetres")
     refused(cli("tracks", "--smooth"), "need the name of the track")
+    path = written(tmp_path, ["1,1,0.2,0.3"] * 20)
+    refused(cli("tracks", path, "--smooth"), "too few points (0)")
+    path = written(tmp_path, noisy(0.01, 800)[:600])
+    refused(cli("tracks", path, "--smooth"), "is not closed")
+    path = written(tmp_path, [*noisy(0.01, 800)[:400], "9,9,0.2,0.3", *noisy(0.01, 800)[400:]])
+    refused(cli("tracks", path, "--smooth"), "row 401: the point is", "leave it out")
+    path = written(tmp_path, [*noisy(0.01, 800), *noisy(0.01, 800)])
+    refused(cli("tracks", path, "--smooth"), "give the points of one lap in driving order")
+
+
+@pytest.mark.parametrize("name", ["harbour", "random:3", "map.yaml"])
+def test_what_was_not_measured_is_not_smoothed(tmp_path: Path, cli: Cli, name: str) -> None:
+    (tmp_path / "map.yaml").touch()
+    refused(cli("tracks", name, "--smooth"), "--smooth is for a CSV file of measured points, not f")
+
+
+def test_a_logger_that_stood_has_measured_one_point(tmp_path: Path) -> None:
+    lines = noisy(0.003, 1500)
+    track, away_m = read_smoothed(written(tmp_path, lines))
+    stood, all_m = read_smoothed(
+        written(tmp_path, [*lines[:100], *[lines[100]] * 30, *lines[101:]])
+    )
+    np.testing.assert_array_equal(stood.x_m, track.x_m)
+    assert len(all_m) == len(away_m) + 29
 
 
 def test_tracks_of_all_scales_are_plausible(tmp_path: Path) -> None:

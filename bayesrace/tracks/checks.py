@@ -67,7 +67,7 @@ def find_fault(points: Floats, right: Floats, left: Floats, min_width_m: float) 
 def find_value_fault(
     points: Floats, right: Floats, left: Floats, min_width_m: float
 ) -> Fault | None:
-    """:func:`find_fault`, but for the shape: what no smoothing mends."""
+    """:func:`find_fault` of what no smoothing mends: all but the shape."""
     if len(points) < MIN_POINTS:
         return Fault(
             None,
@@ -81,7 +81,7 @@ def find_value_fault(
             "a value is not finite",
             "give every coordinate and width as a finite number in metres",
         )
-    return _find_width_fault(right, left, min_width_m)
+    return _find_width_fault(right, left, min_width_m) or _find_gap_fault(points)
 
 
 def _find_width_fault(right: Floats, left: Floats, min_width_m: float) -> Fault | None:
@@ -104,9 +104,8 @@ def _find_width_fault(right: Floats, left: Floats, min_width_m: float) -> Fault 
     return None
 
 
-def _find_shape_fault(points: Floats) -> Fault | None:
-    edge = np.roll(points, -1, axis=0) - points
-    length = np.linalg.norm(edge, axis=1)
+def _find_gap_fault(points: Floats) -> Fault | None:
+    length = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
     if length[-1] > _OPEN * length[:-1].max():
         return Fault(
             None,
@@ -114,6 +113,12 @@ def _find_shape_fault(points: Floats) -> Fault | None:
             f"other neighbours at most {length[:-1].max():.3g} m",
             "give the whole lap, up to the point before the first one",
         )
+    return None
+
+
+def _find_shape_fault(points: Floats) -> Fault | None:
+    edge = np.roll(points, -1, axis=0) - points
+    length = np.linalg.norm(edge, axis=1)
     if (length < _DUPLICATE_M).any():
         first = int(np.argmax(length < _DUPLICATE_M))
         second = (first + 1) % len(points)

@@ -51,13 +51,29 @@ def read_smoothed(path: Path | str, car_width_m: float | None = None) -> tuple[T
     path = Path(path)
     points, right, left, rows = _read_points(path)
     least_m = default_car_width_m(car_width_m)
-    fault = find_value_fault(points, right, left, least_m)
-    _refuse(path, rows, fault or find_scale_fault(points, right, left, car_width_m))
-    try:
-        track = Track.from_points(path.stem, *smooth(points, right, left), least_m)
-    except InputError as error:
-        raise InputError(f"{path}, smoothed: {error}") from None
-    return track, np.abs(track.project_points(points).n_m)
+    moved = (points != np.roll(points, 1, axis=0)).any(axis=1)  # a logger that stood repeats itself
+    distinct = points[moved], right[moved], left[moved]
+    fault = find_value_fault(*distinct, least_m)
+    _refuse(
+        path,
+        [row for row, kept in zip(rows, moved.tolist(), strict=False) if kept],
+        fault or find_scale_fault(*distinct, car_width_m),
+    )
+    smoothed = smooth(*distinct)
+    if find_fault(*smoothed, least_m) is not None:
+        raise InputError(
+            f"{path}: even smoothed, the centreline crosses itself or turns back; give the points "
+            "of one lap in driving order"
+        )
+    track = Track._from_checked(path.stem, *smoothed)
+    away_m = np.abs(track.project_points(points).n_m)
+    if (outlier := away_m > right + left).any():
+        first = int(np.argmax(outlier))
+        raise InputError(
+            f"{path}, row {rows[first]}: the point is {away_m[first]:.3g} m from the smooth "
+            "centreline, farther than the track is wide; leave it out"
+        )
+    return track, away_m
 
 
 def _read_points(path: Path) -> tuple[Floats, Floats, Floats, list[int]]:

@@ -2,14 +2,19 @@
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
 from bayesrace.errors import InputError
 from operation.cli.options import writable
 
+if TYPE_CHECKING:
+    from bayesrace.tracks import Track
+
 __all__ = ["tracks"]
+
+_MAPS: Final = (".yaml", ".yml")
 
 
 def tracks(
@@ -48,10 +53,9 @@ def tracks(
     ] = "",
 ) -> None:
     """List the built-in tracks, check a track, turn a ROS map into one, write or draw it."""
-    import numpy as np
     from rich.table import Table
 
-    from bayesrace.tracks import builtin_tracks, load_track, read_smoothed, write_track
+    from bayesrace.tracks import builtin_tracks, load_track, write_track
     from bayesrace.vehicles import get_car
     from operation.terminal.terminal import Terminal
 
@@ -62,40 +66,58 @@ def tracks(
         from operation.report.track_picture import check_picture, write_picture
 
         check_picture(picture)
-    place, grid = _point(start), None
+    place, remark = _point(start), ""
     car_width_m = get_car(car).width_m if car else None
-    moved = ""
     table = Table("track", "length m", "width m", "tightest radius m", "points")
     for one in [name] if name else builtin_tracks():
-        if Path(one).suffix in (".yaml", ".yml"):
+        grid = None
+        if smooth:
+            track, remark = _smoothed(one, car_width_m)
+        elif Path(one).suffix in _MAPS:
             from bayesrace.tracks.maps import read_map, track_of_map
 
             grid = read_map(one)
             track = track_of_map(grid, car_width_m)
-        elif smooth:
-            track, away_m = read_smoothed(one, car_width_m)
-            rms_m, largest_m = float(np.sqrt(np.mean(away_m**2))), float(away_m.max())
-            moved = (
-                f"{len(away_m)} points are {1e3 * rms_m:.1f} mm (RMS) and at most "
-                f"{1e3 * largest_m:.1f} mm away from the smooth centreline"
-            )
         else:
             track = load_track(one, car_width_m)
         if place is not None or reverse:
             track = track.driven_from(place, reverse)
-        width = track.width_left_m + track.width_right_m
-        bend = np.abs(track.curvature(np.arange(0, track.length_m, 0.01))).max()
-        table.add_row(
-            track.name, f"{track.length_m:.2f}", f"{width.min():.2f}–{width.max():.2f}",
-            f"{1 / bend:.2f}", str(len(track.s_m)),
-        )  # fmt: skip
+        table.add_row(*_cells(track))
         if out is not None:
             write_track(out, track)
         if picture is not None:
             write_picture(picture, track, grid)
     Terminal().print(table)
-    if moved:
-        typer.echo(moved)
+    if remark:
+        typer.echo(remark)
+
+
+def _smoothed(name: str, car_width_m: float | None) -> "tuple[Track, str]":
+    """The smooth track in a file of measured points, and how far these are away from it."""
+    import numpy as np
+
+    from bayesrace.tracks import read_smoothed
+
+    if Path(name).suffix in _MAPS or not Path(name).is_file():
+        raise InputError(f"--smooth is for a CSV file of measured points, not for '{name}'")
+    track, away_m = read_smoothed(name, car_width_m)
+    rms_m, largest_m = float(np.sqrt(np.mean(away_m**2))), float(away_m.max())
+    return track, (
+        f"{len(away_m)} points are {1e3 * rms_m:.1f} mm (RMS) and at most {1e3 * largest_m:.1f} mm "
+        "away from the smooth centreline"
+    )
+
+
+def _cells(track: "Track") -> tuple[str, ...]:
+    """A track's row of the table."""
+    import numpy as np
+
+    width = track.width_left_m + track.width_right_m
+    bend = np.abs(track.curvature(np.arange(0, track.length_m, 0.01))).max()
+    return (
+        track.name, f"{track.length_m:.2f}", f"{width.min():.2f}–{width.max():.2f}",
+        f"{1 / bend:.2f}", str(len(track.s_m)),
+    )  # fmt: skip
 
 
 def _point(text: str | None) -> tuple[float, float] | None:
