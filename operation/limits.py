@@ -49,9 +49,10 @@ def limits_beside(settings: RaceSettings, car_file: str, out: Path) -> Iterator[
                 continue
             arguments = [
                 "limit", settings.track, "--car", car_file, "--out", str(out / name),
-                "--start-speed", repr(options.start_speed_mps), "--parent-pid", str(os.getpid()),
-                *(["--standing"] if options.standing else []),
+                "--parent-pid", str(os.getpid()),
             ]  # fmt: skip
+            if options.standing:
+                arguments += ["--standing", "--start-speed", repr(options.start_speed_mps)]
             children.append(stack.enter_context(child(arguments, (out / name).with_suffix(".log"))))
             with suppress(OSError):  # it has ended already
                 os.setpriority(os.PRIO_PROCESS, children[-1].pid, _LOWEST)

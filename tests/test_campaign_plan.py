@@ -44,6 +44,11 @@ def read(tmp_path: Path, weights: GpWeights) -> Read:
         ("laps = 2", ("laps = 2 is unknown", "a plan has controllers")),
         ('controllers = ["me"]', ("controllers.0 = 'me'", "bestcase")),
         ('controllers = ["bayesrace-updated"]', ("learns from the laps of 'bayesrace'",)),
+        ('controllers = ["bayesrace-limit"]', ("learns from the laps of 'bayesrace'",)),
+        (
+            'controllers = ["bayesrace", "bayesrace-limit"]\n[grid]\ncar = "f1tenth"',
+            ("progress_drives is 0, as by default on linear tyres", "leave the controller out"),
+        ),
         ("draws = 0\n[random]\npoints = [20]", ("draws = 0", "greater than or equal to 1")),
         ("draws = 9", ("draws = 9", "add [random]")),
         ("[grid]\npoint = 3", ("grid.point = 3 is no setting", "points")),
@@ -63,6 +68,10 @@ def read(tmp_path: Path, weights: GpWeights) -> Read:
         ("weights = 'peanut.csv'\ncontrollers = ['bayesrace']", ("weights = 'peanut.csv'",)),
         ("weights = 'weights.bin'", ("bayesrace-updated", "leave it or the weights out")),
         (
+            "weights = 'weights.bin'\ncontrollers = ['bayesrace', 'bayesrace-limit']",
+            ("bayesrace-limit", "leave it or the weights out"),
+        ),
+        (
             "weights = 'weights.bin'\ncontrollers = ['bayesrace']\n[grid]\nseed = '0..3'",
             ("seed shapes what is learned", "leave it or the weights out"),
         ),
@@ -77,6 +86,12 @@ def test_what_cannot_be_is_refused_with_field_value_and_remedy(
     assert len(str(refusal.value).splitlines()) == 1
     for word in words:
         assert word in str(refusal.value)
+
+
+def test_controllers_drive_in_the_order_in_which_they_learn(read: Read) -> None:
+    plan = 'controllers = ["bestcase", "bayesrace-limit", "bayesrace"]'
+    (case,) = read(plan).cases.values()
+    assert case.controllers == ("bayesrace", "bayesrace-limit", "bestcase")
 
 
 def test_two_cars_of_one_name_are_refused(read: Read, car: CarParameters, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from bayesrace.tracks import StartLine
 from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import command_limits, dynamic, top_command
 from plant.simulator import Simulator, plant_discretisation
-from tests.command_line import Cli
+from tests.command_line import Cli, refused
 from tests.test_raceline import circle, track_called
 
 CAR = get_car("orca")
@@ -194,3 +194,7 @@ def test_the_command_prints_and_writes_it_and_keeps_it_in_the_cache(
     assert f"standing lap {lap.lap_s:.3f} s" in printed.out
     assert f"{lap.intervals}, solved in {lap.solve_s:.1f} s" in printed.out
     assert read_limit(out).lap_s == lap.lap_s
+
+
+def test_a_start_speed_is_that_of_a_standing_lap(cli: Cli) -> None:
+    refused(cli("limit", "paddock", "--start-speed", "1"), "--start-speed", "add --standing")

@@ -101,14 +101,13 @@ class _Limit:
 
     def _fastest(self, gates: Gates, guess: Lap, options: dict[str, Any]) -> Lap:
         """The fastest lap; with an outline, repeated until this keeps the margin."""
-        lap = self._optimised(gates, guess, options)
-        if self._outline is None:
-            return lap
-        most_m = _TOUCHING * self._model.car.width_m
+        lap, most_m = guess, _TOUCHING * self._model.car.width_m
         for _ in range(_ROUNDS):
-            if self._outline.beyond_m(gates.points(lap.states[:, 0]), lap.states[:, 1]) <= most_m:
+            lap = self._optimised(gates, lap, options)
+            at = gates.points(lap.states[:, 0]), lap.states[:, 1]
+            if self._outline is None or self._outline.beyond_m(*at) <= most_m:
                 return lap
-            lap = self._optimised(gates, lap, _WARM)
+            options = _WARM
         raise _NoLapError(
             f"no limit for track '{self._track.name}': the outline still passes the margin after "
             f"{_ROUNDS} rounds; try another --margin"

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from bayesrace.clock import die_with_parent
+from bayesrace.errors import InputError
 from bayesrace.vehicles import DEFAULT_CAR
 from operation.cli.options import Car, ParentPid, Tyres, writable
 
@@ -31,9 +32,15 @@ def limit(
         bool, typer.Option("--body", help="The car's outline keeps the margin.")
     ] = False,
     start_speed: Annotated[
-        float,
-        typer.Option(metavar="V", min=0, max=5, help="Speed at the start of a standing lap [m/s]."),
-    ] = 0.1,
+        float | None,
+        typer.Option(
+            metavar="V",
+            min=0,
+            max=5,
+            show_default="0.1",
+            help="Speed at the start of a standing lap [m/s].",
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -53,10 +60,12 @@ def limit(
     from bayesrace.tracks import load_track
     from bayesrace.vehicles import get_car
 
+    if start_speed is not None and not standing:
+        raise InputError("--start-speed is that of a standing lap: add --standing, or leave it out")
     parameters = get_car(car)
     if tyres is not None:
         parameters = parameters.on_tyres(tyres.value)
-    speed = {"start_speed_mps": start_speed} if standing else {}
+    speed = {} if start_speed is None else {"start_speed_mps": start_speed}
     settings = LimitSettings(standing=standing, margin_m=margin, body=body, **speed)
     lap = cached_limit(load_track(track, parameters.width_m), parameters, settings)
     typer.echo(

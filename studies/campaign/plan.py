@@ -49,6 +49,7 @@ __all__ = ["Campaign", "read_plan", "spread"]
 _MOST_CASES: Final = 1_000_000
 _SPAN: Final = re.compile(r"(.*?)(\d{1,9})\.\.(\d{1,9})")
 _TRAINING: Final = ("train_track", "seed", "collect_s", "points", "kernels")
+_LEARN_FROM_LAPS: Final = ("bayesrace-updated", "bayesrace-limit")
 _RANDOM_TRACK: Final = re.compile(r"random:\d{1,18}")
 
 
@@ -173,9 +174,12 @@ class _Reader:
                 f"the plan has {count} cases, at most {_MOST_CASES} are possible: "
                 "draw some values in [random] in place of all combinations in [grid]"
             )
+        # In the order in which they learn from each other.
+        controllers = tuple(one for one in CONTROLLERS if one in plan.controllers)
         cases = {}
         for values in self._points(grid, drawn):
-            case = Case(_settings(values), tuple(plan.controllers), weights)
+            case = Case(_settings(values), controllers, weights)
+            _check_runs(case)
             cases[case.key] = case
         cars = {case.settings.car.name: case.settings.car for case in cases.values()}
         return Campaign(cases, self._files, tuple(cars.values()), text)
@@ -271,15 +275,21 @@ class _Reader:
 
 
 def _check_controllers(plan: _Plan) -> None:
-    updated = "bayesrace-updated" in plan.controllers
-    if updated and plan.weights is not None:
+    learning = next((one for one in plan.controllers if one in _LEARN_FROM_LAPS), None)
+    if learning and plan.weights is not None:
         raise InputError(
-            "controllers: 'bayesrace-updated' learns from a training drive, which there is none of "
+            f"controllers: '{learning}' learns from a training drive, which there is none of "
             "with given weights; leave it or the weights out"
         )
-    if updated and "bayesrace" not in plan.controllers:
+    if learning and "bayesrace" not in plan.controllers:
+        raise InputError(f"controllers: '{learning}' learns from the laps of 'bayesrace'; add that")
+
+
+def _check_runs(case: Case) -> None:
+    if "bayesrace-limit" in case.controllers and not case.settings.progress_runs:
         raise InputError(
-            "controllers: 'bayesrace-updated' learns from the laps of 'bayesrace'; add that"
+            "controllers: 'bayesrace-limit' has no runs: progress_drives is 0, as by default on "
+            "linear tyres; set it, or leave the controller out"
         )
 
 
