@@ -250,13 +250,7 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
     this.keep_fmu()
     write_car(this.car_file, this.car)
     write_whole(out / FILES.settings, settings.model_dump_json(indent=1) + "\n")
-    if settings.limit and settings.built_in:
-        with limits_beside(settings, this.car_file, out) as wait:
-            prepared = this.prepare()
-            with stages.stage(f"limit, {prepared.first.track.name}"):
-                wait()
-    else:
-        prepared = this.prepare()
+    prepared = _prepared(this)
     artefact, *perfect = prepared.artefacts
     progress = None
     if settings.progress_runs:
@@ -271,22 +265,42 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
         drives = _Drives(this, prepared.first, system, recorder)
         samples = [] if prepared.training is None else [prepared.training.samples]
         with drives.controller(artefact, "bayesrace"):
-            with stages.stage("drive WorstCase"):
-                driven = drives.drive("worstcase")
-            with stages.stage("drive BayesRace"):
-                driven = drives.drive_with(prepared.weights, "bayesrace") or driven
-            samples.append(drives.samples(driven))
-            with stages.stage("update the residual") as stage:
-                updated = this.update(samples, prepared.weights, FILES.weights_updated, stage)
-            with stages.stage("drive BayesRace-updated"):
-                accepted = drives.drive_with(updated, "bayesrace-updated") is not None
+            accepted = _learn(this, drives, samples, prepared.weights)
         if progress is not None:
-            weights = updated if accepted else prepared.weights
-            with drives.controller(progress, "bayesrace-limit", weights):
-                _approach_limit(this, drives, samples, weights)
+            with drives.controller(progress, "bayesrace-limit", accepted):
+                _approach_limit(this, drives, samples, accepted or prepared.weights)
         for best in perfect:
             with drives.controller(best, "bestcase"), stages.stage("drive BestCase"):
                 drives.drive("bestcase")
+
+
+def _prepared(this: _Race) -> Prepared:
+    """What the race needs, with the limits beside it."""
+    settings, stages = this.settings, this.stages
+    if not (settings.limit and settings.built_in):
+        return this.prepare()
+    with limits_beside(settings, this.car_file, this.out) as wait:
+        prepared = this.prepare()
+        with stages.stage(f"limit, {prepared.first.track.name}"):
+            wait()
+    return prepared
+
+
+def _learn(this: _Race, drives: _Drives, samples: list[Dataset], weights: Path) -> Path | None:
+    """WorstCase, BayesRace and BayesRace-updated; returns the last weights that the controller has
+    accepted, None without any."""
+    stages = this.stages
+    with stages.stage("drive WorstCase"):
+        driven = drives.drive("worstcase")
+    with stages.stage("drive BayesRace"):
+        first = drives.drive_with(weights, "bayesrace")
+    samples.append(drives.samples(first or driven))
+    with stages.stage("update the residual") as stage:
+        updated = this.update(samples, weights, FILES.weights_updated, stage)
+    with stages.stage("drive BayesRace-updated"):
+        if drives.drive_with(updated, "bayesrace-updated") is not None:
+            return updated
+    return weights if first is not None else None
 
 
 def _approach_limit(this: _Race, drives: _Drives, samples: list[Dataset], weights: Path) -> None:

@@ -20,7 +20,7 @@ from codegen.settings import BuildSettings
 from operation import race as driving
 from operation.analysis.race import analyse
 from operation.analysis.results import RaceResult, read_result
-from operation.preparation import updated_weights
+from operation.preparation import Prepared, prepare, updated_weights
 from operation.settings import RaceSettings
 from operation.terminal.progress import stages_on
 from tests.car_fmu import packed_car
@@ -177,19 +177,28 @@ def test_the_weights_are_swapped_in_the_running_controller(peanut_race: Race) ->
     assert (peanut_race.out / "controller-bayesrace.log").read_text().count("plant at") == 1
 
 
+def absurd(weights: Path, path: Path) -> Path:
+    vx, vy, omega = (read := read_weights(weights)).outputs
+    write_weights(path, replace(read, outputs=(vx, vy, replace(omega, alpha=1e4 * omega.alpha))))
+    return path
+
+
+@pytest.mark.parametrize("all_refused", [False, pytest.param(True, marks=pytest.mark.check)])
 def test_a_refusal_is_a_row_and_the_race_goes_on(
-    peanut_track: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    peanut_track: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, all_refused: bool
 ) -> None:
-    """The update has learned something absurd."""
+    """The update, or the first training, too, has learned something absurd."""
 
     def learn(*arguments: Any) -> Path:
-        vx, vy, omega = (weights := read_weights(updated_weights(*arguments))).outputs
-        absurd = replace(omega, alpha=1e4 * omega.alpha)
-        path = tmp_path / "absurd.bin"
-        write_weights(path, replace(weights, outputs=(vx, vy, absurd)))
-        return path
+        return absurd(updated_weights(*arguments), tmp_path / "updated.bin")
+
+    def prepared(*arguments: Any) -> Prepared:
+        found = prepare(*arguments)
+        return replace(found, weights=absurd(found.weights, tmp_path / "first.bin"))
 
     monkeypatch.setattr(driving, "updated_weights", learn)
+    if all_refused:
+        monkeypatch.setattr(driving, "prepare", prepared)
     track = str(peanut_track)
     settings = RaceSettings(track=track, train_track=track, laps=1, progress_drives=1)
     with stages_on(Console(quiet=True)) as stages:
@@ -198,9 +207,11 @@ def test_a_refusal_is_a_row_and_the_race_goes_on(
     *first, best = CONTROLLERS
     assert list(laps) == [*first, LIMIT, best]
     assert "absurd" in laps["bayesrace-updated"].refused
-    assert laps["bayesrace"].finished
-    # It begins with the weights that were accepted.
-    assert laps[LIMIT].weights_version == laps["bayesrace"].weights_version
+    assert ("absurd" in laps["bayesrace"].refused) is all_refused
+    assert laps["bayesrace"].finished is not all_refused
+    # It begins with the weights that were accepted, or without any.
+    accepted = "" if all_refused else laps["bayesrace"].weights_version
+    assert laps[LIMIT].weights_version == accepted
     assert laps["bestcase"].finished
 
 
