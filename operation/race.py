@@ -276,12 +276,12 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
 
 def _prepared(this: _Race) -> Prepared:
     """What the race needs, with the limits beside it."""
-    settings, stages = this.settings, this.stages
-    if not (settings.limit and settings.built_in):
+    settings = this.settings
+    if not settings.compares_limit:
         return this.prepare()
     with limits_beside(settings, this.car_file, this.out) as wait:
         prepared = this.prepare()
-        with stages.stage(f"limit, {prepared.first.track.name}"):
+        with this.stages.stage(f"limit, {prepared.first.track.name}"):
             wait()
     return prepared
 

@@ -134,8 +134,15 @@ class RaceSettings(PreparationSettings):
     )
     mpc: MpcSettings = MpcSettings()
     limit: bool = Field(
-        True, description="compare the laps of the built-in car with the fastest it can drive"
+        True,
+        description="compare the laps of the built-in car with the fastest it can drive; without "
+        "effect on linear tyres, which have no limit",
     )
+
+    @property
+    def compares_limit(self) -> bool:
+        """Whether there is a limit to compare laps with, and it is wanted."""
+        return self.limit and self.built_in and self.car.tyres.model != "linear"
 
     @property
     def progress_runs(self) -> int:

@@ -15,6 +15,7 @@ from bayesrace.limit.cached import limit
 from bayesrace.tracks import StartLine
 from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import command_limits, dynamic, top_command
+from operation.settings import RaceSettings
 from plant.simulator import Simulator, plant_discretisation
 from tests.command_line import Cli, refused
 from tests.test_raceline import circle, track_called
@@ -198,3 +199,11 @@ def test_the_command_prints_and_writes_it_and_keeps_it_in_the_cache(
 
 def test_a_start_speed_is_that_of_a_standing_lap(cli: Cli) -> None:
     refused(cli("limit", "paddock", "--start-speed", "1"), "--start-speed", "add --standing")
+
+
+def test_on_linear_tyres_it_is_said_to_be_no_limit_and_races_leave_it_out(cli: Cli) -> None:
+    assert "linear tyres have no limit" in cli("limit", "workshop", "--car", "f1tenth").out
+    car = get_car("f1tenth")
+    assert not RaceSettings(car=car).compares_limit
+    assert RaceSettings(car=car.on_tyres("pacejka")).compares_limit
+    assert not RaceSettings(car=CAR, limit=False).compares_limit

@@ -193,6 +193,8 @@ def _print_limit(result: RaceResult, console: Console) -> None:
     known = ", ".join(f"{kind} {time_s:.3f} s" for kind, time_s in result.limit_s.items())
     if not known and all(lap.off_track_ms is None for lap in result.laps):
         return
+    if not known and result.settings.tyres == "linear":
+        known = "linear tyres have no limit"
     known = known or "not known; 'bayesrace limit' computes it, or says why not"
     console.print(Text(f"\nThe fastest that the car can drive: {known}"))
     heads = "controller", "each lap over it", "off track\nms", "deepest\nm"
