@@ -29,7 +29,7 @@ _COMPASS: Final = ((1, 0), (0, 1), (-1, 0), (0, -1))
 
 
 def random_track(seed: int) -> Track:
-    """Circuit of 11 to 18 m, .37 to .46 m wide, with hairpins and bends both ways.
+    """Circuit of 11 to 18 m, 0.37 to 0.46 m wide, with hairpins and bends both ways.
 
     Candidates are drawn until one keeps clear of itself. Raises InputError for a negative seed.
     """

@@ -25,6 +25,7 @@ from controller.weights.adoption import Adoption, Offer, WeightsPort
 from controller.weights.settings import GateSettings
 from controller.weights.store import AcceptedWeights, StoreWriter, digest_of
 from controller.weights.supervisor import Supervisor
+from controller.weights.validator_client import ValidatorClient
 
 __all__ = ["WeightUpdateManager"]
 
@@ -42,10 +43,6 @@ _POLL_S: Final = 0.02
 """Between two looks at what is waited for: the control thread wakes no other thread."""
 _LOCKSTEP_POLL_S, _LOCKSTEP_S = 2e-4, 1.0
 """The same in lockstep, where the control loop waits for the watch; and how long after it has."""
-_PING_S: Final = 1.0
-"""From an answer of the validator to the next message at the latest."""
-_CHUNK: Final = 64
-"""States in a message: packing them takes 0.1 ms of the interpreter's lock."""
 
 _BEND: Final = 5.0
 """Wheelbases: radius of the bend that a car still takes at its limit where it is slowed down."""
@@ -88,17 +85,12 @@ class WeightUpdateManager:
             partial(self._warn, kind) for kind in ("validator_ended", "weights_not_kept")
         )
         self._supervisor = Supervisor(arguments, settings.hang_s, lost)
+        self._validator = ValidatorClient(self._supervisor, self.adoption, port.history, self._rule)
         self._writer: StoreWriter | None = None
         if port.store is not None:
             self._writer = StoreWriter(port.store, port.history, not_kept)
         self._adopted = Offer("")
         """The newest adoption; at first of the weights at the start."""
-        self._next, self._stale = 0, True
-        """First state that the validator has not been sent; whether it lacks what is in use."""
-        self._sent: Mapping[str, Any] = {}
-        self._check: bytes | None = None
-        self._verdict: Mapping[str, Any] = {}
-        """Of the file to check, by what is in use."""
         self._due_s = self._rolled_back_s = -math.inf
         """Monotonic clock: deadline of the request that is served, but for the store; and when the
         watch has rolled back."""
@@ -176,7 +168,7 @@ class WeightUpdateManager:
     def _run(self) -> None:
         while not self._stopping:
             try:
-                self._follow()
+                self._validator.follow()
                 self._serve(*self._waiting.get(timeout=self._poll_s))
             except Empty:
                 continue
@@ -256,61 +248,21 @@ class WeightUpdateManager:
             if self._stopping or time.monotonic() > until_s:
                 raise _RefusalError(_ENDS if self._stopping else why_not)
             time.sleep(self._poll_s)
-            self._follow()
+            self._validator.follow()
 
     # Validator -----------------------------------------------------------------------------------
 
     def _judge(self, data: bytes) -> Mapping[str, Any]:
         """The validator's verdict, by what is in use when it is given."""
-        validator, late = self._supervisor, "the validator has not answered in time"
-        self._check, self._verdict = data, {}
+        validator, late = self._validator, "the validator has not answered in time"
+        validator.check(data)
         try:
-            self._wait(lambda: self._verdict or validator.trouble, self._due_s, late)
+            self._wait(lambda: validator.verdict or self._supervisor.trouble, self._due_s, late)
         finally:
-            self._check = None
-        if not self._verdict:
-            raise _RefusalError(f"{validator.trouble}; send them again in a moment")
-        return self._verdict
-
-    def _follow(self) -> None:
-        """Exchanges messages with the validator, which is started or replaced if need be."""
-        validator = self._supervisor
-        if (answer := validator.receive()) is not None:
-            self._act_on(answer)
-        self.adoption.validator = validator.ready
-        if validator.idle and ((message := self._message()) or validator.age_s > _PING_S):
-            self._sent = message
-            validator.send(message)
-
-    def _message(self) -> dict[str, Any]:
-        """The next message to the validator; empty if there is nothing new."""
-        message: dict[str, Any] = {}
-        if states := self.adoption.states(self._next, _CHUNK):
-            message["states"], self._next = states, states[-1].number + 1
-        if self._stale and self._next >= self._adopted.states:
-            in_use, reference = self._history.in_use, self._history.reference
-            message["context"] = {
-                "in_use": in_use.data, "accepted_utc_ns": in_use.accepted_utc_ns,
-                "reference": reference.data, "watched": not in_use.proven,
-                "begin": self._adopted.states,
-            }  # fmt: skip
-            self._stale = False
-        if self._check is not None and not self._stale and len(states) < _CHUNK:
-            message["check"] = self._check
-        return message
-
-    def _act_on(self, answer: Mapping[str, Any]) -> None:
-        """Acts on an answer, unless it is about weights that are not in use any more."""
-        if not answer:  # the validator has just started
-            self._next, self._stale, self.adoption.allowed = 0, True, -1
-        elif not self._stale:
-            for ruling in answer["watch"]:
-                self._rule(*ruling)
-            if all(action == "slow" for action, *_ in answer["watch"]):  # the watch goes on
-                self.adoption.allowed = math.inf if answer["seen"] is None else answer["seen"]
-        sent = self._sent.get("check")
-        if sent is not None and sent is self._check and not self._stale:
-            self._check, self._verdict = None, answer["verdict"]
+            validator.check(None)
+        if not validator.verdict:
+            raise _RefusalError(f"{self._supervisor.trouble}; send them again in a moment")
+        return validator.verdict
 
     @property
     def _poll_s(self) -> float:
@@ -390,7 +342,7 @@ class WeightUpdateManager:
 
     def _keep(self) -> StoreWriter | None:
         """Has the validator sent what is in use, and the store written."""
-        self._stale = True
+        self._validator.renew(self._adopted.states)
         if self._writer:
             self._writer.write()
         return self._writer
