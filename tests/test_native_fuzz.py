@@ -64,17 +64,30 @@ def linked(objects: dict[str, Path], program: Path) -> Path:
     return program
 
 
+def objects_of(artefact: Path, folder: Path) -> dict[str, Path]:
+    """Object files by name, those under test with the coverage that guides the driver."""
+    sources = [*sorted(artefact.glob("*.c")), SOURCES / "fuzz.c"]
+    out = {s.stem: compiled(s, artefact, folder / f"{s.stem}.o", COVERAGE) for s in sources}
+    main = SOURCES / "fuzz_main.c"
+    return out | {main.stem: compiled(main, artefact, folder / "fuzz_main.o")}
+
+
 @pytest.fixture(scope="module")
 def objects(small: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Object files by name, those under test with the coverage that guides the driver."""
-    folder = tmp_path_factory.mktemp("fuzz")
-    sources = [*sorted(small.glob("*.c")), SOURCES / "fuzz.c"]
-    out = {s.stem: compiled(s, small, folder / f"{s.stem}.o", COVERAGE) for s in sources}
-    main = SOURCES / "fuzz_main.c"
-    return out | {main.stem: compiled(main, small, folder / "fuzz_main.o")}
+    """Those of the tracking problem."""
+    return objects_of(small, tmp_path_factory.mktemp("fuzz"))
 
 
 def test_no_input_breaks_a_promise(objects: dict[str, Path], tmp_path: Path) -> None:
+    no_input_breaks_a_promise(objects, tmp_path)
+
+
+def test_nor_of_the_problem_that_maximises_progress(tmp_path: Path) -> None:
+    progress = BuildSettings(problem="progress", horizon=6, gp_capacity=16)
+    no_input_breaks_a_promise(objects_of(build(progress)[0], tmp_path), tmp_path)
+
+
+def no_input_breaks_a_promise(objects: dict[str, Path], tmp_path: Path) -> None:
     program, crash = linked(objects, tmp_path / "fuzz"), tmp_path / "crash.bin"
     done = ran([program, "3000", SEED, crash])
     assert done.returncode == 0, f"input left in {crash}\n{done.stderr[-4000:]}"

@@ -140,6 +140,7 @@ def test_prepared_steps_are_the_same_to_the_bit(
         assert prepared.step(x, d, environment=slow) is plain.step(x, d, environment=slow)
         assert result(prepared) == result(plain)
         prepared.prepare()
+        assert prepared.read_reference().tobytes() == plain.read_reference().tobytes()
         d, x = float(plain.u[0]), plant(x, plain.u)
 
 

@@ -162,7 +162,7 @@ BR_API br_mpc_error br_mpc_predict(const br_mpc *mpc, const double x[BR_NX], con
 BR_API br_mpc_error br_mpc_rehearse(br_mpc *mpc);
 
 /* Plan of the last step, row major: x (BR_N + 1) x BR_NX, u BR_N x BR_NU; NULL for what is not
- * wanted. br_mpc_prepare does not change it. */
+ * wanted; and the stage parameters that it was made with. br_mpc_prepare changes neither. */
 BR_API br_mpc_error br_mpc_get_plan(const br_mpc *mpc, double *x, double *u);
 BR_API br_mpc_error br_mpc_get_reference(const br_mpc *mpc, br_mpc_reference reference[BR_N]);
 

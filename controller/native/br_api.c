@@ -68,7 +68,7 @@ br_mpc_error br_mpc_get_plan(const br_mpc *mpc, double *x, double *u) {
 
 br_mpc_error br_mpc_get_reference(const br_mpc *mpc, br_mpc_reference reference[BR_N]) {
     if (!mpc || !reference) return BR_ERROR_NULL;
-    memcpy(reference, mpc->reference, sizeof mpc->reference);
+    memcpy(reference, mpc->answer_reference, sizeof mpc->answer_reference);
     return BR_OK;
 }
 

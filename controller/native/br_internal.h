@@ -194,6 +194,7 @@ struct br_mpc {
     br_plan kept;       /* the plan, and the QP's working set, before those shifts */
     int kept_sense[BR_ROWS];
     double answer_x[BR_N + 1][BR_NX], answer_u[BR_N][BR_NU]; /* plan of the last step */
+    br_mpc_reference answer_reference[BR_N];                 /* what it was made with */
     br_timer timer;
     br_stage stage[BR_N];
     BR_ALIGNED br_gp_row kernels[BR_NE * BR_GP_BLOCKS * BR_N]; /* see br_gp_evaluate */

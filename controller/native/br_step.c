@@ -131,6 +131,7 @@ static void solve(br_mpc *mpc, double u[BR_NU], br_mpc_status *status, br_mpc_in
     mpc->unfinished = unfinished ? mpc->unfinished + mpc->info.iterations : 0;
     memcpy(mpc->answer_x, mpc->plan.x, sizeof mpc->answer_x);
     memcpy(mpc->answer_u, mpc->plan.u, sizeof mpc->answer_u);
+    memcpy(mpc->answer_reference, mpc->reference, sizeof mpc->answer_reference);
     mpc->info.status = *status;
     if (info) *info = mpc->info;
 }

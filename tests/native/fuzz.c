@@ -90,6 +90,10 @@ static const br_mpc_parameters usual = {
     .d_max = 1,
     .delta_max_rad = 0.35,
     .delta_rate_max_radps = 5,
+#if BR_FOLLOWS_PLAN
+    .q_contour = 0.1,
+    .gain = 2.5,
+#endif
     .tolerance = 1e-6,
     .defect_max = 0.1,
     .early_stop_tol = 1e-4,
