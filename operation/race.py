@@ -256,6 +256,7 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
     if settings.progress_runs:
         with stages.stage("build the controller that maximises progress"):
             progress = progress_artefact(settings)
+            shutil.copyfile(progress / MANIFEST, out / "manifest-progress.json")
     about = {"race": {"settings": settings.model_dump_json()}}
     with (
         started_system(this.car.name, out, this.plant_options, this.both_options) as system,

@@ -177,9 +177,13 @@ def test_file_round_trip(tmp_path: Path) -> None:
     again = read_limit(path)
     for field in fields(LimitLap):
         np.testing.assert_array_equal(getattr(again, field.name), getattr(lap, field.name))
-    path.write_text("\n".join(path.read_text().splitlines()[8:]))
-    with pytest.raises(InputError, match="does not say which limit it is"):
-        read_limit(path)
+    text = path.read_text()
+    said = f"# lap_s: {lap.lap_s}"
+    assert said in text
+    for damaged in ("\n".join(text.splitlines()[8:]), text.replace(said, "# lap_s: nan")):
+        path.write_text(damaged)
+        with pytest.raises(InputError, match="does not say which limit it is"):
+            read_limit(path)
 
 
 def test_the_command_prints_and_writes_it_and_keeps_it_in_the_cache(

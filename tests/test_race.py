@@ -219,7 +219,8 @@ def test_the_run_directory_is_whole(peanut_race: Race) -> None:
     names = {path.name for path in peanut_race.out.iterdir()}
     wanted = {"settings.json", "run.mcap", "result.json", "report.html", "collect.mcap"}
     assert wanted <= names
-    assert {"manifest-e_kinematic.json", "manifest-dynamic.json"} <= names
+    manifests = {f"manifest-{one}.json" for one in ("e_kinematic", "progress", "dynamic")}
+    assert manifests <= names
     assert not [name for name in names if ".part" in name]
 
 

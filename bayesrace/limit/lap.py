@@ -4,6 +4,7 @@ Columns :data:`COLUMNS`; lines with # are comments, and those of the form ``# ke
 the limit is and how well it is known.
 """
 
+import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -69,6 +70,8 @@ def read_limit(path: Path | str) -> LimitLap:
     values = {match[1]: match[2] for match in found if match}
     try:
         about = {key: kind(values[key]) for key, kind in _KEYS.items()}
+        if not (0 < about["lap_s"] < math.inf):
+            raise ValueError
     except (KeyError, ValueError):
         raise InputError(
             f"{path} does not say which limit it is; write it anew with 'bayesrace limit'"
