@@ -20,6 +20,7 @@ from studies.paper.finding import Finding, at_most
 from studies.paper.kernels import kernel_section, smoothness
 from studies.paper.make import DRIVES, PaperSettings
 from studies.paper.models import model_section
+from studies.paper.residual import gains
 from tests.command_line import Cli, refused
 from tests.driven import CAR, drive
 from tests.programs import peanut
@@ -44,6 +45,15 @@ def test_a_verdict_follows_from_the_numbers(ours: float, word: str) -> None:
 def test_without_anything_to_compare_with_the_sentence_says_why() -> None:
     found = Finding("lap", "7.797 s", "6.972 s", "ours is shorter", None, "another track")
     assert (found.verdict, found.sentence) == ("not compared", "Not compared: another track.")
+
+
+def test_an_update_that_has_little_left_to_gain_says_so() -> None:
+    """Published: 0.08, 0.02, 0.001."""
+    for first, reason in ((0.01, "has left less error"), (0.03, "visits fewer states")):
+        correction, update = gains("vy", (0.08, 0.02, 0.001), (0.08, first, 0.005))
+        assert correction.holds
+        assert update.sentence.startswith("Differs")
+        assert reason in update.sentence
 
 
 def test_the_models_diverge_as_in_the_paper() -> None:
