@@ -126,7 +126,8 @@ class RaceSettings(PreparationSettings):
         ge=0,
         le=20,
         description="runs of bayesrace-limit, which maximises progress, each after the first with "
-        "weights learned from all before; None: 3, but none on linear tyres, which have no limit",
+        "weights learned from all before; None: 3, but none on linear tyres, which have no limit, "
+        "and with slipx, where they leave the track",
     )
     mode: Literal["lockstep", "realtime"] = Field("lockstep", description="time mode of the runs")
     time_limit: float = Field(
@@ -165,7 +166,6 @@ class RaceSettings(PreparationSettings):
         object.__setattr__(self, "pursuit", seeded)
         object.__setattr__(self, "track", self.track or self.car.race_track)
         if self.progress_drives is None:
-            object.__setattr__(
-                self, "progress_drives", 0 if self.car.tyres.model == "linear" else 3
-            )
+            without = self.car.tyres.model == "linear" or self.simulator != "equations"
+            object.__setattr__(self, "progress_drives", 0 if without else 3)
         return self

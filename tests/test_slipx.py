@@ -111,6 +111,12 @@ def test_only_its_own_car_is_simulated_and_by_one_simulator(cli: Cli, tmp_path: 
         RaceSettings(car=CAR, simulator="slipx", true_grip=0.9)
 
 
+def test_races_do_not_maximise_progress_unless_asked() -> None:
+    assert RaceSettings(car=CAR, simulator="slipx").progress_runs == 0
+    assert RaceSettings(car=CAR, simulator="slipx", progress_drives=1).progress_runs == 1
+    assert RaceSettings(car=CAR).progress_runs == 3
+
+
 def test_a_state_that_is_no_number_is_a_fault_and_the_last_good_one_stays() -> None:
     with open_vehicle(CAR, simulator="slipx") as vehicle:
         assert isinstance(vehicle, SlipxSimulator)

@@ -69,7 +69,7 @@ def race(
             metavar="N",
             min=0,
             max=20,
-            show_default="3; 0 on linear tyres",
+            show_default="3; 0 on linear tyres and with slipx",
             help="Runs of bayesrace-limit, which maximises progress, with an update between them.",
         ),
     ] = None,
