@@ -266,7 +266,17 @@ static inline const double *br_theta(const br_mpc_parameters *parameters) {
     return (const double *)parameters; /* the problem's come first, all of them doubles */
 }
 
-/* br_qp.c: condensing and the QP of one SQP iteration */
+/* Whole vectors that cover columns 0..n-1 of a BR_MP-wide row; the rest of a row is zero. */
+static inline int br_padded(int n) { return (n + 7) & ~7; }
+
+/* br_condense.c */
+void br_condense_states(br_mpc *mpc); /* the sensitivities of all states, into qp.g */
+/* Into qp.h, with this share of the second-order part of dynamics and rows. */
+void br_condense_hessian(br_mpc *mpc, double tau);
+/* At dU = 0, into qp.gradient; and the change of the states there, into qp.xbar. */
+void br_condense_gradient(br_mpc *mpc, double tau);
+
+/* br_qp.c: the QP of one SQP iteration */
 void br_qp_init(br_qp *qp);
 void br_qp_factorise(br_mpc *mpc);
 br_mpc_status br_qp_condense(br_mpc *mpc);

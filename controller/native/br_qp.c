@@ -1,5 +1,5 @@
-/* The QP of one SQP iteration: condensed to the inputs, turned into a least-distance problem,
- * solved by DAQP's dual active-set method, warm started.
+/* The QP of one SQP iteration, condensed to the inputs by br_condense.c: turned into a
+ * least-distance problem, solved by DAQP's dual active-set method, warm started.
  *
  *   min 1/2 dU' H dU + g' dU   s.t.  lower <= A dU <= upper
  *
@@ -61,182 +61,6 @@ void br_qp_shift_rows(void *rows, size_t size) {
     memmove(at, at + BR_NU * size, (BR_M - BR_NU) * size);
     at += BR_M * size;
     for (int r = 0; r < BR_NR; ++r, at += BR_N * size) memmove(at, at + size, (BR_N - 1) * size);
-}
-
-/* Whole vectors that cover columns 0..n-1 of a BR_MP-wide row; the rest of a row is zero. */
-static inline int padded(int n) { return (n + 7) & ~7; }
-
-/* out[c] (+)= sum_n weight_n rows[n][c] for whole vectors of columns. */
-static inline __attribute__((always_inline)) void combine(double *restrict out, const int columns,
-                                                          const int add, const int count,
-                                                          const double *restrict weight,
-                                                          const double *const *restrict rows) {
-    for (int c = 0; c < columns; c += BR_LANES) {
-        br_vec sum = add ? br_load(&out[c]) : br_splat(0.0);
-        for (int n = 0; n < count; ++n) sum += weight[n] * br_load(&rows[n][c]);
-        br_store(&out[c], sum);
-    }
-}
-
-/* G_{k+1} = [A_k G_k, B_k] */
-static void propagate_sensitivity(double (*restrict next)[BR_MP], double (*restrict g)[BR_MP],
-                                  const br_stage *stage, int k) {
-    const int columns = padded(BR_NU * k);
-    BR_UNROLL
-    for (int i = 0; i < BR_NX; ++i) {
-        double weight[BR_NX];
-        const double *rows[BR_NX];
-        int count = 0;
-        BR_UNROLL
-        for (int n = BR_A_START[i]; n < BR_A_START[i + 1]; ++n, ++count) {
-            weight[count] = stage->jacobian[i][BR_A_INDEX[n]];
-            rows[count] = g[BR_A_INDEX[n]];
-        }
-        combine(next[i], columns, 0, count, weight, rows);
-        BR_UNROLL
-        for (int c = 0; c < BR_NU; ++c) next[i][BR_NU * k + c] = stage->jacobian[i][BR_NX + c];
-    }
-}
-
-/* Change of the states under dU = 0: the measured state and the defects. */
-static void propagate_state(br_mpc *mpc) {
-    br_qp *qp = &mpc->qp;
-    for (int i = 0; i < BR_NX; ++i) qp->xbar[0][i] = mpc->x0[i] - mpc->plan.x[0][i];
-    for (int k = 0; k < BR_N; ++k) {
-        const br_stage *stage = &mpc->stage[k];
-        for (int i = 0; i < BR_NX; ++i) {
-            double sum = stage->f[i] - mpc->plan.x[k + 1][i];
-            for (int j = 0; j < BR_NX; ++j) sum += stage->jacobian[i][j] * qp->xbar[k][j];
-            qp->xbar[k + 1][i] = sum;
-        }
-    }
-}
-
-/* One step of the backward recursion for the Hessian's rows of stage k, columns of inputs <= k:
- * H_k = B' P + S G_k,  P <- A' P + (W + second derivatives of cost and rows) G_k, the second-order
- * part of dynamics and rows with the weight tau. */
-static void hessian_rows(br_mpc *mpc, int k, double tau, double (*restrict p)[BR_MP],
-                         double (*restrict p_next)[BR_MP]) {
-    br_qp *qp = &mpc->qp;
-    const br_stage *stage = &mpc->stage[k];
-    const int columns = padded(BR_NU * (k + 1)), before = padded(BR_NU * k);
-    double (*restrict g)[BR_MP] = qp->g[k];
-    double weight[2 * BR_NX];
-    const double *rows[2 * BR_NX];
-    BR_UNROLL
-    for (int r = 0; r < BR_NU; ++r) {
-        double *restrict row = qp->h[BR_NU * k + r];
-        int count = 0;
-        BR_UNROLL
-        for (int n = BR_BT_START[r]; n < BR_BT_START[r + 1]; ++n, ++count) {
-            weight[count] = stage->jacobian[BR_BT_INDEX[n]][BR_NX + r];
-            rows[count] = p[BR_BT_INDEX[n]];
-        }
-        combine(row, columns, 0, count, weight, rows);
-        count = 0;
-        BR_UNROLL
-        for (int n = BR_WUX_START[r]; n < BR_WUX_START[r + 1]; ++n, ++count) {
-            weight[count] = tau * stage->hessian[BR_NX + r][BR_WUX_INDEX[n]];
-            rows[count] = g[BR_WUX_INDEX[n]];
-        }
-        combine(row, before, 1, count, weight, rows);
-        BR_UNROLL
-        for (int c = 0; c < BR_NU; ++c)
-            row[BR_NU * k + c] += tau * stage->hessian[BR_NX + r][BR_NX + c];
-    }
-    if (k == 0) return;
-    BR_UNROLL
-    for (int i = 0; i < BR_NX; ++i) {
-        int count = 0;
-        BR_UNROLL
-        for (int n = BR_AT_START[i]; n < BR_AT_START[i + 1]; ++n, ++count) {
-            weight[count] = stage->jacobian[BR_AT_INDEX[n]][i];
-            rows[count] = p[BR_AT_INDEX[n]];
-        }
-        BR_UNROLL
-        for (int n = BR_WXX_START[i]; n < BR_WXX_START[i + 1]; ++n, ++count) {
-            weight[count] = tau * stage->hessian[i][BR_WXX_INDEX[n]];
-            rows[count] = g[BR_WXX_INDEX[n]];
-        }
-        combine(p_next[i], before, 0, count, weight, rows);
-    }
-    br_stage_curvature *second = &qp->second[k - 1];
-    BR_UNROLL
-    for (int n = 0; n < BR_CXX_NNZ; ++n) {
-        rows[0] = g[BR_CXX_COLUMN[n]];
-        combine(p_next[BR_CXX_ROW[n]], before, 1, 1, &second->cost_xx[n], rows);
-    }
-    BR_UNROLL
-    for (int n = 0; n < BR_RXX_NNZ; ++n) {
-        weight[0] = tau * second->rows_xx[n];
-        rows[0] = g[BR_RXX_COLUMN[n]];
-        combine(p_next[BR_RXX_ROW[n]], before, 1, 1, weight, rows);
-    }
-}
-
-static void condense_hessian(br_mpc *mpc, double tau) {
-    br_qp *qp = &mpc->qp;
-    const br_stage_curvature *final = &qp->second[BR_N - 1];
-    memset(qp->costate[0], 0, sizeof qp->costate[0]);
-    for (int n = 0; n < BR_CXX_NNZ; ++n)
-        for (int c = 0; c < BR_MP; ++c)
-            qp->costate[0][BR_CXX_ROW[n]][c] +=
-                final->cost_xx[n] * qp->g[BR_N][BR_CXX_COLUMN[n]][c];
-    for (int n = 0; n < BR_RXX_NNZ; ++n)
-        for (int c = 0; c < BR_MP; ++c)
-            qp->costate[0][BR_RXX_ROW[n]][c] +=
-                tau * final->rows_xx[n] * qp->g[BR_N][BR_RXX_COLUMN[n]][c];
-    for (int k = BR_N - 1, side = 0; k >= 0; --k, side = !side)
-        hessian_rows(mpc, k, tau, qp->costate[side], qp->costate[!side]);
-    for (int k = 0; k < BR_N; ++k) {
-        const int i = BR_NU * k;
-        for (int a = 0; a < BR_NU; ++a) qp->h[i + a][i + a] += BR_INPUT_PROXIMAL[a];
-        for (int a = 0; a < BR_NU; ++a)
-            for (int b = 0; b < BR_NU; ++b) {
-                const double later =
-                    k + 1 < BR_N ? qp->second[k + 1].uu[BR_NU + a][BR_NU + b] : 0.0;
-                qp->h[i + a][i + b] += qp->second[k].uu[a][b] + later;
-                if (k) qp->h[i + a][i - BR_NU + b] += qp->second[k].uu[a][BR_NU + b];
-            }
-    }
-}
-
-/* Gradient of the QP at dU = 0 by the adjoint recursion along xbar. */
-static void condense_gradient(br_mpc *mpc, double tau) {
-    br_qp *qp = &mpc->qp;
-    double p[BR_NX] = {0};
-    for (int k = BR_N; k >= 0; --k) {
-        double next[BR_NX] = {0};
-        if (k < BR_N) {
-            const br_stage *stage = &mpc->stage[k];
-            const double *dx = qp->xbar[k];
-            BR_UNROLL
-            for (int c = 0; c < BR_NU; ++c) {
-                double sum =
-                    qp->terms[k].in_u[c] + (k + 1 < BR_N ? qp->terms[k + 1].in_u_before[c] : 0.0);
-                for (int j = 0; j < BR_NX; ++j) sum += stage->jacobian[j][BR_NX + c] * p[j];
-                BR_UNROLL
-                for (int n = BR_WUX_START[c]; n < BR_WUX_START[c + 1]; ++n)
-                    sum += tau * stage->hessian[BR_NX + c][BR_WUX_INDEX[n]] * dx[BR_WUX_INDEX[n]];
-                qp->gradient[BR_NU * k + c] = sum;
-            }
-            BR_UNROLL
-            for (int i = 0; i < BR_NX; ++i) {
-                BR_UNROLL
-                for (int n = BR_AT_START[i]; n < BR_AT_START[i + 1]; ++n)
-                    next[i] += stage->jacobian[BR_AT_INDEX[n]][i] * p[BR_AT_INDEX[n]];
-                BR_UNROLL
-                for (int n = BR_WXX_START[i]; n < BR_WXX_START[i + 1]; ++n)
-                    next[i] += tau * stage->hessian[i][BR_WXX_INDEX[n]] * dx[BR_WXX_INDEX[n]];
-            }
-        }
-        if (k) {
-            BR_UNROLL
-            for (int i = 0; i < BR_NX; ++i) next[i] += qp->terms[k - 1].in_x[i];
-            br_add_curvature(&qp->second[k - 1], tau, qp->xbar[k], next);
-        }
-        memcpy(p, next, sizeof p);
-    }
 }
 
 /* Cholesky factor L' of the lower triangle, into the upper one: there, rows are eliminated in whole
@@ -302,7 +126,7 @@ static void fill_sensitivities(br_qp *qp, const int first, const int last) {
                     r < BR_NR_EARLY ? BR_ROW_CONSTANT[BR_NX * r + i] : qp->terms[k].gradient[n];
                 sensitivity[count] = qp->g[k + 1][i];
             }
-            combine(row, padded(BR_NU * (k + 1)), 0, count, weight, sensitivity);
+            br_combine(row, br_padded(BR_NU * (k + 1)), 0, count, weight, sensitivity);
             for (int c = 0; c < BR_NU * (k + 1); ++c) qp->y[c][BR_ROW(r, k)] = row[c];
         }
 }
@@ -351,9 +175,9 @@ void br_qp_factorise(br_mpc *mpc) {
     qp->factorised = 0;
     br_sqp_curve(mpc);
     br_evaluate_curvature(mpc);
-    for (int k = 0; k < BR_N; ++k) propagate_sensitivity(qp->g[k + 1], qp->g[k], &mpc->stage[k], k);
+    br_condense_states(mpc);
     for (int attempt = 0; attempt < 4; ++attempt) {
-        condense_hessian(mpc, curvature[attempt]);
+        br_condense_hessian(mpc, curvature[attempt]);
         if (!cholesky(qp)) continue;
         qp->curvature = curvature[attempt];
         qp->regularised = attempt > 0;
@@ -368,8 +192,7 @@ br_mpc_status br_qp_condense(br_mpc *mpc) {
     br_evaluate_terms(mpc);
     if (!qp->factorised || (BR_CURVATURE_LATE && !mpc->follows)) br_qp_factorise(mpc);
     if (!qp->factorised) return BR_NOT_FINITE; /* a convex cost alone is positive definite */
-    propagate_state(mpc);
-    condense_gradient(mpc, qp->curvature);
+    br_condense_gradient(mpc, qp->curvature);
     mpc->info.regularised += qp->regularised;
     return BR_CONVERGED;
 }

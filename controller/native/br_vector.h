@@ -88,4 +88,15 @@ static inline br_vec br_exp2_negative(br_vec x) {
     return br_exp2_near(br_select(x < floor_, floor_, x));
 }
 
+/* out[c] (+)= sum_n weight_n rows[n][c] for whole vectors of columns. */
+static inline __attribute__((always_inline)) void
+br_combine(double *restrict out, const int columns, const int add, const int count,
+           const double *restrict weight, const double *const *restrict rows) {
+    for (int c = 0; c < columns; c += BR_LANES) {
+        br_vec sum = add ? br_load(&out[c]) : br_splat(0.0);
+        for (int n = 0; n < count; ++n) sum += weight[n] * br_load(&rows[n][c]);
+        br_store(&out[c], sum);
+    }
+}
+
 #endif
