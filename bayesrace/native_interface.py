@@ -40,6 +40,12 @@ SOLVER: Final = (
         ">= 0",
     ),
     (
+        "caution_sigmas",
+        "double",
+        "standard deviations of the residual by which rows are tightened; 0: none",
+        ">= 0",
+    ),
+    (
         "iterations",
         "int",
         "SQP iterations a step without budget may use, once the defect is below 0.01",
@@ -79,6 +85,8 @@ INFO: Final = (
     ),
     ("cost", "double", "objective at the returned plan, slack included"),
     ("slack_max_m", "double", "largest violation of a soft constraint"),
+    ("tube_m", "double", "half the width that uncertainty takes of a soft constraint, the largest"),
+    ("pace", "double", "of the reference, as a share of the line's speed; 1 where all is known"),
     ("s_ref_m", "double", "projection of the car on the racing line"),
     ("lateral_m", "double", "distance of the car from the racing line, positive left"),
 )
@@ -236,7 +244,7 @@ COUNTERS: Final = (
 )
 """What a control cycle has counted: name, type, meaning."""
 
-_FUNCTIONS: Final = 7
+_FUNCTIONS: Final = 8
 """Version of the functions in the public headers: increase it with each change of a signature."""
 
 _TABLES: Final = (

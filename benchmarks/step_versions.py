@@ -48,7 +48,8 @@ from controller.native_step import NativeStep
 from controller.settings import MpcSettings
 data = np.load(sys.argv[2])
 car = get_car(str(data["car"]))
-exact = MpcSettings(iterations=100, iterations_cold=100, tolerance=1e-10, early_stop_tol=0)
+known = {"caution": 0.0} if "caution" in MpcSettings.model_fields else {}
+exact = MpcSettings(**known, iterations=100, iterations_cold=100, tolerance=1e-10, early_stop_tol=0)
 def make(settings):
     step = NativeStep(build(BuildSettings(car=car.name))[0], car, settings)
     step.set_weights(decode_weights(data["weights"].tobytes()))
@@ -69,7 +70,7 @@ def solve(step, prepared=False):
         inputs.append(step.u.tolist())
         good.append(int(status))
     return times, preparation, inputs, good
-fast = make(MpcSettings())
+fast = make(MpcSettings(**known))
 solve(fast)
 print(json.dumps(solve(make(exact))[2:]), flush=True)
 for line in sys.stdin:

@@ -39,7 +39,7 @@ PATH_COLUMNS: Final = 7
 PATH_CAPACITY: Final = 8192
 """BR_PATH_CAPACITY there."""
 
-_SCHEMA: Final = 1
+_SCHEMA: Final = 2
 HEAD: Final = struct.Struct("<8sIIQQ")
 IDENTITY_BYTES: Final = 256
 
@@ -90,9 +90,8 @@ def weights_file(weights: GpWeights | None, identity: str, capacity: int) -> byt
         raise InputError(f"the model's identity '{identity}' is too long for a weights file")
     parts = [name.ljust(IDENTITY_BYTES, b"\0")]
     for output in weights.outputs:
-        scale = output.y_scale * output.signal_variance
         kernel = KERNELS.index(output.kernel)
-        parts.append(struct.pack("<IIdd", kernel, output.count, output.y_mean, scale))
+        parts.append(struct.pack("<IIdddd", kernel, output.count, *output.amplitudes))
         numbers = (output.length_scales, output.inputs, output.alpha)
         parts += [np.ascontiguousarray(array, dtype="<f8").tobytes() for array in numbers]
     return _file(b"BRFMGPWT", b"".join(parts), capacity)

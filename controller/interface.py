@@ -19,6 +19,7 @@ __all__ = ["NO_LIMITS", "NO_PLAN", "ControlLaw", "Controller", "Environment", "S
 NO_PLAN: Final[Floats] = np.zeros((0, 2))
 """``plan_u`` of a controller that does not look ahead."""
 
+_NO_TUBE: Final[Floats] = np.zeros(0)
 _NO_STATES: Final[Floats] = np.zeros((0, 7))
 
 
@@ -56,6 +57,9 @@ class StepOutput:
     cost_shifted: float = -1.0
     second_start: int = 0
     """As in :class:`bayesrace.messages.Telemetry`; -1 if there is none."""
+    tube_m: Floats = field(default_factory=lambda: _NO_TUBE)
+    """Shape (N,) or (0,): as in :class:`bayesrace.messages.Telemetry`."""
+    pace: float = 1.0
     s_ref_m: float = 0.0
     n_ref_m: float = 0.0
 

@@ -32,6 +32,7 @@ class PredictiveController:
             u=step.plan_u[0],
             plan_x=step.plan_x,
             plan_u=step.plan_u,
+            tube_m=step.tube,
             plan_step_s=step.manifest.step_s,
         )
 
@@ -74,6 +75,7 @@ class PredictiveController:
         info = StepInfo.from_address(self.artefact.library.br_cycle_info(cycle))
         output = self._output
         self.native.read_plan()
+        self.native.read_tube()
         # Acceptable and converged may both be driven; the residuals below distinguish them.
         output.status = 0 if StepStatus(info.status).usable else info.status
         output.iterations = info.iterations
@@ -83,6 +85,7 @@ class PredictiveController:
         output.cost = info.cost
         output.cost_shifted = info.shifted_cost if info.shifts >= 0 else -1.0
         output.second_start = info.second_start
+        output.pace = info.pace
         output.s_ref_m = info.s_ref_m
         output.n_ref_m = info.lateral_m
         return output

@@ -99,6 +99,8 @@ class Gp(ct.Structure):
         ("n", ct.c_int),
         ("offset", ct.c_double),
         ("scale", ct.c_double),
+        ("signal", ct.c_double),
+        ("noise", ct.c_double),
         ("length_scales", ct.c_void_p),
         ("inputs", ct.c_void_p),
         ("alpha", ct.c_void_p),
@@ -134,6 +136,8 @@ class StepInfo(ct.Structure):
     shifted_cost: float
     cost: float
     slack_max_m: float
+    tube_m: float
+    pace: float
     s_ref_m: float
     lateral_m: float
 
@@ -230,6 +234,8 @@ def _declare(library: ct.CDLL) -> None:
         "mpc_predict": [pointer, pointer, pointer, real, pointer],
         "mpc_get_plan": [pointer] * 3,
         "mpc_get_reference": [pointer] * 2,
+        "mpc_get_tube": [pointer] * 2,
+        "mpc_variance": [pointer] * 3,
         "mpc_evaluate": [pointer] * 6,
         "mpc_memory_size": [],
         "mpc_error_text": [whole],

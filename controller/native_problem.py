@@ -70,6 +70,8 @@ class NativeProblem:
         self._info_address = ct.addressof(self.info)
         self.plan_x = np.zeros((n + 1, self._nx))
         self.plan_u = np.zeros((n, self._nu))
+        self.tube = np.zeros(n)
+        self._tube_address = _address(self.tube)
         self._plan_addresses = _address(self.plan_x), _address(self.plan_u)
         self._u_held_address = _address(self._u_held)
         self._predicted_address = _address(self._predicted)
@@ -243,11 +245,28 @@ class NativeProblem:
         self._library.br_mpc_get_plan(self._mpc, *self._plan_addresses)
         return self.plan_x, self.plan_u
 
+    def read_tube(self) -> Floats:
+        """How uncertain the stages of the last plan are, (N,): :attr:`StepOutput.tube_m`. In a
+        buffer that the next call overwrites."""
+        self._library.br_mpc_get_tube(self._mpc, self._tube_address)
+        return self.tube
+
     def read_reference(self) -> Reference:
         """The stage parameters of the last step, (N, np)."""
         rows = np.zeros(self._reference_shape)
         self._library.br_mpc_get_reference(self._mpc, _address(rows))
         return rows
+
+    def variance(self, v: Floats) -> Floats:
+        """Posterior variance of the residual's outputs at v = [x; u] (nv,), noise included."""
+        v = np.ascontiguousarray(v, dtype=np.float64)
+        if v.shape != (self._nx + self._nu,):
+            raise InputError(f"variance takes v ({self._nx + self._nu},), not {v.shape}")
+        variance = np.zeros(self.manifest.problem.outputs)
+        self._check(
+            self._library.br_mpc_variance(self._mpc, _address(v), _address(variance)), "variance"
+        )
+        return variance
 
     def evaluate(self, v: Floats, costate: Floats) -> tuple[Floats, Floats, Floats]:
         """Corrected model at v = [x; u] (nv,): x_next (nx,), J (nx, nv), H of lambda' x_next."""

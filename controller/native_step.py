@@ -2,6 +2,7 @@
 
 import ctypes as ct
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -60,12 +61,15 @@ class NativeStep(NativeProblem):
         self._check(error, "weights")
 
 
+_HEAD: Final = 6
+"""Numbers of an output before its arrays."""
+
+
 def pack_weights(weights: GpWeights | None) -> bytes:
     """The arrays of the weights, for :func:`unpack_weights`; None: no correction."""
     packed = b""
     for output in () if weights is None else weights.outputs:
-        scale = output.y_scale * output.signal_variance
-        head = np.array([KERNELS.index(output.kernel), output.count, output.y_mean, scale])
+        head = np.array([KERNELS.index(output.kernel), output.count, *output.amplitudes])
         for part in (head, output.length_scales, output.inputs, output.alpha):
             packed += part.tobytes()
     return packed
@@ -76,10 +80,11 @@ def unpack_weights(packed: bytes) -> "ct.Array[Gp]":
     outputs = (Gp * len(OUTPUTS))()
     numbers, at = np.frombuffer(packed), 0
     for target in outputs if packed else ():
-        kernel, count, target.offset, target.scale = numbers[at : at + 4]
+        kernel, count, *amplitudes = numbers[at : at + _HEAD]
+        target.offset, target.scale, target.signal, target.noise = amplitudes
         target.kernel, target.n = int(kernel), int(count)
-        target.length_scales = numbers.ctypes.data + 8 * (at + 4)
+        target.length_scales = numbers.ctypes.data + 8 * (at + _HEAD)
         target.inputs = target.length_scales + 8 * len(FEATURES)
         target.alpha = target.inputs + 8 * len(FEATURES) * target.n
-        at += 4 + len(FEATURES) * (1 + target.n) + target.n
+        at += _HEAD + len(FEATURES) * (1 + target.n) + target.n
     return outputs

@@ -1,8 +1,9 @@
 """Run-time settings of the OCP (paper, equation 8) and of the SQP that solves it."""
 
+from statistics import NormalDist
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from bayesrace.native_interface import SOLVER
 from bayesrace.vehicles import CarParameters
@@ -29,6 +30,14 @@ class MpcSettings(BaseModel):
     margin_m: float | None = Field(
         None, ge=0, description="distance kept from the track edges [m]; the car's without"
     )
+    caution: float = Field(
+        0.95,
+        ge=0,
+        lt=1,
+        description="probability of each plan's stage to stay on the track that uncertainty of "
+        "the learned model leaves, from 0.5 on; 0: the paper's controller, which takes the "
+        "model's mean for the truth",
+    )
     tolerance: float = Field(1e-6, gt=0, description="KKT residual of a converged step")
     defect_max: float = Field(
         0.03, gt=0, description="largest dynamics defect (m, rad, m/s, 10 rad/s) of a usable plan"
@@ -54,6 +63,18 @@ class MpcSettings(BaseModel):
         description="the same after a reset; with a time budget the larger limits every step",
     )
 
+    @field_validator("caution")
+    @classmethod
+    def _cautious_or_not(cls, value: float) -> float:
+        if 0 < value < 0.5:
+            raise ValueError("is a probability from 0.5 on, or 0 for none")
+        return value
+
+    @property
+    def caution_sigmas(self) -> float:
+        """Standard deviations of a normal distribution that :attr:`caution` amounts to."""
+        return NormalDist().inv_cdf(self.caution) if self.caution else 0.0
+
     def parameters(self, car: CarParameters, problem: str = "tracking") -> dict[str, float]:
         """Run-time parameters of the problem and settings of its solver, by name."""
         tuning = car.tuning.objective.model_dump(exclude={"horizon"})
@@ -64,5 +85,6 @@ class MpcSettings(BaseModel):
         values = tuning | stated
         if not self.constraints:
             values["s_slack"] = 0.0
+        values["caution_sigmas"] = self.caution_sigmas
         limits = ("d_min", "d_max", "delta_max_rad", "delta_rate_max_radps")
         return values | {name: getattr(car, name) for name in limits}

@@ -64,6 +64,8 @@ def telemetry_of(
         delay_s=decision.delay_s,
         plan_x=_finite(output.plan_x),
         plan_u=_finite(output.plan_u),
+        tube_m=_finite(output.tube_m),
+        pace=output.pace,
         residual_dynamics=_known(output.residual_dynamics),
         residual_bounds=_known(output.residual_bounds),
         residual_stationarity=_known(output.residual_stationarity),

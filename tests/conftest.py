@@ -47,6 +47,7 @@ SETTINGS = MpcSettings(
     s_slack=100.0,
     constraints=True,
     margin_m=0.0,
+    caution=0.0,
     tolerance=1e-6,
     defect_max=0.1,
     early_stop_tol=0.0,
@@ -235,8 +236,7 @@ def native_numbers(settings: MpcSettings, car: CarParameters, weights: GpWeights
     names = [*(one.name for one in problem.parameters), *(name for name, *_ in SOLVER)]
     parts: list[ArrayLike] = [[values[name] for name in names]]
     for output in weights.outputs:
-        scale = output.y_scale * output.signal_variance
-        parts.append([KERNELS.index(output.kernel), output.count, output.y_mean, scale])
+        parts.append([KERNELS.index(output.kernel), output.count, *output.amplitudes])
         parts += [output.length_scales, output.inputs.ravel(), output.alpha]
     return np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
 

@@ -13,6 +13,7 @@ from bayesrace.vehicles.models import dynamic
 from controller.assembly import compiled_controller
 from controller.cycle_settings import CompensationSettings
 from controller.process_settings import ControllerSettings
+from controller.settings import MpcSettings
 from operation.closed_loop import ClosedLoop, Driven
 from plant.lockstep import CarRun
 from plant.sensors import SensorNoise, Sensors
@@ -76,7 +77,7 @@ def test_a_delay_is_measured_and_compensated_in_lockstep_too(
         how = compensation or CompensationSettings()
         settings = ControllerSettings(car=car, compensation=how)
         controller = compiled_controller(
-            kinematic_artefact, car, circuit.track, circuit.line, weights
+            kinematic_artefact, car, circuit.track, circuit.line, weights, MpcSettings(caution=0.0)
         )
         loop = ClosedLoop(
             car, circuit.track, circuit.line, controller, settings=settings, delay_s=delay_s

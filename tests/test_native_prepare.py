@@ -23,11 +23,11 @@ def result(step: NativeStep) -> bytes:
     step.read_plan()
     names = ("iterations", "qp_iterations", "regularised", "shortened", "shifts", "cost")
     numbers = [float(getattr(step.info, name)) for name in (*names, "stationarity", "defect")]
-    parts = (step.u, step.plan_x, step.plan_u, np.array(numbers))
+    parts = (step.u, step.plan_x, step.plan_u, step.read_tube(), np.array(numbers))
     return b"".join(part.tobytes() for part in parts)
 
 
-@pytest.mark.parametrize("changes", [{}, DEFAULTS])
+@pytest.mark.parametrize("changes", [{}, DEFAULTS, DEFAULTS | {"caution": 0.95}])
 def test_prepared_steps_are_the_same_to_the_bit(
     make: Make, recorded: list[Problem], changes: dict[str, float]
 ) -> None:

@@ -158,6 +158,16 @@ class GpOutput:
         """Number of training points, n."""
         return len(self.alpha)
 
+    @property
+    def amplitudes(self) -> tuple[float, float, float, float]:
+        """What the native mean and variance are made with, SI units: offset, scale of the mean,
+        variance of the function (0 without a training point: a correction that is known) and of
+        the noise."""
+        square = self.y_scale**2
+        known = self.signal_variance * square if self.count else 0.0
+        scale = self.y_scale * self.signal_variance
+        return self.y_mean, scale, known, self.noise_variance * square
+
 
 _Outputs = tuple[InstanceOf[GpOutput], InstanceOf[GpOutput], InstanceOf[GpOutput]]
 

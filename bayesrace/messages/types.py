@@ -133,7 +133,7 @@ class Actuation(Message):
 class Telemetry(Message):
     """Plan, residuals and timing of one control cycle, on ``bayesrace/{car}/telemetry``."""
 
-    SCHEMA: ClassVar[int] = 2
+    SCHEMA: ClassVar[int] = 3
 
     run: Count
     state_seq: Count
@@ -165,6 +165,12 @@ class Telemetry(Message):
     """Predicted states row by row, N + 1 rows of 7, to 1e-6; empty without a prediction."""
     plan_u: Annotated[tuple[float, ...], Vector(2, rows=500, names=_INPUT)]
     """Planned inputs row by row, N rows of 2, to 1e-6."""
+    tube_m: Annotated[tuple[float, ...], Vector(1, rows=500)]
+    """By how much the car may be off to either side at the plan's stages 1 to N, at the probability
+    that the controller is set to, because its model is uncertain; empty without a prediction."""
+    pace: Annotated[float, Real(0.0, 1.0)]
+    """Speed of the reference as a share of the racing line's; below 1 where the model is too
+    uncertain about the plan."""
     residual_dynamics: Annotated[float, Real(-1.0, 1e12)]
     """Largest dynamics defect of the plan; -1: unknown or not finite (as below)."""
     residual_bounds: Annotated[float, Real(-1.0, 1e12)]

@@ -21,6 +21,7 @@ from bayesrace.vehicles.parts import GRAVITY_MPS2, Part
 __all__ = [
     "REFERENCE_ACCELERATION_MPS2",
     "REFERENCE_WHEELBASE_M",
+    "CautionTuning",
     "DrivingTuning",
     "GateTuning",
     "ObjectiveTuning",
@@ -214,6 +215,37 @@ class ProgressTuning(_Section):
         return self.model_dump(exclude={"horizon", "proximal_duty", "proximal_delta_rate"})
 
 
+class CautionTuning(_Section):
+    """What the controller does about the uncertainty of its model: controller/native/br_caution.c.
+
+    The sizes of deviations and efforts are those that the feedback about a plan weighs equally.
+    """
+
+    position_m: float = _number(0.1, LENGTH, "deviation of a coordinate [m]")
+    heading_rad: float = _number(1.0, NONE, "deviation of the heading [rad]")
+    speed_mps: float = _number(1.0, SPEED, "deviation of a velocity [m/s]")
+    yaw_rate_radps: float = _number(10.0, YAW_RATE, "deviation of the yaw rate [rad/s]")
+    steering_rad: float = _number(1.0, NONE, "deviation of the steering angle [rad]")
+    command: float = _number(1.0, COMMAND, "effort of the drive command [command]")
+    steering_rate_radps: float = _number(3.0, YAW_RATE, "effort of the steering rate [rad/s]")
+    share: float = _number(
+        0.5,
+        NONE,
+        "of half the track's width that uncertainty may take before the car slows down [-]",
+    )
+    slower_ps: float = _number(
+        2.5, YAW_RATE, "speed of the reference then falls at this rate [1/s]"
+    )
+    faster_ps: float = _number(0.5, YAW_RATE, "and rises again at this one [1/s]")
+    least: float = _number(0.5, NONE, "share of the line's speed that is never undercut [-]")
+
+    @property
+    def pace(self) -> list[tuple[str, float]]:
+        """The numbers that the controller's planner is compiled with."""
+        names = {"share": "share", "slower": "slower_ps", "faster": "faster_ps", "least": "least"}
+        return [(key, getattr(self, name)) for key, name in names.items()]
+
+
 class PursuitTuning(_Section):
     """Pure pursuit, which drives for training data."""
 
@@ -302,6 +334,7 @@ class Tuning(_Section):
     scale: ScaleTuning
     objective: ObjectiveTuning
     progress: ProgressTuning
+    caution: CautionTuning
     pursuit: PursuitTuning
     gate: GateTuning
     driving: DrivingTuning

@@ -36,9 +36,17 @@ REFERENCE = (
 
 
 def _inputs(car: CarParameters, proximal: tuple[float, float]) -> tuple[Input, ...]:
+    effort = car.tuning.caution
     return (
-        Input("d", car.drive.unit, limit=1e3, proximal=proximal[0]),
-        Input("delta_rate", "rad/s", held=False, limit=1e3, proximal=proximal[1]),
+        Input("d", car.drive.unit, limit=1e3, proximal=proximal[0], effort=effort.command),
+        Input(
+            "delta_rate",
+            "rad/s",
+            held=False,
+            limit=1e3,
+            proximal=proximal[1],
+            effort=effort.steering_rate_radps,
+        ),
     )
 
 
@@ -62,22 +70,23 @@ def _parameters(car: CarParameters) -> tuple[Parameter, ...]:
 
 def _states(tuning: Tuning) -> tuple[State, ...]:
     """With the sizes by which defects are measured, and the largest plausible values."""
-    size, most = tuning.scale, tuning.plausible
+    size, most, off = tuning.scale, tuning.plausible, tuning.caution
     return (
-        State("x", "m", size.position_m, most.position_m),
-        State("y", "m", size.position_m, most.position_m),
-        State("psi", "rad", size.heading_rad, most.heading_rad),
-        State("vx", "m/s", size.speed_mps, most.speed_mps),
-        State("vy", "m/s", size.speed_mps, most.speed_mps),
-        State("omega", "rad/s", size.yaw_rate_radps, most.yaw_rate_radps),
-        State("delta", "rad", size.steering_rad, most.steering_rad),
+        State("x", "m", size.position_m, most.position_m, off.position_m),
+        State("y", "m", size.position_m, most.position_m, off.position_m),
+        State("psi", "rad", size.heading_rad, most.heading_rad, off.heading_rad),
+        State("vx", "m/s", size.speed_mps, most.speed_mps, off.speed_mps),
+        State("vy", "m/s", size.speed_mps, most.speed_mps, off.speed_mps),
+        State("omega", "rad/s", size.yaw_rate_radps, most.yaw_rate_radps, off.yaw_rate_radps),
+        State("delta", "rad", size.steering_rad, most.steering_rad, off.steering_rad),
     )
 
 
 def _planner(tuning: Tuning) -> dict[str, float]:
-    """What the planner in C is compiled with: see the sections path and turn of the tuning."""
+    """What the planner in C is compiled with: sections path, turn and caution of the tuning."""
     sections = {"path": tuning.path, "turn": tuning.turn}
-    return {f"{n}_{key}": value for n, one in sections.items() for key, value in one}
+    numbers = {f"{n}_{key}": value for n, one in sections.items() for key, value in one}
+    return numbers | {f"caution_{key}": value for key, value in tuning.caution.pace}
 
 
 def driving_problem(
@@ -130,7 +139,10 @@ def driving_problem(
         cost=cost,
         rows=(
             Row("steering angle", delta, -delta_max, delta_max),
-            Row("track", along, p["lower"] + margin, p["upper"] - margin, penalty=theta["s_slack"]),
+            Row(
+                "track", along, p["lower"] + margin, p["upper"] - margin,
+                penalty=theta["s_slack"], cautious=True,
+            ),
         ),
         u_lower=ca.vertcat(brake, -rate_max),
         u_upper=ca.vertcat(top_command(car, ca.sqrt(vx**2 + vy**2), d_max), rate_max),

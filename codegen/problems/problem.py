@@ -33,6 +33,9 @@ class State:
     """Size of a defect that counts as 1 in its norm."""
     limit: float = 1e6
     """A larger absolute value is no state of this system."""
+    deviation: float = 1.0
+    """What feedback about a plan weighs as much as a deviation of another component, or an
+    :attr:`Input.effort`."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,8 @@ class Input:
     """Beyond the end of a plan that is shifted: held, or zero."""
     limit: float = 1e6
     """A larger absolute value is no input of this system."""
+    effort: float = 1.0
+    """What feedback about a plan weighs as much as a :attr:`State.deviation`."""
     proximal: float = 0.0
     """Weight of half the squared change of this input in one QP. Not part of the cost: the plan
     that the iterations converge to is the same. For a cost that is linear in much of the plan."""
@@ -73,6 +78,8 @@ class Row:
     upper: ca.SX | float
     penalty: ca.SX | None = None
     """Weight of the squared violation, of theta alone; 0 switches the row off."""
+    cautious: bool = False
+    """Whether the residual's uncertainty tightens it; for soft rows only."""
 
     @property
     def soft(self) -> bool:
@@ -201,6 +208,8 @@ class Problem:
         if constant != sorted(constant, reverse=True):
             raise ValueError(f"problem '{self.name}': rows with constant gradients come first")
         for row, linear in zip(self.rows, constant, strict=True):
+            if row.cautious and not row.soft:
+                raise ValueError(f"row '{row.name}' is tightened: give it a penalty")
             if not (row.soft or linear):
                 # The line search weighs defects and soft rows alone.
                 raise ValueError(f"row '{row.name}' is not linear: give it a penalty")

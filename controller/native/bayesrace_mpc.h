@@ -61,6 +61,7 @@ typedef struct {
     int kernel; /* br_mpc_kernel */
     int n;      /* training points, at most BR_GP_CAPACITY */
     double offset, scale;
+    double signal, noise;        /* variances of the output and of its noise; signal 0: not known */
     const double *length_scales; /* BR_NZ */
     const double *inputs;        /* n x BR_NZ, row major */
     const double *alpha;         /* n */
@@ -76,8 +77,9 @@ BR_API br_mpc_error br_mpc_set_parameters(br_mpc *mpc, const br_mpc_parameters *
  * x, y, speed, left unit normal of the centreline (2), lower and upper bound of normal . p. */
 BR_API br_mpc_error br_mpc_set_path(br_mpc *mpc, const double *table, int n, double spacing_m);
 
-/* Copies the weights; the next step uses them. About 30 us per 400 points and output. What is
- * staged is forgotten. BR_ERROR_BUSY while another thread stages. */
+/* Copies the weights and, where signal is given, makes what the posterior variance needs; the next
+ * step uses them. Some 10 ms per 400 points and output. What is staged is forgotten. BR_ERROR_BUSY
+ * while another thread stages. */
 BR_API br_mpc_error br_mpc_set_weights(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]);
 
 /* The same in two parts, for a control loop that has no time to copy. br_mpc_stage_weights copies
@@ -166,7 +168,14 @@ BR_API br_mpc_error br_mpc_rehearse(br_mpc *mpc);
 BR_API br_mpc_error br_mpc_get_plan(const br_mpc *mpc, double *x, double *u);
 BR_API br_mpc_error br_mpc_get_reference(const br_mpc *mpc, br_mpc_reference reference[BR_N]);
 
+/* How uncertain the last step's plan is: for each stage, half the width that uncertainty takes of
+ * the rows that it tightens, the largest [the row's unit]. 0 without caution. */
+BR_API br_mpc_error br_mpc_get_tube(const br_mpc *mpc, double tube[BR_N]);
+
 /* --- for tests and tools --- */
+
+/* Posterior variance of the residual at v = [x; u], noise included; 0 where it is not known. */
+BR_API br_mpc_error br_mpc_variance(br_mpc *mpc, const double v[BR_NV], double variance[BR_NE]);
 
 /* Corrected model at v = [x; u]: x_next, J = d x_next / d v (row major) and
  * H = sum_i lambda_i d^2 x_next_i / d v^2. */

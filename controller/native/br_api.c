@@ -12,12 +12,13 @@ br_mpc_error br_mpc_init(void *memory, size_t size, br_mpc **out) {
     memset(mpc, 0, sizeof *mpc);
     br_qp_init(&mpc->qp);
     br_weights_init(mpc);
+    mpc->caution.pace = 1;
     *out = mpc;
     return BR_OK;
 }
 
 static int valid(const br_mpc_parameters *p) {
-    const double numbers[] = {p->tolerance, p->defect_max, p->early_stop_tol};
+    const double numbers[] = {p->tolerance, p->defect_max, p->early_stop_tol, p->caution_sigmas};
     return br_all_finite(numbers, sizeof numbers / sizeof numbers[0]) && BR_SOLVER_VALID(p) &&
            br_valid_parameters(p);
 }
@@ -55,6 +56,8 @@ void br_mpc_reset(br_mpc *mpc) {
     mpc->linearised = 0;
     mpc->ahead = mpc->prepared = mpc->prepared_iterations = 0;
     mpc->path.known = 0;
+    mpc->caution.known = mpc->caution.active = 0;
+    mpc->caution.pace = 1;
     mpc->turn = 0;
     mpc->attempts = mpc->starts = mpc->futile = mpc->looks = 0;
 }
@@ -69,6 +72,22 @@ br_mpc_error br_mpc_get_plan(const br_mpc *mpc, double *x, double *u) {
 br_mpc_error br_mpc_get_reference(const br_mpc *mpc, br_mpc_reference reference[BR_N]) {
     if (!mpc || !reference) return BR_ERROR_NULL;
     memcpy(reference, mpc->answer_reference, sizeof mpc->answer_reference);
+    return BR_OK;
+}
+
+br_mpc_error br_mpc_get_tube(const br_mpc *mpc, double tube[BR_N]) {
+    if (!mpc || !tube) return BR_ERROR_NULL;
+    memcpy(tube, mpc->answer_tube, sizeof mpc->answer_tube);
+    return BR_OK;
+}
+
+br_mpc_error br_mpc_variance(br_mpc *mpc, const double v[BR_NV], double variance[BR_NE]) {
+    if (!mpc || !v || !variance) return BR_ERROR_NULL;
+    double x[1][BR_NX], u[1][BR_NU], found[1][BR_NE];
+    memcpy(x, v, sizeof x);
+    memcpy(u, v + BR_NX, sizeof u);
+    br_stages_variances(&mpc->gp[mpc->gp_in_use], 1, x, u, mpc->caution.correlations, found);
+    memcpy(variance, found, sizeof found);
     return BR_OK;
 }
 

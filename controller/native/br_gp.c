@@ -23,39 +23,11 @@
 #include <math.h>
 
 #include "br_internal.h"
+#include "br_kernel.h"
 
 #define INLINE static inline __attribute__((always_inline))
 
-#define SQRT3 1.7320508075688772
-#define SQRT5 2.23606797749979
 #define NEAR_RBF 37 /* length scales: exp(-r^2 / 2) is above 2^-1000 */
-#define NEAR 1e-8   /* distance in length scales below which 1 / r would lose more than it adds */
-
-typedef struct {
-    br_vec k, g1, g2;
-} kernel_value;
-
-/* Of a Matern kernel. */
-INLINE kernel_value kernel(const int kind, br_vec r2) {
-    kernel_value v;
-    const br_vec inverse = br_inverse_root(r2), r = r2 * inverse;
-    if (kind == BR_KERNEL_MATERN05) {
-        v.k = br_exp2_negative(-BR_LOG2_E * r);
-        v.g1 = br_select(r > NEAR, -v.k * inverse, br_splat(0.0));
-        v.g2 = br_splat(0.0);
-    } else if (kind == BR_KERNEL_MATERN15) {
-        const br_vec e = br_exp2_negative(-SQRT3 * BR_LOG2_E * r);
-        v.k = (1.0 + SQRT3 * r) * e;
-        v.g1 = -3.0 * e;
-        v.g2 = br_select(r > NEAR, 3.0 * SQRT3 * e * inverse, br_splat(0.0));
-    } else {
-        const br_vec e = br_exp2_negative(-SQRT5 * BR_LOG2_E * r);
-        v.k = (1.0 + SQRT5 * r + (5.0 / 3.0) * r2) * e;
-        v.g1 = (-5.0 / 3.0) * (1.0 + SQRT5 * r) * e;
-        v.g2 = (25.0 / 3.0) * e;
-    }
-    return v;
-}
 
 /* Weights of one block of training points for one stage: slope = a g1 and bend = a g2. Returns what
  * the points add to the mean. */
@@ -72,7 +44,7 @@ INLINE br_vec weigh_by(const int kind, const br_gp_output *gp, const double q[BR
             r2 += t * t;
         }
         const br_vec alpha = br_load(&gp->alpha[i]);
-        const kernel_value v = kernel(kind, r2);
+        const br_kernel_value v = br_kernel(kind, r2);
         br_store(&slope[i - first], alpha * v.g1);
         br_store(&bend[i - first], alpha * v.g2);
         sum += alpha * v.k;
@@ -260,6 +232,8 @@ static int valid(const br_mpc_gp *in) {
     if (in->kernel < BR_KERNEL_RBF || in->kernel > BR_KERNEL_MATERN25) return 0;
     if (in->n < 0 || in->n > BR_GP_CAPACITY) return 0;
     if (!isfinite(in->offset) || !isfinite(in->scale)) return 0;
+    if (!(isfinite(in->signal) && in->signal >= 0 && isfinite(in->noise) && in->noise >= 0))
+        return 0;
     if (in->n == 0) return 1;
     if (!in->length_scales || !in->inputs || !in->alpha) return 0;
     for (int a = 0; a < BR_NZ; ++a)
@@ -311,11 +285,13 @@ static int load(br_gp_output *out, const br_mpc_gp *in) {
 br_mpc_error br_gp_load(br_gp *gp, const br_mpc_gp outputs[BR_NE]) {
     for (int j = 0; j < BR_NE; ++j)
         if (!valid(&outputs[j])) return BR_ERROR_WEIGHTS;
-    gp->any = 0;
+    gp->any = gp->uncertain = 0;
     for (int j = 0; j < BR_NE; ++j) {
         /* finite numbers may overflow once scaled: refused here, not found out while driving */
         if (!load(&gp->output[j], &outputs[j])) return BR_ERROR_WEIGHTS;
+        br_variance_load(&gp->output[j], &outputs[j], &gp->variance[j]);
         if (outputs[j].n || outputs[j].offset != 0.0) gp->any = 1;
+        if (outputs[j].signal > 0) gp->uncertain = 1;
     }
     return BR_OK;
 }

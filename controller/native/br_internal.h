@@ -31,6 +31,10 @@
 #define BR_GP_BLOCK 128     /* training points that are taken at a time: in the first-level cache */
 #define BR_GP_BLOCKS ((BR_GP_CAPACITY + BR_GP_BLOCK - 1) / BR_GP_BLOCK)
 #define BR_GP_PADDED (BR_GP_BLOCKS * BR_GP_BLOCK)
+/* Training points that the posterior variance is exact with: the memory for it grows with the
+ * square. */
+#define BR_GP_ROOT (BR_GP_CAPACITY < 512 ? (BR_GP_CAPACITY + 3) / 4 * 4 : 512)
+#define BR_COLUMNS 24                     /* stages whose correlations are at hand at a time */
 #define BR_GP_FIRST ((1 + BR_NZ + 7) / 8) /* groups of eight columns for 1 and the inputs ... */
 #define BR_GP_SECOND ((BR_NZ * (BR_NZ + 1) / 2 + 7) / 8) /* ... and for their products */
 
@@ -46,9 +50,19 @@ typedef struct {
     BR_ALIGNED double columns[BR_GP_FIRST + BR_GP_SECOND][BR_GP_PADDED][8];
 } br_gp_output;
 
+/* What the posterior variance of one output is made from: see br_variance.c. */
+typedef struct {
+    int kernel, count;    /* training points that count */
+    double signal, noise; /* variances; signal 0: not known */
+    double inputs[BR_NZ][BR_GP_ROOT];
+    BR_ALIGNED double root[BR_GP_ROOT][BR_GP_ROOT];
+} br_gp_variance;
+
 typedef struct {
     int any; /* 0 while every output is constant zero: WorstCase and BestCase skip the kernels */
+    int uncertain; /* the variance of an output is known */
     br_gp_output output[BR_NE];
+    br_gp_variance variance[BR_NE];
 } br_gp;
 
 /* Cost and constraints of one stage, at the state of its end: br_terms writes this. */
@@ -142,6 +156,17 @@ typedef struct {
     double residual, worth;
 } br_incumbent;
 
+/* What the residual's uncertainty does to the plan: see br_caution.c. */
+typedef struct {
+    int known;                            /* it belongs to the plan that the step starts with */
+    int active;                           /* there is an uncertainty to be cautious about */
+    double deviation[BR_N][BR_NE][BR_NX]; /* of the states at the ends of the stages */
+    double tube[BR_N];                    /* by how much the rows are uncertain, */
+    double share[BR_N];                   /* as a share of the room that they leave */
+    double pace;                          /* of the reference, as a share of the line's speed */
+    BR_ALIGNED double correlations[BR_GP_ROOT][BR_COLUMNS];
+} br_caution;
+
 /* Time within a call, by the host's clock. */
 typedef struct {
     br_mpc_clock clock; /* NULL: none */
@@ -181,6 +206,7 @@ struct br_mpc {
     int curved;        /* ... and so do its Hessians */
     unsigned attempts; /* steps without a usable plan since the last warm start that gave one */
     int unfinished;    /* iterations that BR_TIME_LIMIT has left without a usable plan */
+    double elapsed;    /* since the call before */
     double lag;        /* of the plan, without what br_mpc_prepare shifted, behind the last state */
     int ahead;         /* shifts that br_mpc_prepare did */
     int prepared, prepared_iterations;
@@ -195,7 +221,9 @@ struct br_mpc {
     int kept_sense[BR_ROWS];
     double answer_x[BR_N + 1][BR_NX], answer_u[BR_N][BR_NU]; /* plan of the last step */
     br_mpc_reference answer_reference[BR_N];                 /* what it was made with */
+    double answer_tube[BR_N];                                /* how uncertain it is */
     br_timer timer;
+    br_caution caution;
     br_stage stage[BR_N];
     BR_ALIGNED br_gp_row kernels[BR_NE * BR_GP_BLOCKS * BR_N]; /* see br_gp_evaluate */
     br_qp qp;
@@ -217,12 +245,24 @@ void br_gp_curvature(const br_gp *gp, int stages, double (*z)[BR_NZ], br_gp_row 
 void br_gp_mean(const br_gp *gp, const double z[BR_NZ], double mean[BR_NE]);
 br_mpc_error br_gp_load(br_gp *gp, const br_mpc_gp outputs[BR_NE]);
 
+/* br_variance.c */
+/* Of one output whose weights are loaded. */
+void br_variance_load(const br_gp_output *gp, const br_mpc_gp *in, br_gp_variance *v);
+/* Noise included, of several stages; 0 where it is not known. */
+void br_gp_variances(const br_gp *gp, int stages, double (*z)[BR_NZ], double (*work)[BR_COLUMNS],
+                     double (*variance)[BR_NE]);
+
+/* br_caution.c */
+void br_caution_update(br_mpc *mpc);
+void br_caution_tighten(br_mpc *mpc, int k, br_stage_terms *terms);
+void br_caution_pace(br_mpc *mpc, double elapsed);
+
 /* br_weights.c */
 void br_weights_init(br_mpc *mpc);
 
 /* br_planner.c */
 br_mpc_error br_path_load(br_path *path, const double *table, int n, double spacing);
-void br_path_plan(const br_path *path, br_mpc_reference reference[BR_N]);
+void br_path_plan(const br_path *path, double pace, br_mpc_reference reference[BR_N]);
 void br_path_project(br_path *path, const double x[BR_NX], double *lateral);
 #if BR_FOLLOWS_PLAN
 void br_path_follow(br_mpc *mpc);
@@ -242,6 +282,8 @@ void br_stages_linearise(const br_gp *gp, int stages, double (*x)[BR_NX], double
 /* Hessians of all linearised stages, at the same x and u; of each slot there is one. */
 void br_stages_curve(const br_gp *gp, int stages, double (*x)[BR_NX], double (*u)[BR_NU],
                      double (*lambda)[BR_NX], br_gp_row *kernels, br_stage *stage);
+void br_stages_variances(const br_gp *gp, int stages, double (*x)[BR_NX], double (*u)[BR_NU],
+                         double (*work)[BR_COLUMNS], double (*variance)[BR_NE]);
 void br_stage_next(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
                    double x_next[BR_NX]);
 void br_stage_advance(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],

@@ -155,13 +155,14 @@ static br_mpc_reference stage_at(const double row[BR_PATH_COLUMNS]) {
     };
 }
 
-/* Points to track: the recursion in the line's speed, from the car's projection on. */
-void br_path_plan(const br_path *path, br_mpc_reference reference[BR_N]) {
+/* Points to track: the recursion in the line's speed, of which pace is a share, from the car's
+ * projection on. */
+void br_path_plan(const br_path *path, double pace, br_mpc_reference reference[BR_N]) {
     double s = path->s, row[BR_PATH_COLUMNS];
     for (int k = 0; k < BR_N; ++k) {
         path_at(path, s, row);
         const double limit = path->speed_limit - k * BR_TS * path->speed_limit_rate;
-        s += BR_TS * fmax(fmin(row[SPEED], limit), 0);
+        s += BR_TS * fmax(fmin(pace * row[SPEED], limit), 0);
         path_at(path, s, row);
         reference[k] = stage_at(row);
     }

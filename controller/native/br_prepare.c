@@ -29,6 +29,7 @@ void br_undo_preparation(br_mpc *mpc) {
         mpc->plan = mpc->kept;
         memcpy(mpc->qp.sense, mpc->kept_sense, sizeof mpc->kept_sense);
         mpc->linearised = mpc->qp.factorised = mpc->qp.evaluated = mpc->followed = 0;
+        mpc->caution.known = 0;
     }
     mpc->ahead = 0;
 }
@@ -91,6 +92,7 @@ br_mpc_error br_mpc_prepare(br_mpc *mpc, double elapsed_s, double budget_s) {
     }
     br_align(mpc, br_shifts_due(&lag));
     br_path_follow(mpc);
+    br_caution_update(mpc);
     if (!mpc->qp.factorised) br_qp_factorise(mpc);
     mpc->prepared = mpc->qp.factorised;
     return BR_OK;

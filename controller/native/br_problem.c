@@ -31,6 +31,7 @@ void br_evaluate_terms(br_mpc *mpc) {
                                                    theta};
         casadi_real *res[br_terms_SZ_RES] = {(double *)&mpc->qp.terms[k]};
         br_terms(arg, res, iw, w, 0);
+        br_caution_tighten(mpc, k, &mpc->qp.terms[k]);
     }
 }
 

@@ -55,6 +55,7 @@ void br_sqp_roll_out(br_mpc *mpc, const double u[BR_NU]) {
 /* By one stage. */
 void br_sqp_shift(br_mpc *mpc) {
     const int last = BR_N - 1, free_slot = mpc->stage[0].slot;
+    mpc->caution.known = 0;
     memmove(mpc->plan.x, mpc->plan.x + 1, BR_N * sizeof mpc->plan.x[0]);
     memmove(mpc->plan.u, mpc->plan.u + 1, last * sizeof mpc->plan.u[0]);
     memmove(mpc->plan.costate, mpc->plan.costate + 1, BR_N * sizeof mpc->plan.costate[0]);

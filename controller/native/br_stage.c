@@ -91,6 +91,13 @@ void br_stages_linearise(const br_gp *gp, int stages, double (*x)[BR_NX], double
     }
 }
 
+void br_stages_variances(const br_gp *gp, int stages, double (*x)[BR_NX], double (*u)[BR_NU],
+                         double (*work)[BR_COLUMNS], double (*variance)[BR_NE]) {
+    double z[BR_N][BR_NZ];
+    for (int k = 0; k < stages; ++k) features(x[k], u[k], z[k]);
+    br_gp_variances(gp, stages, z, work, variance);
+}
+
 /* sum_j (F_e' lambda)_j d^2 mu_j / d z^2 of all stages, by slot. */
 static void residual_curvature(const br_gp *gp, int stages, double (*x)[BR_NX], double (*u)[BR_NU],
                                double (*lambda)[BR_NX], br_gp_row *kernels, const br_stage *stage,

@@ -19,11 +19,13 @@ static void begin_plan(br_mpc *mpc) {
         mpc->info.prepared = mpc->prepared && mpc->qp.factorised;
     } else {
         br_sqp_cold_start(mpc);
+        mpc->caution.known = 0;
         mpc->lag = mpc->unfinished = 0;
         mpc->info.shifts = -1;
     }
     mpc->ahead = mpc->prepared = 0;
     br_path_follow(mpc);
+    br_caution_update(mpc);
 }
 
 /* Another iteration would change little that matters until the next step, or, where the Hessian is
@@ -133,6 +135,8 @@ static void solve(br_mpc *mpc, double u[BR_NU], br_mpc_status *status, br_mpc_in
     memcpy(mpc->answer_u, mpc->plan.u, sizeof mpc->answer_u);
     memcpy(mpc->answer_reference, mpc->reference, sizeof mpc->answer_reference);
     mpc->info.status = *status;
+    mpc->caution.known = 0; /* the next step starts with another plan */
+    br_caution_pace(mpc, mpc->elapsed);
     if (info) *info = mpc->info;
 }
 
@@ -159,6 +163,7 @@ static br_mpc_error begin(br_mpc *mpc, const request *r, int *plausible) {
     if (r->info) *r->info = mpc->info;
     if (!mpc->has_parameters) return BR_ERROR_NOT_READY;
     if (!(r->elapsed_s >= 0 && isfinite(r->elapsed_s))) return BR_ERROR_TIME;
+    mpc->elapsed = r->elapsed_s;
     mpc->lag += r->elapsed_s;
     mpc->path.age += r->elapsed_s;
     *plausible = br_plausible_state(r->x) && plausible_input(r->u_before);
@@ -188,12 +193,13 @@ static int take_environment(br_mpc *mpc, const br_environment *environment) {
  * turn need them, and a slow car, which a turn may begin with. */
 static void plan_reference(br_mpc *mpc) {
 #if BR_FOLLOWS_PLAN
-    const int follows = !isfinite(mpc->path.speed_limit), before = mpc->follows;
+    const int follows = !isfinite(mpc->path.speed_limit) && mpc->caution.pace >= 1;
+    const int before = mpc->follows;
     mpc->follows = follows;
     if (follows && before && fabs(mpc->x0[BR_INDEX_VX]) >= BR_TURN_SLOW_MPS) return;
     mpc->followed = 0;
 #endif
-    br_path_plan(&mpc->path, mpc->reference);
+    br_path_plan(&mpc->path, mpc->caution.pace, mpc->reference);
     br_turnaround(mpc);
     if (mpc->turn) mpc->follows = 0;
 }

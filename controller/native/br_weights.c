@@ -21,7 +21,7 @@ static void hand_over(br_mpc *mpc, int owner) {
 static void exchange(br_mpc *mpc) {
     mpc->gp_in_use = !mpc->gp_in_use;
     br_undo_preparation(mpc); /* its new last stage was predicted with the weights before */
-    mpc->linearised = mpc->qp.factorised = 0;
+    mpc->linearised = mpc->qp.factorised = mpc->caution.known = 0;
 }
 
 br_mpc_error br_mpc_stage_weights(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]) {

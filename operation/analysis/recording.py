@@ -206,6 +206,12 @@ class Recording:
         except ValidationError as error:
             raise InputError(f"settings.json, discretisation: {faults_in(error)}") from None
 
+    @property
+    def caution(self) -> float:
+        """The probability that the controllers are cautious at; 0: they are not."""
+        value = self.settings.get("mpc", {}).get("caution", 0.0)
+        return float(value) if isinstance(value, int | float) else 0.0
+
     def run_of(self, controller: str) -> RunRecord | None:
         """The last run of that controller, None if it did not drive."""
         return next((run for run in reversed(self.runs) if run.plan.controller == controller), None)

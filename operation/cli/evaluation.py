@@ -12,6 +12,7 @@ from bayesrace.vehicles import DEFAULT_CAR
 from operation.cli.options import (
     Car,
     CarName,
+    Caution,
     ControlProblem,
     Delay,
     DriveTime,
@@ -77,6 +78,7 @@ def race(
     no_constraints: Annotated[
         bool, typer.Option("--no-constraints", help="OCP without track constraints.")
     ] = False,
+    caution: Caution = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -103,6 +105,7 @@ def race(
 
     from bayesrace.vehicles import get_car
     from controller.pure_pursuit import PurePursuitSettings
+    from controller.settings import MpcSettings
     from operation.analysis.race import read_race, write_result
     from operation.race import FILES
     from operation.race import race as drive_all
@@ -113,15 +116,16 @@ def race(
     from operation.terminal.terminal import Terminal
 
     driven = get_car(car) if tyres is None else get_car(car).on_tyres(tyres)
+    stated = {} if caution is None else {"caution": caution}
+    mpc = MpcSettings(constraints=not no_constraints, **stated)
     settings = RaceSettings(
         car=driven, track=track, train_track=train_track, laps=laps, mode=mode.value,
         pursuit=PurePursuitSettings(style=style), collect_s=train_time,
         seed=seed, fmu=fmu, fmu_map=fmu_map, simulator=simulator, delay_s=1e-3 * delay,
         noise=sensor_noise(noise), limit=not no_limit, problem=problem.value,
         progress_drives=progress_drives,
+        mpc=mpc,
     )  # fmt: skip
-    mpc = settings.mpc.model_copy(update={"constraints": not no_constraints})
-    settings = settings.model_copy(update={"mpc": mpc})
     out = out or Path("runs") / datetime.now(UTC).astimezone().strftime("%Y%m%d-%H%M%S")
     console = Terminal()
     with stages_on(console) as stages:

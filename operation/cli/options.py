@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AllSamples",
     "Car",
+    "Caution",
     "CarName",
     "Delay",
     "Endpoint",
@@ -99,6 +100,18 @@ ControlProblem = Annotated[
     ProblemChoice,
     typer.Option(
         metavar="PROBLEM", help="tracking: follow the line in its speed; progress: be fast."
+    ),
+]
+
+Caution = Annotated[
+    float | None,
+    typer.Option(
+        metavar="P",
+        min=0,
+        max=0.9999999,
+        show_default="0.95",
+        help="Probability to stay on the track that the model's uncertainty leaves, from 0.5 on; "
+        "0: as in the paper, none.",
     ),
 ]
 

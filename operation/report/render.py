@@ -23,6 +23,7 @@ from operation.report.maps import LapMaps
 from operation.report.style import figure_style, look
 from operation.report.timing import solve_figure
 from operation.report.traces import (
+    caution_figures,
     cornering_figures,
     deviation_figures,
     input_figures,
@@ -65,6 +66,7 @@ def render_report(run_dir: Path, result: RaceResult, analysis: RaceAnalysis | No
         limit_sigma=UNCERTAIN,
         laps_compared=compare_laps(result),
         gp_compared=compare_gp(result),
+        caution=analysis.recording.caution,
         source=SOURCE,
         limit=LIMIT,
         title=f"{result.settings.track} · {analysis.track.length_m:.2f} m",
@@ -153,6 +155,7 @@ def _figures(analysis: RaceAnalysis, result: RaceResult, picture: Path) -> dict[
             figures["inputs"] = input_figures(driven, track, analysis.recording.car)
             figures["cornering"] = cornering_figures(driven, track, result.settings.friction)
             figures["deviation"] = deviation_figures(driven, track)
+            figures["caution"] = caution_figures(driven, track)
         data = analysis.best_case
         if data is not None and analysis.validations:
             progress = track.project_path(data.x[:, :2]).progress_m

@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bayesrace.arrays import Floats
+from bayesrace.messages import Telemetry
 from bayesrace.raceline import RaceLine
 from bayesrace.tracks import Track
 from bayesrace.vehicles import CarParameters
@@ -18,6 +19,7 @@ from operation.report.laps import Lap, first_laps, flying_laps, reference_of
 from operation.report.style import INK, MUTED, look
 
 __all__ = [
+    "caution_figures",
     "cornering_figures",
     "deviation_figures",
     "input_figures",
@@ -148,6 +150,38 @@ def cornering_figures(
 def _held(u: Floats) -> Floats:
     """One value a state: the last state's input is not known, it keeps the one before."""
     return np.append(u, u[-1:]) if len(u) else np.zeros(1)
+
+
+def caution_figures(runs: Sequence[DrivenRun], track: Track) -> list[Figure]:
+    """What the uncertainty of the model does on the first lap: how far off the plan's last stage
+    may be, and the speed that the reference is left with. Nothing if there was no caution."""
+    laps = [
+        lap
+        for lap in first_laps(runs, track)
+        if any(any(one.tube_m) or one.pace < 1 for one in lap.run.record.telemetry)
+    ]
+    rows: list[tuple[str, str, Callable[[Telemetry], float]]] = [
+        ("uncertainty at the end of the plan", "either side [m]", lambda one: _last(one.tube_m)),
+        ("speed of the reference", "share of the line's", lambda one: one.pace),
+    ]
+    figures = []
+    for title, label, value in rows if laps else ():
+        figure, axes = _panel(track, title, label)
+        for lap in laps:
+            _plot(axes, lap, _of_states(lap.run, value)[lap.rows])
+        axes.set_ylim(0, None)
+        figures.append(figure)
+    return figures
+
+
+def _last(tube_m: tuple[float, ...]) -> float:
+    return tube_m[-1] if tube_m else 0.0
+
+
+def _of_states(run: DrivenRun, value: Callable[[Telemetry], float]) -> Floats:
+    """A value of each state's cycle; NaN where there was none."""
+    known = {one.state_seq: value(one) for one in run.record.telemetry}
+    return np.array([known.get(truth.seq, np.nan) for truth in run.record.truth])
 
 
 def deviation_figures(runs: Sequence[DrivenRun], track: Track) -> list[Figure]:

@@ -60,7 +60,7 @@ class Experiment:
         """
         line = replace(self._line, vx_mps=speed * self._line.vx_mps)
         artefact = self._artefacts[controller == "bestcase"]
-        mpc = MpcSettings(constraints=constraints)
+        mpc = MpcSettings(constraints=constraints, caution=0.0)
         law = compiled_controller(artefact, self.car, self.track, line, weights, mpc)
         record = RunRecord(PlannedRun(1, controller, law.weights_version))
         with TemporaryDirectory() as folder:

@@ -97,6 +97,7 @@ static const br_mpc_parameters usual = {
     .tolerance = 1e-6,
     .defect_max = 0.1,
     .early_stop_tol = 1e-4,
+    .caution_sigmas = 1.6,
     .iterations = 3,
     .iterations_cold = 12,
 };
@@ -142,9 +143,10 @@ static void set_weights(controller *c, int count) {
     for (int j = 0; j < BR_NE; ++j) {
         const uint8_t how = byte();
         outputs[j] =
-            (br_mpc_gp){how % 5,        how < 0xf8 ? (how >> 2) % (POINTS + 1) : how - 0xfb,
-                        number(0, 0.1), number(0.1, 1),
-                        scales[j],      inputs[j][0],
+            (br_mpc_gp){how % 5,          how < 0xf8 ? (how >> 2) % (POINTS + 1) : how - 0xfb,
+                        number(0, 0.1),   number(0.1, 1),
+                        number(0.1, 0.2), number(0.01, 0.02),
+                        scales[j],        inputs[j][0],
                         alpha[j]};
         for (int a = 0; a < BR_NZ; ++a) scales[j][a] = number(1, 0.99);
         for (int i = 0; i < POINTS; ++i) {

@@ -3,11 +3,12 @@
  *   harness PROBLEMS RESULTS
  *
  * PROBLEMS, all doubles: spacing, rows, table; the parameters; per GP output kernel, n, offset,
- * scale, 6 length scales, n x 6 inputs, n alphas; steps, then per step x (7) and d_previous.
- * RESULTS: per step error, status, u (2). The first half goes one stage at a time, without budget;
- * the second adds other times, budgets by a clock that counts its readings, and spoiled references.
- * With -DCOUNT_ALLOCATIONS and the linker's --wrap, any allocation after br_mpc_init ends the
- * program with code 3. Code 1: a promise of the interface is broken (the line says which).
+ * scale, signal, noise, 6 length scales, n x 6 inputs, n alphas; steps, then per step x (7) and
+ * d_previous. RESULTS: per step error, status, u (2). The first half goes one stage at a time,
+ * without budget; the second adds other times, budgets by a clock that counts its readings, and
+ * spoiled references. With -DCOUNT_ALLOCATIONS and the linker's --wrap, any allocation after
+ * br_mpc_init ends the program with code 3. Code 1: a promise of the interface is broken (the line
+ * says which).
  */
 #include <math.h>
 #include <stdio.h>
@@ -86,6 +87,7 @@ static void read_weights(br_mpc_gp outputs[BR_NE]) {
         br_mpc_gp *gp = &outputs[j];
         gp->kernel = (int)next(), gp->n = (int)next();
         gp->offset = next(), gp->scale = next();
+        gp->signal = next(), gp->noise = next();
         gp->length_scales = take(BR_NZ);
         gp->inputs = take((size_t)gp->n * BR_NZ);
         gp->alpha = take((size_t)gp->n);

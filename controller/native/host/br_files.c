@@ -9,10 +9,10 @@
 #include "br_files.h"
 
 #define HEAD_BYTES 32
-#define SCHEMA 1
+#define SCHEMA 2
 #define LINE_BYTES 512
 #define WHOLE_MAX 1000
-#define GP_HEAD_BYTES (2 * 4 + (2 + BR_NZ) * 8)
+#define GP_HEAD_BYTES (2 * 4 + (4 + BR_NZ) * 8)
 #define PATH_BYTES_MAX (8 + (size_t)BR_PATH_CAPACITY * BR_PATH_COLUMNS * 8)
 #define WEIGHTS_BYTES_MAX \
     (BR_IDENTITY_BYTES + BR_NE * (GP_HEAD_BYTES + (size_t)BR_GP_CAPACITY * (BR_NZ + 1) * 8))
@@ -120,6 +120,8 @@ static int load_output(reader *r, br_mpc_gp *gp, double *numbers) {
     gp->n = (int)n;
     gp->offset = read_double(r);
     gp->scale = read_double(r);
+    gp->signal = read_double(r);
+    gp->noise = read_double(r);
     const size_t count = BR_NZ + (size_t)n * (BR_NZ + 1);
     if (r->left < count * 8) return wrong(r, "is cut off", ANEW);
     read_doubles(r, numbers, count);

@@ -5,15 +5,15 @@
  * says:
  *
  *   0   magic, 8 bytes: "BRFMPATH" or "BRFMGPWT"
- *   8   schema, u32: 1
+ *   8   schema, u32: 2
  *   12  body's length in bytes, u32
  *   16  FNV-1a hash (64 bit) of the body, u64
  *   24  training points per output that the controller has room for, u64: for tools, not read here
  *
  * Body of path.bin: spacing [m] f64, then rows of BR_PATH_COLUMNS f64, see br_mpc_set_path.
  * Body of weights.bin: identity of the discretised model, 256 bytes, zero padded; for each of the
- * BR_NE outputs kernel u32, points n u32, offset f64, scale f64, BR_NZ length scales f64, inputs
- * n x BR_NZ f64, alpha n f64, see br_mpc_gp.
+ * BR_NE outputs kernel u32, points n u32, offset, scale, signal, noise f64, BR_NZ length scales
+ * f64, inputs n x BR_NZ f64, alpha n f64, see br_mpc_gp.
  *
  * settings.txt: a line for each member of br_mpc_parameters and br_driving, its name and its
  * number, or its numbers, in the C locale; what comes after # is a comment. The limits of the

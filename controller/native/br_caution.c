@@ -1,0 +1,175 @@
+/* Caution: soft rows are tightened by what the residual's posterior does not know.
+ *
+ * The residual is one unknown function, and a posterior of smooth functions errs in the same
+ * direction for as long as the plan stays where it is uncertain. So the errors of a plan's stages
+ * are taken as fully correlated: with sigma_j(z_k) the standard deviation of output j at stage k, a
+ * deviation D_j of the states, which feedback works against, adds up along the plan,
+ *
+ *   D_j,k+1 = (A_k - B_k K_k) D_j,k + F_k,j sigma_j(z_k),   D_j,0 = 0
+ *
+ * F_k,j is what the residual's output does to the states. A row h <= upper becomes
+ * h + n |D_k' grad h| <= upper with n standard deviations. (Independent errors would add up to the
+ * root of the number of stages only, which is far too little: docs/decisions/2026-11-23-caution.md
+ * has the laps.) K is the gain of a linear quadratic regulator about the plan; the problem names
+ * the sizes of the deviations that it weighs equally.
+ *
+ * As in zero-order robust MPC (Zanelli, Frey, Messerer, Diehl, "Zero-order robust nonlinear model
+ * predictive control with ellipsoidal uncertainty sets", 2021) all of this belongs to the plan that
+ * the step starts with and is constant in it: it is done in the preparation.
+ */
+#include <math.h>
+
+#include "br_internal.h"
+
+/* A = Q + A' S (A - B K) with the gain K of one stage; S is overwritten. */
+static void riccati(const br_stage *stage, double s[BR_NX][BR_NX], double gain[BR_NU][BR_NX]) {
+    double sa[BR_NX][BR_NV] = {{0}}, r[BR_NU][BR_NU];
+    for (int i = 0; i < BR_NX; ++i)
+        for (int l = 0; l < BR_NX; ++l)
+            for (int j = 0; j < BR_NV; ++j) sa[i][j] += s[i][l] * stage->jacobian[l][j];
+    for (int a = 0; a < BR_NU; ++a) { /* B' S [A B] */
+        double row[BR_NV] = {0};
+        for (int l = 0; l < BR_NX; ++l)
+            for (int j = 0; j < BR_NV; ++j) row[j] += stage->jacobian[l][BR_NX + a] * sa[l][j];
+        memcpy(gain[a], row, sizeof gain[a]);
+        memcpy(r[a], row + BR_NX, sizeof r[a]);
+        r[a][a] += 1.0 / (BR_INPUT_EFFORT[a] * BR_INPUT_EFFORT[a]);
+    }
+    for (int a = 0; a < BR_NU; ++a) /* Gauss-Jordan: positive definite, no pivoting */
+        for (int b = 0; b < BR_NU; ++b) {
+            const double factor = r[b][a] / r[a][a];
+            if (b == a) continue;
+            for (int c = a; c < BR_NU; ++c) r[b][c] -= factor * r[a][c];
+            for (int j = 0; j < BR_NX; ++j) gain[b][j] -= factor * gain[a][j];
+        }
+    for (int a = 0; a < BR_NU; ++a)
+        for (int j = 0; j < BR_NX; ++j) gain[a][j] /= r[a][a];
+    for (int i = 0; i < BR_NX; ++i) { /* S (A - B K), then A' of that */
+        for (int j = 0; j < BR_NX; ++j)
+            for (int a = 0; a < BR_NU; ++a) sa[i][j] -= sa[i][BR_NX + a] * gain[a][j];
+    }
+    for (int i = 0; i < BR_NX; ++i)
+        for (int j = 0; j < BR_NX; ++j) {
+            double sum = i == j ? 1.0 / (BR_STATE_DEVIATION[i] * BR_STATE_DEVIATION[i]) : 0.0;
+            for (int l = 0; l < BR_NX; ++l) sum += stage->jacobian[l][i] * sa[l][j];
+            s[i][j] = sum;
+        }
+}
+
+/* Feedback about the plan, backwards from its end. */
+static void feedback(const br_mpc *mpc, double gain[BR_N][BR_NU][BR_NX]) {
+    double s[BR_NX][BR_NX] = {{0}};
+    for (int i = 0; i < BR_NX; ++i) s[i][i] = 1.0 / (BR_STATE_DEVIATION[i] * BR_STATE_DEVIATION[i]);
+    for (int k = BR_N - 1; k >= 0; --k) riccati(&mpc->stage[k], s, gain[k]);
+}
+
+/* One stage on: D of the output's error with this standard deviation. */
+static void propagate(const br_stage *stage, double gain[BR_NU][BR_NX], int output, double sigma,
+                      const double before[BR_NX], double after[BR_NX]) {
+    double u[BR_NU] = {0};
+    for (int a = 0; a < BR_NU; ++a)
+        for (int i = 0; i < BR_NX; ++i) u[a] -= gain[a][i] * before[i];
+    for (int i = 0; i < BR_NX; ++i) {
+        double sum = stage->in_e[i][output] * sigma;
+        for (int l = 0; l < BR_NX; ++l) sum += stage->jacobian[i][l] * before[l];
+        for (int a = 0; a < BR_NU; ++a) sum += stage->jacobian[i][BR_NX + a] * u[a];
+        after[i] = sum;
+    }
+}
+
+/* Of the residual at the plan's stages: of BR_COLUMNS evenly spread ones, between which they are
+ * interpolated, so that a long horizon takes no longer. */
+static void standard_deviations(br_mpc *mpc, double sigma[BR_N][BR_NE]) {
+    enum { COUNT = BR_N < BR_COLUMNS ? BR_N : BR_COLUMNS };
+    double x[COUNT][BR_NX], u[COUNT][BR_NU], variance[COUNT][BR_NE];
+    int stage[COUNT];
+    for (int i = 0; i < COUNT; ++i) {
+        stage[i] = COUNT > 1 ? i * (BR_N - 1) / (COUNT - 1) : 0;
+        memcpy(x[i], mpc->plan.x[stage[i]], sizeof x[i]);
+        memcpy(u[i], mpc->plan.u[stage[i]], sizeof u[i]);
+    }
+    br_stages_variances(&mpc->gp[mpc->gp_in_use], COUNT, x, u, mpc->caution.correlations, variance);
+    for (int i = 0; i < COUNT; ++i)
+        for (int j = 0; j < BR_NE; ++j) sigma[stage[i]][j] = sqrt(variance[i][j]);
+    for (int i = 1; i < COUNT; ++i)
+        for (int k = stage[i - 1] + 1; k < stage[i]; ++k) {
+            const double share = (k - stage[i - 1]) / (double)(stage[i] - stage[i - 1]);
+            for (int j = 0; j < BR_NE; ++j)
+                sigma[k][j] =
+                    sigma[stage[i - 1]][j] + share * (sigma[stage[i]][j] - sigma[stage[i - 1]][j]);
+        }
+}
+
+void br_caution_update(br_mpc *mpc) {
+    const br_gp *gp = &mpc->gp[mpc->gp_in_use];
+    br_caution *caution = &mpc->caution;
+    if (caution->known) return;
+    caution->known = 1;
+    const int was = caution->active;
+    caution->active = mpc->parameters.caution_sigmas > 0 && gp->uncertain;
+    if (was || caution->active) mpc->qp.evaluated = 0;
+    if (!caution->active) return;
+    double sigma[BR_N][BR_NE], gain[BR_N][BR_NU][BR_NX];
+    standard_deviations(mpc, sigma);
+    feedback(mpc, gain);
+    static const double none[BR_NX] = {0};
+    for (int k = 0; k < BR_N; ++k)
+        for (int j = 0; j < BR_NE; ++j)
+            propagate(&mpc->stage[k], gain[k], j, sigma[k][j],
+                      k ? caution->deviation[k - 1][j] : none, caution->deviation[k][j]);
+}
+
+/* By how much the row of this gradient is uncertain at the end of stage k, n standard deviations.
+ */
+static double doubt(const br_mpc *mpc, int k, int r, const double *gradient) {
+    double squares = 0;
+    for (int j = 0; j < BR_NE; ++j) {
+        double along = 0;
+        for (int n = BR_ROW_START[r]; n < BR_ROW_START[r + 1]; ++n)
+            along += gradient[n] * mpc->caution.deviation[k][j][BR_ROW_INDEX[n]];
+        squares += along * along;
+    }
+    return mpc->parameters.caution_sigmas * sqrt(squares);
+}
+
+/* The row's bounds, as near to each other as they may come: a tenth of what they were apart. */
+void br_caution_tighten(br_mpc *mpc, int k, br_stage_terms *terms) {
+    br_caution *caution = &mpc->caution;
+    caution->tube[k] = caution->share[k] = 0;
+    if (!caution->active || mpc->turn) return;
+    for (int r = 0; r < BR_NR; ++r) {
+        if (!BR_ROW_CAUTIOUS[r]) continue;
+        const double room = 0.5 * (terms->upper[r] - terms->lower[r]);
+        if (!(room > 0)) continue;
+        const double wanted = doubt(mpc, k, r, terms->gradient);
+        const double taken = fmin(wanted, 0.9 * room);
+        terms->lower[r] += taken;
+        terms->upper[r] -= taken;
+        caution->tube[k] = br_worse(caution->tube[k], wanted);
+        caution->share[k] = br_worse(caution->share[k], wanted / room);
+    }
+}
+
+/* After a step: how fast the next reference is to move along the line, so that the model knows
+ * enough of the plan to keep it on the track. The controller brakes and accelerates the reference
+ * no faster than the car can follow. */
+void br_caution_pace(br_mpc *mpc, double elapsed) {
+    br_caution *caution = &mpc->caution;
+    double worst = 0;
+    mpc->info.tube_m = 0;
+    for (int k = 0; k < BR_N; ++k) {
+        worst = br_worse(worst, caution->share[k]);
+        mpc->info.tube_m = br_worse(mpc->info.tube_m, caution->tube[k]);
+    }
+    memcpy(mpc->answer_tube, caution->tube, sizeof mpc->answer_tube);
+#if BR_HAS_PATH
+    const double excess = worst / BR_CAUTION_SHARE - 1;
+    const double rate = excess > 0 ? -BR_CAUTION_SLOWER * fmin(excess, 1)
+                                   : BR_CAUTION_FASTER * fmin(-2 * excess, 1);
+    const double pace = caution->pace * (1 + rate * fmin(elapsed, BR_TS));
+    caution->pace = caution->active ? fmin(fmax(pace, BR_CAUTION_LEAST), 1) : 1;
+#else
+    (void)elapsed;
+#endif
+    mpc->info.pace = caution->pace;
+}

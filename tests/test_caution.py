@@ -1,0 +1,207 @@
+"""Caution: the posterior variance, the tube that it makes of a plan, and what the car does then."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+from pydantic import ValidationError
+from rich.console import Console
+
+from bayesrace.arrays import Floats
+from bayesrace.gp.weights import KERNELS, GpOutput, GpWeights, read_weights
+from bayesrace.integrators import PREDICTION
+from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles.models import dynamic, e_kinematic
+from codegen.problems.tracking import tracking
+from controller.assembly import compiled_controller
+from controller.native_step import NativeStep
+from controller.settings import MpcSettings
+from learning.validation import predictive_sigma
+from operation.closed_loop import ClosedLoop, built_in_car
+from operation.preparation import prepare
+from operation.settings import RaceSettings
+from operation.terminal.progress import stages_on
+from tests.conftest import SETTINGS, Circuit, discrete, fit_weights, smooth_drive
+
+CAUTIOUS = SETTINGS.model_copy(update={"caution": 0.95})
+
+
+def first_points(output: GpOutput, count: int) -> GpOutput:
+    return replace(output, inputs=output.inputs[:count], alpha=output.alpha[:count])
+
+
+def ready(
+    artefact: Path,
+    car: CarParameters,
+    weights: GpWeights,
+    circuit: Circuit,
+    settings: MpcSettings = CAUTIOUS,
+) -> NativeStep:
+    step = NativeStep(artefact, car, settings)
+    step.set_weights(weights)
+    step.set_path(circuit.table)
+    return step
+
+
+@pytest.fixture
+def unsure(weights: GpWeights) -> GpWeights:
+    """Of a few points, far from which the posterior knows little."""
+    vx, vy, omega = (first_points(output, 12) for output in weights.outputs)
+    return replace(weights, outputs=(vx, vy, omega))
+
+
+@pytest.mark.parametrize("kind", KERNELS)
+@pytest.mark.parametrize("count", [1, 6, 160])
+def test_the_compiled_variance_is_the_posterior_s(
+    kinematic_artefact: Path, car: CarParameters, kind: str, count: int
+) -> None:
+    full = fit_weights(car, (kind, kind, kind))
+    vx, vy, omega = (first_points(output, count) for output in full.outputs)
+    some = replace(full, outputs=(vx, vy, omega))
+    step = NativeStep(kinematic_artefact, car, CAUTIOUS)
+    step.set_weights(some)
+    states, inputs = smooth_drive(car, 30, seed=5)
+    states[0, 3:] *= 5  # far from all data
+    ours = np.array([step.variance(v) for v in np.column_stack([states, inputs])])
+    theirs = predictive_sigma(some, np.column_stack([states[:, 3:], inputs])) ** 2
+    prior = np.array([sum(output.amplitudes[2:]) for output in some.outputs])
+    np.testing.assert_allclose(ours / prior, theirs / prior, rtol=0, atol=1e-9)
+
+
+def test_of_more_points_than_there_is_room_for_some_count(
+    kinematic_artefact: Path, car: CarParameters
+) -> None:
+    """The variance is larger than that of all points, and still smaller than the prior's."""
+    weights = fit_weights(car, ("rbf", "matern25", "matern15"), count=1024)
+    step = NativeStep(kinematic_artefact, car, CAUTIOUS)
+    step.set_weights(weights)
+    states, inputs = smooth_drive(car, 30, seed=5)
+    ours = np.array([step.variance(v) for v in np.column_stack([states, inputs])])
+    exact = predictive_sigma(weights, np.column_stack([states[:, 3:], inputs])) ** 2
+    prior = np.array([sum(output.amplitudes[2:]) for output in weights.outputs])
+    assert (ours >= exact * (1 - 1e-6)).all()
+    assert np.median(ours / prior) < 0.05
+
+
+def output_effect(car: CarParameters, v: Floats, mean: Floats) -> Floats:
+    """What the residual does to the states, (7, 3), by CasADi."""
+    f = PREDICTION.corrected(e_kinematic(car))
+    e = ca.MX.sym("e", 3)
+    effect = ca.Function("effect", [e], [ca.jacobian(f(v[:7], v[7:], e), e)])
+    return np.asarray(ca.densify(effect(mean)))
+
+
+def tube_of(step: NativeStep, car: CarParameters, weights: GpWeights, plan: Floats) -> Floats:
+    """The tube of a plan v = [x; u] (N, 9) by NumPy, along the normals of the last reference."""
+    problem = tracking(e_kinematic(car), PREDICTION)
+    q = np.diag([1 / one.deviation**2 for one in problem.states])
+    r = np.diag([1 / one.effort**2 for one in problem.inputs])
+    jacobians = [step.evaluate(v, np.zeros(7))[1] for v in plan]
+    nominal = PREDICTION.discretise(e_kinematic(car))
+    sigma = predictive_sigma(weights, plan[:, 3:])
+    gains = []
+    s = q
+    for jacobian in reversed(jacobians):
+        a, b = jacobian[:, :7], jacobian[:, 7:]
+        gain = np.linalg.solve(r + b.T @ s @ b, b.T @ s @ a)
+        s = q + a.T @ s @ (a - b @ gain)
+        gains.append(gain)
+    deviation, widths = np.zeros((7, 3)), []
+    rows = step.read_reference()
+    for v, jacobian, gain, each, row in zip(plan, jacobians, gains[::-1], sigma, rows, strict=True):
+        a, b = jacobian[:, :7], jacobian[:, 7:]
+        mean = (step.evaluate(v, np.zeros(7))[0] - np.asarray(nominal(v[:7], v[7:])).ravel())[3:6]
+        deviation = (a - b @ gain) @ deviation + output_effect(car, v, mean) @ np.diag(each)
+        widths.append(np.linalg.norm(row[2:4] @ deviation[:2]))
+    return CAUTIOUS.caution_sigmas * np.array(widths)
+
+
+def test_the_tube_adds_correlated_errors_up_along_the_plan(
+    kinematic_artefact: Path, car: CarParameters, unsure: GpWeights, circuit: Circuit
+) -> None:
+    """Against NumPy: regulator, propagation, and the share of each stage's normal."""
+    step = ready(kinematic_artefact, car, unsure, circuit)
+    plant, x, u = discrete(dynamic(car)), circuit.start(), np.zeros(2)
+    for _ in range(25):
+        assert step.step(x, u).usable
+        u = step.u.copy()
+        x = plant(x, u)
+    plan_x, plan_u = (part.copy() for part in step.read_plan())
+    reference = step.read_reference()
+    assert step.solve(x, u, reference, elapsed_s=0.0).usable
+    expected = tube_of(step, car, unsure, np.column_stack([plan_x[:-1], plan_u]))
+    assert expected[-1] > 0.01
+    np.testing.assert_allclose(step.read_tube(), expected, rtol=1e-6)
+    assert step.info.tube_m == pytest.approx(expected.max())
+
+
+def test_the_car_slows_down_where_it_knows_little_and_speeds_up_again(
+    kinematic_artefact: Path,
+    car: CarParameters,
+    weights: GpWeights,
+    unsure: GpWeights,
+    circuit: Circuit,
+) -> None:
+    vx, vy, omega = (first_points(output, 2) for output in unsure.outputs)
+    guessing = replace(unsure, outputs=(vx, vy, omega))
+    sure = SETTINGS.model_copy(update={"caution": 0.9999999})
+    step = ready(kinematic_artefact, car, guessing, circuit, sure)
+    plant, x, u, paces = discrete(dynamic(car)), circuit.start(), np.zeros(2), []
+    for k in range(180):
+        if k == 60:
+            step.set_weights(weights)
+            step.set_parameters(car, CAUTIOUS)
+        assert step.step(x, u).usable
+        u = step.u.copy()
+        paces.append(step.info.pace)
+        x = plant(x, u)
+    tuning = car.tuning.caution
+    changes = np.diff(paces) / np.array(paces[:-1]) / PREDICTION.step_s
+    assert min(paces[:60]) == tuning.least
+    assert paces[-1] == 1.0
+    assert changes.min() >= -tuning.slower_ps * (1 + 1e-9)
+    assert changes.max() <= tuning.faster_ps * (1 + 1e-9)
+
+
+def test_without_caution_uncertainty_changes_nothing(
+    kinematic_artefact: Path, car: CarParameters, unsure: GpWeights, circuit: Circuit
+) -> None:
+    """To the bit: the paper's controller, which takes the mean for the truth."""
+    vx, vy, omega = (replace(o, noise_variance=0.5) for o in unsure.outputs)
+    other = replace(unsure, outputs=(vx, vy, omega))
+    steps = [
+        ready(kinematic_artefact, car, one, circuit, SETTINGS) for one in (unsure, other)
+    ]  # fmt: skip
+    x, u = circuit.start(), np.zeros(2)
+    for _ in range(10):
+        for step in steps:
+            assert step.step(x, u).usable
+        assert steps[0].u.tobytes() == steps[1].u.tobytes()
+        assert (steps[0].info.tube_m, steps[0].info.pace) == (0.0, 1.0)
+        u = steps[0].u.copy()
+        x = discrete(dynamic(car))(x, u)
+
+
+@pytest.mark.parametrize("value", [-0.1, 0.3, 1.0])
+def test_a_probability_is_asked_for(value: float) -> None:
+    with pytest.raises(ValidationError, match="caution"):
+        MpcSettings(caution=value)
+
+
+@pytest.mark.check
+def test_first_laps_on_slippery_tyres_stay_on_the_track() -> None:
+    """The tyres give 18 % less than the racing line asks for: the plan leaves what was driven."""
+    settings = RaceSettings(track="harbour", true_grip=0.82)
+    with stages_on(Console(quiet=True)) as stages:
+        files = prepare(settings, (settings.track,), stages)
+    weights = read_weights(files.weights)
+    deepest = []
+    for mpc in (MpcSettings(caution=0.0), MpcSettings()):
+        on, line, car = files.first.track, files.first.line, settings.car
+        controller = compiled_controller(files.artefacts[0], car, on, line, weights, mpc)
+        loop = ClosedLoop(car, on, line, controller, built_in_car(settings.true_car))
+        deepest.append(float(loop.drive(2).off_track_m.max()))
+    assert deepest[0] > 0.05
+    assert deepest[1] <= 0
