@@ -257,6 +257,24 @@ def test_a_run_that_never_started_is_reported(tmp_path: Path) -> None:
     assert (lap.deviation_mean_m, lap.deviation_max_m, lap.solve_us) == (None, None, None)
 
 
+def test_runs_of_one_controller_are_numbered(tmp_path: Path) -> None:
+    """In table and report; the only run of a controller is not."""
+    names = ("bayesrace-limit", "bestcase", "bayesrace-limit")
+    path = write_race(tmp_path, [Drive(name, circle(TWO_LAPS, 1.0)) for name in names])
+    result = analyse(path)
+    assert [lap.name for lap in result.laps] == [
+        "bayesrace-limit 1",
+        "bestcase",
+        "bayesrace-limit 2",
+    ]
+    text = io.StringIO()
+    print_table(result, Console(file=text, width=80))
+    assert "\nbayesrace-limit 2 " in text.getvalue()
+    page = render_report(tmp_path, result).read_text()
+    assert "BayesRace at the limit, 2</b>" in page
+    assert "BestCase</b>" in page
+
+
 def test_refused_weights_are_a_row_with_the_reason(tmp_path: Path) -> None:
     refused = Drive(
         "bayesrace-updated", np.zeros((0, 7)), ended=None, refused="absurd over the car's range"

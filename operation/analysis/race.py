@@ -4,6 +4,7 @@ Everything is computed from the messages in ``run.mcap`` and from the track, rac
 beside it; nothing is taken over from the processes that were running.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -85,11 +86,13 @@ class DrivenRun:
         car: CarParameters | None = None,
         *,
         whole: bool = False,
+        number: int | None = None,
     ) -> None:
         """``car``: what the built-in equations simulated; None if something else was driven.
-        ``whole``: all samples count, also after the last lap."""
+        ``whole``: all samples count, also after the last lap. ``number``: among the runs of the
+        controller, if there are several."""
         self.record, self._track, self._car, self._whole = record, track, car, whole
-        self.controller = record.plan.controller
+        self.controller, self.number = record.plan.controller, number
         xy = record.x[:, :2]
         self.on_track: PathProjection = track.project_path(xy)
         self.laps = time_laps(track, record.time_s, xy, self.on_track.s_m)
@@ -158,6 +161,7 @@ class DrivenRun:
         times = self.laps.times_s
         return LapResult(
             controller=self.controller,
+            number=self.number,
             run=self.record.plan.run,
             finished=self.finished,
             lap_time_s=times[0] if times else None,
@@ -211,7 +215,14 @@ class RaceAnalysis:
         self.recording = recording
         self.track, self.line = recording.track, recording.line
         car = recording.car if recording.built_in else None
-        self.runs = [DrivenRun(run, self.track, self.line, car) for run in recording.runs]
+        drives = Counter(run.plan.controller for run in recording.runs)
+        driven: Counter[str] = Counter()
+        self.runs: list[DrivenRun] = []
+        for record in recording.runs:
+            name = record.plan.controller
+            driven[name] += 1
+            number = driven[name] if drives[name] > 1 else None
+            self.runs.append(DrivenRun(record, self.track, self.line, car, number=number))
 
     @cached_property
     def training(self) -> DrivenRun | None:

@@ -36,6 +36,9 @@ class LapResult(_Frozen):
     """One driven controller. Samples count up to the last counted crossing of the start line."""
 
     controller: str = Field(description="worstcase, bayesrace, bayesrace-updated, bestcase, …")
+    number: int | None = Field(
+        None, description="of the run among those of its controller, from 1; null for the only one"
+    )
     run: int = Field(description="number of the run in all messages of the log")
     finished: bool = Field(description="at least one lap was driven, all of it")
     lap_time_s: float | None = Field(description="first lap, from standstill")
@@ -80,6 +83,11 @@ class LapResult(_Frozen):
     remarks: list[str] = Field(
         [], description="of the controller in mid-run: weights rolled back, speed limited"
     )
+
+    @property
+    def name(self) -> str:
+        """Of the controller, with the run's number if there are several."""
+        return self.controller if self.number is None else f"{self.controller} {self.number}"
 
 
 class GpMetrics(_Frozen):

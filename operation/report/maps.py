@@ -16,7 +16,16 @@ from bayesrace.tracks import Track
 from operation.analysis.race import DrivenRun
 from operation.report.canvas import PANEL_WIDTH
 from operation.report.laps import Lap, first_laps, reference_of
-from operation.report.style import INK, MUTED, SURFACE, WARNING, gain_map, look, speed_map
+from operation.report.style import (
+    INK,
+    MUTED,
+    SURFACE,
+    WARNING,
+    gain_map,
+    look,
+    numbered,
+    speed_map,
+)
 
 __all__ = ["LapMaps", "draw_edges", "show_all"]
 
@@ -108,11 +117,10 @@ class LapMaps:
         scale = ScalarMappable(shade.norm, shade.colours)
         bar = axes.figure.colorbar(scale, ax=axes, label=shade.label, shrink=0.6, pad=0.01)
         bar.outline.set_visible(False)
-        appearance = look(run.controller)
+        colour = look(run.controller).colour
         time = f"{run.laps.times_s[0]:.3f} s" if run.finished else "did not finish"
-        same = [one for one in self.runs if one.controller == run.controller]
-        number = f", {same.index(run) + 1}" if len(same) > 1 else ""
-        axes.set_title(appearance.name + number, color=appearance.colour, fontweight="bold")
+        name = numbered(run.controller, run.number)
+        axes.set_title(name, color=colour, fontweight="bold")
         axes.set_title(f"{time} · {int(run.off_track.sum())} off track", loc="right", color=INK)
 
     def _draw_start(self, axes: Axes) -> None:

@@ -20,7 +20,7 @@ from operation.report.canvas import inline_svg, write_png
 from operation.report.coverage import coverage_figures
 from operation.report.gp import gp_figures
 from operation.report.maps import LapMaps
-from operation.report.style import figure_style, look
+from operation.report.style import figure_style, look, numbered
 from operation.report.timing import solve_figure
 from operation.report.traces import (
     caution_figures,
@@ -57,6 +57,7 @@ def render_report(run_dir: Path, result: RaceResult, analysis: RaceAnalysis | No
         gp_cells=gp_cells,
         drive_text=drive_text,
         look=look,
+        numbered=numbered,
         best=result.lap("bestcase"),
         facts=_facts(analysis, result),
         versions=_versions(run_dir),
@@ -128,7 +129,9 @@ def _compilers(run_dir: Path) -> list[tuple[str, str]]:
     for path in sorted(run_dir.glob("manifest*.json")):
         with suppress(OSError, ValidationError):
             one = Manifest.model_validate_json(path.read_bytes())
-            found.append((f"{one.model} step", f"{one.build_hash[:12]}, {one.compiler}"))
+            found.append(
+                (f"{one.problem.name}, {one.model} step", f"{one.build_hash[:12]}, {one.compiler}")
+            )
     return found
 
 

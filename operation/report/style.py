@@ -17,6 +17,7 @@ __all__ = [
     "figure_style",
     "gain_map",
     "look",
+    "numbered",
     "speed_map",
 ]
 
@@ -55,6 +56,12 @@ _LOOKS: Final[Mapping[str, Look]] = {
 def look(controller: str) -> Look:
     """Name, colour and description of a controller."""
     return _LOOKS.get(controller, Look(controller, "#56B4E9", ""))
+
+
+def numbered(controller: str, number: int | None) -> str:
+    """Name of a controller, with the number of its run if there are several."""
+    name = look(controller).name
+    return name if number is None else f"{name}, {number}"
 
 
 def speed_map() -> Colormap:

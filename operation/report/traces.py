@@ -16,7 +16,7 @@ from bayesrace.vehicles.parts import GRAVITY_MPS2
 from operation.analysis.race import DrivenRun
 from operation.report.canvas import panel
 from operation.report.laps import Lap, first_laps, flying_laps, reference_of
-from operation.report.style import INK, MUTED, look
+from operation.report.style import INK, MUTED, look, numbered
 
 __all__ = [
     "caution_figures",
@@ -66,7 +66,7 @@ def time_figures(runs: Sequence[DrivenRun], track: Track) -> list[Figure]:
         reference = reference_of(finished)
         if reference is None or len(finished) < 2:
             continue
-        name = look(reference.run.controller).name
+        name = numbered(reference.run.controller, reference.run.number)
         figure, axes = _panel(track, f"{title}: time behind {name}", "Δt [ms]", 2.4)
         near_ms = [0.1]
         for lap in finished:

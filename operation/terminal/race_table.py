@@ -76,7 +76,7 @@ def _slip(lap: LapResult) -> str:
 
 
 COLUMNS: Final = (
-    Column("controller", "", lambda lap: lap.controller, "name of the controller", number=False),
+    Column("controller", "", lambda lap: lap.name, "name of the controller", number=False),
     Column("lap", "s", _first_lap, "first lap, from standstill; DNF: did not finish one; "
         "refused: the controller refused its weights, and was not driven"),
     Column("flying", "s", lambda lap: _decimals(lap.flying_lap_time_s, 3), "best later lap"),
@@ -178,7 +178,7 @@ def print_table(result: RaceResult, console: Console) -> None:
     )
     for lap in result.laps:
         if lap.weights_version:
-            console.print(Text(f"{lap.controller}: weights {lap.weights_version}"))
+            console.print(Text(f"{lap.name}: weights {lap.weights_version}"))
     if (training := result.training) is not None:
         style = "yellow" if training.off_track_samples else ""
         text = f"training drive on {summary.train_track}: {drive_text(training)}"
@@ -202,7 +202,7 @@ def _print_limit(result: RaceResult, console: Console) -> None:
     for lap in result.laps:
         ratios = " ".join(f"{ratio:.3f}" for ratio in lap.limit_ratios or ()) or "–"
         deepest = _metres(lap.off_track_ms_max_m) if lap.off_track_ms else "–"
-        table.add_row(lap.controller, ratios, _off_track_ms(lap), deepest)
+        table.add_row(lap.name, ratios, _off_track_ms(lap), deepest)
     console.print(table)
 
 
@@ -232,7 +232,7 @@ def _print_cornering(result: RaceResult, console: Console) -> None:
         return
     console.print(Text(f"beyond the friction of {friction:g} g that the line assumes:"))
     for lap in beyond:
-        text = f"  {lap.controller}: {_lateral(lap)} g across the way, {_slip(lap)}° of slip"
+        text = f"  {lap.name}: {_lateral(lap)} g across the way, {_slip(lap)}° of slip"
         console.print(Text(text, style="yellow"))
     if result.settings.tyres == "linear":
         console.print(Text("  (linear tyres never saturate; 'race --tyres pacejka' does)"))
@@ -268,13 +268,13 @@ def _print_notes(result: RaceResult, console: Console) -> None:
         console.print(Text(f"lockstep at {result.real_time_factor:.1f} × real time"))
     for lap in result.laps:
         for remark in lap.remarks:
-            console.print(Text(f"{lap.controller}: {remark}", style="yellow"))
+            console.print(Text(f"{lap.name}: {remark}", style="yellow"))
         if lap.refused:
-            console.print(Text(f"{lap.controller}: refused: {lap.refused}", style="red"))
+            console.print(Text(f"{lap.name}: refused: {lap.refused}", style="red"))
         elif not lap.finished:
-            console.print(Text(f"{lap.controller} did not finish: {lap.ended}", style="red"))
+            console.print(Text(f"{lap.name} did not finish: {lap.ended}", style="red"))
         elif (count := len(lap.lap_times_s)) < result.settings.laps:
-            text = f"{lap.controller} finished {count} of {result.settings.laps} laps: {lap.ended}"
+            text = f"{lap.name} finished {count} of {result.settings.laps} laps: {lap.ended}"
             console.print(Text(text, style="yellow"))
     if result.judged_by == "measurement":
         text = "the log holds no truth: laps and GPs are judged by the measurements"
