@@ -151,7 +151,7 @@ def test_a_stop_on_command_ends_a_turn(native: NativeStep, circuit: Circuit) -> 
     assert abs(rig.x[3]) < 0.05
 
 
-def test_what_has_failed_twice_is_begun_otherwise(
+def test_what_has_failed_is_begun_otherwise_at_once(
     native: NativeStep, circuit: Circuit, car: CarParameters
 ) -> None:
     """The same cold start over and over would fail for ever where the state does not change."""
@@ -159,15 +159,15 @@ def test_what_has_failed_twice_is_begun_otherwise(
     native.set_parameters(car, hopeless)
     x = standing(circuit, 1.0, 0.0, 0.0)
     plans = []
-    for _ in range(5):
+    for _ in range(2):
         assert not native.step(x, 0.0).usable
+        assert native.info.iterations == 4  # one from each guess
         plans.append(native.read_plan()[1].copy())
-    first, second, third, fourth, fifth = plans
-    np.testing.assert_array_equal(first, second)
-    assert not np.allclose(third, first)
-    assert not np.allclose(fourth, third)
-    np.testing.assert_array_equal(fifth, first)
-    native.step(x, 0.0)
+    native.set_parameters(car, SETTINGS)
+    assert native.step(x, 0.0).usable
     native.reset()
+    native.set_parameters(car, hopeless)
     native.step(x, 0.0)
-    np.testing.assert_array_equal(native.read_plan()[1], first)
+    plans.append(native.read_plan()[1].copy())
+    np.testing.assert_array_equal(plans[0], plans[1])
+    np.testing.assert_array_equal(plans[0], plans[2])

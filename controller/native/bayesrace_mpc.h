@@ -32,10 +32,11 @@ extern "C" {
 #endif
 
 #define BR_SECOND_START_ITERATIONS 12 /* at most; most often it needs eight */
-#define BR_NV (BR_NX + BR_NU)         /* stage variables v = [x; u] */
-#define BR_PATH_COLUMNS 7             /* see br_mpc_set_path */
-#define BR_PATH_CAPACITY 8192         /* points of the path table */
-#define BR_PREDICT_MAX_S 1.0          /* longest br_mpc_predict */
+#define BR_COLD_GUESSES 4     /* a step without a plan tries at most; all but the first so long */
+#define BR_NV (BR_NX + BR_NU) /* stage variables v = [x; u] */
+#define BR_PATH_COLUMNS 7     /* see br_mpc_set_path */
+#define BR_PATH_CAPACITY 8192 /* points of the path table */
+#define BR_PREDICT_MAX_S 1.0  /* longest br_mpc_predict */
 
 #if defined(_WIN32)
 #define BR_API __declspec(dllexport)

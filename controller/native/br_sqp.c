@@ -30,12 +30,12 @@ void br_sqp_curve(br_mpc *mpc) {
 }
 
 /* Without a plan from before: the problem's guess, see where that leads; or turn. Where that has
- * led to no plan time and again, Newton's steps may go round in circles: then, but for a turn,
- * other guesses are tried. */
+ * led to no plan, Newton's steps may go round in circles: then, but for a turn, another guess is
+ * the next. */
 void br_sqp_cold_start(br_mpc *mpc) {
-    static const double shares[] = {0.5, 0.5, 1.0, 0.25};
+    static const double shares[BR_COLD_GUESSES] = {0.5, 1.0, 0.25, 0.0};
     double u[BR_NU];
-    br_first_guess(mpc, mpc->u_before, shares[mpc->attempts % 4], u);
+    br_first_guess(mpc, mpc->u_before, shares[mpc->attempts % BR_COLD_GUESSES], u);
     br_sqp_roll_out(mpc, u);
 }
 

@@ -103,12 +103,29 @@ br_mpc_status br_start_again(br_mpc *mpc, br_mpc_status status, unsigned turn) {
     return status;
 }
 
+/* Without a plan from before: from the problem's guesses in turn until one leads to a usable plan.
+ * From rest, half throttle straight ahead may be a bad guess for a line that turns at once. */
+static br_mpc_status start_cold(br_mpc *mpc, int most) {
+    br_timer *timer = &mpc->timer;
+    br_mpc_status status = iterate(mpc, 0, most);
+    for (int guess = 1; guess < BR_COLD_GUESSES && !br_usable(status); ++guess) {
+        if (mpc->turn || mpc->info.time_limited) break; /* there is one way to turn */
+        if (!br_timer_allows(timer, br_timer_now(timer), 3 * timer->iteration)) break;
+        mpc->attempts += 1;
+        br_sqp_cold_start(mpc);
+        br_path_follow(mpc);
+        status =
+            iterate(mpc, 0, most < BR_SECOND_START_ITERATIONS ? most : BR_SECOND_START_ITERATIONS);
+    }
+    return status;
+}
+
 static br_mpc_status optimise(br_mpc *mpc) {
     br_timer *timer = &mpc->timer;
     begin_plan(mpc);
     timer->iteration = timer->trial = 0; /* a stall must not be remembered for ever */
     const int most = br_iteration_limit(mpc);
-    if (!mpc->warm) return iterate(mpc, 0, timer->limited ? most : mpc->parameters.iterations_cold);
+    if (!mpc->warm) return start_cold(mpc, timer->limited ? most : mpc->parameters.iterations_cold);
     br_residuals(mpc);
     const double shifted_cost = mpc->info.cost;
     br_mpc_status status = iterate(mpc, 1, most);
