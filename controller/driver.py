@@ -20,7 +20,7 @@ from controller.cycle_settings import (
     input_limits,
 )
 from controller.interface import Controller, Environment, StepOutput
-from controller.native_library import EnvironmentStructure, aligned_memory
+from controller.native_library import EnvironmentStructure, Layout, aligned_memory
 
 __all__ = [
     "HALTED",
@@ -110,6 +110,8 @@ class Driver:
         self._measured, self._decided = artefact.Measured(), artefact.Decision()
         self._measured_at = ct.addressof(self._measured)
         self._decided_address = ct.addressof(self._decided)
+        self._write_measured = Layout(artefact.Measured, "delays").write
+        self._read_decided = Layout(artefact.Decision, "step_us").read
         self._decide = library.br_cycle_decide
         self._refused: State | None = None
         self.last_error = ""
@@ -182,14 +184,13 @@ class Driver:
 
     def observe(self, state: State) -> bool:
         """Takes a state that has arrived; False if it is not to be driven on."""
-        measured = self._measured
-        measured.epoch, measured.run, measured.seq = state.epoch, state.run, state.seq
-        measured.time_s, measured.lockstep = state.time_s, state.lockstep
-        measured.x[:] = state.x
-        measured.u_applied[:] = state.u_applied
-        delays_s = state.actuation_delays[2::3]
-        measured.delays = len(delays_s)
-        measured.delays_s[: len(delays_s)] = delays_s
+        measured, delays_s = self._measured, state.actuation_delays[2::3]
+        self._write_measured(
+            measured, 0, state.epoch, state.run, state.seq, state.time_s, *state.x,
+            *state.u_applied, state.lockstep, len(delays_s),
+        )  # fmt: skip
+        if delays_s:
+            measured.delays_s[: len(delays_s)] = delays_s
         reception = self._library.br_cycle_observe(self._cycle, self._measured_at)
         if reception != _FOREIGN:
             if self.newest is not None and state.epoch != self.newest.epoch:
@@ -213,18 +214,18 @@ class Driver:
         ``budget_s``: how long after its release the cycle should be done; 0: no limit but the
         step's own. ``spent_s``: how long ago the release is. InputError before the first state.
         """
-        decided, decision = self._decided, self.decision
+        decision = self.decision
         around = None if environment is None else ct.byref(EnvironmentStructure(*environment))
         error = self._decide(
             self._cycle, around, decided_at_s, budget_s, spent_s, self._decided_address
         )
         self.controller.artefact.check(error, "control cycle")
         self.controller.raise_pending()
-        decision.d, decision.delta_rate = decided.u
+        decided = self._read_decided(self._decided)
+        decision.d, decision.delta_rate = decided.u0, decided.u1
         decision.level, decision.status = _LEVELS[decided.level], decided.status
         decision.decided_at_s, decision.delay_s = decided.decided_at_s, decided.delay_s
-        decision.step_us = decided.step_us
-        decision.stepped = bool(decided.stepped)
+        decision.step_us, decision.stepped = decided.step_us, bool(decided.stepped)
         if decision.status == STEP_FAILED:
             text = self._library.br_mpc_error_text(decided.error).decode()
             self.last_error = self.controller.last_error or text

@@ -1,14 +1,17 @@
 """The predictive controller as the process drives it: native step, weights, telemetry."""
 
 import ctypes as ct
+from typing import Final
 
 from bayesrace.gp.weights import decode_weights
 from controller.interface import StepOutput
-from controller.native_library import Artefact, StepInfo, StepStatus
+from controller.native_library import Artefact, Layout, StepInfo, StepStatus
 from controller.native_step import NativeStep
 from controller.weights.adoption import WeightsPort
 
 __all__ = ["PredictiveController"]
+
+_INFO: Final = Layout(StepInfo, "lateral_m")
 
 
 class PredictiveController:
@@ -72,12 +75,12 @@ class PredictiveController:
 
     def result(self, cycle: ct.c_void_p) -> StepOutput:
         """Of the cycle's last step; the plan, too, if it is not usable."""
-        info = StepInfo.from_address(self.artefact.library.br_cycle_info(cycle))
+        info = _INFO.read(StepInfo.from_address(self.artefact.library.br_cycle_info(cycle)))
         output = self._output
         self.native.read_plan()
         self.native.read_tube()
         # Acceptable and converged may both be driven; the residuals below distinguish them.
-        output.status = 0 if StepStatus(info.status).usable else info.status
+        output.status = 0 if info.status <= StepStatus.ACCEPTABLE else info.status
         output.iterations = info.iterations
         output.residual_dynamics = info.defect
         output.residual_bounds = max(info.bound, 0.0)

@@ -4,6 +4,8 @@ Made from the same tables as the C: :mod:`bayesrace.native_interface`, and the a
 """
 
 import ctypes as ct
+import struct
+from collections import namedtuple
 from collections.abc import Iterable, Mapping
 from enum import IntEnum
 from pathlib import Path
@@ -31,6 +33,7 @@ __all__ = [
     "Artefact",
     "EnvironmentStructure",
     "Gp",
+    "Layout",
     "StepInfo",
     "StepStatus",
     "aligned_memory",
@@ -82,6 +85,36 @@ def parameters_type(problem: ProblemInfo) -> type[ct.Structure]:
     """br_mpc_parameters: the problem's run-time parameters, then the settings of the solver."""
     own = [(one.name, ct.c_double) for one in problem.parameters]
     return type("Parameters", (ct.Structure,), {"_fields_": [*own, *_fields(SOLVER)]})
+
+
+_CODES: Final = {ct.c_int: "i", ct.c_int64: "q", ct.c_double: "d"}
+
+
+class Layout:
+    """The fields of a structure up to ``last``, to be read or written all at once.
+
+    The numbers of an array ``u`` follow each other, as ``u0``, ``u1`` and so on. Field by field,
+    ctypes takes ten times as long.
+    """
+
+    def __init__(self, structure: type[ct.Structure], last: str) -> None:
+        codes, names = "@", []
+        fields: Any = structure._fields_
+        for name, kind in fields:
+            length = getattr(kind, "_length_", None)
+            codes += _CODES[kind] if length is None else f"{length}{_CODES[kind._type_]}"
+            names += [name] if length is None else [f"{name}{i}" for i in range(length)]
+            if name == last:
+                break
+        form = struct.Struct(codes)
+        self.write: Final = form.pack_into
+        """(memory, 0, a value for each field)."""
+        make: Any = namedtuple
+        self._unpack, self._named = form.unpack_from, make("Values", names)._make
+
+    def read(self, memory: ct.Structure) -> Any:
+        """The values, by name."""
+        return self._named(self._unpack(memory))
 
 
 def aligned_memory(size: int) -> tuple[Any, ct.c_void_p]:

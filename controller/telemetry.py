@@ -13,6 +13,7 @@ from controller.interface import NO_PLAN, StepOutput
 
 __all__ = ["Timing", "telemetry_of"]
 
+_SCALE, _LARGEST = 1e6, 1e6
 _NO_OUTPUT = StepOutput(u=np.zeros(2), plan_u=NO_PLAN)
 
 
@@ -82,12 +83,12 @@ def _finite(plan: Floats) -> tuple[float, ...]:
 
     Nothing of it if any of it is no number (receivers would refuse it).
     """
-    if not len(plan):
+    if not plan.size:
         return ()
-    flat = np.asarray(plan, dtype=np.float64).ravel()
-    if not (np.abs(flat) <= 1e6).all():
+    scaled = np.rint(plan.ravel() * _SCALE)
+    if not np.maximum.reduce(np.abs(scaled)) <= _LARGEST * _SCALE:
         return ()
-    return tuple(np.round(flat, 6).tolist())
+    return tuple((scaled / _SCALE).tolist())
 
 
 def _known(residual: float) -> float:

@@ -5,8 +5,10 @@ equal to the bit to the same run of two processes over Zenoh (tests/test_closed_
 weights are the caller's: nothing validates them, and no command can stop the run.
 """
 
+import gc
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -29,7 +31,6 @@ from bayesrace.messages import (
     Scalar,
     State,
     Topic,
-    Truth,
     car_key,
     encode,
 )
@@ -47,7 +48,7 @@ from learning.dataset import Dataset
 from learning.logs import dataset_from_messages
 from operation.analysis.laps import LapTimes, Trajectory, time_laps
 from operation.drive import RunPlan, announcement, run_request
-from plant.lockstep import CarRun, End, drive_lockstep
+from plant.lockstep import CarRun, End, drive_lockstep, truth_behind
 from plant.sensors import SensorNoise, Sensors
 from plant.simulator import Simulator
 from plant.vehicle import Vehicle
@@ -70,9 +71,10 @@ class Driven(Trajectory):
     car: CarParameters
     track: Track
     step_s: float
-    truth: list[Truth]
     states: list[State]
-    """As measured, one for each truth."""
+    """As measured, one a sampling period."""
+    true_x: list[tuple[float, ...]]
+    """The true states (7,) behind them."""
     statuses: NDArray[np.int64]
     """Of the controller's steps, shape (m,); m is n - 1, or n if the car failed or left."""
     levels: NDArray[np.int64]
@@ -82,6 +84,16 @@ class Driven(Trajectory):
     second_starts: int
     """Steps that looked for another plan beside the one that went on from before."""
     end: End
+
+    @property
+    def moments(self) -> Sequence[State]:  # type: ignore[override]
+        """What was measured, with times, inputs and laps that are true; :attr:`x` is as well."""
+        return self.states
+
+    @cached_property
+    def x(self) -> Floats:
+        """True states, shape (n, 7)."""
+        return np.array(self.true_x, dtype=np.float64).reshape(-1, 7)
 
     @cached_property
     def laps(self) -> LapTimes:
@@ -187,30 +199,31 @@ class ClosedLoop:
         sensors = Sensors(self._noise, self._seed)
         run = CarRun(request, self._vehicle, _EPOCH, sensors, 2 * self._delay_s)
         self._states: list[State] = []
-        self._truth: list[Truth] = []
+        self._true_x: list[tuple[float, ...]] = []
         self._decided: list[tuple[int, int]] = []
         self._step_us: list[float] = []
         second_starts = self._cycle.driver.count("second_starts")
         if self._log is not None:
             self._log.begins(plan, self._controller.weights_version)
         try:
-            end = drive_lockstep(run, self._seq, self._exchange)
+            with _no_collection():
+                end = drive_lockstep(run, self._seq, self._exchange)
         finally:
             self._cycle.driver.lost(silent=False)
         if self._log is not None:
             self._log.ends(run, end)
-        states, truth = self._states, self._truth
+        states, true_x = self._states, self._true_x
         self._seq = states[-1].seq + 1
         if len(states) > 1 and states[-1].time_s == states[-2].time_s:
             states.pop()  # a fault of the plant repeats the last state
-            truth.pop()
+            true_x.pop()
         decided = np.array(self._decided, dtype=np.int64).reshape(-1, 2)
         return Driven(
             self._car,
             self._track,
             self._vehicle.step_s,
-            truth,
             states,
+            true_x,
             decided[:, 0],
             decided[:, 1],
             np.array(self._step_us),
@@ -218,13 +231,13 @@ class ClosedLoop:
             end,
         )
 
-    def _exchange(self, state: State, truth: Truth) -> tuple[float, ...]:
+    def _exchange(self, state: State, x: tuple[float, ...]) -> tuple[float, ...]:
         """Hands the state to the controller; what it answers."""
         self._states.append(state)
-        self._truth.append(truth)
+        self._true_x.append(x)
         if self._log is not None:
             self._log.write(STATE, state)
-            self._log.write(TRUTH, truth)
+            self._log.write(TRUTH, truth_behind(state, x))
         self._cycle.driver.observe(state)
         if not state.final:
             self._cycle.answer(state, self._send)
@@ -240,6 +253,19 @@ class ClosedLoop:
             seq = cycle.timing.ticks
             self._log.write(ACTUATION, cycle.actuation(seq, state, decision))
             self._log.write(TELEMETRY, cycle.telemetry(seq, state, decision, received_ns))
+
+
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    """A run keeps its states and leaves no cycles: to search it for garbage again and again takes a
+    tenth of its time."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 class _Messages:

@@ -17,7 +17,7 @@ from plant.laps import LineCounter
 from plant.sensors import Sensors
 from plant.vehicle import Vehicle
 
-__all__ = ["CarRun", "End", "drive_lockstep", "fault_end"]
+__all__ = ["CarRun", "End", "drive_lockstep", "fault_end", "truth_behind"]
 
 _WORLD_M: Final = 1e4
 
@@ -33,6 +33,20 @@ class End:
 def fault_end(fault: FmuFault) -> End:
     """The end of a run whose car has failed."""
     return End("plant_fault", str(fault))
+
+
+def truth_behind(state: State, x: tuple[float, ...]) -> Truth:
+    """The message of the true state (7,) that ``state`` was measured of."""
+    return Truth(
+        seq=state.seq,
+        source_time_ns=state.source_time_ns,
+        epoch=state.epoch,
+        run=state.run,
+        time_s=state.time_s,
+        x=x,
+        u_applied=state.u_applied,
+        lap=state.lap,
+    )
 
 
 class CarRun:
@@ -85,21 +99,24 @@ class CarRun:
 
     def sample(
         self, seq: int, actuation_delays: tuple[float, ...] = (), final: bool = False
-    ) -> tuple[State, Truth]:
-        """What the sensors measure now, and what they measure it of."""
+    ) -> tuple[State, tuple[float, ...]]:
+        """What the sensors measure now, and the true state (7,); see :func:`truth_behind`."""
         vehicle, request = self.vehicle, self.request
-        truth = Truth(
+        now_ns, x = time.monotonic_ns(), tuple(vehicle.x.tolist())
+        state = State(
             seq=seq,
-            source_time_ns=time.monotonic_ns(),
+            source_time_ns=now_ns,
             epoch=self._epoch,
             run=request.run,
             time_s=vehicle.time_s,
-            x=tuple(vehicle.x.tolist()),
+            x=self._sensors.measure(x),
             u_applied=vehicle.u_applied,
             lap=self._line.crossings,
+            lockstep=request.lockstep,
+            actuation_delays=actuation_delays or self._delays,
+            final=final,
         )
-        delays = actuation_delays or self._delays
-        return self._sensors.measure(truth, request.lockstep, delays, final), truth
+        return state, x
 
     def step(self, u: tuple[float, ...], seq: int) -> None:
         """One period of lockstep, from the sample ``seq`` that ``u`` answers. FmuFault."""
@@ -136,14 +153,14 @@ class CarRun:
 def drive_lockstep(
     car: CarRun,
     first_seq: int,
-    exchange: Callable[[State, Truth], tuple[float, ...] | End],
+    exchange: Callable[[State, tuple[float, ...]], tuple[float, ...] | End],
     beat: Callable[[], End | None] = lambda: None,
 ) -> End:
     """Drives in lockstep until something ends the run.
 
-    ``exchange`` hands over a state, numbered from ``first_seq`` on, then its truth, and returns the
-    input (2,) that answers the state, or what ends the run; nothing answers a final state. ``beat``
-    is called once a period; what it returns, if anything, ends the run, too.
+    ``exchange`` hands over a state, numbered from ``first_seq`` on, with the true state (7,) behind
+    it, and returns the input (2,) that answers it, or what ends the run; nothing answers a final
+    state. ``beat`` is called once a period; what it returns, if anything, ends the run, too.
     """
     seq = first_seq
     end: End | None = None

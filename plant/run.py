@@ -11,7 +11,7 @@ from bayesrace.clock import sleep_until_ns
 from bayesrace.messages import Actuation, Decoder, RunRequest, State, Truth
 from bayesrace.transport import LOCKSTEP_SPIN_S, Inbox, Item, Kind, Numbering, Publisher
 from plant.fmu.faults import FmuFault
-from plant.lockstep import CarRun, End, drive_lockstep, fault_end
+from plant.lockstep import CarRun, End, drive_lockstep, fault_end, truth_behind
 from plant.sensors import Sensors
 from plant.vehicle import Vehicle
 
@@ -83,7 +83,7 @@ class Run:
         self._beat = beat
         self._numbering = numbering
         # In real time:
-        self._outbox: deque[tuple[int, State, Truth]] = deque()
+        self._outbox: deque[tuple[int, State, tuple[float, ...]]] = deque()
         self._sampled_ns: dict[int, int] = {}
         self._waiting: list[_Waiting] = []
         self._held: Actuation | None = None
@@ -110,16 +110,16 @@ class Run:
         with self._inbox.stamped():
             return self._real_time()
 
-    def _send(self, state: State, truth: Truth) -> None:
+    def _send(self, state: State, x: tuple[float, ...]) -> None:
         """The truth goes second: it must not delay the measurement."""
         self._states.put(state, lockstep=state.lockstep)
-        self._truths.put(truth, lockstep=state.lockstep)
+        self._truths.put(truth_behind(state, x), lockstep=state.lockstep)
 
     # Lockstep ----------------------------------------------------------------------------------
 
-    def _exchange(self, state: State, truth: Truth) -> tuple[float, ...] | End:
+    def _exchange(self, state: State, x: tuple[float, ...]) -> tuple[float, ...] | End:
         """Sends the state and waits for its answer; the last one has none."""
-        self._send(state, truth)
+        self._send(state, x)
         return () if state.final else self._answer_to(state.seq)
 
     def _answer_to(self, seq: int) -> tuple[float, ...] | End:
@@ -178,20 +178,20 @@ class Run:
             if (end := self._beat()) is not None:
                 return end
 
-    def _enqueue(self, state: State, truth: Truth) -> None:
+    def _enqueue(self, state: State, x: tuple[float, ...]) -> None:
         """Send the state when its delay is over; keep in mind when it was sampled."""
         self._sampled_ns[state.seq] = state.source_time_ns
         self._sampled_ns.pop(state.seq - _REMEMBERED, None)
-        self._outbox.append((state.source_time_ns + self._delay_ns, state, truth))
+        self._outbox.append((state.source_time_ns + self._delay_ns, state, x))
         self._sleep_and_send(0)
 
     def _sleep_and_send(self, until_ns: int) -> None:
         """Sleep, sending the states whose delay is over in the meantime."""
         outbox = self._outbox
         while outbox and outbox[0][0] <= max(until_ns, time.monotonic_ns()):
-            due_ns, state, truth = outbox.popleft()
+            due_ns, state, x = outbox.popleft()
             sleep_until_ns(due_ns)
-            self._send(state, truth)
+            self._send(state, x)
         sleep_until_ns(until_ns)
 
     def _receive(self) -> End | None:

@@ -3,8 +3,6 @@
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from bayesrace.messages import State, Truth
-
 __all__ = ["SensorNoise", "Sensors"]
 
 
@@ -37,28 +35,9 @@ class Sensors:
         self._deviations = np.array(deviations) if any(deviations) else None
         self._random = np.random.default_rng(seed)
 
-    def measure(
-        self, truth: Truth, lockstep: bool, actuation_delays: tuple[float, ...], final: bool
-    ) -> State:
-        """What the sensors measure of ``truth``.
-
-        The other arguments are not measured: they concern the exchange of messages, see
-        :class:`State`.
-        """
-        x = truth.x
+    def measure(self, x: tuple[float, ...]) -> tuple[float, ...]:
+        """What the sensors measure of the true state x (7,)."""
         if self._deviations is not None:
             noise = self._deviations * self._random.standard_normal(len(x))
             x = tuple((np.array(x) + noise).tolist())
-        return State(
-            seq=truth.seq,
-            source_time_ns=truth.source_time_ns,
-            epoch=truth.epoch,
-            run=truth.run,
-            time_s=truth.time_s,
-            x=x,
-            u_applied=truth.u_applied,
-            lap=truth.lap,
-            lockstep=lockstep,
-            actuation_delays=actuation_delays,
-            final=final,
-        )
+        return x

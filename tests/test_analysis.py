@@ -54,7 +54,7 @@ def test_cornering_is_that_of_the_circle_driven_and_beyond_the_friction_it_is_sa
 ) -> None:
     """At 2 m/s on a circle of 0.5 m, the nose 0.2 rad inwards of the way."""
     run = Trajectory()
-    run.truth = [
+    run.moments = [
         Truth(
             seq=k, source_time_ns=0, epoch=1, run=1, time_s=0.02 * k, u_applied=(0.0, 0.0), lap=0,
             x=(0.0, 0.0, 0.08 * k, 2 * np.cos(-0.2), 2 * np.sin(-0.2), 4.0, 0.1),

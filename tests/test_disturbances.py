@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bayesrace.gp.weights import GpWeights
-from bayesrace.messages import RunRequest, Truth
+from bayesrace.messages import RunRequest
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
 from controller.assembly import compiled_controller
@@ -27,9 +27,8 @@ START = (0.0, 0.0, 0.3, 1.0, 0.0, 0.0, 0.05)
 
 def measured(noise: SensorNoise, seed: int, count: int = 2000) -> Any:
     """What the sensors add to one truth, (count, 7)."""
-    sensors, truth = Sensors(noise, seed), blank(Truth, x=START, u_applied=(0.0, 0.0))
-    states = [sensors.measure(truth, True, (), False) for _ in range(count)]
-    return np.array([state.x for state in states]) - START
+    sensors = Sensors(noise, seed)
+    return np.array([sensors.measure(START) for _ in range(count)]) - START
 
 
 def test_noise_has_the_deviations_that_are_asked_for_and_is_the_seeds() -> None:

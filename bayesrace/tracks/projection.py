@@ -81,16 +81,12 @@ class CentrelineSearch:
         """Index of the sample where the distance stops falling, going from ``at``."""
         xs, ys = self._lists
         count = self._count
-
-        def squared(i: int) -> float:
-            return (x - xs[i]) ** 2 + (y - ys[i]) ** 2
-
-        here = squared(at)
+        here = (x - xs[at]) ** 2 + (y - ys[at]) ** 2
         for direction in (1, -1):
             moved = False
             for _ in range(count):
                 following = (at + direction) % count
-                there = squared(following)
+                there = (x - xs[following]) ** 2 + (y - ys[following]) ** 2
                 if there >= here:
                     break
                 at, here, moved = following, there, True

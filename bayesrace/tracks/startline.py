@@ -1,7 +1,8 @@
 """The start line as a short segment: counting and timing laps without any spline."""
 
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,11 +36,16 @@ class CrossingLine:
         self._cos, self._sin = math.cos(heading_rad), math.sin(heading_rad)
         self.left_m, self.right_m = left_m, right_m
 
-    def signed_distance(self, x: float, y: float) -> float:
+    def signed_distance(self, x: Any, y: Any) -> Any:
         """Distance past the line along the driving direction [m], negative before it."""
         return (x - self._x) * self._cos + (y - self._y) * self._sin
 
-    def crossing(self, prev_xy: tuple[float, float], cur_xy: tuple[float, float]) -> Crossing:
+    def is_past(self, x: Any, y: Any) -> Any:
+        """Whether points (numbers or arrays) are past it; a step between two that agree does not
+        cross it."""
+        return self.signed_distance(x, y) >= -_ON_LINE_M
+
+    def crossing(self, prev_xy: Sequence[float], cur_xy: Sequence[float]) -> Crossing:
         """Whether the straight step from ``prev_xy`` to ``cur_xy`` [m] crosses the line.
 
         A point on the line counts as past it, so that of two successive steps exactly one crosses.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesrace.arrays import Floats
-from bayesrace.messages import Truth
+from bayesrace.messages import CarSample
 from bayesrace.tracks import StartLine, Track
 
 __all__ = ["LapTimes", "Trajectory", "time_laps", "trajectory_digest"]
@@ -22,26 +22,26 @@ leaves out a piece of it: what comes after is no lap. (At 4 m/s a sample is .08 
 
 
 class Trajectory:
-    """A run as arrays: what is judged is :attr:`truth`, never what was measured."""
+    """A run as arrays: what is judged is where the car was in truth, never what was measured."""
 
-    truth: Sequence[Truth]
+    moments: Sequence[CarSample]
     """In order, one a sampling period."""
 
     @cached_property
     def x(self) -> Floats:
-        """States, shape (n, 7)."""
-        return np.array([one.x for one in self.truth], dtype=np.float64).reshape(-1, 7)
+        """True states, shape (n, 7)."""
+        return np.array([one.x for one in self.moments], dtype=np.float64).reshape(-1, 7)
 
     @cached_property
     def u(self) -> Floats:
         """Inputs that acted from each state to the next, shape (max(n - 1, 0), 2)."""
-        acted = [one.u_applied for one in self.truth[1:]]
+        acted = [one.u_applied for one in self.moments[1:]]
         return np.array(acted, dtype=np.float64).reshape(-1, 2)
 
     @cached_property
     def time_s(self) -> Floats:
         """Plant time of the states, shape (n,)."""
-        return np.array([one.time_s for one in self.truth], dtype=np.float64)
+        return np.array([one.time_s for one in self.moments], dtype=np.float64)
 
     @cached_property
     def slip_rad(self) -> Floats:
@@ -63,7 +63,7 @@ class Trajectory:
     @cached_property
     def lap(self) -> NDArray[np.int64]:
         """Start-line crossings up to each state, shape (n,)."""
-        return np.array([one.lap for one in self.truth], dtype=np.int64)
+        return np.array([one.lap for one in self.moments], dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -92,9 +92,9 @@ def time_laps(track: Track, time_s: Floats, xy: Floats, s_m: Floats) -> LapTimes
     leap = np.abs((np.diff(s_m) + half) % track.length_m - half)
     cuts = np.flatnonzero(leap > SHORT_CUT * track.length_m)
     cut_at = int(cuts[0]) + 1 if len(cuts) else None
-    points = [(float(x), float(y)) for x, y in xy[:cut_at]]
-    for k in range(1, len(points)):
-        crossing = line.crossing(points[k - 1], points[k])
+    past = line.is_past(xy[:cut_at, 0], xy[:cut_at, 1])
+    for k in (np.flatnonzero(past[1:] != past[:-1]) + 1).tolist():
+        crossing = line.crossing(xy[k - 1].tolist(), xy[k].tolist())
         crossings += crossing.direction
         if crossings <= len(after):
             continue

@@ -91,6 +91,11 @@ class RunRecord(Trajectory):
         if not (isinstance(message, CarSample) and found and found[-1].time_s == message.time_s):
             found.append(message)
 
+    @property
+    def moments(self) -> Sequence[CarSample]:  # type: ignore[override]
+        """The truth, sample by sample."""
+        return self.truth
+
     @cached_property
     def solve_us(self) -> Floats:
         """Execution times of the controller's steps [us]."""

@@ -139,7 +139,7 @@ class Collector:
             return None
         before, after = states[-2], states[-1]
         if self._line is not None:
-            crossing = self._line.crossing(before.x[:2], after.x[:2])  # type: ignore[arg-type]
+            crossing = self._line.crossing(before.x[:2], after.x[:2])
             if crossing.direction == 1:
                 return before.time_s + crossing.fraction * (after.time_s - before.time_s)
         return after.time_s
