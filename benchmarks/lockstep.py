@@ -41,7 +41,7 @@ LIMIT_S = 1000.0
 def over_zenoh(system: System, prepared: Prepared, laps: int, run: int, log: Path | None) -> float:
     """Drives a run by two processes, records it if there is a log; its plant time [s]."""
     plan = RunPlan(run, "bayesrace", laps, LIMIT_S, lockstep=True)
-    with Recorder(system.session, CAR, log) if log else ExitStack():
+    with Recorder(system.recording, CAR, log) if log else ExitStack():
         end = system.drive(prepared.first.track, plan)
     return float(end.data["time_s"])
 
@@ -67,7 +67,7 @@ def main() -> None:
     factors: dict[str, list[float]] = {}
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        system = stack.enter_context(started_system(CAR, folder, both=["--low-latency"]))
+        system = stack.enter_context(started_system(CAR, folder, lockstep=True))
         stack.enter_context(system.controller(prepared.arguments))
         runs = itertools.count(1)
         zenoh_log, own_log = folder / "zenoh.mcap", folder / "own.mcap"

@@ -145,9 +145,9 @@ class _Race:
         return _MODELS if self.settings.simulator == "equations" else _MODELS[:1]
 
     @property
-    def both_options(self) -> list[str]:
-        """Of plant and controller: a link in lockstep needs no priorities."""
-        return ["--low-latency"] if self.settings.mode == "lockstep" else []
+    def lockstep(self) -> bool:
+        """Whether its runs are in lockstep."""
+        return self.settings.mode == "lockstep"
 
     def update(self, samples: Sequence[Dataset], weights: Path, name: str, stage: Stage) -> Path:
         """Weights learned from all samples, beginning with ``weights``, as that file."""
@@ -162,9 +162,8 @@ class _Race:
         self._run += 1
         settings = self.settings
         limit_s = settings.limit_s(track.line.lap_time_s)
-        lockstep = settings.mode == "lockstep"
         return RunPlan(
-            self._run, controller, settings.laps, limit_s, lockstep, settings.start_speed_mps
+            self._run, controller, settings.laps, limit_s, self.lockstep, settings.start_speed_mps
         )
 
 
@@ -259,8 +258,8 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
             shutil.copyfile(progress / MANIFEST, out / "manifest-progress.json")
     about = {"race": {"settings": settings.model_dump_json()}}
     with (
-        started_system(this.car.name, out, this.plant_options, this.both_options) as system,
-        Recorder(system.session, this.car.name, out / FILES.log, about) as recorder,
+        started_system(this.car.name, out, this.plant_options, lockstep=this.lockstep) as system,
+        Recorder(system.recording, this.car.name, out / FILES.log, about) as recorder,
         _faults_named(InputError),
     ):
         drives = _Drives(this, prepared.first, system, recorder)

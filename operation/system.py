@@ -1,4 +1,9 @@
-"""A plant and its controllers as processes of their own, and the session that directs them."""
+"""A plant and its controllers as processes of their own, and the sessions that direct and record.
+
+In lockstep the recording has a session of its own, whose links are low-latency: plant and
+controller then send what is recorded in the thread that drives, which takes a fifth of the CPU of
+handing it to another. Weights are too large for such a link, so the director's are ordinary.
+"""
 
 import os
 import time
@@ -11,7 +16,14 @@ from bayesrace.errors import InputError
 from bayesrace.messages import EVENT, Event
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import Track
-from bayesrace.transport import Director, Endpoints, Publisher, free_endpoint, open_session
+from bayesrace.transport import (
+    Director,
+    Endpoints,
+    Publisher,
+    count_processes,
+    free_endpoint,
+    open_session,
+)
 from operation.drive import RunPlan, announcement, execute
 from operation.processes import Child, child, endings
 
@@ -19,22 +31,33 @@ __all__ = ["System", "started_system"]
 
 _START_S: Final = 60.0
 """Time for a process to start on a machine that is busy."""
+_LOOK_S: Final = 0.02
 
 
 class System:
-    """One plant, one controller at a time, and the session that directs both."""
+    """One plant, one controller at a time, and the sessions that direct and record them."""
 
     def __init__(
-        self, session: Any, car: str, folder: Path, endpoints: Endpoints, options: Sequence[str]
+        self,
+        session: Any,
+        recording: Any,
+        car: str,
+        folder: Path,
+        endpoints: Endpoints,
+        options: Sequence[str],
     ) -> None:
         """``folder`` receives the output of the processes; ``options`` are those of both."""
         self.session = session
+        """Directs; for requests of any size."""
+        self.recording = recording
+        """For a :class:`Recorder`, which hears the race's own events on this session alone."""
         self.director = Director(session, car)
         self.children: dict[str, Child] = {}
         """The processes by what they are, plant and controller."""
         self._folder, self._options = folder, list(options)
         self._plant_endpoint, self._controller_endpoint = endpoints.connect
-        self._events: Publisher[Event] = Publisher(session, EVENT, car, "race")
+        self._car = car
+        self._events: Publisher[Event] = Publisher(recording, EVENT, car, "race")
 
     @contextmanager
     def controller(self, options: Sequence[str], log: str = "controller.log") -> Iterator[None]:
@@ -67,12 +90,26 @@ class System:
 
     def drive(self, track: Track, plan: RunPlan, recorder: Recorder | None = None) -> Event:
         """Drives one run to its end; see :func:`operation.drive.execute`."""
+        self._wait_for_recording()
         return execute(self.director, self._events, track, plan, recorder)
 
     def refused(self, plan: RunPlan, reason: str) -> None:
         """Records that a run is not driven, because the controller refuses its weights."""
         event = announcement(plan, self._events.next_seq, "", reason)
         self._events.put(event, lockstep=True)
+
+    def _wait_for_recording(self) -> None:
+        """Waits until plant and controller know what the recorder has subscribed to, as a process
+        does that answers on its session. InputError if they do not in time."""
+        deadline = time.monotonic() + _START_S
+        for source in self.children:
+            while not count_processes(self.recording, self._car, source):
+                if time.monotonic() > deadline:
+                    raise InputError(
+                        f"the {source} of car '{self._car}' cannot be recorded: it does not answer "
+                        f"within {_START_S:g} s"
+                    )
+                time.sleep(_LOOK_S)
 
     def _wait_for_both(self) -> None:
         """Waits as long as the processes live; InputError if they are not there in time."""
@@ -87,20 +124,29 @@ class System:
 
 @contextmanager
 def started_system(
-    car: str, folder: Path, plant: Sequence[str] = (), both: Sequence[str] = ()
+    car: str,
+    folder: Path,
+    plant: Sequence[str] = (),
+    both: Sequence[str] = (),
+    *,
+    lockstep: bool = False,
 ) -> Iterator[System]:
-    """A running plant for the block, and the session that directs it.
+    """A running plant for the block, and the sessions that direct and record it.
 
     ``car`` is its name in message keys, ``plant`` are options of ``bayesrace plant``, ``both``
-    those of plant and controllers. No process outlives the block, however it ends.
+    those of plant and controllers. ``lockstep``: all runs are in lockstep, and their links without
+    priorities. No process outlives the block, however it ends.
     """
     endpoints = Endpoints(connect=(free_endpoint(), free_endpoint()))
-    options = ["--parent-pid", str(os.getpid()), *both]
+    options = ["--parent-pid", str(os.getpid()), *both, *(["--low-latency"] if lockstep else [])]
     line = ["plant", *plant, "--endpoint", endpoints.connect[0], *options]
     with ExitStack() as stack:
         process = stack.enter_context(child(line, folder / "plant.log"))
-        session = stack.enter_context(open_session(endpoints))
-        stack.callback(process.stop)  # before the session, so that its end is seen
-        system = System(session, car, folder, endpoints, options)
+        recording = session = stack.enter_context(open_session(endpoints))
+        if lockstep:
+            fast = endpoints.model_copy(update={"low_latency": True})
+            recording = stack.enter_context(open_session(fast))
+        stack.callback(process.stop)  # before the sessions, so that its end is seen
+        system = System(session, recording, car, folder, endpoints, options)
         system.children["plant"] = process
         yield system
