@@ -4,7 +4,10 @@ Every reader of files, messages, options and numbers raises :class:`InputError`;
 turns it into one line on stderr and exit code 2, so its message must name the thing and the remedy.
 """
 
-from pydantic import ValidationError
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pydantic import ValidationError
 
 __all__ = ["InputError", "faults_in"]
 
@@ -13,7 +16,7 @@ class InputError(ValueError):
     """Something given from outside is unusable; the message names it and says what would help."""
 
 
-def faults_in(error: ValidationError, whole: str = "the content") -> str:
+def faults_in(error: "ValidationError", whole: str = "the content") -> str:
     """What is wrong with data that do not fit a pydantic model: field and fault of each, one line.
 
     ``whole``: the name of what has no field of its own, such as text that is no JSON.

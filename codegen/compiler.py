@@ -6,12 +6,14 @@ import shlex
 import shutil
 import subprocess
 import tempfile
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
+from bayesrace.cache import cache_folder, digest
 from bayesrace.errors import InputError
 from bayesrace.interpreter import RUN_MODULE
 
@@ -98,6 +100,24 @@ def _candidates() -> list[tuple[str, ...]]:
     return found
 
 
+def _can_build(compiler: Compiler) -> None:
+    """Raises what a compiler raises that builds no library.
+
+    One that has built one is not asked again: that would take longer than to find a controller in
+    the cache.
+    """
+    proof = cache_folder() / ".compilers" / digest((*compiler.command, compiler.version))
+    if proof.exists():
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        probe = Path(folder) / "probe.c"
+        probe.write_text("#include <math.h>\nint probe(void) { return 0; }\n")
+        _run([*compiler.command, "-shared", "-fPIC", str(probe), "-lm", "-o", f"{probe}.so"])
+    with suppress(OSError):  # the cache says so where it is used
+        proof.parent.mkdir(parents=True, exist_ok=True)
+        proof.touch()
+
+
 def _run(line: list[str]) -> str:
     done = subprocess.run(line, capture_output=True, text=True, check=True, timeout=120)
     return done.stdout
@@ -112,16 +132,14 @@ def find_compiler() -> Compiler:
     tried = []
     for command in _candidates():
         try:
-            version = _run([*command, "--version"])
-            with tempfile.TemporaryDirectory() as folder:
-                probe = Path(folder) / "probe.c"
-                probe.write_text("#include <math.h>\nint probe(void) { return 0; }\n")
-                _run([*command, "-shared", "-fPIC", str(probe), "-lm", "-o", f"{probe}.so"])
+            version = _run([*command, "--version"]).splitlines() or ["unknown version"]
+            compiler = Compiler(command, version[0])
+            _can_build(compiler)
         except (OSError, subprocess.SubprocessError) as error:
             words = getattr(error, "stderr", "") or str(error)
             tried.append(f"{shlex.join(command)}: {words.strip()[:200]}")
             continue
-        return Compiler(command, (version.splitlines() or ["unknown version"])[0])
+        return compiler
     details = f" (tried: {'; '.join(tried)})" if tried else ""
     raise InputError(
         f"no C compiler found{details}: install gcc or clang, or 'pip install ziglang'"

@@ -65,19 +65,21 @@ def test_help_reads_well(cli: Cli, name: str, monkeypatch: pytest.MonkeyPatch) -
     if not name:
         assert all(command.split()[0] in outcome.out for command in SUBCOMMANDS)
         tasks = ("Race", "Prepare", "Drive", "Learn while driving", "Measure", "Export to other")
-        assert all(f"─ {task}" in outcome.out for task in tasks)
+        assert all(f"\n{task}" in outcome.out for task in tasks)
         assert "--install-completion" in outcome.out
 
 
 def test_every_option_says_what_it_is(cli: Cli) -> None:
     import typer
+    from typer.core import TyperGroup
 
     from operation.cli.app import app
 
     def leaves(command: Any, *names: str) -> dict[str, Any]:
-        below = getattr(command, "commands", None)  # of a group
-        if below is None:
+        if not isinstance(command, TyperGroup):
             return {" ".join(names): command}
+        context: Any = None
+        below = {one: command.get_command(context, one) for one in command.list_commands(context)}
         return {k: v for name, one in below.items() for k, v in leaves(one, *names, name).items()}
 
     commands = leaves(typer.main.get_command(app))
@@ -106,6 +108,7 @@ def test_version(cli: Cli) -> None:
 
 def test_an_unknown_command_or_option_is_refused(cli: Cli) -> None:
     refused(cli("drift"), "drift")
+    refused(cli("rase"), "Did you mean 'race'")
     refused(cli("race", "--lap", "3"), "--lap")
     refused(cli("race", "--mode", "slow"), "lockstep", "realtime")
     refused(cli("race", "--laps", "0"), "--laps")

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Final
 
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 
+from bayesrace.defaults import DEFAULT_CAR
 from bayesrace.errors import InputError
 from bayesrace.files import read_text, write_whole
 from bayesrace.vehicles.parameters import CarParameters
@@ -32,9 +33,6 @@ __all__ = [
     "read_car",
     "write_car",
 ]
-
-DEFAULT_CAR: Final = "orca"
-"""Name of the car that is meant where none is named."""
 
 SECTIONS: Final[dict[str, tuple[str, ...]]] = {
     "geometry": ("lf_m", "lr_m", "mass_kg", "inertia_kgm2", "width_m", "length_m"),

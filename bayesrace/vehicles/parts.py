@@ -7,7 +7,6 @@ is (its name and its unit), and how much of it there is at a speed, are the driv
 import math
 from typing import Annotated, ClassVar, Final, Literal
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 __all__ = [
@@ -174,6 +173,8 @@ class DcMotor(Part):
 
     def top_speed_mps(self, d_max: float) -> float:
         """Where drive and resistance are equal: (cm1 - cm2 v) d_max = cr0 + cr2 v^2."""
+        import numpy as np  # takes longer than to read a car
+
         a, b, c = self.cr2, self.cm2 * d_max, self.cr0 - self.cm1 * d_max
         roots = np.roots([a, b, c]) if a else np.array([-c / b])
         return max((float(v.real) for v in roots if abs(v.imag) < 1e-9 < v.real), default=1.0)

@@ -4,30 +4,14 @@ import io
 import logging
 import shutil
 import sys
-from collections.abc import Callable
 from tempfile import gettempdir
-from typing import Annotated, Final
+from typing import Annotated, ClassVar, Final
 
 import typer
-from pydantic import ValidationError
 
-from bayesrace import __version__
 from bayesrace.errors import InputError, faults_in
 from bayesrace.interrupts import remembering_interrupts
-from operation.cli import (
-    campaign,
-    evaluation,
-    fmu,
-    latency,
-    learning,
-    limit,
-    operation,
-    paper,
-    parts,
-    preparation,
-    raceline,
-    tracks,
-)
+from operation.cli.help import TaskGroup
 
 __all__ = ["app", "main"]
 
@@ -43,35 +27,42 @@ _SLIPX_PACKAGES: Final = ("slipx",)
 _CAMPAIGN_PACKAGES: Final = ("bokeh", "dask", "distributed", "optuna", "pyarrow")
 """Modules that the extras of pyproject.toml install."""
 
-_TASKS: Final[dict[str, tuple[Callable[..., None], ...]]] = {
-    "Race": (evaluation.race, evaluation.report),
-    "Prepare": (
-        tracks.tracks, preparation.cars, raceline.raceline, preparation.collect,
-        preparation.train, learning.validate, preparation.build,
-    ),
-    "Drive": (
-        parts.plant, parts.controller, evaluation.drive, operation.status, operation.stop,
-        operation.go, operation.router,
-    ),
-    "Learn while driving": (learning.learn, learning.publish, learning.rollback),
-    "Measure": (limit.limit, evaluation.bench, latency.latency, paper.paper),
-    "Many laps": (
-        campaign.campaign, campaign.campaign_report, campaign.campaign_worker, campaign.tune,
-    ),
-    "Export to other tools": (preparation.export,),
-}  # fmt: skip
+
+class _Commands(TaskGroup):
+    tasks: ClassVar[dict[str, tuple[str, ...]]] = {
+        "Race": ("evaluation.race", "evaluation.report"),
+        "Prepare": (
+            "tracks.tracks", "preparation.cars", "raceline.raceline", "preparation.collect",
+            "preparation.train", "learning.validate", "preparation.build",
+        ),
+        "Drive": (
+            "parts.plant", "parts.controller", "evaluation.drive", "operation.status",
+            "operation.stop", "operation.go", "operation.router",
+        ),
+        "Learn while driving": ("learning.learn", "learning.publish", "learning.rollback"),
+        "Measure": ("limit.limit", "evaluation.bench", "latency.latency", "paper.paper"),
+        "Many laps": (
+            "campaign.campaign", "campaign.campaign_report", "campaign.campaign_worker",
+            "campaign.tune",
+        ),
+        "Export to other tools": ("preparation.export", "fmu.fmu"),
+    }  # fmt: skip
+
 
 app = typer.Typer(
     name="bayesrace",
     help="Real-time GP-MPC racing: a compiled controller that learns from its own laps.",
     no_args_is_help=True,
-    rich_markup_mode="markdown",
+    rich_markup_mode=None,
+    cls=_Commands,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
 
 def _version(wanted: bool) -> None:
     if wanted:
+        from bayesrace import __version__
+
         typer.echo(f"bayesrace {__version__}")
         raise typer.Exit
 
@@ -90,12 +81,6 @@ def _options(
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(PrintableFormatter("%(name)s: %(message)s"))
     logging.basicConfig(level=logging.INFO, handlers=[handler])
-
-
-for task, commands in _TASKS.items():
-    for command in commands:
-        app.command(rich_help_panel=task)(command)
-app.add_typer(fmu.fmu, rich_help_panel="Export to other tools")
 
 
 def main() -> None:
@@ -122,6 +107,8 @@ def main() -> None:
 
 def _in_words(error: Exception) -> str | None:
     """The message for the user; None for a fault of the program's own, which gets a traceback."""
+    from pydantic import ValidationError
+
     match error:
         case InputError():
             return str(error)

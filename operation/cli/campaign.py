@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from bayesrace.vehicles import DEFAULT_CAR
+from bayesrace.defaults import DEFAULT_CAR
 from operation.cli.options import Car, OutFile, writable
 
 __all__ = ["campaign", "campaign_report", "campaign_worker", "tune"]

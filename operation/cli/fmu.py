@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from bayesrace.defaults import DEFAULT_CAR
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
-from bayesrace.vehicles import DEFAULT_CAR
 from operation.cli.options import Car, OutFile, path_on, writable
 
 if TYPE_CHECKING:
@@ -36,6 +36,8 @@ fmu = typer.Typer(
     name="fmu",
     help="Export the car or its controller as an FMU; inspect an FMU of another tool.",
     no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
 )
 
 

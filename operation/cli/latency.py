@@ -6,9 +6,9 @@ from typing import Annotated
 
 import typer
 
+from bayesrace.defaults import DEFAULT_CAR
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
-from bayesrace.vehicles import DEFAULT_CAR
 from operation.cli.options import Car, CarName, Endpoint, connect_to, writable
 from operation.cli.parts import LockMemory
 

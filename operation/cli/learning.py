@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from bayesrace.defaults import DEFAULT_CAR
 from bayesrace.files import write_whole
-from bayesrace.vehicles import DEFAULT_CAR
 from operation.cli.options import (
     AllSamples,
     Car,

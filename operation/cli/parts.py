@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 
 from bayesrace.clock import die_with_parent
+from bayesrace.defaults import DEFAULT_CAR
 from bayesrace.errors import InputError
-from bayesrace.vehicles import DEFAULT_CAR
 from operation.cli.options import (
     Car,
     CarName,

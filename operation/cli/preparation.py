@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
+from bayesrace.defaults import DEFAULT_CAR
 from bayesrace.errors import InputError
-from bayesrace.vehicles import DEFAULT_CAR
 from operation.cli.options import (
     AllSamples,
     Car,

@@ -6,8 +6,8 @@ from typing import Annotated, Final
 
 import typer
 
+from bayesrace.defaults import DEFAULT_CAR
 from bayesrace.errors import InputError
-from bayesrace.vehicles import DEFAULT_CAR
 from operation.cli.options import Car, OutFile, writable
 
 __all__ = ["raceline"]

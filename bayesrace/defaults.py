@@ -1,0 +1,8 @@
+"""Names that options have by default; a module of its own, so that ``--help`` needs no other."""
+
+from typing import Final
+
+__all__ = ["DEFAULT_CAR"]
+
+DEFAULT_CAR: Final = "orca"
+"""Name of the car that is meant where none is named."""
