@@ -6,6 +6,7 @@ import re
 import signal
 import socket
 import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -89,6 +90,22 @@ def test_every_option_says_what_it_is(cli: Cli) -> None:
         for parameter in command.params:
             text = getattr(parameter, "help", "")
             assert getattr(parameter, "hidden", False) or text, f"{name} {parameter.name}"
+
+
+def test_help_and_version_import_nothing_that_they_do_not_need() -> None:
+    """They would take four times as long: numpy, pydantic and Rich are for the commands."""
+    program = (
+        "import sys\n"
+        "from operation.cli import main\n"
+        "try:\n"
+        "    main()\n"
+        "except SystemExit:\n"
+        "    print(sorted({'numpy', 'pydantic', 'rich', 'zenoh'} & set(sys.modules)))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, "--help"], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.splitlines()[-1] == "[]"
 
 
 def test_without_a_command_help_is_shown(cli: Cli) -> None:

@@ -216,6 +216,22 @@ def test_a_chosen_compiler_that_does_not_work_is_named(monkeypatch: pytest.Monke
         find_compiler()
 
 
+def test_a_compiler_that_has_built_a_library_is_not_asked_again(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = find_compiler()
+    find_compiler.cache_clear()
+    asked: list[str] = []
+
+    def answer(line: list[str]) -> str:
+        asked.append(line[-1])
+        return found.version
+
+    monkeypatch.setattr("codegen.compiler._run", answer)
+    assert find_compiler() == found
+    assert asked == ["--version"]
+
+
 def load(folder: Path, car: CarParameters) -> NativeStep:
     return NativeStep(folder, car, MpcSettings())
 
