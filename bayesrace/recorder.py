@@ -28,9 +28,9 @@ FLUSH_PERIOD_S: Final = 0.2
 _BATCH_S: Final = 0.002
 """Between two batches of messages ..."""
 _LONG_BATCH_S: Final = 0.05
-"""... and after a large one, as come in lockstep: fewer interruptions of what is recorded."""
-_LARGE_BATCH: Final = 12
-"""Messages: more than two cycles', which is more than real time brings in 2 ms."""
+"""... and in lockstep: fewer interruptions of what is recorded, and code that is in the caches."""
+_REAL_TIME_HZ: Final = 3000
+"""More messages a second than real time brings (four a cycle, at 500 Hz): it is lockstep."""
 _CHANNEL_CAPACITY: Final = 1 << 16
 _MOST_OTHER_KEYS: Final = 256
 """Keys that are not in the table of messages; the format has room for 65,535."""
@@ -134,6 +134,7 @@ class Recorder:
 
     def _write_all(self) -> None:
         handler = self._subscriber.handler  # undeclare() fails while the subscriber is borrowed
+        looked_ns = time.monotonic_ns()
         with suppress(zenoh.ZError):  # undeclared and drained
             while True:
                 sample, count = handler.recv(), 0
@@ -142,8 +143,11 @@ class Recorder:
                     self._write(sample)
                     sample, count = handler.try_recv(), count + 1
                 self._writing = False
+                now_ns = time.monotonic_ns()
+                lockstep = count > _REAL_TIME_HZ * 1e-9 * (now_ns - looked_ns)
+                looked_ns = now_ns
                 # Waking once a batch, not once a message, leaves the CPU to what is recorded.
-                time.sleep(_BATCH_S if count <= _LARGE_BATCH else _LONG_BATCH_S)
+                time.sleep(_LONG_BATCH_S if lockstep else _BATCH_S)
 
     def _write(self, sample: Any) -> None:
         now_ns = time.monotonic_ns()
