@@ -2,7 +2,10 @@
 
 from typing import Final
 
-__all__ = ["DEFAULT_CAR"]
+__all__ = ["CONFIGURATION_VARIABLE", "DEFAULT_CAR"]
+
+CONFIGURATION_VARIABLE: Final = "BAYESRACE_CONFIG"
+"""Environment variable that names the configuration."""
 
 DEFAULT_CAR: Final = "orca"
 """Name of the car that is meant where none is named."""

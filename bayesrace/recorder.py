@@ -16,7 +16,7 @@ import zenoh
 
 from bayesrace.errors import InputError
 from bayesrace.log import LogWriter, topic_of
-from bayesrace.messages import EVENT, HEARTBEAT, Event, car_key, encode
+from bayesrace.messages import EVENT, EVERYTHING, HEARTBEAT, Event, car_key, encode
 from bayesrace.messages.codec import peek_seq
 from bayesrace.transport.numbering import Numbering
 
@@ -77,7 +77,7 @@ class Recorder:
         self._writer = LogWriter(path, metadata)
         self._lock = threading.Lock()
         self._subscriber = session.declare_subscriber(
-            car_key("bayesrace/{car}/**", car), zenoh.handlers.FifoChannel(_CHANNEL_CAPACITY)
+            car_key(EVERYTHING, car), zenoh.handlers.FifoChannel(_CHANNEL_CAPACITY)
         )
         self._quiet_since_ns = time.monotonic_ns()
         self._writing = False

@@ -352,6 +352,7 @@ def main(settings: ControllerSettings, controller: Controller) -> int:
     Call it from the main thread of a process: it takes over the signals.
     """
     die_with_parent(settings.parent_pid)
+    settings.endpoints.check_car(settings.name or settings.car.name)
     with open_session(settings.endpoints, "controller") as session:
         process = ControllerProcess(session, settings, controller)
         # The control thread gets the interpreter's lock back from another thread this soon.

@@ -197,6 +197,6 @@ def follow(
 def route(endpoints: Endpoints) -> None:
     """Forward between all that connect to this process, until SIGINT or SIGTERM."""
     signals: queue.SimpleQueue[int] = queue.SimpleQueue()
-    with catching_signals(signals.put), open_session(endpoints):
+    with catching_signals(signals.put), open_session(endpoints, "router"):
         _log.info("router on %s", ", ".join(endpoints.listen))
         signals.get()

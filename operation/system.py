@@ -12,13 +12,14 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final
 
+from bayesrace.configuration import Configuration, as_toml, configured
 from bayesrace.errors import InputError
+from bayesrace.files import write_whole
 from bayesrace.messages import EVENT, Event
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import Track
 from bayesrace.transport import (
     Director,
-    Endpoints,
     Publisher,
     count_processes,
     free_endpoint,
@@ -29,6 +30,9 @@ from operation.processes import Child, child, endings
 
 __all__ = ["System", "started_system"]
 
+CONFIGURATION: Final = "bayesrace.toml"
+"""What the processes of a system read, in its folder."""
+
 _START_S: Final = 60.0
 """Time for a process to start on a machine that is busy."""
 _LOOK_S: Final = 0.02
@@ -38,13 +42,7 @@ class System:
     """One plant, one controller at a time, and the sessions that direct and record them."""
 
     def __init__(
-        self,
-        session: Any,
-        recording: Any,
-        car: str,
-        folder: Path,
-        endpoints: Endpoints,
-        options: Sequence[str],
+        self, session: Any, recording: Any, car: str, folder: Path, options: Sequence[str]
     ) -> None:
         """``folder`` receives the output of the processes; ``options`` are those of both."""
         self.session = session
@@ -55,7 +53,6 @@ class System:
         self.children: dict[str, Child] = {}
         """The processes by what they are, plant and controller."""
         self._folder, self._options = folder, list(options)
-        self._plant_endpoint, self._controller_endpoint = endpoints.connect
         self._car = car
         self._events: Publisher[Event] = Publisher(recording, EVENT, car, "race")
 
@@ -63,13 +60,10 @@ class System:
     def controller(self, options: Sequence[str], log: str = "controller.log") -> Iterator[None]:
         """A controller process for the block; it and the plant are ready for a run.
 
-        ``options`` are those of ``bayesrace controller`` beside the endpoints.
+        ``options`` are those of ``bayesrace controller`` beside the configuration.
         InputError, with the last message of a process that has ended, if they do not get ready.
         """
-        line = [
-            "controller", *options, "--endpoint", self._plant_endpoint,
-            "--listen", self._controller_endpoint, *self._options,
-        ]  # fmt: skip
+        line = ["controller", *options, *self._options]
         with child(line, self._folder / log) as process:
             self.children["controller"] = process
             with self.explained():
@@ -128,25 +122,33 @@ def started_system(
     folder: Path,
     plant: Sequence[str] = (),
     both: Sequence[str] = (),
+    configuration: Configuration | None = None,
     *,
     lockstep: bool = False,
 ) -> Iterator[System]:
     """A running plant for the block, and the sessions that direct and record it.
 
     ``car`` is its name in message keys, ``plant`` are options of ``bayesrace plant``, ``both``
-    those of plant and controllers. ``lockstep``: all runs are in lockstep, and their links without
-    priorities. No process outlives the block, however it ends.
+    those of plant and controllers. ``configuration`` is that of all three; without it they meet on
+    loopback, without certificates, and all else is as configured. It is left in ``folder``.
+    ``lockstep``: all runs are in lockstep, and their links without priorities. No process outlives
+    the block, however it ends.
     """
-    endpoints = Endpoints(connect=(free_endpoint(), free_endpoint()))
-    options = ["--parent-pid", str(os.getpid()), *both, *(["--low-latency"] if lockstep else [])]
-    line = ["plant", *plant, "--endpoint", endpoints.connect[0], *options]
+    used = configuration or configured().plain(free_endpoint(), free_endpoint())
+    file = folder / CONFIGURATION
+    write_whole(file, as_toml(used))
+    endpoints = used.endpoints("director")
+    options = ["--config", str(file), "--parent-pid", str(os.getpid()), *both]
+    if lockstep:
+        options.append("--low-latency")
+    line = ["plant", *plant, *options]
     with ExitStack() as stack:
         process = stack.enter_context(child(line, folder / "plant.log"))
-        recording = session = stack.enter_context(open_session(endpoints))
+        recording = session = stack.enter_context(open_session(endpoints, "director"))
         if lockstep:
             fast = endpoints.model_copy(update={"low_latency": True})
-            recording = stack.enter_context(open_session(fast))
+            recording = stack.enter_context(open_session(fast, "director"))
         stack.callback(process.stop)  # before the sessions, so that its end is seen
-        system = System(session, recording, car, folder, endpoints, options)
+        system = System(session, recording, car, folder, options)
         system.children["plant"] = process
         yield system

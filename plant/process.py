@@ -345,6 +345,7 @@ def main(settings: PlantSettings, compiled: Compile | None = None) -> int:
         settings.car, settings.fmu, settings.fmu_map, settings.rate_hz, compiled,
         simulator=settings.simulator,
     )  # fmt: skip
+    settings.endpoints.check_car(settings.name or settings.car.name)
     with vehicles as vehicle, open_session(settings.endpoints, "plant") as session:
         process = PlantProcess(session, settings, vehicle)
         for refusal in prepare_thread(settings.realtime):

@@ -35,6 +35,8 @@ SUBCOMMANDS = (
     "fmu export", "fmu inspect", "fmu weights",
     "validate", "publish", "rollback", "learn",
     "campaign", "campaign-report", "campaign-worker", "tune", "paper",
+    "config show", "config check", "config example", "doctor",
+    "certs init", "certs add", "certs list", "certs revoke",
 )  # fmt: skip
 
 

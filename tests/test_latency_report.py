@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from bayesrace.transport import Endpoints
 from studies.latency.analysis import Analysis, Beside, analyse
 from studies.latency.beside import bare_result
 from studies.latency.legs import LEGS
@@ -27,7 +28,11 @@ def analysis(tmp_path: Path) -> Analysis:
             if k % 5 == 4:
                 system.heartbeats(lost=5 if k > 100 else 0)
     settings = LatencySettings(
-        log=tmp_path / "run.mcap", warm_up_s=0.0, track="", load=2, attach=("tcp/pit:1",)
+        log=tmp_path / "run.mcap",
+        warm_up_s=0.0,
+        track="",
+        load=2,
+        attach=Endpoints(connect=("tcp/pit:1",)),
     )
     late_ns = np.full(250, 80_000)
     late_ns[9] = PERIOD_NS + 1

@@ -23,6 +23,7 @@ from bayesrace.messages import (
     STATUS,
     Command,
     Reply,
+    Role,
     State,
     Status,
 )
@@ -39,7 +40,6 @@ from bayesrace.transport import (
     free_endpoint,
     open_session,
 )
-from bayesrace.transport.session import Role
 from operation.analysis.network_status import NetworkStatus, ProcessStatus
 from operation.drive import RunPlan, run_request
 from operation.lifecycle import ask_statuses, command, find, follow, pick
@@ -413,7 +413,7 @@ def test_a_router_forwards_between_plant_controller_and_observer_and_a_peer_does
     """Tokens, messages and requests: all that know only the router."""
     endpoint = free_endpoint()
     middle = Endpoints.model_validate({"listen": (endpoint,), "mode": mode})
-    roles: tuple[Role, ...] = ("plant", "controller", "observer")
+    roles: tuple[Role, ...] = ("plant", "controller", "viewer")
     with ExitStack() as stack:
         stack.enter_context(open_session(middle))
         plant, controller, observer = (

@@ -10,9 +10,13 @@ from bayesrace.messages.rules import Scalar
 from bayesrace.messages.table import (
     ACTUATION,
     ALIVE,
+    ALIVE_SOURCES,
     COMMAND,
     EVENT,
+    EVERYTHING,
     HEARTBEAT,
+    RECORDERS,
+    ROLE_OF,
     ROLLBACK,
     RUN,
     SERVICES,
@@ -24,7 +28,9 @@ from bayesrace.messages.table import (
     TRUTH,
     WEIGHTS,
     Qos,
+    Role,
     Service,
+    Source,
     Topic,
     car_key,
     is_car_name,
@@ -47,10 +53,10 @@ from bayesrace.messages.types import (
 )
 
 __all__ = [
-    "ACTUATION", "ALIVE", "COMMAND", "EVENT", "HEARTBEAT", "ROLLBACK", "RUN",
-    "SERVICES", "STATE", "STATUS", "STOP", "TELEMETRY", "TOPICS", "TRUTH", "WEIGHTS", "Actuation",
-    "CarSample", "Command", "Decoder", "Event", "Message", "Qos",
-    "Reply", "RollbackRequest", "RunRequest", "Scalar", "Service", "State", "Status",
-    "StatusRequest", "StopRequest", "Telemetry", "Topic", "Truth", "car_key", "decode", "encode",
-    "from_json", "is_car_name", "json_schema", "to_json",
+    "ACTUATION", "ALIVE", "ALIVE_SOURCES", "COMMAND", "EVENT", "EVERYTHING", "HEARTBEAT",
+    "RECORDERS", "ROLE_OF", "ROLLBACK", "RUN", "SERVICES", "STATE", "STATUS", "STOP", "TELEMETRY",
+    "TOPICS", "TRUTH", "WEIGHTS", "Actuation", "CarSample", "Command", "Decoder", "Event",
+    "Message", "Qos", "Reply", "Role", "RollbackRequest", "RunRequest", "Scalar", "Service",
+    "Source", "State", "Status", "StatusRequest", "StopRequest", "Telemetry", "Topic", "Truth",
+    "car_key", "decode", "encode", "from_json", "is_car_name", "json_schema", "to_json",
 ]  # fmt: skip

@@ -1,7 +1,9 @@
-"""The table of everything that crosses a process boundary: key, message, rate, quality of service.
+"""The table of everything that crosses a process boundary: key, message, rate, quality of service,
+and who may send and receive it.
 
 A topic is published; a service is a request with an answer. ``{car}`` and ``{source}`` in a key
-stand for the car's name and the process.
+stand for the car's name and the process. Who may do what is said by role: the access control of
+secured links (:mod:`bayesrace.transport.access`) is generated from these columns.
 """
 
 import re
@@ -26,15 +28,26 @@ from bayesrace.messages.types import (
 )
 
 __all__ = [
-    "ACTUATION", "ALIVE", "COMMAND", "EVENT", "HEARTBEAT", "ROLLBACK", "RUN",
-    "SERVICES", "STATE", "STATUS", "STOP", "TELEMETRY", "TOPICS", "TRUTH", "WEIGHTS",
-    "Qos", "Service", "Topic", "car_key", "is_car_name",
+    "ACTUATION", "ALIVE", "ALIVE_SOURCES", "COMMAND", "EVENT", "EVERYTHING", "HEARTBEAT",
+    "RECORDERS", "ROLE_OF", "ROLLBACK", "RUN", "SERVICES", "STATE", "STATUS", "STOP", "TELEMETRY",
+    "TOPICS", "TRUTH", "WEIGHTS", "Qos", "Role", "Service", "Source", "Topic", "car_key",
+    "is_car_name",
 ]  # fmt: skip
 
 M = TypeVar("M", bound=Message)
 A = TypeVar("A", bound=Message)
 
-Source = Literal["plant", "controller", "race", "recorder"]
+Source = Literal["plant", "controller", "race", "recorder", "director"]
+"""Part of a process that sends, as named in keys."""
+
+Role = Literal["plant", "controller", "learning", "director", "viewer", "router"]
+"""What a process may do. Learning sends weights, a director does that and commands and records, a
+viewer looks on, a router forwards for the others."""
+
+ROLE_OF: Final[dict[Source, Role]] = {
+    "plant": "plant", "controller": "controller", "race": "director", "recorder": "director",
+    "director": "director",
+}  # fmt: skip
 
 _CAR_NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")
 
@@ -62,6 +75,9 @@ class Topic(Generic[M]):
     """Key expression with its placeholders."""
     message: type[M]
     sources: tuple[Source, ...]
+    """Who sends it: no other role than theirs may."""
+    readers: tuple[Role, ...]
+    """Who may receive it."""
     rate: str
     qos: Qos
 
@@ -74,6 +90,10 @@ class Service(Generic[M, A]):
     key: str
     request: type[M] | None
     answer: type[A]
+    servers: tuple[Source, ...]
+    """Who answers it."""
+    clients: tuple[Role, ...]
+    """Who may send it."""
     timeout_s: float
     repeatable: bool = True
     """Idempotent: a client repeats a request that was lost with its link."""
@@ -83,44 +103,72 @@ _CONTROL: Final = Qos("real_time", express=True)
 _REPORT: Final = Qos("data_low", express=False)
 _NEWS: Final = Qos("data", express=True, realtime_blocks=True)
 
+_WATCHING: Final[tuple[Role, ...]] = ("learning", "director", "viewer")
+
 STATE: Final = Topic(
-    "state", "bayesrace/{car}/state", State, ("plant",), "each period (50 Hz by default)", _CONTROL
-)
-TRUTH: Final = Topic("truth", "bayesrace/{car}/truth", Truth, ("plant",), "each state", _REPORT)
+    "state", "bayesrace/{car}/state", State, ("plant",), ("controller", *_WATCHING),
+    "each period (50 Hz by default)", _CONTROL,
+)  # fmt: skip
+TRUTH: Final = Topic(
+    "truth", "bayesrace/{car}/truth", Truth, ("plant",), ("director", "viewer"), "each state",
+    _REPORT,
+)  # fmt: skip
 ACTUATION: Final = Topic(
-    "actuation", "bayesrace/{car}/actuation", Actuation, ("controller",), "each cycle", _CONTROL
-)
+    "actuation", "bayesrace/{car}/actuation", Actuation, ("controller",), ("plant", *_WATCHING),
+    "each cycle", _CONTROL,
+)  # fmt: skip
 TELEMETRY: Final = Topic(
-    "telemetry", "bayesrace/{car}/telemetry", Telemetry, ("controller",), "each cycle", _REPORT
-)
+    "telemetry", "bayesrace/{car}/telemetry", Telemetry, ("controller",), _WATCHING, "each cycle",
+    _REPORT,
+)  # fmt: skip
 EVENT: Final = Topic(
     "event", "bayesrace/{car}/event/{source}", Event, ("plant", "controller", "race", "recorder"),
-    "when something happens", _NEWS,
+    _WATCHING, "when something happens", _NEWS,
 )  # fmt: skip
 HEARTBEAT: Final = Topic(
-    "heartbeat", "bayesrace/{car}/status/{source}", Status, ("plant", "controller"), "10 Hz",
-    _REPORT,
+    "heartbeat", "bayesrace/{car}/status/{source}", Status, ("plant", "controller"), _WATCHING,
+    "10 Hz", _REPORT,
 )  # fmt: skip
 TOPICS: Final[tuple[Topic[Any], ...]] = (STATE, TRUTH, ACTUATION, TELEMETRY, EVENT, HEARTBEAT)
 
-RUN: Final = Service("run", "bayesrace/{car}/plant/run", RunRequest, Reply, 20.0, False)
-STOP: Final = Service("stop", "bayesrace/{car}/plant/stop", StopRequest, Reply, 5.0, False)
-STATUS: Final = Service("status", "bayesrace/{car}/{source}/status", StatusRequest, Status, 5.0)
-WEIGHTS: Final[Service[Message, Reply]] = Service(
-    "weights", "bayesrace/{car}/controller/weights", None, Reply, 20.0
+RUN: Final = Service(
+    "run", "bayesrace/{car}/plant/run", RunRequest, Reply, ("plant",), ("director",), 20.0, False
 )
+STOP: Final = Service(
+    "stop", "bayesrace/{car}/plant/stop", StopRequest, Reply, ("plant",), ("director",), 5.0, False
+)
+STATUS: Final = Service(
+    "status", "bayesrace/{car}/{source}/status", StatusRequest, Status, ("plant", "controller"),
+    ("plant", *_WATCHING), 5.0,
+)  # fmt: skip
+"""The plant asks how many controllers there are."""
+WEIGHTS: Final[Service[Message, Reply]] = Service(
+    "weights", "bayesrace/{car}/controller/weights", None, Reply, ("controller",),
+    ("learning", "director"), 20.0,
+)  # fmt: skip
 """The payload is a weights file (:mod:`bayesrace.gp.weights`). The answer comes when the weights
 are in use or refused: after a first cycle, earlier requests, and the checks."""
 ROLLBACK: Final = Service(
-    "rollback", "bayesrace/{car}/controller/rollback", RollbackRequest, Reply, 20.0, False
-)
-COMMAND: Final = Service("command", "bayesrace/{car}/controller/command", Command, Reply, 5.0)
+    "rollback", "bayesrace/{car}/controller/rollback", RollbackRequest, Reply, ("controller",),
+    ("learning", "director"), 20.0, False,
+)  # fmt: skip
+COMMAND: Final = Service(
+    "command", "bayesrace/{car}/controller/command", Command, Reply, ("controller",),
+    ("director",), 5.0,
+)  # fmt: skip
 SERVICES: Final[tuple[Service[Any, Any], ...]] = (
     RUN, STOP, STATUS, WEIGHTS, ROLLBACK, COMMAND
 )  # fmt: skip
 
 ALIVE: Final = "bayesrace/{car}/alive/{source}"
-"""Liveliness token of a process."""
+"""Liveliness token of a process, which everyone may see."""
+ALIVE_SOURCES: Final[tuple[Source, ...]] = ("plant", "controller", "director")
+"""Who has one."""
+
+EVERYTHING: Final = "bayesrace/{car}/**"
+"""What a recorder subscribes to; it receives what its role may read."""
+RECORDERS: Final[tuple[Role, ...]] = ("director", "viewer")
+"""Who may."""
 
 
 def is_car_name(name: str) -> bool:

@@ -1,8 +1,10 @@
 """Zenoh, wrapped thinly.
 
-``session`` opens a session with explicit endpoints; ``publisher`` sends messages, ``inbox`` is the
-one subscriber, with ``requests`` for what it serves; ``client`` sends requests, ``director`` starts
-and follows runs; ``numbering`` counts losses.
+``endpoints`` says where a process listens and connects, ``credentials`` holds its certificate,
+``access`` makes Zenoh's access control of the table of messages, and ``session`` opens a session
+with all of that; ``probe`` and ``links`` say why there is no link. ``publisher`` sends messages,
+``inbox`` is the one subscriber, with ``requests`` for what it serves; ``client`` sends requests,
+``director`` starts and follows runs; ``numbering`` counts losses.
 """
 
 from bayesrace.transport.client import (
@@ -14,22 +16,26 @@ from bayesrace.transport.client import (
     send_rollback,
     send_weights,
 )
+from bayesrace.transport.credentials import Credentials, Member, Members
 from bayesrace.transport.director import Director, RefusedError
+from bayesrace.transport.endpoints import (
+    CONTROLLER_ENDPOINT,
+    PLANT_ENDPOINT,
+    Endpoint,
+    Endpoints,
+    LinkLimits,
+    free_endpoint,
+)
 from bayesrace.transport.inbox import LOCKSTEP_SPIN_S, NEWEST, Inbox, Item, Kind
 from bayesrace.transport.numbering import Numbering
 from bayesrace.transport.publisher import HEARTBEAT_S, Heartbeat, Publisher
 from bayesrace.transport.requests import Request, declare_service, decode_request
-from bayesrace.transport.session import (
-    CONTROLLER_ENDPOINT,
-    PLANT_ENDPOINT,
-    Endpoints,
-    free_endpoint,
-    open_session,
-)
+from bayesrace.transport.session import open_session
 
 __all__ = [
     "CONTROLLER_ENDPOINT", "HEARTBEAT_S", "LOCKSTEP_SPIN_S", "NEWEST", "PLANT_ENDPOINT", "Answers",
-    "Director", "Endpoints", "Heartbeat", "Inbox", "Item", "Kind", "Numbering", "Publisher",
-    "RefusedError", "Request", "ask", "ask_all", "count_processes", "decisive", "declare_service",
-    "decode_request", "free_endpoint", "open_session", "send_rollback", "send_weights",
+    "Credentials", "Director", "Endpoint", "Endpoints", "Heartbeat", "Inbox", "Item", "Kind",
+    "LinkLimits", "Member", "Members", "Numbering", "Publisher", "RefusedError", "Request", "ask",
+    "ask_all", "count_processes", "decisive", "declare_service", "decode_request", "free_endpoint",
+    "open_session", "send_rollback", "send_weights",
 ]  # fmt: skip

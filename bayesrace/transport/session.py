@@ -2,100 +2,58 @@
 
 Topology of a run: the plant listens; the controller connects to the plant and listens itself;
 recorders and directors connect to both, because peers do not forward for each other. Or all connect
-to a router, which forwards between peers of different :data:`Role`. Multicast and gossip are off,
-so a process connects to its endpoints only.
+to a router, which forwards between peers of different regions. Multicast and gossip are off, so a
+process connects to its endpoints only.
 """
 
 import json
+import logging
 import os
 import re
-import socket
 from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any, Final, Literal, get_args
+from contextlib import ExitStack, contextmanager
+from typing import Any, Final
 
 import zenoh
-from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.errors import InputError
+from bayesrace.messages import Role
+from bayesrace.transport.access import access_control
+from bayesrace.transport.credentials import AUTHORITY, CERTIFICATE, KEY, Credentials
+from bayesrace.transport.endpoints import Endpoints, leaves
+from bayesrace.transport.links import LinkWatch, refusals, serve_access, wait_linked
+from bayesrace.transport.probe import probe_all
 
-__all__ = [
-    "CONTROLLER_ENDPOINT", "PLANT_ENDPOINT", "Endpoints", "Role", "free_endpoint", "open_session",
-]  # fmt: skip
+__all__ = ["open_session"]
 
-Role = Literal["plant", "controller", "observer"]
+_log = logging.getLogger("bayesrace.links")
+
+_REGIONS: Final = ("plant", "controller", "observer")
 """Zenoh region of a process; an observer is any other process than plant and controller. A router
-forwards between regions only, which suffices: processes of one role exchange no messages."""
-
-PLANT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
-"""Where a plant listens by default: loopback only."""
-
-CONTROLLER_ENDPOINT: Final = "tcp/127.0.0.1:7448"
-"""Where a controller listens by default: loopback only."""
-
-_ENDPOINT: Final = re.compile(
-    r"unixsock-stream/[^\s#?]+([?#]\S*)?"
-    r"|(tcp|udp|tls|quic|ws)/(\[[^\]]+\]|[^:/\s]+):(?P<port>\d{1,5})([?#]\S*)?"
-)
+forwards between regions only, which suffices: processes of one region exchange no messages."""
 
 # One receiving worker hands over between threads less often than the default of two.
 _RUNTIME: Final = "(rx: (worker_threads: 1))"
-_LEASE_MS: Final = 5000
-"""A link without traffic for so long is closed; shorter stalls of a machine do no harm."""
-_HANDSHAKE_MS: Final = 2000
-"""Time limit of a handshake, for both ends."""
-_MOST_PENDING: Final = 10_000
-"""Connections in their handshake at once. With Zenoh's default of 100, a port scan held up the
-states of a driving car for a second."""
 _RETRY: Final = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
+_LINK_S: Final = 0.7
+"""How long a secured session waits for the links that its handshakes have shown to be possible."""
 
 # Zenoh's own tools name no region: they form one more, and clients another.
 _FILTERS: Final[list[dict[str, list[str]]]] = [
-    *({"modes": ["peer"], "region_names": [role]} for role in get_args(Role)),
+    *({"modes": ["peer"], "region_names": [region]} for region in _REGIONS),
     {"modes": ["peer"]},
     {"modes": ["client"]},
 ]
 _ROUTER: Final = {"south": [{"filters": [one]} for one in _FILTERS]}
 
 
-class Endpoints(BaseModel):
-    """Endpoints that a process listens on and connects to."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    listen: tuple[str, ...] = Field(
-        default=(), description="endpoints to listen on, 'tcp/address:port'"
-    )
-    connect: tuple[str, ...] = Field(
-        default=(), description="endpoints to connect to; retried as long as the process runs"
-    )
-    low_latency: bool = Field(
-        default=False,
-        description="send in the calling thread to peers that do so too, without priorities: "
-        "for lockstep, where the sender waits for the answer anyway",
-    )
-    """Applies to links of which both ends have it. It saves two thread changes a message, but
-    blocks where the table says drop, and carries at most 60 kB a message: not for free-running
-    processes, and not for senders of weights."""
-    mode: Literal["peer", "router"] = Field(
-        default="peer", description="router: forward between those that connect to this process"
-    )
-
-
-def _check_endpoint(endpoint: str) -> None:
-    match = _ENDPOINT.fullmatch(endpoint)
-    if match is None or int(match["port"] or 0) > 65535:
-        raise InputError(
-            f"endpoint '{endpoint}' is not of the form protocol/address:port, such as "
-            f"{PLANT_ENDPOINT}, or unixsock-stream/path; protocols: tcp, udp, tls, quic, ws"
-        )
-
-
 def _config(endpoints: Endpoints, role: Role) -> Any:
     config = zenoh.Config()
+    region = role if role in _REGIONS else "observer"
+    limits = endpoints.limits
     settings: dict[str, Any] = {
         "mode": endpoints.mode,
-        **({"gateway": _ROUTER} if endpoints.mode == "router" else {"region_name": role}),
+        **({"gateway": _ROUTER} if endpoints.mode == "router" else {"region_name": region}),
         "listen/endpoints": list(endpoints.listen),
         "listen/exit_on_failure": True,
         "connect/endpoints": list(endpoints.connect),
@@ -105,10 +63,11 @@ def _config(endpoints: Endpoints, role: Role) -> Any:
         "connect/retry": _RETRY,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
-        "transport/link/tx/lease": _LEASE_MS,
-        "transport/unicast/open_timeout": _HANDSHAKE_MS,
-        "transport/unicast/accept_timeout": _HANDSHAKE_MS,
-        "transport/unicast/accept_pending": _MOST_PENDING,
+        "transport/link/tx/lease": round(1e3 * limits.lease_s),
+        "transport/unicast/open_timeout": round(1e3 * limits.handshake_s),
+        "transport/unicast/accept_timeout": round(1e3 * limits.handshake_s),
+        "transport/unicast/accept_pending": limits.pending,
+        "transport/unicast/max_sessions": limits.sessions,
         # Each message of the control path is a batch of its own: with the default of two, a
         # receiver held up for two periods of 500 Hz loses states instead of getting them late.
         "transport/link/tx/queue/size/real_time": 16,
@@ -117,22 +76,82 @@ def _config(endpoints: Endpoints, role: Role) -> Any:
         # Zenoh has one or the other.
         "transport/unicast/lowlatency": endpoints.low_latency,
         "transport/unicast/qos/enabled": not endpoints.low_latency,
+        **({} if endpoints.credentials is None else _security(endpoints.credentials)),
     }
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
+    for key, value in leaves(endpoints.zenoh):
+        try:
+            config.insert_json5(key, json.dumps(value))
+        except zenoh.ZError as error:
+            why = str(error).splitlines()[0][:200]
+            raise InputError(f"[zenoh] {key} = {value!r}: {why}; see Zenoh's settings") from None
     return config
 
 
-@contextmanager
-def open_session(endpoints: Endpoints, role: Role = "observer") -> Iterator[Any]:
-    """A Zenoh session, closed at the end of the block.
+def _security(credentials: Credentials) -> dict[str, Any]:
+    """Mutual TLS, and access control by the names in the certificates."""
+    authority, certificate, key = (
+        str(credentials.folder / name) for name in (AUTHORITY, CERTIFICATE, KEY)
+    )
+    return {
+        "transport/link/tls": {
+            "root_ca_certificate": authority,
+            "listen_certificate": certificate, "listen_private_key": key,
+            "connect_certificate": certificate, "connect_private_key": key,
+            "enable_mtls": True, "verify_name_on_connect": True, "close_link_on_expiration": True,
+        },
+        "transport/link/protocols": ["tls"],
+        "access_control": access_control(credentials.members),
+    }  # fmt: skip
 
-    Raises InputError if an endpoint is malformed or cannot be listened on. An absent peer is no
-    error: the session connects as soon as it appears; see :class:`.Inbox` for waiting with a limit.
+
+@contextmanager
+def open_session(endpoints: Endpoints, role: Role = "viewer") -> Iterator[Any]:
+    """A Zenoh session of a process in that role, closed at the end of the block.
+
+    Raises InputError if an endpoint is malformed, open to others without protection, or cannot be
+    listened on; if the certificate is not for the role; if a link is refused, here or at its other
+    end. An absent peer is no error: the session connects as soon as it appears, and says in the log
+    that it waits; see :class:`.Inbox` for waiting with a limit.
     """
     os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)
-    for endpoint in (*endpoints.listen, *endpoints.connect):
-        _check_endpoint(endpoint)
+    endpoints.check()
+    credentials = endpoints.credentials
+    if endpoints.exposed:
+        _log.warning(
+            "INSECURE: links by %s are open to everyone in that network, who could drive the car; "
+            "see docs/security.md", ", ".join(endpoints.exposed),
+        )  # fmt: skip
+    if credentials is not None:
+        credentials.check(role)
+        if warning := credentials.expires_soon():
+            _log.warning("%s", warning)
+    absent = _refuse_lasting(endpoints) if credentials is not None else []
+    with ExitStack() as stack:
+        session = stack.enter_context(_opened(endpoints, role))
+        if credentials is not None:
+            access = serve_access(session, credentials)
+            stack.callback(access.undeclare)  # a process with a queryable hangs at its exit
+            possible = [one for one in endpoints.connect if one not in absent]
+            wait_linked(session, endpoints, possible, _LINK_S)
+            if refused := refusals(session, credentials):
+                raise InputError("; ".join(refused))
+        if endpoints.connect:
+            stack.callback(LinkWatch(session, endpoints).close)
+        yield session
+
+
+def _refuse_lasting(endpoints: Endpoints) -> list[str]:
+    """Endpoints that are absent now; InputError for what is wrong with others."""
+    found = probe_all(endpoints.connect, endpoints.credentials)
+    if lasting := [finding.text for finding in found if finding.lasting]:
+        raise InputError("; ".join(lasting))
+    return [finding.endpoint for finding in found]
+
+
+@contextmanager
+def _opened(endpoints: Endpoints, role: Role) -> Iterator[Any]:
     try:
         session = zenoh.open(_config(endpoints, role))
     except zenoh.ZError as error:
@@ -145,10 +164,3 @@ def open_session(endpoints: Endpoints, role: Role = "observer") -> Iterator[Any]
         ) from None
     with session:
         yield session
-
-
-def free_endpoint() -> str:
-    """A loopback endpoint that is free at the moment, for runs that start processes."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"

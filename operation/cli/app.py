@@ -24,6 +24,7 @@ _RACE_PACKAGES: Final = (
     "sklearn", "threadpoolctl", "yaml", "zstandard",
 )  # fmt: skip
 _SLIPX_PACKAGES: Final = ("slipx",)
+_CERTIFICATE_PACKAGES: Final = ("cryptography",)
 _CAMPAIGN_PACKAGES: Final = ("bokeh", "dask", "distributed", "optuna", "pyarrow")
 """Modules that the extras of pyproject.toml install."""
 
@@ -37,7 +38,8 @@ class _Commands(TaskGroup):
         ),
         "Drive": (
             "parts.plant", "parts.controller", "evaluation.drive", "operation.status",
-            "operation.stop", "operation.go", "operation.router",
+            "operation.stop", "operation.go", "operation.router", "operation.doctor",
+            "configuration.config", "certificates.certs",
         ),
         "Learn while driving": ("learning.learn", "learning.publish", "learning.rollback"),
         "Measure": ("limit.limit", "evaluation.bench", "latency.latency", "paper.paper"),
@@ -47,6 +49,11 @@ class _Commands(TaskGroup):
         ),
         "Export to other tools": ("preparation.export", "fmu.fmu"),
     }  # fmt: skip
+    networked = frozenset({
+        "parts.plant", "parts.controller", "evaluation.drive", "operation.status", "operation.stop",
+        "operation.go", "operation.router", "operation.doctor", "learning.learn",
+        "learning.publish", "learning.rollback", "latency.latency",
+    })  # fmt: skip
 
 
 app = typer.Typer(
@@ -134,7 +141,7 @@ def _missing(package: str) -> str | None:
     """What to install for a package; None if no extra brings it."""
     extras = {
         "fmu": _FMU_PACKAGES, "race": _RACE_PACKAGES, "campaign": _CAMPAIGN_PACKAGES,
-        "slipx": _SLIPX_PACKAGES,
+        "slipx": _SLIPX_PACKAGES, "certificates": _CERTIFICATE_PACKAGES,
     }  # fmt: skip
     extra = next((name for name, packages in extras.items() if package in packages), None)
     if extra is None:

@@ -9,6 +9,7 @@ import typer
 
 from bayesrace.defaults import DEFAULT_CAR
 from bayesrace.files import write_whole
+from operation.cli.configured import connect_to
 from operation.cli.options import (
     Car,
     CarName,
@@ -22,12 +23,13 @@ from operation.cli.options import (
     Noise,
     ProblemChoice,
     Seed,
+    SettingsFile,
     Simulator,
     Style,
     TrackName,
     Tyres,
-    connect_to,
     sensor_noise,
+    settings_of,
     writable,
 )
 
@@ -48,6 +50,7 @@ TimeMode = Annotated[
 
 
 def race(
+    context: typer.Context,
     car: Car = DEFAULT_CAR,
     tyres: Tyres = None,
     track: TrackName = "",
@@ -94,6 +97,7 @@ def race(
     no_limit: Annotated[
         bool, typer.Option("--no-limit", help="Do not compare the laps with the limit.")
     ] = False,
+    settings_file: SettingsFile = None,
 ) -> None:
     """Drive the paper's comparison: WorstCase, BayesRace, BayesRace-updated, BestCase; and
     BayesRace-limit, which maximises progress in place of tracking the line.
@@ -104,8 +108,6 @@ def race(
     """
 
     from bayesrace.vehicles import get_car
-    from controller.pure_pursuit import PurePursuitSettings
-    from controller.settings import MpcSettings
     from operation.analysis.race import read_race, write_result
     from operation.race import FILES
     from operation.race import race as drive_all
@@ -116,16 +118,18 @@ def race(
     from operation.terminal.terminal import Terminal
 
     driven = get_car(car) if tyres is None else get_car(car).on_tyres(tyres)
-    stated = {} if caution is None else {"caution": caution}
-    mpc = MpcSettings(constraints=not no_constraints, **stated)
-    settings = RaceSettings(
-        car=driven, track=track, train_track=train_track, laps=laps, mode=mode.value,
-        pursuit=PurePursuitSettings(style=style), collect_s=train_time,
-        seed=seed, fmu=fmu, fmu_map=fmu_map, simulator=simulator, delay_s=1e-3 * delay,
-        noise=sensor_noise(noise), limit=not no_limit, problem=problem.value,
-        progress_drives=progress_drives,
-        mpc=mpc,
-    )  # fmt: skip
+    settings = settings_of(RaceSettings, context, settings_file, {
+        "car": {"car": driven}, "tyres": {"car": driven}, "track": {"track": track},
+        "train_track": {"train_track": train_track}, "laps": {"laps": laps},
+        "mode": {"mode": mode.value}, "style": {"pursuit": {"style": style}},
+        "train_time": {"collect_s": train_time}, "seed": {"seed": seed}, "fmu": {"fmu": fmu},
+        "fmu_map": {"fmu_map": fmu_map}, "simulator": {"simulator": simulator},
+        "delay": {"delay_s": 1e-3 * delay}, "noise": {"noise": sensor_noise(noise).model_dump()},
+        "no_limit": {"limit": not no_limit}, "problem": {"problem": problem.value},
+        "progress_drives": {"progress_drives": progress_drives},
+        "no_constraints": {"mpc": {"constraints": not no_constraints}},
+        "caution": {"mpc": {} if caution is None else {"caution": caution}},
+    })  # fmt: skip
     out = out or Path("runs") / datetime.now(UTC).astimezone().strftime("%Y%m%d-%H%M%S")
     console = Terminal()
     with stages_on(console) as stages:
@@ -185,9 +189,11 @@ def drive(
     parameters = get_car(car)
     course = load_track(track or parameters.race_track, parameters.width_m)
     name = name or parameters.name
+    endpoints = connect_to(endpoint, "director")
+    endpoints.check_car(name)
     about = {"drive": {"car": car_text(parameters), "track": course.name}}
     with (
-        open_session(connect_to(endpoint)) as session,
+        open_session(endpoints, "director") as session,
         Recorder(session, name, log, about) as recorder,
     ):
         director = Director(session, name)

@@ -10,6 +10,8 @@ import typer
 from typer.core import TyperGroup
 from typer.main import get_command
 
+from operation.cli.configured import configurable, networked
+
 __all__ = ["TaskGroup"]
 
 
@@ -18,6 +20,8 @@ class TaskGroup(TyperGroup):
 
     tasks: ClassVar[dict[str, tuple[str, ...]]]
     """Task to commands, as ``module.function`` of this package, or of an application of its own."""
+    networked: ClassVar[frozenset[str]]
+    """Commands that open links to others than they start themselves."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         """Names in the order of the tasks."""
@@ -30,7 +34,9 @@ class TaskGroup(TyperGroup):
             found = getattr(import_module(f"operation.cli.{module}"), name)
             if not isinstance(found, typer.Typer):
                 own, found = found, typer.Typer(add_completion=False, rich_markup_mode=None)
-                found.command(cmd_name, context_settings=dict(self.context_settings))(own)
+                with_options = networked if places[cmd_name] in self.networked else configurable
+                register = found.command(cmd_name, context_settings=dict(self.context_settings))
+                register(with_options(own))
             self.commands[cmd_name] = get_command(found)
         return self.commands.get(cmd_name)
 

@@ -9,13 +9,15 @@ import typer
 from bayesrace.defaults import DEFAULT_CAR
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
-from operation.cli.options import Car, CarName, Endpoint, connect_to, writable
+from operation.cli.configured import connect_to, realtime
+from operation.cli.options import Car, CarName, Endpoint, SettingsFile, settings_of, writable
 from operation.cli.parts import LockMemory
 
 __all__ = ["latency"]
 
 
 def latency(
+    context: typer.Context,
     rate: Annotated[
         float, typer.Option(metavar="HZ", min=1, max=500, help="Rate of plant and controller [Hz].")
     ] = 50,
@@ -88,6 +90,7 @@ def latency(
     ] = None,
     car: Car = DEFAULT_CAR,
     name: CarName = "",
+    settings_file: SettingsFile = None,
 ) -> None:
     """Measure each leg of a control cycle, from the sampled state to the acting input.
 
@@ -102,7 +105,6 @@ def latency(
     if log and (attach or load):
         raise InputError("--log is of a run that is over: leave out --attach and --load")
 
-    from bayesrace.realtime import RealtimeSettings
     from bayesrace.vehicles import get_car
     from operation.terminal.progress import stages_on
     from operation.terminal.terminal import Terminal
@@ -111,14 +113,21 @@ def latency(
     from studies.latency.settings import LatencySettings
 
     here, parameters = not (attach or log), get_car(car)
-    settings = LatencySettings(
-        car=parameters, name=name, rate_hz=rate, load=load,
-        duration_s=duration or (1e9 if log else 20.0), warm_up_s=0.0 if attach else 3.0,
-        track=track if track is not None else parameters.race_track if here else "",
-        realtime=RealtimeSettings(fifo=fifo, lock_memory=lock_memory),
-        weights=weights, artefact=artefact, raceline=raceline, log=log,
-        attach=connect_to(endpoint).connect if attach else (),
-    )  # fmt: skip
+    settings = settings_of(LatencySettings, context, settings_file, {
+        "car": {"car": parameters}, "name": {"name": name}, "rate": {"rate_hz": rate},
+        "load": {"load": load}, "duration": {"duration_s": duration or (1e9 if log else 20.0)},
+        "attach": {
+            "attach": connect_to(endpoint, "director") if attach else None,
+            "warm_up_s": 0.0 if attach else 3.0,
+        },
+        "track": {
+            "track": track if track is not None else parameters.race_track if here else ""
+        },
+        "fifo": {"realtime": realtime(fifo=fifo, lock_memory=lock_memory)},
+        "lock_memory": {"realtime": realtime(fifo=fifo, lock_memory=lock_memory)},
+        "weights": {"weights": weights}, "artefact": {"artefact": artefact},
+        "raceline": {"raceline": raceline}, "log": {"log": log},
+    })  # fmt: skip
     time = datetime.now(UTC).astimezone().strftime("%Y%m%d-%H%M%S")
     out = out or Path("runs") / f"latency-{time}"
     console = Terminal()

@@ -8,13 +8,13 @@ import typer
 
 from bayesrace.defaults import DEFAULT_CAR
 from bayesrace.files import write_whole
+from operation.cli.configured import connect_to
 from operation.cli.options import (
     AllSamples,
     Car,
     CarName,
     Endpoint,
     Seed,
-    connect_to,
     writable,
 )
 from operation.terminal.notation import UNCERTAIN
@@ -151,8 +151,9 @@ def publish(
     from operation.learn.publishing import NotTakenOverError, in_words
 
     data = read_whole(weights, "weights file", MAX_BYTES)
-    endpoints = connect_to(endpoint)
-    with open_session(endpoints) as session:
+    endpoints = connect_to(endpoint, "learning")
+    name = endpoints.car_named(name)
+    with open_session(endpoints, "learning") as session:
         car = _controller(session, endpoints, name, timeout)
         reply = send_weights(session, car, data, timeout)
     if not reply.accepted:
@@ -175,8 +176,9 @@ def rollback(
     from bayesrace.transport import open_session, send_rollback
     from operation.learn.publishing import NotTakenOverError, in_words
 
-    endpoints = connect_to(endpoint)
-    with open_session(endpoints) as session:
+    endpoints = connect_to(endpoint, "learning")
+    name = endpoints.car_named(name)
+    with open_session(endpoints, "learning") as session:
         car = _controller(session, endpoints, name, timeout)
         reply = send_rollback(session, car, reason or "bayesrace rollback", timeout)
     if not reply.accepted:
@@ -257,6 +259,8 @@ def learn(
     stamp = datetime.now(UTC).astimezone().strftime("%Y%m%d-%H%M%S")
     folder = out or Path("runs") / f"learn-{stamp}"
     parameters = get_car(car)
+    endpoints = connect_to(endpoint, "learning")
+    endpoints.check_car(name or parameters.name)
     settings = LearnSettings(
         car=parameters,
         name=name or parameters.name,
@@ -268,7 +272,7 @@ def learn(
         seed=seed,
     )
     record = follow(
-        settings, connect_to(endpoint), folder, typer.echo,
+        settings, endpoints, folder, typer.echo,
         data=data or (), weights=weights, artefact=artefact,
     )  # fmt: skip
     print_laps(record)

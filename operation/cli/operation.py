@@ -11,13 +11,14 @@ import typer
 
 from bayesrace.clock import die_with_parent
 from bayesrace.errors import InputError
-from operation.cli.options import Endpoint, ParentPid, connect_to
+from operation.cli.configured import connect_to, current
+from operation.cli.options import Endpoint, ParentPid
 
 if TYPE_CHECKING:
     from operation.analysis.network_status import NetworkStatus
     from operation.lifecycle import Action
 
-__all__ = ["go", "router", "status", "stop"]
+__all__ = ["doctor", "go", "router", "status", "stop"]
 
 Name = Annotated[str, typer.Option(metavar="NAME", show_default="", help="Name of the car.")]
 Timeout = Annotated[
@@ -66,8 +67,9 @@ def status(
     from operation.terminal.status_table import StatusTable
     from operation.terminal.terminal import Terminal
 
-    endpoints = connect_to(endpoint)
-    with open_session(endpoints) as session, _closed_pipe_allowed():
+    endpoints = connect_to(endpoint, "viewer")
+    name = endpoints.car_named(name)
+    with open_session(endpoints, "viewer") as session, _closed_pipe_allowed():
         network = ask_statuses(session, find(session, endpoints, timeout, name), timeout)
         if watch and as_json:
             for car in follow(session, network, name, 1.0):
@@ -148,8 +150,9 @@ def _command(
     from operation.lifecycle import command, find, pick
     from operation.terminal.printable import printable
 
-    endpoints = connect_to(endpoint)
-    with open_session(endpoints) as session:
+    endpoints = connect_to(endpoint, "director")
+    name = endpoints.car_named(name)
+    with open_session(endpoints, "director") as session:
         source = "plant" if action == "end" else "controller"
         cars = pick(find(session, endpoints, timeout, name, (source,)), name, all_cars, source)
         answers = command(session, cars, action, reason, timeout)
@@ -164,10 +167,31 @@ def _command(
         raise InputError("; ".join(failures))
 
 
+def doctor() -> None:
+    """Say why processes do not meet: certificates, endpoints, access control, cars.
+
+    Tries everything as a process of this machine would. Exit code 1 if something is wrong.
+    """
+    from operation.doctor import examine
+    from operation.terminal.printable import printable
+
+    faults = 0
+    for check in examine(current()):
+        faults += not check.fine
+        typer.echo(f"{'ok' if check.fine else 'FAULT':<6} {printable(check.text)}")
+    if faults:
+        raise typer.Exit(1)
+
+
 def router(
     listen: Annotated[
-        list[str], typer.Option(metavar="ENDPOINT", help="Zenoh endpoint to listen on; repeatable.")
-    ],
+        list[str] | None,
+        typer.Option(
+            metavar="ENDPOINT",
+            show_default="as configured",
+            help="Zenoh endpoint to listen on; repeatable.",
+        ),
+    ] = None,
     connect: Annotated[
         list[str] | None,
         typer.Option(metavar="ENDPOINT", help="Endpoint of another router; repeatable."),
@@ -180,7 +204,9 @@ def router(
     network, and for machines that cannot reach each other directly.
     """
     die_with_parent(parent_pid)
-    from bayesrace.transport import Endpoints
     from operation.lifecycle import route
 
-    route(Endpoints(listen=tuple(listen), connect=tuple(connect or ()), mode="router"))
+    endpoints = current().endpoints("router", listen=listen or None, connect=connect or None)
+    if not endpoints.listen:
+        raise InputError("a router needs an endpoint: give --listen, or [network] router")
+    route(endpoints)

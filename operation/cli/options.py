@@ -2,14 +2,14 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
+from pydantic import BaseModel, ValidationError
 
 from bayesrace.errors import InputError, faults_in
 
 if TYPE_CHECKING:
-    from bayesrace.transport import Endpoints
     from bayesrace.vehicles import CarParameters
     from controller.path_table import PathTable
     from plant.sensors import SensorNoise
@@ -32,13 +32,14 @@ __all__ = [
     "DriveTime",
     "ProblemChoice",
     "Seed",
+    "SettingsFile",
     "Simulator",
     "Style",
     "TrackName",
     "Tyres",
-    "connect_to",
     "path_on",
     "sensor_noise",
+    "settings_of",
     "writable",
 ]
 
@@ -140,16 +141,9 @@ Endpoint = Annotated[
     typer.Option(
         metavar="ENDPOINT",
         help="Zenoh endpoint of a plant, a controller or a router; repeatable.",
-        show_default="tcp/127.0.0.1:7447 and :7448",
+        show_default="as configured; tcp/127.0.0.1:7447 and :7448",
     ),
 ]
-
-
-def connect_to(given: list[str] | None) -> "Endpoints":
-    """What to connect to: the endpoints given, or the plant's and the controller's own."""
-    from bayesrace.transport import CONTROLLER_ENDPOINT, PLANT_ENDPOINT, Endpoints
-
-    return Endpoints(connect=tuple(given or (PLANT_ENDPOINT, CONTROLLER_ENDPOINT)))
 
 
 def path_on(track: str, raceline: Path | None, car: "CarParameters") -> "PathTable":
@@ -175,6 +169,48 @@ def writable(path: Path | None) -> Path | None:
     return path
 
 
+SettingsFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--settings",
+        metavar="FILE",
+        help="Settings of an earlier run (its settings.json); options that are given override it.",
+    ),
+]
+S = TypeVar("S", bound=BaseModel)
+
+
+def settings_of(
+    kind: type[S], options: typer.Context, file: Path | None, values: dict[str, dict[str, Any]]
+) -> S:
+    """Settings of the file, overridden by options on the command line; of all options without one.
+
+    ``values``: option, by the name of its parameter, to the fields that it sets.
+    """
+    from bayesrace.files import read_text
+
+    content: dict[str, Any] = {}
+    if file is not None:
+        text = read_text(file, "settings", "give the settings.json of a run")
+        try:
+            content = kind.model_validate_json(text).model_dump()
+        except ValidationError as error:
+            raise InputError(f"{file}: {faults_in(error, 'the file')}") from None
+    for option, fields in values.items():
+        source = options.get_parameter_source(option)
+        if file is None or (source is not None and source.name == "COMMANDLINE"):
+            _update(content, fields)
+    return kind.model_validate(content)
+
+
+def _update(content: dict[str, Any], fields: dict[str, Any]) -> None:
+    for name, value in fields.items():
+        if isinstance(value, dict):
+            _update(content.setdefault(name, {}), value)
+        else:
+            content[name] = value
+
+
 OutFile = Annotated[
     Path,
     typer.Option("--out", "-o", metavar="FILE", callback=writable, help="File to write."),
@@ -198,8 +234,6 @@ Delay = Annotated[
 
 def sensor_noise(given: list[str] | None) -> "SensorNoise":
     """The noise of the options ``NAME=STD``; InputError naming one that cannot be."""
-    from pydantic import ValidationError
-
     from plant.sensors import SensorNoise
 
     pairs = dict(one.partition("=")[::2] for one in given or ())

@@ -8,6 +8,7 @@ import typer
 from bayesrace.clock import die_with_parent
 from bayesrace.defaults import DEFAULT_CAR
 from bayesrace.errors import InputError
+from operation.cli.configured import current, realtime
 from operation.cli.options import (
     Car,
     CarName,
@@ -25,8 +26,8 @@ from operation.cli.options import (
 
 __all__ = ["controller", "plant"]
 
-_PLANT = "tcp/127.0.0.1:7447"
-_CONTROLLER = "tcp/127.0.0.1:7448"
+_PLANT = "as configured; tcp/127.0.0.1:7447"
+_CONTROLLER = "as configured; tcp/127.0.0.1:7448"
 
 Rate = Annotated[float, typer.Option(metavar="HZ", min=1, max=500, help="Rate in real time [Hz].")]
 Cpu = Annotated[
@@ -45,12 +46,15 @@ def plant(
     car: Car = DEFAULT_CAR,
     name: CarName = "",
     endpoint: Annotated[
-        str, typer.Option(metavar="ENDPOINT", help="Zenoh endpoint to listen on.")
-    ] = _PLANT,
+        str | None,
+        typer.Option(metavar="ENDPOINT", show_default=_PLANT, help="Zenoh endpoint to listen on."),
+    ] = None,
     connect: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="ENDPOINT", help="Endpoint to connect to, as of a router; repeatable."
+            metavar="ENDPOINT",
+            show_default="as configured",
+            help="Endpoint to connect to, as of a router; repeatable.",
         ),
     ] = None,
     rate: Rate = 50.0,
@@ -68,8 +72,6 @@ def plant(
 ) -> None:
     """Simulate the car: waits for runs, as of 'bayesrace drive', until Ctrl-C."""
     die_with_parent(parent_pid)
-    from bayesrace.realtime import RealtimeSettings
-    from bayesrace.transport import Endpoints
     from bayesrace.vehicles import get_car
     from codegen.compiled import compiled
     from plant.process import PlantSettings, main
@@ -77,8 +79,11 @@ def plant(
     settings = PlantSettings(
         car=get_car(car),
         name=name,
-        endpoints=Endpoints(
-            listen=(endpoint,), connect=tuple(connect or ()), low_latency=low_latency
+        endpoints=current().endpoints(
+            "plant",
+            listen=None if endpoint is None else (endpoint,),
+            connect=connect or None,
+            low_latency=low_latency,
         ),
         rate_hz=rate,
         delay_s=delay * 1e-3,
@@ -87,7 +92,7 @@ def plant(
         fmu=fmu,
         fmu_map=fmu_map,
         simulator=simulator,
-        realtime=RealtimeSettings(cpu=cpu, fifo=fifo, lock_memory=lock_memory),
+        realtime=realtime(cpu, fifo, lock_memory),
         parent_pid=parent_pid,
     )
     raise typer.Exit(main(settings, compiled))
@@ -118,12 +123,13 @@ def controller(
         typer.Option(metavar="ENDPOINT", show_default=_PLANT, help="Zenoh endpoint of the plant."),
     ] = None,
     listen: Annotated[
-        str,
+        str | None,
         typer.Option(
             metavar="ENDPOINT",
+            show_default=_CONTROLLER,
             help="Zenoh endpoint to listen on, for recorders and senders of weights.",
         ),
-    ] = _CONTROLLER,
+    ] = None,
     rate: Rate = 50.0,
     budget: Annotated[
         float,
@@ -156,8 +162,6 @@ def controller(
 ) -> None:
     """Drive the car of a plant process with the compiled controller, until Ctrl-C."""
     die_with_parent(parent_pid)
-    from bayesrace.realtime import RealtimeSettings
-    from bayesrace.transport import Endpoints
     from bayesrace.vehicles import get_car
     from controller.assembly import predictive_controller, read_settings
     from controller.process import ControllerSettings, main
@@ -167,15 +171,18 @@ def controller(
     process = ControllerSettings(
         car=parameters,
         name=name,
-        endpoints=Endpoints(
-            listen=(listen,), connect=tuple(endpoint or (_PLANT,)), low_latency=low_latency
+        endpoints=current().endpoints(
+            "controller",
+            listen=None if listen is None else (listen,),
+            connect=endpoint or None,
+            low_latency=low_latency,
         ),
         rate_hz=rate,
         budget=budget,
         compensation=_compensation(delay),
         hold=hold,
         gate=read_settings(gate, GateSettings),
-        realtime=RealtimeSettings(cpu=cpu, fifo=fifo, lock_memory=lock_memory),
+        realtime=realtime(cpu, fifo, lock_memory),
         parent_pid=parent_pid,
     )
     driver = predictive_controller(artefact, parameters, track, raceline, settings, weights, store)

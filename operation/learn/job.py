@@ -83,7 +83,7 @@ def learn(
             journal.add_update(UpdateRecord(after_lap=0), given, **stages)
         elif samples is not None:
             journal.add_driven(samples)
-        with open_session(endpoints) as session:
+        with open_session(endpoints, "learning") as session:
             Learner(session, journal, say, track, beside).run()
         draw(journal.record, beside, folder / "laps.png")
         return journal.record

@@ -99,7 +99,7 @@ def analyse(log: Path, settings: LatencySettings, track: Track | None, beside: B
         rate_hz=rate_hz,
         duration_s=span_s,
         load=settings.load,
-        attached=bool(settings.attach),
+        attached=settings.attach is not None,
         recorded=settings.log is not None,
         started=datetime.fromtimestamp(begin_ns // 1e9, UTC).astimezone().isoformat(),
         host=beside.host,

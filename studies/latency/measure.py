@@ -14,7 +14,7 @@ from bayesrace.files import write_whole
 from bayesrace.messages import Event
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import Track, load_track
-from bayesrace.transport import Director, Endpoints, Item, Kind, open_session
+from bayesrace.transport import Director, Item, Kind, open_session
 from bayesrace.vehicles import write_car
 from operation.drive import RunPlan, run_request
 from operation.preparation import Prepared, prepare
@@ -121,7 +121,7 @@ def _record(
     run: Run, settings: LatencySettings, track: Track | None, out: Path, stages: Stages
 ) -> None:
     """Records the run, and the machine beside it."""
-    start = not settings.attach
+    start = settings.attach is None
     files = _files(settings, stages) if start else None
     out.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
@@ -132,8 +132,9 @@ def _record(
                 system = stack.enter_context(started_system(run.car, out, plant, both))
                 stack.enter_context(system.controller([*files.arguments, *plant]))
                 session, director, run.children = system.session, system.director, system.children
-            else:
-                session = stack.enter_context(open_session(Endpoints(connect=settings.attach)))
+            elif settings.attach is not None:
+                settings.attach.check_car(run.car)
+                session = stack.enter_context(open_session(settings.attach, "director"))
                 director = Director(session, run.car)
                 director.wait_for(("plant", "controller"), _ATTACH_S)
             rate_hz, phase = director.status("controller").rate_hz, director.status("plant").phase

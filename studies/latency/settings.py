@@ -6,6 +6,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.realtime import RealtimeSettings
 from bayesrace.tracks import DEFAULT_RACE_TRACK
+from bayesrace.transport import Endpoints
 from bayesrace.vehicles import CarSetting, default_car
 
 __all__ = ["LatencySettings"]
@@ -27,7 +28,7 @@ class LatencySettings(BaseModel):
     weights: Path | None = Field(None, description="instead of those trained here")
     artefact: Path | None = Field(None, description="instead of the one built here")
     raceline: Path | None = Field(None, description="instead of the one computed here")
-    attach: tuple[str, ...] = Field((), description="endpoints of a running system")
+    attach: Endpoints | None = Field(None, description="where a running system is")
     log: Path | None = Field(None, description="log of a recorded run, in place of a new one")
 
     @property

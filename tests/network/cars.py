@@ -129,7 +129,7 @@ def start_plant(
     name: str = "orca",
 ) -> Program:
     """A plant that listens there; it does not outlive this process."""
-    where = ("--name", name, "--endpoint", listen, *_each("--connect", connect))
+    where = ("--name", name, "--endpoint", listen, *_each("--connect", connect), "--insecure")
     return Program(folder / f"{name}-plant.txt", "plant", *where, *_parent(), *options, host=host)
 
 
@@ -144,7 +144,7 @@ def start_controller(
 ) -> Program:
     """A controller that connects to its plant, or a router, there; it does not outlive this
     process."""
-    where = ("--name", name, "--endpoint", connect, "--listen", listen)
+    where = ("--name", name, "--endpoint", connect, "--listen", listen, "--insecure")
     output = folder / f"{name}-controller.txt"
     arguments = ("controller", *course.arguments, *where, *_parent(), *options)
     return Program(output, *arguments, host=host)
@@ -152,7 +152,7 @@ def start_controller(
 
 def start_router(folder: Path, listen: str) -> Program:
     """A router; it does not outlive this process."""
-    return Program(folder / "router.txt", "router", "--listen", listen, *_parent())
+    return Program(folder / "router.txt", "router", "--listen", listen, "--insecure", *_parent())
 
 
 def _each(option: str, values: Sequence[str]) -> list[str]:

@@ -106,7 +106,7 @@ class Observer:
 @contextmanager
 def observing(endpoints: Sequence[str], name: str, track: Track, log: Path) -> Iterator[Observer]:
     """Follows and records from this process."""
-    connect = Endpoints(connect=tuple(endpoints))
+    connect = Endpoints(connect=tuple(endpoints), insecure=True)
     with open_session(connect) as session, Recorder(session, name, log):
         yield Observer(session, name, track)
 

@@ -155,7 +155,7 @@ def test_a_drive_from_the_command_line_outlasts_a_short_partition(
     plant_at, controller_at = f"tcp/{PLANT_IP}:7447", f"tcp/{CONTROLLER_IP}:7448"
     log = tmp_path / "run.mcap"
     where = ("--track", course.track_file, "--endpoint", plant_at, "--endpoint", controller_at)
-    options = ("--mode", "realtime", "--laps", "2", "--max-time", "200", "--log", log)
+    options = ("--mode", "realtime", "--laps", "2", "--max-time", "200", "--log", log, "--insecure")
     with (
         start_plant(tmp_path, plant_at, host=net.plant) as plant,
         start_controller(

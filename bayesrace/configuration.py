@@ -1,0 +1,194 @@
+"""``bayesrace.toml``: where the parts of a system are, how they are secured, and what they ask for.
+
+One file serves every machine and every command. The environment variable ``BAYESRACE_CONFIG`` names
+it, or the option ``--config``, which sets that variable: so processes that a command starts read
+the same file. Options of a command override it.
+"""
+
+import json
+import os
+import tomllib
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, Final, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from bayesrace.defaults import CONFIGURATION_VARIABLE
+from bayesrace.errors import InputError, faults_in
+from bayesrace.files import read_text
+from bayesrace.messages import Role
+from bayesrace.realtime import RealtimeSettings
+from bayesrace.transport.credentials import COVERS, MEMBERS, Credentials
+from bayesrace.transport.endpoints import (
+    CONTROLLER_ENDPOINT,
+    PLANT_ENDPOINT,
+    Endpoint,
+    Endpoints,
+    LinkLimits,
+    ZenohSettings,
+)
+
+__all__ = [
+    "VARIABLE", "Configuration", "NetworkSettings", "TlsSettings", "as_toml", "configured",
+    "read_configuration",
+]  # fmt: skip
+
+VARIABLE: Final = CONFIGURATION_VARIABLE
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class NetworkSettings(_Section):
+    """Where the processes are: an endpoint is protocol/host:port, a protocol tcp or tls."""
+
+    plant: tuple[Endpoint, ...] = Field(
+        (PLANT_ENDPOINT,), description="where the plant listens, and the others find it"
+    )
+    controller: tuple[Endpoint, ...] = Field(
+        (CONTROLLER_ENDPOINT,), description="where the controller listens, and the others find it"
+    )
+    router: tuple[Endpoint, ...] = Field(
+        (), description="where the router listens; with one, all others connect to it alone"
+    )
+    insecure: bool = Field(
+        False, description="without certificates: allow endpoints beyond loopback; warns each time"
+    )
+
+
+class TlsSettings(_Section):
+    """Certificates, as 'bayesrace certs' makes them. With a folder every link is encrypted."""
+
+    folder: Path | None = Field(None, description="holds a folder for each certificate")
+    use: dict[Role, str] = Field(
+        {}, description="role of a process to its certificate, where it has not the role's name"
+    )
+
+    def credentials(self, role: Role) -> Credentials | None:
+        """The certificate of a process in that role: its own, or of a role that covers it."""
+        if self.folder is None:
+            return None
+        covering = (one for one, covered in COVERS.items() if role in covered)
+        names = [self.use.get(one, one) for one in (role, *reversed(list(covering)))]
+        there = (name for name in names if (self.folder / name).is_dir())
+        return Credentials.read(self.folder / next(there, names[0]))
+
+    def certificates(self) -> list[Credentials]:
+        """Every certificate in the folder; InputError at one that cannot be used."""
+        if self.folder is None or not self.folder.is_dir():
+            return []
+        folders = sorted(one.parent for one in self.folder.glob(f"*/{MEMBERS}"))
+        return [Credentials.read(folder) for folder in folders]
+
+
+class Configuration(_Section):
+    """Everything in the file; what is left out has its default."""
+
+    network: NetworkSettings = Field(NetworkSettings())
+    tls: TlsSettings = Field(TlsSettings())
+    realtime: RealtimeSettings = Field(RealtimeSettings())
+    limits: LinkLimits = Field(LinkLimits())
+    zenoh: ZenohSettings = Field(
+        {}, description='Zenoh\'s own settings, such as "transport/link/tx/queue/size/data" = 4'
+    )
+
+    def endpoints(
+        self,
+        role: Role,
+        *,
+        listen: Iterable[str] | None = None,
+        connect: Iterable[str] | None = None,
+        low_latency: bool = False,
+    ) -> Endpoints:
+        """Where a process in that role listens and connects; what is given overrides the file."""
+        network = self.network
+        everyone = (*network.plant, *network.controller)
+        where: dict[Role, tuple[tuple[str, ...], tuple[str, ...]]] = {
+            "plant": (network.plant, ()), "controller": (network.controller, network.plant),
+            "router": (network.router, ()),
+        }  # fmt: skip
+        listens, connects = where.get(role, ((), everyone))
+        if network.router and role != "router":
+            listens, connects = (), network.router
+        return Endpoints(
+            listen=listens if listen is None else tuple(listen),
+            connect=connects if connect is None else tuple(connect),
+            low_latency=low_latency,
+            mode="router" if role == "router" else "peer",
+            credentials=self.tls.credentials(role),
+            insecure=network.insecure,
+            limits=self.limits,
+            zenoh=self.zenoh,
+        )
+
+    def plain(self, plant: str, controller: str) -> Self:
+        """The same for processes of one run that meet on loopback, without certificates."""
+        network = NetworkSettings(plant=(plant,), controller=(controller,))
+        return self.model_copy(update={"network": network, "tls": TlsSettings()})
+
+
+def configured() -> Configuration:
+    """The configuration of this process: the file in the environment variable, or the defaults."""
+    name = os.environ.get(VARIABLE, "")
+    return read_configuration(Path(name)) if name else Configuration()
+
+
+def read_configuration(path: Path) -> Configuration:
+    """A file's content; paths in it are relative to its folder. InputError names every fault."""
+    remedy = "write one with 'bayesrace config example'"
+    text = read_text(path, "configuration", remedy)
+    try:
+        content = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path} is no TOML: {error}; {remedy}") from None
+    try:
+        found = Configuration.model_validate(content)
+    except ValidationError as error:
+        raise InputError(f"{path}: {faults_in(error, 'the file')}; {remedy}") from None
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    folder = found.tls.folder
+    if folder is None:
+        return found
+    folder = path.absolute().parent / folder.expanduser()
+    tls = found.tls.model_copy(update={"folder": folder})
+    return found.model_copy(update={"tls": tls})
+
+
+def as_toml(configuration: Configuration, explained: bool = False) -> str:
+    """The content of a file with these settings; ``explained``: with what each one means."""
+    lines: list[str] = []
+    for name, field in Configuration.model_fields.items():
+        section = getattr(configuration, name)
+        is_model = isinstance(section, BaseModel)
+        if explained:
+            words = (type(section).__doc__ or "").splitlines()[0] if is_model else field.description
+            lines += [f"# {words}"]
+        lines += [f"[{name}]"]
+        if is_model:
+            lines += _fields(section, explained)
+        else:
+            lines += [f"{json.dumps(key)} = {_value(value)}" for key, value in section.items()]
+        lines += [""]
+    return "\n".join(lines[:-1]) + "\n"
+
+
+def _fields(section: BaseModel, explained: bool) -> Iterator[str]:
+    for name, field in type(section).model_fields.items():
+        value = getattr(section, name)
+        if explained:
+            yield f"# {field.description}"
+        # TOML has no null: what is not set is a comment.
+        yield f"# {name} =" if value is None else f"{name} = {_value(value)}"
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, dict):
+        if not value:
+            return "{}"
+        return "{ " + ", ".join(f"{json.dumps(k)} = {_value(v)}" for k, v in value.items()) + " }"
+    if isinstance(value, tuple | list):
+        return "[" + ", ".join(map(_value, value)) + "]"
+    return json.dumps(str(value) if isinstance(value, Path) else value)

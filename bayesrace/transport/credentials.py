@@ -1,0 +1,197 @@
+"""A process's certificate: the files, whose it is, and what the others are.
+
+A folder holds what one process needs, as ``bayesrace certs`` writes it: the authority's certificate
+(``ca.pem``), its own (``certificate.pem``) with the private key (``key.pem``), and
+``members.json``, which says what each name may do. A name that is not in it may do nothing.
+"""
+
+import os
+import ssl
+import stat
+import time
+from pathlib import Path
+from typing import Final, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from bayesrace.errors import InputError, faults_in
+from bayesrace.files import read_text
+from bayesrace.messages import Role
+
+__all__ = [
+    "AUTHORITY", "CERTIFICATE", "COVERS", "EVERY_CAR", "KEY", "MEMBERS", "Credentials", "Member",
+    "Members", "read_members",
+]  # fmt: skip
+
+AUTHORITY: Final = "ca.pem"
+CERTIFICATE: Final = "certificate.pem"
+KEY: Final = "key.pem"
+MEMBERS: Final = "members.json"
+
+EVERY_CAR: Final = "*"
+
+COVERS: Final[dict[Role, tuple[Role, ...]]] = {
+    "director": ("learning", "viewer"), "learning": ("viewer",),
+}  # fmt: skip
+"""Roles that may do all that these may."""
+
+_SOON_S: Final = 14 * 86400
+_OPENSSL_EXPIRED: Final = 10
+_OPENSSL_NOT_YET: Final = 9
+
+
+class Member(BaseModel):
+    """What the bearer of a certificate may do."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    role: Role
+    car: str = Field(EVERY_CAR, description="name of the one car that it concerns; *: every car")
+
+    def may_be(self, role: Role) -> bool:
+        """Whether it can do the work of that role."""
+        return role == self.role or role in COVERS.get(self.role, ())
+
+
+class Members(BaseModel):
+    """Everyone with a certificate that counts."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    members: dict[str, Member] = Field({}, description="by the name in the certificate")
+    revoked: tuple[str, ...] = Field((), description="names that never count again")
+
+
+def read_members(path: Path) -> Members:
+    """The members in a file; InputError if it cannot be used."""
+    text = read_text(path, "list of members", "copy it from where 'bayesrace certs' wrote it")
+    try:
+        return Members.model_validate_json(text)
+    except ValidationError as error:
+        raise InputError(f"{path}: {faults_in(error)}; copy it again") from None
+
+
+class Credentials(BaseModel):
+    """The certificate of one process, checked, with what all members may do."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    folder: Path
+    name: str = Field(description="common name in the certificate")
+    ends_s: float = Field(description="calendar time of its expiry, as of time.time()")
+    members: Members
+
+    @classmethod
+    def read(cls, folder: Path) -> Self:
+        """The content of a folder; InputError naming what cannot be used.
+
+        Expired, of another authority than that of the folder, with another key: all is noticed
+        here, before there is a link.
+        """
+        folder = folder.expanduser().absolute()
+        if not folder.is_dir():
+            raise InputError(f"no certificate in {folder}: make one with 'bayesrace certs add'")
+        for name in (AUTHORITY, CERTIFICATE, KEY, MEMBERS):
+            read_text(folder / name, "file", "copy the folder again, as 'bayesrace certs' wrote it")
+        _check_private(folder / KEY)
+        name, ends_s = _verified(folder)
+        return cls(folder=folder, name=name, ends_s=ends_s, members=read_members(folder / MEMBERS))
+
+    @property
+    def member(self) -> Member | None:
+        """What its own list says about it."""
+        return self.members.members.get(self.name)
+
+    @property
+    def car(self) -> str:
+        """The one car that it is for; empty: every car."""
+        member = self.member
+        return "" if member is None or member.car == EVERY_CAR else member.car
+
+    def check(self, role: Role) -> None:
+        """InputError if the certificate is not for such a process."""
+        member = self.member
+        if member is None:
+            revoked = self.name in self.members.revoked
+            why = "has been revoked" if revoked else f"is not in {self.folder / MEMBERS}"
+            raise InputError(
+                f"certificate '{self.name}' {why}: make another one with 'bayesrace certs add NAME "
+                f"--role {role}'"
+            )
+        if not member.may_be(role):
+            raise InputError(
+                f"certificate '{self.name}' ({self.folder}) is for the role {member.role}, and "
+                f"this needs {role}: make one with 'bayesrace certs add NAME --role {role}'"
+            )
+
+    def check_car(self, car: str) -> None:
+        """InputError if the certificate is for another car."""
+        if self.car and car != self.car:
+            raise InputError(
+                f"certificate '{self.name}' is for car '{self.car}', not for '{car}': give --name "
+                f"{self.car}, or make one with 'bayesrace certs add NAME --car {car}'"
+            )
+
+    def expires_soon(self) -> str:
+        """A warning in the last two weeks; empty before."""
+        left_s = self.ends_s - time.time()
+        if left_s > _SOON_S:
+            return ""
+        return (
+            f"certificate '{self.name}' expires in {left_s / 86400:.1f} days, and its links are "
+            f"closed then: renew it with 'bayesrace certs add {self.name} --renew'"
+        )
+
+
+def _check_private(key: Path) -> None:
+    """InputError if others can read the key: theirs may be a group, where root owns the file."""
+    status = key.stat()
+    forbidden = 0o077 if status.st_uid else 0o027
+    if stat.S_IMODE(status.st_mode) & (forbidden if os.geteuid() else 0o077):
+        raise InputError(f"others can read the private key {key}: chmod 600 {key}")
+
+
+def _verified(folder: Path) -> tuple[str, float]:
+    """Name and end of the certificate, after a handshake with itself; InputError if that fails."""
+    authority, files = folder / AUTHORITY, (folder / CERTIFICATE, folder / KEY)
+    try:
+        server = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        client = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        client.check_hostname, client.verify_mode = False, ssl.CERT_NONE
+        server.verify_mode = ssl.CERT_REQUIRED
+        server.load_verify_locations(authority)
+        for context in (server, client):
+            context.load_cert_chain(*files)
+    except ssl.SSLError as error:
+        reason = (error.reason or str(error)).replace("_", " ").lower()
+        raise InputError(
+            f"{folder}: certificate, key and authority do not fit ({reason}): copy the folder "
+            "again, as 'bayesrace certs' wrote it"
+        ) from None
+    here, there, incoming, outgoing = (ssl.MemoryBIO() for _ in range(4))
+    one = server.wrap_bio(here, there, server_side=True)
+    other = client.wrap_bio(incoming, outgoing)
+    try:
+        for _ in range(4):
+            for end in (other, one):
+                try:
+                    end.do_handshake()
+                except ssl.SSLWantReadError:
+                    here.write(outgoing.read())
+                    incoming.write(there.read())
+    except ssl.SSLCertVerificationError as error:
+        raise InputError(f"certificate in {folder} {_why_not(error)}") from None
+    found = one.getpeercert() or {}
+    subject = {str(pair[0]): str(pair[1]) for group in found["subject"] for pair in group}
+    return subject["commonName"], ssl.cert_time_to_seconds(str(found["notAfter"]))
+
+
+def _why_not(error: ssl.SSLCertVerificationError) -> str:
+    if error.verify_code == _OPENSSL_EXPIRED:
+        return "has expired: renew it with 'bayesrace certs add NAME --renew'"
+    if error.verify_code == _OPENSSL_NOT_YET:
+        return "is not valid yet: set the clock of this machine"
+    return (
+        f"is not of the authority in {AUTHORITY} ({error.verify_message}): copy the folder again, "
+        "as 'bayesrace certs' wrote it"
+    )

@@ -1,0 +1,196 @@
+"""Where a process listens and connects, and how its links are limited and secured."""
+
+import ipaddress
+import re
+import socket
+from collections.abc import Iterator
+from typing import Annotated, Any, Final, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue
+
+from bayesrace.errors import InputError
+from bayesrace.transport.credentials import Credentials
+
+__all__ = [
+    "CONTROLLER_ENDPOINT", "PLANT_ENDPOINT", "Address", "Endpoint", "Endpoints", "LinkLimits",
+    "ZenohSettings", "address_of", "free_endpoint", "leaves",
+]  # fmt: skip
+
+PLANT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
+"""Where a plant listens by default: loopback only."""
+
+CONTROLLER_ENDPOINT: Final = "tcp/127.0.0.1:7448"
+"""Where a controller listens by default: loopback only."""
+
+_OURS: Final = (
+    "mode", "id", "metadata", "listen", "connect", "region_name", "gateway", "access_control",
+    "transport/link/tls", "transport/link/protocols", "transport/auth",
+    "transport/unicast/lowlatency", "transport/unicast/qos", "scouting", "adminspace", "plugins",
+    "plugins_loading",
+)  # fmt: skip
+"""Zenoh's settings that follow from ours, or that would let others in past them."""
+
+_ENDPOINT: Final = re.compile(
+    r"(?P<local>unixsock-stream)/[^\s#?]+([?#]\S*)?"
+    r"|(?P<protocol>tcp|udp|tls|quic|ws)/(?P<host>\[[^\]]+\]|[^:/\s]+):(?P<port>\d{1,5})([?#]\S*)?"
+)
+
+
+class Address(BaseModel):
+    """Protocol, host and port of an endpoint."""
+
+    model_config = ConfigDict(frozen=True)
+
+    protocol: str
+    host: str = ""
+    port: int = 0
+
+    @property
+    def loopback(self) -> bool:
+        """Whether only processes of this machine reach it; names are not looked up."""
+        if self.protocol == "unixsock-stream" or self.host == "localhost":
+            return True
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return False
+
+
+def address_of(endpoint: str) -> Address:
+    """The parts of an endpoint; InputError if it is malformed."""
+    match = _ENDPOINT.fullmatch(endpoint)
+    if match is None or int(match["port"] or 0) > 65535:
+        raise InputError(
+            f"endpoint '{endpoint}' is not of the form protocol/address:port, such as "
+            f"{PLANT_ENDPOINT}, or unixsock-stream/path; protocols: tcp, udp, tls, quic, ws"
+        )
+    if match["local"]:
+        return Address(protocol=match["local"])
+    host = match["host"].strip("[]")
+    return Address(protocol=match["protocol"], host=host, port=int(match["port"]))
+
+
+def _well_formed(endpoint: str) -> str:
+    address_of(endpoint)
+    return endpoint
+
+
+Endpoint = Annotated[str, AfterValidator(_well_formed)]
+
+
+def leaves(settings: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Nested settings by their paths, as Zenoh has them: 'transport/link/tx/lease'."""
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            yield from leaves(value, f"{prefix}{name}/")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _beside_ours(settings: dict[str, Any]) -> dict[str, Any]:
+    for path, _ in leaves(settings):
+        if any(path == one or path.startswith(one + "/") for one in _OURS):
+            raise ValueError(f"{path} follows from [network] and [tls]; leave it out")
+    return settings
+
+
+ZenohSettings = Annotated[dict[str, JsonValue], AfterValidator(_beside_ours)]
+"""Settings of Zenoh, nested or by their paths, but for those that are made of ours."""
+
+
+class LinkLimits(BaseModel):
+    """What links may cost, and how soon a silent one is closed."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    lease_s: float = Field(
+        5.0, gt=0, le=600, description="silence after which a link is closed; shorter stalls pass"
+    )
+    handshake_s: float = Field(
+        2.0, gt=0, le=60, description="time limit of a handshake, for both ends"
+    )
+    pending: int = Field(
+        10_000, ge=1, le=100_000, description="connections in their handshake at once"
+    )
+    """With Zenoh's default of 100, a port scan held up the states of a driving car for a second."""
+    sessions: int = Field(1000, ge=1, le=100_000, description="processes that are linked at once")
+
+
+class Endpoints(BaseModel):
+    """Endpoints that a process listens on and connects to, and what holds for its links."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    listen: tuple[str, ...] = Field(
+        default=(), description="endpoints to listen on, 'tcp/address:port'"
+    )
+    connect: tuple[str, ...] = Field(
+        default=(), description="endpoints to connect to; retried as long as the process runs"
+    )
+    low_latency: bool = Field(
+        default=False,
+        description="send in the calling thread to peers that do so too, without priorities: "
+        "for lockstep, where the sender waits for the answer anyway",
+    )
+    """Applies to links of which both ends have it. It saves two thread changes a message, but
+    blocks where the table says drop, and carries at most 60 kB a message: not for free-running
+    processes, and not for senders of weights."""
+    mode: Literal["peer", "router"] = Field(
+        default="peer", description="router: forward between those that connect to this process"
+    )
+    credentials: Credentials | None = Field(
+        None,
+        exclude=True,
+        description="certificate of this process; with one, every link is encrypted",
+    )
+    insecure: bool = Field(
+        False, description="without a certificate: allow endpoints beyond loopback all the same"
+    )
+    limits: LinkLimits = LinkLimits()
+    zenoh: ZenohSettings = Field({}, description="Zenoh's own settings, by their paths")
+
+    def check(self) -> None:
+        """InputError if an endpoint is malformed, or open to others without protection."""
+        for endpoint in (*self.listen, *self.connect):
+            address = address_of(endpoint)
+            if self.credentials is not None and address.protocol != "tls":
+                raise InputError(
+                    f"endpoint {endpoint} is not encrypted, and this process has a certificate "
+                    f"({self.credentials.folder}): write tls/, or leave the certificate out"
+                )
+            if self.credentials is None and address.protocol in ("tls", "quic"):
+                raise InputError(
+                    f"endpoint {endpoint} needs a certificate: make one with 'bayesrace certs', "
+                    "and name its folder in [tls] of bayesrace.toml (docs/security.md)"
+                )
+        if self.exposed and not self.insecure:
+            raise InputError(
+                f"{', '.join(self.exposed)}: whoever is in that network could drive the car, since "
+                "links without certificates are open; make certificates with 'bayesrace certs' "
+                "(docs/security.md), or accept it with --insecure"
+            )
+
+    def check_car(self, car: str) -> None:
+        """InputError if the certificate is for another car."""
+        if self.credentials is not None:
+            self.credentials.check_car(car)
+
+    def car_named(self, name: str) -> str:
+        """The car that is meant: the one named, or the certificate's; empty: any."""
+        if name:
+            self.check_car(name)
+        return name or (self.credentials.car if self.credentials is not None else "")
+
+    @property
+    def exposed(self) -> list[str]:
+        """Endpoints beyond loopback, where links are neither encrypted nor authenticated."""
+        if self.credentials is not None:
+            return []
+        return [one for one in (*self.listen, *self.connect) if not address_of(one).loopback]
+
+
+def free_endpoint(protocol: Literal["tcp", "tls"] = "tcp") -> str:
+    """A loopback endpoint that is free at the moment, for runs that start processes."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"

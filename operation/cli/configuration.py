@@ -1,0 +1,85 @@
+"""``config``: the configuration file, shown, checked and begun."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bayesrace.configuration import Configuration, as_toml, configured, read_configuration
+from bayesrace.errors import InputError
+from bayesrace.files import write_whole
+from operation.cli.configured import configurable, current
+from operation.cli.options import writable
+
+__all__ = ["config"]
+
+config = typer.Typer(
+    name="config",
+    no_args_is_help=True,
+    help="The configuration, bayesrace.toml: where processes are, how they are secured.",
+)
+
+
+def show() -> None:
+    """Print the configuration that commands use here: the file, and the defaults of all else."""
+    typer.echo(as_toml(current()), nl=False)
+
+
+def check(
+    file: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="FILE", show_default="the one that commands use here", help="Configuration."
+        ),
+    ] = None,
+) -> None:
+    """Check a configuration: each value, and the certificates that it names.
+
+    'bayesrace doctor' tries the links, too.
+    """
+    found = configured() if file is None else read_configuration(file)
+    typer.echo(f"{file or 'configuration'}: {_certificates(found)}")
+
+
+def _certificates(found: Configuration) -> str:
+    """What there is of certificates, each of which is read; InputError if one cannot be used."""
+    if found.tls.folder is None:
+        return "fine; no certificates, so links are for loopback only"
+    there = found.tls.certificates()
+    if not there:
+        raise InputError(
+            f"no certificates in {found.tls.folder}: make them with 'bayesrace certs', or correct "
+            "[tls] folder"
+        )
+    roles = {one.name: "revoked" if one.member is None else one.member.role for one in there}
+    for role in ("plant", "controller", "director", "router"):
+        if role in roles.values():
+            found.endpoints(role).check()
+    return "fine; certificates " + ", ".join(f"'{name}' ({role})" for name, role in roles.items())
+
+
+def example(
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            metavar="FILE",
+            callback=writable,
+            show_default="printed",
+            help="File to write; never over another one.",
+        ),
+    ] = None,
+) -> None:
+    """Write a configuration to start from: every setting with its default and its meaning."""
+    text = as_toml(Configuration(), explained=True)
+    if out is None:
+        typer.echo(text, nl=False)
+    elif out.exists():
+        raise InputError(f"{out} exists: name another file, or remove it")
+    else:
+        write_whole(out, text)
+
+
+for command in (show, check, example):
+    config.command()(configurable(command))

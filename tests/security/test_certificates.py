@@ -1,0 +1,156 @@
+"""Making, listing and revoking certificates, and what is said of those that can't be used."""
+
+import shutil
+import stat
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+from cryptography.x509.oid import ExtendedKeyUsageOID
+
+from bayesrace.errors import InputError
+from bayesrace.transport import Credentials
+from tests.command_line import Cli, refused
+from tests.security.authority import CAR, Bundles, bundles
+
+__all__ = ["bundles"]
+
+
+def mode(path: Path) -> int:
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+def test_from_nothing_to_certificates_that_are_read(cli: Cli, tmp_path: Path) -> None:
+    """As docs/security.md does it; only the authority's folder and each own one hold a key."""
+    assert cli("certs", "init").code == 0
+    assert (
+        cli("certs", "add", "car", "--role", "plant", "--car", "orca", "--host", "10.0.0.1").code
+        == 0
+    )
+    assert cli("certs", "add", "boss", "--role", "director").code == 0
+    car, boss = (Credentials.read(tmp_path / "certs" / name) for name in ("car", "boss"))
+    assert (car.name, car.car, boss.car) == ("car", "orca", "")
+    assert car.members == boss.members
+    assert car.member is not None
+    assert car.member.role == "plant"
+    listed = cli("certs", "list").out.splitlines()
+    assert len(listed) == 2
+    assert all(word in listed[1] for word in ("car", "plant", "orca", "until", "10.0.0.1"))
+    for key in (tmp_path / "certs").rglob("key.pem"):
+        assert mode(key) == 0o600
+        assert mode(key.parent) == 0o700
+    refused(cli("certs", "init"), "exists")
+
+
+def test_a_certificate_serves_its_purposes_alone(bundles: Bundles) -> None:
+    """A viewer's can't be shown by a server; none can sign another."""
+    usages = {}
+    for name in ("plant", "viewer"):
+        text = (bundles.path(name) / "certificate.pem").read_bytes()
+        extensions = x509.load_pem_x509_certificate(text).extensions
+        assert not extensions.get_extension_for_class(x509.BasicConstraints).value.ca
+        assert not extensions.get_extension_for_class(x509.KeyUsage).value.key_cert_sign
+        usages[name] = extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
+    assert ExtendedKeyUsageOID.SERVER_AUTH in usages["plant"]
+    assert ExtendedKeyUsageOID.SERVER_AUTH not in usages["viewer"]
+
+
+def test_renewed_keeps_what_is_not_given_and_revoked_never_returns(
+    cli: Cli, tmp_path: Path
+) -> None:
+    cli("certs", "init")
+    cli("certs", "add", "a", "--role", "controller", "--car", "orca", "--days", "1")
+    cli("certs", "add", "b", "--role", "plant")
+    folder = tmp_path / "certs" / "a"
+    before = Credentials.read(folder)
+    assert "expires in" in before.expires_soon()
+    refused(cli("certs", "add", "a", "--role", "viewer"), "there is a certificate 'a'", "--renew")
+    assert cli("certs", "add", "a", "--renew").code == 0
+    after = Credentials.read(folder)
+    assert after.member == before.member
+    assert after.expires_soon() == ""
+    assert cli("certs", "revoke", "a").code == 0
+    assert Credentials.read(tmp_path / "certs" / "b").members.revoked == ("a",)
+    with pytest.raises(InputError, match="'a' has been revoked: make another"):
+        Credentials.read(folder).check("controller")
+    assert "revoked" in cli("certs", "list").out
+    refused(cli("certs", "add", "a", "--role", "viewer"), "revoked, for ever")
+    refused(cli("certs", "add", "a", "--renew"), "revoked, for ever")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("add", "x"), ("no role", "--role")),
+        (("add", "x", "--role", "king"), ("king",)),
+        (("add", "authority", "--role", "plant"), ("can't name",)),
+        (("add", "../x", "--role", "plant"), ("can't name",)),
+        (("add", "x", "--role", "plant", "--car", "a/b"), ("--car a/b",)),
+        (("add", "x", "--role", "plant", "--host", "schloß"), ("--host schloß",)),
+        (("add", "x", "--renew"), ("no certificate 'x' to renew",)),
+        (("revoke", "x"), ("no certificate 'x'", "there are: none")),
+    ],
+)
+def test_what_cannot_be_made_is_refused(
+    cli: Cli, arguments: tuple[str, ...], words: tuple[str, ...]
+) -> None:
+    cli("certs", "init")
+    refused(cli("certs", *arguments), *words)
+
+
+def test_without_an_authority_there_is_a_remedy(cli: Cli) -> None:
+    refused(cli("certs", "list"), "bayesrace certs init")
+
+
+def _readable(folder: Path) -> None:
+    (folder / "key.pem").chmod(0o644)
+
+
+def _without_list(folder: Path) -> None:
+    (folder / "members.json").unlink()
+
+
+def _spoilt_list(folder: Path) -> None:
+    (folder / "members.json").write_text('{"members": {"plant": {"role": "king"}}}')
+
+
+def _of(name: str, *files: str) -> Callable[[Path, Bundles], None]:
+    def take(folder: Path, bundles: Bundles) -> None:
+        for file in files:
+            shutil.copy(bundles.path(name) / file, folder / file)
+
+    return take
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda folder, _: _readable(folder), "others can read .*chmod 600"),
+        (lambda folder, _: _without_list(folder), "members.json.*copy the folder again"),
+        (lambda folder, _: _spoilt_list(folder), "members.plant.role"),
+        (_of("controller", "key.pem"), "do not fit"),
+        (_of("foreign-plant", "certificate.pem", "key.pem"), "not of the authority"),
+        (_of("expired", "certificate.pem", "key.pem"), "has expired: renew"),
+    ],
+)
+def test_a_folder_that_cannot_be_used_is_refused_with_the_remedy(
+    bundles: Bundles, tmp_path: Path, spoil: Callable[[Path, Bundles], None], words: str
+) -> None:
+    folder = tmp_path / "plant"
+    shutil.copytree(bundles.path("plant"), folder)
+    assert Credentials.read(folder).name == "plant"
+    spoil(folder, bundles)
+    with pytest.raises(InputError, match=words):
+        Credentials.read(folder)
+
+
+def test_a_certificate_is_for_a_role_and_a_car(bundles: Bundles) -> None:
+    viewer, director = bundles.credentials("one-viewer"), bundles.credentials("director")
+    with pytest.raises(InputError, match=r"is for the role viewer.*needs controller.*certs add"):
+        viewer.check("controller")
+    with pytest.raises(InputError, match=f"is for car '{CAR}', not for 'blue'"):
+        viewer.check_car("blue")
+    for role in ("director", "learning", "viewer"):
+        director.check(role)
+    director.check_car("blue")

@@ -1,0 +1,191 @@
+"""One configuration file: validated, read by every command and its children, safe by default."""
+
+import json
+import os
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from bayesrace.configuration import VARIABLE, Configuration, as_toml, read_configuration
+from bayesrace.errors import InputError
+from bayesrace.transport import Endpoints, free_endpoint, open_session
+from operation.settings import RaceSettings
+from operation.system import CONFIGURATION, started_system
+from tests.command_line import Cli, refused
+from tests.programs import finish, start
+
+BEYOND = "tcp/0.0.0.0:7447"
+
+
+def config(folder: Path, text: str) -> Path:
+    path = folder / "bayesrace.toml"
+    path.write_text(text)
+    return path
+
+
+def test_the_example_holds_every_setting_with_its_meaning(cli: Cli, tmp_path: Path) -> None:
+    assert cli("config", "example", "--out", "bayesrace.toml").code == 0
+    assert read_configuration(tmp_path / "bayesrace.toml") == Configuration()
+    text = (tmp_path / "bayesrace.toml").read_text()
+    for name, field in Configuration.model_fields.items():
+        assert f"[{name}]" in text
+        for setting, one in getattr(field.annotation, "model_fields", {}).items():
+            assert f"{setting} =" in text
+            assert f"# {one.description}" in text
+    refused(cli("config", "example", "--out", "bayesrace.toml"), "exists")
+
+
+def test_what_is_written_is_read_back() -> None:
+    content = {
+        "network": {"plant": ["tls/10.0.0.1:1", "tls/[::1]:2"], "insecure": True},
+        "tls": {"folder": "/certs", "use": {"plant": 'a "b"'}}, "realtime": {"fifo": 7},
+        "limits": {"lease_s": 0.5}, "zenoh": {"transport/link/rx/buffer_size": 1000},
+    }  # fmt: skip
+    made = Configuration.model_validate(content)
+    assert Configuration.model_validate(tomllib.loads(as_toml(made))) == made
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[network]\nplant = ['tcp/nowhere']", ("network.plant.0", "protocol/address:port")),
+        ("[network]\nplants = []", ("network.plants", "not permitted")),
+        ("[limits]\nlease_s = -1", ("limits.lease_s", "greater than 0")),
+        ("[limits]\nlease_s = nan", ("limits.lease_s",)),
+        ("[tls]\nuse = { driver = 'x' }", ("tls.use.driver",)),
+        ("[zenoh.access_control]\nenabled = false", ("zenoh", "access_control/enabled")),
+        ("[zenoh]\n'scouting/multicast/enabled' = true", ("zenoh", "scouting/multicast")),
+        ("[zenoh.transport.link.tls]\nenable_mtls = false", ("zenoh", "transport/link/tls")),
+        ("[network", ("no TOML",)),
+    ],
+)
+def test_a_fault_is_named_with_file_and_field(
+    cli: Cli, tmp_path: Path, text: str, words: tuple[str, ...]
+) -> None:
+    path = config(tmp_path, text)
+    refused(cli("config", "check", path), str(path), *words)
+    refused(cli("cars", "--config", path), str(path), *words)
+
+
+def test_flags_override_the_file_which_overrides_the_variable(
+    cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, two = (tmp_path / name for name in ("one.toml", "two.toml"))
+    one.write_text("[network]\nplant = ['tcp/127.0.0.1:1001']\n")
+    two.write_text("[network]\nplant = ['tcp/127.0.0.1:1002']\n[realtime]\nfifo = 5\n")
+    monkeypatch.setenv(VARIABLE, str(one))
+    assert "127.0.0.1:1001" in cli("config", "show").out
+    assert "127.0.0.1:1002" in cli("config", "show", "--config", two).out
+    assert os.environ[VARIABLE] == str(one)
+    refused(cli("stop", "--config", two, "--timeout", "0.2"), "127.0.0.1:1002")
+    where = free_endpoint()
+    asked = cli("stop", "--config", two, "--timeout", "0.2", "--endpoint", where)
+    refused(asked, where)
+    assert "1002" not in asked.err
+
+
+def test_a_router_in_the_file_is_what_all_connect_to() -> None:
+    found = Configuration.model_validate({"network": {"router": ["tcp/127.0.0.1:9"]}})
+    assert found.endpoints("router").listen == ("tcp/127.0.0.1:9",)
+    for role in ("plant", "controller", "director"):
+        ends = found.endpoints(role)
+        assert (ends.listen, ends.connect) == ((), ("tcp/127.0.0.1:9",))
+
+
+@pytest.mark.wall_clock
+def test_the_processes_of_a_system_read_the_file_that_it_leaves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beside where they meet, they have what is configured."""
+    monkeypatch.setenv(
+        VARIABLE, str(config(tmp_path, "[limits]\nlease_s = 3.5\n[realtime]\ncpu = 9999\n"))
+    )
+    folder = tmp_path / "run"
+    folder.mkdir()
+    with started_system("orca", folder) as system:
+        system.director.wait_for(("plant",), 30.0)
+    left = read_configuration(folder / CONFIGURATION)
+    assert left.limits.lease_s == 3.5
+    assert left.network.plant != Configuration().network.plant
+    assert "not bound to CPU 9999" in (folder / "plant.log").read_text()
+
+
+def test_settings_of_zenoh_reach_it_and_unknown_ones_are_named() -> None:
+    with open_session(Endpoints(zenoh={"transport": {"link": {"tx": {"batch_size": 1000}}}})):
+        pass
+    with (
+        pytest.raises(InputError, match=r"\[zenoh\] transport/link/tx/bath_size"),
+        open_session(Endpoints(zenoh={"transport/link/tx/bath_size": 1000})),
+    ):
+        pass
+
+
+# Safe by default ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", ["plant", "status", "stop", "go", "rollback", "router"])
+def test_beyond_loopback_nothing_starts_without_certificates(cli: Cli, command: str) -> None:
+    option = "--listen" if command == "router" else "--endpoint"
+    refused(cli(command, option, BEYOND), BEYOND, "could drive the car", "--insecure", "certs")
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "loopback"),
+    [
+        ("tcp/127.0.0.1:1", True), ("tcp/127.9.9.9:1", True), ("tcp/[::1]:1", True),
+        ("tcp/localhost:1", True), ("unixsock-stream/x", True), ("tcp/0.0.0.0:1", False),
+        ("tcp/[::]:1", False), ("tcp/10.0.0.1:1", False), ("tcp/127.0.0.1.example:1", False),
+        ("ws/plant:1", False), ("tcp/localhost.example:1", False),
+    ],
+)  # fmt: skip
+def test_only_loopback_counts_as_such(endpoint: str, loopback: bool) -> None:
+    for ends in (Endpoints(listen=(endpoint,)), Endpoints(connect=(endpoint,))):
+        assert (ends.exposed == []) == loopback
+
+
+@pytest.mark.wall_clock
+def test_insecure_is_possible_and_warns_each_time() -> None:
+    where = free_endpoint().replace("127.0.0.1", "0.0.0.0")  # noqa: S104
+    plant = start("plant", "--endpoint", where, "--insecure")
+    assert plant.stderr is not None
+    line = plant.stderr.readline()
+    plant.terminate()
+    finish(plant)
+    assert "INSECURE" in line
+    assert where in line
+
+
+def test_an_encrypted_endpoint_needs_a_certificate(cli: Cli) -> None:
+    refused(cli("plant", "--endpoint", "tls/127.0.0.1:7447"), "certificate", "bayesrace certs")
+
+
+# settings.json -----------------------------------------------------------------------------------
+
+
+def test_a_race_repeats_the_settings_of_another(
+    cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Options that are given override them, all others stay; also of nested settings."""
+    seen: list[RaceSettings] = []
+
+    class StopError(RuntimeError):
+        pass
+
+    def record(settings: RaceSettings, *_: object) -> None:
+        seen.append(settings)
+        raise StopError
+
+    StopError.__module__ = "operation.race"
+    monkeypatch.setattr("operation.race.race", record)
+    first = ("--laps", "5", "--seed", "3", "--style", "calm", "--no-constraints", "--delay", "20")
+    cli("race", *first, "--track", "paddock", "--noise", "speed_mps=0.5")
+    path = tmp_path / "settings.json"
+    path.write_text(seen[0].model_dump_json())
+    cli("race", "--settings", path)
+    assert seen[1] == seen[0]
+    cli("race", "--settings", path, "--seed", "4", "--style", "weave")
+    pursuit = seen[0].pursuit.model_copy(update={"style": "weave", "seed": 4})
+    assert seen[2] == seen[0].model_copy(update={"seed": 4, "pursuit": pursuit})
+    path.write_text(json.dumps({"laps": 0}))
+    refused(cli("race", "--settings", path), str(path), "laps")
