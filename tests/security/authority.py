@@ -72,7 +72,7 @@ def bundles(tmp_path_factory: pytest.TempPathFactory) -> Bundles:
     return Bundles(session_folder(tmp_path_factory, "certificates", _make))
 
 
-def written(folder: Path, bundles: Bundles, plant: str, controller: str, **use: str) -> Path:
+def written(folder: Path, bundles: Bundles, plant: str, controller: str, /, **use: str) -> Path:
     """A configuration with these certificates; ``use``: role to certificate."""
     path = folder / "bayesrace.toml"
     names = ", ".join(f'{role} = "{name}"' for role, name in use.items())

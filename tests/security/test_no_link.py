@@ -1,0 +1,272 @@
+"""Why there is no link is said by every process, and ends those that waiting cannot help."""
+
+import json
+import re
+import shutil
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+import pytest
+
+from bayesrace.errors import InputError
+from bayesrace.messages import Role
+from bayesrace.raceline.line import write_raceline
+from bayesrace.tracks import write_track
+from bayesrace.transport import Credentials, Endpoints, free_endpoint, open_session
+from operation.certificates import add, init
+from tests.command_line import Cli, refused
+from tests.conftest import Circuit
+from tests.programs import finish, start, until
+from tests.security.authority import CAR, Bundles, bundles, written
+from tests.security.intruder import bare_session
+
+__all__ = ["bundles"]
+
+pytestmark = pytest.mark.wall_clock
+
+ABSENT: Final = "nobody listens at"
+FOREIGN: Final = "of another authority"
+NAME: Final = "certificate for other hosts"
+
+
+@contextmanager
+def listening(where: str, folder: Path | None) -> Iterator[None]:
+    """Something that listens with that certificate, whatever it is worth."""
+    settings: dict[str, Any] = {"listen/endpoints": [where], "connect/endpoints": []}
+    if folder is not None:
+        settings["transport/link/tls"] = {
+            "root_ca_certificate": str(folder / "ca.pem"), "enable_mtls": True,
+            "listen_certificate": str(folder / "certificate.pem"),
+            "listen_private_key": str(folder / "key.pem"),
+        }  # fmt: skip
+    with bare_session(where, None, **settings):
+        yield
+
+
+def why_not(endpoints: Endpoints, role: Role) -> str:
+    """What a process says that ends at its start."""
+    with pytest.raises(InputError) as error, open_session(endpoints, role):
+        pass
+    return str(error.value)
+
+
+# In a session ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("at_plant", "at_controller", "words"),
+    [
+        ("foreign-plant", "controller", FOREIGN),
+        ("plant", "foreign-controller", FOREIGN),
+        ("expired", "controller", "has a certificate that has expired: renew it there"),
+        ("blue-plant", "revoked", "'blue-plant' refuses certificate 'stale', which is revoked"),
+    ],
+)
+def test_a_refused_certificate_is_said_at_either_end(
+    bundles: Bundles, at_plant: str, at_controller: str, words: str
+) -> None:
+    where = free_endpoint("tls")
+    with ExitStack() as stack:
+        if at_plant in ("plant", "blue-plant"):
+            ends = bundles.endpoints(at_plant, listen=(where,))
+            stack.enter_context(open_session(ends, "plant"))
+        else:
+            stack.enter_context(listening(where, bundles.path(at_plant)))
+        said = why_not(bundles.endpoints(at_controller, connect=(where,)), "controller")
+    assert words in said
+    assert where in said or at_controller == "revoked"
+    assert "bayesrace certs" in said
+
+
+def test_another_host_name_is_said(bundles: Bundles) -> None:
+    where = free_endpoint("tls").replace("127.0.0.1", "127.0.0.2")
+    with open_session(bundles.endpoints("plant", listen=(where,)), "plant"):
+        said = why_not(bundles.endpoints("controller", connect=(where,)), "controller")
+    assert NAME in said
+    assert "--renew --host 127.0.0.2" in said
+
+
+def test_an_older_list_at_the_other_end_is_said(bundles: Bundles, tmp_path: Path) -> None:
+    """It does not have a certificate yet, or has it for another role."""
+    folder = tmp_path / "plant"
+    shutil.copytree(bundles.path("plant"), folder)
+    where = free_endpoint("tls")
+    for change, words in (
+        ({"role": "viewer", "car": "*"}, "knows certificate 'controller' as viewer of car"),
+        (None, "has no certificate 'controller' in its list"),
+    ):
+        content = json.loads((folder / "members.json").read_text())
+        if change is None:
+            del content["members"]["controller"]
+        else:
+            content["members"]["controller"] = change
+        (folder / "members.json").write_text(json.dumps(content))
+        older = Endpoints(listen=(where,), credentials=Credentials.read(folder))
+        with open_session(older, "plant"):
+            said = why_not(bundles.endpoints("controller", connect=(where,)), "controller")
+        assert words in said
+        assert "copy the newest members.json" in said
+
+
+def test_encryption_at_one_end_only_is_said(
+    bundles: Bundles, caplog: pytest.LogCaptureFixture
+) -> None:
+    where = free_endpoint("tls")
+    plain = where.replace("tls/", "tcp/")
+    with listening(plain, None):
+        said = why_not(bundles.endpoints("controller", connect=(where,)), "controller")
+    assert "is not encrypted" in said
+    with (
+        open_session(bundles.endpoints("plant", listen=(where,)), "plant"),
+        open_session(Endpoints(connect=(plain,)), "controller"),
+    ):
+        until(lambda: "asks for a certificate" in caplog.text, "the reason", 10.0)
+    assert where not in caplog.text
+    assert plain in caplog.text
+
+
+def test_who_is_absent_is_said_once_and_waited_for(
+    bundles: Bundles, caplog: pytest.LogCaptureFixture
+) -> None:
+    """And what waiting does not help, as soon as it is there."""
+    where = free_endpoint("tls")
+    with open_session(bundles.endpoints("controller", connect=(where,)), "controller") as session:
+        until(lambda: ABSENT in caplog.text, "who is absent", 10.0)
+        with listening(where, bundles.path("foreign-plant")):
+            until(lambda: FOREIGN in caplog.text, "why there is no link", 10.0)
+        with open_session(bundles.endpoints("plant", listen=(where,)), "plant"):
+            until(lambda: session.info.links(), "the link", 10.0)
+    assert caplog.text.count(FOREIGN) == 1
+    assert caplog.text.count(ABSENT) <= 2
+
+
+def test_a_link_ends_with_its_certificate(tmp_path: Path) -> None:
+    init(tmp_path)
+    add(tmp_path, "plant", "plant", CAR)
+    add(tmp_path, "brief", "controller", CAR, days=8 / 86400)
+    where = free_endpoint("tls")
+    ends = [Credentials.read(tmp_path / name) for name in ("plant", "brief")]
+    with (
+        open_session(Endpoints(listen=(where,), credentials=ends[0]), "plant") as plant,
+        open_session(Endpoints(connect=(where,), credentials=ends[1]), "controller"),
+    ):
+        assert plant.info.links()
+        until(lambda: not plant.info.links(), "the end of the link", 60.0)
+
+
+# Every process -----------------------------------------------------------------------------------
+
+COMMANDS: Final = (
+    ("controller", "controller"), ("status", "viewer"), ("stop", "director"), ("go", "director"),
+    ("rollback", "learning"), ("publish", "learning"), ("learn", "learning"),
+    ("drive", "director"), ("latency", "director"),
+)  # fmt: skip
+
+
+@pytest.fixture
+def arguments(
+    cli: Cli, circuit: Circuit, kinematic_artefact: Path, tmp_path: Path
+) -> dict[str, tuple[str | Path, ...]]:
+    """What each command needs besides."""
+    track, line, weights = (tmp_path / name for name in ("t.csv", "l.csv", "w.bin"))
+    write_track(track, circuit.track)
+    write_raceline(line, circuit.line)
+    weights.write_bytes(b"")
+    drives = ("--artefact", kinematic_artefact, "--track", track, "--raceline", line)
+    return {"controller": drives, "publish": (weights,), "latency": ("--attach",)}
+
+
+@pytest.mark.parametrize(("command", "role"), COMMANDS)
+def test_every_command_that_cannot_work_says_why_and_ends(
+    cli: Cli, bundles: Bundles, tmp_path: Path, command: str, role: str,
+    arguments: dict[str, tuple[str | Path, ...]],
+) -> None:  # fmt: skip
+    """Another authority; a certificate for another role; for another car."""
+    where, others = free_endpoint("tls"), arguments.get(command, ())
+    foreign = bundles.path("foreign-plant")
+    with listening(where, foreign):
+        config = written(tmp_path, bundles, where, where)
+        refused(cli(command, *others, "--config", config), FOREIGN, "bayesrace certs init")
+    config = written(tmp_path, bundles, where, where, **{role: "plant"})
+    refused(cli(command, *others, "--config", config), "is for the role plant", f"--role {role}")
+
+
+@pytest.mark.parametrize("command", ["plant", "controller", "drive", "learn"])
+def test_a_certificate_for_another_car_is_refused(
+    cli: Cli, bundles: Bundles, tmp_path: Path, command: str,
+    arguments: dict[str, tuple[str | Path, ...]],
+) -> None:  # fmt: skip
+    where = free_endpoint("tls")
+    names = {"drive": "director", "learn": "learning"}
+    if command in names:  # the certificates made for all tests are for every car
+        folder = tmp_path / "certs"
+        init(folder)
+        add(folder, names[command], names[command], "blue")  # type: ignore[arg-type]
+        config = written(tmp_path, Bundles(folder), where, where)
+    else:
+        config = written(tmp_path, bundles, where, where, **{command: f"blue-{command}"})
+    outcome = cli(command, *arguments.get(command, ()), "--config", config)
+    refused(outcome, "is for car 'blue', not for 'orca'", "--name blue")
+
+
+def test_plant_and_router_say_why_they_cannot_start(
+    cli: Cli, bundles: Bundles, tmp_path: Path
+) -> None:
+    where = free_endpoint("tls")
+    for command, options in (("plant", ()), ("router", ("--listen", where))):
+        config = written(tmp_path, bundles, where, where, **{command: "viewer"})
+        refused(cli(command, *options, "--config", config), "is for the role viewer")
+        expired = tmp_path / "certs" / command
+        shutil.copytree(bundles.path("expired"), expired)
+        config = written(tmp_path, Bundles(tmp_path / "certs"), where, where)
+        refused(cli(command, *options, "--config", config), "has expired", "--renew")
+
+
+def test_a_controller_without_a_plant_says_so_and_waits(
+    bundles: Bundles, tmp_path: Path, arguments: dict[str, tuple[str | Path, ...]]
+) -> None:
+    plant_at, here = free_endpoint("tls"), free_endpoint("tls")
+    config = written(tmp_path, bundles, plant_at, here)
+    process = start("controller", *arguments["controller"], "--config", config)
+    assert process.stderr is not None
+    lines = [process.stderr.readline() for _ in range(3)]
+    assert process.poll() is None
+    process.terminate()
+    assert finish(process).returncode == 0
+    assert re.search(f"{ABSENT} {plant_at}", "".join(lines))
+
+
+# doctor ------------------------------------------------------------------------------------------
+
+
+def test_doctor_tries_everything(cli: Cli, bundles: Bundles, tmp_path: Path) -> None:
+    plant_at, controller_at = free_endpoint("tls"), free_endpoint("tls")
+    config = written(tmp_path, bundles, plant_at, controller_at)
+    with open_session(bundles.endpoints("plant", listen=(plant_at,)), "plant") as session:
+        token = session.liveliness().declare_token(f"bayesrace/{CAR}/alive/plant")
+        found = cli("doctor", "--config", config)
+        token.undeclare()
+    assert found.code == 1
+    lines = found.out.splitlines()
+    assert f"ok     {plant_at} answers" in lines
+    assert any(line.startswith(f"FAULT  {ABSENT} {controller_at}") for line in lines)
+    assert any(line.startswith(f"FAULT  car '{CAR}': plant; no controller") for line in lines)
+    assert any("certificate 'one-viewer': viewer, car 'orca'" in line for line in lines)
+
+
+def test_doctor_says_what_else_may_be_wrong(cli: Cli, bundles: Bundles, tmp_path: Path) -> None:
+    where = free_endpoint("tls")
+    config = written(tmp_path, bundles, where, where)
+    with listening(where, bundles.path("foreign-plant")):
+        found = cli("doctor", "--config", config)
+    assert found.code == 1
+    assert f"FAULT  {where} has a certificate {FOREIGN}" in found.out
+    beyond = tmp_path / "beyond.toml"
+    beyond.write_text("[network]\nplant = ['tcp/10.0.0.1:1']\n")
+    assert "could drive the car" in cli("doctor", "--config", beyond).out
+    shutil.copytree(bundles.path("revoked"), tmp_path / "certs" / "controller")
+    (tmp_path / "certs" / "controller" / "key.pem").chmod(0o640)
+    config = written(tmp_path, Bundles(tmp_path / "certs"), where, where)
+    assert "FAULT  others can read the private key" in cli("doctor", "--config", config).out
