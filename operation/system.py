@@ -144,10 +144,12 @@ def started_system(
     line = ["plant", *plant, *options]
     with ExitStack() as stack:
         process = stack.enter_context(child(line, folder / "plant.log"))
-        recording = session = stack.enter_context(open_session(endpoints, "director"))
+        recording = session = stack.enter_context(
+            open_session(endpoints, "director", explains=False)
+        )
         if lockstep:
             fast = endpoints.model_copy(update={"low_latency": True})
-            recording = stack.enter_context(open_session(fast, "director"))
+            recording = stack.enter_context(open_session(fast, "director", explains=False))
         stack.callback(process.stop)  # before the sessions, so that its end is seen
         system = System(session, recording, car, folder, options)
         system.children["plant"] = process

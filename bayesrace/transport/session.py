@@ -107,13 +107,16 @@ def _security(credentials: Credentials) -> dict[str, Any]:
 
 
 @contextmanager
-def open_session(endpoints: Endpoints, role: Role = "viewer") -> Iterator[Any]:
+def open_session(
+    endpoints: Endpoints, role: Role = "viewer", *, explains: bool = True
+) -> Iterator[Any]:
     """A Zenoh session of a process in that role, closed at the end of the block.
 
     Raises InputError if an endpoint is malformed, open to others without protection, or cannot be
     listened on; if the certificate is not for the role; if a link is refused, here or at its other
     end. An absent peer is no error: the session connects as soon as it appears, and says in the log
-    that it waits; see :class:`.Inbox` for waiting with a limit.
+    that it waits, unless it is not to ``explains`` because it has just started its peers itself;
+    see :class:`.Inbox` for waiting with a limit.
     """
     os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)
     endpoints.check()
@@ -137,7 +140,7 @@ def open_session(endpoints: Endpoints, role: Role = "viewer") -> Iterator[Any]:
             wait_linked(session, endpoints, possible, _LINK_S)
             if refused := refusals(session, credentials):
                 raise InputError("; ".join(refused))
-        if endpoints.connect:
+        if endpoints.connect and explains:
             stack.callback(LinkWatch(session, endpoints).close)
         yield session
 

@@ -1,0 +1,259 @@
+"""Real processes over secured links: driven, commanded, taught; and what others attempt meanwhile.
+
+The forgers know everything but have the wrong certificate; who replays has the right one.
+"""
+
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from bayesrace.configuration import read_configuration
+from bayesrace.log import LogReader
+from bayesrace.messages import ACTUATION, STATE, Event, car_key, encode
+from bayesrace.recorder import Recorder
+from bayesrace.transport import Director, free_endpoint, open_session
+from operation.drive import RunPlan, run_request
+from operation.processes import child
+from tests.network.cars import Course, Program, gentle_course
+from tests.network.journey import Journey
+from tests.programs import PATIENCE_S, ROOT, run, until
+from tests.security.authority import CAR, Bundles, bundles, written
+from tests.security.intruder import bare_session
+
+__all__ = ["bundles", "child"]
+
+pytestmark = [pytest.mark.wall_clock, pytest.mark.unmeasured]
+
+
+@pytest.fixture(scope="module")
+def course(tmp_path_factory: pytest.TempPathFactory) -> Course:
+    return gentle_course(tmp_path_factory.mktemp("course"))
+
+
+@dataclass
+class Rig:
+    """A secured plant and controller, and their director."""
+
+    config: Path
+    bundles: Bundles
+    plant_at: str
+    director: Director
+    course: Course
+    log: Path
+    closing: ExitStack
+
+    def drive(self, number: int, *, lockstep: bool, laps: int = 1) -> None:
+        """Starts a run."""
+        plan = RunPlan(number, "test", laps, 600.0, lockstep)
+        self.director.start(run_request(self.course.track, plan))
+
+    def end(self, number: int) -> Event:
+        """How it ended."""
+        return self.director.wait_for_end(number, PATIENCE_S)
+
+    def count(self, source: str, *names: str) -> dict[str, object]:
+        """Counters of a process."""
+        counters = self.director.status(source).counters
+        return {name: counters[name] for name in names}
+
+    def phase(self) -> str:
+        """Of the controller."""
+        return self.director.status("controller").phase
+
+    def journey(self) -> Journey:
+        """What was recorded; ends the recording."""
+        self.closing.close()
+        return Journey(self.log, self.course.track)
+
+
+@contextmanager
+def secured(
+    folder: Path, course: Course, bundles: Bundles, *, router: bool = False
+) -> Iterator[Rig]:
+    plant_at, controller_at, router_at = (free_endpoint("tls") for _ in range(3))
+    config = written(folder, bundles, plant_at, controller_at)
+    if router:
+        text = config.read_text().replace("[network]", f'[network]\nrouter = ["{router_at}"]')
+        config.write_text(text)
+    options = ("--config", config)
+    with ExitStack() as stack:
+        if router:
+            stack.enter_context(Program(folder / "router.txt", "router", *options))
+        plant = stack.enter_context(Program(folder / "plant.txt", "plant", *options))
+        driver = ("controller", *course.arguments, *options)
+        stack.enter_context(Program(folder / "controller.txt", *driver))
+        endpoints = read_configuration(config).endpoints("director")
+        closing = stack.enter_context(ExitStack())
+        session = closing.enter_context(open_session(endpoints, "director"))
+        director = Director(session, CAR)
+        director.wait_for(("plant", "controller"), PATIENCE_S)
+        log = folder / "run.mcap"
+        closing.enter_context(Recorder(session, CAR, log))
+        yield Rig(
+            config, bundles, router_at if router else plant_at, director, course, log, closing
+        )
+        del plant
+
+
+@pytest.mark.parametrize(
+    "router", [False, pytest.param(True, marks=pytest.mark.check)], ids=["direct", "router"]
+)
+def test_a_secured_system_is_driven_taught_and_commanded(
+    tmp_path: Path, course: Course, bundles: Bundles, router: bool
+) -> None:
+    """By the commands of people, each with the certificate of its role."""
+    with secured(tmp_path, course, bundles, router=router) as rig:
+        with_config = ("--config", rig.config)
+        rig.drive(1, lockstep=True)
+        assert rig.end(1).data["reason"] == "laps"
+        published = run("publish", course.weights_file, *with_config)
+        assert published.returncode == 0, published.stderr
+        rig.drive(2, lockstep=False, laps=0)
+        until(lambda: rig.phase() == "driving", "driving")
+        assert run("stop", *with_config).returncode == 0
+        until(lambda: rig.phase() == "stopped", "stopped")
+        assert run("go", *with_config).returncode == 0
+        until(lambda: rig.phase() == "driving", "driving again")
+        assert run("status", "--json", *with_config).returncode == 0
+        assert run("stop", "--run", *with_config).returncode == 0
+        assert rig.end(2).data["reason"] == "stopped"
+        journey = rig.journey()
+    assert journey.off_track_m() <= 0
+
+
+# Forged ------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def forging(
+    rig: Rig, name: str, rate: int, connections: int = 0, least: int = 100
+) -> Iterator[None]:
+    """For the block, a program with that certificate forges messages; ``least``: so many."""
+    status = rig.director.status("plant")
+    forger = subprocess.Popen(
+        [
+            sys.executable, "-m", "tests.security.forger", rig.plant_at,
+            rig.bundles.path(name), str(rate), str(connections), CAR, str(status.epoch),
+            str(status.run),
+        ],
+        cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert forger.stdout is not None
+    assert forger.stdout.readline() == "forging\n"
+    try:
+        yield
+    finally:
+        out, _ = forger.communicate("", timeout=PATIENCE_S)
+    assert int(out.split()[0]) >= least
+
+
+UNTOUCHED = {
+    "plant": ("refused", "rejected", "requests_rejected", "runs"),
+    "controller": ("refused", "states_foreign", "requests_rejected"),
+}
+
+
+def check_untouched(rig: Rig, before: Sequence[dict[str, object]]) -> None:
+    """The run goes on, and nothing has been counted as received in error."""
+    assert rig.director.status("plant").phase == "running"
+    assert rig.phase() in ("driving", "fallback")
+    after = [rig.count(source, *names) for source, names in UNTOUCHED.items()]
+    assert after == list(before)
+    received = rig.count("plant", "actuations_received")["actuations_received"]
+    sent = rig.count("controller", "actuations_sent")["actuations_sent"]
+    assert int(str(received)) <= int(str(sent))
+
+
+def test_the_forgers_would_be_obeyed_with_the_right_certificate(
+    tmp_path: Path, course: Course, bundles: Bundles
+) -> None:
+    """Otherwise the tests below would show nothing."""
+    with secured(tmp_path, course, bundles) as rig:
+        rig.drive(1, lockstep=False, laps=0)
+        until(lambda: rig.phase() == "driving", "driving")
+        with forging(rig, "director", rate=1000, least=0):
+            assert rig.end(1).data["reason"] == "stopped"
+
+
+FURTHER = pytest.mark.check
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "viewer",
+        "blue-controller",
+        *(pytest.param(one, marks=FURTHER) for one in ("blue-plant", "revoked")),
+    ],
+)
+def test_forged_messages_reach_nobody(
+    tmp_path: Path, course: Course, bundles: Bundles, name: str
+) -> None:
+    """States, actuations, an end of the run, `stop`: nothing is received, so nothing is counted."""
+    with secured(tmp_path, course, bundles) as rig:
+        rig.drive(1, lockstep=False, laps=0)
+        until(lambda: rig.phase() == "driving", "driving")
+        before = [rig.count(source, *names) for source, names in UNTOUCHED.items()]
+        with forging(rig, name, rate=1000):
+            time.sleep(2.0)
+        check_untouched(rig, before)
+        journey = rig.journey()
+    assert journey.off_track_m() <= 0
+
+
+@pytest.mark.check
+def test_the_car_stays_on_the_track_under_a_flood(
+    tmp_path: Path, course: Course, bundles: Bundles
+) -> None:
+    """10,000 forged messages a second, and 500 connections that never greet."""
+    with secured(tmp_path, course, bundles) as rig:
+        rig.drive(1, lockstep=False, laps=0)
+        until(lambda: rig.phase() == "driving", "driving")
+        before = [rig.count(source, *names) for source, names in UNTOUCHED.items()]
+        with forging(rig, "viewer", rate=10_000, connections=500, least=50_000):
+            time.sleep(10.0)
+        check_untouched(rig, before)
+        journey = rig.journey()
+    assert journey.off_track_m() <= 0
+
+
+# Replayed ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("source", ["plant", "controller"])
+def test_what_was_recorded_has_no_effect_when_it_is_sent_again(
+    tmp_path: Path, course: Course, bundles: Bundles, source: str
+) -> None:
+    """By the one who had sent it: of another run, so it is counted, and not acted on."""
+    topic, port = (STATE, 1) if source == "plant" else (ACTUATION, 0)
+    with secured(tmp_path, course, bundles) as rig:
+        rig.drive(1, lockstep=False)
+        assert rig.end(1).data["reason"] == "laps"
+        time.sleep(0.5)  # the recorder flushes five times a second
+        messages = LogReader(rig.log).messages((topic,))
+        old = [encode(entry.message) for entry in messages]
+        assert len(old) > 100
+        rig.drive(2, lockstep=False, laps=0)
+        until(lambda: rig.phase() == "driving", "driving")
+        other, counter = (
+            ("controller", "states_foreign") if source == "plant" else ("plant", "stale")
+        )
+        before = rig.count(other, counter)[counter]
+        network = read_configuration(rig.config).network
+        where = (network.plant, network.controller)[port][0]
+        with bare_session(where, bundles.path(source)) as session:
+            publisher = session.declare_publisher(car_key(topic.key, CAR))
+            until(lambda: publisher.matching_status.matching, "a subscriber")
+            for payload in old[:200]:
+                publisher.put(payload)
+                time.sleep(0.005)
+        until(lambda: int(str(rig.count(other, counter)[counter])) > int(str(before)), "counted")
+        assert rig.director.status("plant").phase == "running"
+        journey = rig.journey()
+    assert journey.off_track_m() <= 0
