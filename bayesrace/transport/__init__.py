@@ -30,12 +30,12 @@ from bayesrace.transport.inbox import LOCKSTEP_SPIN_S, NEWEST, Inbox, Item, Kind
 from bayesrace.transport.numbering import Numbering
 from bayesrace.transport.publisher import HEARTBEAT_S, Heartbeat, Publisher
 from bayesrace.transport.requests import Request, declare_service, decode_request
-from bayesrace.transport.session import open_session
+from bayesrace.transport.session import check_links, open_session
 
 __all__ = [
     "CONTROLLER_ENDPOINT", "HEARTBEAT_S", "LOCKSTEP_SPIN_S", "NEWEST", "PLANT_ENDPOINT", "Answers",
     "Credentials", "Director", "Endpoint", "Endpoints", "Heartbeat", "Inbox", "Item", "Kind",
     "LinkLimits", "Member", "Members", "Numbering", "Publisher", "RefusedError", "Request", "ask",
-    "ask_all", "count_processes", "decisive", "declare_service", "decode_request", "free_endpoint",
-    "open_session", "send_rollback", "send_weights",
+    "ask_all", "check_links", "count_processes", "decisive", "declare_service", "decode_request",
+    "free_endpoint", "open_session", "send_rollback", "send_weights",
 ]  # fmt: skip

@@ -24,7 +24,7 @@ __all__ = ["LinkWatch", "refusals", "serve_access", "unlinked", "wait_linked"]
 
 _log = logging.getLogger("bayesrace.links")
 
-_FIRST_S: Final = 0.5
+_FIRST_S: Final = 0.2
 """How long a session may take to link before it is asked why it has not."""
 _PERIOD_S: Final = 1.0
 _ANSWER_S: Final = 0.5

@@ -22,9 +22,9 @@ from bayesrace.transport.access import access_control
 from bayesrace.transport.credentials import AUTHORITY, CERTIFICATE, KEY, Credentials
 from bayesrace.transport.endpoints import Endpoints, leaves
 from bayesrace.transport.links import LinkWatch, refusals, serve_access, wait_linked
-from bayesrace.transport.probe import probe_all
+from bayesrace.transport.probe import Finding, probe_all
 
-__all__ = ["open_session"]
+__all__ = ["check_links", "open_session"]
 
 _log = logging.getLogger("bayesrace.links")
 
@@ -119,24 +119,21 @@ def open_session(
     see :class:`.Inbox` for waiting with a limit.
     """
     os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)
-    endpoints.check()
-    credentials = endpoints.credentials
+    credentials, absent = endpoints.credentials, check_links(endpoints, role)
     if endpoints.exposed:
         _log.warning(
             "INSECURE: links by %s are open to everyone in that network, who could drive the car; "
             "see docs/security.md", ", ".join(endpoints.exposed),
         )  # fmt: skip
-    if credentials is not None:
-        credentials.check(role)
-        if warning := credentials.expires_soon():
-            _log.warning("%s", warning)
-    absent = _refuse_lasting(endpoints) if credentials is not None else []
+    if credentials is not None and (warning := credentials.expires_soon()):
+        _log.warning("%s", warning)
     with ExitStack() as stack:
         session = stack.enter_context(_opened(endpoints, role))
         if credentials is not None:
             access = serve_access(session, credentials)
             stack.callback(access.undeclare)  # a process with a queryable hangs at its exit
-            possible = [one for one in endpoints.connect if one not in absent]
+            missing = {finding.endpoint for finding in absent}
+            possible = [one for one in endpoints.connect if one not in missing]
             wait_linked(session, endpoints, possible, _LINK_S)
             if refused := refusals(session, credentials):
                 raise InputError("; ".join(refused))
@@ -145,12 +142,19 @@ def open_session(
         yield session
 
 
-def _refuse_lasting(endpoints: Endpoints) -> list[str]:
-    """Endpoints that are absent now; InputError for what is wrong with others."""
+def check_links(endpoints: Endpoints, role: Role) -> list[Finding]:
+    """Where nobody is now, for a secured process; InputError for what waiting cannot help.
+
+    :func:`open_session` does so first; for commands that have seconds of other work before.
+    """
+    endpoints.check()
+    if endpoints.credentials is None:
+        return []
+    endpoints.credentials.check(role)
     found = probe_all(endpoints.connect, endpoints.credentials)
     if lasting := [finding.text for finding in found if finding.lasting]:
         raise InputError("; ".join(lasting))
-    return [finding.endpoint for finding in found]
+    return found
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """``validate``, ``publish``, ``rollback``, ``learn``: validation and update of weights."""
 
+import logging
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -48,6 +49,8 @@ WeightsFile = Annotated[
     typer.Argument(metavar="WEIGHTS", help="Weights file, as 'bayesrace train' writes it."),
 ]
 _TIMEOUT_S = 20.0
+
+_log = logging.getLogger("bayesrace.learn")
 
 
 def validate(
@@ -251,16 +254,19 @@ def learn(
     and publishes the weights. Plant and controller may start before or after this command, and
     restart; with the same --out, this command resumes. Start a run with 'bayesrace drive'.
     """
+    from bayesrace.transport import check_links
     from bayesrace.vehicles import get_car
+
+    parameters, endpoints = get_car(car), connect_to(endpoint, "learning")
+    endpoints.check_car(name or parameters.name)
+    for absent in check_links(endpoints, "learning"):  # before imports that take seconds
+        _log.warning("%s", absent.text)
     from operation.learn.job import learn as follow
     from operation.learn.records import LearnSettings
     from operation.learn.report import print_laps
 
     stamp = datetime.now(UTC).astimezone().strftime("%Y%m%d-%H%M%S")
     folder = out or Path("runs") / f"learn-{stamp}"
-    parameters = get_car(car)
-    endpoints = connect_to(endpoint, "learning")
-    endpoints.check_car(name or parameters.name)
     settings = LearnSettings(
         car=parameters,
         name=name or parameters.name,
