@@ -33,8 +33,8 @@
 #define BR_GP_PADDED (BR_GP_BLOCKS * BR_GP_BLOCK)
 /* Training points that the posterior variance is exact with: the memory for it grows with the
  * square. */
-#define BR_GP_ROOT (BR_GP_CAPACITY < 512 ? (BR_GP_CAPACITY + 3) / 4 * 4 : 512)
-#define BR_COLUMNS 24                     /* stages whose correlations are at hand at a time */
+#define BR_GP_ROOT (BR_GP_CAPACITY < 512 ? (BR_GP_CAPACITY + 7) / 8 * 8 : 512)
+#define BR_COLUMNS 8                      /* stages whose correlations are at hand at a time */
 #define BR_GP_FIRST ((1 + BR_NZ + 7) / 8) /* groups of eight columns for 1 and the inputs ... */
 #define BR_GP_SECOND ((BR_NZ * (BR_NZ + 1) / 2 + 7) / 8) /* ... and for their products */
 

@@ -13,10 +13,10 @@
 #include "br_internal.h"
 #include "br_kernel.h"
 
-#define ROWS 4  /* of W, and ... */
-#define PARTS 3 /* ... vectors of queries that a tile of the product has */
-#define COLUMNS (PARTS * BR_LANES)
-#define LEAST_PIVOT 1e-13 /* of a correlation matrix: below it a point adds nothing */
+#define COLUMNS BR_COLUMNS           /* queries that a tile of the product has, and ... */
+#define PARTS (COLUMNS / BR_LANES)   /* ... vectors of them, ... */
+#define ROWS (8 / PARTS < 4 ? 4 : 8) /* ... and rows of W: as much as the registers hold */
+#define LEAST_PIVOT 1e-13            /* of a correlation matrix: below it a point adds nothing */
 
 _Static_assert(BR_GP_ROOT % ROWS == 0, "a tile holds whole rows");
 
