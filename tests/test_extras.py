@@ -57,6 +57,14 @@ def test_a_missing_package_of_campaigns_is_named_with_its_extra(
     refused(cli("campaign-report", tmp_path), "pyarrow", "bayesrace[campaign]")
 
 
+def test_a_missing_package_of_certificates_is_named_with_its_extra(
+    cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delitem(sys.modules, "operation.certificates", raising=False)
+    monkeypatch.setitem(sys.modules, "cryptography", None)
+    refused(cli("certs", "init"), "cryptography", "bayesrace[certificates]")
+
+
 def test_a_missing_package_is_named_with_the_extra_that_brings_it(
     cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
