@@ -127,7 +127,7 @@ class RaceSettings(PreparationSettings):
         le=20,
         description="runs of bayesrace-limit, which maximises progress, each after the first with "
         "weights learned from all before; None: 3, but none on linear tyres, which have no limit, "
-        "and with slipx, where they leave the track",
+        "and with slipx, where they can leave the track",
     )
     mode: Literal["lockstep", "realtime"] = Field("lockstep", description="time mode of the runs")
     time_limit: float = Field(
