@@ -1,15 +1,17 @@
 """``config``: the configuration file, shown, checked and begun."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bayesrace.configuration import Configuration, as_toml, configured, read_configuration
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from operation.cli.configured import configurable, current
 from operation.cli.options import writable
+
+if TYPE_CHECKING:
+    from bayesrace.configuration import Configuration
 
 __all__ = ["config"]
 
@@ -22,6 +24,8 @@ config = typer.Typer(
 
 def show() -> None:
     """Print the configuration that commands use here: the file, and the defaults of all else."""
+    from bayesrace.configuration import as_toml
+
     typer.echo(as_toml(current()), nl=False)
 
 
@@ -37,11 +41,13 @@ def check(
 
     'bayesrace doctor' tries the links, too.
     """
+    from bayesrace.configuration import configured, read_configuration
+
     found = configured() if file is None else read_configuration(file)
     typer.echo(f"{file or 'configuration'}: {_certificates(found)}")
 
 
-def _certificates(found: Configuration) -> str:
+def _certificates(found: "Configuration") -> str:
     """What there is of certificates, each of which is read; InputError if one cannot be used."""
     if found.tls.folder is None:
         return "fine; no certificates, so links are for loopback only"
@@ -72,6 +78,8 @@ def example(
     ] = None,
 ) -> None:
     """Write a configuration to start from: every setting with its default and its meaning."""
+    from bayesrace.configuration import Configuration, as_toml
+
     text = as_toml(Configuration(), explained=True)
     if out is None:
         typer.echo(text, nl=False)

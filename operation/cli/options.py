@@ -5,11 +5,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
-from pydantic import BaseModel, ValidationError
 
 from bayesrace.errors import InputError, faults_in
 
 if TYPE_CHECKING:
+    from pydantic import BaseModel
+
     from bayesrace.vehicles import CarParameters
     from controller.path_table import PathTable
     from plant.sensors import SensorNoise
@@ -177,7 +178,7 @@ SettingsFile = Annotated[
         help="Settings of an earlier run (its settings.json); options that are given override it.",
     ),
 ]
-S = TypeVar("S", bound=BaseModel)
+S = TypeVar("S", bound="BaseModel")
 
 
 def settings_of(
@@ -187,6 +188,8 @@ def settings_of(
 
     ``values``: option, by the name of its parameter, to the fields that it sets.
     """
+    from pydantic import ValidationError
+
     from bayesrace.files import read_text
 
     content: dict[str, Any] = {}
@@ -234,6 +237,8 @@ Delay = Annotated[
 
 def sensor_noise(given: list[str] | None) -> "SensorNoise":
     """The noise of the options ``NAME=STD``; InputError naming one that cannot be."""
+    from pydantic import ValidationError
+
     from plant.sensors import SensorNoise
 
     pairs = dict(one.partition("=")[::2] for one in given or ())
