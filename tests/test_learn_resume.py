@@ -24,7 +24,7 @@ from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights, decode_weights, write_weights, zero_weights
 from bayesrace.integrators import PERFECT, PREDICTION
-from bayesrace.messages import HEARTBEAT, STATE, Message, Reply, State, Status, encode
+from bayesrace.messages import HEARTBEAT, STATE, Message, Reply, Role, State, Status, encode
 from bayesrace.transport import Endpoints, Inbox, Item, Kind
 from bayesrace.vehicles.models import dynamic
 from learning.arrays import write_npz
@@ -114,7 +114,7 @@ class Jobs:
         self.put: Callable[[Item], None] = self._arrive.append
 
         @contextmanager
-        def no_network(_: Endpoints) -> Iterator[Silent]:
+        def no_network(_: Endpoints, _role: Role) -> Iterator[Silent]:
             yield Silent()
 
         for module, name, value in (
