@@ -193,7 +193,9 @@ def _outputs(drive: Drive) -> list[Variable]:
         output("stationarity", "residual at the plan; -1: not known", unit="1"),
         output("defect", "dynamics residual at the plan; -1: not known", unit="1"),
         output("slack_max_m", "largest violation of the track in the plan", unit="m"),
-        output("tube_m", "half the width of track that uncertainty takes of the plan", unit="m"),
+        output(
+            "tube_m", "half the width that uncertainty takes of the track; -1: not known", unit="m"
+        ),
         output("pace", "of the reference, as a share of the line's speed", unit="1"),
         output("s_ref_m", "arc length of the car on the racing line", unit="m"),
         output("lateral_m", "distance from the racing line, positive to the left", unit="m"),

@@ -21,7 +21,7 @@
 
 #include "br_internal.h"
 
-/* A = Q + A' S (A - B K) with the gain K of one stage; S is overwritten. */
+/* S becomes Q + A' S (A - B K), with the gain K of one stage. */
 static void riccati(const br_stage *stage, double s[BR_NX][BR_NX], double gain[BR_NU][BR_NX]) {
     double sa[BR_NX][BR_NV] = {{0}}, r[BR_NU][BR_NU];
     for (int i = 0; i < BR_NX; ++i)
@@ -37,8 +37,8 @@ static void riccati(const br_stage *stage, double s[BR_NX][BR_NX], double gain[B
     }
     for (int a = 0; a < BR_NU; ++a) /* Gauss-Jordan: positive definite, no pivoting */
         for (int b = 0; b < BR_NU; ++b) {
-            const double factor = r[b][a] / r[a][a];
             if (b == a) continue;
+            const double factor = r[b][a] / r[a][a];
             for (int c = a; c < BR_NU; ++c) r[b][c] -= factor * r[a][c];
             for (int j = 0; j < BR_NX; ++j) gain[b][j] -= factor * gain[a][j];
         }
@@ -119,7 +119,7 @@ void br_caution_update(br_mpc *mpc) {
                       k ? caution->deviation[k - 1][j] : none, caution->deviation[k][j]);
 }
 
-/* By how much the row of this gradient is uncertain at the end of stage k, n standard deviations.
+/* By how much the row of this gradient is uncertain at the end of stage k: n standard deviations.
  */
 static double doubt(const br_mpc *mpc, int k, int r, const double *gradient) {
     double squares = 0;

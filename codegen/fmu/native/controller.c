@@ -146,7 +146,7 @@ static void set_outputs(fmu_instance *instance, const br_decision *decision) {
     v[FMU_V_defect] = known(info->defect);
     v[FMU_V_slack_max_m] = known(info->slack_max_m);
     if (!decision->stepped || status == BR_BAD_STATE) return; /* which projects nothing */
-    v[FMU_V_tube_m] = info->tube_m;
+    v[FMU_V_tube_m] = known(info->tube_m);
     v[FMU_V_pace] = info->pace;
     v[FMU_V_s_ref_m] = info->s_ref_m;
     v[FMU_V_lateral_m] = info->lateral_m;
