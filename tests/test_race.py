@@ -349,7 +349,7 @@ def test_in_real_time_it_drives_too_and_a_second_race_prepares_nothing(
     for lap in result["laps"]:
         # on a machine that is busy with something else a lap may fail, but never without a reason
         assert lap["finished"] or lap["ended"]
-        assert lap["samples"] > 10
+        assert lap["samples"] > 10 or "refused its weights" in lap["ended"]
     assert result["real_time_factor"] is None
     assert result["settings"]["mode"] == "realtime"
     assert leftovers(race.pid) == {}
