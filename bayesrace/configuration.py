@@ -10,7 +10,7 @@ import os
 import tomllib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -30,11 +30,9 @@ from bayesrace.transport.endpoints import (
 )
 
 __all__ = [
-    "VARIABLE", "Configuration", "NetworkSettings", "TlsSettings", "as_toml", "configured",
+    "Configuration", "NetworkSettings", "TlsSettings", "as_toml", "configured",
     "read_configuration",
 ]  # fmt: skip
-
-VARIABLE: Final = CONFIGURATION_VARIABLE
 
 
 class _Section(BaseModel):
@@ -131,7 +129,7 @@ class Configuration(_Section):
 
 def configured() -> Configuration:
     """The configuration of this process: the file in the environment variable, or the defaults."""
-    name = os.environ.get(VARIABLE, "")
+    name = os.environ.get(CONFIGURATION_VARIABLE, "")
     return read_configuration(Path(name)) if name else Configuration()
 
 

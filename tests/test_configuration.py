@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from bayesrace.configuration import VARIABLE, Configuration, as_toml, read_configuration
+from bayesrace.configuration import Configuration, as_toml, read_configuration
+from bayesrace.defaults import CONFIGURATION_VARIABLE
 from bayesrace.errors import InputError
 from bayesrace.transport import Endpoints, free_endpoint, open_session
 from operation.settings import RaceSettings
@@ -74,10 +75,10 @@ def test_flags_override_the_file_which_overrides_the_variable(
     one, two = (tmp_path / name for name in ("one.toml", "two.toml"))
     one.write_text("[network]\nplant = ['tcp/127.0.0.1:1001']\n")
     two.write_text("[network]\nplant = ['tcp/127.0.0.1:1002']\n[realtime]\nfifo = 5\n")
-    monkeypatch.setenv(VARIABLE, str(one))
+    monkeypatch.setenv(CONFIGURATION_VARIABLE, str(one))
     assert "127.0.0.1:1001" in cli("config", "show").out
     assert "127.0.0.1:1002" in cli("config", "show", "--config", two).out
-    assert os.environ[VARIABLE] == str(one)
+    assert os.environ[CONFIGURATION_VARIABLE] == str(one)
     refused(cli("stop", "--config", two, "--timeout", "0.2"), "127.0.0.1:1002")
     where = free_endpoint()
     asked = cli("stop", "--config", two, "--timeout", "0.2", "--endpoint", where)
@@ -99,7 +100,8 @@ def test_the_processes_of_a_system_read_the_file_that_it_leaves(
 ) -> None:
     """Beside where they meet, they have what is configured."""
     monkeypatch.setenv(
-        VARIABLE, str(config(tmp_path, "[limits]\nlease_s = 3.5\n[realtime]\ncpu = 9999\n"))
+        CONFIGURATION_VARIABLE,
+        str(config(tmp_path, "[limits]\nlease_s = 3.5\n[realtime]\ncpu = 9999\n")),
     )
     folder = tmp_path / "run"
     folder.mkdir()

@@ -79,7 +79,7 @@ BR_API br_mpc_error br_mpc_set_parameters(br_mpc *mpc, const br_mpc_parameters *
 BR_API br_mpc_error br_mpc_set_path(br_mpc *mpc, const double *table, int n, double spacing_m);
 
 /* Copies the weights and, where signal is given, makes what the posterior variance needs; the next
- * step uses them. Some 10 ms per 400 points and output. What is staged is forgotten. BR_ERROR_BUSY
+ * step uses them. Some 4 ms per 400 points and output. What is staged is forgotten. BR_ERROR_BUSY
  * while another thread stages. */
 BR_API br_mpc_error br_mpc_set_weights(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]);
 

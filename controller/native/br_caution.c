@@ -21,6 +21,9 @@
 
 #include "br_internal.h"
 
+/* Weight of a deviation or effort of this size as 1. */
+static double weight_of(double size) { return 1.0 / (size * size); }
+
 /* S becomes Q + A' S (A - B K), with the gain K of one stage. */
 static void riccati(const br_stage *stage, double s[BR_NX][BR_NX], double gain[BR_NU][BR_NX]) {
     double sa[BR_NX][BR_NV] = {{0}}, r[BR_NU][BR_NU];
@@ -33,7 +36,7 @@ static void riccati(const br_stage *stage, double s[BR_NX][BR_NX], double gain[B
             for (int j = 0; j < BR_NV; ++j) row[j] += stage->jacobian[l][BR_NX + a] * sa[l][j];
         memcpy(gain[a], row, sizeof gain[a]);
         memcpy(r[a], row + BR_NX, sizeof r[a]);
-        r[a][a] += 1.0 / (BR_INPUT_EFFORT[a] * BR_INPUT_EFFORT[a]);
+        r[a][a] += weight_of(BR_INPUT_EFFORT[a]);
     }
     for (int a = 0; a < BR_NU; ++a) /* Gauss-Jordan: positive definite, no pivoting */
         for (int b = 0; b < BR_NU; ++b) {
@@ -50,7 +53,7 @@ static void riccati(const br_stage *stage, double s[BR_NX][BR_NX], double gain[B
     }
     for (int i = 0; i < BR_NX; ++i)
         for (int j = 0; j < BR_NX; ++j) {
-            double sum = i == j ? 1.0 / (BR_STATE_DEVIATION[i] * BR_STATE_DEVIATION[i]) : 0.0;
+            double sum = i == j ? weight_of(BR_STATE_DEVIATION[i]) : 0.0;
             for (int l = 0; l < BR_NX; ++l) sum += stage->jacobian[l][i] * sa[l][j];
             s[i][j] = sum;
         }
@@ -59,7 +62,7 @@ static void riccati(const br_stage *stage, double s[BR_NX][BR_NX], double gain[B
 /* Feedback about the plan, backwards from its end. */
 static void feedback(const br_mpc *mpc, double gain[BR_N][BR_NU][BR_NX]) {
     double s[BR_NX][BR_NX] = {{0}};
-    for (int i = 0; i < BR_NX; ++i) s[i][i] = 1.0 / (BR_STATE_DEVIATION[i] * BR_STATE_DEVIATION[i]);
+    for (int i = 0; i < BR_NX; ++i) s[i][i] = weight_of(BR_STATE_DEVIATION[i]);
     for (int k = BR_N - 1; k >= 0; --k) riccati(&mpc->stage[k], s, gain[k]);
 }
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from bayesrace.defaults import CONFIGURATION_VARIABLE as VARIABLE
+from bayesrace.defaults import CONFIGURATION_VARIABLE
 
 if TYPE_CHECKING:
     from bayesrace.configuration import Configuration
@@ -26,7 +26,7 @@ ConfigFile = Annotated[
     typer.Option(
         "--config",
         metavar="FILE",
-        show_default=f"that of {VARIABLE}, if any",
+        show_default=f"that of {CONFIGURATION_VARIABLE}, if any",
         help="Configuration, as 'bayesrace config example' writes it.",
     ),
 ]
@@ -95,16 +95,16 @@ def realtime(
 @contextmanager
 def _named(config: Path | None) -> Iterator[None]:
     """For the block, the environment variable names the file, for this process and its children."""
-    before = os.environ.get(VARIABLE)
+    before = os.environ.get(CONFIGURATION_VARIABLE)
     if config is not None:
-        os.environ[VARIABLE] = str(config.absolute())
+        os.environ[CONFIGURATION_VARIABLE] = str(config.absolute())
     try:
         yield
     finally:
         if config is not None and before is None:
-            del os.environ[VARIABLE]
+            del os.environ[CONFIGURATION_VARIABLE]
         elif before is not None:
-            os.environ[VARIABLE] = before
+            os.environ[CONFIGURATION_VARIABLE] = before
 
 
 @contextmanager
