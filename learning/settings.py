@@ -40,4 +40,11 @@ class TrainingSettings(BaseModel):
     folds: int = Field(
         10, ge=2, description="parts of the drive, or of the track, each held out in turn"
     )
+    widen: float = Field(
+        1.5,
+        ge=1,
+        le=100,
+        description="factor on the standard deviations of weights that begin with no others: what "
+        "is driven with them differs from the samples",
+    )
     threads: int = Field(0, ge=0, description="parallel fits; 0 is one per core")

@@ -13,8 +13,8 @@
    estimations of hyper-parameters of Gaussian processes with model misspecification", CSDA 2013).
 
 Only training samples are used for any of this. The metrics in the weights are scores of the errors
-held out by stretches, each stretch with a scale found on the others; hyperparameters, kernel and
-choice of samples depend on all stretches.
+held out by stretches, each stretch with a scale found on the others and without ``widen``, which is
+for other driving; hyperparameters, kernel and choice of samples depend on all stretches.
 """
 
 import hashlib
@@ -110,7 +110,9 @@ def fit(
         fits = _optimise(subsets, settings, initial, report)
         for i, target in enumerate(targets):
             chosen, scores = choose_kernel(subsets[i], fits[i])
-            output, measured, costs = _finish(target, chosen, dataset.features, settings, compare)
+            output, measured, costs = _finish(
+                target, chosen, dataset.features, settings, compare, first=initial is None
+            )
             outputs.append(output)
             kernels += scores
             choices += costs
@@ -195,7 +197,12 @@ def _optimise(
 
 
 def _finish(
-    target: Target, fit: Fit, inputs: Floats, settings: TrainingSettings, compare: bool
+    target: Target,
+    fit: Fit,
+    inputs: Floats,
+    settings: TrainingSettings,
+    compare: bool,
+    first: bool,
 ) -> tuple[GpOutput, dict[str, dict[str, float]], list[ChoiceScore]]:
     """Factorises with the chosen hyperparameters, calibrates the variance, scores the result."""
     covariance = fit.covariance
@@ -203,7 +210,7 @@ def _finish(
     rows = most_informative(fit.kind, target.z, covariance.lengths, noise_ratio, settings.capacity)
     alpha = regressor(covariance, target.z[rows], target.y[rows]).alpha_
     errors = target.errors_from(rows, covariance)
-    scale = errors.variance_scale
+    scale = errors.variance_scale * (settings.widen**2 if first else 1.0)
     output = GpOutput(
         kernel=fit.kind,
         length_scales=covariance.lengths * target.z_scale,

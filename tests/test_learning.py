@@ -332,7 +332,7 @@ def test_coverage_is_nominal_where_the_gp_is_right() -> None:
     x_next = np.array(step(x.T, z[:, 4:].T)).T
     x_next[:, 3:6] += error
     data = Dataset(CAR, STEP_S, x, z[:, 4:], x_next)
-    settings = TrainingSettings(kernels=("rbf",), restarts=0)
+    settings = TrainingSettings(kernels=("rbf",), restarts=0, widen=1)
     weights = train(data.select(slice(250)), PREDICTION, settings)
     checked = validate(weights, data.select(slice(250, None)), PREDICTION)
     for name in OUTPUTS:

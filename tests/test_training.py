@@ -174,6 +174,22 @@ def test_the_metrics_carried_are_those_of_samples_not_learned_from(driven: Datas
     assert np.all(predictive_sigma(weights, driven.features) > 0)
 
 
+def test_first_weights_are_less_sure_and_predict_the_same(driven: Dataset) -> None:
+    """What they are driven with is no longer what they were learned from; updates know it."""
+    plain, wide = (
+        train(driven, PREDICTION, QUICK.model_copy(update={"widen": factor}))
+        for factor in (1.0, 1.5)
+    )
+    z = driven.features + 0.1
+    assert predictive_sigma(wide, z) == pytest.approx(1.5 * predictive_sigma(plain, z))
+    assert evaluate_mean(wide, z) == pytest.approx(evaluate_mean(plain, z))
+    again, same = (
+        train(driven, PREDICTION, QUICK.model_copy(update={"widen": factor}), initial=plain)
+        for factor in (1.0, 1.5)
+    )
+    assert again.version == same.version
+
+
 def test_the_name_does_not_depend_on_time_and_program(
     driven: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
