@@ -168,6 +168,73 @@ def test_the_car_slows_down_where_it_knows_little_and_speeds_up_again(
     assert changes.max() <= tuning.faster_ps * (1 + 1e-9)
 
 
+def noisy(weights: GpWeights, factor: float) -> GpWeights:
+    """The same mean, with so many times the variance of the noise."""
+    outputs = (replace(one, noise_variance=factor * one.noise_variance) for one in weights.outputs)
+    vx, vy, omega = outputs
+    return replace(weights, outputs=(vx, vy, omega))
+
+
+def driven(
+    step: NativeStep, car: CarParameters, circuit: Circuit, count: int
+) -> tuple[Floats, Floats, list[float]]:
+    """State and input after so many steps from the start, and the pace of each step."""
+    plant, x, u, paces = discrete(dynamic(car)), circuit.start(), np.zeros(2), []
+    for _ in range(count):
+        assert step.step(x, u).usable
+        u = step.u.copy()
+        paces.append(step.info.pace)
+        x = plant(x, u)
+    return x, u, paces
+
+
+def test_the_reference_does_not_leap_when_nothing_is_uncertain_any_more(
+    kinematic_artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit
+) -> None:
+    """As after a rollback to no weights."""
+    step = ready(kinematic_artefact, car, noisy(weights, 100), circuit)
+    x, u, paces = driven(step, car, circuit, 40)
+    step.set_zero_weights()
+    assert step.step(x, u).usable
+    assert paces[-1] < 0.9
+    faster = 1 + car.tuning.caution.faster_ps * PREDICTION.step_s
+    assert step.info.pace == pytest.approx(faster * paces[-1])
+
+
+@pytest.mark.parametrize(("side", "bound"), [(1, 5), (-1, 4)])
+def test_the_plan_keeps_its_uncertainty_away_from_the_edge(
+    kinematic_artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit,
+    side: int, bound: int,
+) -> None:  # fmt: skip
+    """Of a track that ends 1 cm beside the line, on either side."""
+    step = ready(kinematic_artefact, car, weights, circuit)
+    x, u, _ = driven(step, car, circuit, 25)
+    line = step.read_reference()
+    along = np.sum(line[:, 2:4] * line[:, :2], axis=1)
+    line[:, bound] = along + side * 0.01
+    lateral = {}
+    for caution in (0.0, 0.95):
+        hard = CAUTIOUS.model_copy(update={"s_slack": 1e5, "caution": caution})
+        step.set_parameters(car, hard)
+        for _ in range(20):
+            assert step.solve(x, u, line, elapsed_s=0.0).usable
+        plan, _ = step.read_plan()
+        lateral[caution] = side * (np.sum(line[:, 2:4] * plan[1:, :2], axis=1) - along)
+    room = 0.01 - step.read_tube()
+    assert (lateral[0.95] <= room + 1e-4).all()
+    assert (lateral[0.0] > room + 0.02).any()
+
+
+def test_a_track_that_is_no_constraint_does_not_slow_the_car_down(
+    kinematic_artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit
+) -> None:
+    without = CAUTIOUS.model_copy(update={"constraints": False})
+    step = ready(kinematic_artefact, car, noisy(weights, 100), circuit, without)
+    _, _, paces = driven(step, car, circuit, 40)
+    assert min(paces) == 1.0
+    assert step.info.tube_m == 0.0
+
+
 def test_without_caution_uncertainty_changes_nothing(
     kinematic_artefact: Path, car: CarParameters, unsure: GpWeights, circuit: Circuit
 ) -> None:

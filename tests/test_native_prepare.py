@@ -75,6 +75,10 @@ def drop_constraints(step: NativeStep, circuit: Circuit, car: CarParameters) -> 
     step.set_parameters(car, SETTINGS.model_copy(update={"constraints": False}))
 
 
+def be_cautious(step: NativeStep, circuit: Circuit, car: CarParameters) -> None:
+    step.set_parameters(car, SETTINGS.model_copy(update={"caution": 0.95}))
+
+
 def reset(step: NativeStep, circuit: Circuit, car: CarParameters) -> None:
     step.reset()
 
@@ -96,8 +100,11 @@ Between = Callable[[NativeStep, Circuit, CarParameters], None]
 
 @pytest.mark.parametrize(
     "between",
-    [change_weights, change_parameters, drop_constraints, reset, change_path, bad_state, predict],
-)
+    [
+        change_weights, change_parameters, drop_constraints, be_cautious, reset, change_path,
+        bad_state, predict,
+    ],
+)  # fmt: skip
 def test_what_happens_in_between_is_seen(
     make: Make, recorded: list[Problem], circuit: Circuit, car: CarParameters, between: Between
 ) -> None:
@@ -154,8 +161,11 @@ def test_a_budget_never_makes_the_plan_worse(make: Make, recorded: list[Problem]
         assert residual(improved) <= residual(plain) + 1e-12
 
 
-def test_the_preparation_ends_within_its_budget(make: Make, recorded: list[Problem]) -> None:
-    step = make(tolerance=1e-14)
+@pytest.mark.parametrize("caution", [0.0, 0.95])
+def test_the_preparation_ends_within_its_budget(
+    make: Make, recorded: list[Problem], caution: float
+) -> None:
+    step = make(tolerance=1e-14, caution=caution)
     clock = Clock(step, 1e-3)
     done = []
     for k, p in enumerate(recorded[:60]):
@@ -163,7 +173,8 @@ def test_the_preparation_ends_within_its_budget(make: Make, recorded: list[Probl
         done.append(step.info.prepared_iterations)
         begin_s, readings = clock.now_s, 1 + k % 20
         step.prepare(TS, readings * 1e-3)
-        assert clock.now_s - begin_s <= (readings + 1.5) * 1e-3
+        most = max(readings + 1.5, 4.5 if caution else 0)  # caution itself is not left out
+        assert clock.now_s - begin_s <= most * 1e-3
     assert max(done) >= 2
     assert min(done) == 0
 

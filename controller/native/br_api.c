@@ -28,7 +28,7 @@ br_mpc_error br_mpc_set_parameters(br_mpc *mpc, const br_mpc_parameters *paramet
     if (!valid(parameters)) return BR_ERROR_PARAMETERS;
     mpc->parameters = *parameters;
     mpc->has_parameters = 1;
-    mpc->qp.factorised = mpc->qp.evaluated = 0;
+    mpc->qp.factorised = mpc->qp.evaluated = mpc->caution.known = 0;
     br_evaluate_penalties(mpc);
     return BR_OK;
 }

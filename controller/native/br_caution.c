@@ -111,7 +111,9 @@ void br_caution_update(br_mpc *mpc) {
     const int was = caution->active;
     caution->active = mpc->parameters.caution_sigmas > 0 && gp->uncertain;
     if (was || caution->active) mpc->qp.evaluated = 0;
+    mpc->timer.caution = 0;
     if (!caution->active) return;
+    const double begin = br_timer_now(&mpc->timer);
     double sigma[BR_N][BR_NE], gain[BR_N][BR_NU][BR_NX];
     standard_deviations(mpc, sigma);
     feedback(mpc, gain);
@@ -120,11 +122,12 @@ void br_caution_update(br_mpc *mpc) {
         for (int j = 0; j < BR_NE; ++j)
             propagate(&mpc->stage[k], gain[k], j, sigma[k][j],
                       k ? caution->deviation[k - 1][j] : none, caution->deviation[k][j]);
+    br_timer_note(&mpc->timer, begin, &mpc->timer.caution);
 }
 
-/* By how much the row of this gradient is uncertain at the end of stage k: n standard deviations.
- */
-static double doubt(const br_mpc *mpc, int k, int r, const double *gradient) {
+/* By how much to back off from the bounds of the row with this gradient at the end of stage k: n
+ * standard deviations. */
+static double back_off(const br_mpc *mpc, int k, int r, const double *gradient) {
     double squares = 0;
     for (int j = 0; j < BR_NE; ++j) {
         double along = 0;
@@ -135,16 +138,17 @@ static double doubt(const br_mpc *mpc, int k, int r, const double *gradient) {
     return mpc->parameters.caution_sigmas * sqrt(squares);
 }
 
-/* The row's bounds, as near to each other as they may come: a tenth of what they were apart. */
+/* Brings the bounds of the stage's rows nearer to each other, at most to a tenth of what they were
+ * apart. A row that its penalty switches off leaves nothing to be cautious about. */
 void br_caution_tighten(br_mpc *mpc, int k, br_stage_terms *terms) {
     br_caution *caution = &mpc->caution;
     caution->tube[k] = caution->share[k] = 0;
     if (!caution->active || mpc->turn) return;
     for (int r = 0; r < BR_NR; ++r) {
-        if (!BR_ROW_CAUTIOUS[r]) continue;
+        if (!BR_ROW_CAUTIOUS[r] || !(mpc->qp.penalty[r] > 0)) continue;
         const double room = 0.5 * (terms->upper[r] - terms->lower[r]);
         if (!(room > 0)) continue;
-        const double wanted = doubt(mpc, k, r, terms->gradient);
+        const double wanted = back_off(mpc, k, r, terms->gradient);
         const double taken = fmin(wanted, 0.9 * room);
         terms->lower[r] += taken;
         terms->upper[r] -= taken;
@@ -153,9 +157,10 @@ void br_caution_tighten(br_mpc *mpc, int k, br_stage_terms *terms) {
     }
 }
 
-/* After a step: how fast the next reference is to move along the line, so that the model knows
- * enough of the plan to keep it on the track. The controller brakes and accelerates the reference
- * no faster than the car can follow. */
+/* After a step: the speed of the next reference as a share of the line's. It falls where
+ * uncertainty takes more than BR_CAUTION_SHARE of the room at a stage, or is not finite, by at most
+ * BR_CAUTION_SLOWER per second, and rises elsewhere by at most BR_CAUTION_FASTER, also when nothing
+ * is uncertain any more: a reference that leaps ahead spoils the plan. */
 void br_caution_pace(br_mpc *mpc, double elapsed) {
     br_caution *caution = &mpc->caution;
     double worst = 0;
@@ -167,10 +172,10 @@ void br_caution_pace(br_mpc *mpc, double elapsed) {
     memcpy(mpc->answer_tube, caution->tube, sizeof mpc->answer_tube);
 #if BR_HAS_PATH
     const double excess = worst / BR_CAUTION_SHARE - 1;
-    const double rate = excess > 0 ? -BR_CAUTION_SLOWER * fmin(excess, 1)
-                                   : BR_CAUTION_FASTER * fmin(-2 * excess, 1);
+    const double rate = excess <= 0 ? BR_CAUTION_FASTER * fmin(-2 * excess, 1)
+                                    : -BR_CAUTION_SLOWER * fmin(excess, 1); /* NaN, too */
     const double pace = caution->pace * (1 + rate * fmin(elapsed, BR_TS));
-    caution->pace = caution->active ? fmin(fmax(pace, BR_CAUTION_LEAST), 1) : 1;
+    caution->pace = fmin(fmax(pace, BR_CAUTION_LEAST), 1);
 #else
     (void)elapsed;
 #endif

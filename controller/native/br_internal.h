@@ -174,6 +174,7 @@ typedef struct {
     int limited; /* there is a deadline */
     double deadline;
     double iteration, trial; /* longest seen, of the line search's trials too; 0: none yet */
+    double caution;          /* what the last br_caution_update took */
 } br_timer;
 
 /* The spare one of the two weight buffers, and whose it is. */

@@ -34,13 +34,18 @@ void br_undo_preparation(br_mpc *mpc) {
     mpc->ahead = 0;
 }
 
-/* Further iterations at the last problem, towards tolerance. The time of a second iteration is
- * left for what follows: restoring the best plan, shift and factorisation. Returns whether there
- * may be time left. */
+/* Time for an iteration, and what follows it: restoring the best plan, shift and factorisation,
+ * which take another one's, and caution. */
+static double iteration_and_rest(const br_timer *timer) {
+    return 2 * timer->iteration + timer->caution;
+}
+
+/* Further iterations at the last problem, towards tolerance. Returns whether there may be time
+ * left. */
 static int improve(br_mpc *mpc) {
     const br_timer *timer = &mpc->timer;
     if (!(timer->iteration > 0)) return 0; /* no step has shown yet how long that takes */
-    if (!br_timer_allows(timer, br_timer_now(timer), 2 * timer->iteration)) return 0;
+    if (!br_timer_allows(timer, br_timer_now(timer), iteration_and_rest(timer))) return 0;
     if (!mpc->linearised) br_sqp_linearise(mpc);
     memset(&mpc->info, 0, sizeof mpc->info);
     mpc->penalty = 0;
@@ -51,7 +56,7 @@ static int improve(br_mpc *mpc) {
     const int limit = br_iteration_limit(mpc);
     int time = 1;
     while (mpc->info.iterations < limit && (status == BR_ACCEPTABLE || status == BR_DEFECT)) {
-        time = br_timer_allows(timer, br_timer_now(timer), 2 * timer->iteration);
+        time = br_timer_allows(timer, br_timer_now(timer), iteration_and_rest(timer));
         if (!time) break;
         status = br_sqp_iterate(mpc, 1, 0);
         br_incumbent_keep(mpc, status, 1);
@@ -67,7 +72,7 @@ static void look_elsewhere(br_mpc *mpc) {
     br_timer *timer = &mpc->timer;
     if (mpc->turn) return;    /* there is one way to turn */
     if (mpc->follows) return; /* costs from different feet on the line do not compare */
-    timer->deadline -= 2 * timer->iteration;
+    timer->deadline -= iteration_and_rest(timer);
     if (!br_timer_allows(timer, br_timer_now(timer), BR_SECOND_START_ITERATIONS * timer->iteration))
         return;
     if (!mpc->linearised) br_sqp_linearise(mpc);

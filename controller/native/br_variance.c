@@ -162,7 +162,7 @@ void br_gp_variances(const br_gp *gp, int stages, double (*z)[BR_NZ], double (*w
             query(v, 0, rows, q, k);
             explain(v->root, rows, k, explained);
             for (int c = 0; c < COLUMNS && first + c < stages; ++c)
-                variance[first + c][j] = v->signal * fmax(1.0 - explained[c], 0.0) + v->noise;
+                variance[first + c][j] = v->signal * br_worse(0.0, 1.0 - explained[c]) + v->noise;
         }
     }
 }
