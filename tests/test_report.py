@@ -1,6 +1,7 @@
 """The report: one file with the numbers of the result, from whatever a race has left."""
 
 import re
+import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -114,6 +115,24 @@ def test_a_race_that_was_cut_off_still_gets_its_page(tmp_path: Path) -> None:
     text = page.read_text(encoding="utf-8")
     assert "The log is not complete" in text
     assert "DNF" in text
+
+
+@pytest.mark.parametrize(
+    ("share", "junk", "shown"), [(1.0, b"", True), (0.5, b"", True), (0.0, b"no log", False)]
+)
+def test_a_damaged_log_of_the_training_drive_leaves_the_race_its_page(
+    tmp_path: Path, share: float, junk: bytes, shown: bool
+) -> None:
+    path, training = race(tmp_path), race(tmp_path / "training")
+    data = (training / "run.mcap").read_bytes()
+    (path / "collect.mcap").write_bytes(junk + data[: int(share * len(data))])
+    for name in ("{}.csv", "{}_raceline.csv"):
+        shutil.copyfile(path / name.format("race"), path / name.format("train"))
+    result = analyse(path)
+    assert result.complete == (share == 1)
+    assert (result.training is not None) == shown
+    assert len(result.laps) == len(analyse(training).laps)
+    assert render_report(path, result).is_file()
 
 
 @pytest.mark.parametrize("states", [0, 1, 2])

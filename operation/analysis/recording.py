@@ -1,6 +1,7 @@
 """A run directory in memory: settings, track, racing line, and the messages of each run."""
 
 import json
+import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -39,6 +40,8 @@ __all__ = [
     "TrainingRecord",
     "read_recording",
 ]
+
+_log = logging.getLogger("bayesrace.report")
 
 
 RUN_EVENT: Final = "run"
@@ -180,9 +183,9 @@ class Recording:
     truth: bool
     """The log holds the truth; without it, as of a real car, measurements take its place."""
     truncated: bool
-    """The log ends without its end mark."""
+    """A log ends without its end mark, or that of the training drive cannot be read."""
     training: "TrainingRecord | None"
-    """The training drive; None where weights were given."""
+    """The training drive; None where weights were given, or it cannot be read."""
     refused: int
     """Messages of the log that could not be decoded."""
     started_ns: int | None
@@ -214,7 +217,8 @@ class Recording:
     @property
     def caution(self) -> float:
         """The probability that the controllers are cautious at; 0: they are not."""
-        value = self.settings.get("mpc", {}).get("caution", 0.0)
+        mpc = self.settings.get("mpc")
+        value = mpc.get("caution") if isinstance(mpc, dict) else None
         return float(value) if isinstance(value, int | float) else 0.0
 
     def run_of(self, controller: str) -> RunRecord | None:
@@ -229,10 +233,11 @@ def read_recording(run_dir: Path) -> Recording:
     track, line = _driven_on(run_dir, settings, "track", "race")
     reader = LogReader(run_dir / "run.mcap")
     planned, started_ns = _runs(reader)
+    training, whole = _read_training(run_dir, settings)
     return Recording(
         directory=run_dir, settings=settings, track=track, line=line, runs=planned,
-        truth=_with_truth(planned), training=_read_training(run_dir, settings),
-        truncated=reader.truncated, refused=reader.refused, started_ns=started_ns,
+        truth=_with_truth(planned), training=training,
+        truncated=reader.truncated or not whole, refused=reader.refused, started_ns=started_ns,
     )  # fmt: skip
 
 
@@ -245,14 +250,26 @@ def _driven_on(
     return track, read_raceline(run_dir / f"{label}_raceline.csv", name)
 
 
-def _read_training(run_dir: Path, settings: dict[str, Any]) -> TrainingRecord | None:
+def _read_training(run_dir: Path, settings: dict[str, Any]) -> tuple[TrainingRecord | None, bool]:
+    """The training drive, if there was one, and whether its log is whole.
+
+    The race does not need it: where it cannot be read, it is left out.
+    """
     log = run_dir / "collect.mcap"
     if not log.is_file():
-        return None
-    planned, _ = _runs(LogReader(log))
+        return None, True
+    try:
+        reader = LogReader(log)
+        planned, _ = _runs(reader)
+        track, line = _driven_on(run_dir, settings, "train_track", "train")
+    except InputError as error:
+        _log.warning("the training drive is left out: %s", error)
+        return None, False
+    if not planned:
+        return None, False
     _with_truth(planned)
-    track, line = _driven_on(run_dir, settings, "train_track", "train")
-    return TrainingRecord(planned[-1], track, line) if planned else None
+    whole = not (reader.truncated or reader.refused)
+    return TrainingRecord(planned[-1], track, line), whole
 
 
 def _runs(reader: LogReader) -> tuple[list[RunRecord], int | None]:

@@ -136,7 +136,7 @@ class RaceResult(_Frozen):
     real_time_factor: float | None = Field(
         description="simulated seconds per second of the lockstep runs; null without any"
     )
-    complete: bool = Field(description="the log is whole: no message missing, refused or cut off")
+    complete: bool = Field(description="the logs are whole: no message missing, refused or cut off")
     gaps: int = Field(description="messages missing by their numbers")
     judged_by: Literal["truth", "measurement"] = Field(
         "measurement",

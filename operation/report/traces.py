@@ -1,5 +1,6 @@
 """Panels over the arc length of the centreline: time lost, speed, inputs, deviation."""
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Final
 
@@ -175,7 +176,7 @@ def caution_figures(runs: Sequence[DrivenRun], track: Track) -> list[Figure]:
 
 
 def _last(tube_m: tuple[float, ...]) -> float:
-    return tube_m[-1] if tube_m else 0.0
+    return tube_m[-1] if tube_m else math.nan
 
 
 def _of_states(run: DrivenRun, value: Callable[[Telemetry], float]) -> Floats:
