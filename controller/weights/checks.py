@@ -171,12 +171,13 @@ class Checks:
 class Watch:
     """Compares adopted weights with proven ones, state by state, until they are worse or proven."""
 
-    def __init__(self, checks: Checks, before: Sequence[Sample]) -> None:
-        """Of the weights in use; ``before``: samples from before their adoption."""
+    def __init__(self, checks: Checks, before: Sequence[Sample], slowed: bool = False) -> None:
+        """Of the weights in use; ``before``: samples from before their adoption. ``slowed``: the
+        car has been slowed down because of them."""
         self._checks, self._settings = checks, checks.settings
         self._models = (checks.in_use, checks.reference, checks.nominal)
         self._errors: deque[Floats] = deque(maxlen=self._settings.watch_window)
-        self._slowed, self._fastest_mps = False, 0.0
+        self._slowed, self._fastest_mps = slowed, 0.0
         self._needed = round(self._settings.watch_s / checks.step_s)
         self._driven = self._cycles = self._fallen_back = 0
         for sample in before[-self._settings.watch_window :]:
@@ -184,8 +185,9 @@ class Watch:
 
     @property
     def over(self) -> bool:
-        """Whether the weights are proven."""
-        return self._driven >= self._needed
+        """Whether the weights are proven; never, if the car has been slowed down because of
+        them."""
+        return self._driven >= self._needed and not self._slowed
 
     @property
     def data(self) -> dict[str, Scalar]:
@@ -197,7 +199,8 @@ class Watch:
         """A cycle, with the sample that its state completes; what is to be done, if anything.
 
         The car goes back only to weights that predict no output worse over the same samples. After
-        a demand to slow down the watch goes on, with samples from then on.
+        a demand to slow down the watch goes on, with samples from then on, until other weights are
+        in use.
         """
         settings = self._settings
         if fallen_back is not None:

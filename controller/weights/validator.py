@@ -78,7 +78,8 @@ class Validator:
         self._checks.use(context["in_use"], context["accepted_utc_ns"], context["reference"])
         before = [one for one in self._driven if one[0].number < context["begin"]]
         watched = context["watched"]
-        self._watch = Watch(self._checks, self._recent(before)) if watched else None
+        slowed = context["slowed"]
+        self._watch = Watch(self._checks, self._recent(before), slowed) if watched else None
         return [one for one in self._driven if one[0].number >= context["begin"]]
 
     def _recent(self, driven: Iterable[_Driven]) -> list[Sample]:

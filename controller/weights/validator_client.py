@@ -72,7 +72,7 @@ class ValidatorClient:
             message["context"] = {
                 "in_use": in_use.data, "accepted_utc_ns": in_use.accepted_utc_ns,
                 "reference": reference.data, "watched": not in_use.proven,
-                "begin": self._begin,
+                "begin": self._begin, "slowed": self._adoption.slow is not None,
             }  # fmt: skip
             self._stale = False
         if self._file is not None and not self._stale and len(states) < _CHUNK:

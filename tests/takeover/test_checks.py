@@ -248,7 +248,8 @@ def test_the_watch_rolls_spoilt_weights_back(
 def test_the_watch_goes_back_only_to_what_is_no_worse(
     checks: Checks, honest: GpWeights, again: GpWeights, drive: list[Sample]
 ) -> None:
-    """Wrong in vx alone, weights are still better than none: the car slows down, once."""
+    """Wrong in vx alone, weights are still better than none: the car slows down, once, and they
+    are never proven."""
     bad = spoilt(again, "flip vx")
     for reference, actions in ((None, ["slow"]), (honest, ["back"])):
         checks.use(file(bad), 2**62, file(reference))
@@ -256,11 +257,11 @@ def test_the_watch_goes_back_only_to_what_is_no_worse(
         for sample in drive:
             if (ruling := watch.add(False, sample)) is not None:
                 rulings.append(ruling)
-            if watch.over or (ruling is not None and ruling.action == "back"):
+            if ruling is not None and ruling.action == "back":
                 break
         assert [ruling.action for ruling in rulings] == actions
         assert "predicted vx worse" in rulings[0].text
-        assert watch.over is (reference is None)
+        assert not watch.over
     assert int(rulings[0].data["samples"]) <= 100
 
 
@@ -282,24 +283,46 @@ class Messages:
         self.answers.append(msgpack.unpackb(data))
 
 
-@pytest.mark.parametrize("chunk", [1, 64, 600])
-def test_what_the_watch_finds_does_not_depend_on_when_states_come(
-    checks: Checks, again: GpWeights, car: CarParameters, chunk: int
-) -> None:
-    """Slow down, and later that the weights are proven, may be found in one message."""
-    states = records(*smooth_drive(car, 601, seed=7))
+def conversation(
+    checks: Checks, car: CarParameters, in_use: GpWeights, states: list[StateRecord], chunk: int,
+    slowed: bool = False,
+) -> list[dict[str, Any]]:  # fmt: skip
+    """What a validator answers to these states, so many at a time, with unproven weights in use."""
     context = {
-        "in_use": file(spoilt(again, "flip vx")), "accepted_utc_ns": 2**62, "reference": b"",
-        "watched": True, "begin": 0,
+        "in_use": file(in_use), "accepted_utc_ns": 2**62, "reference": b"", "watched": True,
+        "begin": 0, "slowed": slowed,
     }  # fmt: skip
     parts = [states[first : first + chunk] for first in range(0, len(states), chunk)]
     connection = Messages([{"context": context}, *({"states": part} for part in parts)])
     with suppress(EOFError):
         Validator(cast(Connection, connection), checks, car).serve()
-    found = [ruling for answer in connection.answers[1:] for ruling in answer["watch"]]
-    assert [action for action, *_ in found] == ["slow", "proven"]
+    return connection.answers[1:]
+
+
+@pytest.mark.parametrize("chunk", [1, 64, 600])
+def test_what_the_watch_finds_does_not_depend_on_when_states_come(
+    checks: Checks, again: GpWeights, car: CarParameters, chunk: int
+) -> None:
+    """Slow down, and later back, may be found in one message."""
+    states = records(*smooth_drive(car, 601, seed=7))
+    states[300:] = [one._replace(fallen_back=True) for one in states[300:]]
+    answers = conversation(checks, car, spoilt(again, "flip vx"), states, chunk)
+    found = [ruling for answer in answers for ruling in answer["watch"]]
+    assert [action for action, *_ in found] == ["slow", "back"]
     assert found[0][2]["driven"] == 5
-    assert connection.answers[-1]["seen"] is None
+    assert answers[-1]["seen"] is None
+
+
+@pytest.mark.parametrize("slowed", [False, True])
+def test_weights_are_proven_unless_the_car_was_slowed_down_because_of_them(
+    checks: Checks, again: GpWeights, car: CarParameters, slowed: bool
+) -> None:
+    """Also where a validator has replaced the one that found that."""
+    states = records(*smooth_drive(car, 601, seed=7))
+    answers = conversation(checks, car, again, states, 64, slowed)
+    found = [action for answer in answers for action, *_ in answer["watch"]]
+    assert found == ([] if slowed else ["proven"])
+    assert (answers[-1]["seen"] is None) == (not slowed)
 
 
 def test_the_watch_rolls_back_what_leaves_no_solution(checks: Checks, honest: GpWeights) -> None:
