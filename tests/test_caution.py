@@ -14,6 +14,7 @@ from bayesrace.gp.weights import KERNELS, GpOutput, GpWeights, read_weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic, e_kinematic
+from bayesrace.vehicles.tuning import CautionTuning
 from codegen.problems.tracking import tracking
 from controller.assembly import compiled_controller
 from controller.native_step import NativeStep
@@ -258,6 +259,13 @@ def test_without_caution_uncertainty_changes_nothing(
 def test_a_probability_is_asked_for(value: float) -> None:
     with pytest.raises(ValidationError, match="caution"):
         MpcSettings(caution=value)
+
+
+@pytest.mark.parametrize("change", [{"least": 1.1}, {"share": 1.1}, {"least": 0.0}])
+def test_shares_in_the_tuning_are_shares(car: CarParameters, change: dict[str, float]) -> None:
+    stated = car.tuning.caution.model_dump() | change
+    with pytest.raises(ValidationError, match=next(iter(change))):
+        CautionTuning.model_validate(stated)
 
 
 @pytest.mark.check

@@ -232,12 +232,16 @@ class CautionTuning(_Section):
         0.5,
         NONE,
         "of half the track's width that uncertainty may take before the car slows down [-]",
+        gt=0,
+        le=1,
     )
     slower_ps: float = _number(
         2.5, YAW_RATE, "speed of the reference then falls at this rate [1/s]"
     )
     faster_ps: float = _number(0.5, YAW_RATE, "and rises again at this one [1/s]")
-    least: float = _number(0.5, NONE, "share of the line's speed that is never undercut [-]")
+    least: float = _number(
+        0.5, NONE, "share of the line's speed that is never undercut [-]", gt=0, le=1
+    )
 
     @property
     def pace(self) -> list[tuple[str, float]]:
