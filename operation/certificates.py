@@ -118,6 +118,7 @@ def add(
     _write_private(target / KEY, key)
     write_whole(target / CERTIFICATE, certificate)
     write_whole(target / AUTHORITY, (folder / _FOLDER / AUTHORITY).read_bytes())
+    ends = x509.load_pem_x509_certificate(certificate).not_valid_after_utc  # the authority's first
     entry = Entry(role=role, car=car or EVERY_CAR, hosts=tuple(hosts), ends=ends)
     _write_register(folder, {**entries, name: entry})
     return target

@@ -38,8 +38,7 @@ def examine(configuration: Configuration) -> Iterator[Check]:
     except InputError as error:
         yield Check(False, str(error))
         return
-    usable = [check for check in map(_certificate, certificates) if check is not None]
-    yield from usable
+    yield from map(_certificate, certificates)
     if configuration.tls.folder is None:
         yield Check(True, "no certificates: links are for loopback, or open to everyone")
     elif not certificates:
@@ -62,7 +61,7 @@ def examine(configuration: Configuration) -> Iterator[Check]:
         yield from _cars(endpoints.model_copy(update={"connect": there}), own)
 
 
-def _certificate(one: Credentials) -> Check | None:
+def _certificate(one: Credentials) -> Check:
     if one.member is None:
         how = "revoked" if one.name in one.members.revoked else "not in its own members.json"
         return Check(False, f"certificate '{one.name}' is {how}: make another one, or remove it")

@@ -10,7 +10,7 @@ import pytest
 from bayesrace.configuration import Configuration, as_toml, read_configuration
 from bayesrace.defaults import CONFIGURATION_VARIABLE
 from bayesrace.errors import InputError
-from bayesrace.transport import Endpoints, free_endpoint, open_session
+from bayesrace.transport import Credentials, Endpoints, Members, free_endpoint, open_session
 from operation.settings import RaceSettings
 from operation.system import CONFIGURATION, started_system
 from tests.command_line import Cli, refused
@@ -58,6 +58,7 @@ def test_what_is_written_is_read_back() -> None:
         ("[zenoh.access_control]\nenabled = false", ("zenoh", "access_control/enabled")),
         ("[zenoh]\n'scouting/multicast/enabled' = true", ("zenoh", "scouting/multicast")),
         ("[zenoh.transport.link.tls]\nenable_mtls = false", ("zenoh", "transport/link/tls")),
+        ("[zenoh]\n'/listen//endpoints' = ['tcp/0.0.0.0:1']", ("zenoh", "listen/endpoints")),
         ("[network", ("no TOML",)),
     ],
 )
@@ -160,6 +161,15 @@ def test_insecure_is_possible_and_warns_each_time() -> None:
 
 def test_an_encrypted_endpoint_needs_a_certificate(cli: Cli) -> None:
     refused(cli("plant", "--endpoint", "tls/127.0.0.1:7447"), "certificate", "bayesrace certs")
+
+
+def test_an_encrypted_endpoint_has_no_settings_of_its_own() -> None:
+    """With enable_mtls=false there, Zenoh lets everyone in."""
+    own = Credentials(folder=Path("certs"), name="plant", ends_s=2e9, members=Members())
+    where = "tls/127.0.0.1:7447"
+    Endpoints(listen=(where,), credentials=own).check()
+    with pytest.raises(InputError, match="settings of its own"):
+        Endpoints(listen=(f"{where}#enable_mtls=false",), credentials=own).check()
 
 
 # settings.json -----------------------------------------------------------------------------------

@@ -88,7 +88,8 @@ def leaves(settings: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, An
 
 
 def _beside_ours(settings: dict[str, Any]) -> dict[str, Any]:
-    for path, _ in leaves(settings):
+    for written, _ in leaves(settings):
+        path = "/".join(filter(None, written.split("/")))  # Zenoh skips what is empty
         if any(path == one or path.startswith(one + "/") for one in _OURS):
             raise ValueError(f"{path} follows from [network] and [tls]; leave it out")
     return settings
@@ -157,6 +158,11 @@ class Endpoints(BaseModel):
                 raise InputError(
                     f"endpoint {endpoint} is not encrypted, and this process has a certificate "
                     f"({self.credentials.folder}): write tls/, or leave the certificate out"
+                )
+            if self.credentials is not None and "#" in endpoint:
+                raise InputError(
+                    f"endpoint {endpoint} has settings of its own, which could switch the check of "
+                    "certificates off: leave out what follows the '#'"
                 )
             if self.credentials is None and address.protocol in ("tls", "quic"):
                 raise InputError(

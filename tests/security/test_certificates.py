@@ -3,6 +3,7 @@
 import shutil
 import stat
 from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from bayesrace.errors import InputError
 from bayesrace.transport import Credentials
+from operation import certificates
 from tests.command_line import Cli, refused
 from tests.security.authority import CAR, Bundles, bundles
 
@@ -154,3 +156,15 @@ def test_a_certificate_is_for_a_role_and_a_car(bundles: Bundles) -> None:
     for role in ("director", "learning", "viewer"):
         director.check(role)
     director.check_car("blue")
+
+
+def test_the_register_says_when_a_certificate_really_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the authority's own, at the latest."""
+    monkeypatch.setattr(certificates, "_AUTHORITY_DAYS", 10)
+    certificates.init(tmp_path)
+    folder = certificates.add(tmp_path, "plant", "plant", days=365)
+    ends = certificates.read_register(tmp_path)["plant"].ends
+    assert ends.timestamp() == Credentials.read(folder).ends_s
+    assert ends < datetime.now(UTC) + timedelta(days=11)
