@@ -112,8 +112,8 @@ Caution = Annotated[
         min=0,
         max=0.9999999,
         show_default="0.95",
-        help="Probability to stay on the track that the model's uncertainty leaves, from 0.5 on; "
-        "0: as in the paper, none.",
+        help="Probability with which the plan stays on the track in spite of the model's "
+        "uncertainty, from 0.5 on; 0: none, as in the paper.",
     ),
 ]
 
