@@ -17,6 +17,7 @@ from bayesrace.vehicles.models import dynamic, e_kinematic
 from bayesrace.vehicles.tuning import CautionTuning
 from codegen.problems.tracking import tracking
 from controller.assembly import compiled_controller
+from controller.native_library import StepStatus
 from controller.native_step import NativeStep
 from controller.settings import MpcSettings
 from learning.validation import predictive_sigma
@@ -195,6 +196,8 @@ def test_the_reference_does_not_leap_when_nothing_is_uncertain_any_more(
     """As after a rollback to no weights."""
     step = ready(kinematic_artefact, car, noisy(weights, 100), circuit)
     x, u, paces = driven(step, car, circuit, 40)
+    assert step.step(np.full(7, np.nan), u) is StepStatus.BAD_STATE
+    assert step.info.pace == paces[-1]  # also that of a step that plans nothing
     step.set_zero_weights()
     assert step.step(x, u).usable
     assert paces[-1] < 0.9

@@ -139,7 +139,7 @@ def test_bad_states_are_answered_as_in_lockstep_and_nothing_bad_comes_out(
     controller.initialise({"d_applied_connected": 1.0, "delay": 0.03})
     outputs = [v.name for v in controller.description.modelVariables if v.causality == "output"]
     limits = np.array([get_car("orca").d_max, get_car("orca").delta_rate_max_radps])
-    poison = (np.nan, np.inf, -np.inf, -1.0, 1e300)
+    poison, unplanned = (np.nan, np.inf, -np.inf, -1.0, 1e300), 0
     for k, x in enumerate(run.x):
         inputs = dict(zip(STATES, x, strict=True))
         names = ("d_applied", "speed_limit", "speed_limit_rate")
@@ -148,6 +148,12 @@ def test_bad_states_are_answered_as_in_lockstep_and_nothing_bad_comes_out(
         controller.step(STEP_S)
         assert np.isfinite(controller.get(*outputs)).all()
         assert (np.abs(controller.get("d", "delta_rate")) <= limits).all()
+        status, tube_m, pace = controller.get("status", "tube_m", "pace")
+        assert pace > 0
+        if status == StepStatus.BAD_STATE or status > max(StepStatus):  # nothing was planned
+            unplanned += 1
+            assert tube_m == -1
+    assert unplanned > 0
     assert controller.messages == []
 
 

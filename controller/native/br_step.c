@@ -177,6 +177,7 @@ static br_mpc_error begin(br_mpc *mpc, const request *r, int *plausible) {
     *r->status = BR_BAD_STATE; /* until there is something better to say */
     memset(&mpc->info, 0, sizeof mpc->info);
     mpc->info.status = BR_BAD_STATE;
+    mpc->info.pace = mpc->caution.pace;
     if (r->info) *r->info = mpc->info;
     if (!mpc->has_parameters) return BR_ERROR_NOT_READY;
     if (!(r->elapsed_s >= 0 && isfinite(r->elapsed_s))) return BR_ERROR_TIME;

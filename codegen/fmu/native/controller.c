@@ -145,8 +145,9 @@ static void set_outputs(fmu_instance *instance, const br_decision *decision) {
     v[FMU_V_stationarity] = known(info->stationarity);
     v[FMU_V_defect] = known(info->defect);
     v[FMU_V_slack_max_m] = known(info->slack_max_m);
-    if (!decision->stepped || status == BR_BAD_STATE) return; /* which projects nothing */
-    v[FMU_V_tube_m] = known(info->tube_m);
+    const bool planned = decision->stepped && status != BR_BAD_STATE;
+    v[FMU_V_tube_m] = planned ? known(info->tube_m) : -1;
+    if (!planned) return; /* nor projected */
     v[FMU_V_pace] = info->pace;
     v[FMU_V_s_ref_m] = info->s_ref_m;
     v[FMU_V_lateral_m] = info->lateral_m;
