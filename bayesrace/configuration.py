@@ -168,7 +168,7 @@ def as_toml(configuration: Configuration, explained: bool = False) -> str:
         if is_model:
             lines += _fields(section, explained)
         else:
-            lines += [f"{json.dumps(key)} = {_value(value)}" for key, value in section.items()]
+            lines += [f"{_text(key)} = {_value(value)}" for key, value in section.items()]
         lines += [""]
     return "\n".join(lines[:-1]) + "\n"
 
@@ -186,7 +186,12 @@ def _value(value: Any) -> str:
     if isinstance(value, dict):
         if not value:
             return "{}"
-        return "{ " + ", ".join(f"{json.dumps(k)} = {_value(v)}" for k, v in value.items()) + " }"
+        return "{ " + ", ".join(f"{_text(k)} = {_value(v)}" for k, v in value.items()) + " }"
     if isinstance(value, tuple | list):
         return "[" + ", ".join(map(_value, value)) + "]"
-    return json.dumps(str(value) if isinstance(value, Path) else value)
+    return _text(str(value) if isinstance(value, Path) else value)
+
+
+def _text(value: Any) -> str:
+    """As JSON, which is TOML but for what it would write as two surrogates."""
+    return json.dumps(value, ensure_ascii=False)

@@ -40,7 +40,7 @@ def test_the_example_holds_every_setting_with_its_meaning(cli: Cli, tmp_path: Pa
 def test_what_is_written_is_read_back() -> None:
     content = {
         "network": {"plant": ["tls/10.0.0.1:1", "tls/[::1]:2"], "insecure": True},
-        "tls": {"folder": "/certs", "use": {"plant": 'a "b"'}}, "realtime": {"fifo": 7},
+        "tls": {"folder": "/certs", "use": {"plant": 'a "b" é 🏁'}}, "realtime": {"fifo": 7},
         "limits": {"lease_s": 0.5}, "zenoh": {"transport/link/rx/buffer_size": 1000},
     }  # fmt: skip
     made = Configuration.model_validate(content)
