@@ -21,7 +21,7 @@ DEFAULTS = {name: getattr(MpcSettings(), name) for name in ("early_stop_tol", "i
 def result(step: NativeStep) -> bytes:
     """All of the last step that is not about preparation."""
     step.read_plan()
-    names = ("iterations", "qp_iterations", "regularised", "shortened", "shifts", "cost")
+    names = ("iterations", "qp_iterations", "regularised", "shortened", "shifts", "cost", "pace")
     numbers = [float(getattr(step.info, name)) for name in (*names, "stationarity", "defect")]
     parts = (step.u, step.plan_x, step.plan_u, step.read_tube(), np.array(numbers))
     return b"".join(part.tobytes() for part in parts)

@@ -144,6 +144,22 @@ def test_prepared_steps_are_the_same_to_the_bit(
         d, x = float(plain.u[0]), plant(x, plain.u)
 
 
+def test_a_car_that_is_measured_elsewhere_is_sought_there_whatever_was_prepared(
+    artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit
+) -> None:
+    """At the other side of the waist, for a cycle: nearer to the plan than what lies between."""
+    prepared, plain = (ready(artefact, car, weights, circuit, MpcSettings()) for _ in range(2))
+    plant, quarter_m = discrete(dynamic(car)), circuit.line.length_m / 4
+    x, d = circuit.start(0.8 * quarter_m), 0.0
+    for k in range(24):
+        measured = circuit.start(3 * quarter_m) if k in (12, 18) else x
+        assert prepared.step(measured, d) is plain.step(measured, d)
+        assert result(prepared) == result(plain)
+        assert prepared.read_reference().tobytes() == plain.read_reference().tobytes()
+        prepared.prepare()
+        d, x = float(plain.u[0]), plant(x, plain.u)
+
+
 def test_a_budget_looks_for_no_other_plan(
     artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit
 ) -> None:

@@ -197,9 +197,10 @@ struct br_mpc {
     double u_lower[BR_NU], u_upper[BR_NU];
     double x0[BR_NX];
     br_mpc_reference reference[BR_N];
-    int follows;  /* the reference is where the plan is on the line, not points to track, ... */
-    int followed; /* ... and belongs to the plan at hand */
-    double turn;  /* the side that the car turns round to, 1 left, -1 right; 0: it does not */
+    int follows;   /* the reference is where the plan is on the line, not points to track, ... */
+    int followed;  /* ... and belongs to the plan at hand, ... */
+    int first_row; /* ... of which the first stage is at this row of the path */
+    double turn;   /* the side that the car turns round to, 1 left, -1 right; 0: it does not */
     double turn_u[BR_N][BR_NU]; /* inputs that the reference of a turn has been made with */
     /* the plan, primal and dual */
     int warm;          /* a plan from the step before is there */

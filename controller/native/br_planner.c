@@ -198,13 +198,17 @@ static double direction_at(const br_path *path, double s, double tangent[2]) {
     return (tangent[0] * ddy - tangent[1] * ddx) / (h * h);
 }
 
-/* The stages where the plan itself is on the line. */
+/* The stages where the plan itself is on the line. Each is sought from the one before, the first
+ * from the car: where another measurement leads to another first one, all are sought again. */
 void br_path_follow(br_mpc *mpc) {
     const br_path *path = &mpc->path;
-    if (!mpc->follows || mpc->followed) return;
+    if (!mpc->follows) return;
+    const int car = (int)(wrap_length(path->s, path->length) / path->spacing) % path->n;
+    int i = nearest_from(path, car, mpc->plan.x[1]);
+    if (mpc->followed && i == mpc->first_row) return;
     mpc->followed = 1;
+    mpc->first_row = i;
     mpc->qp.factorised = mpc->qp.evaluated = 0;
-    int i = (int)(wrap_length(path->s, path->length) / path->spacing) % path->n;
     for (int k = 0; k < BR_N; ++k) {
         const double *x = mpc->plan.x[k + 1];
         double s, lateral, row[BR_PATH_COLUMNS], tangent[2];

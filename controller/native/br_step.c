@@ -16,15 +16,15 @@ static void begin_plan(br_mpc *mpc) {
     if (mpc->warm) {
         mpc->info.shifts = br_shifts_due(&mpc->lag);
         br_align(mpc, mpc->info.shifts);
-        mpc->info.prepared = mpc->prepared && mpc->qp.factorised;
     } else {
         br_sqp_cold_start(mpc);
         mpc->caution.known = 0;
         mpc->lag = mpc->unfinished = 0;
         mpc->info.shifts = -1;
     }
-    mpc->ahead = mpc->prepared = 0;
     br_path_follow(mpc);
+    mpc->info.prepared = mpc->prepared && mpc->qp.factorised;
+    mpc->ahead = mpc->prepared = 0;
     br_caution_update(mpc);
 }
 

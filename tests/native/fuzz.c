@@ -172,6 +172,7 @@ static void check_answer(const double u[BR_NU], br_mpc_status status, const br_m
     const int limit = p->iterations > p->iterations_cold ? p->iterations : p->iterations_cold;
     CHECK(status >= BR_CONVERGED && status <= BR_TIME_LIMIT);
     CHECK(info->iterations <= limit + BR_COLD_GUESSES * BR_SECOND_START_ITERATIONS);
+    CHECK(info->pace > 0 && info->pace <= 1);
     if (status > BR_ACCEPTABLE) {
         CHECK(u[0] == -9 && u[1] == -9);
         return;
@@ -179,7 +180,7 @@ static void check_answer(const double u[BR_NU], br_mpc_status status, const br_m
     CHECK(u[0] >= p->d_min - 1e-6 && u[0] <= p->d_max + 1e-6);
     CHECK(fabs(u[1]) <= p->delta_rate_max_radps + 1e-6);
     CHECK(info->defect <= p->defect_max && info->bound <= 1e-6 && isfinite(info->stationarity));
-    CHECK(isfinite(info->cost) && info->slack_max_m >= 0);
+    CHECK(isfinite(info->cost) && info->slack_max_m >= 0 && info->tube_m >= 0);
     if (status == BR_CONVERGED)
         CHECK(info->stationarity <= p->tolerance && info->defect <= p->tolerance);
 }
