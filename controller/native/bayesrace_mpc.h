@@ -138,7 +138,9 @@ BR_API br_mpc_error br_mpc_step(br_mpc *mpc, const double x[BR_NX], const double
                                 double budget_s, double u[BR_NU], br_mpc_status *status,
                                 br_mpc_info *info);
 
-/* The same with a reference of the caller's own planner, stages 1..BR_N. */
+/* The same with a reference of the caller's own planner, stages 1..BR_N. Caution tightens the track
+ * of these stages; how fast they go is the caller's: info->pace says which share of its speed
+ * br_mpc_step would ask for. */
 BR_API br_mpc_error br_mpc_solve(br_mpc *mpc, const double x[BR_NX], const double u_before[BR_NU],
                                  double elapsed_s, double budget_s,
                                  const br_mpc_reference reference[BR_N], double u[BR_NU],
