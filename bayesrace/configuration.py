@@ -122,7 +122,7 @@ class Configuration(_Section):
         )
 
     def plain(self, plant: str, controller: str) -> Self:
-        """The same for processes of one run that meet on loopback, without certificates."""
+        """The same for processes of one machine that meet there, without certificates."""
         network = NetworkSettings(plant=(plant,), controller=(controller,))
         return self.model_copy(update={"network": network, "tls": TlsSettings()})
 

@@ -3,6 +3,9 @@
 In lockstep the recording has a session of its own, whose links are low-latency: plant and
 controller then send what is recorded in the thread that drives, which takes a fifth of the CPU of
 handing it to another. Weights are too large for such a link, so the director's are ordinary.
+
+All meet at Unix sockets in a folder that only this user may enter, so nobody else on the machine
+can join, and no certificates are needed.
 """
 
 import os
@@ -10,6 +13,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 from bayesrace.configuration import Configuration, as_toml, configured
@@ -22,7 +26,6 @@ from bayesrace.transport import (
     Director,
     Publisher,
     count_processes,
-    free_endpoint,
     open_session,
 )
 from operation.drive import RunPlan, announcement, execute
@@ -129,20 +132,21 @@ def started_system(
     """A running plant for the block, and the sessions that direct and record it.
 
     ``car`` is its name in message keys, ``plant`` are options of ``bayesrace plant``, ``both``
-    those of plant and controllers. ``configuration`` is that of all three; without it they meet on
-    loopback, without certificates, and all else is as configured. It is left in ``folder``.
+    those of plant and controllers. ``configuration`` is that of all three; without it they meet at
+    sockets in a folder of this user's own, without certificates, and all else is as configured. It
+    is left in ``folder``.
     ``lockstep``: all runs are in lockstep, and their links without priorities. No process outlives
     the block, however it ends.
     """
-    used = configuration or configured().plain(free_endpoint(), free_endpoint())
     file = folder / CONFIGURATION
-    write_whole(file, as_toml(used))
-    endpoints = used.endpoints("director")
     options = ["--config", str(file), "--parent-pid", str(os.getpid()), *both]
     if lockstep:
         options.append("--low-latency")
     line = ["plant", *plant, *options]
     with ExitStack() as stack:
+        used = configuration or stack.enter_context(_private_network())
+        write_whole(file, as_toml(used))
+        endpoints = used.endpoints("director")
         process = stack.enter_context(child(line, folder / "plant.log"))
         recording = session = stack.enter_context(
             open_session(endpoints, "director", explains=False)
@@ -154,3 +158,11 @@ def started_system(
         system = System(session, recording, car, folder, options)
         system.children["plant"] = process
         yield system
+
+
+@contextmanager
+def _private_network() -> Iterator[Configuration]:
+    """The configuration of processes that meet at sockets which only this user can reach."""
+    with TemporaryDirectory(prefix="bayesrace-", ignore_cleanup_errors=True) as folder:  # mode 700
+        plant, controller = (f"unixsock-stream/{folder}/{one}" for one in ("plant", "controller"))
+        yield configured().plain(plant, controller)

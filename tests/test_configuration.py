@@ -2,6 +2,7 @@
 
 import json
 import os
+import stat
 import tomllib
 from pathlib import Path
 
@@ -99,7 +100,7 @@ def test_a_router_in_the_file_is_what_all_connect_to() -> None:
 def test_the_processes_of_a_system_read_the_file_that_it_leaves(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Beside where they meet, they have what is configured."""
+    """They meet where no other user may enter; beside that, they have what is configured."""
     monkeypatch.setenv(
         CONFIGURATION_VARIABLE,
         str(config(tmp_path, "[limits]\nlease_s = 3.5\n[realtime]\ncpu = 9999\n")),
@@ -108,9 +109,13 @@ def test_the_processes_of_a_system_read_the_file_that_it_leaves(
     folder.mkdir()
     with started_system("orca", folder) as system:
         system.director.wait_for(("plant",), 30.0)
-    left = read_configuration(folder / CONFIGURATION)
+        left = read_configuration(folder / CONFIGURATION)
+        protocol, _, socket = left.network.plant[0].partition("/")
+        assert protocol == "unixsock-stream"
+        assert Path(socket).is_socket()
+        assert stat.S_IMODE(Path(socket).parent.stat().st_mode) == 0o700
+    assert not Path(socket).parent.exists()
     assert left.limits.lease_s == 3.5
-    assert left.network.plant != Configuration().network.plant
     assert "not bound to CPU 9999" in (folder / "plant.log").read_text()
 
 
