@@ -82,6 +82,8 @@ class Run:
         self._react = react
         self._beat = beat
         self._numbering = numbering
+        self.takes_commands = True
+        """Actuations count; else the car brakes, or in lockstep the run ends for want of them."""
         # In real time:
         self._outbox: deque[tuple[int, State, tuple[float, ...]]] = deque()
         self._sampled_ns: dict[int, int] = {}
@@ -135,7 +137,8 @@ class Run:
                 if actuation is None:
                     continue
                 self._numbering.note(actuation.seq)
-                if (actuation.epoch, actuation.run, actuation.state_seq) == (self._epoch, run, seq):
+                answered = (actuation.epoch, actuation.run, actuation.state_seq)
+                if self.takes_commands and answered == (self._epoch, run, seq):
                     return actuation.u
                 self._counters.stale += 1
             elif item.kind is Kind.GONE and item.name == "controller":
@@ -209,7 +212,8 @@ class Run:
                 mine = (actuation.epoch, actuation.run) == (self._epoch, self.request.run)
                 # one from the future would never grow old, and every later one would be overtaken
                 ahead = actuation.decided_at_s > self._simulator.time_s + 2 * self._simulator.step_s
-                if not mine or ahead or actuation.state_seq not in self._sampled_ns:
+                known = actuation.state_seq in self._sampled_ns
+                if not self.takes_commands or not mine or ahead or not known:
                     self._counters.stale += 1
                     continue
                 waiting = _Waiting(

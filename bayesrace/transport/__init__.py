@@ -2,7 +2,8 @@
 
 ``endpoints`` says where a process listens and connects, ``credentials`` holds its certificate,
 ``access`` makes Zenoh's access control of the table of messages, and ``session`` opens a session
-with all of that; ``probe`` and ``links`` say why there is no link. ``publisher`` sends messages,
+with all of that. ``probe`` says why an endpoint cannot be linked, ``membership`` what its other end
+refuses, and ``watch`` says both while a session is open. ``publisher`` sends messages,
 ``inbox`` is the one subscriber, with ``requests`` for what it serves; ``client`` sends requests,
 ``director`` starts and follows runs; ``numbering`` counts losses.
 """
@@ -30,12 +31,12 @@ from bayesrace.transport.inbox import LOCKSTEP_SPIN_S, NEWEST, Inbox, Item, Kind
 from bayesrace.transport.numbering import Numbering
 from bayesrace.transport.publisher import HEARTBEAT_S, Heartbeat, Publisher
 from bayesrace.transport.requests import Request, declare_service, decode_request
-from bayesrace.transport.session import check_links, open_session
+from bayesrace.transport.session import open_session, try_links
 
 __all__ = [
     "CONTROLLER_ENDPOINT", "HEARTBEAT_S", "LOCKSTEP_SPIN_S", "NEWEST", "PLANT_ENDPOINT", "Answers",
     "Credentials", "Director", "Endpoint", "Endpoints", "Heartbeat", "Inbox", "Item", "Kind",
     "LinkLimits", "Member", "Members", "Numbering", "Publisher", "RefusedError", "Request", "ask",
-    "ask_all", "check_links", "count_processes", "decisive", "declare_service", "decode_request",
-    "free_endpoint", "open_session", "send_rollback", "send_weights",
+    "ask_all", "count_processes", "decisive", "declare_service", "decode_request",
+    "free_endpoint", "open_session", "send_rollback", "send_weights", "try_links",
 ]  # fmt: skip

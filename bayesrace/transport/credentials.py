@@ -137,9 +137,17 @@ class Credentials(BaseModel):
         left_s = self.ends_s - time.time()
         if left_s > _SOON_S:
             return ""
+        left = f"{left_s / 86400:.0f} days" if left_s > 2 * 86400 else f"{left_s / 3600:.1f} hours"
         return (
-            f"certificate '{self.name}' expires in {left_s / 86400:.1f} days, and its links are "
-            f"closed then: renew it with 'bayesrace certs add {self.name} --renew'"
+            f"certificate '{self.name}' expires in {left}, and its links are closed then: renew it "
+            f"with 'bayesrace certs add {self.name} --renew'"
+        )
+
+    def expired(self) -> str:
+        """What to say once it has."""
+        return (
+            f"certificate '{self.name}' has expired, and its links are closed: renew it with "
+            f"'bayesrace certs add {self.name} --renew', and start this process again with it"
         )
 
 

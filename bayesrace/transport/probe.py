@@ -35,26 +35,31 @@ class Finding(NamedTuple):
     """It does not change by waiting."""
 
 
-def probe_all(endpoints: Sequence[str], credentials: Credentials | None) -> list[Finding]:
-    """What is wrong with each of the endpoints; all are tried at once, within some 1.5 s."""
+def probe_all(
+    endpoints: Sequence[str], credentials: Credentials | None, *, greets: bool = True
+) -> list[Finding]:
+    """What is wrong with each of the endpoints; all are tried at once, within some 1.5 s.
+
+    Unless it ``greets``, only whether somebody listens.
+    """
     if not endpoints:
         return []
     with ThreadPoolExecutor(len(endpoints)) as pool:
-        found = pool.map(lambda one: probe(one, credentials), endpoints)
+        found = pool.map(lambda one: probe(one, credentials, greets=greets), endpoints)
         return [finding for finding in found if finding is not None]
 
 
-def probe(endpoint: str, credentials: Credentials | None) -> Finding | None:
+def probe(endpoint: str, credentials: Credentials | None, *, greets: bool = True) -> Finding | None:
     """What is wrong with an endpoint; None if nothing is found."""
     address = address_of(endpoint)
-    if address.protocol not in ("tcp", "tls", "ws"):
+    if address.protocol not in ("tcp", "tls", "ws", "unixsock-stream"):
         return None
     try:
-        connection = socket.create_connection((address.host, address.port), _CONNECT_S)
+        connection = _connected(endpoint, address)
     except OSError as error:
         return Finding(endpoint, _unreached(endpoint, address, error), lasting=False)
     with connection:
-        if address.protocol == "ws":
+        if not greets or address.protocol in ("ws", "unixsock-stream"):
             return None
         if credentials is None:
             text = _asks_for_certificates(connection)
@@ -63,8 +68,21 @@ def probe(endpoint: str, credentials: Credentials | None) -> Finding | None:
         return Finding(endpoint, f"{endpoint} {text}") if text else None
 
 
+def _connected(endpoint: str, address: Address) -> socket.socket:
+    if address.protocol != "unixsock-stream":
+        return socket.create_connection((address.host, address.port), _CONNECT_S)
+    connection = socket.socket(socket.AF_UNIX)
+    try:
+        connection.settimeout(_CONNECT_S)
+        connection.connect(endpoint.partition("/")[2].partition("?")[0].partition("#")[0])
+    except OSError:
+        connection.close()
+        raise
+    return connection
+
+
 def _unreached(endpoint: str, address: Address, error: OSError) -> str:
-    if isinstance(error, ConnectionRefusedError):
+    if isinstance(error, ConnectionRefusedError | FileNotFoundError):
         return f"nobody listens at {endpoint}: start what should, or correct the endpoint"
     if isinstance(error, socket.gaierror):
         return f"{endpoint}: the name '{address.host}' is not known: correct it, or give an address"

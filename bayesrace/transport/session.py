@@ -21,10 +21,12 @@ from bayesrace.messages import Role
 from bayesrace.transport.access import access_control
 from bayesrace.transport.credentials import AUTHORITY, CERTIFICATE, KEY, Credentials
 from bayesrace.transport.endpoints import Endpoints, leaves
-from bayesrace.transport.links import LinkWatch, refusals, serve_access, wait_linked
+from bayesrace.transport.links import nodes_at, wait_linked
+from bayesrace.transport.membership import refusals, serve_access
 from bayesrace.transport.probe import Finding, probe_all
+from bayesrace.transport.watch import LinkWatch, report
 
-__all__ = ["check_links", "open_session"]
+__all__ = ["open_session", "try_links"]
 
 _log = logging.getLogger("bayesrace.links")
 
@@ -108,7 +110,7 @@ def _security(credentials: Credentials) -> dict[str, Any]:
 
 @contextmanager
 def open_session(
-    endpoints: Endpoints, role: Role = "viewer", *, explains: bool = True
+    endpoints: Endpoints, role: Role = "viewer", *, explains: bool = True, grace_s: float = 0.0
 ) -> Iterator[Any]:
     """A Zenoh session of a process in that role, closed at the end of the block.
 
@@ -117,43 +119,76 @@ def open_session(
     end. An absent peer is no error: the session connects as soon as it appears, and says in the log
     that it waits, unless it is not to ``explains`` because it has just started its peers itself;
     see :class:`.Inbox` for waiting with a limit.
+
+    Where the process's certificate expires (``grace_s`` later) or turns out to be revoked, the main
+    thread gets a SIGINT, and the end of the block raises InputError with the reason.
     """
     os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)
-    credentials, absent = endpoints.credentials, check_links(endpoints, role)
+    absent = _checked(endpoints, role, explains)
     if endpoints.exposed:
         _log.warning(
             "INSECURE: links by %s are open to everyone in that network, who could drive the car; "
             "see docs/security.md", ", ".join(endpoints.exposed),
         )  # fmt: skip
-    if credentials is not None and (warning := credentials.expires_soon()):
-        _log.warning("%s", warning)
-    with ExitStack() as stack:
-        session = stack.enter_context(_opened(endpoints, role))
-        if credentials is not None:
-            access = serve_access(session, credentials)
-            stack.callback(access.undeclare)  # a process with a queryable hangs at its exit
-            missing = {finding.endpoint for finding in absent}
-            possible = [one for one in endpoints.connect if one not in missing]
-            wait_linked(session, endpoints, possible, _LINK_S)
-            if refused := refusals(session, credentials):
-                raise InputError("; ".join(refused))
-        if endpoints.connect and explains:
-            stack.callback(LinkWatch(session, endpoints).close)
-        yield session
+    watch: LinkWatch | None = None
+    try:
+        with ExitStack() as stack:
+            session = stack.enter_context(_opened(endpoints, role))
+            known = _join(session, endpoints, absent, stack)
+            if endpoints.credentials is not None or (endpoints.connect and explains):
+                watch = LinkWatch(session, endpoints, known, explains, grace_s)
+                stack.callback(watch.close)
+            yield session
+    except (InputError, KeyboardInterrupt) as error:
+        if watch is None or not watch.fault:
+            raise
+        raise InputError(watch.fault) from error
+    if watch is not None and watch.fault:
+        raise InputError(watch.fault)
 
 
-def check_links(endpoints: Endpoints, role: Role) -> list[Finding]:
-    """Where nobody is now, for a secured process; InputError for what waiting cannot help.
+def _join(session: Any, endpoints: Endpoints, absent: list[Finding], stack: ExitStack) -> set[str]:
+    """Waits for the links of a secured session that can be; returns the nodes at their ends.
 
-    :func:`open_session` does so first; for commands that have seconds of other work before.
+    InputError if one refuses this process's certificate.
     """
-    endpoints.check()
+    credentials = endpoints.credentials
+    if credentials is None:
+        return set()
+    access = serve_access(session, credentials)
+    stack.callback(access.undeclare)  # a process with a queryable hangs at its exit
+    missing = {finding.endpoint for finding in absent}
+    wait_linked(
+        session, endpoints, [one for one in endpoints.connect if one not in missing], _LINK_S
+    )
+    nodes = nodes_at(session, endpoints)
+    if refused := refusals(session, credentials, nodes):
+        raise InputError("; ".join(refusal.text for refusal in refused))
+    return nodes
+
+
+def try_links(endpoints: Endpoints, role: Role) -> None:
+    """What :func:`open_session` says and raises, for commands with seconds of work before it."""
     if endpoints.credentials is None:
+        _checked(endpoints, role)
+    else:
+        with open_session(endpoints, role):
+            pass
+
+
+def _checked(endpoints: Endpoints, role: Role, explains: bool = True) -> list[Finding]:
+    """Where nobody is now, which is logged; InputError for what waiting cannot help."""
+    endpoints.check()
+    credentials = endpoints.credentials
+    if credentials is not None:
+        credentials.check(role)
+    elif not explains:
         return []
-    endpoints.credentials.check(role)
-    found = probe_all(endpoints.connect, endpoints.credentials)
+    found = probe_all(endpoints.connect, credentials, greets=credentials is not None)
     if lasting := [finding.text for finding in found if finding.lasting]:
         raise InputError("; ".join(lasting))
+    if explains:
+        report(found)
     return found
 
 

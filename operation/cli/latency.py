@@ -104,6 +104,11 @@ def latency(
         raise InputError("--weights, --artefact and --raceline are for what is started here")
     if log and (attach or load):
         raise InputError("--log is of a run that is over: leave out --attach and --load")
+    from bayesrace.transport import try_links
+
+    running = connect_to(endpoint, "director") if attach else None
+    if running is not None:  # before imports that take seconds
+        try_links(running, "director")
 
     from bayesrace.vehicles import get_car
     from operation.terminal.progress import stages_on
@@ -117,7 +122,7 @@ def latency(
         "car": {"car": parameters}, "name": {"name": name}, "rate": {"rate_hz": rate},
         "load": {"load": load}, "duration": {"duration_s": duration or (1e9 if log else 20.0)},
         "attach": {
-            "attach": connect_to(endpoint, "director") if attach else None,
+            "attach": running,
             "warm_up_s": 0.0 if attach else 3.0,
         },
         "track": {

@@ -1,6 +1,5 @@
 """``validate``, ``publish``, ``rollback``, ``learn``: validation and update of weights."""
 
-import logging
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -49,8 +48,6 @@ WeightsFile = Annotated[
     typer.Argument(metavar="WEIGHTS", help="Weights file, as 'bayesrace train' writes it."),
 ]
 _TIMEOUT_S = 20.0
-
-_log = logging.getLogger("bayesrace.learn")
 
 
 def validate(
@@ -151,12 +148,14 @@ def publish(
     from bayesrace.files import read_whole
     from bayesrace.gp.weights import MAX_BYTES
     from bayesrace.transport import open_session, send_weights
-    from operation.learn.publishing import NotTakenOverError, in_words
 
     data = read_whole(weights, "weights file", MAX_BYTES)
     endpoints = connect_to(endpoint, "learning")
     name = endpoints.car_named(name)
     with open_session(endpoints, "learning") as session:
+        # Imports that take as long as all before: whether there is a link is said first.
+        from operation.learn.publishing import NotTakenOverError, in_words
+
         car = _controller(session, endpoints, name, timeout)
         reply = send_weights(session, car, data, timeout)
     if not reply.accepted:
@@ -177,11 +176,12 @@ def rollback(
     Exit code 0 once it drives with them, 1 if there are none, 2 if it cannot be reached.
     """
     from bayesrace.transport import open_session, send_rollback
-    from operation.learn.publishing import NotTakenOverError, in_words
 
     endpoints = connect_to(endpoint, "learning")
     name = endpoints.car_named(name)
     with open_session(endpoints, "learning") as session:
+        from operation.learn.publishing import NotTakenOverError, in_words
+
         car = _controller(session, endpoints, name, timeout)
         reply = send_rollback(session, car, reason or "bayesrace rollback", timeout)
     if not reply.accepted:
@@ -254,13 +254,12 @@ def learn(
     and publishes the weights. Plant and controller may start before or after this command, and
     restart; with the same --out, this command resumes. Start a run with 'bayesrace drive'.
     """
-    from bayesrace.transport import check_links
+    from bayesrace.transport import try_links
     from bayesrace.vehicles import get_car
 
     parameters, endpoints = get_car(car), connect_to(endpoint, "learning")
     endpoints.check_car(name or parameters.name)
-    for absent in check_links(endpoints, "learning"):  # before imports that take seconds
-        _log.warning("%s", absent.text)
+    try_links(endpoints, "learning")  # before imports that take seconds
     from operation.learn.job import learn as follow
     from operation.learn.records import LearnSettings
     from operation.learn.report import print_laps

@@ -11,7 +11,7 @@ from bayesrace.transport import Credentials, Endpoints
 from operation.certificates import add, init, revoke
 from tests.shared import session_folder
 
-__all__ = ["CAR", "Bundles", "bundles", "written"]
+__all__ = ["CAR", "OTHER", "Bundles", "bundles", "make_bundles", "written"]
 
 CAR: Final = "orca"
 OTHER: Final = "blue"
@@ -39,7 +39,8 @@ class Bundles:
         return Endpoints(listen=listen, connect=connect, credentials=self.credentials(name))
 
 
-def _make(folder: Path) -> None:
+def make_bundles(folder: Path) -> None:
+    """Makes them all."""
     init(folder)
     drivers: tuple[Role, ...] = ("plant", "controller")
     for role in drivers:
@@ -69,7 +70,7 @@ def _make(folder: Path) -> None:
 @pytest.fixture(scope="session")
 def bundles(tmp_path_factory: pytest.TempPathFactory) -> Bundles:
     """Certificates of one authority, and in ``bad`` what does not count."""
-    return Bundles(session_folder(tmp_path_factory, "certificates", _make))
+    return Bundles(session_folder(tmp_path_factory, "certificates", make_bundles))
 
 
 def written(folder: Path, bundles: Bundles, plant: str, controller: str, /, **use: str) -> Path:

@@ -7,6 +7,8 @@ it got through. It has no access control of its own.
 import json
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,7 +17,10 @@ import zenoh
 from bayesrace.messages import ALIVE, ALIVE_SOURCES, SERVICES, TOPICS
 from tests.security.authority import CAR, OTHER
 
-__all__ = ["ALIVE_KEYS", "FORGED", "KEYS", "SERVICE_KEYS", "TOPIC_KEYS", "bare_session", "settle"]
+__all__ = [
+    "ALIVE_KEYS", "FORGED", "KEYS", "SERVICE_KEYS", "TOPIC_KEYS", "bare_session", "listening",
+    "settle",
+]  # fmt: skip
 
 _CARS: Final = (CAR, OTHER)
 TOPIC_KEYS: Final = tuple(
@@ -62,6 +67,20 @@ def bare_session(endpoint: str, folder: Path | None, **settings: Any) -> Any:
     for name, value in values.items():
         config.insert_json5(name, json.dumps(value))
     return zenoh.open(config)
+
+
+@contextmanager
+def listening(where: str, folder: Path | None) -> Iterator[None]:
+    """Something that listens with that certificate, whatever it is worth."""
+    settings: dict[str, Any] = {"listen/endpoints": [where], "connect/endpoints": []}
+    if folder is not None:
+        settings["transport/link/tls"] = {
+            "root_ca_certificate": str(folder / "ca.pem"), "enable_mtls": True,
+            "listen_certificate": str(folder / "certificate.pem"),
+            "listen_private_key": str(folder / "key.pem"),
+        }  # fmt: skip
+    with bare_session(where, None, **settings):
+        yield
 
 
 def _try_everything(ears: Any, mouth: Any) -> dict[str, list[str]]:

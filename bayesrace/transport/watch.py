@@ -1,0 +1,146 @@
+"""Says while a session is open why its links do not stand, and ends a process that cannot work.
+
+A process ends for what is wrong with its own certificate, which no waiting mends: Zenoh reads it
+once. What is wrong at the other end is a line in the log, since someone may mend it there.
+"""
+
+import logging
+import signal
+import threading
+import time
+from collections.abc import Iterable
+from typing import Any, Final
+
+import zenoh
+
+from bayesrace.transport.endpoints import Endpoints
+from bayesrace.transport.links import nodes_at, unlinked
+from bayesrace.transport.membership import refusals
+from bayesrace.transport.probe import Finding, probe_all
+
+__all__ = ["LinkWatch", "report"]
+
+_log = logging.getLogger("bayesrace.links")
+
+_FIRST_S: Final = 0.2
+"""How long a session may take to link before it is asked why it has not."""
+_PERIOD_S: Final = 1.0
+_REMINDER_S: Final = 86400.0
+
+_said: Final[dict[str, str]] = {}
+"""What the log of this process says of an endpoint, which may be checked before its session."""
+_interrupting: Final = threading.Lock()
+"""Held by the watch that ends the process: two sessions may have one certificate."""
+
+
+def report(findings: Iterable[Finding]) -> None:
+    """Logs what has not been said of these endpoints."""
+    for finding in findings:
+        if _said.get(finding.endpoint) != finding.text:
+            _log.log(logging.ERROR if finding.lasting else logging.WARNING, finding.text)
+        _said[finding.endpoint] = finding.text
+
+
+class LinkWatch:
+    """Watches the links of a session, in a thread."""
+
+    def __init__(
+        self, session: Any, endpoints: Endpoints, known: set[str], explains: bool, grace_s: float
+    ) -> None:
+        """``known``: nodes that are known to accept this process. ``explains``: logs why there is
+        no link. ``grace_s``: from the expiry of the certificate to the end of the process."""
+        self._session, self._endpoints, self._credentials = (
+            session,
+            endpoints,
+            endpoints.credentials,
+        )
+        self._known, self._explains, self._grace_s = known, explains, grace_s
+        self.fault = ""
+        """Why the process has to end, with the remedy; it gets a SIGINT in its main thread."""
+        self._ends_process = threading.current_thread() is threading.main_thread()
+        self._interrupted = False
+        self._missing: list[str] = []
+        self._remind_s = 0.0
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="links", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Ends it."""
+        self._over.set()
+        self._thread.join()
+        if self._interrupted:
+            _interrupting.release()
+
+    def _watch(self) -> None:
+        first, wait_s = True, _FIRST_S
+        while not self._over.wait(self._until_expiry(wait_s)):
+            wait_s = _PERIOD_S
+            try:
+                fault = self._expired() or (self._look(first) if self._explains else "")
+            except zenoh.ZError:  # the session is closed
+                return
+            if fault:
+                self._end(fault)
+                return
+            if self._credentials is None and not (self._explains and self._missing):
+                return
+            first = False
+
+    def _until_expiry(self, wait_s: float) -> float:
+        if self._credentials is None:
+            return wait_s
+        return min(wait_s, max(self._credentials.ends_s - time.time(), 0.0))
+
+    def _expired(self) -> str:
+        """That the certificate has expired, and its links with it; reminds of it in time."""
+        credentials = self._credentials
+        if credentials is None:
+            return ""
+        if time.time() >= credentials.ends_s:
+            text = credentials.expired()
+            if self._grace_s:
+                _log.error("%s; this process ends in %g s", text, self._grace_s)
+                self._over.wait(self._grace_s)
+            return text
+        if time.monotonic() >= self._remind_s and (warning := credentials.expires_soon()):
+            _log.warning("%s", warning)
+            self._remind_s = time.monotonic() + _REMINDER_S
+        return ""
+
+    def _look(self, first: bool) -> str:
+        """Says what is wrong with the links; returns what ends the process."""
+        self._missing = unlinked(self._session, self._endpoints)
+        for endpoint in set(self._endpoints.connect) - set(self._missing):
+            _said.pop(endpoint, None)
+        found = probe_all(self._missing, self._credentials)
+        if self._credentials is None:
+            # Secured links have been tried before there was a session.
+            lasting = [finding.text for finding in found if finding.lasting]
+            if first and lasting:
+                return "; ".join(lasting)
+        report(found)
+        return self._refused()
+
+    def _refused(self) -> str:
+        """Logs what ends that are new refuse; returns that the certificate is revoked."""
+        if self._credentials is None:
+            return ""
+        nodes = nodes_at(self._session, self._endpoints)
+        refused = refusals(self._session, self._credentials, nodes - self._known)
+        self._known = nodes
+        for refusal in refused:
+            if not refusal.revoked:
+                _log.error("%s", refusal.text)
+        return "; ".join(refusal.text for refusal in refused if refusal.revoked)
+
+    def _end(self, fault: str) -> None:
+        if self._over.is_set():
+            return
+        self.fault = fault
+        if not self._ends_process:
+            _log.error("%s", fault)
+        elif _interrupting.acquire(blocking=False):
+            self._interrupted = True
+            # Not to the process: another thread would get it, and the main one would sleep on.
+            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)

@@ -1,0 +1,93 @@
+"""A plant and a controller of real processes over secured links, directed and recorded."""
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from bayesrace.configuration import read_configuration
+from bayesrace.messages import Event
+from bayesrace.recorder import Recorder
+from bayesrace.transport import Director, free_endpoint, open_session
+from operation.drive import RunPlan, run_request
+from tests.network.cars import Course, Program, gentle_course
+from tests.network.journey import Journey
+from tests.programs import PATIENCE_S
+from tests.security.authority import CAR, Bundles, written
+
+__all__ = ["Rig", "course", "secured"]
+
+
+@pytest.fixture(scope="module")
+def course(tmp_path_factory: pytest.TempPathFactory) -> Course:
+    return gentle_course(tmp_path_factory.mktemp("course"))
+
+
+@dataclass
+class Rig:
+    """A secured plant and controller, and their director."""
+
+    config: Path
+    bundles: Bundles
+    plant_at: str
+    director: Director
+    course: Course
+    log: Path
+    closing: ExitStack
+    plant: Program
+    controller: Program
+
+    def drive(self, number: int, *, lockstep: bool, laps: int = 1) -> None:
+        """Starts a run."""
+        plan = RunPlan(number, "test", laps, 600.0, lockstep)
+        self.director.start(run_request(self.course.track, plan))
+
+    def end(self, number: int) -> Event:
+        """How it ended."""
+        return self.director.wait_for_end(number, PATIENCE_S)
+
+    def count(self, source: str, *names: str) -> dict[str, object]:
+        """Counters of a process."""
+        counters = self.director.status(source).counters
+        return {name: counters[name] for name in names}
+
+    def phase(self) -> str:
+        """Of the controller."""
+        return self.director.status("controller").phase
+
+    def journey(self) -> Journey:
+        """What was recorded; ends the recording."""
+        self.closing.close()
+        return Journey(self.log, self.course.track)
+
+
+@contextmanager
+def secured(
+    folder: Path, course: Course, bundles: Bundles, *, router: bool = False
+) -> Iterator[Rig]:
+    """Plant and controller as processes, and their director here; with a router between them."""
+    plant_at, controller_at, router_at = (free_endpoint("tls") for _ in range(3))
+    config = written(folder, bundles, plant_at, controller_at)
+    if router:
+        text = config.read_text().replace("[network]", f'[network]\nrouter = ["{router_at}"]')
+        config.write_text(text)
+    options = ("--config", config)
+    with ExitStack() as stack:
+        if router:
+            stack.enter_context(Program(folder / "router.txt", "router", *options))
+        plant = stack.enter_context(Program(folder / "plant.txt", "plant", *options))
+        driver = ("controller", *course.arguments, *options)
+        controller = stack.enter_context(Program(folder / "controller.txt", *driver))
+        endpoints = read_configuration(config).endpoints("director")
+        closing = stack.enter_context(ExitStack())
+        session = closing.enter_context(open_session(endpoints, "director"))
+        director = Director(session, CAR)
+        director.wait_for(("plant", "controller"), PATIENCE_S)
+        log = folder / "run.mcap"
+        closing.enter_context(Recorder(session, CAR, log))
+        yield Rig(
+            config, bundles, router_at if router else plant_at, director, course, log, closing,
+            plant, controller,
+        )  # fmt: skip

@@ -1,0 +1,119 @@
+"""A certificate that ends while processes run: each says so and ends, and the car stands before."""
+
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from bayesrace.configuration import read_configuration
+from bayesrace.errors import InputError
+from bayesrace.transport import Endpoints, free_endpoint, open_session
+from operation.certificates import add, init, revoke
+from tests.network.cars import Course, Program
+from tests.network.journey import STANDING_MPS
+from tests.programs import PATIENCE_S, until
+from tests.security.authority import CAR, Bundles, written
+from tests.security.rig import course, secured
+
+__all__ = ["course"]
+
+pytestmark = [pytest.mark.wall_clock, pytest.mark.unmeasured]
+
+BRIEF_DAYS = 15 / 86400
+"""Long enough to start, and to drive for a while, on a machine with other work."""
+
+
+def certified(folder: Path, brief: str = "") -> Bundles:
+    """A certificate for each role of a drive; that of the role ``brief`` expires soon."""
+    init(folder)
+    for role in ("plant", "controller", "director"):
+        days = BRIEF_DAYS if role == brief else 1.0
+        add(folder, role, role, CAR, days=days)
+    return Bundles(folder)
+
+
+def check_ended(program: Program, name: str) -> None:
+    """It has ended because of its certificate, and says so in one line, with the remedy."""
+    assert program.process.wait(PATIENCE_S) == 2, program.said()
+    last = program.said().strip().splitlines()[-1]
+    assert f"bayesrace: certificate '{name}' has expired" in last
+    assert f"bayesrace certs add {name} --renew" in last
+    assert "Traceback" not in program.said()
+    assert "nobody listens" not in last
+
+
+def test_a_controller_ends_and_its_car_brakes(tmp_path: Path, course: Course) -> None:
+    with secured(tmp_path, course, certified(tmp_path / "certs", "controller")) as rig:
+        rig.drive(1, lockstep=False, laps=0)
+        until(lambda: rig.phase() == "driving", "driving")
+        check_ended(rig.controller, "controller")
+        before = int(str(rig.count("plant", "braked")["braked"]))
+        until(lambda: int(str(rig.count("plant", "braked")["braked"])) > before + 100, "braked")
+        assert rig.director.status("plant").phase == "running"
+        journey = rig.journey()
+    assert max(state.x[3] for state in journey.states) > 0.5
+    assert abs(journey.states[-1].x[3]) < STANDING_MPS
+
+
+@pytest.mark.check
+def test_a_plant_ends_when_its_car_stands(tmp_path: Path, course: Course) -> None:
+    """Commands do not count from then on, though Zenoh opens the link again."""
+    with secured(tmp_path, course, certified(tmp_path / "certs", "plant")) as rig:
+        rig.drive(1, lockstep=False, laps=0)
+        until(lambda: rig.phase() == "driving", "driving")
+        check_ended(rig.plant, "plant")
+        assert "this process ends in" in rig.plant.said()
+        assert "has been expired, and the car braking, for 10 s" in rig.plant.said()
+        assert rig.controller.process.poll() is None
+        assert "has a certificate that has expired: renew it there" in rig.controller.said()
+        journey = rig.journey()
+    assert max(state.x[3] for state in journey.states) > 0.5
+    assert abs(journey.states[-1].x[3]) < STANDING_MPS
+
+
+@pytest.mark.check
+def test_commands_end(tmp_path: Path, course: Course) -> None:
+    """Whatever they are doing: looking on, learning, driving, forwarding."""
+    certificates = certified(tmp_path / "certs")
+    names = {role: f"brief-{role}" for role in ("viewer", "learning", "director", "router")}
+    for role, name in names.items():
+        add(certificates.folder, name, role, days=2 * BRIEF_DAYS)  # type: ignore[arg-type]
+    folder = tmp_path / "commands"
+    folder.mkdir()
+    lines: dict[str, tuple[str | Path, ...]] = {
+        "viewer": ("status", "--watch"),
+        "learning": ("learn", "--out", folder / "job"),
+        "director": (
+            "drive", "--mode", "realtime", "--track", course.track_file, "--laps", "999",
+            "--max-time", "600", "--log", folder / "run.mcap",
+        ),
+        "router": ("router", "--listen", free_endpoint("tls")),
+    }  # fmt: skip
+    with secured(tmp_path, course, certificates) as rig, ExitStack() as stack:
+        network = read_configuration(rig.config).network
+        config = written(folder, certificates, network.plant[0], network.controller[0], **names)
+        started = {
+            role: stack.enter_context(Program(folder / role, *line, "--config", config))
+            for role, line in lines.items()
+        }
+        until(lambda: rig.phase() == "driving", "driving")
+        for role, program in started.items():
+            check_ended(program, names[role])
+
+
+def test_a_revoked_certificate_ends_its_process(tmp_path: Path) -> None:
+    """Once the other end has the newest list, and has been started again with it."""
+    certificates, where = certified(tmp_path), free_endpoint("tls")
+    ends = Endpoints(connect=(where,), credentials=certificates.credentials("controller"))
+
+    def drive() -> None:
+        with open_session(ends, "controller") as session:
+            with open_session(certificates.endpoints("plant", listen=(where,)), "plant"):
+                until(session.info.links, "the link")
+            revoke(tmp_path, "controller")
+            with open_session(certificates.endpoints("plant", listen=(where,)), "plant"):
+                time.sleep(PATIENCE_S)  # the controller's session interrupts it
+
+    with pytest.raises(InputError, match="'controller', which is revoked"):
+        drive()
