@@ -10,9 +10,9 @@ import os
 import tomllib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from bayesrace.defaults import CONFIGURATION_VARIABLE
 from bayesrace.errors import InputError, faults_in
@@ -42,6 +42,11 @@ class _Section(BaseModel):
 class NetworkSettings(_Section):
     """Where the processes are: an endpoint is protocol/host:port, a protocol tcp or tls."""
 
+    mode: Literal["direct", "router"] | None = Field(
+        None,
+        description="direct: all others connect to plant and controller; router: all connect to it "
+        "alone; not set: router, if one is named",
+    )
     plant: tuple[Endpoint, ...] = Field(
         (PLANT_ENDPOINT,), description="where the plant listens, and the others find it"
     )
@@ -49,11 +54,27 @@ class NetworkSettings(_Section):
         (CONTROLLER_ENDPOINT,), description="where the controller listens, and the others find it"
     )
     router: tuple[Endpoint, ...] = Field(
-        (), description="where the router listens; with one, all others connect to it alone"
+        (), description="where the router listens, and all others find it"
     )
     insecure: bool = Field(
         False, description="without certificates: allow endpoints beyond loopback; warns each time"
     )
+
+    @model_validator(mode="after")
+    def _router_named(self) -> Self:
+        if self.mode == "router" and not self.router:
+            raise ValueError("mode 'router' needs an endpoint: name one, as router = [\"tcp/…\"]")
+        return self
+
+    @property
+    def by_router(self) -> bool:
+        """Whether all connect to a router alone."""
+        return bool(self.router) and self.mode != "direct"
+
+    @property
+    def everyone(self) -> tuple[str, ...]:
+        """Endpoints by which every process is reached."""
+        return self.router if self.by_router else (*self.plant, *self.controller)
 
 
 class TlsSettings(_Section):
@@ -102,13 +123,12 @@ class Configuration(_Section):
     ) -> Endpoints:
         """Where a process in that role listens and connects; what is given overrides the file."""
         network = self.network
-        everyone = (*network.plant, *network.controller)
         where: dict[Role, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "plant": (network.plant, ()), "controller": (network.controller, network.plant),
             "router": (network.router, ()),
         }  # fmt: skip
-        listens, connects = where.get(role, ((), everyone))
-        if network.router and role != "router":
+        listens, connects = where.get(role, ((), network.everyone))
+        if network.by_router and role != "router":
             listens, connects = (), network.router
         return Endpoints(
             listen=listens if listen is None else tuple(listen),

@@ -80,7 +80,7 @@ def _chosen(certificates: list[Credentials]) -> Credentials | None:
 def _everyone(configuration: Configuration, own: Credentials | None) -> Endpoints:
     network = configuration.network
     return Endpoints(
-        connect=network.router or (*network.plant, *network.controller),
+        connect=network.everyone,
         credentials=own,
         insecure=network.insecure,
         limits=configuration.limits,

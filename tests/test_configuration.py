@@ -7,11 +7,14 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from typer.main import get_command
 
 from bayesrace.configuration import Configuration, as_toml, read_configuration
 from bayesrace.defaults import CONFIGURATION_VARIABLE
 from bayesrace.errors import InputError
 from bayesrace.transport import Credentials, Endpoints, Members, free_endpoint, open_session
+from operation.cli.app import app
+from operation.cli.help import TaskGroup
 from operation.settings import RaceSettings
 from operation.system import CONFIGURATION, started_system
 from tests.command_line import Cli, refused
@@ -53,6 +56,7 @@ def test_what_is_written_is_read_back() -> None:
     [
         ("[network]\nplant = ['tcp/nowhere']", ("network.plant.0", "protocol/address:port")),
         ("[network]\nplants = []", ("network.plants", "not permitted")),
+        ("[network]\nmode = 'router'", ("network", "mode 'router' needs an endpoint")),
         ("[limits]\nlease_s = -1", ("limits.lease_s", "greater than 0")),
         ("[limits]\nlease_s = nan", ("limits.lease_s",)),
         ("[tls]\nuse = { driver = 'x' }", ("tls.use.driver",)),
@@ -89,11 +93,28 @@ def test_flags_override_the_file_which_overrides_the_variable(
 
 
 def test_a_router_in_the_file_is_what_all_connect_to() -> None:
-    found = Configuration.model_validate({"network": {"router": ["tcp/127.0.0.1:9"]}})
+    """Unless they are to connect directly."""
+    router = {"router": ["tcp/127.0.0.1:9"]}
+    found = Configuration.model_validate({"network": router})
     assert found.endpoints("router").listen == ("tcp/127.0.0.1:9",)
     for role in ("plant", "controller", "director"):
         ends = found.endpoints(role)
         assert (ends.listen, ends.connect) == ((), ("tcp/127.0.0.1:9",))
+    direct = Configuration.model_validate({"network": {**router, "mode": "direct"}})
+    assert direct.endpoints("plant") == Configuration().endpoints("plant")
+    assert direct.endpoints("director") == Configuration().endpoints("director")
+
+
+def test_every_command_reads_the_file(cli: Cli, tmp_path: Path) -> None:
+    """Those of groups, too."""
+    spoilt = config(tmp_path, "[limits]\nlease = 1\n")
+    group = get_command(app)
+    assert isinstance(group, TaskGroup)
+    for name in group.list_commands(None):
+        command = group.get_command(None, name)
+        for one in getattr(command, "commands", {name: command}).values():
+            assert any("--config" in option.opts for option in one.params), one.name
+    refused(cli("fmu", "inspect", "no.fmu", "--config", spoilt), "limits.lease")
 
 
 @pytest.mark.wall_clock

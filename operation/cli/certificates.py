@@ -7,13 +7,15 @@ from typing import Annotated, get_args
 import typer
 
 from bayesrace.messages import Role
-from operation.cli.configured import configurable, current
+from operation.cli.configured import current
 
 __all__ = ["certs"]
 
 certs = typer.Typer(
     name="certs",
     no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
     help="Certificates: who may drive, learn, command or look on.",
 )
 
@@ -33,6 +35,7 @@ def _folder(given: Path | None) -> Path:
     return given or current().tls.folder or Path("certs")
 
 
+@certs.command()
 def init(folder: Folder = None) -> None:
     """Make the authority of a system, once; its folder 'authority' belongs on no car."""
     from operation.certificates import init as make
@@ -41,6 +44,7 @@ def init(folder: Folder = None) -> None:
     typer.echo(f"{_folder(folder)}: next, 'bayesrace certs add NAME --role ROLE'")
 
 
+@certs.command()
 def add(
     name: Name,
     role: Annotated[
@@ -79,6 +83,7 @@ def add(
     typer.echo(f"{made}: copy it to its machine, and members.json in it to the others")
 
 
+@certs.command("list")
 def show(folder: Folder = None) -> None:
     """List the certificates, and when they expire."""
     from operation.certificates import read_register
@@ -91,6 +96,7 @@ def show(folder: Folder = None) -> None:
         typer.echo(f"{name:<20} {one.role:<10} car {one.car:<12} {state:<18} {hosts}")
 
 
+@certs.command()
 def revoke(name: Name, folder: Folder = None) -> None:
     """Take a certificate off the list of members, for ever.
 
@@ -103,9 +109,3 @@ def revoke(name: Name, folder: Folder = None) -> None:
         f"'{name}' is revoked: copy members.json to each machine, and restart the processes there; "
         "until then they accept it"
     )
-
-
-certs.command()(configurable(init))
-certs.command()(configurable(add))
-certs.command("list")(configurable(show))
-certs.command()(configurable(revoke))

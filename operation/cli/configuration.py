@@ -7,7 +7,7 @@ import typer
 
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
-from operation.cli.configured import configurable, current
+from operation.cli.configured import current
 from operation.cli.options import writable
 
 if TYPE_CHECKING:
@@ -18,10 +18,13 @@ __all__ = ["config"]
 config = typer.Typer(
     name="config",
     no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
     help="The configuration, bayesrace.toml: where processes are, how they are secured.",
 )
 
 
+@config.command()
 def show() -> None:
     """Print the configuration that commands use here: the file, and the defaults of all else."""
     from bayesrace.configuration import as_toml
@@ -29,6 +32,7 @@ def show() -> None:
     typer.echo(as_toml(current()), nl=False)
 
 
+@config.command()
 def check(
     file: Annotated[
         Path | None,
@@ -64,6 +68,7 @@ def _certificates(found: "Configuration") -> str:
     return "fine; certificates " + ", ".join(f"'{name}' ({role})" for name, role in roles.items())
 
 
+@config.command()
 def example(
     out: Annotated[
         Path | None,
@@ -87,7 +92,3 @@ def example(
         raise InputError(f"{out} exists: name another file, or remove it")
     else:
         write_whole(out, text)
-
-
-for command in (show, check, example):
-    config.command()(configurable(command))

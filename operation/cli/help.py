@@ -3,6 +3,7 @@
 All modules, the options of all commands and Rich's boxes take longer than many a command.
 """
 
+from copy import copy
 from importlib import import_module
 from typing import Any, ClassVar
 
@@ -32,7 +33,9 @@ class TaskGroup(TyperGroup):
         if cmd_name not in self.commands and cmd_name in (places := self._places()):
             module, _, name = places[cmd_name].partition(".")
             found = getattr(import_module(f"operation.cli.{module}"), name)
-            if not isinstance(found, typer.Typer):
+            if isinstance(found, typer.Typer):
+                found = _configurable(found)
+            else:
                 own, found = found, typer.Typer(add_completion=False, rich_markup_mode=None)
                 with_options = networked if places[cmd_name] in self.networked else configurable
                 register = found.command(cmd_name, context_settings=dict(self.context_settings))
@@ -64,3 +67,13 @@ class TaskGroup(TyperGroup):
 
 def _name(place: str) -> str:
     return place.partition(".")[2].replace("_", "-")
+
+
+def _configurable(group: typer.Typer) -> typer.Typer:
+    """A copy whose commands have ``--config``."""
+    found = copy(group)
+    found.registered_commands = [copy(one) for one in group.registered_commands]
+    for one in found.registered_commands:
+        if one.callback is not None:
+            one.callback = configurable(one.callback)
+    return found
