@@ -2,16 +2,21 @@
 
     python -m benchmarks.secured_links
     python -m benchmarks.secured_links --rounds 5 --seconds 20 --rate 500
+    python -m benchmarks.secured_links --blocks 0 --rounds 3 --ahead
 
 First bare messages: a state's size there and an actuation's back, one each 2 ms, between two
 processes that have a plain link and a secured one and use them by turns. Then plant and controller
 drive in real time, by turns over plain links, over secured ones, and over secured ones while a
 viewer's certificate forges 10,000 messages a second and holds 500 connections open. Prints the legs
 that cross the network and the whole way from state to actuation, with the ratio of each to the
-plain links of the same round.
+plain links of the same round, and what plant and controller take of a CPU.
+
+``--ahead`` lets plant and controller go before all other work of the machine (SCHED_RR), the
+forger's included, which then is not what is measured: it would come from elsewhere.
 """
 
 import argparse
+import os
 import subprocess
 import sys
 import tempfile
@@ -20,7 +25,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -88,9 +93,29 @@ def flooded(configuration: Configuration, system: System) -> Iterator[None]:
         print("forged:", forger.communicate("")[0].replace("forging\n", "").strip())
 
 
+def put_ahead(pid: int) -> None:
+    """Lets all threads of a process go before ordinary ones."""
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        os.sched_setscheduler(int(task.name), os.SCHED_RR, os.sched_param(1))
+
+
+def cpu_s(pid: int) -> float:
+    """CPU time of a process so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+class Drive(NamedTuple):
+    """What came of a run."""
+
+    result: LatencyResult
+    cpu: dict[str, float]
+    """Share of a CPU that each process took."""
+
+
 def driven(
-    prepared: Prepared, folder: Path, way: str, rate: float, seconds: float
-) -> LatencyResult:
+    prepared: Prepared, folder: Path, way: str, rate: float, seconds: float, ahead: bool
+) -> Drive:
     """One run in real time, and what its log says."""
     folder.mkdir()
     configuration = None if way == "plain" else certified(folder / "certs")
@@ -101,19 +126,25 @@ def driven(
             started_system(CAR, folder, both=both, configuration=configuration)
         )
         stack.enter_context(system.controller(prepared.arguments))
+        pids = {name: child.pid for name, child in system.children.items()}
+        for pid in pids.values() if ahead else ():
+            put_ahead(pid)
         plan = RunPlan(1, "bayesrace", 0, 600.0, lockstep=False)
         recorder = stack.enter_context(Recorder(system.session, CAR, log))
         system.director.start(run_request(track, plan))
         if configuration is not None and way == "flooded":
             stack.enter_context(flooded(configuration, system))
-        time.sleep(WARM_UP_S + seconds)
+        time.sleep(WARM_UP_S)
+        before = {name: cpu_s(pid) for name, pid in pids.items()}
+        time.sleep(seconds)
+        cpu = {name: (cpu_s(pid) - before[name]) / seconds for name, pid in pids.items()}
         system.director.stop("measured")
         recorder.close()
     settings = LatencySettings(
         car=get_car(CAR), rate_hz=rate, duration_s=seconds, warm_up_s=WARM_UP_S,
         track=DEFAULT_RACE_TRACK,
     )  # fmt: skip
-    return analyse(log, settings, track, Beside()).result
+    return Drive(analyse(log, settings, track, Beside()).result, cpu)
 
 
 def echo(names: list[str]) -> None:
@@ -201,28 +232,32 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5, help="of driving")
     parser.add_argument("--seconds", type=float, default=15.0)
     parser.add_argument("--rate", type=float, default=50.0)
+    parser.add_argument("--ahead", action="store_true", help="plant and controller at SCHED_RR")
     options = parser.parse_args()
     if options.echo:
         echo(options.echo)
         return
-    with tempfile.TemporaryDirectory() as name:
-        print_round_trips(round_trips(Path(name), options.blocks))
+    if options.blocks:
+        with tempfile.TemporaryDirectory() as name:
+            print_round_trips(round_trips(Path(name), options.blocks))
     if options.rounds:
-        drives(options.rounds, options.seconds, options.rate)
+        drives(options.rounds, options.seconds, options.rate, options.ahead)
 
 
-def drives(rounds: int, seconds: float, rate: float) -> None:
+def drives(rounds: int, seconds: float, rate: float, ahead: bool) -> None:
     """Drives by turns, and prints what came of it."""
     with stages_on(Console(stderr=True)) as stages:
         prepared = prepare(PreparationSettings(), (DEFAULT_RACE_TRACK,), stages)
     ways = ("plain", "secured", "flooded")
     found: dict[str, list[LatencyResult]] = {way: [] for way in ways}
+    cpu: dict[str, list[dict[str, float]]] = {way: [] for way in ways}
     with tempfile.TemporaryDirectory() as name:
         for number in range(rounds):
             for way in ways:
                 folder = Path(name) / f"{way}-{number}"
-                result = driven(prepared, folder, way, rate, seconds)
-                found[way].append(result)
+                drive = driven(prepared, folder, way, rate, seconds, ahead)
+                found[way].append(drive.result)
+                cpu[way].append(drive.cpu)
     for leg in LEGS:
         for share in ("p50", "p90", "p99"):
             values = {
@@ -236,7 +271,12 @@ def drives(rounds: int, seconds: float, rate: float) -> None:
         off = sum(one.off_track_samples or 0 for one in results)
         lost = sum(one.lost or 0 for one in results)
         fallbacks = sum(one.fallbacks for one in results)
-        print(f"{way}: {off} samples off the track, {lost} messages lost, {fallbacks} fallbacks")
+        took = {name: np.median([one[name] for one in cpu[way]]) for name in cpu[way][0]}
+        shares = ", ".join(f"{name} {100 * share:.0f} %" for name, share in took.items())
+        print(
+            f"{way}: {off} samples off the track, {lost} messages lost, {fallbacks} fallbacks; "
+            f"CPU: {shares}"
+        )
 
 
 if __name__ == "__main__":

@@ -8,9 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from bayesrace.raceline import write_raceline
+from bayesrace.raceline.line import RaceLine
+from bayesrace.tracks import Track, write_track
 from operation.cli import main
 
-__all__ = ["Cli", "Outcome", "cli", "refused"]
+__all__ = ["Cli", "Outcome", "cli", "course_files", "refused"]
 
 
 @dataclass(frozen=True)
@@ -53,3 +56,11 @@ def refused(outcome: Outcome, *words: str, code: int = 2) -> None:
     assert "Traceback" not in outcome.err + outcome.out
     for word in words:
         assert word in outcome.err, outcome.err
+
+
+def course_files(folder: Path, track: Track, line: RaceLine) -> tuple[str | Path, ...]:
+    """Writes track and line; the options that name them."""
+    files = folder / "track.csv", folder / "line.csv"
+    write_track(files[0], track)
+    write_raceline(files[1], line)
+    return "--track", files[0], "--raceline", files[1]

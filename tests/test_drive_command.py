@@ -1,0 +1,197 @@
+"""The parts run by hand, in terminals of their own: by files, directed by ``bayesrace drive``."""
+
+import json
+import signal
+import subprocess
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from bayesrace.log import LogReader
+from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY
+from bayesrace.transport import free_endpoint
+from tests.command_line import Cli, course_files, refused
+from tests.conftest import Circuit
+from tests.programs import finish, peanut, run, start, until
+
+
+@pytest.fixture
+def course(circuit: Circuit, tmp_path: Path) -> tuple[str | Path, ...]:
+    """Options that name a track and its line, as files."""
+    return course_files(tmp_path, circuit.track, circuit.line)
+
+
+def _succeed(*arguments: str | Path) -> str:
+    done = run(*arguments)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture
+def ended() -> Iterator[list[subprocess.Popen[str]]]:
+    """Processes that must not outlive the test."""
+    processes: list[subprocess.Popen[str]] = []
+    yield processes
+    for process in processes:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+@pytest.mark.check
+def test_the_chain_by_files_in_four_terminals(
+    tmp_path: Path, ended: list[subprocess.Popen[str]]
+) -> None:
+    track, line, log = (tmp_path / name for name in ("track.csv", "line.csv", "collect.mcap"))
+    weights, artefact, drive_log = (tmp_path / name for name in ("w.bin", "mpc", "drive.mcap"))
+    quick = ("--kernel", "rbf", "--restarts", "0")
+    assert "peanut" in _succeed("tracks", peanut(tmp_path / "peanut.csv"), "--out", track)
+    assert str(line) in _succeed("raceline", track, "--out", line)
+    assert "600 samples" in _succeed("collect", "--track", track, "--raceline", line, "--out", log)
+    assert "samples" in _succeed("train", log, "--out", weights, "--points", "60", *quick)
+    assert _succeed("build", "--out", artefact).strip() == str(artefact)
+
+    plant_at, controller_at = free_endpoint(), free_endpoint()
+    files = ("--artefact", artefact, "--track", track, "--raceline", line, "--weights", weights)
+    plant = start("plant", "--endpoint", plant_at)
+    controller = start("controller", *files, "--endpoint", plant_at, "--listen", controller_at)
+    ended += [plant, controller]
+    where = ("--endpoint", plant_at, "--endpoint", controller_at)
+    # Twice: a plant waits for the next run.
+    for _ in range(2):
+        said = _succeed("drive", "--track", track, "--laps", "1", *where, "--log", drive_log)
+    assert "1 lap(s) done" in said
+    assert str(drive_log) in said
+    controller.send_signal(signal.SIGINT)
+    plant.send_signal(signal.SIGTERM)
+    assert finish(controller).returncode == 0
+    assert finish(plant).returncode == 0
+
+    reader = LogReader(drive_log)
+    states, actuations = reader.select(STATE), reader.select(ACTUATION)
+    assert not reader.truncated
+    assert reader.refused == 0
+    assert len(states) > 100
+    assert {state.run for state in states} == {2}
+    # the last state of a run needs no answer
+    assert states[-1].final
+    assert [a.state_seq for a in actuations] == [s.seq for s in states[:-1]]
+    assert {a.weights_version for a in actuations} == {actuations[0].weights_version} != {""}
+    assert len(reader.select(TELEMETRY)) == len(actuations)
+    kinds = [event.kind for event in reader.select(EVENT)]
+    assert kinds == ["run", "run_started", "run_ended"]
+    # what was driven can be learned from
+    assert "samples" in _succeed(
+        "train", log, drive_log, "--out", weights, "--points", "60", *quick
+    )
+
+
+@dataclass
+class Waiting:
+    """A plant and a controller that wait for a run."""
+
+    plant: subprocess.Popen[str]
+    controller: subprocess.Popen[str]
+    plant_at: str
+    where: tuple[str, ...]
+    """Endpoints of both, as options."""
+
+
+@pytest.fixture
+def waiting(
+    course: tuple[str | Path, ...], kinematic_artefact: Path, ended: list[subprocess.Popen[str]]
+) -> Waiting:
+    plant_at, controller_at = free_endpoint(), free_endpoint()
+    plant = start("plant", "--endpoint", plant_at)
+    files = ("--artefact", kinematic_artefact, *course)
+    controller = start("controller", *files, "--endpoint", plant_at, "--listen", controller_at)
+    ended += [plant, controller]
+    where = ("--endpoint", plant_at, "--endpoint", controller_at)
+    return Waiting(plant, controller, plant_at, where)
+
+
+def test_drive_refuses_another_track_than_the_controllers(cli: Cli, waiting: Waiting) -> None:
+    outcome = cli("drive", "--track", "paddock", *waiting.where)
+    refused(outcome, "the controller drives the track '", "this run is on 'paddock-", "--track")
+
+
+@pytest.mark.check
+def test_drive_says_when_the_controller_is_lost(
+    tmp_path: Path,
+    course: tuple[str | Path, ...],
+    waiting: Waiting,
+    ended: list[subprocess.Popen[str]],
+) -> None:
+    """The run breaks off, so drive fails; the plant is ready for the next controller."""
+    log = tmp_path / "drive.mcap"
+    many = ("--laps", "10000", "--max-time", "3600")
+    drive = start("drive", *course[:2], *many, *waiting.where, "--log", log)
+    ended.append(drive)
+    until(lambda: log.exists() and log.stat().st_size > 100_000, "a lap in progress")
+    waiting.controller.kill()
+    done = finish(drive)
+    assert done.returncode not in (0, None)
+    assert "Traceback" not in done.stderr
+    assert "controller vanished" in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert LogReader(log).select(STATE)
+    assert waiting.plant.poll() is None
+
+
+@pytest.mark.check
+@pytest.mark.wall_clock
+def test_a_run_whose_director_is_gone_ends_by_itself_or_by_a_command(
+    tmp_path: Path,
+    course: tuple[str | Path, ...],
+    waiting: Waiting,
+    ended: list[subprocess.Popen[str]],
+) -> None:
+    """Nothing watches or records it any more; until then a new one is refused with the remedy."""
+    long = ("drive", *course[:2], "--laps", "10000", "--max-time", "3600", "--mode", "realtime")
+
+    def words() -> str:
+        state = json.loads(run("status", "--json", *waiting.where).stdout)["cars"]["orca"]["plant"]
+        return f"{state['phase']}: {state['text']}"
+
+    def killed(log: Path) -> None:
+        drive = start(*long, *waiting.where, "--log", log)
+        ended.append(drive)
+        until(lambda: log.exists() and log.stat().st_size > 50_000, "a run in progress")
+        drive.kill()
+
+    killed(tmp_path / "one.mcap")
+    busy = run(*long, *waiting.where, "--log", tmp_path / "two.mcap")
+    assert busy.returncode == 2
+    assert "'bayesrace stop --run' ends it" in busy.stderr
+    done = run("stop", "--run", "--endpoint", waiting.plant_at)
+    assert (done.returncode, "stops" in done.stdout) == (0, True), done.stderr
+    until(lambda: words().startswith("idle"), "the end of the run")
+    killed(tmp_path / "three.mcap")
+    until(lambda: "has been gone for 10 s" in words(), "the end of another")
+    assert words().startswith("idle")
+
+
+@pytest.mark.check
+@pytest.mark.wall_clock
+def test_a_run_in_which_the_car_was_not_driven_is_no_success(
+    tmp_path: Path,
+    course: tuple[str | Path, ...],
+    waiting: Waiting,
+    ended: list[subprocess.Popen[str]],
+) -> None:
+    log = tmp_path / "drive.mcap"
+    drive = start(
+        "drive", *course[:2], "--laps", "1000", "--max-time", "4", "--mode", "realtime",
+        *waiting.where, "--log", log,
+    )  # fmt: skip
+    ended.append(drive)
+    until(lambda: log.exists() and log.stat().st_size > 20_000, "a run in progress")
+    waiting.controller.send_signal(signal.SIGSTOP)
+    try:
+        done = finish(drive)
+    finally:
+        waiting.controller.send_signal(signal.SIGCONT)
+    assert done.returncode == 2
+    assert "the car was not driven in" in done.stderr
