@@ -96,7 +96,7 @@ def flooded(configuration: Configuration, system: System) -> Iterator[None]:
 def put_ahead(pid: int) -> None:
     """Lets all threads of a process go before ordinary ones."""
     for task in Path(f"/proc/{pid}/task").iterdir():
-        os.sched_setscheduler(int(task.name), os.SCHED_RR, os.sched_param(1))
+        os.sched_setscheduler(int(task.name), os.SCHED_RR, os.sched_param(10))
 
 
 def cpu_s(pid: int) -> float:

@@ -140,6 +140,16 @@ def test_the_processes_of_a_system_read_the_file_that_it_leaves(
     assert "not bound to CPU 9999" in (folder / "plant.log").read_text()
 
 
+@pytest.mark.parametrize("name", ["x" * 100, "with blanks"])
+def test_a_folder_that_can_hold_no_sockets_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    (tmp_path / name).mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / name))
+    with pytest.raises(InputError, match="set TMPDIR"), started_system("orca", tmp_path):
+        pass
+
+
 def test_settings_of_zenoh_reach_it_and_unknown_ones_are_named() -> None:
     with open_session(Endpoints(zenoh={"transport": {"link": {"tx": {"batch_size": 1000}}}})):
         pass

@@ -3,6 +3,7 @@
 import time
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,10 +14,11 @@ from operation.certificates import add, init, revoke
 from tests.network.cars import Course, Program
 from tests.network.journey import STANDING_MPS
 from tests.programs import PATIENCE_S, until
-from tests.security.authority import CAR, Bundles, written
+from tests.security.authority import CAR, Bundles, bundles, written
+from tests.security.intruder import bare_session
 from tests.security.rig import course, secured
 
-__all__ = ["course"]
+__all__ = ["bundles", "course"]
 
 pytestmark = [pytest.mark.wall_clock, pytest.mark.unmeasured]
 
@@ -117,3 +119,25 @@ def test_a_revoked_certificate_ends_its_process(tmp_path: Path) -> None:
 
     with pytest.raises(InputError, match="'controller', which is revoked"):
         drive()
+
+
+def test_another_member_cannot_end_a_process(tmp_path: Path, bundles: Bundles) -> None:
+    """By saying in place of the plant that the certificate is revoked."""
+    where, here = free_endpoint("tls"), free_endpoint("tls")
+    asked: list[str] = []
+
+    def lie(query: Any) -> None:
+        asked.append(str(query.key_expr))
+        query.reply(query.key_expr, '{"node": "plant", "member": null, "revoked": true}')
+
+    controller = bundles.endpoints("controller", listen=(here,), connect=(where,))
+    with (
+        open_session(controller, "controller") as session,
+        bare_session(here, bundles.path("viewer")) as viewer,
+    ):
+        liar = viewer.declare_queryable("bayesrace-access/*", lie)
+        with open_session(bundles.endpoints("plant", listen=(where,)), "plant"):
+            until(lambda: asked, "the question")
+            time.sleep(1.0)  # it would be interrupted
+            assert len(session.info.links()) == 2
+        liar.undeclare()
