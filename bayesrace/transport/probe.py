@@ -6,6 +6,7 @@ connection, and a handshake with this process's certificate.
 
 import socket
 import ssl
+import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Final, NamedTuple
@@ -13,7 +14,7 @@ from typing import Final, NamedTuple
 from bayesrace.transport.credentials import AUTHORITY, CERTIFICATE, KEY, Credentials
 from bayesrace.transport.endpoints import Address, address_of
 
-__all__ = ["Finding", "probe", "probe_all"]
+__all__ = ["Finding", "expired", "probe", "probe_all"]
 
 _CONNECT_S: Final = 1.0
 _REFUSAL_S: Final = 0.2
@@ -25,6 +26,10 @@ _OTHER_NAME: Final = (62, 64)
 """OpenSSL's numbers of what is wrong with a certificate."""
 
 
+_ends: Final[dict[str, float]] = {}
+"""When the certificate at an endpoint expires, as last seen by this process."""
+
+
 class Finding(NamedTuple):
     """What is wrong with an endpoint."""
 
@@ -33,6 +38,11 @@ class Finding(NamedTuple):
     """What, and the remedy."""
     lasting: bool = True
     """It does not change by waiting."""
+
+
+def expired(endpoints: Sequence[str]) -> list[str]:
+    """Those whose certificate must have expired, or been renewed, since it was last seen."""
+    return [one for one in endpoints if time.time() >= _ends.get(one, float("inf"))]
 
 
 def probe_all(
@@ -64,7 +74,7 @@ def probe(endpoint: str, credentials: Credentials | None, *, greets: bool = True
         if credentials is None:
             text = _asks_for_certificates(connection)
             return Finding(endpoint, f"{endpoint} {text}") if text else None
-        text = _refused(connection, address, credentials)
+        text = _refused(connection, endpoint, address, credentials)
         return Finding(endpoint, f"{endpoint} {text}") if text else None
 
 
@@ -106,7 +116,9 @@ def _asks_for_certificates(connection: socket.socket) -> str:
     )
 
 
-def _refused(connection: socket.socket, address: Address, credentials: Credentials) -> str:
+def _refused(
+    connection: socket.socket, endpoint: str, address: Address, credentials: Credentials
+) -> str:
     """Why the handshake fails at one of its ends; empty if it does not."""
     folder = credentials.folder
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
@@ -114,6 +126,8 @@ def _refused(connection: socket.socket, address: Address, credentials: Credentia
     context.load_cert_chain(folder / CERTIFICATE, folder / KEY)
     try:
         with context.wrap_socket(connection, server_hostname=address.host) as link:
+            theirs = link.getpeercert() or {}
+            _ends[endpoint] = ssl.cert_time_to_seconds(str(theirs["notAfter"]))
             # The other end judges our certificate when the handshake is over for this one.
             link.settimeout(_REFUSAL_S)
             link.recv(1)

@@ -16,7 +16,7 @@ import zenoh
 from bayesrace.transport.endpoints import Endpoints
 from bayesrace.transport.links import nodes_at, unlinked
 from bayesrace.transport.membership import refusals
-from bayesrace.transport.probe import Finding, probe_all
+from bayesrace.transport.probe import Finding, expired, probe_all
 
 __all__ = ["LinkWatch", "report"]
 
@@ -110,7 +110,9 @@ class LinkWatch:
 
     def _look(self, first: bool) -> str:
         """Says what is wrong with the links; returns what ends the process."""
-        self._missing = unlinked(self._session, self._endpoints)
+        # Zenoh may open a link again whose other end has an expired certificate.
+        stale = expired(self._endpoints.connect)
+        self._missing = list({*unlinked(self._session, self._endpoints), *stale})
         for endpoint in set(self._endpoints.connect) - set(self._missing):
             _said.pop(endpoint, None)
         found = probe_all(self._missing, self._credentials)
@@ -127,8 +129,10 @@ class LinkWatch:
         if self._credentials is None:
             return ""
         nodes = nodes_at(self._session, self._endpoints)
-        refused = refusals(self._session, self._credentials, nodes - self._known)
-        self._known = nodes
+        new, self._known = nodes - self._known, nodes
+        if new:  # with certificates that have not been seen
+            report(probe_all(self._endpoints.connect, self._credentials))
+        refused = refusals(self._session, self._credentials, new)
         for refusal in refused:
             if not refusal.revoked:
                 _log.error("%s", refusal.text)

@@ -1,5 +1,6 @@
 """A certificate that ends while processes run: each says so and ends, and the car stands before."""
 
+import re
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -66,7 +67,7 @@ def test_a_plant_ends_when_its_car_stands(tmp_path: Path, course: Course) -> Non
         until(lambda: rig.phase() == "driving", "driving")
         check_ended(rig.plant, "plant")
         assert "this process ends in" in rig.plant.said()
-        assert "has been expired, and the car braking, for 10 s" in rig.plant.said()
+        assert re.search("run 1 ended .* for 10 s", rig.plant.said())
         assert rig.controller.process.poll() is None
         assert "has a certificate that has expired: renew it there" in rig.controller.said()
         journey = rig.journey()
