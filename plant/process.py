@@ -314,8 +314,7 @@ class PlantProcess:
     def _check_certificate(self) -> None:
         """Once it has expired, no command is taken any more, so that the car brakes.
 
-        Zenoh closes such links, and opens them again: it resumes a TLS session without looking at
-        the certificate.
+        Zenoh closes such links, and opens them again without looking at the certificate.
         """
         credentials = self._settings.endpoints.credentials
         if credentials is None or time.time() < credentials.ends_s:
