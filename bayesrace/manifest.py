@@ -78,7 +78,6 @@ class Manifest(BaseModel):
     gp_capacity: int = Field(gt=0, description="training points per output that fit")
     casadi: str
     compiler: str
-    cpu: str = Field(description="identity of the CPU it was compiled for")
     flags: list[str]
     build_hash: str = Field(description="hash of everything that shaped the artefact")
     library_sha256: str

@@ -18,6 +18,7 @@ __all__ = [
     "ENVIRONMENT",
     "ERRORS",
     "INFO",
+    "INSTRUCTIONS",
     "LEVELS",
     "MEASURED",
     "NO_STEP",
@@ -120,8 +121,16 @@ ERRORS: Final = (
     ("ERROR_STATE", "a state or input is not finite or absurd"),
     ("ERROR_BUSY", "another thread is staging weights"),
     ("ERROR_NOT_STAGED", "no weights are staged"),
+    ("ERROR_INSTRUCTIONS", "this processor lacks these instructions"),
 )
 """What is wrong with a call, from 0 on: name, text."""
+
+INSTRUCTIONS: Final = (
+    ("BASELINE", "those that every processor of its kind has"),
+    ("AVX2", "x86-64 with AVX2 and fused multiply-add"),
+    ("AVX512", "x86-64 with AVX-512"),
+)
+"""Instruction sets that a library has code for, from 0 on: name, meaning."""
 
 NO_STEP: Final = (
     ("UNPREDICTABLE", 252, "the state cannot be predicted to the moment of acting"),
@@ -244,12 +253,12 @@ COUNTERS: Final = (
 )
 """What a control cycle has counted: name, type, meaning."""
 
-_FUNCTIONS: Final = 8
+_FUNCTIONS: Final = 9
 """Version of the functions in the public headers: increase it with each change of a signature."""
 
 _TABLES: Final = (
-    SOLVER, INFO, STATUSES, ERRORS, NO_STEP, LEVELS, PHASES, RECEPTIONS, COMPENSATIONS, DELAYS,
-    ENVIRONMENT, MEASURED, DRIVING, SOLUTION, DECISION, COUNTERS, _FUNCTIONS,
+    SOLVER, INFO, STATUSES, ERRORS, INSTRUCTIONS, NO_STEP, LEVELS, PHASES, RECEPTIONS,
+    COMPENSATIONS, DELAYS, ENVIRONMENT, MEASURED, DRIVING, SOLUTION, DECISION, COUNTERS, _FUNCTIONS,
 )  # fmt: skip
 
 ABI: Final = zlib.crc32(repr(_TABLES).encode()) & 0x7FFFFFFF
@@ -307,6 +316,7 @@ def c_interface() -> str:
         f"#define BR_DELAYS {DELAYS}",
         *_enum("", _numbered(ERRORS), "br_mpc_error"),
         *_enum("", statuses, "br_mpc_status"),
+        *_enum("", _numbered(INSTRUCTIONS), "br_instructions"),
         *_enum("", NO_STEP, "br_no_step"),
         *_enum("", _numbered(LEVELS), "br_level"),
         *_enum("PHASE_", _numbered(PHASES), "br_phase"),

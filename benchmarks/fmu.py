@@ -170,19 +170,17 @@ def print_laps(fmus: dict[str, Path], prepared: Prepared, folder: Path, console:
         row(name, own, own.x)
     path = make_path_table(track, line, car.tuning.path.spacing_m)
     x0 = reference.x[0].tolist()
-    for cpu in ("native", "portable"):
-        for version, fmu in zip(VERSIONS, fmus.values(), strict=True):
-            definition = controller_fmu(
-                artefact, car, rows=path.rows, spacing_m=path.spacing_m,
-                settings=MpcSettings().parameters(car),
-                fallback=FallbackSettings().model_dump() | {"brake_fade_mps": car.brake_fade_mps},
-                weights=weights, version=version, cpu=cpu,
-            )  # fmt: skip
-            controller = pack(definition, folder / f"controller-{cpu}-{version}.fmu")
-            x = master(fmu, controller, x0, len(reference.x) - 1)
-            apart = float(np.abs(x - reference.x).max())
-            name = f"car and controller ({cpu}), FMI {version}.0, fmpy"
-            table.add_row(name, "", "", f"{apart:.3g}")
+    for version, fmu in zip(VERSIONS, fmus.values(), strict=True):
+        definition = controller_fmu(
+            artefact, car, rows=path.rows, spacing_m=path.spacing_m,
+            settings=MpcSettings().parameters(car),
+            fallback=FallbackSettings().model_dump() | {"brake_fade_mps": car.brake_fade_mps},
+            weights=weights, version=version,
+        )  # fmt: skip
+        controller = pack(definition, folder / f"controller-{version}.fmu")
+        x = master(fmu, controller, x0, len(reference.x) - 1)
+        apart = float(np.abs(x - reference.x).max())
+        table.add_row(f"car and controller, FMI {version}.0, fmpy", "", "", f"{apart:.3g}")
     console.print(table)
 
 

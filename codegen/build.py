@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from bayesrace.cache import cache_folder, digest, locked, note_use, software
-from bayesrace.cpu import cpu_digest, cpu_identity
 from bayesrace.errors import InputError
 from bayesrace.manifest import (
     LIBRARY,
@@ -65,7 +64,7 @@ _SHAPED_BY: Final = (
 def build_hash(
     settings: BuildSettings, compiler: Compiler, problem: "Problem | None" = None
 ) -> str:
-    """Identity of the artefact: settings, car, every source file, CasADi, compiler, CPU.
+    """Identity of the artefact: settings, car, every source file, CasADi, compiler.
 
     Of a problem that no source file here describes, its header and functions, too.
     """
@@ -77,7 +76,6 @@ def build_hash(
             *compiler.command,
             compiler.version,
             *FLAGS,
-            cpu_identity(),
             *software(_SHAPED_BY, ("casadi",)),
         ]
     )
@@ -109,7 +107,7 @@ def generate(problem: "Problem", settings: BuildSettings, folder: Path) -> None:
 
     # CasADi derives the include guard from the name and writes into the working folder
     generator = ca.CodeGenerator(
-        "br_model.c", {"with_header": True, "casadi_int": "int", "with_export": False}
+        "br_model.c", {"with_header": True, "casadi_int": "int", "with_export": True}
     )
     for function in functions(problem):
         generator.add(function)
@@ -261,7 +259,6 @@ def _manifest(
         gp_capacity=settings.gp_capacity,
         casadi=version("casadi"),
         compiler=compiler.version,
-        cpu=cpu_digest(),
         flags=list(FLAGS),
         build_hash=identity,
         library_sha256=hashlib.sha256((folder / LIBRARY).read_bytes()).hexdigest(),

@@ -22,7 +22,6 @@ __all__ = ["FLAGS", "CompileError", "Compiler", "find_compiler"]
 FLAGS: Final = (
     "-std=gnu11",
     "-O3",
-    "-march=native",
     "-fPIC",
     "-fvisibility=hidden",
     "-ffp-contract=fast",

@@ -11,7 +11,6 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Any, Final
 
-from bayesrace.cpu import cpu_digest
 from bayesrace.errors import InputError
 from bayesrace.manifest import Manifest, ProblemInfo, check_library, read_manifest
 from bayesrace.native_interface import (
@@ -229,10 +228,6 @@ _STRUCTURES: Final = {
 def _load(artefact: Path, manifest: Manifest) -> ct.CDLL:
     """The artefact's library with its functions' types; InputError if it cannot be used here."""
     path = check_library(artefact, manifest)
-    if manifest.cpu != cpu_digest():
-        raise InputError(
-            f"{path} was compiled for another CPU: remove the folder and run 'bayesrace build' here"
-        )
     try:
         library = ct.CDLL(str(path))
     except OSError as error:
@@ -270,6 +265,8 @@ def _declare(library: ct.CDLL) -> None:
         "mpc_get_tube": [pointer] * 2,
         "mpc_variance": [pointer] * 3,
         "mpc_evaluate": [pointer] * 6,
+        "mpc_set_instructions": [pointer, whole],
+        "mpc_get_instructions": [pointer],
         "mpc_memory_size": [],
         "mpc_error_text": [whole],
         "mpc_status_text": [whole],

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
+from bayesrace.native_interface import INSTRUCTIONS
 from controller.interface import Environment
 from controller.native_library import (
     Artefact,
@@ -93,6 +94,17 @@ class NativeProblem:
     def _set_clock(self) -> None:
         clock = ct.cast(self._library.br_mpc_monotonic, ct.c_void_p)
         self._check(self._library.br_mpc_set_clock(self._mpc, clock, None), "clock")
+
+    @property
+    def instructions(self) -> str:
+        """What the step is compiled for, a name of INSTRUCTIONS; at first the fastest here."""
+        return INSTRUCTIONS[self._library.br_mpc_get_instructions(self._mpc)][0]
+
+    def set_instructions(self, name: str) -> None:
+        """Others, whose results differ by rounding; InputError if the processor lacks them."""
+        names = [known for known, _ in INSTRUCTIONS]
+        error = self._library.br_mpc_set_instructions(self._mpc, names.index(name))
+        self._check(error, f"instructions {name}")
 
     def set_values(self, values: Mapping[str, float]) -> None:
         """Sets run-time parameters and solver settings by name; effective from the next step.

@@ -108,12 +108,12 @@ class Exported:
     """With the test processes beside this one: they take seconds to compile."""
     define: Callable[..., FmuDefinition]
 
-    def fmu(self, version: Literal[2, 3], cpu: str = "native") -> Path:
+    def fmu(self, version: Literal[2, 3]) -> Path:
         """The controller's."""
-        out = self.shared / f"controller{version}-{cpu}.fmu"
+        out = self.shared / f"controller{version}.fmu"
         with out.with_suffix(".lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
-            return out if out.exists() else pack(self.define(version=version, cpu=cpu), out)
+            return out if out.exists() else pack(self.define(version=version), out)
 
     def plant(self, version: Literal[2, 3]) -> Path:
         """The car's."""

@@ -13,7 +13,6 @@ from typing import Final
 import pytest
 
 from bayesrace.cache import software
-from bayesrace.cpu import cpu_identity
 from codegen.build import casadi_includes
 from codegen.compiler import FLAGS
 from tests.shared import shared_folder
@@ -35,7 +34,6 @@ PROGRAMS: Final = Path(__file__).parent / "native"
 SANITIZERS: Final[tuple[str, ...]] = (
     "-g",
     "-std=gnu11",
-    "-march=native",
     "-fno-omit-frame-pointer",
     "-fsanitize=address,undefined",
     "-fno-sanitize-recover=all",
@@ -81,7 +79,7 @@ def artefact_objects(artefact: Path, flags: tuple[str, ...]) -> tuple[Path, ...]
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             list(pool.map(compiled, sources))
 
-    parts: list[str | bytes] = [*flags, gcc("-v"), cpu_identity(), *software((), ("casadi",))]
+    parts: list[str | bytes] = [*flags, gcc("-v"), *software((), ("casadi",))]
     parts += [path.read_bytes() for path in [*sources, *sorted(artefact.glob("*.h"))]]
     folder = shared_folder("objects", parts, make)
     return tuple(folder / f"{source.stem}.o" for source in sources)

@@ -30,7 +30,7 @@ def test_the_controller_of_a_track_is_exported_and_given_other_weights(
     write_raceline(line, circuit.line)
     write_weights(learned, weights)
     files = ("--track", track, "--raceline", line)
-    done = cli("fmu", "export", "--controller", *files, "--cpu", "native", "--out", out)
+    done = cli("fmu", "export", "--controller", *files, "--out", out)
     assert (done.code, "FMI 3.0 cs" in done.out) == (0, True), done.err
     done = cli("fmu", "weights", out, learned, "--out", other)
     assert (done.code, weights.version in done.out) == (0, True), done.err
@@ -42,7 +42,7 @@ def test_the_controller_of_a_track_is_exported_and_given_other_weights(
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        (("--track", "oval", "--cpu", "native"), "--track, --cpu: for a controller's FMU"),
+        (("--track", "oval", "--artefact", "x"), "--track, --artefact: for a controller's FMU"),
         (("--controller", "--kind", "me"), "export it with --kind cs"),
     ],
 )

@@ -1,6 +1,5 @@
 """The artefact's C without Python: under sanitizers, without allocations, to the same bits."""
 
-import platform
 import shutil
 import subprocess
 from pathlib import Path
@@ -134,9 +133,7 @@ def test_valgrind_finds_nothing(kinematic_artefact: Path, problems: Path, tmp_pa
     valgrind = shutil.which("valgrind")
     if valgrind is None:
         pytest.skip("valgrind is not installed")
-    # not for this very CPU, whose instructions valgrind may not know
-    march = ("-march=x86-64-v2",) if platform.machine() == "x86_64" else ()
-    flags = ("-O1", "-g", "-std=gnu11", *march, *STRICT)
+    flags = ("-O1", "-g", "-std=gnu11", *STRICT)
     program = native_program(kinematic_artefact, HARNESS, tmp_path / "harness", *flags)
     # --track-origins=yes takes as long again: for when there is a finding
     line = [valgrind, "-q", "--leak-check=full", "--error-exitcode=9"]

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.check
 
 SOURCES: Final = Path(__file__).parent / "native"
 SANITIZERS: Final = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
-FLAGS: Final = ("-std=gnu11", "-O2", "-g", "-march=native")
+FLAGS: Final = ("-std=gnu11", "-O2", "-g")
 STRICT: Final = ("-Wall", "-Wextra", "-Werror", "-Wno-unused-parameter", "-Wno-unused-function")
 COVERAGE: Final = "-fsanitize-coverage=trace-pc"
 SEED: Final = "1"

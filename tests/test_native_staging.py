@@ -32,7 +32,7 @@ def staging(artefact: Path, folder: Path, *flags: str, under: Sequence[str] = ()
 
 @pytest.mark.check
 def test_no_data_race_and_no_mixture(kinematic_artefact: Path, tmp_path: Path) -> None:
-    flags = ("-O0", "-g", "-std=gnu11", "-march=native", "-fsanitize=thread")
+    flags = ("-O0", "-g", "-std=gnu11", "-fsanitize=thread")
     # some kernels spread memory farther than the sanitizer expects
     flat = shutil.which("setarch")
     under = [flat, platform.machine(), "-R"] if flat else []

@@ -62,16 +62,14 @@ def controller_fmu(
     fallback: Mapping[str, float],
     weights: GpWeights | None = None,
     version: Literal[2, 3] = 3,
-    cpu: str = "portable",
 ) -> FmuDefinition:
     """The controller of a built artefact on one racing line, ready for :func:`codegen.fmu.pack`.
 
     ``rows`` (n, 7), ``spacing_m``: the table of ``controller.path_table``; ``settings``: the
     parameters of problem and solver (``controller.settings.MpcSettings.parameters``); ``fallback``:
-    the fields of ``FallbackSettings``; both become start values of parameters. ``cpu``: "portable"
-    runs on any of its kind; "native" only on one like this, faster, and gives the bits of the
-    artefact's own library; else a value for the compiler's ``-march``. InputError for an artefact
-    of another car, foreign weights, a bad table.
+    the fields of ``FallbackSettings``; both become start values of parameters. Built by the same
+    compiler, it gives the bits of the artefact's own library on the same processor. InputError for
+    an artefact of another car, foreign weights, a bad table.
     """
     manifest = read_manifest(artefact)
     manifest.check_car(car, artefact)
@@ -83,7 +81,7 @@ def controller_fmu(
         version=version,
         variables=tuple(_variables(manifest, car.drive, settings, fallback)),
         sources=_sources(artefact),
-        flags=_flags(cpu),
+        flags=FLAGS,
         constants={
             "NO_SPEED_LIMIT": _NO_LIMIT_MPS,
             **{name.upper(): brake[name] for name in ("brake_d", "brake_slow")},
@@ -92,7 +90,7 @@ def controller_fmu(
             PATH_FILE: path_file(rows, spacing_m),
             WEIGHTS_FILE: weights_file(weights, manifest.discretisation, manifest.gp_capacity),
         },
-        documentation=_documentation(manifest, weights, cpu),
+        documentation=_documentation(manifest, weights),
         default_step_s=manifest.step_s,
         serialises=False,  # DAQP's workspace points into the same block of memory
     )
@@ -104,16 +102,6 @@ def _sources(artefact: Path) -> dict[str, bytes]:
     files = {path.name: path for path in (NATIVE / "controller.c", *own, *artefact.glob("*.a"))}
     files |= {f"daqp/{path.name}": path for path in (artefact / "daqp").iterdir()}
     return {name: path.read_bytes() for name, path in sorted(files.items())}
-
-
-def _flags(cpu: str) -> tuple[str, ...]:
-    """The artefact's own but for the CPU; portable ones give the same bits on every CPU."""
-    if cpu == "portable":
-        own = [flag for flag in FLAGS if flag not in ("-march=native", "-ffp-contract=fast")]
-        return (*own, "-ffp-contract=off")
-    if not cpu.replace("-", "").replace("_", "").replace(".", "").isalnum():
-        raise InputError(f"'{cpu}' is not a CPU: portable, native, or one such as x86-64-v3")
-    return tuple(f"-march={cpu}" if flag == "-march=native" else flag for flag in FLAGS)
 
 
 def _value(values: Mapping[str, float], name: str) -> float:
@@ -202,11 +190,11 @@ def _outputs(drive: Drive) -> list[Variable]:
     ]
 
 
-def _documentation(manifest: Manifest, weights: GpWeights | None, cpu: str) -> str:
+def _documentation(manifest: Manifest, weights: GpWeights | None) -> str:
     correction = "no correction" if weights is None else f"weights '{escape(weights.version)}'"
     return f"""<p>Nonlinear model predictive controller, {manifest.horizon} stages of
-{manifest.step_s:g} s, model {escape(manifest.discretisation)}, {correction}; the binary is for the
-CPU '{escape(cpu)}'.</p>
+{manifest.step_s:g} s, model {escape(manifest.discretisation)}, {correction}. On x86-64 the binary
+uses AVX2 or AVX-512 where the processor has them.</p>
 <p>Every doStep in which a control step is due makes one for the inputs set before it. Its outputs
 are meant for the plant's step over the same time. So step the controller first, hand its outputs to
 the plant, and step that. If your tool steps all FMUs side by side, set <code>delay</code> to the

@@ -177,6 +177,12 @@ BR_API br_mpc_error br_mpc_get_tube(const br_mpc *mpc, double tube[BR_N]);
 
 /* --- for tests and tools --- */
 
+/* The instructions that the functions above use: at first the best that processor and system have.
+ * For others, between two calls, and not while another thread stages: results differ by rounding.
+ * BR_ERROR_INSTRUCTIONS if the processor lacks them. */
+BR_API br_mpc_error br_mpc_set_instructions(br_mpc *mpc, br_instructions instructions);
+BR_API br_instructions br_mpc_get_instructions(const br_mpc *mpc);
+
 /* Posterior variance of the residual at v = [x; u], noise included; 0 where it is not known. */
 BR_API br_mpc_error br_mpc_variance(br_mpc *mpc, const double v[BR_NV], double variance[BR_NE]);
 

@@ -13,6 +13,7 @@ br_mpc_error br_mpc_init(void *memory, size_t size, br_mpc **out) {
     br_qp_init(&mpc->qp);
     br_weights_init(mpc);
     mpc->caution.pace = 1;
+    mpc->code = br_fastest_code();
     *out = mpc;
     return BR_OK;
 }
@@ -78,35 +79,6 @@ br_mpc_error br_mpc_get_reference(const br_mpc *mpc, br_mpc_reference reference[
 br_mpc_error br_mpc_get_tube(const br_mpc *mpc, double tube[BR_N]) {
     if (!mpc || !tube) return BR_ERROR_NULL;
     memcpy(tube, mpc->answer_tube, sizeof mpc->answer_tube);
-    return BR_OK;
-}
-
-br_mpc_error br_mpc_variance(br_mpc *mpc, const double v[BR_NV], double variance[BR_NE]) {
-    if (!mpc || !v || !variance) return BR_ERROR_NULL;
-    double x[1][BR_NX], u[1][BR_NU], found[1][BR_NE];
-    memcpy(x, v, sizeof x);
-    memcpy(u, v + BR_NX, sizeof u);
-    br_stages_variances(&mpc->gp[mpc->gp_in_use], 1, x, u, mpc->caution.correlations, found);
-    memcpy(variance, found, sizeof found);
-    return BR_OK;
-}
-
-br_mpc_error br_mpc_evaluate(const br_mpc *mpc, const double v[BR_NV], const double lambda[BR_NX],
-                             double x_next[BR_NX], double jacobian[BR_NX * BR_NV],
-                             double hessian[BR_NV * BR_NV]) {
-    if (!mpc || !v || !lambda || !x_next || !jacobian || !hessian) return BR_ERROR_NULL;
-    BR_ALIGNED br_gp_row kernels[BR_NE * BR_GP_BLOCKS];
-    const br_gp *gp = &mpc->gp[mpc->gp_in_use];
-    double x[1][BR_NX], u[1][BR_NU], costate[1][BR_NX];
-    memcpy(x, v, sizeof x);
-    memcpy(u, v + BR_NX, sizeof u);
-    memcpy(costate, lambda, sizeof costate);
-    br_stage stage;
-    br_stages_linearise(gp, 1, x, u, kernels, 1, 0, &stage);
-    br_stages_curve(gp, 1, x, u, costate, kernels, &stage);
-    memcpy(x_next, stage.f, sizeof stage.f);
-    memcpy(jacobian, stage.jacobian, sizeof stage.jacobian);
-    memcpy(hessian, stage.hessian, sizeof stage.hessian);
     return BR_OK;
 }
 

@@ -134,7 +134,7 @@ static void add_sums(const br_gp_output *gp, int first, int group, const int gro
         for (; s + TILE <= stages; s += TILE)
             add_tile(TILE, points, columns, weights + s, &sums[stride * s + 8 * g], stride);
         for (; s < stages; ++s)
-            add_tile(1, points, columns, weights + s, &sums[stride * s + 8 * g], stride);
+            add_tile(1, points, columns, weights + s, &sums[stride * (size_t)s + 8 * g], stride);
     }
 }
 
@@ -257,12 +257,12 @@ static void fill_columns(br_gp_output *out, int i) {
 }
 
 /* Inputs and weights of one output as the kernel wants them; 0 if they are not finite there. What
- * fills the last vector is the middle of the inputs, without weight. */
+ * fills the last vectors is the middle of the inputs, without weight. */
 static int load(br_gp_output *out, const br_mpc_gp *in) {
     out->kernel = in->kernel;
     out->offset = in->offset;
     out->reach = 0;
-    out->n_padded = (in->n + BR_LANES - 1) / BR_LANES * BR_LANES;
+    out->n_padded = (in->n + BR_WIDEST - 1) / BR_WIDEST * BR_WIDEST;
     for (int i = 0; i < out->n_padded; ++i)
         out->alpha[i] = i < in->n ? in->scale * in->alpha[i] : 0;
     for (int a = 0; a < BR_NZ; ++a) {

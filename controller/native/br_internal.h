@@ -7,6 +7,7 @@
 
 #define BR_TABLES /* the sparsity of the problem, too */
 #include "bayesrace_mpc.h"
+#include "br_code.h"
 #include "br_vector.h"
 
 /* Before loops over states, inputs, rows and their nonzeros, which have constant bounds: unrolled,
@@ -58,7 +59,7 @@ typedef struct {
     BR_ALIGNED double root[BR_GP_ROOT][BR_GP_ROOT];
 } br_gp_variance;
 
-typedef struct {
+typedef struct br_gp {
     int any; /* 0 while every output is constant zero: WorstCase and BestCase skip the kernels */
     int uncertain; /* the variance of an output is known */
     br_gp_output output[BR_NE];
@@ -185,6 +186,7 @@ enum {
 };
 
 struct br_mpc {
+    const br_code *code; /* that makes the steps */
     br_mpc_parameters parameters;
     int has_parameters;
     br_path path;
@@ -238,61 +240,63 @@ struct br_mpc {
 /* br_gp.c */
 /* Mean and gradient of several stages, at most BR_N. Their weights for br_gp_curvature go into
  * kept, which has room for those of so many stages: (output, block, stage), row by row. */
-void br_gp_evaluate(const br_gp *gp, int stages, double (*z)[BR_NZ], br_gp_row *kept, int room,
-                    br_correction *out);
+BR_PART void br_gp_evaluate(const br_gp *gp, int stages, double (*z)[BR_NZ], br_gp_row *kept,
+                            int room, br_correction *out);
 /* Of all stages that kept has room for, out[s] = sum_j weight[s][j] d^2 mu_j / d z^2. */
-void br_gp_curvature(const br_gp *gp, int stages, double (*z)[BR_NZ], br_gp_row *kept,
-                     const br_correction *const values[], double (*weight)[BR_NE],
-                     double (*out)[BR_NZ][BR_NZ]);
-void br_gp_mean(const br_gp *gp, const double z[BR_NZ], double mean[BR_NE]);
-br_mpc_error br_gp_load(br_gp *gp, const br_mpc_gp outputs[BR_NE]);
+BR_PART void br_gp_curvature(const br_gp *gp, int stages, double (*z)[BR_NZ], br_gp_row *kept,
+                             const br_correction *const values[], double (*weight)[BR_NE],
+                             double (*out)[BR_NZ][BR_NZ]);
+BR_PART void br_gp_mean(const br_gp *gp, const double z[BR_NZ], double mean[BR_NE]);
+BR_PART br_mpc_error br_gp_load(br_gp *gp, const br_mpc_gp outputs[BR_NE]);
 
 /* br_variance.c */
 /* Of one output whose weights are loaded. */
-void br_variance_load(const br_gp_output *gp, const br_mpc_gp *in, br_gp_variance *v);
+BR_PART void br_variance_load(const br_gp_output *gp, const br_mpc_gp *in, br_gp_variance *v);
 /* Noise included, of several stages; 0 where it is not known. */
-void br_gp_variances(const br_gp *gp, int stages, double (*z)[BR_NZ], double (*work)[BR_COLUMNS],
-                     double (*variance)[BR_NE]);
+BR_PART void br_gp_variances(const br_gp *gp, int stages, double (*z)[BR_NZ],
+                             double (*work)[BR_COLUMNS], double (*variance)[BR_NE]);
 
 /* br_caution.c */
-void br_caution_update(br_mpc *mpc);
-void br_caution_tighten(br_mpc *mpc, int k, br_stage_terms *terms);
-void br_caution_pace(br_mpc *mpc, double elapsed);
+BR_PART void br_caution_update(br_mpc *mpc);
+BR_PART void br_caution_tighten(br_mpc *mpc, int k, br_stage_terms *terms);
+BR_PART void br_caution_pace(br_mpc *mpc, double elapsed);
 
 /* br_weights.c */
 void br_weights_init(br_mpc *mpc);
 
 /* br_planner.c */
-br_mpc_error br_path_load(br_path *path, const double *table, int n, double spacing);
-void br_path_plan(const br_path *path, double pace, br_mpc_reference reference[BR_N]);
-void br_path_project(br_path *path, const double x[BR_NX], double *lateral);
+BR_PART br_mpc_error br_path_load(br_path *path, const double *table, int n, double spacing);
+BR_PART void br_path_plan(const br_path *path, double pace, br_mpc_reference reference[BR_N]);
+BR_PART void br_path_project(br_path *path, const double x[BR_NX], double *lateral);
 #if BR_FOLLOWS_PLAN
-void br_path_follow(br_mpc *mpc);
+BR_PART void br_path_follow(br_mpc *mpc);
 #else
 static inline void br_path_follow(br_mpc *mpc) { (void)mpc; }
 #endif
-void br_path_ahead(const br_path *path, double distance, double point[2]);
+BR_PART void br_path_ahead(const br_path *path, double distance, double point[2]);
 
 /* br_turnaround.c */
-void br_turnaround(br_mpc *mpc);
+BR_PART void br_turnaround(br_mpc *mpc);
 
 /* br_stage.c */
 /* Values and Jacobians of several stages, which take the slots from the given one on of kernels,
  * with room for so many. */
-void br_stages_linearise(const br_gp *gp, int stages, double (*x)[BR_NX], double (*u)[BR_NU],
-                         br_gp_row *kernels, int room, int slot, br_stage *stage);
+BR_PART void br_stages_linearise(const br_gp *gp, int stages, double (*x)[BR_NX],
+                                 double (*u)[BR_NU], br_gp_row *kernels, int room, int slot,
+                                 br_stage *stage);
 /* Hessians of all linearised stages, at the same x and u; of each slot there is one. */
-void br_stages_curve(const br_gp *gp, int stages, double (*x)[BR_NX], double (*u)[BR_NU],
-                     double (*lambda)[BR_NX], br_gp_row *kernels, br_stage *stage);
-void br_stages_variances(const br_gp *gp, int stages, double (*x)[BR_NX], double (*u)[BR_NU],
-                         double (*work)[BR_COLUMNS], double (*variance)[BR_NE]);
-void br_stage_next(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
-                   double x_next[BR_NX]);
-void br_stage_advance(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
-                      double duration, double x_next[BR_NX]);
+BR_PART void br_stages_curve(const br_gp *gp, int stages, double (*x)[BR_NX], double (*u)[BR_NU],
+                             double (*lambda)[BR_NX], br_gp_row *kernels, br_stage *stage);
+BR_PART void br_stages_variances(const br_gp *gp, int stages, double (*x)[BR_NX],
+                                 double (*u)[BR_NU], double (*work)[BR_COLUMNS],
+                                 double (*variance)[BR_NE]);
+BR_PART void br_stage_next(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
+                           double x_next[BR_NX]);
+BR_PART void br_stage_advance(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
+                              double duration, double x_next[BR_NX]);
 
 /* br_problem.c: cost and constraints as the problem's generated functions have them */
-void br_evaluate_terms(br_mpc *mpc);
+BR_PART void br_evaluate_terms(br_mpc *mpc);
 /* out += (cost_xx + share * rows_xx) dx */
 static inline void br_add_curvature(const br_stage_curvature *second, double share,
                                     const double dx[BR_NX], double out[BR_NX]) {
@@ -301,11 +305,12 @@ static inline void br_add_curvature(const br_stage_curvature *second, double sha
     for (int n = 0; n < BR_RXX_NNZ; ++n)
         out[BR_RXX_ROW[n]] += share * second->rows_xx[n] * dx[BR_RXX_COLUMN[n]];
 }
-void br_evaluate_curvature(br_mpc *mpc);
-void br_evaluate_bounds(br_mpc *mpc);
-void br_evaluate_penalties(br_mpc *mpc);
-void br_first_guess(const br_mpc *mpc, const double u_before[BR_NU], double share, double u[BR_NU]);
-int br_valid_parameters(const br_mpc_parameters *parameters);
+BR_PART void br_evaluate_curvature(br_mpc *mpc);
+BR_PART void br_evaluate_bounds(br_mpc *mpc);
+BR_PART void br_evaluate_penalties(br_mpc *mpc);
+BR_PART void br_first_guess(const br_mpc *mpc, const double u_before[BR_NU], double share,
+                            double u[BR_NU]);
+BR_PART int br_valid_parameters(const br_mpc_parameters *parameters);
 static inline const double *br_theta(const br_mpc_parameters *parameters) {
     return (const double *)parameters; /* the problem's come first, all of them doubles */
 }
@@ -314,58 +319,76 @@ static inline const double *br_theta(const br_mpc_parameters *parameters) {
 static inline int br_padded(int n) { return (n + 7) & ~7; }
 
 /* br_condense.c */
-void br_condense_states(br_mpc *mpc); /* the sensitivities of all states, into qp.g */
+BR_PART void br_condense_states(br_mpc *mpc); /* the sensitivities of all states, into qp.g */
 /* Into qp.h, with this share of the second-order part of dynamics and rows. */
-void br_condense_hessian(br_mpc *mpc, double tau);
+BR_PART void br_condense_hessian(br_mpc *mpc, double tau);
 /* At dU = 0, into qp.gradient; and the change of the states there, into qp.xbar. */
-void br_condense_gradient(br_mpc *mpc, double tau);
+BR_PART void br_condense_gradient(br_mpc *mpc, double tau);
 
 /* br_qp.c: the QP of one SQP iteration */
-void br_qp_init(br_qp *qp);
-void br_qp_factorise(br_mpc *mpc);
-br_mpc_status br_qp_condense(br_mpc *mpc);
-br_mpc_status br_qp_solve(br_mpc *mpc, int warm);
-void br_qp_shift_rows(void *rows, size_t size);
-void br_qp_forget_working_set(br_qp *qp);
+BR_PART void br_qp_init(br_qp *qp);
+BR_PART void br_qp_factorise(br_mpc *mpc);
+BR_PART br_mpc_status br_qp_condense(br_mpc *mpc);
+BR_PART br_mpc_status br_qp_solve(br_mpc *mpc, int warm);
+BR_PART void br_qp_shift_rows(void *rows, size_t size);
+BR_PART void br_qp_forget_working_set(br_qp *qp);
 
 /* br_timer.c */
-void br_timer_start(br_timer *timer, double budget);
-double br_timer_now(const br_timer *timer);
-int br_timer_allows(const br_timer *timer, double now, double duration);
-void br_timer_note(const br_timer *timer, double begin, double *longest);
+BR_PART void br_timer_start(br_timer *timer, double budget);
+BR_PART double br_timer_now(const br_timer *timer);
+BR_PART int br_timer_allows(const br_timer *timer, double now, double duration);
+BR_PART void br_timer_note(const br_timer *timer, double begin, double *longest);
 
 /* br_sqp.c: the plan's start, shift and iteration */
-void br_sqp_linearise(br_mpc *mpc);
-void br_sqp_curve(br_mpc *mpc);
-void br_sqp_cold_start(br_mpc *mpc);
-void br_sqp_roll_out(br_mpc *mpc, const double u[BR_NU]);
-void br_sqp_shift(br_mpc *mpc);
-br_mpc_status br_sqp_iterate(br_mpc *mpc, int warm, int first_of_warm);
+BR_PART void br_sqp_linearise(br_mpc *mpc);
+BR_PART void br_sqp_curve(br_mpc *mpc);
+BR_PART void br_sqp_cold_start(br_mpc *mpc);
+BR_PART void br_sqp_roll_out(br_mpc *mpc, const double u[BR_NU]);
+BR_PART void br_sqp_shift(br_mpc *mpc);
+BR_PART br_mpc_status br_sqp_iterate(br_mpc *mpc, int warm, int first_of_warm);
 
 /* br_prepare.c: in step with time */
-int br_plausible_state(const double x[BR_NX]);
-int br_shifts_due(double *lag);
-void br_align(br_mpc *mpc, int shifts);
-void br_undo_preparation(br_mpc *mpc);
+BR_PART int br_plausible_state(const double x[BR_NX]);
+BR_PART int br_shifts_due(double *lag);
+BR_PART void br_align(br_mpc *mpc, int shifts);
+BR_PART void br_undo_preparation(br_mpc *mpc);
+BR_PART void br_forget_linearisation(br_mpc *mpc);
+
+/* br_step.c, br_prepare.c, br_predict.c, br_inspect.c: functions of the interface, see br_code.h */
+BR_PART br_mpc_error br_step(br_mpc *mpc, const double x[BR_NX], const double u_before[BR_NU],
+                             const br_environment *environment, double elapsed_s, double budget_s,
+                             double u[BR_NU], br_mpc_status *status, br_mpc_info *info);
+BR_PART br_mpc_error br_solve(br_mpc *mpc, const double x[BR_NX], const double u_before[BR_NU],
+                              double elapsed_s, double budget_s,
+                              const br_mpc_reference reference[BR_N], double u[BR_NU],
+                              br_mpc_status *status, br_mpc_info *info);
+BR_PART br_mpc_error br_prepare(br_mpc *mpc, double elapsed_s, double budget_s);
+BR_PART br_mpc_error br_rehearse(br_mpc *mpc);
+BR_PART br_mpc_error br_predict(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
+                                double duration_s, double x_next[BR_NX]);
+BR_PART br_mpc_error br_variance(br_mpc *mpc, const double v[BR_NV], double variance[BR_NE]);
+BR_PART br_mpc_error br_evaluate(const br_mpc *mpc, const double v[BR_NV],
+                                 const double lambda[BR_NX], double x_next[BR_NX],
+                                 double jacobian[BR_NX * BR_NV], double hessian[BR_NV * BR_NV]);
 
 /* br_step.c */
-br_mpc_status br_start_again(br_mpc *mpc, br_mpc_status status, unsigned turn);
-int br_iteration_limit(const br_mpc *mpc);
+BR_PART br_mpc_status br_start_again(br_mpc *mpc, br_mpc_status status, unsigned turn);
+BR_PART int br_iteration_limit(const br_mpc *mpc);
 
 /* br_incumbent.c */
-void br_incumbent_reset(br_mpc *mpc);
-void br_incumbent_keep(br_mpc *mpc, br_mpc_status status, int lowest);
-br_mpc_status br_incumbent_restore(br_mpc *mpc, br_mpc_status status);
-void br_first_plan_keep(br_mpc *mpc, br_mpc_status status);
-br_mpc_status br_first_plan_compare(br_mpc *mpc, br_mpc_status status, int *second);
+BR_PART void br_incumbent_reset(br_mpc *mpc);
+BR_PART void br_incumbent_keep(br_mpc *mpc, br_mpc_status status, int lowest);
+BR_PART br_mpc_status br_incumbent_restore(br_mpc *mpc, br_mpc_status status);
+BR_PART void br_first_plan_keep(br_mpc *mpc, br_mpc_status status);
+BR_PART br_mpc_status br_first_plan_compare(br_mpc *mpc, br_mpc_status status, int *second);
 
 /* br_residuals.c */
-int br_all_finite(const double *values, int n);
+BR_PART int br_all_finite(const double *values, int n);
 /* The larger one, and NaN if either is: fmax would lose a NaN and with it a bad solution. */
 static inline double br_worse(double a, double b) { return b > a || b != b ? b : a; }
-void br_residuals(br_mpc *mpc);
-double br_residual(const br_mpc *mpc);
-br_mpc_status br_judge(const br_mpc *mpc);
+BR_PART void br_residuals(br_mpc *mpc);
+BR_PART double br_residual(const br_mpc *mpc);
+BR_PART br_mpc_status br_judge(const br_mpc *mpc);
 static inline int br_usable(br_mpc_status status) { return status <= BR_ACCEPTABLE; }
 
 #endif

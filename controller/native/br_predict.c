@@ -27,9 +27,9 @@ static void advance(const br_mpc *mpc, double x[BR_NX], const double u[BR_NU], d
     br_reached(arg, res, iw, w, 0);
 }
 
-br_mpc_error br_mpc_predict(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
-                            double duration_s, double x_next[BR_NX]) {
-    if (!mpc || !x || !u || !x_next) return BR_ERROR_NULL;
+br_mpc_error br_predict(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
+                        double duration_s, double x_next[BR_NX]) {
+    if (!x || !u || !x_next) return BR_ERROR_NULL;
     if (!mpc->has_parameters) return BR_ERROR_NOT_READY;
     if (!(duration_s >= 0 && duration_s <= BR_PREDICT_MAX_S)) return BR_ERROR_TIME;
     if (!br_plausible_state(x) || !br_all_finite(u, BR_NU)) return BR_ERROR_STATE;

@@ -34,6 +34,12 @@ void br_undo_preparation(br_mpc *mpc) {
     mpc->ahead = 0;
 }
 
+/* Of other weights or code; the preparation's new last stage was predicted with those before. */
+void br_forget_linearisation(br_mpc *mpc) {
+    br_undo_preparation(mpc);
+    mpc->linearised = mpc->qp.factorised = mpc->caution.known = 0;
+}
+
 /* Time for an iteration, and what follows it: restoring the best plan, shift and factorisation,
  * which take another one's, and caution. */
 static double iteration_and_rest(const br_timer *timer) {
@@ -83,8 +89,7 @@ static void look_elsewhere(br_mpc *mpc) {
     mpc->prepared_iterations += mpc->info.iterations;
 }
 
-br_mpc_error br_mpc_prepare(br_mpc *mpc, double elapsed_s, double budget_s) {
-    if (!mpc) return BR_ERROR_NULL;
+br_mpc_error br_prepare(br_mpc *mpc, double elapsed_s, double budget_s) {
     br_timer_start(&mpc->timer, budget_s);
     if (!mpc->has_parameters) return BR_ERROR_NOT_READY;
     if (!(elapsed_s >= 0 && isfinite(elapsed_s))) return BR_ERROR_TIME;
@@ -103,8 +108,7 @@ br_mpc_error br_mpc_prepare(br_mpc *mpc, double elapsed_s, double budget_s) {
     return BR_OK;
 }
 
-br_mpc_error br_mpc_rehearse(br_mpc *mpc) {
-    if (!mpc) return BR_ERROR_NULL;
+br_mpc_error br_rehearse(br_mpc *mpc) {
     if (!mpc->prepared || !mpc->qp.factorised) return BR_OK;
     br_sqp_linearise(mpc);
     br_path_follow(mpc);

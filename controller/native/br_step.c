@@ -172,7 +172,7 @@ typedef struct {
 } request;
 
 static br_mpc_error begin(br_mpc *mpc, const request *r, int *plausible) {
-    if (!mpc || !r->x || !r->u_before || !r->u || !r->status) return BR_ERROR_NULL;
+    if (!r->x || !r->u_before || !r->u || !r->status) return BR_ERROR_NULL;
     br_timer_start(&mpc->timer, r->budget_s);
     *r->status = BR_BAD_STATE; /* until there is something better to say */
     memset(&mpc->info, 0, sizeof mpc->info);
@@ -223,9 +223,9 @@ static void plan_reference(br_mpc *mpc) {
 }
 #endif
 
-br_mpc_error br_mpc_step(br_mpc *mpc, const double x[BR_NX], const double u_before[BR_NU],
-                         const br_environment *environment, double elapsed_s, double budget_s,
-                         double u[BR_NU], br_mpc_status *status, br_mpc_info *info) {
+br_mpc_error br_step(br_mpc *mpc, const double x[BR_NX], const double u_before[BR_NU],
+                     const br_environment *environment, double elapsed_s, double budget_s,
+                     double u[BR_NU], br_mpc_status *status, br_mpc_info *info) {
     int plausible;
     const request r = {x, u_before, elapsed_s, budget_s, u, status, info};
     const br_mpc_error error = begin(mpc, &r, &plausible);
@@ -242,9 +242,9 @@ br_mpc_error br_mpc_step(br_mpc *mpc, const double x[BR_NX], const double u_befo
     return BR_OK;
 }
 
-br_mpc_error br_mpc_solve(br_mpc *mpc, const double x[BR_NX], const double u_before[BR_NU],
-                          double elapsed_s, double budget_s, const br_mpc_reference reference[BR_N],
-                          double u[BR_NU], br_mpc_status *status, br_mpc_info *info) {
+br_mpc_error br_solve(br_mpc *mpc, const double x[BR_NX], const double u_before[BR_NU],
+                      double elapsed_s, double budget_s, const br_mpc_reference reference[BR_N],
+                      double u[BR_NU], br_mpc_status *status, br_mpc_info *info) {
     if (!reference) return BR_ERROR_NULL;
     int plausible;
     const request r = {x, u_before, elapsed_s, budget_s, u, status, info};

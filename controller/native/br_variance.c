@@ -13,10 +13,10 @@
 #include "br_internal.h"
 #include "br_kernel.h"
 
-#define COLUMNS BR_COLUMNS           /* queries that a tile of the product has, and ... */
-#define PARTS (COLUMNS / BR_LANES)   /* ... vectors of them, ... */
-#define ROWS (8 / PARTS < 4 ? 4 : 8) /* ... and rows of W: as much as the registers hold */
-#define LEAST_PIVOT 1e-13            /* of a correlation matrix: below it a point adds nothing */
+#define COLUMNS BR_COLUMNS             /* queries that a tile of the product has, and ... */
+#define VECTORS (COLUMNS / BR_LANES)   /* ... vectors of them, ... */
+#define ROWS (8 / VECTORS < 4 ? 4 : 8) /* ... and rows of W: as much as the registers hold */
+#define LEAST_PIVOT 1e-13              /* of a correlation matrix: below it a point adds nothing */
 
 _Static_assert(BR_GP_ROOT % ROWS == 0, "a tile holds whole rows");
 
@@ -28,7 +28,7 @@ static inline __attribute__((always_inline)) void query_by(const int kind, const
                                                            double q[BR_NZ][COLUMNS],
                                                            double (*restrict k)[COLUMNS]) {
     for (int i = 0; i < rows; ++i) BR_UNROLL
-    for (int p = 0; p < PARTS; ++p) {
+    for (int p = 0; p < VECTORS; ++p) {
         br_vec r2 = {0};
         BR_UNROLL
         for (int a = 0; a < BR_NZ; ++a) {
@@ -126,22 +126,22 @@ void br_variance_load(const br_gp_output *gp, const br_mpc_gp *in, br_gp_varianc
 /* |W k|^2 of each column. */
 static void explain(const matrix_row *root, int rows, double (*restrict k)[COLUMNS],
                     double explained[COLUMNS]) {
-    br_vec total[PARTS] = {{0}};
+    br_vec total[VECTORS] = {{0}};
     for (int first = 0; first < rows; first += ROWS) {
-        br_vec t[ROWS][PARTS] = {{{0}}};
+        br_vec t[ROWS][VECTORS] = {{{0}}};
         for (int j = 0; j < first + ROWS; ++j) {
-            br_vec row[PARTS];
+            br_vec row[VECTORS];
             BR_UNROLL
-            for (int p = 0; p < PARTS; ++p) row[p] = br_load(&k[j][BR_LANES * p]);
+            for (int p = 0; p < VECTORS; ++p) row[p] = br_load(&k[j][BR_LANES * p]);
             BR_UNROLL
             for (int i = 0; i < ROWS; ++i) BR_UNROLL
-            for (int p = 0; p < PARTS; ++p) t[i][p] += root[first + i][j] * row[p];
+            for (int p = 0; p < VECTORS; ++p) t[i][p] += root[first + i][j] * row[p];
         }
         BR_UNROLL
         for (int i = 0; i < ROWS; ++i) BR_UNROLL
-        for (int p = 0; p < PARTS; ++p) total[p] += t[i][p] * t[i][p];
+        for (int p = 0; p < VECTORS; ++p) total[p] += t[i][p] * t[i][p];
     }
-    for (int p = 0; p < PARTS; ++p) br_store(&explained[BR_LANES * p], total[p]);
+    for (int p = 0; p < VECTORS; ++p) br_store(&explained[BR_LANES * p], total[p]);
 }
 
 void br_gp_variances(const br_gp *gp, int stages, double (*z)[BR_NZ], double (*work)[BR_COLUMNS],

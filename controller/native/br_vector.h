@@ -8,13 +8,12 @@
 
 #define BR_ALIGNED __attribute__((aligned(64)))
 
-#if defined(__AVX512F__)
-#define BR_LANES 8
-#elif defined(__AVX__)
-#define BR_LANES 4
-#else
+/* Numbers of a vector. br_avx2.c and br_avx512.c define it before; else what every x86-64 and
+ * aarch64 has. */
+#ifndef BR_LANES
 #define BR_LANES 2
 #endif
+#define BR_WIDEST 8 /* what is stored is padded for the widest, whichever is used */
 
 typedef double br_vec __attribute__((vector_size(BR_LANES * 8)));
 typedef int64_t br_ivec __attribute__((vector_size(BR_LANES * 8)));

@@ -20,14 +20,13 @@ static void hand_over(br_mpc *mpc, int owner) {
 /* The caller has taken the spare buffer and is the control thread. */
 static void exchange(br_mpc *mpc) {
     mpc->gp_in_use = !mpc->gp_in_use;
-    br_undo_preparation(mpc); /* its new last stage was predicted with the weights before */
-    mpc->linearised = mpc->qp.factorised = mpc->caution.known = 0;
+    br_forget_linearisation(mpc);
 }
 
 br_mpc_error br_mpc_stage_weights(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]) {
     if (!mpc || !outputs) return BR_ERROR_NULL;
     if (!take_from(mpc, BR_SPARE_STAGED) && !take_from(mpc, BR_SPARE_FREE)) return BR_ERROR_BUSY;
-    const br_mpc_error error = br_gp_load(&mpc->gp[!mpc->gp_in_use], outputs);
+    const br_mpc_error error = mpc->code->load(&mpc->gp[!mpc->gp_in_use], outputs);
     hand_over(mpc, error ? BR_SPARE_FREE : BR_SPARE_STAGED);
     return error;
 }
@@ -43,7 +42,7 @@ br_mpc_error br_mpc_adopt_weights(br_mpc *mpc) {
 br_mpc_error br_mpc_set_weights(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]) {
     if (!mpc || !outputs) return BR_ERROR_NULL;
     if (!take_from(mpc, BR_SPARE_STAGED) && !take_from(mpc, BR_SPARE_FREE)) return BR_ERROR_BUSY;
-    const br_mpc_error error = br_gp_load(&mpc->gp[!mpc->gp_in_use], outputs);
+    const br_mpc_error error = mpc->code->load(&mpc->gp[!mpc->gp_in_use], outputs);
     if (!error) exchange(mpc); /* else the weights in use stay */
     hand_over(mpc, BR_SPARE_FREE);
     return error;

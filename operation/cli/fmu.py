@@ -89,14 +89,6 @@ def export(
             metavar="DIR", show_default="built", help="Controller: folder of 'bayesrace build'."
         ),
     ] = None,
-    cpu: Annotated[
-        str,
-        typer.Option(
-            metavar="CPU",
-            help="Controller: CPU to build for. portable: any of this architecture; native: this "
-            "one, faster; or a value for the compiler's -march.",
-        ),
-    ] = "portable",
 ) -> None:
     """Write the car, or the controller of a track, as an FMU, C sources inside."""
     from bayesrace.vehicles import get_car
@@ -107,7 +99,6 @@ def export(
     if not controller:
         _only_for_controllers(
             track=track, raceline=raceline, weights=weights, settings=settings, artefact=artefact,
-            cpu=None if cpu == "portable" else cpu,
         )  # fmt: skip
         definition = car_fmu(parameters, number, kind.value)
     elif kind is Kind.me:
@@ -115,7 +106,7 @@ def export(
     else:
         definition = _controller(
             parameters, track or parameters.race_track, raceline=raceline, weights=weights,
-            settings=settings, artefact=artefact, version=number, cpu=cpu,
+            settings=settings, artefact=artefact, version=number,
         )  # fmt: skip
     pack(definition, out, platform)
     typer.echo(f"{definition.name}, FMI {number}.0 {kind.value}: {out}")
@@ -136,7 +127,6 @@ def _controller(
     settings: Path | None,
     artefact: Path | None,
     version: Literal[2, 3],
-    cpu: str,
 ) -> "FmuDefinition":
     from bayesrace.gp.weights import read_weights
     from bayesrace.manifest import read_manifest
@@ -159,7 +149,6 @@ def _controller(
         fallback=FallbackSettings().model_dump() | {"brake_fade_mps": car.brake_fade_mps},
         weights=None if weights is None else read_weights(weights),
         version=version,
-        cpu=cpu,
     )
 
 

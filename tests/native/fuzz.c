@@ -105,6 +105,16 @@ static const br_mpc_parameters usual = {
 static br_mpc_parameters parameters;
 static double x[BR_NX], before[BR_NU];
 
+/* The same for all, whose answers must agree to the bit. */
+static void set_instructions(controller *c, int count) {
+    const br_instructions wanted = byte() % 4;
+    for (int i = 0; i < count; ++i) {
+        const br_mpc_error error = br_mpc_set_instructions(c[i].mpc, wanted);
+        CHECK(error == BR_OK || error == BR_ERROR_INSTRUCTIONS);
+        CHECK(br_mpc_get_instructions(c[i].mpc) == br_mpc_get_instructions(c[0].mpc));
+    }
+}
+
 static void set_parameters(controller *c, int count) {
     br_mpc_parameters p = usual;
     double *field = &p.q_position;
@@ -267,6 +277,8 @@ static void call(controller *c, int count) {
     case 3:
         if (what < 0x40)
             for (int i = 0; i < count; ++i) br_mpc_reset(c[i].mpc);
+        else
+            set_instructions(c, count);
         break;
     case 4:
         if (what & 0x40)
