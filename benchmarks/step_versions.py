@@ -3,13 +3,13 @@
     python -m benchmarks.step_versions OTHER_CHECKOUT [--passes 10] [--json FILE]
 
 Records drives of the present step on three tracks (those of ``bayesrace bench``), gives all
-problems, with their references, to a process of each checkout, and lets both solve them in turn,
-pass by pass: the whole step, and, in passes between, the feedback (the step after its preparation)
-and the preparation. Times are CPU times of the thread, so that other processes do not count, though
-a busy hyperthread beside does. A problem's time is the lower quintile of its passes, so that a
-stall of the machine does not count either. Where memory happens to lie makes some percent of
-difference from process to process: ratios, of this checkout over the other one, are medians over
-several pairs.
+problems, with their paths, to a process of each checkout, and lets both solve them in turn, pass by
+pass: the whole step, and, in passes between, the feedback (the step after its preparation) and the
+preparation, as in lockstep, and with the budget that the preparation has in real time. Times are
+CPU times of the thread, so that other processes do not count, though a busy hyperthread beside
+does. A problem's time is the lower quintile of its passes, so that a stall of the machine does not
+count either. Where memory happens to lie makes some percent of difference from process to process:
+ratios, of this checkout over the other one, are medians over several pairs.
 """
 
 import argparse
@@ -26,13 +26,19 @@ from rich.console import Console
 from bayesrace.gp.weights import encode_weights, read_weights
 from bayesrace.vehicles.models import dynamic
 from controller.assembly import compiled_controller
+from controller.path_table import make_path_table
 from operation.preparation import prepare
 from operation.terminal.progress import stages_on
 from plant.simulator import Simulator
 from studies.bench import BenchSettings
 
 ROOT = Path(__file__).resolve().parents[1]
-TIMES = ("step_us", "feedback_us", "prepare_us")
+TIMES = {
+    "whole": ("step_us",),
+    "prepared": ("feedback_us", "prepare_us"),
+    "budget": ("realtime_feedback_us", "realtime_prepare_us"),
+}
+"""By how the steps are prepared."""
 PERCENTILES = (50, 90, 99)
 
 # Runs in either checkout, so it may use only what both have.
@@ -45,6 +51,7 @@ from bayesrace.vehicles import get_car
 from codegen.build import build
 from codegen.settings import BuildSettings
 from controller.native_step import NativeStep
+from controller.path_table import PathTable
 from controller.settings import MpcSettings
 data = np.load(sys.argv[2])
 car = get_car(str(data["car"]))
@@ -55,26 +62,27 @@ def make(settings):
     step.set_weights(decode_weights(data["weights"].tobytes()))
     return step
 now = time.thread_time_ns
-def solve(step, prepared=False):
+def solve(step, how="whole"):
     times, preparation, inputs, good = [], [], [], []
-    for x, d, reference, first in zip(data["x"], data["d"], data["reference"], data["first"]):
-        if first:
+    for x, d, track in zip(data["x"], data["d"], data["track"]):
+        if track >= 0:
+            step.set_path(PathTable(data[f"path{track}"], float(data["spacing_m"])))
             step.reset()
-        if prepared:
+        if how != "whole":
             begin = now()
-            step.prepare()
+            step.prepare(0.02, 0.016 if how == "budget" else 0.0)
             preparation.append((now() - begin) * 1e-3)
         begin = now()
-        status = step.solve(x, d, reference)
+        status = step.step(x, d)
         times.append((now() - begin) * 1e-3)
         inputs.append(step.u.tolist())
         good.append(int(status))
-    return times, preparation, inputs, good
+    return [times, preparation][: 1 + (how != "whole")], inputs, good
 fast = make(MpcSettings(**known))
 solve(fast)
-print(json.dumps(solve(make(exact))[2:]), flush=True)
+print(json.dumps(solve(make(exact))[1:]), flush=True)
 for line in sys.stdin:
-    print(json.dumps(solve(fast, line == "prepared\\n")), flush=True)
+    print(json.dumps(solve(fast, line.strip())), flush=True)
 """
 
 
@@ -85,15 +93,17 @@ def record(problems: int, seed: int) -> dict[str, Any]:
     with stages_on(Console(stderr=True)) as stages:
         prepared = prepare(settings, settings.driven_on, stages)
     weights = read_weights(prepared.weights)
-    rows: dict[str, list[Any]] = {name: [] for name in ("x", "d", "reference", "first")}
-    for one in prepared.tracks:
+    rows: dict[str, Any] = {name: [] for name in ("x", "d", "track")}
+    for number, one in enumerate(prepared.tracks):
+        path = make_path_table(one.track, one.line, car.tuning.path.spacing_m)
+        rows |= {f"path{number}": path.rows, "spacing_m": path.spacing_m}
         controller = compiled_controller(prepared.artefacts[0], car, one.track, one.line, weights)
         step, simulator = controller.native, Simulator(dynamic(car))
         simulator.reset([*one.track.start_pose(), 1.0, 0.0, 0.0, 0.0])
         for k in range(problems // len(settings.driven_on)):
             x, d = simulator.x.copy(), simulator.u_applied[0]
             status = step.step(x, d)
-            for key, value in zip(rows, (x, d, step.read_reference(), k == 0), strict=True):
+            for key, value in (("x", x), ("d", d), ("track", -1 if k else number)):
                 rows[key].append(value)
             simulator.step(step.u.tolist() if status.usable else None)
     encoded = np.frombuffer(encode_weights(weights), dtype=np.uint8)
@@ -110,13 +120,13 @@ class _Worker:
         )
         self.inputs, self.converged = self._read()
 
-    def solve(self, how: str) -> tuple[list[float], list[float], list[list[float]], list[int]]:
-        """One pass, "whole" or "prepared": times and preparation [us], first inputs, statuses."""
+    def solve(self, how: str) -> tuple[list[list[float]], list[list[float]], list[int]]:
+        """One pass, of TIMES: its times [us], first inputs, statuses."""
         assert self._process.stdin is not None
         self._process.stdin.write(f"{how}\n")
         self._process.stdin.flush()
-        times, preparation, inputs, good = self._read()
-        return times, preparation, inputs, good
+        times, inputs, good = self._read()
+        return times, inputs, good
 
     def close(self) -> None:
         """Ends the process."""
@@ -131,17 +141,18 @@ class _Worker:
 
 
 def _passes(workers: dict[str, _Worker], passes: int) -> dict[str, Any]:
-    """Of each checkout, the times by name (passes, problems), and the first inputs that it gives
-    with their statuses, from the last pass."""
-    found: dict[str, Any] = {name: {kind: [] for kind in TIMES} for name in workers}
+    """Of each checkout, the times by name (passes, problems), and by how it was prepared the first
+    inputs that it gives with their statuses, from the last pass."""
+    found: dict[str, Any] = {name: {} for name in workers}
     for number in range(passes):
         for name in list(workers)[:: 1 if number % 2 else -1]:
-            step, _, inputs, good = workers[name].solve("whole")
-            feedback, prepare, *prepared = workers[name].solve("prepared")
-            assert prepared == [inputs, good], "the preparation has changed a step"
-            for kind, took in zip(TIMES, (step, feedback, prepare), strict=True):
-                found[name][kind].append(took)
-            found[name]["answers"] = np.array(inputs), np.array(good) <= 1
+            own, answers = found[name], {}
+            for how, kinds in TIMES.items():
+                times, *answers[how] = workers[name].solve(how)
+                for kind, took in zip(kinds, times, strict=True):
+                    own.setdefault(kind, []).append(took)
+                own[how] = np.array(answers[how][0]), np.array(answers[how][1]) <= 1
+            assert answers["prepared"] == answers["whole"], "the preparation has changed a step"
     return found
 
 
@@ -160,22 +171,27 @@ def measure(other: Path, problems: Path, passes: int) -> dict[str, Any]:
         "same_minimum": int(same.sum()),
         "exact_difference_same_minimum": float(apart[same].max()),
     }
-    answers = {name: found[name]["answers"][0] for name in workers}
+    answers = {name: found[name]["whole"][0] for name in workers}
     result["u0_difference"] = np.abs(answers["this"] - answers["other"]).max(axis=0).tolist()
     for name in workers:
-        inputs, good = found[name]["answers"]
-        error = np.abs(inputs - exact[name])[same & good]
-        result[name] = {
-            "u0_error": {f"p{q}": np.percentile(error, q, axis=0).tolist() for q in (95, 99)},
-            "usable": int(good.sum()),
-        }
-        for kind in TIMES:
+        result[name] = {}
+        for label, how in (("", "whole"), ("realtime_", "budget")):
+            inputs, good = found[name][how]
+            error = np.abs(inputs - exact[name])[same & good]
+            result[name] |= {
+                f"{label}u0_error": {
+                    f"p{q}": np.percentile(error, q, axis=0).tolist() for q in (95, 99)
+                },
+                f"{label}usable": int(good.sum()),
+            }
+        for kind in (kind for kinds in TIMES.values() for kind in kinds):
             us = np.percentile(found[name][kind], 20, axis=0)
             result[name][kind] = {f"p{q}": float(np.percentile(us, q)) for q in PERCENTILES}
         workers[name].close()
     result["ratio"] = {
         kind: {q: us / result["other"][kind][q] for q, us in result["this"][kind].items()}
-        for kind in TIMES
+        for kinds in TIMES.values()
+        for kind in kinds
     }
     return result
 

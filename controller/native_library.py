@@ -8,6 +8,7 @@ import struct
 from collections import namedtuple
 from collections.abc import Iterable, Mapping
 from enum import IntEnum
+from mmap import ACCESS_COPY, mmap
 from pathlib import Path
 from typing import Any, Final
 
@@ -38,8 +39,6 @@ __all__ = [
     "aligned_memory",
     "parameters_type",
 ]
-
-_ALIGNMENT: Final = 64
 
 
 class StepStatus(IntEnum):
@@ -117,10 +116,12 @@ class Layout:
 
 
 def aligned_memory(size: int) -> tuple[Any, ct.c_void_p]:
-    """A block for an object of the library, and the address of its aligned part."""
-    block = ct.create_string_buffer(size + _ALIGNMENT)
-    start = -ct.addressof(block) % _ALIGNMENT
-    return block, ct.c_void_p(ct.addressof(block) + start)
+    """A block for an object of the library, zeros, and its address.
+
+    Of pages of its own: those that nobody writes, as for weights of more points, take no memory.
+    """
+    block = (ct.c_char * size).from_buffer(mmap(-1, size, access=ACCESS_COPY))
+    return block, ct.c_void_p(ct.addressof(block))
 
 
 class Gp(ct.Structure):

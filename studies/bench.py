@@ -46,6 +46,9 @@ __all__ = ["BenchResult", "BenchSettings", "run_bench"]
 _NOMINAL: Final = MpcSettings(caution=0.0)
 """The problem that IPOPT and acados solve knows no uncertainty."""
 
+_PREPARATION_S: Final = 0.8 * PLANT.step_s
+"""Budget of a preparation in real time."""
+
 _CONVERGED: Final = MpcSettings(
     caution=0.0, iterations=100, iterations_cold=100, tolerance=1e-9, early_stop_tol=0
 )
@@ -256,7 +259,7 @@ class _Recorder:
         begin_ns = time.perf_counter_ns()
         self._prepared.step(x, u_previous, elapsed_s=elapsed_s, budget_s=budget_s)
         recording.feedback_us.append((time.perf_counter_ns() - begin_ns) * 1e-3)
-        self._prepared.prepare()
+        self._prepared.prepare(elapsed_s, _PREPARATION_S)
         recording.second_starts += step.info.second_start > 0
         other = converged.step(x, u_previous, elapsed_s=elapsed_s)
         converged.read_plan()

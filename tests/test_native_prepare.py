@@ -1,11 +1,13 @@
 """The preparation phase: saves the step time, and changes nothing else."""
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from bayesrace.arrays import Floats
 from bayesrace.gp.weights import GpWeights
 from bayesrace.vehicles import CarParameters
 from controller.native_step import NativeStep
@@ -16,6 +18,15 @@ from tests.test_native_time import TS, Clock, Make, make, residual, solve
 __all__ = ["make"]  # the fixture
 
 DEFAULTS = {name: getattr(MpcSettings(), name) for name in ("early_stop_tol", "iterations")}
+
+
+@dataclass
+class Drive:
+    """What was asked and answered."""
+
+    x: list[tuple[Floats, float]] = field(default_factory=list)
+    u: list[Floats] = field(default_factory=list)
+    iterations: list[int] = field(default_factory=list)
 
 
 def result(step: NativeStep) -> bytes:
@@ -177,6 +188,56 @@ def test_the_preparation_ends_within_its_budget(
         assert clock.now_s - begin_s <= most * 1e-3
     assert max(done) >= 2
     assert min(done) == 0
+
+
+def drive(step: NativeStep, circuit: Circuit, budget_s: float) -> Drive:
+    """A lap of a car as the model has it, in which each step is prepared with this budget."""
+    step.set_path(circuit.table)
+    x, d, seen = circuit.start(), 0.0, Drive()
+    for _ in range(150):
+        assert step.step(x, d).usable
+        seen.iterations.append(step.info.iterations)
+        seen.x.append((x, d))
+        seen.u.append(step.u.copy())
+        step.prepare(TS, budget_s)
+        d, x = float(step.u[0]), step.predict(x, step.u, TS).copy()
+    return seen
+
+
+def test_with_a_budget_the_next_problem_is_solved_ahead(make: Make, circuit: Circuit) -> None:
+    """So that nearly all steps need one iteration, from a start nearer to the solution."""
+    ahead, plain = (drive(make(**DEFAULTS), circuit, budget_s) for budget_s in (0.1, 0.0))
+    more = [np.mean(np.array(one.iterations[5:]) > 1) for one in (ahead, plain)]
+    assert more[0] < 0.05 < 0.1 < more[1]
+    error = []
+    for one in (ahead, plain):
+        exact = make(iterations=60, iterations_cold=60, early_stop_tol=0, tolerance=1e-10)
+        exact.set_path(circuit.table)
+        solutions = []
+        for x, d in one.x:
+            exact.step(x, d)
+            solutions.append(exact.u.copy())
+        error.append(np.percentile(np.abs(np.array(solutions) - one.u)[:, 1], 95))
+    assert error[0] < 0.5 * error[1]
+
+
+@pytest.mark.parametrize("elapsed_s", [0.0, 2 * TS, 0.39])
+def test_what_was_solved_ahead_and_does_not_come_does_no_harm(
+    make: Make, circuit: Circuit, elapsed_s: float
+) -> None:
+    """Sooner, the plan is the one before; later, that of the problem ahead goes on."""
+    ahead, plain = make(), make()
+    for step in (ahead, plain):
+        Clock(step, 1e-6)
+        drive(step, circuit, 0.0)
+        x, d = circuit.start(3.0, 1.5), 0.3
+        step.step(x, d)
+        if step is ahead:
+            step.prepare(TS, 1.0)
+        assert step.step(x, d, elapsed_s=elapsed_s).usable
+    if elapsed_s == 0:
+        assert result(ahead) == result(plain)
+    np.testing.assert_allclose(ahead.u, plain.u, rtol=0, atol=0.05)
 
 
 def test_without_a_plan_there_is_nothing_to_prepare(

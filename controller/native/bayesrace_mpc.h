@@ -148,10 +148,12 @@ BR_API br_mpc_error br_mpc_solve(br_mpc *mpc, const double x[BR_NX], const doubl
 
 /* The preparation phase of the next step, between two steps: shifts the plan for the elapsed_s
  * that is expected, linearises there, and does what of the QP depends neither on the next state nor
- * on its reference. With budget_s (and a clock) it iterates the last problem on first, towards
- * tolerance, keeping what lowers the residuals. Never needed: with no budget, the step returns the
- * same to the last bit without it, also if the real elapsed_s, the weights or the parameters turn
- * out to be others. Does nothing if there is no plan. */
+ * on its reference. With budget_s (and a clock) it first solves the next problem as it is foreseen,
+ * from the state that the plan predicts, towards tolerance, and looks for another local minimum of
+ * it, so that the step has little left to do; after br_mpc_solve, whose next reference is the
+ * caller's, the last problem. Never needed: with no budget, the step returns the same to the last
+ * bit without it, also if the real elapsed_s, the weights or the parameters turn out to be others.
+ * Does nothing if there is no plan. */
 BR_API br_mpc_error br_mpc_prepare(br_mpc *mpc, double elapsed_s, double budget_s);
 
 /* Where the corrected model takes x within duration_s (0 to BR_PREDICT_MAX_S) under input u, both

@@ -9,7 +9,9 @@ br_mpc_error br_mpc_init(void *memory, size_t size, br_mpc **out) {
     if (!memory || !out) return BR_ERROR_NULL;
     if (size < sizeof(br_mpc) || (uintptr_t)memory % 64) return BR_ERROR_MEMORY;
     br_mpc *mpc = memory;
-    memset(mpc, 0, sizeof *mpc);
+    memset(mpc, 0, offsetof(br_mpc, gp));
+    br_gp_clear(&mpc->gp[0]);
+    br_gp_clear(&mpc->gp[1]);
     br_qp_init(&mpc->qp);
     br_weights_init(mpc);
     mpc->caution.pace = 1;

@@ -282,6 +282,16 @@ static int load(br_gp_output *out, const br_mpc_gp *in) {
            br_all_finite(out->inverse_scale, BR_NZ);
 }
 
+/* No residual, and an unknown uncertainty. The arrays are written when they are filled, so that
+ * memory for points that never come is not taken from the system. */
+void br_gp_clear(br_gp *gp) {
+    gp->any = gp->uncertain = 0;
+    for (int j = 0; j < BR_NE; ++j) {
+        memset(&gp->output[j], 0, offsetof(br_gp_output, inputs));
+        memset(&gp->variance[j], 0, offsetof(br_gp_variance, inputs));
+    }
+}
+
 br_mpc_error br_gp_load(br_gp *gp, const br_mpc_gp outputs[BR_NE]) {
     for (int j = 0; j < BR_NE; ++j)
         if (!valid(&outputs[j])) return BR_ERROR_WEIGHTS;

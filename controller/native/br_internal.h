@@ -35,6 +35,9 @@
 /* Training points that the posterior variance is exact with: the memory for it grows with the
  * square. */
 #define BR_GP_ROOT (BR_GP_CAPACITY < 512 ? (BR_GP_CAPACITY + 7) / 8 * 8 : 512)
+#define BR_ROOT_TILE 8 /* rows of a triangular matrix that are stored together */
+#define BR_ROOT_SIZE(n) \
+    ((n) * ((n) + BR_ROOT_TILE) / 2)      /* numbers of n rows, whole tiles of them */
 #define BR_COLUMNS 8                      /* stages whose correlations are at hand at a time */
 #define BR_GP_FIRST ((1 + BR_NZ + 7) / 8) /* groups of eight columns for 1 and the inputs ... */
 #define BR_GP_SECOND ((BR_NZ * (BR_NZ + 1) / 2 + 7) / 8) /* ... and for their products */
@@ -44,9 +47,9 @@ typedef struct {
     int kernel, n_padded;
     double offset;
     double inverse_scale[BR_NZ], middle[BR_NZ]; /* z * inverse_scale - middle is what is in ... */
+    double reach;                               /* length of the longest input */
     BR_ALIGNED double inputs[BR_NZ][BR_GP_PADDED];
     BR_ALIGNED double alpha[BR_GP_PADDED];   /* signal scale folded in */
-    double reach;                            /* length of the longest input */
     BR_ALIGNED double squares[BR_GP_PADDED]; /* of the length of the inputs, times -log2(e) / 2 */
     BR_ALIGNED double columns[BR_GP_FIRST + BR_GP_SECOND][BR_GP_PADDED][8];
 } br_gp_output;
@@ -56,7 +59,7 @@ typedef struct {
     int kernel, count;    /* training points that count */
     double signal, noise; /* variances; signal 0: not known */
     double inputs[BR_NZ][BR_GP_ROOT];
-    BR_ALIGNED double root[BR_GP_ROOT][BR_GP_ROOT];
+    BR_ALIGNED double root[BR_ROOT_SIZE(BR_GP_ROOT)];
 } br_gp_variance;
 
 typedef struct br_gp {
@@ -190,7 +193,6 @@ struct br_mpc {
     br_mpc_parameters parameters;
     int has_parameters;
     br_path path;
-    br_gp gp[2];
     int gp_in_use; /* written by the thread that has taken the spare buffer, in the control thread
                     */
     atomic_int spare;
@@ -199,6 +201,7 @@ struct br_mpc {
     double u_lower[BR_NU], u_upper[BR_NU];
     double x0[BR_NX];
     br_mpc_reference reference[BR_N];
+    int own_reference; /* of the caller's planner */
     int follows;   /* the reference is where the plan is on the line, not points to track, ... */
     int followed;  /* ... and belongs to the plan at hand, ... */
     int first_row; /* ... of which the first stage is at this row of the path */
@@ -220,7 +223,8 @@ struct br_mpc {
     br_incumbent first; /* the plan that a second start has to beat */
     unsigned starts;    /* second ones in a row */
     unsigned futile;    /* tries in a row since one was better */
-    unsigned looks;     /* second starts of br_mpc_prepare */
+    unsigned looks;     /* second starts of br_mpc_prepare, ... */
+    int looked;         /* ... of which one was at the problem that comes */
     br_plan kept;       /* the plan, and the QP's working set, before those shifts */
     int kept_sense[BR_ROWS];
     double answer_x[BR_N + 1][BR_NX], answer_u[BR_N][BR_NU]; /* plan of the last step */
@@ -235,6 +239,7 @@ struct br_mpc {
     double merit;   /* ... beside its cost */
     double worth;   /* cost, to first order, once the defects are gone: costates price them */
     br_mpc_info info;
+    br_gp gp[2]; /* last: what of it no weights are loaded into is never touched */
 };
 
 /* br_gp.c */
@@ -246,6 +251,7 @@ BR_PART void br_gp_evaluate(const br_gp *gp, int stages, double (*z)[BR_NZ], br_
 BR_PART void br_gp_curvature(const br_gp *gp, int stages, double (*z)[BR_NZ], br_gp_row *kept,
                              const br_correction *const values[], double (*weight)[BR_NE],
                              double (*out)[BR_NZ][BR_NZ]);
+BR_PART void br_gp_clear(br_gp *gp);
 BR_PART void br_gp_mean(const br_gp *gp, const double z[BR_NZ], double mean[BR_NE]);
 BR_PART br_mpc_error br_gp_load(br_gp *gp, const br_mpc_gp outputs[BR_NE]);
 

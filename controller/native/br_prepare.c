@@ -31,7 +31,7 @@ void br_undo_preparation(br_mpc *mpc) {
         mpc->linearised = mpc->qp.factorised = mpc->qp.evaluated = mpc->followed = 0;
         mpc->caution.known = 0;
     }
-    mpc->ahead = 0;
+    mpc->ahead = mpc->looked = 0;
 }
 
 /* Of other weights or code; the preparation's new last stage was predicted with those before. */
@@ -46,15 +46,34 @@ static double iteration_and_rest(const br_timer *timer) {
     return 2 * timer->iteration + timer->caution;
 }
 
-/* Further iterations at the last problem, towards tolerance. Returns whether there may be time
- * left. */
-static int improve(br_mpc *mpc) {
+/* The next problem as far as it can be told: from the state that the plan predicts after so many
+ * shifts, with the input before it and the line's reference there. Without a shift, the last one.
+ */
+static void foresee(br_mpc *mpc, double elapsed, int shifts) {
+    memcpy(mpc->reference, mpc->answer_reference, sizeof mpc->reference);
+    if (shifts) {
+        memcpy(mpc->x0, mpc->plan.x[0], sizeof mpc->x0);
+        memcpy(mpc->u_before, mpc->answer_u[shifts - 1], sizeof mpc->u_before);
+    }
+#if BR_HAS_PATH
+    if (shifts && !mpc->follows) {
+        double lateral;
+        mpc->path.age += elapsed;
+        br_path_project(&mpc->path, mpc->x0, &lateral);
+        br_path_plan(&mpc->path, mpc->caution.pace, mpc->reference);
+    }
+#endif
+    mpc->followed = mpc->qp.evaluated = 0;
+    br_evaluate_bounds(mpc);
+    br_path_follow(mpc);
+}
+
+/* Iterations at the problem at hand, towards tolerance. Returns whether there may be time left. */
+static int improve(br_mpc *mpc, int shifts) {
     const br_timer *timer = &mpc->timer;
-    if (!(timer->iteration > 0)) return 0; /* no step has shown yet how long that takes */
-    if (!br_timer_allows(timer, br_timer_now(timer), iteration_and_rest(timer))) return 0;
-    if (!mpc->linearised) br_sqp_linearise(mpc);
     memset(&mpc->info, 0, sizeof mpc->info);
     mpc->penalty = 0;
+    if (shifts) br_caution_update(mpc); /* else it is that of the last step */
     br_residuals(mpc);
     br_mpc_status status = br_judge(mpc);
     br_incumbent_reset(mpc);
@@ -64,7 +83,7 @@ static int improve(br_mpc *mpc) {
     while (mpc->info.iterations < limit && (status == BR_ACCEPTABLE || status == BR_DEFECT)) {
         time = br_timer_allows(timer, br_timer_now(timer), iteration_and_rest(timer));
         if (!time) break;
-        status = br_sqp_iterate(mpc, 1, 0);
+        status = br_sqp_iterate(mpc, 1, shifts && mpc->info.iterations == 0);
         br_incumbent_keep(mpc, status, 1);
     }
     mpc->prepared_iterations += mpc->info.iterations;
@@ -72,11 +91,10 @@ static int improve(br_mpc *mpc) {
     return time;
 }
 
-/* Looks for a better local minimum of the last problem from another start, if there is time for
- * that and for what follows. */
+/* Looks for a better local minimum from another start, if there is time for that and for what
+ * follows. */
 static void look_elsewhere(br_mpc *mpc) {
     br_timer *timer = &mpc->timer;
-    if (mpc->turn) return;    /* there is one way to turn */
     if (mpc->follows) return; /* costs from different feet on the line do not compare */
     timer->deadline -= iteration_and_rest(timer);
     if (!br_timer_allows(timer, br_timer_now(timer), BR_SECOND_START_ITERATIONS * timer->iteration))
@@ -86,7 +104,34 @@ static void look_elsewhere(br_mpc *mpc) {
     br_residuals(mpc);
     const br_mpc_status status = br_judge(mpc);
     if (br_usable(status)) br_start_again(mpc, status, mpc->looks++);
+    mpc->looked = br_usable(status) && !mpc->own_reference;
     mpc->prepared_iterations += mpc->info.iterations;
+}
+
+/* Solves the problem that is foreseen, so that the step begins near its solution: the advanced-step
+ * real-time iteration (Nurkanovic, Zanelli, Albrecht, Diehl, "The advanced step real time iteration
+ * for NMPC", 2019). */
+static void solve_ahead(br_mpc *mpc, double elapsed, int shifts) {
+    const br_timer *timer = &mpc->timer;
+    if (mpc->turn) return;               /* its reference is made from the measured state */
+    if (!(timer->iteration > 0)) return; /* no step has shown yet how long one takes */
+    const double needed = iteration_and_rest(timer) + (shifts ? timer->caution : 0);
+    if (!br_timer_allows(timer, br_timer_now(timer), needed)) return;
+    if (!mpc->linearised) br_sqp_linearise(mpc);
+    double x0[BR_NX], u_before[BR_NU];
+    const double s = mpc->path.s, age = mpc->path.age;
+    const int known = mpc->path.known;
+    memcpy(x0, mpc->x0, sizeof x0);
+    memcpy(u_before, mpc->u_before, sizeof u_before);
+    foresee(mpc, elapsed, shifts);
+    if (improve(mpc, shifts)) look_elsewhere(mpc);
+    mpc->caution.known = mpc->qp.evaluated = 0;
+    if (!mpc->linearised) br_sqp_linearise(mpc);
+    memcpy(mpc->x0, x0, sizeof x0);
+    memcpy(mpc->u_before, u_before, sizeof u_before);
+    mpc->path.s = s;
+    mpc->path.age = age;
+    mpc->path.known = known;
 }
 
 br_mpc_error br_prepare(br_mpc *mpc, double elapsed_s, double budget_s) {
@@ -95,12 +140,15 @@ br_mpc_error br_prepare(br_mpc *mpc, double elapsed_s, double budget_s) {
     if (!(elapsed_s >= 0 && isfinite(elapsed_s))) return BR_ERROR_TIME;
     double lag = mpc->lag + elapsed_s;
     if (!mpc->warm || lag >= BR_HORIZON_S) return BR_OK;
-    if (!mpc->ahead && mpc->timer.limited && improve(mpc)) look_elsewhere(mpc);
-    if (!mpc->ahead) {
+    const int first = !mpc->ahead, shifts = br_shifts_due(&lag);
+    const int ahead = first && mpc->timer.limited, known = !mpc->own_reference;
+    if (ahead && !known) solve_ahead(mpc, elapsed_s, 0); /* the next reference is the caller's */
+    if (first) {
         mpc->kept = mpc->plan;
         memcpy(mpc->kept_sense, mpc->qp.sense, sizeof mpc->kept_sense);
     }
-    br_align(mpc, br_shifts_due(&lag));
+    br_align(mpc, shifts);
+    if (ahead && known) solve_ahead(mpc, elapsed_s, shifts);
     br_path_follow(mpc);
     br_caution_update(mpc);
     if (!mpc->qp.factorised) br_qp_factorise(mpc);

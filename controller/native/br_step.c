@@ -71,9 +71,11 @@ static br_mpc_status iterate(br_mpc *mpc, int warm, int most) {
  * exact Hessian is indefinite, or Newton's steps had to be shortened. Typically the horizon has
  * reached a bend for which the plan is too fast: the tyres slide, and neither more nor less
  * steering helps. Such a plan satisfies every residual and costs more with each step. A plan that
- * maximises progress is always near that, and no sign of anything. */
+ * maximises progress is always near that, and no sign of anything; nor is one that the preparation
+ * has compared with that of another start. */
 static int doubtful(const br_mpc *mpc, br_mpc_status status) {
-    return ((mpc->qp.regularised || mpc->info.shortened) && !mpc->follows) || !br_usable(status);
+    const int sign = (mpc->qp.regularised || mpc->info.shortened) && !mpc->follows && !mpc->looked;
+    return sign || !br_usable(status);
 }
 
 /* Whether to try: where nothing has been better for long, as with a model that is wrong all over,
@@ -146,6 +148,7 @@ static void solve(br_mpc *mpc, double u[BR_NU], br_mpc_status *status, br_mpc_in
         mpc->attempts += 1;
     else if (mpc->warm)
         mpc->attempts = 0;
+    mpc->looked = 0;
     mpc->warm = good || unfinished; /* another bad plan is no start for the next step */
     mpc->unfinished = unfinished ? mpc->unfinished + mpc->info.iterations : 0;
     memcpy(mpc->answer_x, mpc->plan.x, sizeof mpc->answer_x);
@@ -236,6 +239,7 @@ br_mpc_error br_step(br_mpc *mpc, const double x[BR_NX], const double u_before[B
 #if BR_HAS_PATH
     br_path_project(&mpc->path, x, &mpc->info.lateral_m);
     plan_reference(mpc);
+    mpc->own_reference = 0;
     mpc->info.s_ref_m = mpc->path.s;
 #endif
     solve(mpc, u, status, info);
@@ -252,6 +256,7 @@ br_mpc_error br_solve(br_mpc *mpc, const double x[BR_NX], const double u_before[
     if (error || !plausible) return error;
     memcpy(mpc->reference, reference, sizeof mpc->reference);
     mpc->turn = mpc->follows = 0;
+    mpc->own_reference = 1;
     solve(mpc, u, status, info);
     return BR_OK;
 }

@@ -13,20 +13,15 @@
 #include "br_internal.h"
 #include "br_kernel.h"
 
-#define COLUMNS BR_COLUMNS             /* queries that a tile of the product has, and ... */
-#define VECTORS (COLUMNS / BR_LANES)   /* ... vectors of them, ... */
-#define ROWS (8 / VECTORS < 4 ? 4 : 8) /* ... and rows of W: as much as the registers hold */
-#define LEAST_PIVOT 1e-13              /* of a correlation matrix: below it a point adds nothing */
+#define VECTORS (BR_COLUMNS / BR_LANES)       /* that a row of a tile has */
+#define ROWS (VECTORS > 2 ? 4 : BR_ROOT_TILE) /* of W at a time: as much as the registers hold */
+#define LEAST_PIVOT 1e-13 /* of a correlation matrix: below it a point adds nothing */
 
-_Static_assert(BR_GP_ROOT % ROWS == 0, "a tile holds whole rows");
-
-typedef double matrix_row[BR_GP_ROOT];
-
-/* Correlations of COLUMNS queries with so many training points from one on, a row each. */
+/* Correlations of BR_COLUMNS queries with so many training points from one on, a row each. */
 static inline __attribute__((always_inline)) void query_by(const int kind, const br_gp_variance *v,
                                                            int first, int rows,
-                                                           double q[BR_NZ][COLUMNS],
-                                                           double (*restrict k)[COLUMNS]) {
+                                                           double q[BR_NZ][BR_COLUMNS],
+                                                           double (*restrict k)[BR_COLUMNS]) {
     for (int i = 0; i < rows; ++i) BR_UNROLL
     for (int p = 0; p < VECTORS; ++p) {
         br_vec r2 = {0};
@@ -39,8 +34,8 @@ static inline __attribute__((always_inline)) void query_by(const int kind, const
     }
 }
 
-static void query(const br_gp_variance *v, int first, int rows, double q[BR_NZ][COLUMNS],
-                  double (*k)[COLUMNS]) {
+static void query(const br_gp_variance *v, int first, int rows, double q[BR_NZ][BR_COLUMNS],
+                  double (*k)[BR_COLUMNS]) {
     switch (v->kernel) {
     case BR_KERNEL_RBF:
         query_by(BR_KERNEL_RBF, v, first, rows, q, k);
@@ -66,48 +61,86 @@ static void choose(const br_gp_output *gp, int count, br_gp_variance *v) {
     }
 }
 
-/* K + noise I, its upper triangle. */
-static void correlate(const br_gp_variance *v, double noise, matrix_row *m) {
-    const int n = v->count;
-    for (int left = 0; left < n; left += COLUMNS) {
-        BR_ALIGNED double q[BR_NZ][COLUMNS], k[1][COLUMNS];
-        for (int a = 0; a < BR_NZ; ++a)
-            for (int c = 0; c < COLUMNS; ++c) q[a][c] = left + c < n ? v->inputs[a][left + c] : 0;
-        for (int i = 0; i < n && i < left + COLUMNS; ++i) {
-            query(v, i, 1, q, k);
-            for (int c = 0; c < COLUMNS && left + c < n; ++c)
-                if (left + c > i) m[i][left + c] = k[0][c];
-        }
-    }
-    for (int i = 0; i < n; ++i) m[i][i] = 1.0 + noise;
+/* Rows of a triangular matrix from one of BR_ROOT_TILE rows on, column by column: (i, j) is [j][i %
+ * BR_ROOT_TILE]. */
+typedef double tile_column[BR_ROOT_TILE];
+
+static tile_column *rows_from(br_gp_variance *v, int first) {
+    return (tile_column *)&v->root[BR_ROOT_SIZE(first)];
 }
 
-/* The upper triangle becomes U with U'U = it. A point that is as good as a combination of others
- * gets a row of zeros: it is left out. */
-static void factorise(int n, matrix_row *m) {
-    for (int k = 0; k < n; ++k) {
-        const double pivot = m[k][k];
-        const double scale = pivot > LEAST_PIVOT ? 1.0 / sqrt(pivot) : 0.0;
-        for (int j = k; j < n; ++j) m[k][j] *= scale;
-        for (int i = k + 1; i < n; ++i) {
-            const double factor = m[k][i];
-            for (int j = i; j < n; ++j) m[i][j] -= factor * m[k][j];
+/* K + noise I, its rows of one tile up to the diagonal; 0 after it and for rows that are none. */
+static void correlate(const br_gp_variance *v, double noise, int first, tile_column *m) {
+    BR_ALIGNED double q[BR_NZ][BR_COLUMNS];
+    for (int a = 0; a < BR_NZ; ++a)
+        for (int c = 0; c < BR_ROOT_TILE; ++c) q[a][c] = v->inputs[a][first + c];
+    query(v, 0, first + BR_ROOT_TILE, q, m);
+    for (int j = 0; j < first + BR_ROOT_TILE; ++j)
+        for (int c = 0; c < BR_ROOT_TILE; ++c)
+            if (first + c >= v->count || j > first + c)
+                m[j][c] = 0;
+            else if (j == first + c)
+                m[j][c] = 1.0 + noise;
+}
+
+/* total[c] -= sum_k rows[k] factors[next k + across c] of so many k, for the columns of a tile. */
+static inline __attribute__((always_inline)) void subtract(int count, const tile_column *rows,
+                                                           const double *factors, const int next,
+                                                           const int across, tile_column *total) {
+    br_vec sum[BR_ROOT_TILE][VECTORS];
+    BR_UNROLL
+    for (int c = 0; c < BR_ROOT_TILE; ++c) BR_UNROLL
+    for (int p = 0; p < VECTORS; ++p) sum[c][p] = br_load(&total[c][BR_LANES * p]);
+    for (int k = 0; k < count; ++k) BR_UNROLL
+    for (int p = 0; p < VECTORS; ++p) {
+        const br_vec row = br_load(&rows[k][BR_LANES * p]);
+        BR_UNROLL
+        for (int c = 0; c < BR_ROOT_TILE; ++c) sum[c][p] -= factors[next * k + across * c] * row;
+    }
+    BR_UNROLL
+    for (int c = 0; c < BR_ROOT_TILE; ++c) BR_UNROLL
+    for (int p = 0; p < VECTORS; ++p) br_store(&total[c][BR_LANES * p], sum[c][p]);
+}
+
+/* Rows of the Cholesky factor L in place of those of the matrix, given the rows before. A point
+ * that is as good as a combination of others gets a column of zeros: it is left out. */
+static void factorise(br_gp_variance *v, int first, tile_column *m) {
+    for (int left = 0; left <= first; left += BR_ROOT_TILE) {
+        const tile_column *above = rows_from(v, left);
+        subtract(left, m, above[0], BR_ROOT_TILE, 1, m + left);
+        for (int j = 0; j < BR_ROOT_TILE; ++j) { /* the triangle at the diagonal */
+            double *column = m[left + j];
+            for (int k = 0; k < j; ++k)
+                for (int c = 0; c < BR_ROOT_TILE; ++c)
+                    column[c] -= above[left + k][j] * m[left + k][c];
+            double pivot = above[left + j][j];
+            if (left == first) pivot = column[j] > LEAST_PIVOT ? sqrt(column[j]) : 0.0;
+            const double scale = pivot > 0 ? 1.0 / pivot : 0.0;
+            for (int c = 0; c < BR_ROOT_TILE; ++c)
+                column[c] = left + j <= first + c ? column[c] * scale : 0.0;
         }
     }
 }
 
-/* The lower triangle, zero before, becomes W = (U')^-1; then the upper one zero. */
-static void invert(int n, matrix_row *m) {
-    for (int i = 0; i < n; ++i) {
-        const double scale = m[i][i] > 0 ? 1.0 / m[i][i] : 0.0;
-        for (int k = 0; k < i; ++k) {
-            const double factor = scale * m[k][i];
-            for (int j = 0; j <= k; ++j) m[i][j] -= factor * m[k][j];
+/* Rows of W = L^-1 in place of those of L, given the rows of W before. */
+static void invert(br_gp_variance *v, int first, tile_column *m) {
+    BR_ALIGNED tile_column diagonal[BR_ROOT_TILE];
+    memcpy(diagonal, m + first, sizeof diagonal);
+    for (int left = 0; left <= first; left += BR_ROOT_TILE) {
+        BR_ALIGNED tile_column right[BR_ROOT_TILE] = {{0}};
+        if (left == first)
+            for (int c = 0; c < BR_ROOT_TILE; ++c) right[c][c] = 1;
+        for (int k = left; k < first; k += BR_ROOT_TILE) /* the columns that W has above */
+            subtract(BR_ROOT_TILE, m + k, rows_from(v, k)[left], 1, BR_ROOT_TILE, right);
+        for (int i = 0; i < BR_ROOT_TILE; ++i) { /* forward substitution */
+            const double scale = diagonal[i][i] > 0 ? 1.0 / diagonal[i][i] : 0.0;
+            for (int c = 0; c < BR_ROOT_TILE; ++c) {
+                for (int k = 0; k < i; ++k) right[c][i] -= diagonal[k][i] * right[c][k];
+                right[c][i] *= scale;
+            }
         }
-        m[i][i] = scale;
+        memcpy(m + left, right, sizeof right);
     }
-    for (int i = 0; i < n; ++i)
-        for (int j = i + 1; j < n; ++j) m[i][j] = 0;
 }
 
 void br_variance_load(const br_gp_output *gp, const br_mpc_gp *in, br_gp_variance *v) {
@@ -116,52 +149,55 @@ void br_variance_load(const br_gp_output *gp, const br_mpc_gp *in, br_gp_varianc
     v->count = 0;
     if (!(v->signal > 0)) return;
     choose(gp, in->n, v);
-    for (int i = 0; i < (v->count + ROWS - 1) / ROWS * ROWS; ++i)
-        memset(v->root[i], 0, sizeof v->root[i]);
-    correlate(v, in->noise / in->signal, v->root);
-    factorise(v->count, v->root);
-    invert(v->count, v->root);
+    for (int first = 0; first < v->count; first += BR_ROOT_TILE) {
+        correlate(v, in->noise / in->signal, first, rows_from(v, first));
+        factorise(v, first, rows_from(v, first));
+    }
+    for (int first = 0; first < v->count; first += BR_ROOT_TILE)
+        invert(v, first, rows_from(v, first));
 }
 
 /* |W k|^2 of each column. */
-static void explain(const matrix_row *root, int rows, double (*restrict k)[COLUMNS],
-                    double explained[COLUMNS]) {
+static void explain(const br_gp_variance *v, double (*restrict k)[BR_COLUMNS],
+                    double explained[BR_COLUMNS]) {
     br_vec total[VECTORS] = {{0}};
-    for (int first = 0; first < rows; first += ROWS) {
-        br_vec t[ROWS][VECTORS] = {{{0}}};
-        for (int j = 0; j < first + ROWS; ++j) {
-            br_vec row[VECTORS];
-            BR_UNROLL
-            for (int p = 0; p < VECTORS; ++p) row[p] = br_load(&k[j][BR_LANES * p]);
+    for (int first = 0; first < v->count; first += BR_ROOT_TILE) {
+        const tile_column *restrict rows = (const tile_column *)&v->root[BR_ROOT_SIZE(first)];
+        for (int half = 0; half < BR_ROOT_TILE; half += ROWS) {
+            br_vec t[ROWS][VECTORS] = {{{0}}};
+            for (int j = 0; j < first + BR_ROOT_TILE; ++j) {
+                br_vec row[VECTORS];
+                BR_UNROLL
+                for (int p = 0; p < VECTORS; ++p) row[p] = br_load(&k[j][BR_LANES * p]);
+                BR_UNROLL
+                for (int i = 0; i < ROWS; ++i) BR_UNROLL
+                for (int p = 0; p < VECTORS; ++p) t[i][p] += rows[j][half + i] * row[p];
+            }
             BR_UNROLL
             for (int i = 0; i < ROWS; ++i) BR_UNROLL
-            for (int p = 0; p < VECTORS; ++p) t[i][p] += root[first + i][j] * row[p];
+            for (int p = 0; p < VECTORS; ++p) total[p] += t[i][p] * t[i][p];
         }
-        BR_UNROLL
-        for (int i = 0; i < ROWS; ++i) BR_UNROLL
-        for (int p = 0; p < VECTORS; ++p) total[p] += t[i][p] * t[i][p];
     }
     for (int p = 0; p < VECTORS; ++p) br_store(&explained[BR_LANES * p], total[p]);
 }
 
 void br_gp_variances(const br_gp *gp, int stages, double (*z)[BR_NZ], double (*work)[BR_COLUMNS],
                      double (*variance)[BR_NE]) {
-    _Static_assert(COLUMNS <= BR_COLUMNS, "the memory for correlations has room for a tile");
-    double (*k)[COLUMNS] = (double (*)[COLUMNS])work;
+    double (*k)[BR_COLUMNS] = work;
     for (int j = 0; j < BR_NE; ++j) {
         const br_gp_output *output = &gp->output[j];
         const br_gp_variance *v = &gp->variance[j];
-        const int rows = (v->count + ROWS - 1) / ROWS * ROWS;
-        for (int first = 0; first < stages; first += COLUMNS) {
-            BR_ALIGNED double q[BR_NZ][COLUMNS], explained[COLUMNS];
-            for (int c = 0; c < COLUMNS; ++c) { /* what fills the tile is the last stage again */
+        const int rows = (v->count + BR_ROOT_TILE - 1) / BR_ROOT_TILE * BR_ROOT_TILE;
+        for (int first = 0; first < stages; first += BR_COLUMNS) {
+            BR_ALIGNED double q[BR_NZ][BR_COLUMNS], explained[BR_COLUMNS];
+            for (int c = 0; c < BR_COLUMNS; ++c) { /* what fills the tile is the last stage again */
                 const double *at = z[first + c < stages ? first + c : stages - 1];
                 for (int a = 0; a < BR_NZ; ++a)
                     q[a][c] = at[a] * output->inverse_scale[a] - output->middle[a];
             }
             query(v, 0, rows, q, k);
-            explain(v->root, rows, k, explained);
-            for (int c = 0; c < COLUMNS && first + c < stages; ++c)
+            explain(v, k, explained);
+            for (int c = 0; c < BR_COLUMNS && first + c < stages; ++c)
                 variance[first + c][j] = v->signal * br_worse(0.0, 1.0 - explained[c]) + v->noise;
         }
     }
