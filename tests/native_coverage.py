@@ -23,6 +23,9 @@ OURS: Final = {
     for folder in ("controller/native", "controller/native/host", "codegen/fmu/native")
     for path in (ROOT / folder).glob("*.[ch]")
 }
+WITHOUT_CODE: Final = {"br_avx2.c", "br_avx512.c", "br_table.c"}
+"""They include the code of others, or name it."""
+
 TESTS: Final = (
     "native_", "turn", "fmu_controller", "fmu_export", "fmu_misuse", "driver", "fallback",
     "compensation", "c_host",
@@ -74,7 +77,7 @@ def main() -> None:
             lines[name][number] += line["count"]
             for index, branch in enumerate(line["branches"]):
                 branches[name][number, index] += branch["count"]
-    if unbuilt := sorted(name for name in OURS - set(lines) if name.endswith(".c")):
+    if unbuilt := sorted(name for name in OURS - WITHOUT_CODE - set(lines) if name.endswith(".c")):
         sys.exit(f"no test builds {', '.join(unbuilt)}")
     print(f"{'C source':26} {'lines':>12} {'branches':>12}  not executed")
     rows = [[0, 0, 0, 0]]
