@@ -31,6 +31,11 @@ __all__ = ["LapMaps", "draw_edges", "show_all"]
 
 
 _MARGIN_M: Final = 0.12
+_SCALE: Final = 0.85
+"""Beside a map, for its scale [inch]."""
+
+_TITLE: Final = 0.45
+"""Above a map [inch]."""
 
 
 class _Shade(NamedTuple):
@@ -84,16 +89,34 @@ class LapMaps:
         return self._figure(self.runs, 1 if len(self.runs) == 1 else 2)
 
     def _figure(self, runs: Sequence[DrivenRun], columns: int) -> Figure:
+        """Rows of maps, each with its scale, at fixed places: a layout by what is drawn would draw
+        everything twice."""
         rows = max(1, -(-len(runs) // columns))
         width, height = np.ptp(self._corners, axis=0) + 2 * _MARGIN_M
-        size = PANEL_WIDTH * columns, rows * (min((PANEL_WIDTH - 0.8) * height / width, 6.0) + 0.5)
-        figure = Figure(figsize=size, layout="constrained")
-        grid = figure.subplots(rows, columns, squeeze=False)
-        for axes in grid.flat:
+        wide = PANEL_WIDTH - _SCALE
+        tall = min(wide * height / width, 6.0)
+        size = PANEL_WIDTH * columns, rows * (tall + _TITLE)
+        figure = Figure(figsize=size)
+
+        def place(left: float, bottom: float, width: float, height: float) -> Axes:
+            x, y = left / size[0], bottom / size[1]
+            return figure.add_axes((x, y, width / size[0], height / size[1]))
+
+        for i, run in enumerate(runs):
+            left, bottom = i % columns * PANEL_WIDTH, (rows - 1 - i // columns) * (tall + _TITLE)
+            axes = place(left + 0.05, bottom + 0.05, wide, tall)
             axes.axis("off")
-        for axes, run in zip(grid.flat, runs, strict=False):
             self._draw(axes, run)
+            scale = place(left + 0.1 + wide, bottom + 0.05 + 0.2 * tall, 0.11, 0.6 * tall)
+            self._draw_scale(scale, self._shades[run])
         return figure
+
+    @staticmethod
+    def _draw_scale(axes: Axes, shade: _Shade) -> None:
+        bar = axes.figure.colorbar(
+            ScalarMappable(shade.norm, shade.colours), cax=axes, label=shade.label
+        )
+        bar.outline.set_visible(False)
 
     def _draw(self, axes: Axes, run: DrivenRun) -> None:
         draw_edges(axes, *self._edges)
@@ -114,9 +137,6 @@ class LapMaps:
         off = everything[run.off_track[counted]]
         axes.plot(off[:, 0], off[:, 1], "x", color=WARNING, markersize=3.6, zorder=5)
         show_all(axes, self._corners)
-        scale = ScalarMappable(shade.norm, shade.colours)
-        bar = axes.figure.colorbar(scale, ax=axes, label=shade.label, shrink=0.6, pad=0.01)
-        bar.outline.set_visible(False)
         colour = look(run.controller).colour
         time = f"{run.laps.times_s[0]:.3f} s" if run.finished else "did not finish"
         name = numbered(run.controller, run.number)
