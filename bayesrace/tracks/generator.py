@@ -46,7 +46,8 @@ def random_track(seed: int) -> Track:
     return Track.from_points(f"random:{seed}", points, width / 2, width / 2)
 
 
-def _candidate(rng: np.random.Generator, width: float) -> Floats | None:
+# Quoted: numpy loads np.random, 2 MB, when it is named, and a controller has no use for it.
+def _candidate(rng: "np.random.Generator", width: float) -> Floats | None:
     """One circuit, or None if its corners don't fit or it doesn't keep clear of itself."""
     outline = _outline(_grow(rng, int(rng.integers(7, 13))))
     if outline is None:
@@ -69,7 +70,7 @@ def _candidate(rng: np.random.Generator, width: float) -> Floats | None:
     return np.roll(points, round(0.3 * float(edge[longest]) / spacing), axis=0)
 
 
-def _grow(rng: np.random.Generator, size: int) -> set[Cell]:
+def _grow(rng: "np.random.Generator", size: int) -> set[Cell]:
     """``size`` joined cells, most of them in branches one cell wide."""
     cells: set[Cell] = {(int(rng.integers(_GRID[0])), int(rng.integers(_GRID[1])))}
     for _ in range(60 * size):
@@ -112,7 +113,7 @@ def _outline(cells: set[Cell]) -> list[Cell] | None:
     ]
 
 
-def _with_radii(rng: np.random.Generator, xy: Floats, width: float) -> list[Corner] | None:
+def _with_radii(rng: "np.random.Generator", xy: Floats, width: float) -> list[Corner] | None:
     """Corners rounded as far as their edges allow, at random; None if one must be too tight."""
     out = np.roll(xy, -1, axis=0) - xy
     into = np.roll(out, 1, axis=0)
