@@ -24,6 +24,7 @@ __all__ = [
     "ParameterInfo",
     "ProblemInfo",
     "check_library",
+    "check_owner",
     "read_manifest",
 ]
 
@@ -146,6 +147,7 @@ def check_library(artefact: Path, manifest: Manifest) -> Path:
 
 
 def check_owner(path: Path) -> None:
+    """InputError for a file of another user but root, or one that every user may write."""
     status = path.stat()
     if status.st_uid not in (os.geteuid(), _ROOT):
         raise InputError(

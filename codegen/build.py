@@ -15,7 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from bayesrace.cache import cache_folder, digest, locked, note_use, software
+from bayesrace.cache import cache_folder, digest, kept, locked, note_use, software
 from bayesrace.errors import InputError
 from bayesrace.manifest import (
     LIBRARY,
@@ -24,6 +24,7 @@ from bayesrace.manifest import (
     ParameterInfo,
     ProblemInfo,
     check_library,
+    check_owner,
     read_manifest,
 )
 from bayesrace.native_interface import ABI, c_interface
@@ -150,9 +151,35 @@ def _compile(problem: "Problem", settings: BuildSettings, compiler: Compiler, fo
     # its licence wants to go where its code goes
     shutil.copy(include / "licenses" / "daqp-external" / "LICENSE", folder / "daqp")
     shutil.copy(daqp, folder)
-    compiler.shared_library(
-        sorted(folder.glob("*.c")), [folder], [folder / daqp.name], folder / LIBRARY
-    )
+    (folder / LIBRARY).write_bytes(_library(compiler, folder, folder / daqp.name))
+
+
+def _library(compiler: Compiler, folder: Path, daqp: Path) -> bytes:
+    """The library of the sources in a folder; compiled once for all cars that share them, such as
+    those that differ in weights, margins or friction alone."""
+    files = sorted((*folder.rglob("*.[ch]"), daqp))
+    named = (part for file in files for part in (file.name, file.read_bytes()))
+    identity = digest((*compiler.command, compiler.version, *FLAGS, *named))
+
+    def make(path: Path) -> None:
+        compiler.shared_library(sorted(folder.glob("*.c")), [folder], [daqp], path)
+        data = path.read_bytes()
+        path.write_bytes(hashlib.sha256(data).digest() + data)
+
+    return kept(cache_folder() / f"library-{identity}", make, _read_library)
+
+
+def _read_library(path: Path) -> bytes:
+    """A library behind its SHA-256; InputError if it is absent, damaged or another user's."""
+    try:
+        check_owner(path)
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}") from None
+    seal, library = data[:32], data[32:]
+    if hashlib.sha256(library).digest() != seal:
+        raise InputError(f"{path} is damaged")
+    return library
 
 
 def build(

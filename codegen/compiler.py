@@ -6,6 +6,7 @@ import shlex
 import shutil
 import subprocess
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -53,25 +54,31 @@ class Compiler:
         flags: tuple[str, ...] = FLAGS,
         exports: str = "br_mpc_*; br_cycle_*",
     ) -> None:
-        """Compiles ``sources`` and links them with ``archives``; hides all symbols but ``exports``,
-        patterns with semicolons between."""
-        line = [
-            *self.command,
-            *flags,
-            *(f"-I{path}" for path in includes),
-            "-shared",
-            *(str(path) for path in sources),
-            *(str(path) for path in archives),
-            "-lm",
-            "-o",
-            str(out),
-        ]
-        if platform.system() == "Linux":
-            # A version script instead of --exclude-libs, which zig's linker does not know; -z defs,
-            # or a library that lacks a symbol would fail only when it is loaded.
-            script = sources[0].with_suffix(".map")
-            script.write_text(f"{{ global: {exports}; local: *; }};\n")
-            line += [f"-Wl,--version-script={script}", "-Wl,-z,defs"]
+        """Compiles ``sources``, as many at once as there are processors, and links them with
+        ``archives``; hides all symbols but ``exports``, patterns with semicolons between."""
+        seen = [f"-I{path}" for path in includes]
+        with (
+            tempfile.TemporaryDirectory(prefix="bayesrace-") as folder,
+            ThreadPoolExecutor(os.cpu_count() or 1) as pool,
+        ):
+            objects = [Path(folder) / f"{i}.o" for i in range(len(sources))]
+            compiled = [
+                pool.submit(self._run, *flags, *seen, "-c", source, "-o", target)
+                for source, target in zip(sources, objects, strict=True)
+            ]
+            for one in compiled:
+                one.result()
+            line: list[str | Path] = [*flags, "-shared", *objects, *archives, "-lm", "-o", out]
+            if platform.system() == "Linux":
+                # A version script instead of --exclude-libs, which zig's linker does not know;
+                # -z defs, or a library that lacks a symbol would fail only when it is loaded.
+                script = Path(folder) / "exports.map"
+                script.write_text(f"{{ global: {exports}; local: *; }};\n")
+                line += [f"-Wl,--version-script={script}", "-Wl,-z,defs"]
+            self._run(*line)
+
+    def _run(self, *arguments: str | Path) -> None:
+        line = [*self.command, *(str(one) for one in arguments)]
         done = subprocess.run(line, capture_output=True, text=True, check=False)
         if done.returncode:
             raise CompileError(f"{shlex.join(line)}\n{_shortened(done.stderr)}")

@@ -20,7 +20,7 @@ from bayesrace.integrators import PERFECT, PREDICTION, Discretisation
 from bayesrace.interpreter import RUN_MODULE
 from bayesrace.manifest import LIBRARY, MANIFEST, read_manifest
 from bayesrace.native_interface import ABI, INFO, STATUSES
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import MODELS
 from codegen.build import build, build_hash, generate
 from codegen.compiler import FLAGS, CompileError, Compiler, find_compiler
@@ -54,8 +54,13 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def contents(cache: Path) -> list[Path]:
-    """What the cache holds, but for its locks and the compilers that work."""
-    return [path for path in cache.iterdir() if path.name not in (".locks", ".compilers")]
+    """What the cache holds, but for its locks, the compilers that work and compiled libraries."""
+    others = (".locks", ".compilers")
+    return [
+        path
+        for path in cache.iterdir()
+        if path.name not in others and not path.name.startswith("library-")
+    ]
 
 
 @pytest.fixture
@@ -173,6 +178,31 @@ def test_the_chain_rule_gives_the_derivatives_of_the_whole(
             expected = np.asarray(ca.densify(b))
             size = np.abs(expected).max()
             np.testing.assert_allclose(np.asarray(a), expected, rtol=0, atol=1e-12 * size)
+
+
+def test_cars_that_differ_in_tuning_alone_share_a_library(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Compiling is what takes the time; a damaged library is compiled again."""
+    compiled: list[Path] = []
+    shared_library = Compiler.shared_library
+
+    def counted(compiler: Compiler, sources: list[Path], *rest: Any) -> None:
+        compiled.append(sources[0])
+        shared_library(compiler, sources, *rest)
+
+    monkeypatch.setattr(Compiler, "shared_library", counted)
+    own = get_car(SMALL.car)
+    folders = [
+        build(SMALL.model_copy(update={"car": own.model_copy(update={"friction": friction})}))[0]
+        for friction in (0.7, 0.8)
+    ]
+    assert len({*folders}) == 2
+    assert len(compiled) == 1
+    (library,) = cache.glob("library-*")
+    _cut(library)
+    build(SMALL.model_copy(update={"car": own.model_copy(update={"friction": 0.9})}))
+    assert len(compiled) == 2
 
 
 def test_a_compile_error_comes_with_the_compilers_words(tmp_path: Path) -> None:
