@@ -108,7 +108,7 @@ def generate(problem: "Problem", settings: BuildSettings, folder: Path) -> None:
 
     # CasADi derives the include guard from the name and writes into the working folder
     generator = ca.CodeGenerator(
-        "br_model.c", {"with_header": True, "casadi_int": "int", "with_export": True}
+        "br_model.c", {"with_header": True, "casadi_int": "int", "with_export": False}
     )
     for function in functions(problem):
         generator.add(function)

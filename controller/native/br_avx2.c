@@ -2,7 +2,6 @@
 #if defined(__x86_64__)
 #define BR_LANES 4
 #define BR_CODE br_code_avx2
-#define CODEGEN_PREFIX br_avx2_ /* of the functions that CasADi's need */
 
 #if defined(__clang__)
 #pragma clang attribute push(__attribute__((target("avx2,fma,bmi,bmi2,lzcnt,popcnt"))), \

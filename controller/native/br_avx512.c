@@ -2,7 +2,6 @@
 #if defined(__x86_64__)
 #define BR_LANES 8
 #define BR_CODE br_code_avx512
-#define CODEGEN_PREFIX br_avx512_ /* of the functions that CasADi's need */
 
 #if defined(__clang__)
 #pragma clang attribute push(                                                                     \

@@ -1,6 +1,4 @@
-/* All of the step once more, by br_avx2.c and br_avx512.c: see br_code.h. */
-#define CASADI_SYMBOL_EXPORT static
-#define CASADI_CODEGEN_PREFIX
+/* All of the step but the model, once more, by br_avx2.c and br_avx512.c: see br_code.h. */
 
 /* Compiled as if each were in a file of its own: inlined into each other, or copied for constant
  * arguments, which gcc does to functions of one file, second derivatives take a quarter longer. */
@@ -12,7 +10,6 @@
 
 #pragma GCC diagnostic ignored "-Wunused-function" /* part of it is for other files */
 
-#include "br_model.c"
 #include "br_caution.c"
 #include "br_condense.c"
 #include "br_gp.c"
