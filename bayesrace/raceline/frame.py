@@ -38,6 +38,9 @@ class Frame:
     n_min_m: Floats
     n_max_m: Floats
     length_m: float
+    """Of the lap, or of a path that is not closed."""
+    start_mps: float | None = None
+    """Speed at the first station of a path that ends at the last one; None: a closed lap."""
 
 
 def build_frame(track: Track, tuning: RacelineTuning, margin_m: float) -> Frame:

@@ -36,7 +36,7 @@ from bayesrace.vehicles.models import longitudinal_force, top_command
 from bayesrace.vehicles.parameters import CarParameters
 from bayesrace.vehicles.parts import GRAVITY_MPS2
 
-__all__ = ["CarLimits", "car_limits", "solve", "top_speed"]
+__all__ = ["CarLimits", "car_limits", "optimise", "solve", "top_speed"]
 
 _XI_MAX_RAD: Final = 1.2
 _ROUNDS: Final = 3
@@ -100,7 +100,7 @@ def solve(track: Track, car: CarParameters, settings: RaceLineSettings) -> RaceL
     extra, shares = 0.0, [1.0, _SLOWER]
     for _ in range(_ROUNDS):
         frame = build_frame(track, tuning, margin + extra)
-        path = _optimise(track.name, frame, limits, settings, shares)
+        path = optimise(track.name, frame, limits, settings, shares)
         line = sample_line(track, path, tuning.spacing_m)
         excess = float(np.max(track.project_path(line.xy_m).off_track_m)) + margin
         if excess <= tuning.tolerance_m:
@@ -130,9 +130,13 @@ def _following(x: Any) -> Any:
 
 
 def _problem(frame: Frame, limits: CarLimits) -> _Problem:
-    """Objective and constraints over x = [n, xi, E, kappa, a], each (N, 1)."""
+    """Objective and constraints over x = [n, xi, E, kappa, a], each (N, 1).
+
+    From the last station of a path that is not closed nothing leads to the first one.
+    """
     count = len(frame.kappa_radpm)
-    step = frame.length_m / count
+    intervals = count if frame.start_mps is None else count - 1
+    step = frame.length_m / intervals
     n, xi, energy, kappa, a = (ca.SX.sym(x, count) for x in ("n", "xi", "E", "kappa", "a"))
 
     x, y = (frame.xy_m[:, i] + n * frame.normal[:, i] for i in range(2))
@@ -147,35 +151,42 @@ def _problem(frame: Frame, limits: CarLimits) -> _Problem:
     ]
     v = ca.sqrt(energy)
     time = 2 * length / (_following(v) + v)
-    within = _car_within(limits, time, energy, kappa, a)
+    within = _car_within(limits, energy, kappa, a)
+    steered = _steered_within(limits, time, kappa)
     tuning = limits.car.tuning.raceline
     rough = tuning.rate_weight * (_following(a) - a) ** 2
     rough += tuning.curvature_weight * (_following(kappa) - kappa) ** 2
+    equal, steered = ([part[:intervals] for part in parts] for parts in (equal, steered))
+    limited = ca.vertcat(*within, *steered)
     return _Problem(
         x=ca.vertcat(n, xi, energy, kappa, a),
-        f=ca.sum1(time) + ca.sum1(rough) / step,
-        g=ca.vertcat(*(ca.vec(part) for part in equal + within)),
-        g_min=np.repeat([0.0] * len(equal) + [-np.inf] * len(within), count),
+        f=ca.sum1(time[:intervals]) + ca.sum1(rough[:intervals]) / step,
+        g=ca.vertcat(*equal, limited),
+        g_min=np.append(np.zeros(len(equal) * intervals), np.full(limited.numel(), -np.inf)),
         length=length,
     )
 
 
-def _car_within(limits: CarLimits, time: Any, energy: Any, kappa: Any, a: Any) -> list[Any]:
-    """What the car can do, as expressions that must be <= 0; all arguments (N, 1).
+def _car_within(limits: CarLimits, energy: Any, kappa: Any, a: Any) -> list[Any]:
+    """What the car can do at a station, as expressions (N, 1) that must be <= 0.
 
     The steering angle's limit is the bound on kappa.
     """
     car = limits.car
     v, ay = ca.sqrt(energy), kappa * energy
-    steering = limits.steering(kappa)
-    steered = _following(steering) - steering
     return [
         (ay / limits.grip_mps2) ** 2 + (a / limits.grip_mps2) ** 2 - 1,
-        a.T - limits.straight(v.T, car.d_max),
-        limits.straight(v.T, car.d_min) - a.T,
-        steered - car.delta_rate_max_radps * time,
-        -steered - car.delta_rate_max_radps * time,
+        a - limits.straight(v.T, car.d_max).T,
+        limits.straight(v.T, car.d_min).T - a,
     ]
+
+
+def _steered_within(limits: CarLimits, time: Any, kappa: Any) -> list[Any]:
+    """The limit of the steering rate between stations, as expressions (N, 1) that must be <= 0."""
+    steering = limits.steering(kappa)
+    steered = _following(steering) - steering
+    most = limits.car.delta_rate_max_radps * time
+    return [steered - most, -steered - most]
 
 
 def _bounds(frame: Frame, limits: CarLimits, v_max: float) -> tuple[Floats, Floats]:
@@ -183,9 +194,12 @@ def _bounds(frame: Frame, limits: CarLimits, v_max: float) -> tuple[Floats, Floa
     one = np.ones(len(frame.kappa_radpm))
     kappa, tuning = limits.kappa_max_radpm, limits.car.tuning.raceline
     v_min, a_any = tuning.speed_min_mps, tuning.acceleration_bound_mps2
-    low = [frame.n_min_m, -_XI_MAX_RAD * one, v_min**2 * one, -kappa * one, -a_any * one]
-    high = [frame.n_max_m, _XI_MAX_RAD * one, (1.05 * v_max) ** 2 * one, kappa * one]
-    return np.concatenate(low), np.concatenate([*high, a_any * one])
+    slowest, fastest = v_min**2 * one, (1.05 * v_max) ** 2 * one
+    if frame.start_mps is not None:
+        slowest[0] = fastest[0] = frame.start_mps**2
+    low = [frame.n_min_m, -_XI_MAX_RAD * one, slowest, -kappa * one, -a_any * one]
+    high = [frame.n_max_m, _XI_MAX_RAD * one, fastest, kappa * one, a_any * one]
+    return np.concatenate(low), np.concatenate(high)
 
 
 def _guess(frame: Frame, limits: CarLimits, v_max: float) -> Floats:
@@ -203,13 +217,16 @@ def _guess(frame: Frame, limits: CarLimits, v_max: float) -> Floats:
         lambda v: limits.straight_values(v, car.d_min),
         2 * car.tuning.raceline.speed_min_mps,
         v_max,
+        frame.start_mps,
     )
     n = np.clip(0.0, frame.n_min_m, frame.n_max_m)
     a = (np.roll(v, -1) ** 2 - v**2) / (2 * step)
+    if frame.start_mps is not None:
+        a[-1] = 0.0
     return np.concatenate([n, np.zeros(count), v**2, kappa, a])
 
 
-def _optimise(
+def optimise(
     name: str, frame: Frame, limits: CarLimits, settings: RaceLineSettings, shares: list[float]
 ) -> Clothoids:
     """The fastest path. ``shares`` of the guess's squared speeds and accelerations are tried in
