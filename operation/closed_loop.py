@@ -42,7 +42,7 @@ from codegen.compiled import compiled
 from controller.assembly import compiled_controller
 from controller.cycle import Cycle
 from controller.driver import Decision
-from controller.interface import Controller
+from controller.interface import Controller, Environment
 from controller.process_settings import ControllerSettings
 from learning.dataset import Dataset
 from learning.logs import dataset_from_messages
@@ -240,8 +240,12 @@ class ClosedLoop:
             self._log.write(TRUTH, truth_behind(state, x))
         self._cycle.driver.observe(state)
         if not state.final:
-            self._cycle.answer(state, self._send)
+            self._cycle.answer(state, self._send, self._limits(state))
         return self._answer
+
+    def _limits(self, state: State) -> Environment | None:
+        """What limits the car in this cycle, as the watch of a controller process may: nothing."""
+        return None
 
     def _send(self, state: State, decision: Decision) -> None:
         self._answer = decision.d, decision.delta_rate

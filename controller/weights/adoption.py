@@ -15,12 +15,14 @@ from typing import Final
 from bayesrace.errors import InputError
 from bayesrace.messages import State
 from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles.parts import GRAVITY_MPS2
 from controller.interface import Environment
 from controller.native_step import NativeStep
 from controller.weights.prediction import StateRecord
+from controller.weights.settings import GateSettings
 from controller.weights.store import History, Store
 
-__all__ = ["RECORDED", "Adoption", "Offer", "WeightsPort"]
+__all__ = ["RECORDED", "Adoption", "Offer", "WeightsPort", "limits_at", "slowed_down"]
 
 RECORDED: Final = 8192
 """States kept: 16 s at 500 Hz, which is more than the validator looks back."""
@@ -28,6 +30,9 @@ RECORDED: Final = 8192
 _PATIENCE_S: Final = 2.0
 """How long lockstep waits for the watch. Without waiting, one run would differ from the next."""
 _POLL_S: Final = 5e-5
+
+_BEND: Final = 5.0
+"""Wheelbases: radius of the bend that a car still takes at its limit where it is slowed down."""
 
 
 @dataclass
@@ -57,6 +62,21 @@ class Offer:
     """States recorded before the adoption."""
     us: float = 0.0
     """Time that the adoption has taken."""
+
+
+def slowed_down(settings: GateSettings, car: CarParameters, fastest_mps: float) -> Environment:
+    """The limit of a car that has driven so fast with weights that are worse for it."""
+    bend_m = _BEND * car.wheelbase_m
+    least_mps = math.sqrt(car.friction * GRAVITY_MPS2 * bend_m)
+    limit_mps = max(settings.slow_share * fastest_mps, least_mps)
+    return Environment(limit_mps, car.tuning.driving.stop_mps2)
+
+
+def limits_at(vx_mps: float, slow: Environment) -> Environment:
+    """The limit in a cycle: a faster car slows down from its own speed."""
+    if vx_mps > slow.speed_limit_mps:
+        return slow._replace(speed_limit_mps=vx_mps)
+    return slow._replace(speed_limit_rate_mps2=0.0)
 
 
 class Adoption:
@@ -91,13 +111,8 @@ class Adoption:
         self.recorded += 1
 
     def limits(self, vx_mps: float) -> Environment | None:
-        """What limits the car in the next cycle: a faster one slows down from its own speed."""
-        slow = self.slow
-        if slow is None:
-            return None
-        if vx_mps > slow.speed_limit_mps:
-            return slow._replace(speed_limit_mps=vx_mps)
-        return slow._replace(speed_limit_rate_mps2=0.0)
+        """What limits the car in the next cycle."""
+        return None if self.slow is None else limits_at(vx_mps, self.slow)
 
     def states(self, begin: int, most: int) -> list[StateRecord]:
         """For the manager: at most so many states from number ``begin`` on, or the oldest kept."""

@@ -153,7 +153,9 @@ class Checks:
             for errors in (new, nominal, *others)
         )
         rmse = {"new": new_rmse, "old": np.min(old, axis=0), "nominal": nominal_rmse}
-        slack = self.settings.worse_share * rmse["nominal"] + self._slack
+        # The excess of a window is what counts: fewer samples must be worse by as much in all.
+        few = max(self.settings.watch_window / max(count, 1), 1.0)
+        slack = self.settings.worse_share * rmse["nominal"] + few * self._slack
         # Written so that infinity on both sides is worse, too.
         fine = rmse["new"] <= self.settings.worse_factor * np.minimum(rmse["old"], 1e12) + slack
         worse = " and ".join(name for name, good in zip(OUTPUTS, fine, strict=True) if not good)

@@ -18,10 +18,8 @@ from bayesrace.errors import InputError
 from bayesrace.messages import ROLLBACK, WEIGHTS, Reply, Scalar
 from bayesrace.transport import Request, declare_service, decode_request
 from bayesrace.vehicles import car_text
-from bayesrace.vehicles.parts import GRAVITY_MPS2
-from controller.interface import Environment
 from controller.native_step import unpack_weights
-from controller.weights.adoption import Adoption, Offer, WeightsPort
+from controller.weights.adoption import Adoption, Offer, WeightsPort, slowed_down
 from controller.weights.settings import GateSettings
 from controller.weights.store import AcceptedWeights, StoreWriter, digest_of
 from controller.weights.supervisor import Supervisor
@@ -43,9 +41,6 @@ _POLL_S: Final = 0.02
 """Between two looks at what is waited for: the control thread wakes no other thread."""
 _LOCKSTEP_POLL_S, _LOCKSTEP_S = 2e-4, 1.0
 """The same in lockstep, where the control loop waits for the watch; and how long after it has."""
-
-_BEND: Final = 5.0
-"""Wheelbases: radius of the bend that a car still takes at its limit where it is slowed down."""
 
 _MOST_WAITING: Final = 32
 """Requests; each may hold a file."""
@@ -295,13 +290,10 @@ class WeightUpdateManager:
         """Limits the speed until other weights are in use: going back would be no better."""
         if self.adoption.slow is not None:  # by a validator that has ended meanwhile
             return
-        car, fastest_mps = self._port.car, float(data["fastest_mps"])
-        bend_m = _BEND * car.wheelbase_m
-        least_mps = math.sqrt(car.friction * GRAVITY_MPS2 * bend_m)
-        limit_mps = max(self._settings.slow_share * fastest_mps, least_mps)
-        self.adoption.slow = Environment(limit_mps, car.tuning.driving.stop_mps2)
-        text = f"at most {limit_mps:.2f} m/s until other weights are in use; {why}"
-        self._announce("weights_slowed", text, {**data, "speed_limit_mps": limit_mps})
+        slow = slowed_down(self._settings, self._port.car, float(data["fastest_mps"]))
+        self.adoption.slow = slow
+        text = f"at most {slow.speed_limit_mps:.2f} m/s until other weights are in use; {why}"
+        self._announce("weights_slowed", text, {**data, "speed_limit_mps": slow.speed_limit_mps})
 
     # Adoption and store --------------------------------------------------------------------------
 

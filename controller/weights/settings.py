@@ -13,10 +13,12 @@ class GateSettings(BaseModel):
     One-step errors are compared as velocities after one Ts. The new weights are worse if for any
     output
 
-        error_new > worse_factor * error_old + worse_share * error_nominal + resolution * Ts
+        error_new > worse_factor * error_old + worse_share * error_nominal + resolution * Ts * few
 
     with RMSEs over the same samples and ``nominal`` the model without correction. ``resolution``
     and the bound on corrections depend on the car: :class:`bayesrace.vehicles.tuning.GateTuning`.
+    ``few`` is ``watch_window`` over the number of samples, and at least 1: a handful of samples,
+    as after a standing start, must be far worse.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)

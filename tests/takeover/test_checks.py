@@ -212,6 +212,17 @@ def test_an_error_that_is_not_finite_is_worse_than_anything(checks: Checks) -> N
     assert checks.compare(fine, [fine], infinite).data["samples"] == 0
 
 
+@pytest.mark.parametrize(("count", "factor"), [(5, 20.0), (20, 5.0), (100, 1.0), (200, 1.0)])
+def test_fewer_samples_must_be_worse_by_as_much_in_all(
+    checks: Checks, car: CarParameters, count: int, factor: float
+) -> None:
+    """The resolution holds for a window of samples; fewer ones have as much excess together."""
+    none = np.zeros((count, 3))
+    excess = np.array(car.tuning.gate.resolution) * STEP_S * factor
+    assert checks.compare(none + 0.99 * excess, [none], none).worse == ""
+    assert checks.compare(none + 1.01 * excess, [none], none).worse == "vx and vy and omega"
+
+
 # Watch ---------------------------------------------------------------------------------------
 
 
@@ -309,7 +320,7 @@ def test_what_the_watch_finds_does_not_depend_on_when_states_come(
     answers = conversation(checks, car, spoilt(again, "flip vx"), states, chunk)
     found = [ruling for answer in answers for ruling in answer["watch"]]
     assert [action for action, *_ in found] == ["slow", "back"]
-    assert found[0][2]["driven"] == 5
+    assert found[0][2]["driven"] == 10
     assert answers[-1]["seen"] is None
 
 
