@@ -5,10 +5,12 @@ to 54 rad/s); all its samples are used here, and only here, to compare like with
 variance are chosen from training samples alone.
 """
 
+import io
 import json
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from bayesrace.integrators import PREDICTION
 from bayesrace.vehicles import get_car
@@ -16,6 +18,7 @@ from learning.arrays import dataset_from_npz
 from learning.dataset import Dataset, concatenate, filter_dataset
 from learning.training import train
 from learning.validation import Validation, validate
+from operation.terminal.learning_table import print_beyond_limits
 from tests.command_line import Cli
 from tests.reference import reference_file
 
@@ -72,6 +75,16 @@ def test_published_drive_is_outside_the_cars_limits() -> None:
     kept = filter_dataset(training)
     assert kept.dropped["outside limits"] > 50
     assert len(kept) + sum(kept.dropped.values()) == len(training)
+
+
+@pytest.mark.parametrize(("beyond", "kept", "hinted"), [(439, 61, True), (5, 61, False)])
+def test_where_most_samples_exceed_the_limits_the_option_that_keeps_them_is_named(
+    beyond: int, kept: int, hinted: bool
+) -> None:
+    console = Console(record=True, file=io.StringIO())
+    print_beyond_limits({"outside limits": beyond, "standing": 3}, kept, console)
+    text = console.export_text()
+    assert ("439 samples are beyond the car's limits; --all-samples keeps them" in text) is hinted
 
 
 @pytest.mark.check

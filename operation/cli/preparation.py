@@ -192,7 +192,11 @@ def train(
     from learning.settings import TrainingSettings
     from learning.sources import read_samples
     from learning.training import fit
-    from operation.terminal.learning_table import print_choices, print_kernels
+    from operation.terminal.learning_table import (
+        print_beyond_limits,
+        print_choices,
+        print_kernels,
+    )
     from operation.terminal.progress import stages_on
     from operation.terminal.terminal import Terminal
 
@@ -234,6 +238,7 @@ def train(
         highlight=False,
         soft_wrap=True,
     )
+    print_beyond_limits(samples.dataset.dropped, len(samples.dataset), console)
 
 
 def build(

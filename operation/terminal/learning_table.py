@@ -1,6 +1,6 @@
 """Results of training and validation on the terminal."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from rich.console import Console
 from rich.text import Text
@@ -13,7 +13,7 @@ from operation.terminal.notation import SMOOTHNESS
 from operation.terminal.race_table import GP_COLUMNS, gp_cells
 from operation.terminal.terminal import plain_table
 
-__all__ = ["print_choices", "print_kernels", "print_validation"]
+__all__ = ["print_beyond_limits", "print_choices", "print_kernels", "print_validation"]
 
 
 def print_kernels(scores: Sequence[KernelScore], console: Console) -> None:
@@ -54,10 +54,18 @@ def print_choices(scores: Sequence[ChoiceScore], console: Console) -> None:
     console.print(table)
 
 
+def print_beyond_limits(dropped: Mapping[str, int], kept: int, console: Console) -> None:
+    """How to keep what exceeds the car's limits, where that is most of a drive."""
+    if (beyond := dropped.get("outside limits", 0)) > kept:
+        text = f"{beyond} samples are beyond the car's limits; --all-samples keeps them"
+        console.print(Text(text, style="yellow"), soft_wrap=True)
+
+
 def print_validation(result: ValidationResult, console: Console) -> None:
     """Metrics per output, and the drift over one step and over the horizon."""
     counts = f"{result.samples} samples (left out: {left_out(result.dropped)})"
     console.print(Text(f"{result.weights_version} on {counts}", style="bold"))
+    print_beyond_limits(result.dropped, result.samples, console)
     if result.learned_from:
         text = "the weights were learned from these very samples: expect larger errors on others"
         console.print(Text(text, style="yellow"))
