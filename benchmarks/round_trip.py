@@ -1,8 +1,6 @@
 """Lockstep over Zenoh: how a process should wait for the other one's answer.
 
     python -m benchmarks.round_trip
-    python -m benchmarks.round_trip --rate 50     one round trip each 20 ms, neither works or polls:
-                                                  what messages alone cost a free-running loop
 
 Two processes on loopback play ping-pong with the states' size of message; one computes for
 as long as a control step in between, the other as long as the plant. What is printed is the round
@@ -24,12 +22,10 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from bayesrace.clock import sleep_until_ns
 from bayesrace.transport import Endpoints, free_endpoint, open_session
 
 WAYS = ("callback and queue", "channel", "channel, polled", "channel, polled with sched_yield")
 ROUNDS, WARM_UP = 4000, 500
-PACED_S = 20.0
 CONTROL_US, PLANT_US = 180, 50
 SPIN_S = 0.002
 PAYLOAD = bytes(120)
@@ -82,32 +78,28 @@ def publish(session: Any, key: str) -> Any:
     return session.declare_publisher(key, express=True, congestion_control=control)
 
 
-def measure(way: str, low_latency: bool, rate_hz: float = 0.0) -> list[float]:
-    """Round trips less the work [us], the plant's part; ``rate_hz`` 0: one after another."""
-    work_us = 0 if rate_hz else CONTROL_US
+def measure(way: str, low_latency: bool) -> list[float]:
+    """Round trips one after another, less the work [us]; the plant's part."""
     endpoint = free_endpoint()
     with open_session(Endpoints(listen=(endpoint,), low_latency=low_latency)) as session:
         wait, _subscriber = receiver(session, "pong", way)
         publisher = publish(session, "ping")
         line = [sys.executable, "-m", "benchmarks.round_trip", "--answer", endpoint, "--way", way]
-        line += ["--work", str(work_us)]
+        line += ["--work", str(CONTROL_US)]
         with subprocess.Popen(line + ["--low-latency"] * low_latency) as other:
             while not publisher.matching_status.matching:
                 time.sleep(0.01)
             time.sleep(0.2)
             times = []
-            start_ns = time.monotonic_ns()
-            for k in range(round(PACED_S * rate_hz) if rate_hz else ROUNDS):
-                if rate_hz:
-                    sleep_until_ns(start_ns + round(k * 1e9 / rate_hz))
+            for _ in range(ROUNDS):
                 begin_ns = time.perf_counter_ns()
                 publisher.put(PAYLOAD)
                 wait()
-                times.append((time.perf_counter_ns() - begin_ns) * 1e-3 - work_us)
-                work(0 if rate_hz else PLANT_US)
+                times.append((time.perf_counter_ns() - begin_ns) * 1e-3 - CONTROL_US)
+                work(PLANT_US)
             publisher.put(b"")
             other.wait(10)
-    return times[WARM_UP if not rate_hz else len(times) // 10 :]
+    return times[WARM_UP:]
 
 
 def main() -> None:
@@ -116,17 +108,10 @@ def main() -> None:
     parser.add_argument("--answer", default="", help=argparse.SUPPRESS)
     parser.add_argument("--way", default="", help=argparse.SUPPRESS)
     parser.add_argument("--work", type=float, default=0.0, help=argparse.SUPPRESS)
-    parser.add_argument("--rate", type=float, default=0.0, help="paced, without work [Hz]")
     parser.add_argument("--low-latency", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.answer:
         answer(arguments.answer, arguments.way, arguments.low_latency, arguments.work)
-        return
-    if arguments.rate:
-        p50, p90, p99 = np.percentile(measure("channel", False, arguments.rate), [50, 90, 99])
-        print(
-            f"round trip at {arguments.rate:g} Hz: p50 {p50:.0f}  p90 {p90:.0f}  p99 {p99:.0f} us"
-        )
         return
     print(f"{'what waits':<34} {'sends in':<16} p50 us  p90 us  p99 us")
     for low_latency in (False, True):

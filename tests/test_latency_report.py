@@ -12,9 +12,10 @@ from rich.console import Console
 from bayesrace.transport import Endpoints
 from studies.latency.analysis import Analysis, Beside, analyse
 from studies.latency.beside import bare_result
-from studies.latency.legs import LEGS
+from studies.latency.legs import BESIDE, LEGS
 from studies.latency.report import print_report, write_files
 from studies.latency.results import Memory
+from studies.latency.series import Series
 from studies.latency.settings import LatencySettings
 from tests.synthetic_latency import PERIOD_NS, Loop
 
@@ -38,7 +39,8 @@ def analysis(tmp_path: Path) -> Analysis:
     late_ns[9] = PERIOD_NS + 1
     rss = {"plant": Memory(begin_bytes=2**26, most_bytes=2**26 + 4096)}
     bare = bare_result(late_ns, PERIOD_NS, [])
-    beside = Beside("pit", bare, rss, ["ended early: the sun went down"])
+    passed = Series(np.linspace(0.0, 4.98, 250), np.full(250, 300_000.0))
+    beside = Beside("pit", bare, passed, rss, ["ended early: the sun went down"])
     return analyse(tmp_path / "run.mcap", settings, None, beside)
 
 
@@ -53,7 +55,7 @@ def test_table_fits_a_terminal_of_80_columns_and_says_everything(analysis: Analy
         "3 deadlines missed (bare loop 1)", "190 sent = 190 received + 0 lost",
         "185 received + 0 lost +5 NOT ACCOUNTED FOR", "off track 6 of 200", "± 500 us", "laps 1",
         "7.000100 s ahead of the plant's", "the sun went down", "+0.0000%", "attached", "load 2",
-        "that of this machine, pit", "4 kB on 64.0 MB", "bare loop's wake-up error",
+        "on this machine, pit", "4 kB on 64.0 MB", *BESIDE.values(),
     ):  # fmt: skip
         assert words in " ".join(text.split()), words
 
@@ -65,7 +67,7 @@ def test_files_are_made_of_whatever_was_measured(
     write_files(tmp_path, analysis if measured else replace(analysis, series={}))
     assert (tmp_path / "latency.png").read_bytes().startswith(b"\x89PNG")
     logs = {path.stem for path in tmp_path.glob("*.hlog")}
-    assert logs == ({*LEGS, "bare_loop"} if measured else set())
+    assert logs == ({*LEGS, *BESIDE} if measured else set())
     content = json.loads((tmp_path / "latency.json").read_text())
     assert content == json.loads(analysis.result.model_dump_json())
     promised = {

@@ -23,7 +23,7 @@ from operation.drive import RunPlan, run_request
 from operation.preparation import Prepared, prepare
 from operation.settings import PreparationSettings
 from operation.terminal.progress import stages_on
-from studies.latency.legs import LEGS
+from studies.latency.legs import BESIDE, LEGS
 from studies.latency.series import new_histogram
 from tests.command_line import Cli, refused
 from tests.programs import COMMAND, ROOT, environment, finish, leftovers, peanut, run, start, until
@@ -67,7 +67,7 @@ def loaded(files: Prepared, tmp_path_factory: pytest.TempPathFactory) -> Run:
         done = finish(process)
         assert done.returncode == 0, done.stderr
         assert json.loads((folder / "copy.json").read_text()) is not None
-        # plant, controller, bare loop and load carry its process number
+        # plant, controller, load and what is measured beside carry its process number
         assert not leftovers(process.pid)
         assert not _with_parent(process.pid)
         (folder / "stdout").write_text(done.stdout.replace(str(folder / "run"), "RUN"))
@@ -85,6 +85,9 @@ def test_every_leg_is_measured(loaded: Run) -> None:
         assert leg["below_zero"] == 0, name
     assert result["bare_loop_us"]["count"] > 0
     assert result["bare_loop_misses"] == result["bare_loop_us"]["misses"]
+    passed = result["round_trip_us"]
+    assert passed["count"] > 0
+    assert 0 < passed["p50"] < result["state_to_actuation_us"]["max"]
 
 
 def test_messages_sent_are_received_or_lost(loaded: Run) -> None:
@@ -109,7 +112,7 @@ def test_memory_laps_and_clocks_are_reported(loaded: Run) -> None:
 
 def test_files_are_those_of_the_documentation(loaded: Run) -> None:
     names = {path.name for path in loaded.out.iterdir()}
-    logs = {f"{name}.hlog" for name in LEGS} | {"bare_loop.hlog"}
+    logs = {f"{name}.hlog" for name in (*LEGS, *BESIDE)}
     assert logs | {"latency.json", "latency.png", "settings.json", "run.mcap"} <= names
     for name in logs:
         reader = HistogramLogReader(str(loaded.out / name), new_histogram())
@@ -117,7 +120,7 @@ def test_files_are_those_of_the_documentation(loaded: Run) -> None:
         while (interval := reader.get_next_interval_histogram()) is not None:
             total += interval.get_total_count()
         leg = loaded.result["legs_us"].get(name.removesuffix(".hlog"))
-        expected = loaded.result["bare_loop_us"] if leg is None else leg
+        expected = leg or loaded.result[f"{name.removesuffix('.hlog')}_us"]
         assert total == expected["count"], name
 
 
@@ -200,7 +203,7 @@ def test_killed_measurement_takes_its_children_along(files: Prepared, tmp_path: 
     out = tmp_path / "run"
     process = start("latency", *files.arguments, "--duration", "60", "--load", "2", "--out", out)
     until(lambda: _observing(out), "time observed")
-    assert len(_with_parent(process.pid)) == 5
+    assert len(_with_parent(process.pid)) == 7
     process.kill()
     finish(process)
     until(lambda: not _with_parent(process.pid), "children ended", 20.0)

@@ -41,6 +41,8 @@ class Beside:
 
     host: str = ""
     bare: tuple[Series, BareLoop] | None = None
+    round_trip: Series | None = None
+    """Of messages alone."""
     rss: dict[str, Memory] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
@@ -51,7 +53,7 @@ class Analysis:
 
     result: LatencyResult
     series: dict[str, Series]
-    """By leg, and of the bare loop; one without values is left out."""
+    """By leg, and of what ran beside; one without values is left out."""
     edges_s: Floats
     """Of the intervals of logs and medians, since the first state that counts."""
     begin_s: float
@@ -110,6 +112,7 @@ def analyse(log: Path, settings: LatencySettings, track: Track | None, beside: B
         overruns=counts["overruns"] if len(tables["heartbeats"]) else None,
         bare_loop_misses=bare.misses if bare else None,
         bare_loop_us=bare,
+        round_trip_us=None if beside.round_trip is None else beside.round_trip.distribution(),
         mean_period_us=period_us,
         rate_error=period_us * rate_hz * 1e-6 - 1.0 if period_us else None,
         **{
@@ -127,6 +130,8 @@ def analyse(log: Path, settings: LatencySettings, track: Track | None, beside: B
     edges_s = np.linspace(0.0, max(span_s, 1e-3), int(np.clip(span_s // 2.0, 1, _INTERVALS)) + 1)
     if beside.bare:
         series["bare_loop"] = beside.bare[0]
+    if beside.round_trip is not None:
+        series["round_trip"] = beside.round_trip
     return Analysis(result, series, edges_s, begin_ns * 1e-9)
 
 

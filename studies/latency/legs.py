@@ -15,7 +15,7 @@ from studies.latency.clocks import ClockMap
 from studies.latency.columns import Columns, Tables
 from studies.latency.traffic import heartbeats, traffic
 
-__all__ = ["ANSWER", "LEGS", "Cycles"]
+__all__ = ["ANSWER", "BESIDE", "LEGS", "Cycles"]
 
 
 LEGS: Final = {
@@ -34,6 +34,12 @@ LEGS: Final = {
 }
 """Title of each leg, and the clock on which it begins and ends; both: it crosses from one to the
 other. In the order of a cycle; docs/latency.md says from where to where each goes."""
+
+BESIDE: Final = {
+    "bare_loop": "bare loop's wake-up error",
+    "round_trip": "bare round trip of messages",
+}
+"""Title of each series that is measured beside the run, not in it."""
 
 ANSWER: Final = "state_to_actuation"
 """The leg that counts."""

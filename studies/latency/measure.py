@@ -26,6 +26,7 @@ from studies.latency.analysis import Beside, analyse
 from studies.latency.beside import read_bare_loop, running_beside
 from studies.latency.report import RESULT, write_files
 from studies.latency.results import LatencyResult, Memory
+from studies.latency.round_trip import passing_messages, read_round_trips
 from studies.latency.settings import LatencySettings
 
 __all__ = ["LatencyError", "Run", "measure"]
@@ -155,11 +156,14 @@ def _record(
         count = round(settings.duration_s * rate_hz)
         with (
             running_beside(out, settings.load, settings.realtime, rate_hz, begin_ns, count),
+            passing_messages(out, settings.realtime, rate_hz, begin_ns, count),
             stages.stage(f"record {settings.duration_s:g} s"),
         ):
             run.watch(director, recorder, begin_ns, end_ns)
     run.host, run.bare = socket.gethostname(), read_bare_loop(out, rate_hz)
+    run.round_trip = read_round_trips(out, rate_hz)
     run.notes += [] if run.bare else ["no bare loop to compare the misses with: it was lost"]
+    run.notes += [] if run.round_trip else ["no bare round trip of messages: it was lost"]
 
 
 def _files(settings: LatencySettings, stages: Stages) -> Prepared:

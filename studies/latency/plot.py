@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from operation.report.canvas import write_png
 from operation.report.style import INK, MUTED, figure_style
 from studies.latency.analysis import Analysis
-from studies.latency.legs import ANSWER, LEGS
+from studies.latency.legs import ANSWER, BESIDE, LEGS
 
 __all__ = ["plot"]
 
@@ -22,6 +22,7 @@ _COLOURS: Final = {
     **dict(zip(_STACKED, ("#009E73", "#E69F00", "#0072B2", "#D55E00"), strict=True)),
     "wake_up": "#CC79A7",
     "bare_loop": MUTED,
+    "round_trip": "#56B4E9",
 }
 """Okabe and Ito's."""
 
@@ -61,7 +62,7 @@ def _percentiles(axes: Axes, analysis: Analysis) -> None:
             k = np.unique(np.geomspace(1, len(ns), min(len(ns), _POINTS)).astype(int))
             axes.plot(
                 len(ns) / k, np.maximum(ns[len(ns) - k] * 1e-3, _LEAST_US), color=colour,
-                label=LEGS[name][0] if name in LEGS else "bare loop's wake-up error",
+                label=LEGS[name][0] if name in LEGS else BESIDE[name],
                 linewidth=2.2 if name == ANSWER else 1.2,
             )  # fmt: skip
     axes.set(

@@ -10,7 +10,7 @@ from rich.text import Text
 from bayesrace.files import write_whole
 from operation.terminal.terminal import plain_table
 from studies.latency.analysis import Analysis
-from studies.latency.legs import ANSWER, LEGS
+from studies.latency.legs import ANSWER, BESIDE, LEGS
 from studies.latency.plot import plot
 from studies.latency.results import Distribution, LatencyResult
 
@@ -18,16 +18,14 @@ __all__ = ["RESULT", "print_report", "write_files"]
 
 RESULT: Final = "latency.json"
 
-_BARE: Final = "bare loop's wake-up error"
-
 _PARTS: Final = ("decode", "feedback", "encode")
 """Legs within the one before, or at the beginning of the one after."""
 
 
 def write_files(out: Path, analysis: Analysis) -> None:
-    """``latency.json``, ``latency.png``, and a histogram log of each leg and of the bare loop."""
+    """``latency.json``, ``latency.png``, and a histogram log of each leg and of what ran beside."""
     for name, series in analysis.series.items():
-        title = LEGS[name][0] if name in LEGS else _BARE
+        title = LEGS[name][0] if name in LEGS else BESIDE[name]
         series.write_log(out / f"{name}.hlog", title, analysis.begin_s, analysis.edges_s)
     plot(out / "latency.png", analysis)
     write_whole(out / RESULT, analysis.result.model_dump_json(indent=1) + "\n")
@@ -45,8 +43,9 @@ def print_report(result: LatencyResult, console: Console) -> None:
             title = f"  {title}" if name in _PARTS else title
             style = "bold" if name == ANSWER else ""
             table.add_row(Text(title), *_cells(leg, leg.uncertainty_us), style=style)
-    if result.bare_loop_us is not None:
-        table.add_row(_BARE, *_cells(result.bare_loop_us), style="dim")
+    for name, title in BESIDE.items():
+        if (beside := getattr(result, f"{name}_us")) is not None:
+            table.add_row(title, *_cells(beside), style="dim")
     console.print(table)
     for line, alarming in _lines(result):
         console.print(Text(line, style="yellow" if alarming else ""))
@@ -76,7 +75,7 @@ def _lines(result: LatencyResult) -> list[tuple[str, bool]]:
         growth = f"{one.growth_bytes / 1024:.0f} kB on {one.begin_bytes / 2**20:.1f} MB"
         lines.append((f"resident memory of the {name} grew by {growth}", False))
     if result.attached:
-        lines.append((f"the bare loop is that of this machine, {result.host}", False))
+        lines.append((f"what is bare is measured on this machine, {result.host}", False))
     return lines + [(note, True) for note in result.notes]
 
 

@@ -93,6 +93,9 @@ class LatencyResult(_Frozen):
     fallbacks: int = Field(description="cycles that the fallback drove")
     bare_loop_misses: int | None
     bare_loop_us: BareLoop | None
+    round_trip_us: Distribution | None = Field(
+        description="of messages between two processes without any work, beside the run"
+    )
     mean_period_us: float | None
     rate_error: float | None = Field(description="mean period over the nominal one, less 1")
     sent: int | None = Field(description="states and actuations")
