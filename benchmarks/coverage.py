@@ -27,7 +27,7 @@ from operation.terminal.progress import stages_on
 
 __all__ = ["normalised_errors"]
 
-FACTORS: Final = (1.0, 1.1, 1.2, 1.3, 1.4, 1.5)
+FACTORS: Final = (1.0, 1.2, 1.3, 1.4, 1.45)
 WANTED: Final = 0.90
 """Share of the errors within the band that is asked for."""
 
@@ -62,7 +62,7 @@ def main() -> None:
         band = np.median([share * np.median(band, axis=0) for _, band in runs], axis=0)
         each = " ".join(f"{one:.2f}" for one in held.mean(axis=0))
         print(
-            f"  deviations x {factor:.1f}: {names} {each}, all three {held.all(axis=1).mean():.2f};"
+            f"  deviations x {factor:.2f}: {names} {each}, all three {held.all(axis=1).mean():.2f};"
             f" median half band {band[0]:.2g} m/s, {band[1]:.2g} m/s, {band[2]:.2g} rad/s"
         )
 

@@ -41,7 +41,7 @@ class TrainingSettings(BaseModel):
         10, ge=2, description="parts of the drive, or of the track, each held out in turn"
     )
     widen: float = Field(
-        1.5,
+        1.45,
         ge=1,
         le=100,
         description="factor on the standard deviations of weights that begin with no others: what "
