@@ -1,9 +1,15 @@
 """A plan that has gone into a bad local minimum is left again: laps stay on the track."""
 
+import numpy as np
 import pytest
 from rich.console import Console
 
+from bayesrace.vehicles import default_car
 from benchmarks.many_tracks import drives
+from controller.assembly import compiled_controller
+from controller.native_library import StepStatus
+from operation.preparation import prepare
+from operation.settings import PreparationSettings
 from operation.terminal.progress import stages_on
 
 
@@ -17,3 +23,20 @@ def test_with_a_model_that_is_right_the_laps_stay_on_the_track() -> None:
     assert perfect.off_track_m.max() <= 0
     for mine, best in zip(updated.laps_s, perfect.laps_s, strict=True):
         assert mine <= 1.02 * best  # random:11 keeps one such minimum, of 1.7 %
+
+
+@pytest.mark.check
+@pytest.mark.parametrize("track", ["random:3", "random:7"])
+def test_from_rest_a_plan_is_found_anywhere_on_the_line(track: str) -> None:
+    """Without a start that leaves the track's edges out, none is at 7 and 5 of these places."""
+    with stages_on(Console(quiet=True)) as stages:
+        prepared = prepare(PreparationSettings(), (track,), stages)
+    on, car = prepared.first, default_car()
+    native = compiled_controller(prepared.artefacts[0], car, on.track, on.line, None).native
+    line = on.line
+    for k in range(0, len(line.x_m), 3):
+        for speed_mps in (0.1, 0.0):
+            native.reset()
+            pose = (line.x_m[k], line.y_m[k], line.psi_rad[k])
+            native.step(np.array([*pose, speed_mps, 0.0, 0.0, 0.0]), np.zeros(2))
+            assert StepStatus(native.info.status).usable, (k, speed_mps)

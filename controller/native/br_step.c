@@ -105,6 +105,20 @@ br_mpc_status br_start_again(br_mpc *mpc, br_mpc_status status, unsigned turn) {
     return status;
 }
 
+/* From the first guess without soft rows, then from where that leads with them: a track that turns
+ * at once may send Newton's steps round in circles from every guess. */
+static br_mpc_status start_without_soft_rows(br_mpc *mpc, int most) {
+    mpc->attempts += 1;
+    br_sqp_cold_start(mpc);
+    br_path_follow(mpc);
+    memset(mpc->qp.penalty, 0, sizeof mpc->qp.penalty);
+    mpc->qp.evaluated = mpc->qp.factorised = 0;
+    const br_mpc_status status = iterate(mpc, 0, most);
+    br_evaluate_penalties(mpc);
+    mpc->qp.evaluated = mpc->qp.factorised = 0;
+    return br_usable(status) ? iterate(mpc, 1, most) : status;
+}
+
 /* Without a plan from before: from the problem's guesses in turn until one leads to a usable plan.
  * From rest, half throttle straight ahead may be a bad guess for a line that turns at once. */
 static br_mpc_status start_cold(br_mpc *mpc, int most) {
@@ -119,7 +133,9 @@ static br_mpc_status start_cold(br_mpc *mpc, int most) {
         status =
             iterate(mpc, 0, most < BR_SECOND_START_ITERATIONS ? most : BR_SECOND_START_ITERATIONS);
     }
-    return status;
+    if (br_usable(status) || mpc->turn || mpc->info.time_limited) return status;
+    if (!br_timer_allows(timer, br_timer_now(timer), 3 * timer->iteration)) return status;
+    return start_without_soft_rows(mpc, most);
 }
 
 static br_mpc_status optimise(br_mpc *mpc) {
