@@ -135,7 +135,8 @@ def test_drive_says_when_the_controller_is_lost(
     assert done.returncode not in (0, None)
     assert "Traceback" not in done.stderr
     assert "controller vanished" in done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
+    said = [one for one in done.stderr.strip().splitlines() if "bayesrace.links" not in one]
+    assert len(said) == 1  # besides, on a loaded machine, that a link takes long
     assert LogReader(log).select(STATE)
     assert waiting.plant.poll() is None
 

@@ -105,11 +105,13 @@ br_mpc_status br_start_again(br_mpc *mpc, br_mpc_status status, unsigned turn) {
     return status;
 }
 
-/* From the first guess without soft rows, then from where that leads with them: a track that turns
+/* From the usual guess without soft rows, then from where that leads with them: a track that turns
  * at once may send Newton's steps round in circles from every guess. */
 static br_mpc_status start_without_soft_rows(br_mpc *mpc, int most) {
-    mpc->attempts += 1;
-    br_sqp_cold_start(mpc);
+    if (most > BR_SECOND_START_ITERATIONS) most = BR_SECOND_START_ITERATIONS;
+    double u[BR_NU];
+    br_first_guess(mpc, mpc->u_before, 0.5, u);
+    br_sqp_roll_out(mpc, u);
     br_path_follow(mpc);
     memset(mpc->qp.penalty, 0, sizeof mpc->qp.penalty);
     mpc->qp.evaluated = mpc->qp.factorised = 0;

@@ -181,7 +181,7 @@ static void check_answer(const double u[BR_NU], br_mpc_status status, const br_m
     const br_mpc_parameters *p = &parameters;
     const int limit = p->iterations > p->iterations_cold ? p->iterations : p->iterations_cold;
     CHECK(status >= BR_CONVERGED && status <= BR_TIME_LIMIT);
-    CHECK(info->iterations <= limit + BR_COLD_GUESSES * BR_SECOND_START_ITERATIONS);
+    CHECK(info->iterations <= limit + (BR_COLD_GUESSES + 1) * BR_SECOND_START_ITERATIONS);
     CHECK(info->pace > 0 && info->pace <= 1);
     if (status > BR_ACCEPTABLE) {
         CHECK(u[0] == -9 && u[1] == -9);

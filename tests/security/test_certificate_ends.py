@@ -69,7 +69,9 @@ def test_a_plant_ends_when_its_car_stands(tmp_path: Path, course: Course) -> Non
         assert "this process ends in" in rig.plant.said()
         assert re.search("run 1 ended .* for 10 s", rig.plant.said())
         assert rig.controller.process.poll() is None
-        assert "has a certificate that has expired: renew it there" in rig.controller.said()
+        # A controller that is late to look, on a loaded machine, finds that the plant has ended.
+        seen = "has a certificate that has expired: renew it there|nobody listens"
+        assert re.search(seen, rig.controller.said())
         journey = rig.journey()
     assert max(state.x[3] for state in journey.states) > 0.5
     assert abs(journey.states[-1].x[3]) < STANDING_MPS
