@@ -25,7 +25,6 @@ _log = logging.getLogger("bayesrace.links")
 _FIRST_S: Final = 0.2
 """How long a session may take to link before it is asked why it has not."""
 _PERIOD_S: Final = 1.0
-_MOMENT_S: Final = 0.5
 _REMINDER_S: Final = 86400.0
 
 _said: Final[dict[str, str]] = {}
@@ -70,10 +69,6 @@ class LinkWatch:
         """Ends it."""
         self._over.set()
         self._thread.join()
-        # The other ends may close the links a moment before, which some processes take for an end.
-        credentials = self._credentials
-        if not self.fault and credentials and time.time() >= credentials.ends_s - _MOMENT_S:
-            self.fault = credentials.expired()
         if self._interrupted:
             _interrupting.release()
 

@@ -90,7 +90,7 @@ def test_commands_end(tmp_path: Path, course: Course) -> None:
     folder.mkdir()
     lines: dict[str, tuple[str | Path, ...]] = {
         "viewer": ("status", "--watch"),
-        "learning": ("learn", "--out", folder / "job"),
+        "learning": ("learn", "--watch", "--out", folder / "job"),
         "director": (
             "drive", "--mode", "realtime", "--track", course.track_file, "--laps", "999",
             "--max-time", "600", "--log", folder / "run.mcap",
