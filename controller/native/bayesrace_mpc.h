@@ -32,7 +32,9 @@ extern "C" {
 #endif
 
 #define BR_SECOND_START_ITERATIONS 12 /* at most; most often it needs eight */
-#define BR_COLD_GUESSES 4     /* a step without a plan tries at most; all but the first so long */
+/* A step without a plan tries so many guesses at most, all but the first so long; then as long each
+ * without the soft rows and from there with them. */
+#define BR_COLD_GUESSES 4
 #define BR_NV (BR_NX + BR_NU) /* stage variables v = [x; u] */
 #define BR_PATH_COLUMNS 7     /* see br_mpc_set_path */
 #define BR_PATH_CAPACITY 8192 /* points of the path table */

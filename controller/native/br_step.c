@@ -108,7 +108,6 @@ br_mpc_status br_start_again(br_mpc *mpc, br_mpc_status status, unsigned turn) {
 /* From the usual guess without soft rows, then from where that leads with them: a track that turns
  * at once may send Newton's steps round in circles from every guess. */
 static br_mpc_status start_without_soft_rows(br_mpc *mpc, int most) {
-    if (most > BR_SECOND_START_ITERATIONS) most = BR_SECOND_START_ITERATIONS;
     double u[BR_NU];
     br_first_guess(mpc, mpc->u_before, 0.5, u);
     br_sqp_roll_out(mpc, u);
@@ -121,19 +120,20 @@ static br_mpc_status start_without_soft_rows(br_mpc *mpc, int most) {
     return br_usable(status) ? iterate(mpc, 1, most) : status;
 }
 
-/* Without a plan from before: from the problem's guesses in turn until one leads to a usable plan.
- * From rest, half throttle straight ahead may be a bad guess for a line that turns at once. */
+/* Without a plan from before: from the problem's guesses in turn until one leads to a usable plan;
+ * all but the first get no more iterations than a second start. From rest, half throttle straight
+ * ahead may be a bad guess for a line that turns at once. */
 static br_mpc_status start_cold(br_mpc *mpc, int most) {
     br_timer *timer = &mpc->timer;
     br_mpc_status status = iterate(mpc, 0, most);
+    if (most > BR_SECOND_START_ITERATIONS) most = BR_SECOND_START_ITERATIONS;
     for (int guess = 1; guess < BR_COLD_GUESSES && !br_usable(status); ++guess) {
         if (mpc->turn || mpc->info.time_limited) break; /* there is one way to turn */
         if (!br_timer_allows(timer, br_timer_now(timer), 3 * timer->iteration)) break;
         mpc->attempts += 1;
         br_sqp_cold_start(mpc);
         br_path_follow(mpc);
-        status =
-            iterate(mpc, 0, most < BR_SECOND_START_ITERATIONS ? most : BR_SECOND_START_ITERATIONS);
+        status = iterate(mpc, 0, most);
     }
     if (br_usable(status) || mpc->turn || mpc->info.time_limited) return status;
     if (!br_timer_allows(timer, br_timer_now(timer), 3 * timer->iteration)) return status;

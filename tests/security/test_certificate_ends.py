@@ -10,6 +10,7 @@ import pytest
 
 from bayesrace.configuration import read_configuration
 from bayesrace.errors import InputError
+from bayesrace.messages import Role
 from bayesrace.transport import Endpoints, free_endpoint, open_session
 from operation.certificates import add, init, revoke
 from tests.network.cars import Course, Program
@@ -83,11 +84,12 @@ def test_a_plant_ends_when_its_car_stands(tmp_path: Path, course: Course) -> Non
 def test_commands_end(tmp_path: Path, course: Course) -> None:
     """Whatever they are doing: looking on, learning, driving, forwarding."""
     certificates = certified(tmp_path / "certs")
-    names = {role: f"brief-{role}" for role in ("viewer", "learning", "director", "router")}
-    for role, name in names.items():
+    brief: tuple[Role, ...] = ("viewer", "learning", "director", "router")
+    names: dict[str, str] = {role: f"brief-{role}" for role in brief}
+    for one in brief:
         # 'learn' ends with the drive, so that one has to outlast it.
-        days = (3 if role == "director" else 2) * BRIEF_DAYS
-        add(certificates.folder, name, role, days=days)  # type: ignore[arg-type]
+        days = (3 if one == "director" else 2) * BRIEF_DAYS
+        add(certificates.folder, names[one], one, days=days)
     folder = tmp_path / "commands"
     folder.mkdir()
     lines: dict[str, tuple[str | Path, ...]] = {
