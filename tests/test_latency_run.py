@@ -333,6 +333,8 @@ def test_clock_of_another_host_is_found_and_corrected(files: Prepared, tmp_path:
         leg = result["legs_us"][name]
         assert leg["uncertainty_us"] == margin_us
         assert -margin_us <= leg["min"]
-        assert leg["p50"] <= result["state_to_actuation_us"]["p50"] + margin_us, name
+        # A state that is answered again is older each time: its age has no bound in its answer.
+        answer_us = 1e6 if name == "state_age" else result["state_to_actuation_us"]["p50"]
+        assert leg["p50"] <= answer_us + margin_us, name
     for name in ("state_to_actuation", "feedback"):
         assert result["legs_us"][name]["uncertainty_us"] == 0

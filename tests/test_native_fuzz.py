@@ -22,6 +22,8 @@ FLAGS: Final = ("-std=gnu11", "-O2", "-g")
 STRICT: Final = ("-Wall", "-Wextra", "-Werror", "-Wno-unused-parameter", "-Wno-unused-function")
 COVERAGE: Final = "-fsanitize-coverage=trace-pc"
 SEED: Final = "1"
+SEEDS: Final = tuple(map(str, range(1, 13)))
+"""Which of them finds a fault changes with the code that guides the driver."""
 
 Word = str | Path
 
@@ -113,7 +115,7 @@ def test_a_guard_left_out_is_found(
     source.write_text(text.replace(guard, without))
     broken = compiled(source, small, tmp_path / f"{file}.o", COVERAGE)
     program, crash = linked(objects | {file: broken}, tmp_path / "fuzz"), tmp_path / "crash.bin"
-    assert ran([program, "20000", SEED, crash]).returncode != 0
+    assert any(ran([program, "6000", seed, crash]).returncode for seed in SEEDS)
     assert crash.is_file()
     assert ran([program, "--replay", crash]).returncode != 0
 
