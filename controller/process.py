@@ -2,8 +2,9 @@
 
 In real time the loop keeps its rate whatever arrives: it wakes shortly before a release,
 looks for the state that is due, steps, sends, and does everything else (telemetry, requests,
-heartbeat, preparation of the next step) in the time that is left. It writes nothing to disk, waits
-for no other process and logs nothing while it drives.
+heartbeat, preparation of the next step) in the time that is left. Where the state has not come in
+time, it looks for it after that cycle, and answers it by a second one. It writes nothing to disk,
+waits for no other process and logs nothing while it drives.
 """
 
 import gc
@@ -28,6 +29,7 @@ from bayesrace.transport import (
     HEARTBEAT_S,
     LOCKSTEP_SPIN_S,
     NEWEST,
+    POLL_S,
     Inbox,
     Item,
     Kind,
@@ -60,9 +62,9 @@ _REHEARSAL_NS: Final = 700_000
 _COLD_NS: Final = 5_000_000
 """Periods from which on caches are cold at each release; at higher rates there is no rehearsal."""
 
-_GRACE: Final = 0.25
-"""How long after a release the loop still waits for the state that is due (fraction of the
-period)."""
+_ROOM: Final = 2.0
+"""Time that a late cycle must still have within the budget, in times of the cycle before it. It
+takes longer than that one: no preparation has gone before."""
 
 _SERVE_NS: Final = 40_000_000
 """Between two requests that are served while driving: each takes as long as a cycle, and a
@@ -208,25 +210,32 @@ class ControllerProcess:
         schedule.start(self._arrived_ns)
         schedule.observe(self._arrived_ns, first.time_s, 0.0)
         self._timing.wake_us = 0.0
-        state, fresh = first, True
+        state, fresh, late = first, True, False
         while not self._service.stopping:
             if fresh and (state.final or state.lockstep):
                 break
             if self._silent():
                 fresh = False
                 break
-            self._tick(state)
-            self._rest()
-            self._timing.skipped += schedule.advance(time.monotonic_ns())
-            newer = self._next_state()
+            self._tick(state, late)
+            self._serve_others()
+            newer = self._late_state()
+            late = newer is not None
+            if not late:
+                self._prepare()
+                self._timing.skipped += schedule.advance(time.monotonic_ns())
+                newer = self._next_state()
             fresh = newer is not None
             state = newer or state
         return self._leave(state if fresh else None)
 
-    def _tick(self, state: State) -> None:
-        """One cycle: decide, send, report."""
+    def _tick(self, state: State, late: bool) -> None:
+        """One cycle: decide, send, report; ``late``: a further one after the same release."""
         schedule, timing = self._schedule, self._timing
         timing.released_ns = time.monotonic_ns()
+        if late:
+            timing.late_states += 1
+            timing.wake_us = timing.prepare_us = 0.0
         budget_s = self._settings.budget * schedule.period_ns * 1e-9
         # What has held up a state on its way is part of its age: hence the schedule's plant time,
         # not the time since this state's own arrival.
@@ -234,50 +243,75 @@ class ControllerProcess:
         spent_s = (time.monotonic_ns() - schedule.release_ns) * 1e-9
         limits = self._limits(state)
         decision = self._cycle.decide(decided_at_s, budget_s, spent_s, limits)
-        timing.overruns += time.monotonic_ns() > schedule.release_ns + 1e9 * budget_s
+        timing.overruns += time.monotonic_ns() > self._budget_end_ns
         self._send(state, decision)
         timing.missed = time.monotonic_ns() > schedule.deadline_ns
         timing.misses += timing.missed
 
-    def _rest(self) -> None:
-        """The time until the next release: what has happened meanwhile, and the preparation."""
-        end_ns = self._schedule.release_ns + round(self._settings.budget * self._schedule.period_ns)
-        if self._adoption is not None:
-            self._adoption.between_cycles(self._next_cycle)
-        if min(end_ns, time.monotonic_ns()) >= self._serve_ns:
+    def _serve_others(self) -> None:
+        """What has happened meanwhile."""
+        if min(self._budget_end_ns, time.monotonic_ns()) >= self._serve_ns:
             item = self.inbox.poll_queue()
             if item is not None:
                 self._serve_ns = time.monotonic_ns() + _SERVE_NS
                 self._service.react(item)
         self._service.beat()
-        left_s = (end_ns - time.monotonic_ns()) * 1e-9
+
+    def _late_state(self) -> State | None:
+        """The state that was due at this release, if it comes while another cycle still fits.
+
+        Not where several are missing: one of them says little, and a plant that has fallen behind
+        needs the CPU to catch up.
+        """
+        if self._missing() != 1:
+            return None
+        spent_ns = time.monotonic_ns() - self._timing.released_ns
+        latest_ns = self._budget_end_ns - round(_ROOM * spent_ns)
+        while time.monotonic_ns() < latest_ns:
+            if (late := self._newest_state(0)) is not None:
+                return late
+            time.sleep(POLL_S)
+        return None
+
+    def _prepare(self) -> None:
+        """New weights, and the preparation of the next cycle, in what is left of the budget."""
+        if self._adoption is not None:
+            self._adoption.between_cycles(self._next_cycle)
+        left_s = (self._budget_end_ns - time.monotonic_ns()) * 1e-9
         if left_s > 0:
-            self._cycle.prepare(self._schedule.period_ns * 1e-9, left_s)
+            until_next_ns = self._schedule.deadline_ns - self._timing.released_ns
+            self._cycle.prepare(until_next_ns * 1e-9, left_s)
 
     def _next_state(self) -> State | None:
         """Sleeps until shortly before the release, then looks for the state that is due."""
         schedule, period_ns = self._schedule, self._schedule.period_ns
-        release_ns = schedule.release_ns
         rehearses = period_ns >= _COLD_NS
-        wake_ns = release_ns - min(round(_LEAD * period_ns), _LEAD_NS)
+        wake_ns = schedule.release_ns - min(round(_LEAD * period_ns), _LEAD_NS)
         wake_ns -= _REHEARSAL_NS if rehearses else 0
         sleep_until_ns(wake_ns)
         self._timing.wake_us = max(time.monotonic_ns() - wake_ns, 0) * 1e-3
         if rehearses:
             self._rehearse()
+        return self._newest_state(
+            schedule.window_end_ns if self._missing() else schedule.release_ns
+        )
+
+    def _newest_state(self, until_ns: int) -> State | None:
+        """The newest state that is there, or comes until then; the one that is due is waited for
+        even if an older one is there."""
         fresh: State | None = None
         newest = self._driver.newest
         run = newest.run if newest is not None else None
-        until_ns = release_ns + (round(_GRACE * period_ns) if self._state_due() else 0)
         for _ in range(NEWEST):  # what came while the loop was held up, but no flood
-            item = self.inbox.poll(0 if fresh else until_ns)
+            waits = fresh is None or self._missing() == 1
+            item = self.inbox.poll(until_ns if waits else 0)
             if item is None:
                 break
             fresh = self._take(item) or fresh
         if fresh is not None:
             if fresh.run != run:
-                schedule.start(self._arrived_ns)
-            schedule.observe(self._arrived_ns, fresh.time_s, self._driver.interval_s)
+                self._schedule.start(self._arrived_ns)
+            self._schedule.observe(self._arrived_ns, fresh.time_s, self._driver.interval_s)
         return fresh
 
     def _rehearse(self) -> None:
@@ -292,13 +326,17 @@ class ControllerProcess:
             self._driver.rehearse()
             encode(self._actuation(state, self._driver.decision))
 
-    def _state_due(self) -> bool:
-        """Whether a state is due at the next release: they may come less often than releases."""
-        schedule = self._schedule
-        interval_ns = self._driver.interval_s * 1e9 or schedule.period_ns
-        since_ns = schedule.release_ns - self._arrived_ns
-        away_ns = since_ns - round(since_ns / interval_ns) * interval_ns
-        return abs(away_ns) < schedule.period_ns / 2 or interval_ns < schedule.period_ns
+    def _missing(self) -> int:
+        """How many states that have not come yet are due by the release."""
+        newest = self._driver.newest
+        if newest is None:
+            return 0
+        return self._schedule.missing(newest.time_s, self._driver.interval_s)
+
+    @property
+    def _budget_end_ns(self) -> int:
+        """When the budget of the cycles after this release is used up."""
+        return self._schedule.release_ns + round(self._settings.budget * self._schedule.period_ns)
 
     # Both --------------------------------------------------------------------------------------
 
@@ -320,8 +358,8 @@ class ControllerProcess:
 
     @property
     def _next_cycle(self) -> int:
-        """``tick`` of the next cycle, unless its release is passed over."""
-        return self._timing.ticks + self._timing.skipped
+        """``tick`` of the next release's cycle, unless it is passed over."""
+        return self._timing.tick + 1
 
     def _words(self) -> str:
         return "" if self._weights is None else self._weights.text
@@ -334,6 +372,7 @@ class ControllerProcess:
             "skipped": timing.skipped,
             "deadline_misses": timing.misses,
             "overruns": timing.overruns,
+            "late_states": timing.late_states,
             "states_received": driver.numbering.received,
             "states_lost": driver.numbering.lost,
             "states_stale": driver.count("stale"),

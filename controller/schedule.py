@@ -6,6 +6,7 @@ whatever holds up a message makes it later and never sooner: the smallest differ
 and the plant's own time, over the last second, is the one to trust (as in NTP's clock filter).
 """
 
+import math
 from collections import deque
 from typing import Final
 
@@ -19,6 +20,9 @@ _LOST: Final = 0.25
 """Phase error, as a fraction of the period, beyond which the lock is taken anew ..."""
 _LOST_FOR: Final = 5
 """... if it stays there for so many states in a row."""
+_GRACE: Final = 0.25
+"""How long after a release the loop still waits for the state that is due (fraction of the
+period)."""
 _WHOLE: Final = 0.02
 """How far the ratio of the two periods may be from a whole number for a lock to be possible."""
 
@@ -59,6 +63,11 @@ class Schedule:
     def deadline_ns(self) -> int:
         """By when the work released next must be done."""
         return self.release_ns + self.period_ns
+
+    @property
+    def window_end_ns(self) -> int:
+        """Until when the loop waits for the state that is due at the release."""
+        return self.release_ns + round(_GRACE * self.period_ns)
 
     def start(self, release_ns: int) -> None:
         """Begin with a release at this time."""
@@ -103,6 +112,17 @@ class Schedule:
     def plant_time_s(self, at_ns: int) -> float:
         """Plant time whose state would have arrived by then, had nothing held it up."""
         return (at_ns - self._offset_ns) * 1e-9
+
+    def missing(self, time_s: float, interval_s: float) -> int:
+        """How many states newer than that of plant time ``time_s`` are due by the release; two are
+        ``interval_s`` apart (0: not known). 0, too, if none is due at the release itself."""
+        period_s = self.period_ns * 1e-9
+        interval_s = interval_s or period_s
+        since_s = self.plant_time_s(self.release_ns) - time_s
+        # States may come less often than releases: not every release has one.
+        if abs(math.remainder(since_s, interval_s)) >= period_s / 2:
+            return 0
+        return max(int((since_s + _GRACE * period_s) / max(interval_s, period_s)), 0)
 
     def _lockable(self, interval_ns: float) -> bool:
         if interval_ns <= 0:

@@ -31,13 +31,20 @@ class Timing:
     solve_us: float = 0.0
     encode_us: float = 0.0
     ticks: int = 0
-    """Cycles."""
+    """Cycles, late ones included."""
     skipped: int = 0
     """Releases passed over because a cycle before took too long."""
     misses: int = 0
     """Cycles whose actuation was on its way only after the deadline."""
     overruns: int = 0
     """Cycles that took more than their budget."""
+    late_states: int = 0
+    """Late cycles: further ones after a release, for a state that came after its window."""
+
+    @property
+    def tick(self) -> int:
+        """Number of the newest cycle's release."""
+        return self.ticks + self.skipped - self.late_states - 1
 
 
 def telemetry_of(
@@ -53,7 +60,7 @@ def telemetry_of(
         status=decision.status,
         fallback=int(decision.level),
         iterations=output.iterations,
-        tick=timing.ticks + timing.skipped - 1,
+        tick=timing.tick,
         released_ns=timing.released_ns,
         received_ns=timing.received_ns,
         missed=timing.missed,

@@ -78,19 +78,23 @@ class Loop:
             self._write("truth", Truth(**car), seq)
         return seq
 
-    def tick(self, seq: int, released_ns: int = 700_000, seen: bool = True) -> None:
-        """A cycle on state ``seq``, released that long after its sampling."""
+    def tick(
+        self, seq: int, released_ns: int = 700_000, seen: bool = True, late: bool = False
+    ) -> None:
+        """A cycle on state ``seq``, released that long after its sampling; ``late``: a further one
+        after a release, as soon as the state is there."""
         sampled_ns = self.sampled_ns(seq)
         released = self.controller_ns(sampled_ns + released_ns)
         sent = self.controller_ns(sampled_ns + released_ns + 400_000)
-        received = self.controller_ns(sampled_ns + 600_000)
+        received = self.controller_ns(sampled_ns + (released_ns - 40_000 if late else 600_000))
         both = {"seq": self.sent, "source_time_ns": sent, "run": self.run, "state_seq": seq}
         telemetry = blank(
-            Telemetry, **both, tick=self.ticks, released_ns=released, received_ns=received,
-            wake_us=31.0, decode_us=42.0, prepare_us=150.0, solve_us=250.0, encode_us=53.0,
+            Telemetry, **both, tick=self.ticks - late, released_ns=released, received_ns=received,
+            wake_us=0.0 if late else 31.0, decode_us=42.0, prepare_us=0.0 if late else 150.0,
+            solve_us=250.0, encode_us=53.0,
         )  # fmt: skip
         actuation = blank(Actuation, **both, epoch=self.epoch, u=(0.0, 0.0))
-        self.sent, self.ticks = self.sent + 1, self.ticks + 1
+        self.sent, self.ticks = self.sent + 1, self.ticks + (not late)
         if seen:
             self._write("actuation", actuation, seq)
             self._write("telemetry", telemetry, seq)

@@ -86,6 +86,38 @@ def test_a_second_answer_to_a_state_is_no_latency_of_it(path: Path) -> None:
     assert (result.repeated_answers, result.overtaken_answers) == (1, 1)
 
 
+def test_a_late_cycle_is_a_cycle_of_its_release(path: Path) -> None:
+    """Its state has the latency that it had; period, rate and skipped releases stay those of the
+    releases, and so do the legs that belong to a release."""
+    with Loop(path, ahead_ns=0) as system:
+        for k in range(10):
+            seq = system.state()
+            if k == 5:  # the release answers the state before, then this one when it comes
+                system.tick(seq - 1, released_ns=PERIOD_NS + 700_000)
+                system.answer(seq - 1, arrival_s=21.5e-3)
+                system.tick(seq, released_ns=9_000_000, late=True)
+                system.answer(seq, arrival_s=9.8e-3)
+                system.ticks += 2  # the next two releases are passed over
+            elif k not in (6, 7):
+                system.tick(seq)
+                system.answer(seq)
+            if k % 5 == 4:
+                system.heartbeats()
+        system.state()
+    found, result = values(path), report_of(path).result
+    assert found[ANSWER] == [*[1_500_000] * 5, 9_800_000, *[1_500_000] * 2]
+    assert found["release_wait"] == [*[100_000] * 5, 40_000, *[100_000] * 2]
+    assert found["state_transport"][5] == 8_960_000
+    assert found["state_age"][5:7] == [20_700_000, 9_000_000]
+    assert [len(found[leg]) for leg in ("compute", "feedback", "encode")] == [9, 9, 9]
+    assert found["wake_up"] == [31_000] * 8
+    assert found["prepare"] == [150_000] * 8
+    assert (result.late_states, result.repeated_answers) == (1, 1)
+    assert (result.skipped, result.ticks) == (2, 10)
+    assert result.mean_period_us == pytest.approx(9 * PERIOD_NS * 1e-3 / 7)
+    assert result.rate_error == pytest.approx(2 / 7)
+
+
 def test_a_lost_answer_is_not_taken_for_another(path: Path) -> None:
     """Of two answers one arrived, and no message says which: no transport is made up."""
     with Loop(path, ahead_ns=0) as system:

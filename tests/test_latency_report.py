@@ -46,7 +46,8 @@ def analysis(tmp_path: Path) -> Analysis:
 
 def test_table_fits_a_terminal_of_80_columns_and_says_everything(analysis: Analysis) -> None:
     out = io.StringIO()
-    result = analysis.result.model_copy(update={"off_track_samples": 6, "deadline_misses": 3})
+    changes = {"off_track_samples": 6, "deadline_misses": 3, "late_states": 2}
+    result = analysis.result.model_copy(update=changes)
     print_report(result, Console(file=out, width=80))
     text = out.getvalue()
     assert all(title in text for title, _ in LEGS.values())
@@ -55,7 +56,8 @@ def test_table_fits_a_terminal_of_80_columns_and_says_everything(analysis: Analy
         "3 deadlines missed (bare loop 1)", "190 sent = 190 received + 0 lost",
         "185 received + 0 lost +5 NOT ACCOUNTED FOR", "off track 6 of 200", "± 500 us", "laps 1",
         "7.000100 s ahead of the plant's", "the sun went down", "+0.0000%", "attached", "load 2",
-        "on this machine, pit", "4 kB on 64.0 MB", *BESIDE.values(),
+        "on this machine, pit", "4 kB on 64.0 MB", "0 repeated answers, 2 late states",
+        *BESIDE.values(),
     ):  # fmt: skip
         assert words in " ".join(text.split()), words
 
@@ -72,7 +74,7 @@ def test_files_are_made_of_whatever_was_measured(
     assert content == json.loads(analysis.result.model_dump_json())
     promised = {
         "state_to_actuation_us", "deadline_misses", "bare_loop_misses", "ticks", "sent",
-        "received", "lost", "rss_growth_bytes",
+        "received", "lost", "rss_growth_bytes", "repeated_answers", "late_states",
     }  # fmt: skip
     assert promised <= set(content)
     assert {"p50", "p90", "p99", "p999", "max"} <= set(content["state_to_actuation_us"])

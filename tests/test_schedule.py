@@ -106,3 +106,25 @@ def test_one_state_moves_a_release_by_half_a_percent_at_most(arrival_ns: float) 
     schedule.start(0)
     schedule.observe(int(arrival_ns), 0.0, 0.02)
     assert abs(schedule.release_ns) <= 0.005 * 20 * MS
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "interval_s", "missing"),
+    [
+        # by the age of the newest state at a release, in ms
+        (50.0, 0.02, {0: 0, 4: 0, 14: 0, 16: 1, 20: 1, 24: 1, 34: 1, 36: 2, 44: 2, 60: 3}),
+        (50.0, 0.0, {0: 0, 14: 0, 16: 1, 24: 1, 40: 2}),  # the interval is not known yet
+        (500.0, 0.02, {0: 0, 2: 0, 10: 0, 18: 0, 19.6: 1, 20.4: 1, 22: 0, 39.6: 2, 42: 0}),
+        (50.0, 0.002, {0: 0, 2: 0, 14: 0, 16: 1, 20: 1, 40: 2}),
+        (50.0, 0.014, {0: 0, 7: 0, 14: 0, 16: 1, 20: 1}),
+    ],
+)
+def test_a_release_knows_which_states_are_missing(
+    rate_hz: float, interval_s: float, missing: dict[float, int]
+) -> None:
+    """By plant time: when the newest state arrived, and how late, makes no difference."""
+    schedule = Schedule(rate_hz)
+    schedule.start(100 * MS)
+    schedule.observe(100 * MS, 5.0, 0.0)
+    ages = {age_ms: schedule.missing(5.0 - age_ms * 1e-3, interval_s) for age_ms in missing}
+    assert ages == missing

@@ -142,7 +142,9 @@ class Telemetry(Message):
     """0 solution, 1 shifted previous plan, 2 braking with the last safe steering, 3 stop."""
     iterations: Annotated[int, Integer(0, 100_000)]
     tick: Count
-    """Number of the cycle since the process started; missing numbers are skipped cycles."""
+    """Number of the cycle's release since the process started; missing numbers are releases passed
+    over. A late cycle, which answers a state that came after its window, has that of the cycle
+    before it."""
     released_ns: Count
     """Monotonic clock when the cycle began, with its state received."""
     received_ns: Count
@@ -150,10 +152,11 @@ class Telemetry(Message):
     missed: Annotated[bool, Flag()]
     """The actuation was sent after the deadline, the next release."""
     wake_us: Seconds
-    """Wake-up error before this cycle [us, as all below]; 0 in lockstep."""
+    """Wake-up error before this cycle [us, as all below]; 0 in lockstep and of a late cycle."""
     decode_us: Seconds
     prepare_us: Seconds
-    """Preparation phase of the step, executed after the previous cycle."""
+    """Preparation phase of the step, executed after the previous cycle; 0 of a late cycle, which
+    has none."""
     solve_us: Seconds
     """Feedback phase: execution time of the controller's step."""
     encode_us: Seconds

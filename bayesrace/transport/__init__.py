@@ -27,16 +27,16 @@ from bayesrace.transport.endpoints import (
     LinkLimits,
     free_endpoint,
 )
-from bayesrace.transport.inbox import LOCKSTEP_SPIN_S, NEWEST, Inbox, Item, Kind
+from bayesrace.transport.inbox import LOCKSTEP_SPIN_S, NEWEST, POLL_S, Inbox, Item, Kind
 from bayesrace.transport.numbering import Numbering
 from bayesrace.transport.publisher import HEARTBEAT_S, Heartbeat, Publisher
 from bayesrace.transport.requests import Request, declare_service, decode_request
 from bayesrace.transport.session import open_session, try_links
 
 __all__ = [
-    "CONTROLLER_ENDPOINT", "HEARTBEAT_S", "LOCKSTEP_SPIN_S", "NEWEST", "PLANT_ENDPOINT", "Answers",
-    "Credentials", "Director", "Endpoint", "Endpoints", "Heartbeat", "Inbox", "Item", "Kind",
-    "LinkLimits", "Member", "Members", "Numbering", "Publisher", "RefusedError", "Request", "ask",
-    "ask_all", "count_processes", "decisive", "declare_service", "decode_request",
+    "CONTROLLER_ENDPOINT", "HEARTBEAT_S", "LOCKSTEP_SPIN_S", "NEWEST", "PLANT_ENDPOINT", "POLL_S",
+    "Answers", "Credentials", "Director", "Endpoint", "Endpoints", "Heartbeat", "Inbox", "Item",
+    "Kind", "LinkLimits", "Member", "Members", "Numbering", "Publisher", "RefusedError", "Request",
+    "ask", "ask_all", "count_processes", "decisive", "declare_service", "decode_request",
     "free_endpoint", "open_session", "send_rollback", "send_weights", "try_links",
 ]  # fmt: skip

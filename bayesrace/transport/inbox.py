@@ -25,7 +25,7 @@ from bayesrace.interrupts import catching_signals
 from bayesrace.messages import ALIVE, Decoder, Message, Service, Topic, car_key
 from bayesrace.transport.requests import Request, declare_service, in_transport_thread
 
-__all__ = ["LOCKSTEP_SPIN_S", "NEWEST", "Inbox", "Item", "Kind"]
+__all__ = ["LOCKSTEP_SPIN_S", "NEWEST", "POLL_S", "Inbox", "Item", "Kind"]
 
 M = TypeVar("M", bound=Message)
 
@@ -42,7 +42,7 @@ LOCKSTEP_SPIN_S: Final = 0.002
 """How long a lockstep peer polls for the answer before it sleeps. Waking an idle CPU takes longer
 than the answer: measured, the round trip falls from 270 to 90 us."""
 
-_POLL_S: Final = 5e-5
+POLL_S: Final = 5e-5
 """Shortest sleep between two looks ..."""
 _IDLE_S: Final = 2e-3
 """... and the longest: how late a thread that has waited for long may notice something. 500 looks a
@@ -195,7 +195,7 @@ class Inbox:
             if waited_s < self.spin_s:
                 os.sched_yield()  # the thread that receives may be waiting for this very CPU
                 continue
-            sleep_s = min(max(_SHARE * waited_s, _POLL_S), _IDLE_S)
+            sleep_s = min(max(_SHARE * waited_s, POLL_S), _IDLE_S)
             time.sleep(min(sleep_s, timeout_s - waited_s))
 
     def poll(self, until_ns: int) -> Item | None:
@@ -208,7 +208,7 @@ class Inbox:
         while (item := self._from_channels()) is None:
             if time.monotonic_ns() >= until_ns:
                 return None
-            time.sleep(_POLL_S)
+            time.sleep(POLL_S)
         return item
 
     @property

@@ -93,8 +93,8 @@ def analyse(log: Path, settings: LatencySettings, track: Track | None, beside: B
         ),
     }
     bare = beside.bare[1] if beside.bare else None
-    by_name = ("skipped", "deadline_misses", "fallbacks", "repeated_answers", "overtaken_answers",
-               "unobserved")  # fmt: skip
+    by_name = ("skipped", "deadline_misses", "fallbacks", "repeated_answers", "late_states",
+               "overtaken_answers", "unobserved")  # fmt: skip
     result = LatencyResult(
         car=car,
         track=settings.track,
@@ -107,7 +107,7 @@ def analyse(log: Path, settings: LatencySettings, track: Track | None, beside: B
         host=beside.host,
         state_to_actuation_us=legs.get(ANSWER),
         legs_us=legs,
-        ticks=counts["cycles"] + counts["skipped"],
+        ticks=counts["releases"] + counts["skipped"],
         **{name: counts[name] for name in by_name},
         overruns=counts["overruns"] if len(tables["heartbeats"]) else None,
         bare_loop_misses=bare.misses if bare else None,

@@ -62,6 +62,8 @@ class Cycles:
         self.ticks = ticks[ticks["n"] < self.states["n"][-1]]
         self._starts = self.ticks[_first(self.ticks, "state")]
         """The first cycle of each state."""
+        self._releases = self.ticks[_first(self.ticks, "tick")]
+        """The first cycle of each release; all others are late ones."""
         self._sent, self._arrived = _paired(self._known(self.actuations), self.answers)
         self._arrived_at = self._sampled(self._arrived) + self._arrived["arrival_s"] * 1e9
         self.clock = ClockMap.of(*self._exchanges())
@@ -79,14 +81,14 @@ class Cycles:
 
     def legs(self) -> dict[str, tuple[Floats, Floats]]:
         """Calendar times at the recorder, and values, of each leg that the messages give [ns]."""
-        ticks, starts = self.ticks, self._starts
+        ticks, starts, releases = self.ticks, self._starts, self._releases
         first = self.answers[_first(self.answers, "state")]
         acted = self.answers[self.answers["acting_s"] >= 0]
         # Every cycle sends one actuation and one telemetry message, with equal numbers.
         _, i, j = np.intersect1d(self.actuations["seq"], ticks["seq"], return_indices=True)
         made, released = self.actuations["sent"][i], ticks["released"][j]
         legs = {
-            "wake_up": (ticks["at"], ticks["wake_us"] * 1e3),
+            "wake_up": (releases["at"], releases["wake_us"] * 1e3),
             "decode": (starts["at"], starts["decode_us"] * 1e3),
             "release_wait": (starts["at"], starts["released"] - starts["received"]),
             "feedback": (ticks["at"], ticks["solve_us"] * 1e3),
@@ -94,7 +96,7 @@ class Cycles:
             "encode": (ticks["at"], ticks["encode_us"] * 1e3),
             "state_to_actuation": (first["at"], first["arrival_s"] * 1e9),
             "acting": (acted["at"], acted["acting_s"] * 1e9),
-            "prepare": (ticks["at"], ticks["prepare_us"] * 1e3),
+            "prepare": (releases["at"], releases["prepare_us"] * 1e3),
         }
         if self.clock is not None:
             readings = starts["received"], ticks["released"], self._sent["sent"]
@@ -106,17 +108,19 @@ class Cycles:
 
     def counts(self) -> Counter[str]:
         """What can be added up over the parts of a log; messages as :func:`traffic` names them."""
-        ticks, answers = self.ticks, self.answers
+        ticks, answers, releases = self.ticks, self.answers, self._releases
+        late = len(ticks) - len(releases)
         streams = self.states, self.actuations, self._tables["ticks"]
         beats = heartbeats(self._tables, controller=True)
         found = {
-            "cycles": len(ticks),
+            "releases": len(releases),
+            "late_states": late,
             "skipped": np.maximum(np.diff(ticks["tick"]) - np.diff(ticks["seq"]), 0).sum(),
             "deadline_misses": ticks["missed"].sum(),
             "fallbacks": np.count_nonzero(ticks["fallback"]),
             "overruns": np.diff(beats["overruns"]).sum(),
-            "periods": np.diff(ticks["seq"]).sum(),
-            "length_ns": np.diff(ticks["released"]).sum(),
+            "periods": np.diff(ticks["seq"]).sum() - late,
+            "length_ns": np.diff(releases["released"]).sum(),
             "repeated_answers": len(answers) - len(_first(answers, "state")),
             "overtaken_answers": np.count_nonzero(answers["acting_s"] < 0),
             # By their numbers; the run itself may have had them.

@@ -85,6 +85,7 @@ def _timing(result: LatencyResult) -> str:
     line = f"{result.ticks} ticks: {result.deadline_misses} deadlines missed{misses}, "
     line += f"{result.skipped} skipped{skips}"
     line += "" if result.overruns is None else f", {result.overruns} overruns"
+    line += f", {result.repeated_answers} repeated answers, {result.late_states} late states"
     if result.mean_period_us is not None and result.rate_error is not None:
         line += f"; mean period {result.mean_period_us:.1f} us ({result.rate_error:+.4%})"
     return line

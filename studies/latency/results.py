@@ -105,6 +105,7 @@ class LatencyResult(_Frozen):
     rss_growth_bytes: int | None = Field(description="the larger one of the two")
     rss: dict[str, Memory]
     repeated_answers: int = Field(description="further answers to a state, predicted forward")
+    late_states: int = Field(description="states that came after their window, answered at once")
     overtaken_answers: int = Field(description="answers that never acted")
     unobserved: int = Field(description="messages missing in the log alone")
     restarts: int
