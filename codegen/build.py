@@ -52,6 +52,9 @@ NATIVE: Final = _ROOT / "controller" / "native"
 HOST: Final = "host"
 """Folder of the C that is for hosts, and no part of the library."""
 
+_MODE: Final = 0o755
+"""Of what is loaded, whatever the umask: what others may write is refused."""
+
 _SHAPED_BY: Final = (
     "controller/native",
     "controller/native/host",
@@ -165,6 +168,7 @@ def _library(compiler: Compiler, folder: Path, daqp: Path) -> bytes:
         compiler.shared_library(sorted(folder.glob("*.c")), [folder], [daqp], path)
         data = path.read_bytes()
         path.write_bytes(hashlib.sha256(data).digest() + data)
+        path.chmod(_MODE)
 
     return kept(cache_folder() / f"library-{identity}", make, _read_library)
 
@@ -224,7 +228,7 @@ def build(
             manifest = _manifest(problem, settings, compiler, identity, folder)
             (folder / MANIFEST).write_text(manifest.model_dump_json(indent=1) + "\n")
             for one in (folder, folder / LIBRARY):
-                one.chmod(0o755)  # whatever the umask: what others may write is not loaded
+                one.chmod(_MODE)
             folder.rename(target)
     note_use(made=True)
     return target, manifest

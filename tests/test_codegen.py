@@ -314,6 +314,15 @@ def test_what_anybody_may_write_or_others_own_is_not_loaded(
         load(artefact, car)
 
 
+@pytest.mark.usefixtures("cache")
+def test_what_is_built_may_be_loaded_whatever_the_umask(car: CarParameters) -> None:
+    before = os.umask(0)
+    try:
+        load(build(SMALL)[0], car)
+    finally:
+        os.umask(before)
+
+
 def test_a_library_without_its_functions_is_refused(artefact: Path, car: CarParameters) -> None:
     source = artefact / "empty.c"
     source.write_text(f"int br_mpc_abi(void) {{ return {ABI}; }}\n")
