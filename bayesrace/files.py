@@ -1,5 +1,6 @@
 """Files that appear whole or not at all, and are read whole or refused."""
 
+import errno
 import os
 import time
 from collections.abc import Iterator
@@ -47,8 +48,11 @@ def replacing(path: Path) -> Iterator[Path]:
 
     It is on the disk before it does: after a power failure ``path`` is the old file or the new one.
     It is beside ``path`` and has the same suffix, as some writers add what they miss. OSError as
-    of the block, or of the system, but about ``path``; what was begun is deleted then.
+    of the block, or of the system, but about ``path``; what was begun is deleted then. A device,
+    which root could replace, is an OSError, too.
     """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
     unique = f"{os.getpid()}.{time.monotonic_ns()}"
     partial = path.with_name(f".{path.stem}.{unique}.part{path.suffix}")
     try:

@@ -49,3 +49,11 @@ def test_what_killed_processes_have_begun_is_cleared_away(tmp_path: Path) -> Non
     clear_partials(tmp_path)
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {".gitignore", "a.npz", "copy", "data.part.npz"}
+
+
+def test_a_device_is_not_replaced_by_a_file(tmp_path: Path) -> None:
+    """Root could: of 'bayesrace train … --out /dev/null' the null device would be gone."""
+    os.mkfifo(path := tmp_path / "pipe")
+    with pytest.raises(OSError, match="not a regular file"):
+        write_whole(path, b"")
+    assert path.is_fifo()
