@@ -17,6 +17,7 @@ from typing import Final
 from bayesrace.cache import cache_folder, digest
 from bayesrace.errors import InputError
 from bayesrace.interpreter import RUN_MODULE
+from bayesrace.temporary import temporary_folder
 
 __all__ = ["FLAGS", "CompileError", "Compiler", "find_compiler"]
 
@@ -58,21 +59,20 @@ class Compiler:
         ``archives``; hides all symbols but ``exports``, patterns with semicolons between."""
         seen = [f"-I{path}" for path in includes]
         with (
-            tempfile.TemporaryDirectory(prefix="bayesrace-") as folder,
+            temporary_folder() as folder,
             ThreadPoolExecutor(os.cpu_count() or 1) as pool,
         ):
-            objects = [Path(folder) / f"{i}.o" for i in range(len(sources))]
-            compiled = [
-                pool.submit(self._run, *flags, *seen, "-c", source, "-o", target)
-                for source, target in zip(sources, objects, strict=True)
-            ]
-            for one in compiled:
-                one.result()
+            objects = [folder / f"{i}.o" for i in range(len(sources))]
+
+            def compile_one(source: Path, target: Path) -> None:
+                self._run(*flags, *seen, "-c", source, "-o", target)
+
+            list(pool.map(compile_one, sources, objects))  # after a failure no other is begun
             line: list[str | Path] = [*flags, "-shared", *objects, *archives, "-lm", "-o", out]
             if platform.system() == "Linux":
                 # A version script instead of --exclude-libs, which zig's linker does not know;
                 # -z defs, or a library that lacks a symbol would fail only when it is loaded.
-                script = Path(folder) / "exports.map"
+                script = folder / "exports.map"
                 script.write_text(f"{{ global: {exports}; local: *; }};\n")
                 line += [f"-Wl,--version-script={script}", "-Wl,-z,defs"]
             self._run(*line)

@@ -9,12 +9,10 @@ can join, and no certificates are needed.
 """
 
 import os
-import re
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 from bayesrace.configuration import Configuration, as_toml, configured
@@ -28,6 +26,7 @@ from bayesrace.transport import (
     Publisher,
     count_processes,
     open_session,
+    private_endpoints,
 )
 from operation.drive import RunPlan, announcement, execute
 from operation.processes import Child, child, endings
@@ -40,8 +39,6 @@ CONFIGURATION: Final = "bayesrace.toml"
 _START_S: Final = 60.0
 """Time for a process to start on a machine that is busy."""
 _LOOK_S: Final = 0.02
-_LONGEST: Final = 90
-"""Characters of a folder's name; the system allows 108 of a socket's."""
 
 
 class System:
@@ -166,11 +163,5 @@ def started_system(
 @contextmanager
 def _private_network() -> Iterator[Configuration]:
     """The configuration of processes that meet at sockets which only this user can reach."""
-    with TemporaryDirectory(prefix="bayesrace-", ignore_cleanup_errors=True) as folder:  # mode 700
-        if len(folder) > _LONGEST or not re.fullmatch(r"[^\s#?]+", folder):
-            raise InputError(
-                f"no sockets can be made in {folder}: set TMPDIR to a folder whose name has "
-                f"{_LONGEST - 20} characters at most, without blanks, '#' and '?'"
-            )
-        plant, controller = (f"unixsock-stream/{folder}/{one}" for one in ("plant", "controller"))
+    with private_endpoints("plant", "controller") as (plant, controller):
         yield configured().plain(plant, controller)

@@ -42,7 +42,10 @@ from bayesrace.transport import (
     decode_request,
     free_endpoint,
     open_session,
+    private_endpoints,
 )
+from bayesrace.transport.links import unlinked, wait_linked
+from tests.programs import PATIENCE_S
 
 pytestmark = pytest.mark.wall_clock
 
@@ -367,11 +370,22 @@ def test_a_taken_port_is_an_error_that_says_what_to_do() -> None:
 
 
 @pytest.mark.parametrize(
-    "endpoint", ["", "localhost", "tcp/localhost", "tcp/localhost:70000", "ftp/x:1", "tcp/ a:1"]
+    "endpoint",
+    ["", "localhost", "tcp/localhost", "tcp/localhost:70000", "ftp/x:1", "tcp/ a:1", "tcp/a..b:1"],
 )
 def test_a_malformed_endpoint_is_refused_by_name(endpoint: str) -> None:
     with pytest.raises(InputError, match="endpoint"), open_session(Endpoints(connect=(endpoint,))):
         pass
+
+
+def test_each_unix_socket_is_a_link_of_its_own() -> None:
+    with (
+        private_endpoints("here", "nowhere") as ends,
+        open_session(Endpoints(listen=(ends[0],))),
+        open_session(wanted := Endpoints(connect=tuple(ends)), explains=False) as session,
+    ):
+        assert wait_linked(session, wanted, ends[:1], PATIENCE_S)
+        assert unlinked(session, wanted) == ends[1:]
 
 
 def test_events_of_all_sources_arrive(pair: tuple[Any, Any]) -> None:

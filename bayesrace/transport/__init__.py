@@ -26,6 +26,7 @@ from bayesrace.transport.endpoints import (
     Endpoints,
     LinkLimits,
     free_endpoint,
+    private_endpoints,
 )
 from bayesrace.transport.inbox import LOCKSTEP_SPIN_S, NEWEST, POLL_S, Inbox, Item, Kind
 from bayesrace.transport.numbering import Numbering
@@ -38,5 +39,6 @@ __all__ = [
     "Answers", "Credentials", "Director", "Endpoint", "Endpoints", "Heartbeat", "Inbox", "Item",
     "Kind", "LinkLimits", "Member", "Members", "Numbering", "Publisher", "RefusedError", "Request",
     "ask", "ask_all", "count_processes", "decisive", "declare_service", "decode_request",
-    "free_endpoint", "open_session", "send_rollback", "send_weights", "try_links",
+    "free_endpoint", "open_session", "private_endpoints", "send_rollback", "send_weights",
+    "try_links",
 ]  # fmt: skip

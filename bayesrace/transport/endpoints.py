@@ -4,16 +4,18 @@ import ipaddress
 import re
 import socket
 from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue
 
 from bayesrace.errors import InputError
+from bayesrace.temporary import temporary_folder
 from bayesrace.transport.credentials import Credentials
 
 __all__ = [
     "CONTROLLER_ENDPOINT", "PLANT_ENDPOINT", "Address", "Endpoint", "Endpoints", "LinkLimits",
-    "ZenohSettings", "address_of", "free_endpoint", "leaves",
+    "ZenohSettings", "address_of", "free_endpoint", "leaves", "private_endpoints",
 ]  # fmt: skip
 
 PLANT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
@@ -34,6 +36,10 @@ _ENDPOINT: Final = re.compile(
     r"(?P<local>unixsock-stream)/[^\s#?]+([?#]\S*)?"
     r"|(?P<protocol>tcp|udp|tls|quic|ws)/(?P<host>\[[^\]]+\]|[^:/\s]+):(?P<port>\d{1,5})([?#]\S*)?"
 )
+
+
+_LONGEST: Final = 90
+"""Characters of a folder's name; the system allows 108 of a socket's."""
 
 
 class Address(BaseModel):
@@ -59,7 +65,7 @@ class Address(BaseModel):
 def address_of(endpoint: str) -> Address:
     """The parts of an endpoint; InputError if it is malformed."""
     match = _ENDPOINT.fullmatch(endpoint)
-    if match is None or int(match["port"] or 0) > 65535:
+    if match is None or int(match["port"] or 0) > 65535 or not _encodes(match["host"] or ""):
         raise InputError(
             f"endpoint '{endpoint}' is not of the form protocol/address:port, such as "
             f"{PLANT_ENDPOINT}, or unixsock-stream/path; protocols: tcp, udp, tls, quic, ws"
@@ -68,6 +74,15 @@ def address_of(endpoint: str) -> Address:
         return Address(protocol=match["local"])
     host = match["host"].strip("[]")
     return Address(protocol=match["protocol"], host=host, port=int(match["port"]))
+
+
+def _encodes(host: str) -> bool:
+    """Whether the system takes the name at all; what it does not, such as 'a..b', is no OSError."""
+    try:
+        host.encode("idna")
+    except UnicodeError:
+        return False
+    return True
 
 
 def _well_formed(endpoint: str) -> str:
@@ -200,3 +215,15 @@ def free_endpoint(protocol: Literal["tcp", "tls"] = "tcp") -> str:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@contextmanager
+def private_endpoints(*names: str) -> Iterator[list[str]]:
+    """Unix sockets of these names in a folder that only this user may enter, for the block."""
+    with temporary_folder() as folder:
+        if len(str(folder)) > _LONGEST or not re.fullmatch(r"[^\s#?]+", str(folder)):
+            raise InputError(
+                f"no sockets can be made in {folder}: set TMPDIR to a folder whose name has "
+                f"{_LONGEST - 25} characters at most, without blanks, '#' and '?'"
+            )
+        yield [f"unixsock-stream/{folder}/{name}" for name in names]

@@ -49,6 +49,8 @@ def _end(link: Any) -> str:
 
 def _is_among(endpoint: str, ends: set[str]) -> bool:
     address = address_of(endpoint)
+    if address.protocol == "unixsock-stream":
+        return endpoint.partition("?")[0].partition("#")[0] in ends
     if address.protocol not in ("tcp", "tls"):
         return any(end.startswith(address.protocol) for end in ends)
     try:

@@ -122,8 +122,12 @@ def _refused(
     """Why the handshake fails at one of its ends; empty if it does not."""
     folder = credentials.folder
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.load_verify_locations(folder / AUTHORITY)
-    context.load_cert_chain(folder / CERTIFICATE, folder / KEY)
+    try:
+        context.load_verify_locations(folder / AUTHORITY)
+        context.load_cert_chain(folder / CERTIFICATE, folder / KEY)
+    except OSError as error:  # the folder is gone, or half of a renewed one, while we run
+        why = f"certificate '{credentials.name}' in {folder} cannot be read ({error.strerror})"
+        return f"cannot be tried, since {why}: copy the folder again, as 'bayesrace certs' wrote it"
     try:
         with context.wrap_socket(connection, server_hostname=address.host) as link:
             theirs = link.getpeercert() or {}

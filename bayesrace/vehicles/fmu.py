@@ -8,9 +8,9 @@ cannot be turned into C: the native step takes models that are expressions.
 import atexit
 import hashlib
 import re
-import tempfile
 import zipfile
 from collections.abc import Iterable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
 
@@ -18,6 +18,7 @@ import casadi as ca
 import numpy as np
 
 from bayesrace.errors import InputError
+from bayesrace.temporary import temporary_folder
 from bayesrace.vehicles.models import INPUTS, STATES, Model
 from bayesrace.vehicles.parameters import CarParameters
 
@@ -102,11 +103,12 @@ def _extracted(path: Path) -> str:
     CasADi would extract it next to the file, where it may not be allowed to write. The library
     stays loaded, and may look for its resources, as long as any function made of it lives.
     """
-    folder = tempfile.TemporaryDirectory(prefix="bayesrace-fmu-", ignore_cleanup_errors=True)
-    atexit.register(folder.cleanup)
+    stack = ExitStack()
+    folder = str(stack.enter_context(temporary_folder()))
+    atexit.register(stack.close)
     with zipfile.ZipFile(path) as archive:
-        archive.extractall(folder.name)
-    return folder.name
+        archive.extractall(folder)
+    return folder
 
 
 def _ordered(ode: ca.Function, states: list[str], inputs: list[str]) -> ca.Function:

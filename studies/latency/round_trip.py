@@ -12,7 +12,6 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
@@ -20,7 +19,7 @@ import zenoh
 
 from bayesrace.clock import die_with_parent, sleep_until_ns
 from bayesrace.realtime import RealtimeSettings, prepare_thread
-from bayesrace.transport import Endpoints, open_session
+from bayesrace.transport import Endpoints, open_session, private_endpoints
 from operation.processes import child
 from studies.latency.series import Series
 
@@ -40,10 +39,8 @@ def passing_messages(
     module, period_ns = "studies.latency.round_trip", round(1e9 / rate_hz)
     np.save(out / _FILE, np.zeros(count, dtype=np.int64))
     with ExitStack() as stack:
-        folder = stack.enter_context(
-            TemporaryDirectory(prefix="bayesrace-", ignore_cleanup_errors=True)
-        )
-        meet = {"endpoint": f"unixsock-stream/{folder}/answers", "realtime": realtime.model_dump()}
+        (endpoint,) = stack.enter_context(private_endpoints("answers"))
+        meet = {"endpoint": endpoint, "realtime": realtime.model_dump()}
         sender = {"path": str(out / _FILE), "period_ns": period_ns}
         sender |= {"begin_ns": begin_ns + period_ns // 2}
         for name, part in (("answer", meet), ("round_trip", meet | sender)):

@@ -15,6 +15,7 @@ from bayesrace.messages import Role
 from bayesrace.raceline.line import write_raceline
 from bayesrace.tracks import write_track
 from bayesrace.transport import Credentials, Endpoints, free_endpoint, open_session
+from bayesrace.transport.probe import probe
 from operation.certificates import add, init
 from tests.command_line import Cli, refused
 from tests.conftest import Circuit
@@ -64,6 +65,17 @@ def test_a_refused_certificate_is_said_at_either_end(
     assert words in said
     assert where in said or at_controller == "revoked"
     assert "bayesrace certs" in said
+
+
+def test_a_certificate_that_is_gone_meanwhile_is_said(bundles: Bundles, tmp_path: Path) -> None:
+    where = free_endpoint("tls")
+    shutil.copytree(bundles.path("controller"), tmp_path / "own")
+    credentials = Credentials.read(tmp_path / "own")
+    shutil.rmtree(tmp_path / "own")
+    with listening(where, bundles.path("plant")):
+        found = probe(where, credentials)
+    assert found is not None
+    assert re.search("'controller' in .*/own cannot be read .*: copy the folder again", found.text)
 
 
 def test_another_host_name_is_said(bundles: Bundles) -> None:
