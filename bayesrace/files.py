@@ -1,16 +1,25 @@
 """Files that appear whole or not at all, and are read whole or refused."""
 
 import errno
+import fcntl
 import os
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
 from bayesrace.errors import InputError
 
-__all__ = ["clear_partials", "read_text", "read_whole", "replacing", "write_whole"]
+__all__ = [
+    "claimed",
+    "clear_partials",
+    "held",
+    "read_text",
+    "read_whole",
+    "replacing",
+    "write_whole",
+]
 
 _LARGEST: Final = 1 << 22
 
@@ -73,6 +82,37 @@ def write_whole(path: Path, data: str | bytes) -> None:
     """The content of a file, text in UTF-8; see :func:`replacing`."""
     with replacing(path) as partial:
         partial.write_bytes(data.encode() if isinstance(data, str) else data)
+
+
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Holds a lock on a folder, which the system releases however this process ends.
+
+    BlockingIOError if another one holds it; another OSError where there are no such locks.
+    """
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def claimed(folder: Path) -> Iterator[None]:
+    """Makes a folder, for this process alone where there are locks.
+
+    InputError if another one writes there.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(held(folder))
+        except BlockingIOError:
+            raise InputError(f"another process writes to {folder}: choose another folder") from None
+        except OSError:
+            pass
+        yield
 
 
 def clear_partials(folder: Path) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from bayesrace.errors import InputError
-from bayesrace.files import write_whole
+from bayesrace.files import claimed, write_whole
 from bayesrace.gp.weights import read_weights
 from bayesrace.manifest import MANIFEST
 from bayesrace.recorder import Recorder
@@ -245,7 +245,12 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
     this = _Race(settings, out, stages)
     for name in (settings.train_track, settings.track):
         load_track(name, this.car.width_m)
-    out.mkdir(parents=True, exist_ok=True)
+    with claimed(out):
+        _compare(this)
+
+
+def _compare(this: _Race) -> None:
+    settings, out, stages = this.settings, this.out, this.stages
     this.keep_fmu()
     write_car(this.car_file, this.car)
     write_whole(out / FILES.settings, settings.model_dump_json(indent=1) + "\n")

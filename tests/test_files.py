@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from bayesrace.files import clear_partials, replacing, write_whole
+from bayesrace.errors import InputError
+from bayesrace.files import claimed, clear_partials, replacing, write_whole
 
 
 def test_a_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
@@ -57,3 +58,16 @@ def test_a_device_is_not_replaced_by_a_file(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="not a regular file"):
         write_whole(path, b"")
     assert path.is_fifo()
+
+
+def test_a_folder_is_claimed_by_one_process(tmp_path: Path) -> None:
+    """Of two races that begin in one folder at once, the second is refused."""
+    folder = tmp_path / "run"
+    with (
+        claimed(folder),
+        pytest.raises(InputError, match="another process writes to"),
+        claimed(folder),
+    ):
+        pass
+    with claimed(folder):
+        assert folder.is_dir()

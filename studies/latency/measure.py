@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from bayesrace.errors import InputError
-from bayesrace.files import write_whole
+from bayesrace.files import claimed, write_whole
 from bayesrace.messages import Event
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import Track, load_track
@@ -124,8 +124,8 @@ def _record(
     """Records the run, and the machine beside it."""
     start = settings.attach is None
     files = _files(settings, stages) if start else None
-    out.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
+        stack.enter_context(claimed(out))
         with stages.stage("start plant and controller" if start else "attach"):
             stack.enter_context(_explained(run))
             if files is not None:
