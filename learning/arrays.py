@@ -6,10 +6,11 @@ samples, ``x`` (n, 7), ``u`` (n, 2), ``x_next`` (n, 7), or one unbroken drive, `
 is refused: it may be a misspelt one.
 
 The published form, the drives of the paper's code, is read as well: ``states`` (6 or 7, n + 1),
-``inputs`` (2, n) with duty cycle and **steering angle**, any other arrays, but no ``car``. The
-published plant holds inputs[1, k] during the whole step k, while our cars turn the steering at a
-constant rate, from delta_k to delta_k + step * delta_rate. Both agree on the angle at the end of a
-step, so
+their rates ``dstates``, ``inputs`` (2, n) with duty cycle and **steering angle**, any other arrays,
+but no ``car``. Without ``dstates`` the published states are one-step predictions of a model, each
+from a state of another file, and are refused. The published plant holds inputs[1, k] during the
+whole step k, while our cars turn the steering at a constant rate, from delta_k to delta_k + step *
+delta_rate. Both agree on the angle at the end of a step, so
 
     delta_k = inputs[1, k - 1]  (0 at the start),    delta_rate_k = (inputs[1, k] - delta_k) / step
 
@@ -116,6 +117,11 @@ def _dataset(
         if arrays[name].dtype.kind not in "fiu":
             raise InputError(f"'{name}' holds no numbers")
     if published:
+        if "dstates" not in names:
+            raise InputError(
+                "no 'dstates', so these are predictions of a model (the published KIN-*.npz) and "
+                "not a drive: give the drive (DYN-*.npz)"
+            )
         if car is None or step_s is None:
             raise InputError("the published form does not name its car and step; give both")
         return _published(arrays["states"], arrays["inputs"], car, step_s)

@@ -166,7 +166,7 @@ def test_published_arrays_hold_the_angle_at_the_end_of_the_step(tmp_path: Path, 
     states = random.normal(size=(rows, 8))
     inputs = np.vstack((np.full(7, 0.5), random.uniform(-0.3, 0.3, 7)))
     states[:, 6:], inputs[:, 6:] = 0, 0
-    np.savez(tmp_path / "drive.npz", states=states, inputs=inputs)
+    np.savez(tmp_path / "drive.npz", states=states, dstates=states, inputs=inputs)
     data = dataset_from_npz(tmp_path / "drive.npz", CAR, STEP_S)
     assert len(data) == 5  # two padding columns are gone
     assert data.x[0, 6] == 0

@@ -60,7 +60,9 @@ def test_samples_and_unbroken_drives_are_read(tmp_path: Path, driven: Dataset) -
     assert same(dataset_from_npz(tmp_path / "b.npz", CAR, STEP_S), driven)
 
 
-def test_the_published_form_needs_car_and_step(tmp_path: Path, driven: Dataset) -> None:
+def test_the_published_form_is_a_drive_and_needs_car_and_step(
+    tmp_path: Path, driven: Dataset
+) -> None:
     path, steering = tmp_path / "p.npz", np.vstack((driven.u[:, 0], driven.x_next[:, 6]))
     states = np.vstack((driven.x, driven.x_next[-1:])).T
     np.savez(path, states=states[:6], inputs=steering, time=np.arange(3), dstates=states)
@@ -69,6 +71,9 @@ def test_the_published_form_needs_car_and_step(tmp_path: Path, driven: Dataset) 
     assert found.u == pytest.approx(driven.u)
     with pytest.raises(InputError, match="does not name its car"):
         dataset_from_npz(path)
+    np.savez(path, states=states, inputs=steering, time=np.arange(3))
+    with pytest.raises(InputError, match="predictions of a model"):
+        dataset_from_npz(path, CAR, STEP_S)
 
 
 @pytest.mark.parametrize(
