@@ -109,7 +109,9 @@ def claimed(folder: Path) -> Iterator[None]:
         try:
             stack.enter_context(held(folder))
         except BlockingIOError:
-            raise InputError(f"another process writes to {folder}: choose another folder") from None
+            raise InputError(
+                f"another process writes to {folder}: wait for its end, or give another folder"
+            ) from None
         except OSError:
             pass
         yield

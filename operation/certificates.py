@@ -8,7 +8,8 @@ to drive; who has the former can make himself a director.
 import ipaddress
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Final
@@ -26,7 +27,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from bayesrace.errors import InputError, faults_in
-from bayesrace.files import read_text, replacing, write_whole
+from bayesrace.files import claimed, read_text, replacing, write_whole
 from bayesrace.messages import Role, is_car_name
 from bayesrace.transport.credentials import (
     AUTHORITY,
@@ -37,6 +38,7 @@ from bayesrace.transport.credentials import (
     Member,
     Members,
 )
+from bayesrace.transport.endpoints import address_of
 
 __all__ = ["Entry", "add", "init", "read_register", "revoke"]
 
@@ -101,37 +103,38 @@ def add(
 
     ``car``: the one that it is for, None: all. What is not given when renewing stays.
     """
-    entries = read_register(folder)
-    before = entries.get(name)
-    _check_name(name, before, renew)
-    if before is not None:
-        role, car, hosts = role or before.role, car or before.car, hosts or before.hosts
-    if role is None:
-        raise InputError(f"no role for certificate '{name}': give --role")
-    if car not in (None, EVERY_CAR) and not is_car_name(car or ""):
-        raise InputError(f"--car {car}: a name of up to 40 letters, digits, '-' or '_'")
-    ends = datetime.now(UTC) + timedelta(days=days)
-    target = folder / name
-    target.mkdir(mode=0o700, exist_ok=True)
-    key = ec.generate_private_key(ec.SECP256R1())
-    certificate = _signed(folder, name, role, hosts, key.public_key(), ends)
-    _write_private(target / KEY, key)
-    write_whole(target / CERTIFICATE, certificate)
-    write_whole(target / AUTHORITY, (folder / _FOLDER / AUTHORITY).read_bytes())
-    ends = x509.load_pem_x509_certificate(certificate).not_valid_after_utc  # the authority's first
-    entry = Entry(role=role, car=car or EVERY_CAR, hosts=tuple(hosts), ends=ends)
-    _write_register(folder, {**entries, name: entry})
-    return target
+    with _changing(folder) as entries:
+        before = entries.get(name)
+        _check_name(name, before, renew)
+        if before is not None:
+            role, car, hosts = role or before.role, car or before.car, hosts or before.hosts
+        if role is None:
+            raise InputError(f"no role for certificate '{name}': give --role")
+        if car not in (None, EVERY_CAR) and not is_car_name(car or ""):
+            raise InputError(f"--car {car}: a name of up to 40 letters, digits, '-' or '_'")
+        ends = datetime.now(UTC) + timedelta(days=days)
+        target = folder / name
+        target.mkdir(mode=0o700, exist_ok=True)
+        key = ec.generate_private_key(ec.SECP256R1())
+        certificate = _signed(folder, name, role, hosts, key.public_key(), ends)
+        _write_private(target / KEY, key)
+        write_whole(target / CERTIFICATE, certificate)
+        write_whole(target / AUTHORITY, (folder / _FOLDER / AUTHORITY).read_bytes())
+        # That of the authority, if it ends before.
+        ends = x509.load_pem_x509_certificate(certificate).not_valid_after_utc
+        entry = Entry(role=role, car=car or EVERY_CAR, hosts=tuple(hosts), ends=ends)
+        _write_register(folder, {**entries, name: entry})
+        return target
 
 
 def revoke(folder: Path, name: str) -> None:
     """Take a name off the list of members, for ever; InputError if it is not on it."""
-    entries = read_register(folder)
-    if name not in entries:
-        known = ", ".join(sorted(entries)) or "none"
-        raise InputError(f"no certificate '{name}' in {folder}; there are: {known}")
-    revoked = entries[name].model_copy(update={"revoked": True})
-    _write_register(folder, {**entries, name: revoked})
+    with _changing(folder) as entries:
+        if name not in entries:
+            known = ", ".join(sorted(entries)) or "none"
+            raise InputError(f"no certificate '{name}' in {folder}; there are: {known}")
+        revoked = entries[name].model_copy(update={"revoked": True})
+        _write_register(folder, {**entries, name: revoked})
 
 
 def read_register(folder: Path) -> dict[str, Entry]:
@@ -143,6 +146,14 @@ def read_register(folder: Path) -> dict[str, Entry]:
         return dict(_Register.model_validate_json(text).entries)
     except ValidationError as error:
         raise InputError(f"{path}: {faults_in(error)}") from None
+
+
+@contextmanager
+def _changing(folder: Path) -> Iterator[dict[str, Entry]]:
+    """The register, which no other process changes within the block."""
+    read_register(folder)  # there is one
+    with claimed(folder / _FOLDER):
+        yield read_register(folder)
 
 
 def _check_name(name: str, before: Entry | None, renew: bool) -> None:
@@ -235,8 +246,9 @@ def _alternatives(hosts: Sequence[str]) -> x509.SubjectAlternativeName:
             names.append(x509.IPAddress(ipaddress.ip_address(host)))
         except ValueError:
             try:
+                address_of(f"tls/{host}:1")
                 names.append(x509.DNSName(host))
-            except ValueError:
+            except (ValueError, InputError):
                 raise InputError(
                     f"--host {host}: give a host name in ASCII, or an address"
                 ) from None

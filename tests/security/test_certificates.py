@@ -11,6 +11,7 @@ from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from bayesrace.errors import InputError
+from bayesrace.files import claimed
 from bayesrace.transport import Credentials
 from operation import certificates
 from tests.command_line import Cli, refused
@@ -90,6 +91,8 @@ def test_renewed_keeps_what_is_not_given_and_revoked_never_returns(
         (("add", "../x", "--role", "plant"), ("can't name",)),
         (("add", "x", "--role", "plant", "--car", "a/b"), ("--car a/b",)),
         (("add", "x", "--role", "plant", "--host", "schloß"), ("--host schloß",)),
+        (("add", "x", "--role", "plant", "--host", "a..b"), ("--host a..b",)),
+        (("add", "x", "--role", "plant", "--host", ""), ("--host :",)),
         (("add", "x", "--renew"), ("no certificate 'x' to renew",)),
         (("revoke", "x"), ("no certificate 'x'", "there are: none")),
     ],
@@ -99,6 +102,14 @@ def test_what_cannot_be_made_is_refused(
 ) -> None:
     cli("certs", "init")
     refused(cli("certs", *arguments), *words)
+
+
+def test_only_one_process_at_a_time_changes_the_register(cli: Cli, tmp_path: Path) -> None:
+    """Of four at once, three were in no list of members afterwards."""
+    cli("certs", "init")
+    with claimed(tmp_path / "certs" / "authority"):
+        refused(cli("certs", "add", "x", "--role", "viewer"), "another process", "wait for its end")
+    assert not (tmp_path / "certs" / "x").exists()
 
 
 def test_without_an_authority_there_is_a_remedy(cli: Cli) -> None:
