@@ -22,6 +22,7 @@ def faults_in(error: "ValidationError", whole: str = "the content") -> str:
     ``whole``: the name of what has no field of its own, such as text that is no JSON.
     """
     return "; ".join(
-        f"{'.'.join(str(part) for part in one['loc']) or whole}: {one['msg']}"
+        f"{'.'.join(str(part) for part in one['loc']) or whole}: "
+        + one["msg"].removeprefix("Value error, ")  # what pydantic puts before our own words
         for one in error.errors()
     )

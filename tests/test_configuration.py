@@ -75,6 +75,20 @@ def test_a_fault_is_named_with_file_and_field(
     refused(cli("cars", "--config", path), str(path), *words)
 
 
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[network]\nplant = ['tcp/10.0.0.1:1']", ("tcp/10.0.0.1:1", "'bayesrace certs'")),
+        ("[network]\ncontroller = ['tls/127.0.0.1:1']", ("needs a certificate",)),
+        ("[zenoh]\nnonsense = 1", ("[zenoh] nonsense = 1",)),
+    ],
+)
+def test_what_no_process_would_start_with_is_found_by_the_check(
+    cli: Cli, tmp_path: Path, text: str, words: tuple[str, ...]
+) -> None:
+    refused(cli("config", "check", config(tmp_path, text)), *words)
+
+
 def test_flags_override_the_file_which_overrides_the_variable(
     cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -26,7 +26,7 @@ from bayesrace.transport.membership import refusals, serve_access
 from bayesrace.transport.probe import Finding, probe_all
 from bayesrace.transport.watch import LinkWatch, report
 
-__all__ = ["open_session", "try_links"]
+__all__ = ["open_session", "try_links", "zenoh_config"]
 
 _log = logging.getLogger("bayesrace.links")
 
@@ -49,7 +49,8 @@ _FILTERS: Final[list[dict[str, list[str]]]] = [
 _ROUTER: Final = {"south": [{"filters": [one]} for one in _FILTERS]}
 
 
-def _config(endpoints: Endpoints, role: Role) -> Any:
+def zenoh_config(endpoints: Endpoints, role: Role) -> Any:
+    """Zenoh's configuration of such a process; InputError for a setting that it does not have."""
     config = zenoh.Config()
     region = role if role in _REGIONS else "observer"
     limits = endpoints.limits
@@ -195,7 +196,7 @@ def _checked(endpoints: Endpoints, role: Role, explains: bool = True) -> list[Fi
 @contextmanager
 def _opened(endpoints: Endpoints, role: Role) -> Iterator[Any]:
     try:
-        session = zenoh.open(_config(endpoints, role))
+        session = zenoh.open(zenoh_config(endpoints, role))
     except zenoh.ZError as error:
         text = re.sub(r" at /\S+", "", str(error).splitlines()[0])  # places in Zenoh's source
         cause = re.search(r"[^:\[]+ \(os error \d+\)", text)

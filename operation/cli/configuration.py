@@ -7,6 +7,7 @@ import typer
 
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
+from bayesrace.messages import Role
 from operation.cli.configured import current
 from operation.cli.options import writable
 
@@ -53,8 +54,15 @@ def check(
 
 def _certificates(found: "Configuration") -> str:
     """What there is of certificates, each of which is read; InputError if one cannot be used."""
+    from bayesrace.transport.session import zenoh_config
+
+    names: tuple[Role, ...] = ("plant", "controller", "director", "router")
     if found.tls.folder is None:
-        return "fine; no certificates, so links are for loopback only"
+        for role in names:
+            (ends := found.endpoints(role)).check()
+            zenoh_config(ends, role)
+        reach = "open to everyone in the network" if found.network.insecure else "for loopback only"
+        return f"fine; no certificates, so links are {reach}"
     there = found.tls.certificates()
     if not there:
         raise InputError(
@@ -62,9 +70,10 @@ def _certificates(found: "Configuration") -> str:
             "[tls] folder"
         )
     roles = {one.name: "revoked" if one.member is None else one.member.role for one in there}
-    for role in ("plant", "controller", "director", "router"):
+    for role in names:
         if role in roles.values():
-            found.endpoints(role).check()
+            (ends := found.endpoints(role)).check()
+            zenoh_config(ends, role)
     return "fine; certificates " + ", ".join(f"'{name}' ({role})" for name, role in roles.items())
 
 
