@@ -17,6 +17,8 @@ from tests.command_line import Cli, course_files, refused
 from tests.conftest import Circuit
 from tests.programs import finish, peanut, run, start, until
 
+LONG = ("--laps", "10000", "--max-time", "3600")
+
 
 @pytest.fixture
 def course(circuit: Circuit, tmp_path: Path) -> tuple[str | Path, ...]:
@@ -98,6 +100,17 @@ class Waiting:
     plant_at: str
     where: tuple[str, ...]
     """Endpoints of both, as options."""
+    track: tuple[str | Path, ...]
+    ended: list[subprocess.Popen[str]]
+
+    def drive(self, log: Path, *options: str) -> subprocess.Popen[str]:
+        """A drive of many laps, of which the first is in progress."""
+        # Else 'drive' says, besides, that nobody listens yet.
+        until(lambda: not probe_all(self.where[1::2], None, greets=False), "both to listen")
+        drive = start("drive", *self.track, *LONG, *options, *self.where, "--log", log)
+        self.ended.append(drive)
+        until(lambda: log.exists() and log.stat().st_size > 20_000, "a run in progress")
+        return drive
 
 
 @pytest.fixture
@@ -110,7 +123,7 @@ def waiting(
     controller = start("controller", *files, "--endpoint", plant_at, "--listen", controller_at)
     ended += [plant, controller]
     where = ("--endpoint", plant_at, "--endpoint", controller_at)
-    return Waiting(plant, controller, plant_at, where)
+    return Waiting(plant, controller, plant_at, where, course[:2], ended)
 
 
 def test_drive_refuses_another_track_than_the_controllers(cli: Cli, waiting: Waiting) -> None:
@@ -119,20 +132,10 @@ def test_drive_refuses_another_track_than_the_controllers(cli: Cli, waiting: Wai
 
 
 @pytest.mark.check
-def test_drive_says_when_the_controller_is_lost(
-    tmp_path: Path,
-    course: tuple[str | Path, ...],
-    waiting: Waiting,
-    ended: list[subprocess.Popen[str]],
-) -> None:
+def test_drive_says_when_the_controller_is_lost(tmp_path: Path, waiting: Waiting) -> None:
     """The run breaks off, so drive fails; the plant is ready for the next controller."""
     log = tmp_path / "drive.mcap"
-    many = ("--laps", "10000", "--max-time", "3600")
-    # Else 'drive' says, besides, that nobody listens yet.
-    until(lambda: not probe_all(waiting.where[1::2], None, greets=False), "both to listen")
-    drive = start("drive", *course[:2], *many, *waiting.where, "--log", log)
-    ended.append(drive)
-    until(lambda: log.exists() and log.stat().st_size > 100_000, "a lap in progress")
+    drive = waiting.drive(log)
     waiting.controller.kill()
     done = finish(drive)
     assert done.returncode not in (0, None)
@@ -146,32 +149,22 @@ def test_drive_says_when_the_controller_is_lost(
 @pytest.mark.check
 @pytest.mark.wall_clock
 def test_a_run_whose_director_is_gone_ends_by_itself_or_by_a_command(
-    tmp_path: Path,
-    course: tuple[str | Path, ...],
-    waiting: Waiting,
-    ended: list[subprocess.Popen[str]],
+    tmp_path: Path, waiting: Waiting
 ) -> None:
     """Nothing watches or records it any more; until then a new one is refused with the remedy."""
-    long = ("drive", *course[:2], "--laps", "10000", "--max-time", "3600", "--mode", "realtime")
 
     def words() -> str:
         state = json.loads(run("status", "--json", *waiting.where).stdout)["cars"]["orca"]["plant"]
         return f"{state['phase']}: {state['text']}"
 
-    def killed(log: Path) -> None:
-        drive = start(*long, *waiting.where, "--log", log)
-        ended.append(drive)
-        until(lambda: log.exists() and log.stat().st_size > 50_000, "a run in progress")
-        drive.kill()
-
-    killed(tmp_path / "one.mcap")
-    busy = run(*long, *waiting.where, "--log", tmp_path / "two.mcap")
+    waiting.drive(tmp_path / "one.mcap", "--mode", "realtime").kill()
+    busy = run("drive", *waiting.track, *waiting.where, "--log", tmp_path / "two.mcap")
     assert busy.returncode == 2
     assert "'bayesrace stop --run' ends it" in busy.stderr
     done = run("stop", "--run", "--endpoint", waiting.plant_at)
     assert (done.returncode, "stops" in done.stdout) == (0, True), done.stderr
     until(lambda: words().startswith("idle"), "the end of the run")
-    killed(tmp_path / "three.mcap")
+    waiting.drive(tmp_path / "three.mcap", "--mode", "realtime").kill()
     until(lambda: "has been gone for 10 s" in words(), "the end of another")
     assert words().startswith("idle")
 
@@ -179,18 +172,9 @@ def test_a_run_whose_director_is_gone_ends_by_itself_or_by_a_command(
 @pytest.mark.check
 @pytest.mark.wall_clock
 def test_a_run_in_which_the_car_was_not_driven_is_no_success(
-    tmp_path: Path,
-    course: tuple[str | Path, ...],
-    waiting: Waiting,
-    ended: list[subprocess.Popen[str]],
+    tmp_path: Path, waiting: Waiting
 ) -> None:
-    log = tmp_path / "drive.mcap"
-    drive = start(
-        "drive", *course[:2], "--laps", "1000", "--max-time", "4", "--mode", "realtime",
-        *waiting.where, "--log", log,
-    )  # fmt: skip
-    ended.append(drive)
-    until(lambda: log.exists() and log.stat().st_size > 20_000, "a run in progress")
+    drive = waiting.drive(tmp_path / "drive.mcap", "--mode", "realtime", "--max-time", "4")
     waiting.controller.send_signal(signal.SIGSTOP)
     try:
         done = finish(drive)

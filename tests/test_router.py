@@ -5,12 +5,12 @@ from contextlib import ExitStack
 
 import pytest
 
-from bayesrace.messages import STATE, Role, State
+from bayesrace.messages import STATE, Role
 from bayesrace.transport import Endpoints, Inbox, Kind, Publisher, free_endpoint, open_session
 from tests.command_line import Cli, refused
 from tests.fake_processes import Fakes, fakes, status_of
 from tests.programs import finish, run, start, until
-from tests.test_transport import take
+from tests.test_transport import state, take
 
 __all__ = ["fakes"]
 
@@ -44,20 +44,7 @@ def test_a_router_forwards_between_plant_controller_and_observer_and_a_peer_does
         theirs.watch("controller")
         for inbox in (theirs, *receivers):
             take(inbox, Kind.ALIVE)
-        state = State(
-            seq=0,
-            source_time_ns=0,
-            epoch=0,
-            run=1,
-            time_s=0.0,
-            x=(0.0,) * 7,
-            u_applied=(0.0, 0.0),
-            lap=0,
-            lockstep=True,
-            actuation_delays=(),
-            final=False,
-        )
-        Publisher(plant, STATE, "a").put(state, lockstep=True)
+        Publisher(plant, STATE, "a").put(state(0), lockstep=True)
         for inbox in receivers:
             take(inbox, Kind.MESSAGE)
 
