@@ -79,7 +79,7 @@ class Compiler:
 
     def _run(self, *arguments: str | Path) -> None:
         line = [*self.command, *(str(one) for one in arguments)]
-        done = subprocess.run(line, capture_output=True, text=True, check=False)
+        done = subprocess.run(line, capture_output=True, text=True, errors="replace", check=False)
         if done.returncode:
             raise CompileError(f"{shlex.join(line)}\n{_shortened(done.stderr)}")
 
@@ -125,7 +125,9 @@ def _can_build(compiler: Compiler) -> None:
 
 
 def _run(line: list[str]) -> str:
-    done = subprocess.run(line, capture_output=True, text=True, check=True, timeout=120)
+    done = subprocess.run(
+        line, capture_output=True, text=True, errors="replace", check=True, timeout=120
+    )
     return done.stdout
 
 

@@ -206,8 +206,9 @@ def test_cars_that_differ_in_tuning_alone_share_a_library(
 
 
 def test_a_compile_error_comes_with_the_compilers_words(tmp_path: Path) -> None:
+    """Whatever their encoding."""
     source = tmp_path / "wrong.c"
-    source.write_text("int main(void) { return undeclared_thing; }\n")
+    source.write_bytes(b'#pragma message("\xfc")\nint main(void) { return undeclared_thing; }\n')
     with pytest.raises(CompileError, match="undeclared_thing"):
         find_compiler().shared_library([source], [], [], tmp_path / "out.so")
 

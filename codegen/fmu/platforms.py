@@ -94,6 +94,8 @@ def compile_binary(
     Raises CompileError with the compiler's words, InputError if no compiler serves.
     """
     line = [*target.command(), *arguments(target, linked, str(out), flags)]
-    done = subprocess.run(line, cwd=folder, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        line, cwd=folder, capture_output=True, text=True, errors="replace", check=False
+    )
     if done.returncode:
         raise CompileError(f"{shlex.join(line)}\n{done.stderr[:4000]}")
