@@ -30,7 +30,8 @@ _REMINDER_S: Final = 86400.0
 _said: Final[dict[str, str]] = {}
 """What the log of this process says of an endpoint, which may be checked before its session."""
 _interrupting: Final = threading.Lock()
-"""Held by the watch that ends the process: two sessions may have one certificate."""
+"""Held once a watch ends the process, which may have several sessions with one certificate; until
+the process, which has not ended, opens another one."""
 
 
 def report(findings: Iterable[Finding]) -> None:
@@ -58,7 +59,8 @@ class LinkWatch:
         self.fault = ""
         """Why the process has to end, with the remedy; it gets a SIGINT in its main thread."""
         self._ends_process = threading.current_thread() is threading.main_thread()
-        self._interrupted = False
+        if self._ends_process and _interrupting.locked():
+            _interrupting.release()
         self._missing: list[str] = []
         self._remind_s = 0.0
         self._over = threading.Event()
@@ -69,8 +71,6 @@ class LinkWatch:
         """Ends it."""
         self._over.set()
         self._thread.join()
-        if self._interrupted:
-            _interrupting.release()
 
     def _watch(self) -> None:
         first, wait_s = True, _FIRST_S
@@ -145,6 +145,5 @@ class LinkWatch:
         if not self._ends_process:
             _log.error("%s", fault)
         elif _interrupting.acquire(blocking=False):
-            self._interrupted = True
             # Not to the process: another thread would get it, and the main one would sleep on.
             signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)

@@ -130,6 +130,31 @@ def test_a_revoked_certificate_ends_its_process(tmp_path: Path) -> None:
         drive()
 
 
+def test_a_process_is_interrupted_once(bundles: Bundles) -> None:
+    """Whatever its further sessions find out while it ends because of the first one."""
+    own, now_s, ended = bundles.credentials("director"), time.time(), []
+    sooner, later = (
+        Endpoints(
+            connect=(free_endpoint("tls"),),
+            credentials=own.model_copy(update={"ends_s": now_s + after_s}),
+        )
+        for after_s in (4.0, 4.5)
+    )
+
+    def work() -> None:
+        with open_session(later, "director"):
+            try:
+                with open_session(sooner, "director"):
+                    time.sleep(PATIENCE_S)
+            finally:
+                time.sleep(1.5)
+                ended.append("in order")
+
+    with pytest.raises(InputError, match="has expired"):
+        work()
+    assert ended == ["in order"]
+
+
 def test_another_member_cannot_end_a_process(tmp_path: Path, bundles: Bundles) -> None:
     """By saying in place of the plant that the certificate is revoked."""
     where, here = free_endpoint("tls"), free_endpoint("tls")
