@@ -118,10 +118,13 @@ def generate(problem: "Problem", settings: BuildSettings, folder: Path) -> None:
     generator.generate(str(folder) + os.sep)
     (folder / "br_problem.h").write_text(c_header(problem))
     (folder / "br_interface.h").write_text(c_interface())
+    free, block = settings.blocks
     (folder / "br_config.h").write_text(
         "/* generated: dimensions of this controller */\n"
         "#ifndef BR_CONFIG_H\n#define BR_CONFIG_H\n"
         f"#define BR_N {settings.stages}\n"
+        f"#define BR_FREE {free}\n"
+        f"#define BR_BLOCK {block}\n"
         f"#define BR_TS {settings.discretisation.step_s!r}\n"
         f"#define BR_GP_CAPACITY {settings.gp_capacity}\n"
         f'#define BR_MODEL_NAME "{settings.model}"\n'

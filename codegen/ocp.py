@@ -6,7 +6,7 @@ and, expanded to scalars and started cold as the published code does, the peer o
 bench``.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
@@ -38,8 +38,9 @@ class OcpNlp:
 
     ``f``: CasADi function (x, u) -> x_next. ``expand``: scalar expressions instead of matrices
     (as the published code; takes seconds and hundreds of MB with 400 training points).
-    ``options``: IPOPT's own. Parameters are given by name; settings of the native solver among
-    them are not looked at.
+    ``options``: IPOPT's own. ``blocks``: of each stage, the number of its block, whose stages have
+    one input; without, each stage has its own. Parameters are given by name; settings of the native
+    solver among them are not looked at.
     """
 
     def __init__(
@@ -49,8 +50,10 @@ class OcpNlp:
         horizon: int,
         expand: bool = False,
         options: dict[str, Any] | None = None,
+        blocks: Sequence[int] | None = None,
     ) -> None:
         self.horizon, self._problem = horizon, problem
+        self._blocks = list(range(horizon) if blocks is None else blocks)
         self._nx, self._nu = len(problem.states), len(problem.inputs)
         self._soft = [row for row in problem.rows if row.soft]
         self._hard = [row for row in problem.rows if not row.soft]
@@ -87,7 +90,8 @@ class OcpNlp:
 
     def _formulate(self, f: ca.Function) -> tuple[dict[str, Any], ca.Function]:
         n, nx, nu, soft = self.horizon, self._nx, self._nu, 2 * len(self._soft)
-        u, x, eps = ca.MX.sym("u", nu, n), ca.MX.sym("x", nx, n), ca.MX.sym("eps", soft, n)
+        held = ca.MX.sym("u", nu, self._blocks[-1] + 1)
+        u, x, eps = held[:, self._blocks], ca.MX.sym("x", nx, n), ca.MX.sym("eps", soft, n)
         x0, u_before = ca.MX.sym("x0", nx), ca.MX.sym("u_before", nu)
         p = ca.MX.sym("p", len(self._problem.stage_parameters), n)
         theta = ca.MX.sym("theta", len(self._problem.parameters))
@@ -101,7 +105,7 @@ class OcpNlp:
             acting = u[:, k]
             cost += stage + ca.dot(weights, eps[:, k] ** 2)
             constraints += [over - eps[:, k], hard]
-        variables = ca.veccat(u, x, eps)
+        variables = ca.veccat(held, x, eps)
         nlp = {
             "x": variables,
             "p": ca.veccat(x0, u_before, p, theta),
@@ -112,7 +116,8 @@ class OcpNlp:
 
     def _variable_bounds(self, x0: Floats, theta: list[float]) -> dict[str, Any]:
         n, rows = self.horizon, 2 * (len(self._soft) + len(self._hard))
-        low_u, high_u = (ca.repmat(one, 1, n) for one in self._input_bounds(x0, theta))
+        blocks = self._blocks[-1] + 1
+        low_u, high_u = (ca.repmat(one, 1, blocks) for one in self._input_bounds(x0, theta))
         free = np.full((self._nx, n), np.inf)
         soft = 2 * len(self._soft)
         return {
@@ -191,7 +196,8 @@ class OcpNlp:
             _, _, over, _ = self._stage(x[k + 1], u[k], acting, 0.0, reference[k], theta)
             slack.append(ca.fmax(0, over))
             acting = u[k]
-        return _dm(u.T, x[1:].T, ca.horzcat(*slack))
+        first = [self._blocks.index(block) for block in range(self._blocks[-1] + 1)]
+        return _dm(u[first].T, x[1:].T, ca.horzcat(*slack))
 
 
 def _dm(*parts: Any) -> ca.DM:

@@ -26,6 +26,20 @@ class BuildSettings(BaseModel):
     horizon: int | None = Field(
         None, ge=2, le=100, description="stages N; the car's, from its tuning, without"
     )
+    free_stages: int | None = Field(
+        None,
+        ge=1,
+        le=100,
+        description="first stages, whose inputs each change by themselves in a QP; the car's "
+        "without",
+    )
+    block_stages: int | None = Field(
+        None,
+        ge=1,
+        le=100,
+        description="of the stages after them, so many change alike; 1: no blocks; the car's "
+        "without",
+    )
     gp_capacity: int = Field(1024, ge=8, le=16384, description="training points per output")
 
     @property
@@ -34,6 +48,17 @@ class BuildSettings(BaseModel):
         tuning = self.car.tuning
         own = tuning.progress if self.problem == "progress" else tuning.objective
         return self.horizon or own.horizon
+
+    @property
+    def blocks(self) -> tuple[int, int]:
+        """Free stages, at most all, and stages of a block after them, resolved."""
+        free, block = self.free_stages, self.block_stages
+        if self.problem == "progress":
+            own = self.car.tuning.progress
+            free, block = free or own.free_stages, block or own.block_stages
+        if block is None or block == 1:
+            return self.stages, 1
+        return min(free or self.stages, self.stages), block
 
     @classmethod
     def best_case(

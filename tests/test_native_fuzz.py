@@ -85,7 +85,9 @@ def test_no_input_breaks_a_promise(objects: dict[str, Path], tmp_path: Path) -> 
 
 
 def test_nor_of_the_problem_that_maximises_progress(tmp_path: Path) -> None:
-    progress = BuildSettings(problem="progress", horizon=6, gp_capacity=16)
+    progress = BuildSettings(
+        problem="progress", horizon=6, free_stages=2, block_stages=2, gp_capacity=16
+    )
     no_input_breaks_a_promise(objects_of(build(progress)[0], tmp_path), tmp_path)
 
 

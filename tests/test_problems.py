@@ -124,9 +124,12 @@ def native(problem: Problem) -> NativeProblem:
     return compiled(problem)
 
 
-def compiled(problem: Problem) -> NativeProblem:
+def compiled(problem: Problem, **blocks: int) -> NativeProblem:
     settings = BuildSettings(
-        discretisation=Discretisation(step_s=STEP_S), horizon=HORIZON, gp_capacity=CAPACITY
+        discretisation=Discretisation(step_s=STEP_S),
+        horizon=HORIZON,
+        gp_capacity=CAPACITY,
+        **blocks,
     )
     step = NativeProblem(build(settings, problem=problem)[0])
     step.set_values(VALUES)

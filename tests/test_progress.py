@@ -26,7 +26,8 @@ from tests.test_native_step import EXACT, FROM_OUR_PLAN, TIGHT_IPOPT
 from tests.test_native_time import Clock
 
 HORIZON = 20
-PROGRESS = BuildSettings(problem="progress", horizon=HORIZON)
+PROGRESS = BuildSettings(problem="progress", horizon=HORIZON, block_stages=1)
+"""Without blocks, which IPOPT's solution does not have; see test_blocks.py."""
 
 
 @pytest.fixture(scope="module")

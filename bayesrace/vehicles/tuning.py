@@ -188,6 +188,12 @@ class ObjectiveTuning(_Section):
     horizon: int = _number(20, NONE, "stages that the OCP looks ahead [-]", ge=2, le=100)
 
 
+_COMPILED: Final = frozenset(
+    {"horizon", "free_stages", "block_stages", "proximal_duty", "proximal_delta_rate"}
+)
+"""What of the tuning below shapes the generated code."""
+
+
 class ProgressTuning(_Section):
     """The same for the OCP that maximises progress."""
 
@@ -208,11 +214,17 @@ class ProgressTuning(_Section):
     s_slack: float = _number(1000.0, (-2.0, 0.0, 0.0), "S: squared track violation [1/m^2]")
     margin_m: float = _number(0.01, LENGTH, "distance kept from the track edges [m]")
     horizon: int = _number(40, NONE, "stages that the OCP looks ahead [-]", ge=2, le=100)
+    free_stages: int = _number(
+        10, NONE, "first stages whose inputs each change by themselves in one QP [-]", ge=1, le=100
+    )
+    block_stages: int = _number(
+        5, NONE, "of the stages after them, so many change alike; 1: no blocks [-]", ge=1, le=100
+    )
 
     @property
     def run_time(self) -> dict[str, float]:
         """The numbers that can change between two steps, by the names of the OCP's parameters."""
-        return self.model_dump(exclude={"horizon", "proximal_duty", "proximal_delta_rate"})
+        return self.model_dump(exclude=set(_COMPILED))
 
 
 class CautionTuning(_Section):

@@ -1,13 +1,15 @@
 /* Condensing: the QP's states are functions of its inputs, dx_k = xbar_k + G_k dU. Sensitivities
  * G_k, Hessian and gradient of the QP in the inputs alone, by recursions along the horizon. What is
- * zero by the problem's sparsity is left out.
+ * zero by the problem's sparsity is left out. dU has one entry for each input of a block: a column
+ * of G_k is the sum of those of the block's stages before k.
  */
 #include "br_internal.h"
 
-/* G_{k+1} = [A_k G_k, B_k] */
+/* G_{k+1} = [A_k G_k, B_k], or, within a block, B_k added to its columns. */
 static void propagate_sensitivity(double (*restrict next)[BR_MP], double (*restrict g)[BR_MP],
                                   const br_stage *stage, int k) {
-    const int columns = br_padded(BR_NU * k);
+    const int opens = br_opens_block(k), own = BR_NU * BR_BLOCK_OF(k);
+    const int columns = br_padded(opens ? own : own + BR_NU);
     BR_UNROLL
     for (int i = 0; i < BR_NX; ++i) {
         double weight[BR_NX];
@@ -20,7 +22,8 @@ static void propagate_sensitivity(double (*restrict next)[BR_MP], double (*restr
         }
         br_combine(next[i], columns, 0, count, weight, rows);
         BR_UNROLL
-        for (int c = 0; c < BR_NU; ++c) next[i][BR_NU * k + c] = stage->jacobian[i][BR_NX + c];
+        for (int c = 0; c < BR_NU; ++c)
+            next[i][own + c] = (opens ? 0 : next[i][own + c]) + stage->jacobian[i][BR_NX + c];
     }
 }
 
@@ -43,27 +46,30 @@ static void propagate_state(br_mpc *mpc) {
     }
 }
 
-/* One step of the backward recursion for the Hessian's rows of stage k, columns of inputs <= k:
- * H_k = B' P + S G_k,  P <- A' P + (W + second derivatives of cost and rows) G_k, the second-order
- * part of dynamics and rows with the weight tau. */
+/* One step of the backward recursion for the Hessian's rows of stage k, columns of its block and of
+ * those before: H_k = B' P + S [G_k, I],  P <- A' P + (W + second derivatives of cost and rows)
+ * G_k, the second-order part of dynamics and rows with the weight tau. Rows of a block add up; so
+ * that its earlier stages meet the later ones, P has the columns of the block's inputs, S', too. */
 static void hessian_rows(br_mpc *mpc, int k, double tau, double (*restrict p)[BR_MP],
                          double (*restrict p_next)[BR_MP]) {
     br_qp *qp = &mpc->qp;
     const br_stage *stage = &mpc->stage[k];
-    const int columns = br_padded(BR_NU * (k + 1)), before = br_padded(BR_NU * k);
+    const int own = BR_NU * BR_BLOCK_OF(k), opens = br_opens_block(k);
+    const int columns = br_padded(own + BR_NU), before = opens ? br_padded(own) : columns;
+    const int adds = k + 1 < BR_N && !br_opens_block(k + 1);
     double (*restrict g)[BR_MP] = qp->g[k];
     double weight[2 * BR_NX];
     const double *rows[2 * BR_NX];
     BR_UNROLL
     for (int r = 0; r < BR_NU; ++r) {
-        double *restrict row = qp->h[BR_NU * k + r];
+        double *restrict row = qp->h[own + r];
         int count = 0;
         BR_UNROLL
         for (int n = BR_BT_START[r]; n < BR_BT_START[r + 1]; ++n, ++count) {
             weight[count] = stage->jacobian[BR_BT_INDEX[n]][BR_NX + r];
             rows[count] = p[BR_BT_INDEX[n]];
         }
-        br_combine(row, columns, 0, count, weight, rows);
+        br_combine(row, columns, adds, count, weight, rows);
         count = 0;
         BR_UNROLL
         for (int n = BR_WUX_START[r]; n < BR_WUX_START[r + 1]; ++n, ++count) {
@@ -72,8 +78,7 @@ static void hessian_rows(br_mpc *mpc, int k, double tau, double (*restrict p)[BR
         }
         br_combine(row, before, 1, count, weight, rows);
         BR_UNROLL
-        for (int c = 0; c < BR_NU; ++c)
-            row[BR_NU * k + c] += tau * stage->hessian[BR_NX + r][BR_NX + c];
+        for (int c = 0; c < BR_NU; ++c) row[own + c] += tau * stage->hessian[BR_NX + r][BR_NX + c];
     }
     if (k == 0) return;
     BR_UNROLL
@@ -90,6 +95,9 @@ static void hessian_rows(br_mpc *mpc, int k, double tau, double (*restrict p)[BR
             rows[count] = g[BR_WXX_INDEX[n]];
         }
         br_combine(p_next[i], before, 0, count, weight, rows);
+        if (opens) continue;
+        BR_UNROLL
+        for (int c = 0; c < BR_NU; ++c) p_next[i][own + c] += tau * stage->hessian[i][BR_NX + c];
     }
     br_stage_curvature *second = &qp->second[k - 1];
     BR_UNROLL
@@ -103,6 +111,23 @@ static void hessian_rows(br_mpc *mpc, int k, double tau, double (*restrict p)[BR
         rows[0] = g[BR_RXX_COLUMN[n]];
         br_combine(p_next[BR_RXX_ROW[n]], before, 1, 1, weight, rows);
     }
+}
+
+/* What of the cost couples the inputs of stage k with each other and with those before, and the
+ * proximal term. */
+static void add_input_curvature(br_qp *qp, int k) {
+    const int i = BR_NU * BR_BLOCK_OF(k), before = i - BR_NU, opens = br_opens_block(k);
+    double (*uu)[2 * BR_NU] = qp->second[k].uu;
+    for (int a = 0; a < BR_NU; ++a) qp->h[i + a][i + a] += BR_INPUT_PROXIMAL[a];
+    for (int a = 0; a < BR_NU; ++a)
+        for (int b = 0; b < BR_NU; ++b) {
+            const double later = k + 1 < BR_N ? qp->second[k + 1].uu[BR_NU + a][BR_NU + b] : 0.0;
+            qp->h[i + a][i + b] += uu[a][b] + later;
+            if (!opens)
+                qp->h[i + a][i + b] += uu[a][BR_NU + b] + uu[BR_NU + a][b];
+            else if (k)
+                qp->h[i + a][before + b] += uu[a][BR_NU + b];
+        }
 }
 
 void br_condense_hessian(br_mpc *mpc, double tau) {
@@ -119,17 +144,7 @@ void br_condense_hessian(br_mpc *mpc, double tau) {
                 tau * final->rows_xx[n] * qp->g[BR_N][BR_RXX_COLUMN[n]][c];
     for (int k = BR_N - 1, side = 0; k >= 0; --k, side = !side)
         hessian_rows(mpc, k, tau, qp->costate[side], qp->costate[!side]);
-    for (int k = 0; k < BR_N; ++k) {
-        const int i = BR_NU * k;
-        for (int a = 0; a < BR_NU; ++a) qp->h[i + a][i + a] += BR_INPUT_PROXIMAL[a];
-        for (int a = 0; a < BR_NU; ++a)
-            for (int b = 0; b < BR_NU; ++b) {
-                const double later =
-                    k + 1 < BR_N ? qp->second[k + 1].uu[BR_NU + a][BR_NU + b] : 0.0;
-                qp->h[i + a][i + b] += qp->second[k].uu[a][b] + later;
-                if (k) qp->h[i + a][i - BR_NU + b] += qp->second[k].uu[a][BR_NU + b];
-            }
-    }
+    for (int k = 0; k < BR_N; ++k) add_input_curvature(qp, k);
 }
 
 /* By the adjoint recursion along xbar. */
@@ -142,6 +157,7 @@ void br_condense_gradient(br_mpc *mpc, double tau) {
         if (k < BR_N) {
             const br_stage *stage = &mpc->stage[k];
             const double *dx = qp->xbar[k];
+            const int adds = k + 1 < BR_N && !br_opens_block(k + 1);
             BR_UNROLL
             for (int c = 0; c < BR_NU; ++c) {
                 double sum =
@@ -150,7 +166,8 @@ void br_condense_gradient(br_mpc *mpc, double tau) {
                 BR_UNROLL
                 for (int n = BR_WUX_START[c]; n < BR_WUX_START[c + 1]; ++n)
                     sum += tau * stage->hessian[BR_NX + c][BR_WUX_INDEX[n]] * dx[BR_WUX_INDEX[n]];
-                qp->gradient[BR_NU * k + c] = sum;
+                double *entry = &qp->gradient[BR_NU * BR_BLOCK_OF(k) + c];
+                *entry = (adds ? *entry : 0) + sum;
             }
             BR_UNROLL
             for (int i = 0; i < BR_NX; ++i) {

@@ -18,9 +18,13 @@
 #define BR_UNROLL _Pragma("GCC unroll 16")
 #endif
 
-#define BR_M (BR_NU * BR_N)                      /* condensed variables */
-#define BR_MP (((BR_M + 7) / 8) * 8)             /* padded to whole vectors */
-#define BR_ROWS (BR_M + BR_NR * BR_N)            /* input bounds, then the problem's, row by row */
+/* Inputs that a QP changes alike make a block: each of the first BR_FREE stages is one, and of the
+ * stages after them each BR_BLOCK. */
+#define BR_BLOCK_OF(k) ((k) < BR_FREE ? (k) : BR_FREE + ((k) - BR_FREE) / BR_BLOCK)
+#define BR_BLOCKS (BR_BLOCK_OF(BR_N - 1) + 1)
+#define BR_M (BR_NU * BR_BLOCKS)      /* condensed variables */
+#define BR_MP (((BR_M + 7) / 8) * 8)  /* padded to whole vectors */
+#define BR_ROWS (BR_M + BR_NR * BR_N) /* bounds of the blocks, then the problem's, row by row */
 #define BR_ROW(r, k) (BR_M + BR_N * (r) + (k))   /* row r of stage k + 1 */
 #define BR_ACTIVE (BR_M + BR_NR_SOFT * BR_N + 2) /* most rows that DAQP holds active at a time */
 #define BR_ROW_LATE BR_ROW(BR_NR_EARLY, 0) /* from here on gradients are known at a step only */
@@ -120,7 +124,7 @@ typedef struct {
     br_stage_terms terms[BR_N];
     br_stage_curvature second[BR_N];
     double penalty[BR_NR];                       /* of the soft rows */
-    BR_ALIGNED double g[BR_N + 1][BR_NX][BR_MP]; /* sensitivity of stage k to all inputs */
+    BR_ALIGNED double g[BR_N + 1][BR_NX][BR_MP]; /* sensitivity of stage k to all blocks */
     BR_ALIGNED double costate[2][BR_NX][BR_MP];
     BR_ALIGNED double h[BR_M][BR_MP];   /* condensed Hessian, then its Cholesky factor */
     BR_ALIGNED double y[BR_M][BR_COLS]; /* L^{-1} [A' | gradient] */
@@ -128,7 +132,7 @@ typedef struct {
     double xbar[BR_N + 1][BR_NX];
     double gradient[BR_M];
     double lower[BR_ROWS], upper[BR_ROWS], scale[BR_ROWS];
-    double delta_u[BR_M];
+    double delta_u[BR_NU * BR_N];
     double multiplier[BR_ROWS]; /* of the rows above, QP units */
     double delta_x[BR_N + 1][BR_NX];
     double costate_next[BR_N + 1][BR_NX];
@@ -320,6 +324,9 @@ BR_PART int br_valid_parameters(const br_mpc_parameters *parameters);
 static inline const double *br_theta(const br_mpc_parameters *parameters) {
     return (const double *)parameters; /* the problem's come first, all of them doubles */
 }
+
+/* Whether the stage is the first of its block. */
+static inline int br_opens_block(int k) { return k == 0 || BR_BLOCK_OF(k) > BR_BLOCK_OF(k - 1); }
 
 /* Whole vectors that cover columns 0..n-1 of a BR_MP-wide row; the rest of a row is zero. */
 static inline int br_padded(int n) { return (n + 7) & ~7; }

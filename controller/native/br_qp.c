@@ -3,10 +3,10 @@
  *
  *   min 1/2 dU' H dU + g' dU   s.t.  lower <= A dU <= upper
  *
- * rows: BR_M input bounds, then BR_N for each row of the problem (stages 1..N), two-sided, those
- * with constant gradients first. Soft ones have the penalty w eps^2, eps >= 0 per side; only one
- * side can be violated, and with a purely quadratic penalty eps >= 0 never binds, so DAQP's dual
- * regularisation (1 / 2w on a soft row's diagonal) is exact.
+ * rows: BR_M bounds of the blocks' inputs, then BR_N for each row of the problem (stages 1..N),
+ * two-sided, those with constant gradients first. Soft ones have the penalty w eps^2, eps >= 0 per
+ * side; only one side can be violated, and with a purely quadratic penalty eps >= 0 never binds, so
+ * DAQP's dual regularisation (1 / 2w on a soft row's diagonal) is exact.
  *
  * DAQP gets M = A L^{-T} (H = L L') in caller-owned memory; only its core daqp_ldp is called,
  * which neither allocates nor reads a clock. docs/decisions/ says why DAQP and not HPIPM.
@@ -55,10 +55,12 @@ void br_qp_forget_working_set(br_qp *qp) {
         for (int k = 0; k < BR_N; ++k) qp->sense[BR_ROW(r, k)] = BR_ROW_SOFT[r] ? SOFT : 0;
 }
 
-/* What belongs to rows moves with the horizon: stage k takes what stage k + 1 had. */
+/* What belongs to rows moves with the horizon: stage k takes what stage k + 1 had. A block keeps
+ * what it had, because all its stages but one were in it before. */
 void br_qp_shift_rows(void *rows, size_t size) {
+    enum { MOVED = BR_FREE < BR_BLOCKS ? BR_FREE : BR_BLOCKS - 1 };
     char *at = rows;
-    memmove(at, at + BR_NU * size, (BR_M - BR_NU) * size);
+    memmove(at, at + BR_NU * size, BR_NU * MOVED * size);
     at += BR_M * size;
     for (int r = 0; r < BR_NR; ++r, at += BR_N * size) memmove(at, at + size, (BR_N - 1) * size);
 }
@@ -126,8 +128,9 @@ static void fill_sensitivities(br_qp *qp, const int first, const int last) {
                     r < BR_NR_EARLY ? BR_ROW_CONSTANT[BR_NX * r + i] : qp->terms[k].gradient[n];
                 sensitivity[count] = qp->g[k + 1][i];
             }
-            br_combine(row, br_padded(BR_NU * (k + 1)), 0, count, weight, sensitivity);
-            for (int c = 0; c < BR_NU * (k + 1); ++c) qp->y[c][BR_ROW(r, k)] = row[c];
+            const int columns = BR_NU * (BR_BLOCK_OF(k) + 1);
+            br_combine(row, br_padded(columns), 0, count, weight, sensitivity);
+            for (int c = 0; c < columns; ++c) qp->y[c][BR_ROW(r, k)] = row[c];
         }
 }
 
@@ -197,13 +200,26 @@ br_mpc_status br_qp_condense(br_mpc *mpc) {
     return BR_CONVERGED;
 }
 
+/* Of a block: what all its stages leave. That may be nothing where limits have come nearer since
+ * the plan was made: then the block stays, and spread puts each stage within its own limits. */
+static void block_bounds(br_mpc *mpc) {
+    br_qp *qp = &mpc->qp;
+    for (int k = 0; k < BR_N; ++k)
+        for (int c = 0; c < BR_NU; ++c) {
+            const int i = BR_NU * BR_BLOCK_OF(k) + c, opens = br_opens_block(k);
+            const double lower = mpc->u_lower[c] - mpc->plan.u[k][c];
+            const double upper = mpc->u_upper[c] - mpc->plan.u[k][c];
+            qp->lower[i] = opens ? lower : fmax(lower, qp->lower[i]);
+            qp->upper[i] = opens ? upper : fmin(upper, qp->upper[i]);
+        }
+    for (int i = BR_NU * BR_FREE; i < BR_M; ++i)
+        if (qp->lower[i] > qp->upper[i]) qp->lower[i] = qp->upper[i] = 0;
+}
+
 static void bounds(br_mpc *mpc) {
     br_qp *qp = &mpc->qp;
+    block_bounds(mpc);
     for (int k = 0; k < BR_N; ++k) {
-        for (int c = 0; c < BR_NU; ++c) {
-            qp->lower[BR_NU * k + c] = mpc->u_lower[c] - mpc->plan.u[k][c];
-            qp->upper[BR_NU * k + c] = mpc->u_upper[c] - mpc->plan.u[k][c];
-        }
         const br_stage_terms *terms = &qp->terms[k];
         for (int r = 0; r < BR_NR; ++r) {
             double value = terms->value[r];
@@ -267,6 +283,16 @@ static void recover(br_qp *qp) {
     }
 }
 
+/* The change of each block as that of its stages. */
+static void spread(br_mpc *mpc) {
+    double *change = mpc->qp.delta_u;
+    for (int k = BR_N - 1; k >= BR_FREE; --k)
+        for (int c = 0; c < BR_NU; ++c) {
+            const double u = mpc->plan.u[k][c], wanted = change[BR_NU * BR_BLOCK_OF(k) + c];
+            change[BR_NU * k + c] = fmin(fmax(wanted, mpc->u_lower[c] - u), mpc->u_upper[c] - u);
+        }
+}
+
 br_mpc_status br_qp_solve(br_mpc *mpc, int warm) {
     br_qp *qp = &mpc->qp;
     bounds(mpc);
@@ -284,7 +310,8 @@ br_mpc_status br_qp_solve(br_mpc *mpc, int warm) {
     if (flag == EXIT_INFEASIBLE) return BR_INFEASIBLE;
     if (flag < 0) return BR_QP_LIMIT;
     recover(qp);
-    return br_all_finite(qp->delta_u, BR_M) && br_all_finite(qp->multiplier, BR_ROWS)
-               ? BR_CONVERGED
-               : BR_NOT_FINITE;
+    if (!br_all_finite(qp->delta_u, BR_M) || !br_all_finite(qp->multiplier, BR_ROWS))
+        return BR_NOT_FINITE;
+    spread(mpc);
+    return BR_CONVERGED;
 }

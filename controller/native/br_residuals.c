@@ -36,14 +36,15 @@ static double bound_violation(const br_mpc *mpc, int k) {
     return worst;
 }
 
-/* Gradient of the Lagrangian in the inputs by the adjoint recursion, which makes it stationary in
- * the states; relative to the largest gradient that flows through the dynamics. */
+/* Gradient of the Lagrangian in the blocks' inputs by the adjoint recursion, which makes it
+ * stationary in the states; relative to the largest gradient that flows through the dynamics. */
 static double stationarity(const br_mpc *mpc) {
     const double *multiplier = mpc->plan.multiplier;
-    double p[BR_NX] = {0}, worst = 0, size = 1;
+    double p[BR_NX] = {0}, in_block[BR_NU], worst = 0, size = 1;
     for (int k = BR_N; k >= 1; --k) {
         const br_stage_terms *terms = &mpc->qp.terms[k - 1];
         const br_stage *stage = &mpc->stage[k - 1];
+        if (k == BR_N || br_opens_block(k)) memset(in_block, 0, sizeof in_block);
         BR_UNROLL
         for (int i = 0; i < BR_NX; ++i) p[i] += terms->in_x[i];
         BR_UNROLL
@@ -55,8 +56,9 @@ static double stationarity(const br_mpc *mpc) {
             const double later = k < BR_N ? mpc->qp.terms[k].in_u_before[c] : 0.0;
             double through = 0;
             for (int j = 0; j < BR_NX; ++j) through += stage->jacobian[j][BR_NX + c] * p[j];
-            worst = br_worse(
-                worst, fabs(terms->in_u[c] + later + through + multiplier[BR_NU * (k - 1) + c]));
+            in_block[c] += terms->in_u[c] + later + through;
+            const double bound = multiplier[BR_NU * BR_BLOCK_OF(k - 1) + c];
+            if (br_opens_block(k - 1)) worst = br_worse(worst, fabs(in_block[c] + bound));
             size = br_worse(size, fabs(through));
         }
         double next[BR_NX] = {0};
@@ -104,7 +106,7 @@ br_mpc_status br_judge(const br_mpc *mpc) {
     const br_mpc_info *info = &mpc->info;
     const double tolerance = mpc->parameters.tolerance;
     if (!br_all_finite(&mpc->plan.x[0][0], (BR_N + 1) * BR_NX) ||
-        !br_all_finite(&mpc->plan.u[0][0], BR_M) ||
+        !br_all_finite(&mpc->plan.u[0][0], BR_NU * BR_N) ||
         !isfinite(info->stationarity + mpc->merit + info->bound))
         return BR_NOT_FINITE;
     /* linear in the QP, as inputs and early rows are, they are violated by no more than round-off

@@ -128,7 +128,7 @@ static void move(br_mpc *mpc, double t) {
     double *x = mpc->plan.x[0], *u = mpc->plan.u[0];
     const double *x_from = from->x[0], *u_from = from->u[0], *dx = qp->delta_x[0];
     for (int i = 0; i < (BR_N + 1) * BR_NX; ++i) x[i] = x_from[i] + t * dx[i];
-    for (int i = 0; i < BR_M; ++i) u[i] = u_from[i] + t * qp->delta_u[i];
+    for (int i = 0; i < BR_NU * BR_N; ++i) u[i] = u_from[i] + t * qp->delta_u[i];
     blend(mpc->plan.costate[1], from->costate[1], qp->costate_next[1], t, BR_N * BR_NX);
     blend(mpc->plan.multiplier, from->multiplier, qp->multiplier, t, BR_ROWS);
     br_sqp_linearise(mpc);
