@@ -51,28 +51,26 @@ class ChoiceScore:
 
 
 def choose_kernel(target: Target, fits: Sequence[Fit]) -> tuple[Fit, list[KernelScore]]:
-    """Best start per kernel by likelihood, then best kernel by held-out log density."""
-    best: dict[str, Fit] = {}
+    """The kernel of largest held-out log density, of fits with one kernel each."""
+    held: list[tuple[Fit, PredictionErrors]] = []
     for fit in fits:
-        best[fit.kind] = max(best.get(fit.kind, fit), fit, key=lambda one: one.log_likelihood)
-    held: dict[str, PredictionErrors] = {}
-    for kind, fit in best.items():
         try:
-            held[kind] = Posterior(fit.covariance, target.z, target.y).held_out(target.folds)
+            posterior = Posterior(fit.covariance, target.z, target.y)
+            held.append((fit, posterior.held_out(target.folds)))
         except InputError:  # singular at this kernel's optimum; another one may do
-            if kind == [*best][-1] and not held:
+            if fit is fits[-1] and not held:
                 raise
-    chosen = max(held, key=lambda kind: held[kind].log_density)
+    chosen, _ = max(held, key=lambda one: one[1].log_density)
     scale = target.y_scale
-    return best[chosen], [
+    return chosen, [
         KernelScore(
             output=target.name,
-            kernel=kind,
+            kernel=fit.kind,
             rmse=errors.rmse * scale,
             log_density=errors.log_density - math.log(scale),
-            chosen=kind == chosen,
+            chosen=fit is chosen,
         )
-        for kind, errors in held.items()
+        for fit, errors in held
     ]
 
 

@@ -5,16 +5,22 @@ With K the covariance of the training samples, noise included, and k that with a
 
     alpha = K^-1 y,    mean = k' alpha,    variance = s^2 + noise - k' K^-1 k.
 
-A fold B of the training samples, predicted from all others (section 5.4.2, blockwise):
+Without a fold B of the training samples, K^-1 becomes that of the others, padded with zeros. With
+K = L L', r = L^-1 k, and the columns of Q an orthonormal basis of those of L^-1 in B, that is
 
-    y_B - mean_B = C alpha_B,    covariance_B = C,    C = ([K^-1]_BB)^-1.
+    r~ = r - Q Q' r,    mean = r~' L^-1 y,    variance = s^2 + noise - r~' r~,
+
+so that one factorisation does for all folds. With Q R = [L^-1]_B, the samples of the fold are
+predicted with
+
+    y_B - mean_B = R^-1 Q' L^-1 y,    covariance_B = R^-1 R^-1'.
 """
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import cholesky, lapack, solve_triangular
 
 from bayesrace.arrays import Floats, Rows
 from bayesrace.errors import InputError
@@ -83,31 +89,62 @@ class Posterior:
         matrix = covariance.between(z, z)
         matrix[np.diag_indices_from(matrix)] += covariance.noise
         try:
-            self._factor = cho_factor(matrix, lower=True, overwrite_a=True)
+            self._factor = cholesky(matrix, lower=True, overwrite_a=True)
         except np.linalg.LinAlgError as error:
             raise InputError(_SINGULAR) from error
-        self.alpha: Floats = cho_solve(self._factor, y)
+        self._white = self._solved(y)
+        self.alpha: Floats = solve_triangular(self._factor, self._white, trans=1, lower=True)
         """K^-1 y, (n,)."""
+
+    def _solved(self, right: Floats) -> Floats:
+        """L^-1 times a vector or a matrix."""
+        solved: Floats = solve_triangular(self._factor, right, lower=True, check_finite=False)
+        return solved
+
+    @property
+    def _inverse(self) -> Floats:
+        """L^-1."""
+        return np.tril(lapack.dtrtri(self._factor, lower=1)[0])
+
+    def _sigma(self, root: Floats) -> Floats:
+        """Standard deviations, noise included, for the columns of L^-1 k."""
+        noise, prior = self._covariance.noise, self._covariance.signal + self._covariance.noise
+        explained = np.einsum("ij,ij->j", root, root)
+        return np.asarray(np.sqrt(np.maximum(prior - explained, noise)))
 
     def predict(self, z: Floats) -> tuple[Floats, Floats]:
         """Mean and standard deviation, noise included, each (m,), at features ``z`` (m, 6)."""
         mean, sigma = np.empty(len(z)), np.empty(len(z))
-        noise, prior = self._covariance.noise, self._covariance.signal + self._covariance.noise
         for begin in range(0, len(z), _AT_ONCE):
             part = slice(begin, begin + _AT_ONCE)
             cross = self._covariance.between(self._z, z[part])
             mean[part] = self.alpha @ cross
-            root = solve_triangular(self._factor[0], cross, lower=True, overwrite_b=True)
-            sigma[part] = np.sqrt(np.maximum(prior - np.einsum("ij,ij->j", root, root), noise))
+            sigma[part] = self._sigma(self._solved(cross))
+        return mean, sigma
+
+    def predict_without(self, folds: Rows, z: Floats, own: Rows) -> tuple[Floats, Floats]:
+        """As :meth:`predict`, each point without the training samples of its own fold.
+
+        ``folds`` (n,) numbers those of the training samples, ``own`` (m,) those of the points.
+        """
+        inverse = self._inverse
+        mean, sigma = np.empty(len(z)), np.empty(len(z))
+        for fold in np.unique(own):
+            part = own == fold
+            basis, _ = np.linalg.qr(inverse[:, folds == fold])
+            root = self._solved(self._covariance.between(z[part], self._z).T)
+            root -= basis @ (basis.T @ root)
+            mean[part], sigma[part] = self._white @ root, self._sigma(root)
         return mean, sigma
 
     def held_out(self, folds: Rows) -> PredictionErrors:
         """Errors at the training samples, each predicted without its fold of ``folds`` (n,)."""
-        inverse = cho_solve(self._factor, np.eye(len(folds)))
+        inverse, noise = self._inverse, self._covariance.noise
         error, sigma = np.empty(len(folds)), np.empty(len(folds))
         for fold in np.unique(folds):
-            rows = np.flatnonzero(folds == fold)
-            covariance = np.linalg.inv(inverse[np.ix_(rows, rows)])
-            error[rows] = covariance @ self.alpha[rows]
-            sigma[rows] = np.sqrt(np.maximum(np.diag(covariance), self._covariance.noise))
+            rows = folds == fold
+            basis, root = np.linalg.qr(inverse[:, rows])
+            root = np.linalg.inv(root)
+            error[rows] = root @ (basis.T @ self._white)
+            sigma[rows] = np.sqrt(np.maximum(np.einsum("ij,ij->i", root, root), noise))
         return PredictionErrors(error, sigma)

@@ -36,7 +36,6 @@ class TrainingSettings(BaseModel):
         TOLERANCE, gt=0, lt=1, description="relative gain at which the optimiser stops"
     )
     iterations: int = Field(100, ge=1, description="optimiser iterations per start")
-    warm_iterations: int = Field(30, ge=1, description="the same, starting from given weights")
     folds: int = Field(
         10, ge=2, description="parts of the drive, or of the track, each held out in turn"
     )

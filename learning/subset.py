@@ -3,10 +3,11 @@
 from typing import Final
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from bayesrace.arrays import Floats, Rows
 from bayesrace.errors import InputError
-from bayesrace.gp.expression import kernel_matrix
+from bayesrace.gp.expression import kernel
 
 __all__ = ["MAX_BYTES", "evenly", "most_informative"]
 
@@ -38,13 +39,14 @@ def most_informative(
             f"choosing {wanted} of {count} samples would take {8e-9 * count * wanted:.0f} GB of "
             "memory; give fewer samples, or choose fewer"
         )
+    scaled = z / length_scales
     variance = np.ones(count)
     columns = np.zeros((wanted, count))
     chosen = np.zeros(wanted, dtype=np.int64)
     for step in range(wanted):
         pivot = int(np.argmax(variance))
         chosen[step] = pivot
-        column = kernel_matrix(kind, z, z[pivot : pivot + 1], length_scales)[:, 0]
+        column = kernel(kind, cdist(scaled[pivot : pivot + 1], scaled, "sqeuclidean")[0])
         column -= columns[:step, pivot] @ columns[:step]
         column /= np.sqrt(max(variance[pivot], 0.0) + noise_ratio)
         columns[step] = column

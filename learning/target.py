@@ -65,14 +65,11 @@ class Target:
 
     def errors_from(self, rows: Rows, covariance: Covariance) -> PredictionErrors:
         """Errors at the tests, each predicted from the samples ``rows`` of all other folds."""
-        z, y, tests = self.z, self.y, self.tests
-        error, sigma = np.empty(len(tests)), np.empty(len(tests))
-        for fold in np.unique(self.folds[tests]):
-            inside = self.folds[tests] == fold
-            known, unseen = rows[self.folds[rows] != fold], tests[inside]
-            mean, sigma[inside] = Posterior(covariance, z[known], y[known]).predict(z[unseen])
-            error[inside] = y[unseen] - mean
-        return PredictionErrors(error, sigma)
+        tests = self.tests
+        posterior = Posterior(covariance, self.z[rows], self.y[rows])
+        own = self.folds[tests]
+        mean, sigma = posterior.predict_without(self.folds[rows], self.z[tests], own)
+        return PredictionErrors(self.y[tests] - mean, sigma)
 
     def calibrated(self, errors: PredictionErrors) -> PredictionErrors:
         """Errors of :meth:`errors_from`, each fold's variances scaled by those of the others."""

@@ -1,8 +1,10 @@
 """From samples to weights of the mean function: one GP per output of the residual.
 
 1. Standardise features and targets (:mod:`learning.target`).
-2. Per output and candidate kernel: hyperparameters by marginal likelihood from seeded starts, or
-   from given weights (:mod:`learning.hyperparameters`), on at most ``hyper_points`` samples.
+2. Per output and candidate kernel: hyperparameters by marginal likelihood
+   (:mod:`learning.hyperparameters`) on at most ``hyper_points`` samples. Seeded starts, or given
+   weights, are followed on a third of them, where an evaluation costs a tenth; the best is refined
+   on all.
 3. Per output: the kernel of largest log density held out by spans of the drive
    (:mod:`learning.folds`, :mod:`learning.assessment`).
 4. Factorise all samples, or the most informative ones that fit (:mod:`learning.subset`).
@@ -52,6 +54,9 @@ MAX_SAMPLES: Final = 100_000
 _CONSTANT: Final = 1e-9
 """A column whose standard deviation is below this share of its size never changes."""
 
+_THINNED: Final = 3
+"""One in so many samples shows where the optimum is."""
+
 
 @dataclass(frozen=True, eq=False)
 class Training:
@@ -86,7 +91,7 @@ def fit(
     """Weights that correct the discretised nominal model of the dataset's car.
 
     ``initial``: earlier weights of the same car and discretisation, for the model update: their
-    hyperparameters are refined instead of searched anew, and other candidate kernels start once.
+    hyperparameters are the only start of their kernels, and other candidate kernels start once.
     ``compare``: also measure what it costs to learn from chosen samples instead of all.
     InputError for too few or too many samples, a column that never changes, or weights of another
     model.
@@ -152,18 +157,12 @@ def _targets(dataset: Dataset, discretisation: Discretisation, folds: int) -> li
 
 def _starts(
     target: Target, settings: TrainingSettings, initial: GpOutput | None
-) -> list[tuple[str, Floats, int]]:
-    """Kernel, start and number of iterations of each optimisation for one output."""
-    if initial is None:
-        guesses = starts(settings.restarts, settings.seed)
-        return [
-            (kind, guess, settings.iterations) for kind in settings.kernels for guess in guesses
-        ]
+) -> dict[str, list[Floats]]:
+    """Where the optimisations for one output start, by kernel."""
+    guesses = starts(settings.restarts if initial is None else 0, settings.seed)
+    every: dict[str, list[Floats]] = dict.fromkeys(settings.kernels, guesses)
     # The kernel that suits more data may be another one: those not in use start anew, once.
-    (first,) = starts(0, settings.seed)
-    others = [kind for kind in settings.kernels if kind != initial.kernel]
-    warm = (initial.kernel, target.theta_of(initial), settings.warm_iterations)
-    return [warm] + [(kind, first, settings.iterations) for kind in others]
+    return every if initial is None else every | {initial.kernel: [target.theta_of(initial)]}
 
 
 def _optimise(
@@ -172,28 +171,51 @@ def _optimise(
     initial: GpWeights | None,
     report: Progress,
 ) -> list[list[Fit]]:
-    """The fits of each output; several run at once."""
+    """The fits of each output, one for each kernel."""
     known = (
         initial.outputs if initial is not None and all(initial.counts) else [None] * len(targets)
     )
-    pairs = PairDistances(targets[0].z)
+    count = len(targets[0].y)
+    some = evenly(count, max(MIN_SAMPLES, count // _THINNED))
+    rough = [
+        (target.select(some, target.folds[some]), kind, start)
+        for target, output in zip(targets, known, strict=True)
+        for kind, guesses in _starts(target, settings, output).items()
+        for start in guesses
+    ]
+    found = _maximised(rough, settings, lambda share, text: report(0.4 * share, text))
+    best: dict[tuple[str, str], Fit] = {}
+    for (target, kind, _), fit in zip(rough, found, strict=True):
+        own = target.name, kind
+        best[own] = max(best.get(own, fit), fit, key=lambda one: one.log_likelihood)
+    named = {target.name: target for target in targets}
+    fine = [(named[name], kind, fit.theta) for (name, kind), fit in best.items()]
+    found = _maximised(fine, settings, lambda share, text: report(0.4 + 0.5 * share, text))
+    return [
+        [fit for (other, _, _), fit in zip(fine, found, strict=True) if other is target]
+        for target in targets
+    ]
+
+
+def _maximised(
+    tasks: Sequence[tuple[Target, str, Floats]], settings: TrainingSettings, report: Progress
+) -> list[Fit]:
+    """The optimum for each target, kernel and start, several at once; all share their features."""
+    pairs = PairDistances(tasks[0][0].z)
     pool = ThreadPoolExecutor(settings.threads or os.cpu_count() or 1)
+    limits = settings.iterations, settings.tolerance
     try:
-        futures = [
-            [
-                pool.submit(maximise, kind, pairs, target.y, start, count, settings.tolerance)
-                for kind, start, count in _starts(target, settings, output)
-            ]
-            for target, output in zip(targets, known, strict=True)
-        ]
-        every = {future: i for i, own in enumerate(futures) for future in own}
-        for done, future in enumerate(as_completed(every), start=1):
-            kind = future.result().kind
-            report(0.9 * done / len(every), f"{targets[every[future]].name}: {kind}")
+        futures = {
+            pool.submit(maximise, kind, pairs, target.y, start, *limits): f"{target.name}: {kind}"
+            for target, kind, start in tasks
+        }
+        for done, future in enumerate(as_completed(futures), start=1):
+            future.result()
+            report(done / len(tasks), futures[future])
     finally:
         # After an interruption or a failure no other optimisation begins.
         pool.shutdown(cancel_futures=True)
-    return [[future.result() for future in own] for own in futures]
+    return [future.result() for future in futures]
 
 
 def _finish(

@@ -210,11 +210,18 @@ def test_block_errors_equal_training_without_the_block() -> None:
     z, y = gp_problem(30)
     theta = np.log([2.0] + [1.5] * 6 + [0.02])
     posterior = Posterior(Covariance.of("rbf", theta), z, y)
-    checked = posterior.held_out(np.repeat([0, 1, 2], 10))
+    folds = np.repeat([0, 1, 2], 10)
+    checked = posterior.held_out(folds)
     without = scikit_gp("rbf", theta, z[10:], y[10:])
     mean, sigma = without.predict(z[:10], return_std=True)
     assert checked.error[:10] == pytest.approx(y[:10] - mean, abs=1e-9)
     assert checked.sigma[:10] == pytest.approx(sigma, abs=1e-9)
+    new, _ = gp_problem(15, seed=5)
+    own = np.arange(15) % 3
+    elsewhere = posterior.predict_without(folds, new, own)
+    mean, sigma = without.predict(new[own == 0], return_std=True)
+    assert elsewhere[0][own == 0] == pytest.approx(mean, abs=1e-9)
+    assert elsewhere[1][own == 0] == pytest.approx(sigma, abs=1e-9)
 
 
 def test_informative_samples_beat_the_same_number_of_first_ones() -> None:

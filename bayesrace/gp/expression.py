@@ -25,7 +25,7 @@ from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import FEATURES, KERNELS, OUTPUTS, GpOutput, GpWeights
 
-__all__ = ["evaluate_mean", "kernel", "kernel_matrix", "mean_function"]
+__all__ = ["evaluate_mean", "kernel", "kernel_matrix", "kernel_slope", "mean_function"]
 
 # Added to r^2 under the root: keeps derivatives finite where z meets a training input (there the
 # gradient is 0). The smooth kernels change by O(1e-20), matern05 by 1e-12 (it is linear in r).
@@ -51,6 +51,19 @@ def kernel(kind: str, r2: Any) -> Any:
         a = math.sqrt(5) * of.sqrt(r2 + _SOFT_SMOOTH)
         return (1 + a + a * a / 3) * of.exp(-a)
     raise InputError(f"unknown kernel '{kind}'; known: {', '.join(KERNELS)}")
+
+
+def kernel_slope(kind: str, r2: Floats, k: Floats) -> Floats:
+    """dk/d(r^2), elementwise, where ``k`` is :func:`kernel` of ``r2``: takes no exponential."""
+    slope: Floats = -k / 2
+    if kind == "matern05":
+        slope /= np.sqrt(r2 + _SOFT_ROUGH)
+    if kind == "matern15":
+        slope *= 3 / (1 + np.sqrt(3 * r2))
+    if kind == "matern25":
+        b = 1 + np.sqrt(5 * r2)
+        slope *= 5 / 3 * b / (b + 5 / 3 * r2)
+    return slope
 
 
 def kernel_matrix(kind: str, a: Floats, b: Floats, length_scales: ArrayLike) -> Floats:
