@@ -22,9 +22,10 @@ for other driving; hyperparameters, kernel and choice of samples depend on all s
 import hashlib
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -38,7 +39,7 @@ from bayesrace.integrators import Discretisation
 from learning.assessment import ChoiceScore, KernelScore, choice_scores, choose_kernel
 from learning.dataset import Dataset, left_out
 from learning.folds import spans, stretches
-from learning.hyperparameters import Fit, maximise, starts
+from learning.hyperparameters import Fit, maximise, refine, starts
 from learning.likelihood import PairDistances
 from learning.posterior import regressor
 from learning.residual import identity, residual
@@ -175,43 +176,42 @@ def _optimise(
     known = (
         initial.outputs if initial is not None and all(initial.counts) else [None] * len(targets)
     )
-    count = len(targets[0].y)
-    some = evenly(count, max(MIN_SAMPLES, count // _THINNED))
+    z = targets[0].z
+    some = evenly(len(z), max(MIN_SAMPLES, len(z) // _THINNED))
+    pairs, few = PairDistances(z), PairDistances(z[some])
+    limits = settings.iterations, settings.tolerance
     rough = [
-        (target.select(some, target.folds[some]), kind, start)
+        (target.name, partial(maximise, kind, few, target.y[some], start, *limits))
         for target, output in zip(targets, known, strict=True)
         for kind, guesses in _starts(target, settings, output).items()
         for start in guesses
     ]
-    found = _maximised(rough, settings, lambda share, text: report(0.4 * share, text))
     best: dict[tuple[str, str], Fit] = {}
-    for (target, kind, _), fit in zip(rough, found, strict=True):
-        own = target.name, kind
-        best[own] = max(best.get(own, fit), fit, key=lambda one: one.log_likelihood)
-    named = {target.name: target for target in targets}
-    fine = [(named[name], kind, fit.theta) for (name, kind), fit in best.items()]
-    found = _maximised(fine, settings, lambda share, text: report(0.4 + 0.5 * share, text))
+    found = _side_by_side(rough, settings, lambda share, text: report(0.4 * share, text))
+    for (name, _), fit in zip(rough, found, strict=True):
+        best[name, fit.kind] = max(
+            best.get((name, fit.kind), fit), fit, key=lambda one: one.log_likelihood
+        )
+    y = {target.name: target.y for target in targets}
+    fine = [
+        (name, partial(refine, pairs, y[name], fit, *limits)) for (name, _), fit in best.items()
+    ]
+    found = _side_by_side(fine, settings, lambda share, text: report(0.4 + 0.5 * share, text))
     return [
-        [fit for (other, _, _), fit in zip(fine, found, strict=True) if other is target]
+        [fit for (name, _), fit in zip(fine, found, strict=True) if name == target.name]
         for target in targets
     ]
 
 
-def _maximised(
-    tasks: Sequence[tuple[Target, str, Floats]], settings: TrainingSettings, report: Progress
+def _side_by_side(
+    tasks: Sequence[tuple[str, Callable[[], Fit]]], settings: TrainingSettings, report: Progress
 ) -> list[Fit]:
-    """The optimum for each target, kernel and start, several at once; all share their features."""
-    pairs = PairDistances(tasks[0][0].z)
+    """What the optimisations find, each with the name of its output; several run at once."""
     pool = ThreadPoolExecutor(settings.threads or os.cpu_count() or 1)
-    limits = settings.iterations, settings.tolerance
     try:
-        futures = {
-            pool.submit(maximise, kind, pairs, target.y, start, *limits): f"{target.name}: {kind}"
-            for target, kind, start in tasks
-        }
+        futures = {pool.submit(task): name for name, task in tasks}
         for done, future in enumerate(as_completed(futures), start=1):
-            future.result()
-            report(done / len(tasks), futures[future])
+            report(done / len(tasks), f"{futures[future]}: {future.result().kind}")
     finally:
         # After an interruption or a failure no other optimisation begins.
         pool.shutdown(cancel_futures=True)
