@@ -19,7 +19,7 @@ from bayesrace.gp.weights import KERNELS, OUTPUTS, decode_weights, encode_weight
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from learning.dataset import Dataset
-from learning.hyperparameters import BOUNDS, Fit, maximise, starts
+from learning.hyperparameters import BOUNDS, Fit, maximise, refine, starts
 from learning.likelihood import MarginalLikelihood, PairDistances
 from learning.posterior import Covariance, Posterior
 from learning.residual import discretisation_of, identity, residual
@@ -64,6 +64,20 @@ def test_the_optimum_is_scikit_learns() -> None:
                 found.append(gp.fit(target.z, target.y).log_marginal_likelihood_value_)
         ours = [maximise("rbf", pairs, target.y, guess, 300, 1e-9) for guess in guesses]
         assert max(fit.log_likelihood for fit in ours) == pytest.approx(max(found), abs=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["rbf", "matern25"])
+def test_a_fit_to_a_third_of_the_samples_is_refined_to_the_optimum(
+    driven: Dataset, kind: str
+) -> None:
+    y, folds = residual(driven, PREDICTION)[:, 1], np.zeros(len(driven), dtype=np.int64)
+    target = Target.of("vy", driven.features, y, folds)
+    pairs, (start,) = PairDistances(target.z), starts(0, seed=0)
+    rough = maximise(kind, PairDistances(target.z[::3]), target.y[::3], start, 100)
+    found = refine(pairs, target.y, rough, 100)
+    whole = maximise(kind, pairs, target.y, start, 300, 1e-9)
+    assert found.log_likelihood == pytest.approx(whole.log_likelihood, abs=1e-2)
+    assert np.all((BOUNDS[:, 0] <= found.theta) & (found.theta <= BOUNDS[:, 1]))
 
 
 def test_shared_distances_and_reused_memory_change_nothing() -> None:
