@@ -25,6 +25,10 @@ __all__ = [
 _ROUNDING: Final = 1e-6
 """Larger than the error of a plant in single precision: 2.4e-7 at 5 rad/s."""
 
+_MIRRORED_STATE: Final = np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0, -1.0])
+_MIRRORED_INPUT: Final = np.array([1.0, -1.0])
+"""Signs of x, y, psi, vx, vy, omega, delta, and of d, delta_rate, in a mirror along the x axis."""
+
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
@@ -70,6 +74,19 @@ class Dataset:
         kept = replace(self, x=self.x[index], u=self.u[index], x_next=self.x_next[index])
         lost = len(self) - len(kept) if reason else 0
         return replace(kept, dropped=Counter(self.dropped) + Counter({reason: lost}))
+
+    def with_mirror_images(self) -> "Dataset":
+        """Each sample followed by its mirror image: a symmetric car turns the other way alike."""
+
+        def both(values: Floats, signs: Floats) -> Floats:
+            return np.stack((values, values * signs), axis=1).reshape(-1, values.shape[1])
+
+        return replace(
+            self,
+            x=both(self.x, _MIRRORED_STATE),
+            u=both(self.u, _MIRRORED_INPUT),
+            x_next=both(self.x_next, _MIRRORED_STATE),
+        )
 
     def digest(self) -> str:
         """sha256 over car, step and samples."""

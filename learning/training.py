@@ -1,6 +1,7 @@
 """From samples to weights of the mean function: one GP per output of the residual.
 
-1. Standardise features and targets (:mod:`learning.target`).
+1. Add each sample's mirror image, if the car is symmetric, and standardise features and targets
+   (:mod:`learning.target`). A sample and its image are in the same stretch.
 2. Per output and candidate kernel: hyperparameters by marginal likelihood
    (:mod:`learning.hyperparameters`) on at most ``hyper_points`` samples. Seeded starts, or given
    weights, are followed on a third of them, where an evaluation costs a tenth; the best is refined
@@ -32,7 +33,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from bayesrace import __version__
-from bayesrace.arrays import Floats
+from bayesrace.arrays import Floats, Rows
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import FEATURES, OUTPUTS, GpOutput, GpWeights, encode_weights
 from bayesrace.integrators import Discretisation
@@ -103,8 +104,12 @@ def fit(
         raise InputError(
             f"GP training: cannot start from weights for {initial.discretisation}, this is {model}"
         )
-    targets = _targets(dataset, discretisation, settings.folds)
-    rows = evenly(len(dataset), settings.hyper_points)
+    _check(dataset, discretisation)
+    samples = dataset.with_mirror_images() if dataset.car.symmetric else dataset
+    targets = _targets(samples, discretisation, stretches(dataset, settings.folds))
+    rows = evenly(len(samples), settings.hyper_points)
+    if dataset.car.symmetric and len(samples) >= 2 * len(rows):
+        rows = rows - rows % 2 + np.arange(len(rows)) % 2  # a sample and an image in turn
     parts = spans(len(rows), settings.folds)
     subsets = [target.select(rows, parts) for target in targets]
     outputs: list[GpOutput] = []
@@ -117,7 +122,7 @@ def fit(
         for i, target in enumerate(targets):
             chosen, scores = choose_kernel(subsets[i], fits[i])
             output, measured, costs = _finish(
-                target, chosen, dataset.features, settings, compare, first=initial is None
+                target, chosen, samples.features, settings, compare, first=initial is None
             )
             outputs.append(output)
             kernels += scores
@@ -135,8 +140,8 @@ def fit(
     return Training(_named(weights), tuple(kernels), tuple(choices))
 
 
-def _targets(dataset: Dataset, discretisation: Discretisation, folds: int) -> list[Target]:
-    """One target per output; InputError for samples that nothing can be learned from."""
+def _check(dataset: Dataset, discretisation: Discretisation) -> None:
+    """InputError for samples that nothing can be learned from."""
     count = len(dataset)
     if not MIN_SAMPLES <= count <= MAX_SAMPLES:
         few = count < MIN_SAMPLES
@@ -152,8 +157,13 @@ def _targets(dataset: Dataset, discretisation: Discretisation, folds: int) -> li
         if column.std() <= _CONSTANT * max(1.0, float(np.abs(column).max())):
             fault = f"{name} is {column[0]:g} in every sample"
             raise InputError(f"GP training: {fault}: nothing to learn; vary the driving")
-    number = stretches(dataset, folds)
-    return [Target.of(name, z, column, number) for name, column in zip(OUTPUTS, y.T, strict=True)]
+
+
+def _targets(samples: Dataset, discretisation: Discretisation, parts: Rows) -> list[Target]:
+    """One target per output; ``parts``: the fold of each sample, and of its mirror image."""
+    folds = np.repeat(parts, len(samples) // len(parts))
+    columns = zip(OUTPUTS, residual(samples, discretisation).T, strict=True)
+    return [Target.of(name, samples.features, column, folds) for name, column in columns]
 
 
 def _starts(

@@ -25,6 +25,7 @@ from learning.settings import TrainingSettings
 from learning.subset import evenly, most_informative
 from learning.training import train
 from learning.validation import predictive_sigma, validate
+from tests.conftest import discrete
 from tests.driven import CAR, QUICK, STEP_S, drive, logged, telemetry
 from tests.programs import ROOT
 from tests.scikit import scikit_gp
@@ -290,9 +291,24 @@ def test_training_is_reproducible_and_named_by_content(driven: Dataset) -> None:
     assert other.version != first.version
 
 
+def test_the_car_drives_a_mirror_image_as_it_drives(driven: Dataset) -> None:
+    """The image of each sample follows it, and obeys the same equations."""
+    both = driven.with_mirror_images()
+    np.testing.assert_array_equal(both.x[::2], driven.x)
+    np.testing.assert_array_equal(both.x_next[::2], driven.x_next)
+    np.testing.assert_array_equal(both.x[1::2, [0, 3]], driven.x[:, [0, 3]])
+    np.testing.assert_array_equal(both.u[1::2], driven.u * (1, -1))
+    y = residual(both, PREDICTION)
+    np.testing.assert_allclose(y[1::2], y[::2] * (1, -1, -1), atol=1e-12)
+    plant = discrete(dynamic(CAR))
+    for x, u, x_next in zip(both.x[1:40:2], both.u[1:40:2], both.x_next[1:40:2], strict=True):
+        np.testing.assert_allclose(plant(x, u), x_next, atol=1e-6)  # of two step sizes
+
+
 def test_trained_weights_evaluate_as_scikit_learn_predicts(driven: Dataset) -> None:
     """Scaling is done once and undone once (scikit-learn's normalize_y would do it again)."""
     weights = train(driven, PREDICTION, QUICK)
+    driven = driven.with_mirror_images()
     z, y = driven.features, residual(driven, PREDICTION)
     for i, output in enumerate(weights.outputs):
         theta = np.log([output.signal_variance, *output.length_scales, output.noise_variance])

@@ -110,7 +110,7 @@ def test_the_cost_of_choosing_is_reported(chosen: Training, driven: Dataset) -> 
     for output in OUTPUTS:
         everything, greedy, random = (s for s in chosen.choices if s.output == output)
         assert (everything.choice, greedy.choice, random.choice) == ("all", "greedy", "random")
-        assert (everything.points, greedy.points, random.points) == (len(driven), 50, 50)
+        assert (everything.points, greedy.points, random.points) == (2 * len(driven), 50, 50)
         assert everything.log_density > greedy.log_density
         carried = chosen.weights.metrics[output]
         assert carried["rmse"] == pytest.approx(greedy.rmse)
@@ -175,7 +175,7 @@ def test_weights_carry_what_they_were_made_from_and_how_good_they_are(
         assert 0 < held["rmse"] < held["uncorrected_rmse"]
         assert held["r2"] < 1
         assert weights.metrics[f"training {output}"]["points"] == 50
-        assert weights.metrics[f"training {output}"]["samples"] == len(driven)
+        assert weights.metrics[f"training {output}"]["samples"] == 2 * len(driven)  # and images
 
 
 def test_the_metrics_carried_are_those_of_samples_not_learned_from(driven: Dataset) -> None:
@@ -202,6 +202,23 @@ def test_first_weights_are_less_sure_and_predict_the_same(driven: Dataset) -> No
         for factor in (1.0, 1.5)
     )
     assert again.version == same.version
+
+
+def test_a_symmetric_car_knows_the_other_way_round(driven: Dataset) -> None:
+    """Samples of right turns alone predict left turns, where another car's do not."""
+    right = driven.select(driven.x[:, 5] < 0)
+    left = driven.select(driven.x[:, 5] > 0)
+    other = right.car.model_copy(update={"symmetric": False})
+    error = {}
+    for car in (right.car, other):
+        weights = train(replace(right, car=car), PREDICTION, QUICK)
+        y = residual(left, PREDICTION)
+        mean = evaluate_mean(weights, left.features)
+        error[car.symmetric] = np.sqrt(np.mean((y - mean) ** 2, axis=0)) / y.std(axis=0)
+        image = evaluate_mean(weights, left.features * (1, -1, -1, -1, 1, -1))
+        apart = np.abs(image * (1, -1, -1) - mean).max(axis=0) / y.std(axis=0)
+        assert (apart < 0.1).all() == car.symmetric
+    assert (error[True] < 0.3 * error[False]).all()
 
 
 def test_the_name_does_not_depend_on_time_and_program(

@@ -35,7 +35,10 @@ __all__ = [
 ]
 
 SECTIONS: Final[dict[str, tuple[str, ...]]] = {
-    "geometry": ("lf_m", "lr_m", "mass_kg", "inertia_kgm2", "width_m", "length_m"),
+    "geometry": (
+        *("lf_m", "lr_m", "mass_kg", "inertia_kgm2", "width_m", "length_m"),
+        "symmetric",
+    ),
     "limits": (
         *("d_min", "d_max", "delta_max_rad", "delta_rate_max_radps"),
         *("friction", "brake_fade_mps"),
@@ -257,6 +260,8 @@ def _line(model: BaseModel, name: str) -> str:
         text = f"{{ {text} }}"
     elif isinstance(value, str):
         text = f'"{value}"'
+    elif isinstance(value, bool):
+        text = str(value).lower()
     else:
         text = repr(value)
     return f"{name} = {text}  # {type(model).model_fields[name].description}"

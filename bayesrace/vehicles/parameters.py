@@ -73,6 +73,12 @@ class CarParameters(Part):
     )
     width_m: float = Field(gt=0, description="width of the outline [m]")
     length_m: float = Field(gt=0, description="length of the outline [m]")
+    symmetric: bool = Field(
+        True,
+        strict=True,
+        description="whether it turns left as it turns right: what it learns in one it then knows "
+        "of the other [-]",
+    )
     brake_fade_mps: float = Field(
         default_factory=lambda known: scaled(_BRAKE_FADE_MPS, SPEED, _scales(known)),
         gt=0,

@@ -11,7 +11,7 @@ from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from bayesrace.integrators import PREDICTION
 from bayesrace.raceline import RaceLineSettings
-from bayesrace.vehicles import get_car
+from bayesrace.vehicles import CarParameters, get_car
 from learning.arrays import dataset_from_npz
 from operation.analysis.published import SOURCE
 from operation.preparation import training_settings
@@ -65,7 +65,7 @@ class PaperSettings(NamedTuple):
     def orca(self) -> tuple[PreparationSettings, str]:
         """Of the 1:43 car, and its race track."""
         train, race = _files(self.tracks, _TRACKS, "--tracks") or ("", "")
-        car = get_car("orca")
+        car = _as_published("orca")
         return self._of(car=car, train_track=str(train)), str(race) or car.race_track
 
     @property
@@ -74,7 +74,7 @@ class PaperSettings(NamedTuple):
 
         There the racing line assumes a friction of 1, as published.
         """
-        car = get_car("f1tenth")
+        car = _as_published("f1tenth")
         race = (self.tracks or Path()) / _TENTH_TRACK
         if self.tracks is None or not race.is_file():
             return self._of(car=car), car.race_track
@@ -84,6 +84,11 @@ class PaperSettings(NamedTuple):
     def _of(self, **others: Any) -> PreparationSettings:
         fewer: Any = {"kernels": ("matern25",), "points": 150} if self.quick else {}
         return PreparationSettings(seed=self.seed, **fewer, **others)
+
+
+def _as_published(name: str) -> CarParameters:
+    """The built-in car, which learns from its own samples alone, without their mirror images."""
+    return get_car(name).model_copy(update={"symmetric": False})
 
 
 def _files(folder: Path | None, names: Iterable[str], option: str) -> tuple[Path, ...]:
