@@ -27,7 +27,7 @@ WITHOUT_CODE: Final = {"br_avx2.c", "br_avx512.c", "br_table.c"}
 """They include the code of others, or name it."""
 
 TESTS: Final = (
-    "native_", "turn", "fmu_controller", "fmu_export", "fmu_misuse", "driver", "fallback",
+    "native_", "blocks", "turn", "fmu_controller", "fmu_export", "fmu_misuse", "driver", "fallback",
     "compensation", "c_host",
 )  # fmt: skip
 """Beginnings of the names of the modules that test C."""
