@@ -76,7 +76,7 @@ class Dataset:
         return replace(kept, dropped=Counter(self.dropped) + Counter({reason: lost}))
 
     def with_mirror_images(self) -> "Dataset":
-        """Each sample followed by its mirror image: a symmetric car turns the other way alike."""
+        """Each sample followed by its mirror image, in which the car turns the other way."""
 
         def both(values: Floats, signs: Floats) -> Floats:
             return np.stack((values, values * signs), axis=1).reshape(-1, values.shape[1])

@@ -1,6 +1,6 @@
 """From samples to weights of the mean function: one GP per output of the residual.
 
-1. Add each sample's mirror image, if the car is symmetric, and standardise features and targets
+1. Add each sample's mirror image, if the car's file says so, and standardise features and targets
    (:mod:`learning.target`). A sample and its image are in the same stretch.
 2. Per output and candidate kernel: hyperparameters by marginal likelihood
    (:mod:`learning.hyperparameters`) on at most ``hyper_points`` samples. Seeded starts, or given
@@ -105,10 +105,10 @@ def fit(
             f"GP training: cannot start from weights for {initial.discretisation}, this is {model}"
         )
     _check(dataset, discretisation)
-    samples = dataset.with_mirror_images() if dataset.car.symmetric else dataset
+    samples = dataset.with_mirror_images() if dataset.car.mirrored_samples else dataset
     targets = _targets(samples, discretisation, stretches(dataset, settings.folds))
     rows = evenly(len(samples), settings.hyper_points)
-    if dataset.car.symmetric and len(samples) >= 2 * len(rows):
+    if dataset.car.mirrored_samples and len(samples) >= 2 * len(rows):
         rows = rows - rows % 2 + np.arange(len(rows)) % 2  # a sample and an image in turn
     parts = spans(len(rows), settings.folds)
     subsets = [target.select(rows, parts) for target in targets]

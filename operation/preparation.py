@@ -276,6 +276,7 @@ def trained_weights(
     identity = digest(
         [
             samples.digest(),
+            str(samples.car.mirrored_samples),
             discretisation.model_dump_json(),
             settings.model_dump_json(exclude={"threads"}),
             b"" if initial is None else encode_weights(replace(initial, created_utc_ns=0)),

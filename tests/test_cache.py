@@ -116,6 +116,7 @@ def test_weights_are_kept_for_their_samples_settings_and_beginning(
 
     monkeypatch.setattr("learning.training.train", train)
     samples, settings = drive(dynamic(CAR), 30, seed=1), TrainingSettings()
+    one_sided = CAR.model_copy(update={"mirrored_samples": False})
 
     def version(*changes: object) -> str:
         arguments: list[Any] = [samples, PREDICTION, settings, None]
@@ -131,8 +132,9 @@ def test_weights_are_kept_for_their_samples_settings_and_beginning(
         version(2, TrainingSettings(seed=1)),
         version(3, weights),
         version(3, replace(weights, outputs=mirrored_weights(weights).outputs)),
+        version(0, replace(samples, car=one_sided)),
     ]
-    assert others == ["2", "3", "4", "5", "6"]
+    assert others == ["2", "3", "4", "5", "6", "7"]
     assert version(3, replace(weights, created_utc_ns=7)) == "5"
     assert version() == "1"
 

@@ -104,7 +104,11 @@ def test_every_value_of_a_car_has_its_place_in_the_file_and_a_unit() -> None:
         ('name = "orca"', "name = ", ("no TOML", "line 3")),
         ("[limits]", "[limit]", ("limit = ", "is unknown", "limits")),
         ("[limits]", "[tuning.turn]\nslow_mps = 0\n[limits]", ("tuning.turn.slow_mps = 0 m/s",)),
-        ("[tyres]", "symmetric = 1\n[tyres]", ("geometry.symmetric = 1", "valid boolean", "left")),
+        (
+            "mirrored_samples = true",
+            "mirrored_samples = 1",
+            ("learning.mirrored_samples = 1", "boolean"),
+        ),
         ("[limits]", "[tuning.turn]\nslow = 1\n[limits]", ("tuning.turn.slow = 1", "slow_mps")),
     ],
 )

@@ -204,20 +204,20 @@ def test_first_weights_are_less_sure_and_predict_the_same(driven: Dataset) -> No
     assert again.version == same.version
 
 
-def test_a_symmetric_car_knows_the_other_way_round(driven: Dataset) -> None:
+def test_mirror_images_show_the_other_way_round(driven: Dataset) -> None:
     """Samples of right turns alone predict left turns, where another car's do not."""
     right = driven.select(driven.x[:, 5] < 0)
     left = driven.select(driven.x[:, 5] > 0)
-    other = right.car.model_copy(update={"symmetric": False})
+    other = right.car.model_copy(update={"mirrored_samples": False})
     error = {}
     for car in (right.car, other):
         weights = train(replace(right, car=car), PREDICTION, QUICK)
         y = residual(left, PREDICTION)
         mean = evaluate_mean(weights, left.features)
-        error[car.symmetric] = np.sqrt(np.mean((y - mean) ** 2, axis=0)) / y.std(axis=0)
+        error[car.mirrored_samples] = np.sqrt(np.mean((y - mean) ** 2, axis=0)) / y.std(axis=0)
         image = evaluate_mean(weights, left.features * (1, -1, -1, -1, 1, -1))
         apart = np.abs(image * (1, -1, -1) - mean).max(axis=0) / y.std(axis=0)
-        assert (apart < 0.1).all() == car.symmetric
+        assert (apart < 0.1).all() == car.mirrored_samples
     assert (error[True] < 0.3 * error[False]).all()
 
 

@@ -35,15 +35,13 @@ __all__ = [
 ]
 
 SECTIONS: Final[dict[str, tuple[str, ...]]] = {
-    "geometry": (
-        *("lf_m", "lr_m", "mass_kg", "inertia_kgm2", "width_m", "length_m"),
-        "symmetric",
-    ),
+    "geometry": ("lf_m", "lr_m", "mass_kg", "inertia_kgm2", "width_m", "length_m"),
     "limits": (
         *("d_min", "d_max", "delta_max_rad", "delta_rate_max_radps"),
         *("friction", "brake_fade_mps"),
     ),
     "tracks": ("train_track", "race_track"),
+    "learning": ("mirrored_samples",),
 }
 """Section of a car's file to the fields of CarParameters in it."""
 
@@ -53,7 +51,7 @@ MODELS: Final[dict[str, dict[str, type[Part]]]] = {
 }
 """Section with a ``model``, a field of CarParameters as a whole, to what each model holds."""
 
-_ORDER: Final = ("geometry", "tyres", "drive", "limits", "tracks")
+_ORDER: Final = ("geometry", "tyres", "drive", "limits", "tracks", "learning")
 
 _FOLDER: Final = Path(__file__).resolve().parents[1] / "cars"
 

@@ -73,11 +73,11 @@ class CarParameters(Part):
     )
     width_m: float = Field(gt=0, description="width of the outline [m]")
     length_m: float = Field(gt=0, description="length of the outline [m]")
-    symmetric: bool = Field(
-        True,
+    mirrored_samples: bool = Field(
+        False,
         strict=True,
-        description="whether it turns left as it turns right: what it learns in one it then knows "
-        "of the other [-]",
+        description="whether the mirror image of each sample is learned from, too: for a car that "
+        "turns left as it turns right and whose whole state is measured [-]",
     )
     brake_fade_mps: float = Field(
         default_factory=lambda known: scaled(_BRAKE_FADE_MPS, SPEED, _scales(known)),

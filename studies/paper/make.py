@@ -88,7 +88,7 @@ class PaperSettings(NamedTuple):
 
 def _as_published(name: str) -> CarParameters:
     """The built-in car, which learns from its own samples alone, without their mirror images."""
-    return get_car(name).model_copy(update={"symmetric": False})
+    return get_car(name).model_copy(update={"mirrored_samples": False})
 
 
 def _files(folder: Path | None, names: Iterable[str], option: str) -> tuple[Path, ...]:
