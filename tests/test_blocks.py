@@ -11,7 +11,17 @@ from codegen.problems.problem import Problem
 from codegen.settings import BuildSettings
 from controller.native_library import StepStatus
 from controller.native_problem import NativeProblem
-from tests.test_problems import HORIZON, IPOPT, STEP_S, VALUES, compiled, corrected, craft, stages
+from tests.test_problems import (
+    HORIZON,
+    IPOPT,
+    STEP_S,
+    VALUES,
+    compiled,
+    corrected,
+    craft,
+    note_active,
+    stages,
+)
 
 BLOCKS = [0, 1, 2, 3, 4, 4, 4, 5, 5, 5, 6, 6]
 """Four free stages, then blocks of three, of which the last is shorter."""
@@ -56,11 +66,7 @@ def test_from_a_constant_guess_it_solves_to_the_solution_of_ipopt(
         np.testing.assert_allclose(plan_u, oracle.u, rtol=0, atol=1e-6)
         np.testing.assert_allclose(plan_x, oracle.x, rtol=0, atol=1e-6)
         assert native.info.cost == pytest.approx(oracle.cost, rel=1e-8)
-        distance = np.hypot(plan_x[1:, 0] - 0.2, plan_x[1:, 1] - 0.1)
-        active["obstacle"] += bool(distance.min() < 0.4 - 1e-6)
-        active["hard"] += bool(plan_x[1:, 4].max() > 0.5 - 1e-8)
-        active["lane"] += bool(np.abs(plan_x[1:, 1]).max() > VALUES["lane"] + 1e-6)
-        active["input"] += bool(np.abs(plan_u[:, :2]).max() > VALUES["a_max"] - 1e-8)
+        note_active(active, plan_x, plan_u)
         u = native.u.copy()
         x = native.predict(x, u, STEP_S)
     assert min(active.values()) > 0

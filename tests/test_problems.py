@@ -167,6 +167,15 @@ def test_the_derivatives_are_those_of_the_model(native: NativeProblem, problem: 
             np.testing.assert_allclose(ours, theirs.full().reshape(shape), rtol=0, atol=1e-12)
 
 
+def note_active(active: dict[str, int], plan_x: Floats, plan_u: Floats) -> None:
+    """Counts the limits that a plan touches."""
+    distance = np.hypot(plan_x[1:, 0] - 0.2, plan_x[1:, 1] - 0.1)
+    active["obstacle"] += bool(distance.min() < 0.4 - 1e-6)
+    active["hard"] += bool(plan_x[1:, 4].max() > 0.5 - 1e-8)
+    active["lane"] += bool(np.abs(plan_x[1:, 1]).max() > VALUES["lane"] + 1e-6)
+    active["input"] += bool(np.abs(plan_u[:, :2]).max() > VALUES["a_max"] - 1e-8)
+
+
 def test_it_solves_to_the_solution_of_ipopt_along_a_flight(
     native: NativeProblem, problem: Problem
 ) -> None:
@@ -185,11 +194,7 @@ def test_it_solves_to_the_solution_of_ipopt_along_a_flight(
         np.testing.assert_allclose(plan_u, oracle.u, rtol=0, atol=1e-6)
         np.testing.assert_allclose(plan_x, oracle.x, rtol=0, atol=1e-6)
         assert native.info.cost == pytest.approx(oracle.cost, rel=1e-8)
-        distance = np.hypot(plan_x[1:, 0] - 0.2, plan_x[1:, 1] - 0.1)
-        active["obstacle"] += bool(distance.min() < 0.4 - 1e-6)
-        active["hard"] += bool(plan_x[1:, 4].max() > 0.5 - 1e-8)
-        active["lane"] += bool(np.abs(plan_x[1:, 1]).max() > VALUES["lane"] + 1e-6)
-        active["input"] += bool(np.abs(plan_u[:, :2]).max() > VALUES["a_max"] - 1e-8)
+        note_active(active, plan_x, plan_u)
         u = native.u.copy()
         native.prepare()
         x = native.predict(x, u, STEP_S)
