@@ -88,6 +88,11 @@ INFO: Final = (
     ("slack_max_m", "double", "largest violation of a soft constraint"),
     ("tube_m", "double", "half the width that uncertainty takes of a soft constraint, the largest"),
     ("pace", "double", "of the reference, as a share of the line's speed; 1 where all is known"),
+    (
+        "widening",
+        "double",
+        "of the residual's standard deviations by the errors observed; 1: they cover these",
+    ),
     ("s_ref_m", "double", "projection of the car on the racing line"),
     ("lateral_m", "double", "distance of the car from the racing line, positive left"),
 )
@@ -253,7 +258,7 @@ COUNTERS: Final = (
 )
 """What a control cycle has counted: name, type, meaning."""
 
-_FUNCTIONS: Final = 9
+_FUNCTIONS: Final = 10
 """Version of the functions in the public headers: increase it with each change of a signature."""
 
 _TABLES: Final = (

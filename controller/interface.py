@@ -60,6 +60,7 @@ class StepOutput:
     tube_m: Floats = field(default_factory=lambda: _NO_TUBE)
     """Shape (N,) or (0,): as in :class:`bayesrace.messages.Telemetry`."""
     pace: float = 1.0
+    widening: float = 1.0
     s_ref_m: float = 0.0
     n_ref_m: float = 0.0
 

@@ -89,6 +89,7 @@ class PredictiveController:
         output.cost_shifted = info.shifted_cost if info.shifts >= 0 else -1.0
         output.second_start = info.second_start
         output.pace = info.pace
+        output.widening = info.widening
         output.s_ref_m = info.s_ref_m
         output.n_ref_m = info.lateral_m
         return output

@@ -171,6 +171,7 @@ class StepInfo(ct.Structure):
     slack_max_m: float
     tube_m: float
     pace: float
+    widening: float
     s_ref_m: float
     lateral_m: float
 
@@ -258,6 +259,7 @@ def _declare(library: ct.CDLL) -> None:
         "mpc_reset": [pointer],
         "mpc_step": [*[pointer] * 4, real, real, *[pointer] * 3],
         "mpc_solve": [*[pointer] * 3, real, real, *[pointer] * 4],
+        "mpc_observe": [pointer, pointer, pointer, real, pointer],
         "mpc_prepare": [pointer, real, real],
         "mpc_rehearse": [pointer],
         "mpc_predict": [pointer, pointer, pointer, real, pointer],

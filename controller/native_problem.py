@@ -215,6 +215,21 @@ class NativeProblem:
         self._check(error, "solve")
         return StepStatus(self._status.value)
 
+    def observe(self, x: Floats, u: Floats, duration_s: float, x_next: Floats) -> None:
+        """What the car did between two measured states (nx,), under u (nu,) on average.
+
+        Where such errors are larger than the posterior's standard deviations, caution widens these:
+        ``info.widening``. InputError for a duration that is not above 0 and at most 1, or numbers
+        that are not finite.
+        """
+        self._x[:] = x
+        self._u_held[:] = u
+        self._predicted[:] = x_next
+        error = self._library.br_mpc_observe(
+            self._mpc, self._x_address, self._u_held_address, duration_s, self._predicted_address
+        )
+        self._check(error, "observe")
+
     def prepare(self, elapsed_s: float | None = None, budget_s: float = 0.0) -> None:
         """Makes ready what of the next step needs no state; call it after :meth:`step`.
 

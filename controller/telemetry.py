@@ -74,6 +74,7 @@ def telemetry_of(
         plan_u=_finite(output.plan_u),
         tube_m=_finite(output.tube_m),
         pace=output.pace,
+        widening=output.widening,
         residual_dynamics=_known(output.residual_dynamics),
         residual_bounds=_known(output.residual_bounds),
         residual_stationarity=_known(output.residual_stationarity),

@@ -102,7 +102,7 @@ def tube_of(step: NativeStep, car: CarParameters, weights: GpWeights, plan: Floa
     r = np.diag([1 / one.effort**2 for one in problem.inputs])
     jacobians = [step.evaluate(v, np.zeros(7))[1] for v in plan]
     nominal = PREDICTION.discretise(e_kinematic(car))
-    at = np.arange(8) * (len(plan) - 1) // 7  # the others are interpolated
+    at = np.arange(7) * (len(plan) - 1) // 6  # the others are interpolated
     known = predictive_sigma(weights, plan[at, 3:])
     stages = np.arange(len(plan))
     sigma = np.column_stack([np.interp(stages, at, column) for column in known.T])

@@ -67,7 +67,7 @@ def test_the_page_needs_nothing_but_itself(rendered: tuple[Path, RaceResult]) ->
     assert not re.search(r"@import|url\(\s*[\"']?(?!#|data:)", text)
     assert "script" not in parse(rendered[0]).tags
     # Maps, time, speed, inputs, cornering, deviation, caution, GPs, execution times.
-    assert text.count("<svg ") == 4 + 2 + 2 + 3 + 2 + 2 + 2 + 6 + 1
+    assert text.count("<svg ") == 4 + 2 + 2 + 3 + 2 + 2 + 3 + 6 + 1
     assert str(rendered[0].parent) not in text
 
 

@@ -133,7 +133,7 @@ class Actuation(Message):
 class Telemetry(Message):
     """Plan, residuals and timing of one control cycle, on ``bayesrace/{car}/telemetry``."""
 
-    SCHEMA: ClassVar[int] = 3
+    SCHEMA: ClassVar[int] = 4
 
     run: Count
     state_seq: Count
@@ -174,6 +174,9 @@ class Telemetry(Message):
     pace: Annotated[float, Real(0.0, 1.0)]
     """Speed of the reference as a share of the racing line's; below 1 where the model is too
     uncertain about the plan."""
+    widening: Annotated[float, Real(0.0, 1e6)]
+    """Factor by which the model's standard deviations have been widened because its one-step errors
+    exceeded them; 1 where they cover these."""
     residual_dynamics: Annotated[float, Real(-1.0, 1e12)]
     """Largest dynamics defect of the plan; -1: unknown or not finite (as below)."""
     residual_bounds: Annotated[float, Real(-1.0, 1e12)]

@@ -185,6 +185,9 @@ def _outputs(drive: Drive) -> list[Variable]:
             "tube_m", "half the width that uncertainty takes of the track; -1: not known", unit="m"
         ),
         output("pace", "of the reference, as a share of the line's speed", unit="1"),
+        output(
+            "widening", "of the model's band by the errors observed; 1: it covers them", unit="1"
+        ),
         output("s_ref_m", "arc length of the car on the racing line", unit="m"),
         output("lateral_m", "distance from the racing line, positive to the left", unit="m"),
     ]

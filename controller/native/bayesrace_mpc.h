@@ -148,6 +148,14 @@ BR_API br_mpc_error br_mpc_solve(br_mpc *mpc, const double x[BR_NX], const doubl
                                  const br_mpc_reference reference[BR_N], double u[BR_NU],
                                  br_mpc_status *status, br_mpc_info *info);
 
+/* What the car has done between two measured states, under an input that acted on average:
+ * tells whether the residual's standard deviations cover its errors. Where they do not, caution
+ * widens them, from the step after the next on (info->widening). For consecutive states of a car
+ * that moves; the newest counts. Never needed. BR_ERROR_TIME: over BR_PREDICT_MAX_S, or not above
+ * 0. */
+BR_API br_mpc_error br_mpc_observe(br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
+                                   double duration_s, const double x_next[BR_NX]);
+
 /* The preparation phase of the next step, between two steps: shifts the plan for the elapsed_s
  * that is expected, linearises there, and does what of the QP depends neither on the next state nor
  * on its reference. With budget_s (and a clock) it first solves the next problem as it is foreseen,

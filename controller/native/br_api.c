@@ -15,6 +15,7 @@ br_mpc_error br_mpc_init(void *memory, size_t size, br_mpc **out) {
     br_qp_init(&mpc->qp);
     br_weights_init(mpc);
     mpc->caution.pace = 1;
+    br_innovation_reset(&mpc->innovation);
     mpc->code = br_fastest_code();
     *out = mpc;
     return BR_OK;
@@ -32,6 +33,7 @@ br_mpc_error br_mpc_set_parameters(br_mpc *mpc, const br_mpc_parameters *paramet
     mpc->parameters = *parameters;
     mpc->has_parameters = 1;
     mpc->qp.factorised = mpc->qp.evaluated = mpc->caution.known = 0;
+    br_innovation_undo(&mpc->innovation);
     br_evaluate_penalties(mpc);
     return BR_OK;
 }
@@ -61,8 +63,24 @@ void br_mpc_reset(br_mpc *mpc) {
     mpc->path.known = 0;
     mpc->caution.known = mpc->caution.active = 0;
     mpc->caution.pace = 1;
+    mpc->innovation.newest.duration = 0;
+    br_innovation_reset(&mpc->innovation);
     mpc->turn = 0;
     mpc->attempts = mpc->starts = mpc->futile = mpc->looks = 0;
+}
+
+br_mpc_error br_mpc_observe(br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
+                            double duration_s, const double x_next[BR_NX]) {
+    if (!mpc || !x || !u || !x_next) return BR_ERROR_NULL;
+    if (!(duration_s > 0 && duration_s <= BR_PREDICT_MAX_S)) return BR_ERROR_TIME;
+    if (!br_all_finite(x, BR_NX) || !br_all_finite(u, BR_NU) || !br_all_finite(x_next, BR_NX))
+        return BR_ERROR_STATE;
+    br_transition *newest = &mpc->innovation.newest;
+    newest->duration = duration_s;
+    memcpy(newest->x, x, sizeof newest->x);
+    memcpy(newest->u, u, sizeof newest->u);
+    memcpy(newest->x_next, x_next, sizeof newest->x_next);
+    return BR_OK;
 }
 
 br_mpc_error br_mpc_get_plan(const br_mpc *mpc, double *x, double *u) {

@@ -11,7 +11,8 @@
  * h + n |D_k' grad h| <= upper with n standard deviations. (Independent errors would add up to the
  * root of the number of stages only, which is far too little: docs/decisions/2026-11-23-caution.md
  * has the laps.) K is the gain of a linear quadratic regulator about the plan; the problem names
- * the sizes of the deviations that it weighs equally.
+ * the sizes of the deviations that it weighs equally. Where the car errs more than sigma says,
+ * sigma is widened: br_innovation.c.
  *
  * As in zero-order robust MPC (Zanelli, Frey, Messerer, Diehl, "Zero-order robust nonlinear model
  * predictive control with ellipsoidal uncertainty sets", 2021) all of this belongs to the plan that
@@ -80,20 +81,28 @@ static void propagate(const br_stage *stage, double gain[BR_NU][BR_NX], int outp
     }
 }
 
-/* Of the residual at the plan's stages: of BR_COLUMNS evenly spread ones, between which they are
- * interpolated, so that a long horizon takes no longer. */
+/* Of the residual at the plan's stages: of evenly spread ones, between which they are interpolated,
+ * so that a long horizon takes no longer. With the state observed last there are BR_COLUMNS. */
 static void standard_deviations(br_mpc *mpc, double sigma[BR_N][BR_NE]) {
-    enum { COUNT = BR_N < BR_COLUMNS ? BR_N : BR_COLUMNS };
-    double x[COUNT][BR_NX], u[COUNT][BR_NU], variance[COUNT][BR_NE];
+    enum { COUNT = BR_N < BR_COLUMNS ? BR_N : BR_COLUMNS - 1 };
+    double x[COUNT + 1][BR_NX], u[COUNT + 1][BR_NU], variance[COUNT + 1][BR_NE];
+    const br_transition *due = &mpc->innovation.due;
+    const int observed = br_innovation_due(&mpc->innovation);
     int stage[COUNT];
     for (int i = 0; i < COUNT; ++i) {
         stage[i] = COUNT > 1 ? i * (BR_N - 1) / (COUNT - 1) : 0;
         memcpy(x[i], mpc->plan.x[stage[i]], sizeof x[i]);
         memcpy(u[i], mpc->plan.u[stage[i]], sizeof u[i]);
     }
-    br_stages_variances(&mpc->gp[mpc->gp_in_use], COUNT, x, u, mpc->caution.correlations, variance);
-    for (int i = 0; i < COUNT; ++i)
-        for (int j = 0; j < BR_NE; ++j) sigma[stage[i]][j] = sqrt(variance[i][j]);
+    memcpy(x[COUNT], due->x, sizeof x[COUNT]);
+    memcpy(u[COUNT], due->u, sizeof u[COUNT]);
+    br_stages_variances(&mpc->gp[mpc->gp_in_use], COUNT + observed, x, u, mpc->caution.correlations,
+                        variance);
+    if (observed) br_innovation_judge(mpc, variance[COUNT]);
+    for (int j = 0; j < BR_NE; ++j) {
+        const double widening = br_innovation_widening(&mpc->innovation, j);
+        for (int i = 0; i < COUNT; ++i) sigma[stage[i]][j] = widening * sqrt(variance[i][j]);
+    }
     for (int i = 1; i < COUNT; ++i)
         for (int k = stage[i - 1] + 1; k < stage[i]; ++k) {
             const double share = (k - stage[i - 1]) / (double)(stage[i] - stage[i - 1]);
@@ -157,6 +166,15 @@ void br_caution_tighten(br_mpc *mpc, int k, br_stage_terms *terms) {
     }
 }
 
+void br_caution_report(br_mpc *mpc) {
+    mpc->info.pace = mpc->caution.pace;
+    mpc->info.widening = 1;
+    for (int j = 0; j < BR_NE && mpc->caution.active; ++j) {
+        const double widening = br_innovation_widening(&mpc->innovation, j);
+        mpc->info.widening = fmax(mpc->info.widening, widening);
+    }
+}
+
 /* After a step: the speed of the next reference as a share of the line's. It falls where
  * uncertainty takes more than BR_CAUTION_SHARE of the room at a stage, or is not finite, by at most
  * BR_CAUTION_SLOWER per second, and rises elsewhere by at most BR_CAUTION_FASTER, also when nothing
@@ -179,5 +197,5 @@ void br_caution_pace(br_mpc *mpc, double elapsed) {
 #else
     (void)elapsed;
 #endif
-    mpc->info.pace = caution->pace;
+    br_caution_report(mpc);
 }

@@ -145,15 +145,22 @@ static void forget_delay(br_cycle *cycle) {
         settings->compensation == BR_COMPENSATION_FIXED ? settings->delay_s : 0;
 }
 
+/* The compiled controller learns how well it predicts; a standing car shows nothing of that. */
+static void show(br_cycle *cycle, const br_measured *before, const br_measured *state) {
+    if (!cycle->mpc || !(fabs(before->x[BR_INDEX_VX]) > cycle->settings.standing_mps)) return;
+    br_mpc_observe(cycle->mpc, before->x, state->u_applied, state->time_s - before->time_s,
+                   state->x);
+}
+
 br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state) {
     if (!cycle || !state) return BR_STATE_FOREIGN;
     if (!isfinite(state->time_s)) {
         cycle->counters.foreign += 1;
         return BR_STATE_FOREIGN;
     }
-    const br_measured *newest = &cycle->stream.newest;
+    const br_measured before = cycle->stream.newest;
     const int begins =
-        !cycle->stream.has_newest || newest->epoch != state->epoch || newest->run != state->run;
+        !cycle->stream.has_newest || before.epoch != state->epoch || before.run != state->run;
     const br_reception reception = br_stream_accept(&cycle->stream, state, &cycle->counters);
     if (reception != BR_STATE_NEW) return reception;
     if (begins) {
@@ -163,6 +170,8 @@ br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state) {
             forget_delay(cycle); /* but for simulated time, which reports its own */
         cycle->controller.reset(cycle->controller.self);
         cycle->stepped = cycle->stopping = cycle->reckoned = 0;
+    } else {
+        show(cycle, &before, state);
     }
     br_delay_observe(&cycle->delay, &cycle->settings, state, &cycle->counters.delay_s);
     return BR_STATE_NEW;

@@ -164,6 +164,23 @@ typedef struct {
     double residual, worth;
 } br_incumbent;
 
+/* From one measured state to the next. */
+typedef struct {
+    double duration; /* 0: there is none */
+    double x[BR_NX], u[BR_NU], x_next[BR_NX];
+} br_transition;
+
+/* Of each output, by how many standard deviations the residual errs: see br_innovation.c. */
+typedef struct {
+    double recent[BR_NE], held[BR_NE]; /* mean of the newest; the largest, slowly forgotten */
+} br_misfit;
+
+typedef struct {
+    br_transition newest, due; /* due: observed before the last step */
+    int judged;                /* what is due is in misfit, else in neither */
+    br_misfit misfit, before;
+} br_innovation;
+
 /* What the residual's uncertainty does to the plan: see br_caution.c. */
 typedef struct {
     int known;                            /* it belongs to the plan that the step starts with */
@@ -236,6 +253,7 @@ struct br_mpc {
     double answer_tube[BR_N];                                /* how uncertain it is */
     br_timer timer;
     br_caution caution;
+    br_innovation innovation;
     br_stage stage[BR_N];
     BR_ALIGNED br_gp_row kernels[BR_NE * BR_GP_BLOCKS * BR_N]; /* see br_gp_evaluate */
     br_qp qp;
@@ -270,6 +288,19 @@ BR_PART void br_gp_variances(const br_gp *gp, int stages, double (*z)[BR_NZ],
 BR_PART void br_caution_update(br_mpc *mpc);
 BR_PART void br_caution_tighten(br_mpc *mpc, int k, br_stage_terms *terms);
 BR_PART void br_caution_pace(br_mpc *mpc, double elapsed);
+BR_PART void br_caution_report(br_mpc *mpc); /* into mpc->info */
+
+/* br_innovation.c */
+BR_PART void br_innovation_reset(br_innovation *innovation);
+/* A step has been made: what was observed before it is due. */
+BR_PART void br_innovation_advance(br_innovation *innovation);
+/* By what the standard deviations of the output are to be multiplied. */
+BR_PART double br_innovation_widening(const br_innovation *innovation, int output);
+BR_PART int br_innovation_due(const br_innovation *innovation);
+/* As if what is due had not been judged: parameters or code are others now. */
+BR_PART void br_innovation_undo(br_innovation *innovation);
+/* What is due, by the variance of the residual there; the plan is linearised. */
+BR_PART void br_innovation_judge(br_mpc *mpc, const double variance[BR_NE]);
 
 /* br_weights.c */
 void br_weights_init(br_mpc *mpc);
@@ -297,6 +328,7 @@ BR_PART void br_stages_linearise(const br_gp *gp, int stages, double (*x)[BR_NX]
 /* Hessians of all linearised stages, at the same x and u; of each slot there is one. */
 BR_PART void br_stages_curve(const br_gp *gp, int stages, double (*x)[BR_NX], double (*u)[BR_NU],
                              double (*lambda)[BR_NX], br_gp_row *kernels, br_stage *stage);
+/* Of at most BR_N + 1 states and inputs. */
 BR_PART void br_stages_variances(const br_gp *gp, int stages, double (*x)[BR_NX],
                                  double (*u)[BR_NU], double (*work)[BR_COLUMNS],
                                  double (*variance)[BR_NE]);

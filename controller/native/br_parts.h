@@ -14,6 +14,7 @@
 #include "br_condense.c"
 #include "br_gp.c"
 #include "br_incumbent.c"
+#include "br_innovation.c"
 #include "br_inspect.c"
 #include "br_planner.c"
 #include "br_predict.c"

@@ -38,6 +38,7 @@ void br_undo_preparation(br_mpc *mpc) {
 void br_forget_linearisation(br_mpc *mpc) {
     br_undo_preparation(mpc);
     mpc->linearised = mpc->qp.factorised = mpc->caution.known = 0;
+    br_innovation_undo(&mpc->innovation);
 }
 
 /* Time for an iteration, and what follows it: restoring the best plan, shift and factorisation,

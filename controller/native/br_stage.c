@@ -93,7 +93,7 @@ void br_stages_linearise(const br_gp *gp, int stages, double (*x)[BR_NX], double
 
 void br_stages_variances(const br_gp *gp, int stages, double (*x)[BR_NX], double (*u)[BR_NU],
                          double (*work)[BR_COLUMNS], double (*variance)[BR_NE]) {
-    double z[BR_N][BR_NZ];
+    double z[BR_N + 1][BR_NZ];
     for (int k = 0; k < stages; ++k) features(x[k], u[k], z[k]);
     br_gp_variances(gp, stages, z, work, variance);
 }

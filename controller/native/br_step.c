@@ -174,6 +174,7 @@ static void solve(br_mpc *mpc, double u[BR_NU], br_mpc_status *status, br_mpc_in
     memcpy(mpc->answer_reference, mpc->reference, sizeof mpc->answer_reference);
     mpc->info.status = *status;
     mpc->caution.known = 0; /* the next step starts with another plan */
+    br_innovation_advance(&mpc->innovation);
     br_caution_pace(mpc, mpc->elapsed);
     if (info) *info = mpc->info;
 }
@@ -198,7 +199,7 @@ static br_mpc_error begin(br_mpc *mpc, const request *r, int *plausible) {
     *r->status = BR_BAD_STATE; /* until there is something better to say */
     memset(&mpc->info, 0, sizeof mpc->info);
     mpc->info.status = BR_BAD_STATE;
-    mpc->info.pace = mpc->caution.pace;
+    br_caution_report(mpc);
     if (r->info) *r->info = mpc->info;
     if (!mpc->has_parameters) return BR_ERROR_NOT_READY;
     if (!(r->elapsed_s >= 0 && isfinite(r->elapsed_s))) return BR_ERROR_TIME;

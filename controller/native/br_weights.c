@@ -21,6 +21,7 @@ static void hand_over(br_mpc *mpc, int owner) {
 static void exchange(br_mpc *mpc) {
     mpc->gp_in_use = !mpc->gp_in_use;
     br_forget_linearisation(mpc);
+    br_innovation_reset(&mpc->innovation);
 }
 
 br_mpc_error br_mpc_stage_weights(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]) {

@@ -155,7 +155,8 @@ def _held(u: Floats) -> Floats:
 
 def caution_figures(runs: Sequence[DrivenRun], track: Track) -> list[Figure]:
     """What the uncertainty of the model does on the first lap: how far off the plan's last stage
-    may be, and the speed that the reference is left with. Nothing if there was no caution."""
+    may be, the speed that the reference is left with, and by how much the errors that were seen
+    have widened the model's band. Nothing if there was no caution."""
     laps = [
         lap
         for lap in first_laps(runs, track)
@@ -164,6 +165,7 @@ def caution_figures(runs: Sequence[DrivenRun], track: Track) -> list[Figure]:
     rows: list[tuple[str, str, Callable[[Telemetry], float]]] = [
         ("uncertainty at the end of the plan", "either side [m]", lambda one: _last(one.tube_m)),
         ("speed of the reference", "share of the line's", lambda one: one.pace),
+        ("band of the model", "widened by", lambda one: one.widening),
     ]
     figures = []
     for title, label, value in rows if laps else ():

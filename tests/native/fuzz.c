@@ -5,6 +5,7 @@
  *   - a usable status comes with a finite first input within the limits, small residuals, and no
  *     more iterations than allowed; any other leaves the input alone;
  *   - a prediction is a plausible state, or an error;
+ *   - what is observed is taken, or refused;
  *   - br_mpc_prepare leaves the plan that is read; without a budget it changes no bit of any step:
  *     a second controller, which is never prepared, must agree.
  * Numbers are mostly plausible, so that the calls get past the checks, and now and then anything
@@ -241,6 +242,18 @@ static void prepare(controller *c, double budget) {
     CHECK(memcmp(plan_u[0], plan_u[1], sizeof plan_u[0]) == 0);
 }
 
+/* From the state at hand, mostly to one that the car may have come to. */
+static void observe(controller *c, int count) {
+    double after[BR_NX], u[BR_NU];
+    for (int i = 0; i < BR_NX; ++i) after[i] = number(x[i], 0.5);
+    u[0] = number(0.3, 1), u[1] = number(0, 6);
+    const double duration = number(BR_TS, 2 * BR_TS);
+    for (int i = 0; i < count; ++i) {
+        const br_mpc_error error = br_mpc_observe(c[i].mpc, x, u, duration, after);
+        CHECK(error == BR_OK || error == BR_ERROR_TIME || error == BR_ERROR_STATE);
+    }
+}
+
 static void predict(const controller *c) {
     double from[BR_NX], after[BR_NX], u[BR_NU];
     for (int i = 0; i < BR_NX; ++i) from[i] = number(x[i], 0.5);
@@ -290,8 +303,10 @@ static void call(controller *c, int count) {
         CHECK(br_mpc_set_clock(c->mpc, what & 0x40 ? ticking : NULL, c) == BR_OK);
         break;
     case 6:
-    case 7:
         predict(c);
+        break;
+    case 7:
+        observe(c, count);
         break;
     case 8:
         evaluate(c);

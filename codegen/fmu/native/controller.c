@@ -149,6 +149,7 @@ static void set_outputs(fmu_instance *instance, const br_decision *decision) {
     v[FMU_V_tube_m] = planned ? known(info->tube_m) : -1;
     if (!planned) return; /* nor projected */
     v[FMU_V_pace] = info->pace;
+    v[FMU_V_widening] = info->widening;
     v[FMU_V_s_ref_m] = info->s_ref_m;
     v[FMU_V_lateral_m] = info->lateral_m;
 }
