@@ -8,11 +8,11 @@ every whole chunk, also where the file ends without its index.
 import json
 import struct
 import time
-from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import IO, Any, Final, Generic, TypeVar, cast
+from typing import IO, Any, Final, Generic, NamedTuple, TypeVar, cast
 
 import lz4.frame
 import zstandard
@@ -23,7 +23,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import Writer
 
 from bayesrace.errors import InputError
-from bayesrace.messages import TOPICS, Message, Topic, decode, from_json, json_schema, to_json
+from bayesrace.messages import TOPICS, Message, Topic, decode, decode_json, json_schema, to_json
 
 __all__ = ["Entry", "LogReader", "LogWriter", "topic_of"]
 
@@ -120,8 +120,28 @@ class Entry(Generic[M]):
     message: M
 
 
+class _Channel(NamedTuple):
+    """The messages of one key in a log."""
+
+    key: str
+    topic: Topic[Any]
+    decode: Callable[[type[Message], bytes], Message]
+
+
+@dataclass
+class _Place:
+    """How far a log has been read, and what has been found on the way there."""
+
+    offset: int = 0
+    unpacked: int = 0
+    """Bytes of all chunks."""
+    ended: bool = False
+    """The end mark has been read."""
+    channels: dict[int, _Channel] = field(default_factory=dict)
+
+
 class LogReader:
-    """Reads a log in order of arrival, also one that was cut off.
+    """Reads a log in order of arrival, also one that was cut off, or is being written.
 
     After an iteration, ``refused`` and ``last_reason`` say what could not be decoded, and
     ``truncated`` whether the file ends without its end mark.
@@ -134,64 +154,80 @@ class LogReader:
         self.refused = 0
         self.last_reason = ""
         self.truncated = False
+        self._place = _Place()
 
     def metadata(self) -> dict[str, dict[str, str]]:
         """Name to map of texts; the last of one name wins."""
-        found = (record for record in self._records() if isinstance(record, Metadata))
+        found = (record for record in self._records(_Place()) if isinstance(record, Metadata))
         return {record.name: dict(record.metadata) for record in found}
 
     def channels(self) -> set[str]:
         """The keys that it holds messages of."""
-        return {record.topic for record in self._records() if isinstance(record, Channel)}
+        return {record.topic for record in self._records(_Place()) if isinstance(record, Channel)}
 
     def messages(self, topics: Collection[Topic[Any]] = TOPICS) -> Iterator[Entry[Any]]:
         """The messages of these topics, typed; those that cannot be decoded are counted."""
-        channels: dict[int, tuple[str, type[Message], bool]] = {}
-        self.refused = 0
-        for record in self._records():
+        self._place, self.refused = _Place(), 0
+        yield from self.newer(topics)
+
+    def newer(self, topics: Collection[Topic[Any]] = TOPICS) -> Iterator[Entry[Any]]:
+        """The messages of these topics in what has been added to the log since the last call."""
+        channels = self._place.channels
+        wanted = {number: one for number, one in channels.items() if one.topic in topics}
+        for record in self._records(self._place):
             if isinstance(record, Channel):
                 topic = topic_of(record.topic)
-                if topic is not None and topic in topics:
-                    channels[record.id] = (
-                        record.topic, topic.message, record.message_encoding == "json"
-                    )  # fmt: skip
-            elif isinstance(record, Record) and record.channel_id in channels:
-                key, kind, as_json = channels[record.channel_id]
+                if topic is None:
+                    continue
+                form = decode_json if record.message_encoding == "json" else decode
+                channels[record.id] = _Channel(record.topic, topic, form)
+                if topic in topics:
+                    wanted[record.id] = channels[record.id]
+            elif isinstance(record, Record) and record.channel_id in wanted:
+                channel = wanted[record.channel_id]
                 try:
-                    data = from_json(kind, record.data) if as_json else record.data
-                    message = decode(kind, data)
+                    message = channel.decode(channel.topic.message, record.data)
                 except InputError as error:
                     self.refused += 1
                     self.last_reason = str(error)
                     continue
-                yield Entry(key, record.log_time, message)
+                yield Entry(channel.key, record.log_time, message)
 
     def select(self, topic: Topic[M]) -> list[M]:
         """All messages of one topic."""
         return [entry.message for entry in self.messages((topic,))]
 
-    def _records(self) -> Iterator[Any]:
+    def _records(self, place: _Place) -> Iterator[Any]:
+        """What follows that place, which moves on with each whole record or chunk."""
         self.truncated = False
+        if place.ended:
+            return
         with self.path.open("rb") as file:
             head = file.read(len(_MCAP_MAGIC))
-            file.seek(0)
             if not _MCAP_MAGIC.startswith(head):
                 raise InputError(f"{self.path} is not an MCAP log; give the log of a run")
+            file.seek(place.offset)
             whole = cast(Any, _Whole(file))
-            left = _MOST_UNPACKED + _RATIO * self.path.stat().st_size
+            most = _MOST_UNPACKED + _RATIO * self.path.stat().st_size
+            reader = StreamReader(
+                whole,
+                skip_magic=place.offset > 0,
+                emit_chunks=True,
+                record_size_limit=_LARGEST_RECORD,
+            )
             try:
-                for record in StreamReader(
-                    whole, emit_chunks=True, record_size_limit=_LARGEST_RECORD
-                ).records:
-                    if not isinstance(record, Chunk):
+                for record in reader.records:
+                    if isinstance(record, Chunk):
+                        place.unpacked += record.uncompressed_size
+                        if place.unpacked > most:
+                            raise InputError(
+                                f"{self.path} would unpack to many times its size: no log of a run"
+                            )
+                        yield from breakup_chunk(_unpacked(record), validate_crc=True)
+                    else:
                         yield record
-                        continue
-                    left -= record.uncompressed_size
-                    if left < 0:
-                        raise InputError(
-                            f"{self.path} would unpack to many times its size: no log of a run"
-                        )
-                    yield from breakup_chunk(_unpacked(record), validate_crc=True)
+                    place.offset = file.tell()
+                place.ended = True
             except InputError:
                 raise
             except _DAMAGED:

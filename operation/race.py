@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Final
 
@@ -21,7 +22,8 @@ from bayesrace.transport import RefusedError
 from bayesrace.vehicles import write_car
 from codegen.compiler import find_compiler
 from learning.dataset import Dataset
-from learning.logs import dataset_from_log
+from learning.logs import dataset_from_messages, fallback_cycles
+from operation.analysis.recording import Recording, RecordingReader
 from operation.drive import RunPlan
 from operation.limits import limits_beside
 from operation.preparation import (
@@ -184,11 +186,15 @@ class _Drives:
     ) -> None:
         self._race, self._track = race, track
         self._system, self._recorder = system, recorder
+        self.reader = RecordingReader(race.out)
 
     def controller(
         self, artefact: Path, name: str, weights: Path | None = None
     ) -> AbstractContextManager[None]:
-        """A controller process for the block; ready for its first run, with these weights."""
+        """A controller process for the block; ready for its first run, with these weights.
+
+        What has been driven is read while it starts: no control step is measured then.
+        """
         race, track = self._race, self._track
         settings_file = race.out / FILES.mpc
         write_whole(settings_file, race.settings.mpc.model_dump_json(indent=1) + "\n")
@@ -198,7 +204,13 @@ class _Drives:
         ]  # fmt: skip
         if weights is not None:
             options += ["--weights", str(weights)]
-        return self._system.controller(options, f"controller-{name}.log")
+        return self._system.controller(options, f"controller-{name}.log", self._read)
+
+    def _read(self) -> None:
+        """Reads the log as far as it goes, and imports what will draw it, once there is a run."""
+        self._recorder.drain(at_most_s=20.0)
+        if self.reader.runs():
+            import_module("operation.report")
 
     def drive(self, controller: str) -> RunPlan:
         """One run; InputError if it broke off."""
@@ -218,18 +230,22 @@ class _Drives:
 
     def samples(self, plan: RunPlan) -> Dataset:
         """What can be learned from a run, from the log."""
-        self._recorder.drain(at_most_s=20.0)  # the next stage reads the log
+        self._recorder.drain(at_most_s=20.0)
+        record = self.reader.runs().get(plan.run)
+        if record is None:
+            raise InputError(f"run {plan.run} ({plan.controller}) is not in the log")
         step_s = self._race.settings.discretisation.step_s
-        return dataset_from_log(self._race.out / FILES.log, self._race.car, step_s, (plan.run,))
+        fallback = fallback_cycles(record.telemetry)
+        return dataset_from_messages(record.states, fallback, self._race.car, step_s)
 
 
-def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
+def race(settings: RaceSettings, out: Path, stages: Stages) -> Recording:
     """Drives WorstCase, BayesRace, BayesRace-updated, BayesRace-limit and, where the true model is
     known, BestCase.
 
-    Leaves everything in ``out``. Weights that the controller refuses are no error: their run is
-    left out, and the log has the reason. Where the first ones are refused, the update learns from
-    the run of WorstCase in place of BayesRace's.
+    Leaves everything in ``out``, and returns what was recorded. Weights that the controller refuses
+    are no error: their run is left out, and the log has the reason. Where the first ones are
+    refused, the update learns from the run of WorstCase in place of BayesRace's.
 
     Raises InputError for unusable settings, RaceError when a process is lost (the log stays
     readable), KeyboardInterrupt on Ctrl-C; no process outlives the call.
@@ -246,10 +262,10 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> None:
     for name in (settings.train_track, settings.track):
         load_track(name, this.car.width_m)
     with claimed(out):
-        _compare(this)
+        return _compare(this)
 
 
-def _compare(this: _Race) -> None:
+def _compare(this: _Race) -> Recording:
     settings, out, stages = this.settings, this.out, this.stages
     this.keep_fmu()
     write_car(this.car_file, this.car)
@@ -277,6 +293,7 @@ def _compare(this: _Race) -> None:
         for best in perfect:
             with drives.controller(best, "bestcase"), stages.stage("drive BestCase"):
                 drives.drive("bestcase")
+    return drives.reader.recording()
 
 
 def _prepared(this: _Race) -> Prepared:
@@ -311,13 +328,14 @@ def _learn(this: _Race, drives: _Drives, samples: list[Dataset], weights: Path) 
 def _approach_limit(this: _Race, drives: _Drives, samples: list[Dataset], weights: Path) -> None:
     """The runs that maximise progress, the first with the weights that the controller has, with an
     update before each other; ends where the controller refuses an update."""
+    driven: RunPlan | None = None
     for number in range(1, this.settings.progress_runs + 1):
-        if number > 1:
+        if driven is not None:
+            samples.append(drives.samples(driven))
             with this.stages.stage(f"update the residual, {number}") as stage:
                 weights = this.update(samples, weights, FILES.weights_limit, stage)
         with this.stages.stage(f"drive BayesRace-limit, {number}"):
             name = "bayesrace-limit"
-            driven = drives.drive(name) if number == 1 else drives.drive_with(weights, name)
+            driven = drives.drive(name) if driven is None else drives.drive_with(weights, name)
         if driven is None:
             return
-        samples.append(drives.samples(driven))

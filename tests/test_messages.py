@@ -26,8 +26,8 @@ from bayesrace.messages import (
     Telemetry,
     car_key,
     decode,
+    decode_json,
     encode,
-    from_json,
     json_schema,
     to_json,
 )
@@ -304,7 +304,7 @@ def conforms(value: Any, schema: dict[str, Any]) -> bool:
 def test_every_message_survives_json_to_the_bit_and_is_as_its_schema_says(message: Message) -> None:
     kind, text = type(message), to_json(type(message), encode(message))
     assert text is not None
-    read = decode(kind, from_json(kind, text))
+    read = decode_json(kind, text)
     assert read == message
     assert encode(read) == encode(message)  # -0.0 is not 0.0
     assert conforms(json.loads(text), json_schema(kind))
@@ -324,7 +324,7 @@ def test_json_names_the_numbers_of_states_and_inputs() -> None:
         "acting_s": [1e-3],
     }
     whole = text.replace(b'"time_s":0.5', b'"time_s":2').replace(b'"psi":3.0', b'"psi":3')
-    assert decode(State, from_json(State, whole)) == replace(STATE, time_s=2.0)
+    assert decode_json(State, whole) == replace(STATE, time_s=2.0)
 
 
 def test_what_is_not_finite_is_recorded_and_refused() -> None:
@@ -333,7 +333,7 @@ def test_what_is_not_finite_is_recorded_and_refused() -> None:
     assert b'"time_s":"NaN"' in text
     assert b'"delta_rate":"-Infinity"' in text
     with pytest.raises(InputError, match=r"State\.time_s: .NaN. is not a float"):
-        decode(State, from_json(State, text))
+        decode_json(State, text)
 
 
 @pytest.mark.parametrize("changes", [{"x": [0.0] * 6}, {"x": 7}, {"extra": 1}, {"lap": ...}])
@@ -348,7 +348,7 @@ def test_what_has_no_form_in_json_is_no_message(changes: dict[str, Any]) -> None
 def test_any_bytes_become_json_or_are_refused(kind: type[Message], data: bytes) -> None:
     to_json(kind, data)
     with pytest.raises(InputError):
-        decode(kind, from_json(kind, data))
+        decode_json(kind, data)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -5,7 +5,7 @@
 """
 
 from bayesrace.messages.codec import Decoder, decode, encode
-from bayesrace.messages.json_form import from_json, json_schema, to_json
+from bayesrace.messages.json_form import decode_json, json_schema, to_json
 from bayesrace.messages.rules import Scalar
 from bayesrace.messages.table import (
     ACTUATION,
@@ -58,5 +58,5 @@ __all__ = [
     "TOPICS", "TRUTH", "WEIGHTS", "Actuation", "CarSample", "Command", "Decoder", "Event",
     "Message", "Qos", "Reply", "Role", "RollbackRequest", "RunRequest", "Scalar", "Service",
     "Source", "State", "Status", "StatusRequest", "StopRequest", "Telemetry", "Topic", "Truth",
-    "car_key", "decode", "encode", "from_json", "is_car_name", "json_schema", "to_json",
+    "car_key", "decode", "decode_json", "encode", "is_car_name", "json_schema", "to_json",
 ]  # fmt: skip

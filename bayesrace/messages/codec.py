@@ -19,7 +19,7 @@ from bayesrace.errors import InputError
 from bayesrace.messages.rules import Integer, Rule, Scalars, Text, Vector, wire_bytes
 from bayesrace.messages.types import Message
 
-__all__ = ["Decoder", "decode", "encode", "largest_bytes", "peek_seq"]
+__all__ = ["Decoder", "checked", "decode", "encode", "largest_bytes", "peek_seq"]
 
 M = TypeVar("M", bound=Message)
 
@@ -116,6 +116,15 @@ def decode(kind: type[M], data: bytes) -> M:
         content = spec.unpack(data)
     except _MALFORMED as error:
         raise InputError(f"{title}: not a message ({error or 'malformed'})") from None
+    return checked(kind, content)
+
+
+def checked(kind: type[M], content: Any) -> M:
+    """The message of class ``kind`` with this content, a map of its fields and its schema version.
+
+    Raises InputError for anything else.
+    """
+    spec, title = _SPECS[kind], kind.__name__
     if type(content) is not dict:
         raise InputError(f"{title}: not a message (no map)")
     version = content.get("schema", kind.SCHEMA)  # first: it explains other fields

@@ -7,16 +7,19 @@ Floats keep their bits. NaN and infinities, which no valid message holds, become
 from collections.abc import Mapping
 from dataclasses import fields
 from itertools import chain
-from typing import Any, Final, NamedTuple, get_args, get_type_hints
+from typing import Any, Final, NamedTuple, TypeVar, get_args, get_type_hints
 
 import msgpack
 import pydantic_core
 
 from bayesrace.errors import InputError
+from bayesrace.messages.codec import checked
 from bayesrace.messages.rules import Choice, Flag, Integer, Real, Rule, Scalars, Text, Vector
 from bayesrace.messages.types import Message
 
-__all__ = ["from_json", "json_schema", "to_json"]
+__all__ = ["decode_json", "json_schema", "to_json"]
+
+M = TypeVar("M", bound=Message)
 
 _MALFORMED = (ValueError, TypeError, KeyError, OverflowError, msgpack.UnpackException)
 
@@ -62,11 +65,11 @@ def to_json(kind: type[Message], data: bytes) -> bytes | None:
         return None
 
 
-def from_json(kind: type[Message], data: bytes) -> bytes:
-    """The encoded message whose JSON is ``data``, to be checked by ``decode``.
+def decode_json(kind: type[M], data: bytes) -> M:
+    """The message of class ``kind`` whose JSON is ``data``, checked as :func:`decode` checks.
 
     JSON does not distinguish 1 from 1.0: where a float belongs, an integer becomes one. InputError
-    if the JSON does not have the form of the message.
+    for anything but exactly one such message.
     """
     form = _FORMS[kind]
     try:
@@ -75,10 +78,9 @@ def from_json(kind: type[Message], data: bytes) -> bytes:
             content[name] = _flat(rule, content[name])
         for name in form.reals:
             content[name] = _float(content[name])
-        packed: bytes = msgpack.packb(content)
     except _MALFORMED as error:
         raise InputError(f"{kind.__name__}: not a message in JSON ({error!r:.100})") from None
-    return packed
+    return checked(kind, content)
 
 
 def _named(rule: Vector, value: Any) -> Any:

@@ -36,6 +36,7 @@ __all__ = [
     "RUN_EVENT",
     "PlannedRun",
     "Recording",
+    "RecordingReader",
     "RunRecord",
     "TrainingRecord",
     "read_recording",
@@ -226,19 +227,36 @@ class Recording:
         return next((run for run in reversed(self.runs) if run.plan.controller == controller), None)
 
 
+class RecordingReader:
+    """Reads the log of a race, each message once, also while the race is driven."""
+
+    def __init__(self, run_dir: Path) -> None:
+        """InputError if the directory holds no log."""
+        self._directory = Path(run_dir)
+        self._log = _RunsOfLog(self._directory / "run.mcap")
+
+    def runs(self) -> dict[int, RunRecord]:
+        """What has been recorded up to now of each run, by its number."""
+        return self._log.read()
+
+    def recording(self) -> Recording:
+        """The run directory as it is now; InputError if it is none of a race."""
+        settings = _read_settings(self._directory / "settings.json")
+        track, line = _driven_on(self._directory, settings, "track", "race")
+        self._log.read()
+        planned, reader = self._log.planned, self._log.reader
+        training, whole = _read_training(self._directory, settings)
+        return Recording(
+            directory=self._directory, settings=settings, track=track, line=line, runs=planned,
+            truth=_with_truth(planned), training=training,
+            truncated=reader.truncated or not whole, refused=reader.refused,
+            started_ns=self._log.started_ns,
+        )  # fmt: skip
+
+
 def read_recording(run_dir: Path) -> Recording:
     """Reads a run directory, also one whose race was cut short; InputError if it is none."""
-    run_dir = Path(run_dir)
-    settings = _read_settings(run_dir / "settings.json")
-    track, line = _driven_on(run_dir, settings, "track", "race")
-    reader = LogReader(run_dir / "run.mcap")
-    planned, started_ns = _runs(reader)
-    training, whole = _read_training(run_dir, settings)
-    return Recording(
-        directory=run_dir, settings=settings, track=track, line=line, runs=planned,
-        truth=_with_truth(planned), training=training,
-        truncated=reader.truncated or not whole, refused=reader.refused, started_ns=started_ns,
-    )  # fmt: skip
+    return RecordingReader(run_dir).recording()
 
 
 def _driven_on(
@@ -259,34 +277,48 @@ def _read_training(run_dir: Path, settings: dict[str, Any]) -> tuple[TrainingRec
     if not log.is_file():
         return None, True
     try:
-        reader = LogReader(log)
-        planned, _ = _runs(reader)
+        runs = _RunsOfLog(log)
+        runs.read()
         track, line = _driven_on(run_dir, settings, "train_track", "train")
     except InputError as error:
         _log.warning("the training drive is left out: %s", error)
         return None, False
+    planned = runs.planned
     if not planned:
         return None, False
     _with_truth(planned)
-    whole = not (reader.truncated or reader.refused)
+    whole = not (runs.reader.truncated or runs.reader.refused)
     return TrainingRecord(planned[-1], track, line), whole
 
 
-def _runs(reader: LogReader) -> tuple[list[RunRecord], int | None]:
-    """The runs of a log in order, and the calendar time of its first message [ns since 1970]."""
-    runs: dict[int, RunRecord] = {}
-    started_ns: int | None = None
-    for entry in reader.messages([topic for topic in TOPICS if topic is not HEARTBEAT]):
-        started_ns = entry.log_time_ns if started_ns is None else started_ns
-        message = entry.message
-        plan = PlannedRun.from_event(message) if isinstance(message, Event) else None
-        run = message.run if plan is None else plan.run
-        record = runs.setdefault(run, RunRecord(PlannedRun(run, "", "")))
-        if plan is None:
-            record.add(message)
-        else:  # a state can overtake it, since it comes from another process
-            record.plan = plan
-    return [record for _, record in sorted(runs.items()) if record.plan.controller], started_ns
+class _RunsOfLog:
+    """The runs of a log that may still be written."""
+
+    def __init__(self, path: Path) -> None:
+        self.reader = LogReader(path)
+        self.started_ns: int | None = None
+        """Calendar time of the first message [ns since 1970]."""
+        self._runs: dict[int, RunRecord] = {}
+
+    @property
+    def planned(self) -> list[RunRecord]:
+        """The runs that were announced, in order."""
+        return [record for _, record in sorted(self._runs.items()) if record.plan.controller]
+
+    def read(self) -> dict[int, RunRecord]:
+        """Takes in what has been added to the log; all runs by their number."""
+        for entry in self.reader.newer([topic for topic in TOPICS if topic is not HEARTBEAT]):
+            if self.started_ns is None:
+                self.started_ns = entry.log_time_ns
+            message = entry.message
+            plan = PlannedRun.from_event(message) if isinstance(message, Event) else None
+            run = message.run if plan is None else plan.run
+            record = self._runs.setdefault(run, RunRecord(PlannedRun(run, "", "")))
+            if plan is None:
+                record.add(message)
+            else:  # a state can overtake it, since it comes from another process
+                record.plan = plan
+        return self._runs
 
 
 def _with_truth(planned: Sequence[RunRecord]) -> bool:

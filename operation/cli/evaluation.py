@@ -108,10 +108,9 @@ def race(
     """
 
     from bayesrace.vehicles import get_car
-    from operation.analysis.race import read_race, write_result
+    from operation.analysis.race import RaceAnalysis, write_result
     from operation.race import FILES
     from operation.race import race as drive_all
-    from operation.report import render_report
     from operation.settings import RaceSettings
     from operation.terminal.progress import stages_on
     from operation.terminal.race_table import print_table
@@ -133,9 +132,11 @@ def race(
     out = out or Path("runs") / datetime.now(UTC).astimezone().strftime("%Y%m%d-%H%M%S")
     console = Terminal()
     with stages_on(console) as stages:
-        drive_all(settings, out, stages)
+        recording = drive_all(settings, out, stages)
         with stages.stage("result and report"):
-            analysis = read_race(out)
+            from operation.report import render_report  # matplotlib takes half a second to import
+
+            analysis = RaceAnalysis(recording)
             write_result(out / FILES.result, analysis.result)
             report = render_report(out, analysis.result, analysis)
     print_table(analysis.result, console)

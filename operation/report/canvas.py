@@ -6,9 +6,6 @@ from pathlib import Path
 from typing import Final
 
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.backends.backend_pdf import FigureCanvasPdf
-from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from bayesrace.files import replacing
@@ -48,7 +45,6 @@ def inline_svg(figure: Figure) -> str:
     Two figures on one page share no ids but those of identical definitions.
     """
     buffer = io.StringIO()
-    FigureCanvasSVG(figure)
     figure.savefig(buffer, format="svg", metadata=_NO_METADATA)
     text = _SIZE.sub("", _DROPPED.sub("", buffer.getvalue()), count=2)
     # A hundredth of a point is enough for lines; texts keep their digits.
@@ -57,13 +53,11 @@ def inline_svg(figure: Figure) -> str:
 
 def write_pdf(figure: Figure, path: Path) -> None:
     """Writes the figure as a PDF file, whole or not at all; the same figure gives the same file."""
-    FigureCanvasPdf(figure)
     with replacing(path) as partial:
-        figure.savefig(partial, metadata={"CreationDate": None})
+        figure.savefig(partial, format="pdf", metadata={"CreationDate": None})
 
 
 def write_png(figure: Figure, path: Path, dpi: int = 120) -> None:
     """Writes the figure as a PNG file, whole or not at all."""
-    FigureCanvasAgg(figure)
     with replacing(path) as partial:
-        figure.savefig(partial, dpi=dpi, metadata={"Software": None})
+        figure.savefig(partial, format="png", dpi=dpi, metadata={"Software": None})

@@ -27,7 +27,7 @@ def solve_figure(runs: Sequence[DrivenRun]) -> Figure:
     bins = np.geomspace(0.98 * min(map(np.min, times)), 1.02 * max(map(np.max, times)), 90)
     for axes, run, values in zip(grid, timed, times, strict=True):
         colour, (p50, p99) = look(run.controller).colour, np.percentile(values, [50, 99])
-        axes.hist(values, bins=list(bins), color=colour, alpha=0.75)
+        axes.hist(values, bins=list(bins), histtype="stepfilled", color=colour, alpha=0.75)
         axes.axvline(p50, color=INK, linewidth=1.2)
         axes.axvline(p99, color=INK, linewidth=1.0, linestyle=(0, (3, 2)))
         axes.set(xscale="log", yticks=[], xlim=(bins[0], bins[-1]))
