@@ -378,6 +378,15 @@ def test_a_malformed_endpoint_is_refused_by_name(endpoint: str) -> None:
         pass
 
 
+def test_a_session_that_has_started_its_peers_itself_does_not_wait_for_them_to_open() -> None:
+    begin_s = time.monotonic()
+    with (
+        private_endpoints("absent") as ends,
+        open_session(Endpoints(connect=tuple(ends)), explains=False),
+    ):
+        assert time.monotonic() - begin_s < 0.4  # Zenoh waits for 0.5 s otherwise
+
+
 def test_each_unix_socket_is_a_link_of_its_own() -> None:
     with (
         private_endpoints("here", "nowhere") as ends,

@@ -49,8 +49,11 @@ _FILTERS: Final[list[dict[str, list[str]]]] = [
 _ROUTER: Final = {"south": [{"filters": [one]} for one in _FILTERS]}
 
 
-def zenoh_config(endpoints: Endpoints, role: Role) -> Any:
-    """Zenoh's configuration of such a process; InputError for a setting that it does not have."""
+def zenoh_config(endpoints: Endpoints, role: Role, *, waits: bool = True) -> Any:
+    """Zenoh's configuration of such a process; InputError for a setting that it does not have.
+
+    ``waits``: opening the session takes half a second where nobody answers yet.
+    """
     config = zenoh.Config()
     region = role if role in _REGIONS else "observer"
     limits = endpoints.limits
@@ -64,6 +67,7 @@ def zenoh_config(endpoints: Endpoints, role: Role) -> Any:
         "connect/timeout_ms": -1,
         "connect/exit_on_failure": False,
         "connect/retry": _RETRY,
+        "open/return_conditions/connect_scouted": waits,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/link/tx/lease": round(1e3 * limits.lease_s),
@@ -118,8 +122,8 @@ def open_session(
     Raises InputError if an endpoint is malformed, open to others without protection, or cannot be
     listened on; if the certificate is not for the role; if a link is refused, here or at its other
     end. An absent peer is no error: the session connects as soon as it appears, and says in the log
-    that it waits, unless it is not to ``explains`` because it has just started its peers itself;
-    see :class:`.Inbox` for waiting with a limit.
+    that it waits, unless it is not to ``explains`` because it has just started its peers itself:
+    then it neither says so nor waits for them here. See :class:`.Inbox` for waiting with a limit.
 
     Where the process's certificate expires (``grace_s`` later) or turns out to be revoked, the main
     thread gets a SIGINT, and the end of the block raises InputError with the reason.
@@ -134,7 +138,7 @@ def open_session(
     watch: LinkWatch | None = None
     try:
         with ExitStack() as stack:
-            session = stack.enter_context(_opened(endpoints, role))
+            session = stack.enter_context(_opened(endpoints, role, explains))
             known = _join(session, endpoints, absent, stack)
             if endpoints.credentials is not None or (endpoints.connect and explains):
                 watch = LinkWatch(session, endpoints, known, explains, grace_s)
@@ -194,9 +198,9 @@ def _checked(endpoints: Endpoints, role: Role, explains: bool = True) -> list[Fi
 
 
 @contextmanager
-def _opened(endpoints: Endpoints, role: Role) -> Iterator[Any]:
+def _opened(endpoints: Endpoints, role: Role, waits: bool) -> Iterator[Any]:
     try:
-        session = zenoh.open(zenoh_config(endpoints, role))
+        session = zenoh.open(zenoh_config(endpoints, role, waits=waits))
     except zenoh.ZError as error:
         text = re.sub(r" at /\S+", "", str(error).splitlines()[0])  # places in Zenoh's source
         cause = re.search(r"[^:\[]+ \(os error \d+\)", text)
