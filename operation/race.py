@@ -47,6 +47,10 @@ _MODELS: Final[tuple[PredictionModel, ...]] = ("e_kinematic", "dynamic")
 """Of BayesRace and of BestCase."""
 
 
+_REPORT_MODULES: Final = "operation.report", "operation.analysis.race"
+"""What the report needs, the last first; each takes as long to import as a controller to start."""
+
+
 class RaceError(RuntimeError):
     """The race could not be driven to its end; the message says why. The log is readable."""
 
@@ -187,6 +191,7 @@ class _Drives:
         self._race, self._track = race, track
         self._system, self._recorder = system, recorder
         self.reader = RecordingReader(race.out)
+        self._needed = list(_REPORT_MODULES)
 
     def controller(
         self, artefact: Path, name: str, weights: Path | None = None
@@ -207,10 +212,11 @@ class _Drives:
         return self._system.controller(options, f"controller-{name}.log", self._read)
 
     def _read(self) -> None:
-        """Reads the log as far as it goes, and imports what will draw it, once there is a run."""
-        self._recorder.drain(at_most_s=20.0)
-        if self.reader.runs():
-            import_module("operation.report")
+        """Reads the log as far as it goes, and imports a part of what the report needs."""
+        if not self.reader.runs():
+            return
+        if self._needed:
+            import_module(self._needed.pop())
 
     def drive(self, controller: str) -> RunPlan:
         """One run; InputError if it broke off."""

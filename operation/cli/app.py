@@ -1,5 +1,6 @@
 """The Typer application: subcommands grouped by task, and errors as one line."""
 
+import gc
 import io
 import logging
 import shutil
@@ -101,6 +102,7 @@ def main() -> None:
             code = app(standalone_mode=False, prog_name="bayesrace")
             if code == _INTERRUPTED:
                 raise KeyboardInterrupt
+        gc.freeze()  # the process ends: nothing is worth looking for
         sys.exit(code)
     except (typer.Abort, KeyboardInterrupt):
         _fail("interrupted", _INTERRUPTED)

@@ -9,6 +9,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
 
 from bayesrace.arrays import Floats
 from bayesrace.raceline import RaceLine
@@ -156,7 +157,8 @@ class LapMaps:
 def draw_edges(axes: Axes, right: Floats, left: Floats) -> None:
     """The track as an area between its edges, each (n, 2)."""
     ring = np.concatenate([right, right[:1], left[:1], left[::-1]])
-    axes.fill(ring[:, 0], ring[:, 1], color=SURFACE, linewidth=0)
+    # An artist alone: as a patch it would be searched for its extent, which show_all sets.
+    axes.add_artist(Polygon(ring, color=SURFACE, linewidth=0))
     for edge in (right, left):
         closed = np.concatenate([edge, edge[:1]])
         axes.plot(closed[:, 0], closed[:, 1], color="#a3a39b", linewidth=0.7)
