@@ -76,6 +76,26 @@ def test_a_log_gives_back_typed_messages_and_metadata(tmp_path: Path) -> None:
     assert abs(entries[0].log_time_ns - time.time_ns()) < 60e9
 
 
+def test_a_log_that_is_being_written_gives_what_was_added_once(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    writer = LogWriter(path)
+    reader, found = LogReader(path), []
+    for seq in range(6):
+        writer.write(KEY, encode(state(seq)), time.monotonic_ns(), seq)
+        if seq % 2:
+            writer.flush()
+        found.append([entry.message.seq for entry in reader.newer((STATE,))])
+        assert reader.truncated
+    assert found == [[], [0, 1], [], [2, 3], [], [4, 5]]
+    writer.write(KEY, b"junk", time.monotonic_ns(), 6)
+    writer.close()
+    for _ in range(2):  # nothing follows the end
+        assert list(reader.newer()) == []
+        assert not reader.truncated
+        assert reader.refused == 1
+    assert reader.select(STATE) == [state(seq) for seq in range(6)]
+
+
 def test_other_mcap_tools_read_json_with_schemas_and_an_index(tmp_path: Path) -> None:
     """With the mcap package alone: what viewers such as Foxglove need, they find."""
     write(tmp_path / "log.mcap")

@@ -231,12 +231,15 @@ class RecordingReader:
     """Reads the log of a race, each message once, also while the race is driven."""
 
     def __init__(self, run_dir: Path) -> None:
-        """InputError if the directory holds no log."""
         self._directory = Path(run_dir)
-        self._log = _RunsOfLog(self._directory / "run.mcap")
+
+    @cached_property
+    def _log(self) -> "_RunsOfLog":
+        return _RunsOfLog(self._directory / "run.mcap")
 
     def runs(self) -> dict[int, RunRecord]:
-        """What has been recorded up to now of each run, by its number."""
+        """What has been recorded up to now of each run, by its number; InputError if there is no
+        log."""
         return self._log.read()
 
     def recording(self) -> Recording:

@@ -1,11 +1,14 @@
 """The report page: figures and tables put into the template."""
 
 import platform
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
+from multiprocessing import get_context
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from matplotlib.figure import Figure
@@ -14,7 +17,7 @@ from pydantic import ValidationError
 from bayesrace.files import write_whole
 from bayesrace.manifest import Manifest
 from operation.analysis.published import LIMIT, SOURCE, compare_gp, compare_laps
-from operation.analysis.race import RaceAnalysis, read_race
+from operation.analysis.race import DrivenRun, RaceAnalysis, read_race
 from operation.analysis.results import RaceResult
 from operation.report.canvas import inline_svg, write_png
 from operation.report.coverage import coverage_figures
@@ -144,31 +147,65 @@ def _uncertain(analysis: RaceAnalysis) -> list[tuple[str, int, int]]:
 
 
 def _figures(analysis: RaceAnalysis, result: RaceResult, picture: Path) -> dict[str, list[str]]:
-    """Name to panels as SVG; what has nothing to show is left out."""
-    runs, track, line = analysis.runs, analysis.track, analysis.line
-    driven = [run for run in runs if len(run.record.truth) > 1]
-    figures: dict[str, list[Figure]] = {}
+    """Name to panels as SVG; what has nothing to show is left out.
+
+    Laps on the track are half of the work: a copy of this process draws them beside it.
+    """
+    beside = get_context("fork")
+    with ProcessPoolExecutor(1, beside, _share, (analysis, picture)) as pool, figure_style():
+        maps = pool.submit(_maps)
+        panels = _svg(_panels(analysis, result))
+        return panels | maps.result()
+
+
+_shared: list[Any] = []
+"""In the process that draws maps: the analysis, and the file of the picture."""
+
+
+def _share(*values: Any) -> None:
+    _shared[:] = values
+
+
+def _maps() -> dict[str, list[str]]:
+    """Laps on the track, and the training drive; writes the picture, too."""
+    analysis, picture = _shared
+    driven = _driven(analysis)
     with figure_style():
-        maps = LapMaps(driven, track, line)
+        maps = LapMaps(driven, analysis.track, analysis.line)
         write_png(maps.picture(), picture)
-        figures["laps"] = maps.figures()
-        if driven:
-            figures["time"] = time_figures(driven, track)
-            figures["speed"] = speed_figures(driven, track, line)
-            figures["inputs"] = input_figures(driven, track, analysis.recording.car)
-            figures["cornering"] = cornering_figures(driven, track, result.settings.friction)
-            figures["deviation"] = deviation_figures(driven, track)
-            figures["caution"] = caution_figures(driven, track)
-        data = analysis.best_case
-        if data is not None and analysis.validations:
-            progress = track.project_path(data.x[:, :2]).progress_m
-            figures["gp"] = gp_figures(analysis.validations, progress, track.length_m)
-        if any(len(run.record.solve_us) for run in driven):
-            figures["solve"] = [solve_figure(driven)]
+        figures = {"laps": maps.figures()}
         if (found := analysis.recording.training) is not None and analysis.training is not None:
             training = LapMaps([analysis.training], found.track, found.line)
             figures["training"] = [
                 *training.figures(),
                 *coverage_figures(analysis.training, driven),
             ]
-        return {name: [inline_svg(one) for one in some] for name, some in figures.items() if some}
+        return _svg(figures)
+
+
+def _panels(analysis: RaceAnalysis, result: RaceResult) -> dict[str, list[Figure]]:
+    """What is drawn over the track's length, and the execution times."""
+    driven, track, line = _driven(analysis), analysis.track, analysis.line
+    figures: dict[str, list[Figure]] = {}
+    if driven:
+        figures["time"] = time_figures(driven, track)
+        figures["speed"] = speed_figures(driven, track, line)
+        figures["inputs"] = input_figures(driven, track, analysis.recording.car)
+        figures["cornering"] = cornering_figures(driven, track, result.settings.friction)
+        figures["deviation"] = deviation_figures(driven, track)
+        figures["caution"] = caution_figures(driven, track)
+    data = analysis.best_case
+    if data is not None and analysis.validations:
+        progress = track.project_path(data.x[:, :2]).progress_m
+        figures["gp"] = gp_figures(analysis.validations, progress, track.length_m)
+    if any(len(run.record.solve_us) for run in driven):
+        figures["solve"] = [solve_figure(driven)]
+    return figures
+
+
+def _driven(analysis: RaceAnalysis) -> list[DrivenRun]:
+    return [run for run in analysis.runs if len(run.record.truth) > 1]
+
+
+def _svg(figures: Mapping[str, Sequence[Figure]]) -> dict[str, list[str]]:
+    return {name: [inline_svg(one) for one in some] for name, some in figures.items() if some}
