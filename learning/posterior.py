@@ -17,7 +17,7 @@ predicted with
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Final
 
 import numpy as np
 from scipy.linalg import cholesky, lapack, solve_triangular
@@ -27,12 +27,7 @@ from bayesrace.errors import InputError
 from bayesrace.gp.expression import kernel_matrix
 from learning.scores import PredictionErrors
 
-if TYPE_CHECKING:
-    from sklearn.gaussian_process import GaussianProcessRegressor
-
-__all__ = ["Covariance", "Posterior", "regressor"]
-
-_NU: Final = {"matern05": 0.5, "matern15": 1.5, "matern25": 2.5}
+__all__ = ["Covariance", "Posterior"]
 
 _SINGULAR: Final = "GP: the covariance of the samples is singular; train without repeated samples"
 
@@ -58,24 +53,6 @@ class Covariance:
     def between(self, a: Floats, b: Floats) -> Floats:
         """Covariances (n, m) of the noise-free outputs at features ``a`` (n, 6), ``b`` (m, 6)."""
         return self.signal * kernel_matrix(self.kind, a, b, self.lengths)
-
-
-def regressor(covariance: Covariance, z: Floats, y: Floats) -> "GaussianProcessRegressor":
-    """scikit-learn's GP with these hyperparameters, fitted to ``z`` (n, 6) and ``y`` (n,).
-
-    The weights of a controller come from it. InputError if the covariance is singular.
-    """
-    # Imported here: it takes a second, and only training needs it.
-    from sklearn.gaussian_process import GaussianProcessRegressor
-    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
-
-    kind, lengths = covariance.kind, covariance.lengths
-    correlation: Any = RBF(lengths) if kind == "rbf" else Matern(lengths, nu=_NU[kind])
-    kernel = ConstantKernel(covariance.signal) * correlation + WhiteKernel(covariance.noise)
-    try:
-        return GaussianProcessRegressor(kernel, alpha=0.0, optimizer=None).fit(z, y)
-    except np.linalg.LinAlgError as error:
-        raise InputError(_SINGULAR) from error
 
 
 class Posterior:

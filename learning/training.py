@@ -42,7 +42,7 @@ from learning.dataset import Dataset, left_out
 from learning.folds import spans, stretches
 from learning.hyperparameters import Fit, maximise, refine, starts
 from learning.likelihood import PairDistances
-from learning.posterior import regressor
+from learning.posterior import Posterior
 from learning.residual import identity, residual
 from learning.settings import MIN_SAMPLES, Progress, TrainingSettings
 from learning.subset import evenly, most_informative
@@ -240,7 +240,7 @@ def _finish(
     covariance = fit.covariance
     noise_ratio = covariance.noise / covariance.signal
     rows = most_informative(fit.kind, target.z, covariance.lengths, noise_ratio, settings.capacity)
-    alpha = regressor(covariance, target.z[rows], target.y[rows]).alpha_
+    alpha = Posterior(covariance, target.z[rows], target.y[rows]).alpha
     errors = target.errors_from(rows, covariance)
     scale = errors.variance_scale * (settings.widen**2 if first else 1.0)
     output = GpOutput(

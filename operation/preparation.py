@@ -281,7 +281,7 @@ def trained_weights(
             settings.model_dump_json(exclude={"threads"}),
             b"" if initial is None else encode_weights(replace(initial, created_utc_ns=0)),
             cpu_identity(),
-            *software(_WEIGHTS_SOURCES, ("casadi", "numpy", "scipy", "scikit-learn")),
+            *software(_WEIGHTS_SOURCES, ("casadi", "numpy", "scipy")),
         ]
     )
     path = cache_folder() / f"weights-{identity}.bin"

@@ -42,7 +42,7 @@ REPORT: Final = "report.html"
 PICTURE: Final = "lap.png"
 
 _TEMPLATE: Final = "report.html.j2"
-_PACKAGES: Final = ("bayesrace", "casadi", "numpy", "scikit-learn", "eclipse-zenoh")
+_PACKAGES: Final = ("bayesrace", "casadi", "numpy", "scipy", "eclipse-zenoh")
 
 
 def render_report(run_dir: Path, result: RaceResult, analysis: RaceAnalysis | None = None) -> Path:
