@@ -6,17 +6,19 @@ A folder holds what one process needs, as ``bayesrace certs`` writes it: the aut
 """
 
 import os
-import ssl
 import stat
 import time
 from pathlib import Path
-from typing import Final, Self
+from typing import TYPE_CHECKING, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_text
 from bayesrace.messages import Role
+
+if TYPE_CHECKING:
+    import ssl
 
 __all__ = [
     "AUTHORITY", "CERTIFICATE", "COVERS", "EVERY_CAR", "KEY", "MEMBERS", "Credentials", "Member",
@@ -161,6 +163,8 @@ def _check_private(key: Path) -> None:
 
 def _verified(folder: Path) -> tuple[str, float]:
     """Name and end of the certificate, after a handshake with itself; InputError if that fails."""
+    import ssl  # two megabytes, which a process without certificates does not need
+
     authority, files = folder / AUTHORITY, (folder / CERTIFICATE, folder / KEY)
     try:
         server = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
@@ -194,7 +198,7 @@ def _verified(folder: Path) -> tuple[str, float]:
     return subject["commonName"], ssl.cert_time_to_seconds(str(found["notAfter"]))
 
 
-def _why_not(error: ssl.SSLCertVerificationError) -> str:
+def _why_not(error: "ssl.SSLCertVerificationError") -> str:
     if error.verify_code == _OPENSSL_EXPIRED:
         return "has expired: renew it with 'bayesrace certs add NAME --renew'"
     if error.verify_code == _OPENSSL_NOT_YET:

@@ -5,14 +5,16 @@ connection, and a handshake with this process's certificate.
 """
 
 import socket
-import ssl
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from bayesrace.transport.credentials import AUTHORITY, CERTIFICATE, KEY, Credentials
 from bayesrace.transport.endpoints import Address, address_of
+
+if TYPE_CHECKING:
+    import ssl
 
 __all__ = ["Finding", "expired", "probe", "probe_all"]
 
@@ -103,6 +105,8 @@ def _unreached(endpoint: str, address: Address, error: OSError) -> str:
 
 def _asks_for_certificates(connection: socket.socket) -> str:
     """Whether TLS is spoken where plain links were asked for."""
+    import ssl  # two megabytes, which a process without certificates does not need
+
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     connection.settimeout(_REFUSAL_S)
@@ -120,6 +124,8 @@ def _refused(
     connection: socket.socket, endpoint: str, address: Address, credentials: Credentials
 ) -> str:
     """Why the handshake fails at one of its ends; empty if it does not."""
+    import ssl  # as above
+
     folder = credentials.folder
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     try:
@@ -153,7 +159,7 @@ _NO_TLS: Final = (
 )
 
 
-def _we_refuse(error: ssl.SSLCertVerificationError, address: Address, name: str) -> str:
+def _we_refuse(error: "ssl.SSLCertVerificationError", address: Address, name: str) -> str:
     if error.verify_code == _EXPIRED:
         return (
             "has a certificate that has expired: renew it there with 'bayesrace certs add NAME "
@@ -172,7 +178,7 @@ def _we_refuse(error: ssl.SSLCertVerificationError, address: Address, name: str)
     )
 
 
-def _they_refuse(error: ssl.SSLError, credentials: Credentials) -> str:
+def _they_refuse(error: "ssl.SSLError", credentials: Credentials) -> str:
     reason = error.reason or str(error)
     if "UNKNOWN_CA" in reason or "BAD_CERTIFICATE" in reason or "DECRYPT_ERROR" in reason:
         return (
