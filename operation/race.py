@@ -63,7 +63,6 @@ class _Files:
     car: str = "car.toml"
     log: str = "run.mcap"
     collect_log: str = "collect.mcap"
-    result: str = "result.json"
     weights: str = "weights-bayesrace.bin"
     weights_updated: str = "weights-updated.bin"
     weights_limit: str = "weights-limit.bin"

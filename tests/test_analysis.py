@@ -270,7 +270,7 @@ def test_runs_of_one_controller_are_numbered(tmp_path: Path) -> None:
     text = io.StringIO()
     print_table(result, Console(file=text, width=80))
     assert "\nbayesrace-limit 2 " in text.getvalue()
-    page = render_report(tmp_path, result).read_text()
+    page = render_report(tmp_path).read_text()
     assert "BayesRace at the limit, 2</b>" in page
     assert "BestCase</b>" in page
 
@@ -288,7 +288,7 @@ def test_refused_weights_are_a_row_with_the_reason(tmp_path: Path) -> None:
     rows = [line.split() for line in text.getvalue().splitlines()]
     assert ["bayesrace-updated", "refused", "–"] in [row[:3] for row in rows]
     assert "bayesrace-updated: refused: absurd over the car's range" in text.getvalue()
-    page = render_report(tmp_path, result).read_text()
+    page = render_report(tmp_path).read_text()
     assert '<div class="time">refused</div>' in page
     assert "absurd over the car&#39;s range" in page
 

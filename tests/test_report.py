@@ -56,7 +56,7 @@ def parse(page: Path) -> _Tables:
 def rendered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RaceResult]:
     path = race(tmp_path_factory.mktemp("race"))
     analysis = read_race(path)
-    return render_report(path, analysis.result, analysis), analysis.result
+    return render_report(path, analysis), analysis.result
 
 
 def test_the_page_needs_nothing_but_itself(rendered: tuple[Path, RaceResult]) -> None:
@@ -111,7 +111,7 @@ def test_a_race_that_was_cut_off_still_gets_its_page(tmp_path: Path) -> None:
     path = race(tmp_path)
     data = (path / "run.mcap").read_bytes()
     (path / "run.mcap").write_bytes(data[: int(0.3 * len(data))])
-    page = render_report(path, analyse(path))
+    page = render_report(path)
     text = page.read_text(encoding="utf-8")
     assert "The log is not complete" in text
     assert "DNF" in text
@@ -132,22 +132,22 @@ def test_a_damaged_log_of_the_training_drive_leaves_the_race_its_page(
     assert result.complete == (share == 1)
     assert (result.training is not None) == shown
     assert len(result.laps) == len(analyse(training).laps)
-    assert render_report(path, result).is_file()
+    assert render_report(path).is_file()
 
 
 @pytest.mark.parametrize("states", [0, 1, 2])
 def test_a_race_that_hardly_began_still_gets_its_page(tmp_path: Path, states: int) -> None:
     drive = Drive("bestcase", circle(TWO_LAPS[:states], 1.0), ended=None)
     path = write_race(tmp_path, [drive])
-    assert render_report(path, analyse(path)).is_file()
+    assert render_report(path).is_file()
     path = write_race(tmp_path / "empty", [])
-    assert render_report(path, analyse(path)).is_file()
+    assert render_report(path).is_file()
 
 
 def test_names_from_files_are_text_not_markup(tmp_path: Path) -> None:
     drive = Drive("<script>alert(1)</script>", circle(TWO_LAPS, 1.0), ended="<b>over</b>")
     path = write_race(tmp_path, [drive])
-    tags = parse(render_report(path, analyse(path))).tags
+    tags = parse(render_report(path)).tags
     assert "script" not in tags
 
 

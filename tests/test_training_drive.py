@@ -138,7 +138,7 @@ def test_a_race_reports_its_training_drive(
     said = f"none of 601 samples off the track, up to {training.speed_max_mps:.2f} m/s"
     assert f"training drive on paddock: laps {one.laps_s[0]:.3f}" in text.getvalue()
     assert said in text.getvalue()
-    page = render_report(run, result).read_text()
+    page = render_report(run).read_text()
     assert said in page
     section = page.split('<section id="training">')[1].split("</section>")[0]
     assert section.count("<svg ") == 4  # the map, and three pictures of the states

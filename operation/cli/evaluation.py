@@ -124,7 +124,6 @@ def race(
     """
 
     from bayesrace.vehicles import get_car
-    from operation.race import FILES
     from operation.race import race as drive_all
     from operation.settings import RaceSettings
     from operation.terminal.progress import stages_on
@@ -149,13 +148,12 @@ def race(
         recording = drive_all(settings, out, stages)
         with stages.stage("result and report"):
             # They take a second to import, which the race does while its controllers start.
-            from operation.analysis.race import RaceAnalysis, write_result
+            from operation.analysis.race import RaceAnalysis
             from operation.report import render_report
             from operation.terminal.race_table import print_table
 
             analysis = RaceAnalysis(recording)
-            write_result(out / FILES.result, analysis.result)
-            report = render_report(out, analysis.result, analysis)
+            report = render_report(out, analysis)
     print_table(analysis.result, console)
     console.print(f"{report}", highlight=False, soft_wrap=True)
 
@@ -168,17 +166,16 @@ def report(
 ) -> None:
     """Compute result.json, the table and report.html again from a run's log."""
 
-    from operation.analysis.race import read_race, write_result
-    from operation.race import FILES
+    from operation.analysis.race import read_race
     from operation.report import render_report
     from operation.terminal.race_table import print_table
     from operation.terminal.terminal import Terminal
 
     with _uncollected():
         analysis = read_race(run)
-        write_result(run / FILES.result, analysis.result)
-        print_table(analysis.result, Terminal())
-        typer.echo(str(render_report(run, analysis.result, analysis)))
+        page = render_report(run, analysis)
+    print_table(analysis.result, Terminal())
+    typer.echo(str(page))
 
 
 def drive(

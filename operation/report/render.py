@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from bayesrace.files import write_whole
 from bayesrace.manifest import Manifest
 from operation.analysis.published import LIMIT, SOURCE, compare_gp, compare_laps
-from operation.analysis.race import DrivenRun, RaceAnalysis, read_race
+from operation.analysis.race import DrivenRun, RaceAnalysis, read_race, write_result
 from operation.analysis.results import RaceResult
 from operation.report.canvas import inline_svg, write_png
 from operation.report.coverage import coverage_figures
@@ -40,20 +40,38 @@ __all__ = ["PICTURE", "REPORT", "render_report", "template"]
 
 REPORT: Final = "report.html"
 PICTURE: Final = "lap.png"
+RESULT: Final = "result.json"
 
 _TEMPLATE: Final = "report.html.j2"
 _PACKAGES: Final = ("bayesrace", "casadi", "numpy", "scipy", "eclipse-zenoh")
 
 
-def render_report(run_dir: Path, result: RaceResult, analysis: RaceAnalysis | None = None) -> Path:
-    """Writes ``report.html`` and ``lap.png`` into the run directory; returns the page's path.
+def render_report(run_dir: Path, analysis: RaceAnalysis | None = None) -> Path:
+    """Writes ``result.json``, ``report.html`` and ``lap.png`` into the run directory; returns the
+    page's path.
 
-    ``result`` is what the tables show; ``analysis`` saves reading the log a second time. InputError
-    if it is no run directory.
+    ``analysis`` saves reading the log a second time. InputError if it is no run directory.
+
+    Laps on the track are half of the drawing: a copy of this process does that, while this one
+    computes the result and draws the rest.
     """
     run_dir = Path(run_dir)
     analysis = analysis or read_race(run_dir)
-    page = template(_TEMPLATE).render(
+    shared = analysis, run_dir / PICTURE
+    with ProcessPoolExecutor(1, get_context("fork"), _share, shared) as pool:
+        maps = pool.submit(_maps)
+        write_result(run_dir / RESULT, analysis.result)
+        with figure_style():
+            figures = _svg(_panels(analysis, analysis.result))
+        page = _page(run_dir, analysis, figures | maps.result())
+    path = run_dir / REPORT
+    write_whole(path, page)
+    return path
+
+
+def _page(run_dir: Path, analysis: RaceAnalysis, figures: Mapping[str, Sequence[str]]) -> str:
+    result = analysis.result
+    return template(_TEMPLATE).render(
         result=result,
         columns=COLUMNS,
         gp_columns=GP_COLUMNS,
@@ -64,7 +82,7 @@ def render_report(run_dir: Path, result: RaceResult, analysis: RaceAnalysis | No
         best=result.lap("bestcase"),
         facts=_facts(analysis, result),
         versions=_versions(run_dir),
-        figures=_figures(analysis, result, run_dir / PICTURE),
+        figures=figures,
         uncertain=_uncertain(analysis),
         period_us=round(analysis.recording.discretisation.step_s * 1e6),
         limit_sigma=UNCERTAIN,
@@ -75,9 +93,6 @@ def render_report(run_dir: Path, result: RaceResult, analysis: RaceAnalysis | No
         limit=LIMIT,
         title=f"{result.settings.track} · {analysis.track.length_m:.2f} m",
     )
-    path = run_dir / REPORT
-    write_whole(path, page)
-    return path
 
 
 def template(name: str, folder: Path | None = None) -> Template:
@@ -146,18 +161,6 @@ def _uncertain(analysis: RaceAnalysis) -> list[tuple[str, int, int]]:
     ]
 
 
-def _figures(analysis: RaceAnalysis, result: RaceResult, picture: Path) -> dict[str, list[str]]:
-    """Name to panels as SVG; what has nothing to show is left out.
-
-    Laps on the track are half of the work: a copy of this process draws them beside it.
-    """
-    beside = get_context("fork")
-    with ProcessPoolExecutor(1, beside, _share, (analysis, picture)) as pool, figure_style():
-        maps = pool.submit(_maps)
-        panels = _svg(_panels(analysis, result))
-        return panels | maps.result()
-
-
 _shared: list[Any] = []
 """In the process that draws maps: the analysis, and the file of the picture."""
 
@@ -167,7 +170,7 @@ def _share(*values: Any) -> None:
 
 
 def _maps() -> dict[str, list[str]]:
-    """Laps on the track, and the training drive; writes the picture, too."""
+    """Name to panels as SVG: laps on the track, and the training drive; writes the picture, too."""
     analysis, picture = _shared
     driven = _driven(analysis)
     with figure_style():
@@ -184,7 +187,8 @@ def _maps() -> dict[str, list[str]]:
 
 
 def _panels(analysis: RaceAnalysis, result: RaceResult) -> dict[str, list[Figure]]:
-    """What is drawn over the track's length, and the execution times."""
+    """What is drawn over the track's length, and the execution times; what has nothing to show is
+    left out."""
     driven, track, line = _driven(analysis), analysis.track, analysis.line
     figures: dict[str, list[Figure]] = {}
     if driven:
