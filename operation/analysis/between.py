@@ -12,7 +12,6 @@ import numpy as np
 from bayesrace.arrays import Floats
 from bayesrace.integrators import PLANT_SCHEME, PLANT_SUBSTEP_HZ, Discretisation
 from bayesrace.vehicles import CarParameters
-from codegen.compiled import compiled
 from operation.analysis.laps import Trajectory
 
 __all__ = ["positions_between"]
@@ -46,7 +45,7 @@ def _integrated(x: Floats, u: Floats, car: CarParameters, count: int) -> Floats:
 
     model = dynamic(car)
     substep = Discretisation(scheme=PLANT_SCHEME, step_s=1 / PLANT_SUBSTEP_HZ, substeps=1)
-    period = compiled(substep.for_any_car(model)).mapaccum(count)
+    period = substep.for_any_car(model).mapaccum(count)
     numbers = ca.DM(np.array(model.parameters))
     places = np.empty((len(x), count, 2))
     for begin in range(0, len(x), _AT_ONCE):
