@@ -10,9 +10,11 @@ import pytest
 from rich.console import Console
 
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import GpWeights, write_weights
+from bayesrace.gp.weights import GpWeights, read_weights, write_weights
 from bayesrace.vehicles import CarParameters, write_car
 from bayesrace.vehicles.parts import PacejkaTyres
+from learning.dataset import Dataset
+from operation.preparation import updated_weights
 from operation.race import race
 from operation.settings import RaceSettings
 from operation.terminal.progress import stages_on
@@ -45,6 +47,10 @@ def read(tmp_path: Path, weights: GpWeights) -> Read:
         ('controllers = ["me"]', ("controllers.0 = 'me'", "bestcase")),
         ('controllers = ["bayesrace-updated"]', ("learns from the laps of 'bayesrace'",)),
         ('controllers = ["bayesrace-limit"]', ("learns from the laps of 'bayesrace'",)),
+        (
+            'controllers = ["bayesrace", "bayesrace-updated-twice"]',
+            ("learns from the laps of 'bayesrace-updated'; add that",),
+        ),
         (
             'controllers = ["bayesrace", "bayesrace-limit"]\n[grid]\ncar = "f1tenth"',
             ("progress_drives is 0, as by default on linear tyres", "leave the controller out"),
@@ -103,7 +109,7 @@ def test_two_cars_of_one_name_are_refused(read: Read, car: CarParameters, tmp_pa
 def test_a_grid_is_every_combination(read: Read) -> None:
     text = """
         [grid]
-        track = ["harbour", "random:1..3", "peanut.csv"]
+        track = ["harbour", "random:1..2", "random10:3", "peanut.csv"]
         seed = "0..1"
         kernels = [["rbf"], ["rbf", "matern25"]]
         mpc.q_position = 2
@@ -112,7 +118,7 @@ def test_a_grid_is_every_combination(read: Read) -> None:
     assert len(settings) == 5 * 2 * 2
     assert {one.seed for one in settings} == {one.pursuit.seed for one in settings} == {0, 1}
     assert {Path(one.track).name for one in settings} == {
-        "harbour", "random:1", "random:2", "random:3", "peanut.csv",
+        "harbour", "random:1", "random:2", "random10:3", "peanut.csv",
     }  # fmt: skip
     assert {one.kernels for one in settings} == {("rbf",), ("rbf", "matern25")}
     assert {one.mpc.q_position for one in settings} == {2.0}
@@ -208,6 +214,35 @@ def test_a_case_has_a_row_for_each_lap_and_for_each_failure(read: Read) -> None:
     assert failed["ended"] == FAILED
     assert "RaceLine" in failed["reason"] or "InputError" in failed["reason"]
     assert "margin" in failed["reason"]
+
+
+def test_each_update_learns_from_all_laps_before_it(
+    read: Read, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learned = []
+
+    def recorded(samples: list[Dataset], settings: RaceSettings, first: GpWeights) -> Path:
+        made = updated_weights(samples, settings, first)
+        learned.append(([len(one) for one in samples], first.version, read_weights(made).version))
+        return made
+
+    monkeypatch.setattr("studies.campaign.execute.updated_weights", recorded)
+    text = """
+        controllers = ["bayesrace-updated-twice", "bayesrace-updated", "bayesrace"]
+        [grid]
+        track = "peanut.csv"
+        train_track = "peanut.csv"
+        collect_s = 8
+        points = 100
+        kernels = ["rbf"]
+    """
+    rows = only(read(text))
+    versions = [row["weights"] for row in rows if row["lap"] == 1]
+    (once, begun_with, first), (twice, *after) = learned
+    assert len(twice) == 3
+    assert twice[:2] == once
+    assert [begun_with, first, after[1]] == versions
+    assert after[0] == first
 
 
 def only(campaign: Campaign) -> list[dict[str, Any]]:

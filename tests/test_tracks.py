@@ -285,6 +285,14 @@ def test_a_seed_gives_the_same_circuit_again_and_others_differ() -> None:
     assert random_track(7).length_m != random_track(8).length_m
 
 
+def test_circuits_for_larger_cars_have_the_same_shape() -> None:
+    track, larger = load_track("random:7"), load_track("random10:7")
+    assert (track.name, larger.name) == ("random:7", "random10:7")
+    np.testing.assert_allclose(larger.x_m, 4.3 * track.x_m, rtol=1e-12)
+    np.testing.assert_allclose(larger.width_left_m, 4.3 * track.width_left_m, rtol=1e-12)
+    assert larger.length_m == pytest.approx(4.3 * track.length_m, rel=1e-9)
+
+
 @pytest.mark.parametrize("name", ["random:", "random:-1", "random:x", "random:1.5"])
 def test_bad_seeds_are_refused(name: str) -> None:
     with pytest.raises(InputError, match="seed must be a whole number"):

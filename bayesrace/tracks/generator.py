@@ -15,7 +15,10 @@ from bayesrace.tracks.checks import clearance_m, find_crossing
 from bayesrace.tracks.shapes import Corner, rounded_polygon
 from bayesrace.tracks.track import Track
 
-__all__ = ["random_track"]
+__all__ = ["RANDOM_TRACKS", "random_track"]
+
+RANDOM_TRACKS: Final = {"random": 1.0, "random10": 4.3}
+"""How much larger each kind of circuit is than those for 1:43 cars: the second is for 1:10 cars."""
 
 Cell = tuple[int, int]
 
@@ -28,13 +31,15 @@ _GRID: Final = (6, 4)  # cells in x and y
 _COMPASS: Final = ((1, 0), (0, 1), (-1, 0), (0, -1))
 
 
-def random_track(seed: int) -> Track:
-    """Circuit of 11 to 18 m, 0.37 to 0.46 m wide, with hairpins and bends both ways.
+def random_track(seed: int, kind: str = "random") -> Track:
+    """Circuit of 11 to 18 m, 0.37 to 0.46 m wide, with hairpins and bends both ways; ``kind``: one
+    of :data:`RANDOM_TRACKS`, which have the same shapes.
 
     Candidates are drawn until one keeps clear of itself. Raises InputError for a negative seed.
     """
+    name, larger = f"{kind}:{seed}", RANDOM_TRACKS[kind]
     if seed < 0:
-        raise InputError(f"random:{seed}: the seed is negative; give a whole number from 0 on")
+        raise InputError(f"{name}: the seed is negative; give a whole number from 0 on")
     rng = np.random.default_rng(seed)
     width = round(float(rng.uniform(*_WIDTH_M)), 3)
     for _ in range(_ATTEMPTS):
@@ -43,7 +48,7 @@ def random_track(seed: int) -> Track:
             break
     else:
         points = _plain()
-    return Track.from_points(f"random:{seed}", points, width / 2, width / 2)
+    return Track.from_points(name, larger * points, larger * width / 2, larger * width / 2)
 
 
 # Quoted: numpy loads np.random, 2 MB, when it is named, and a controller has no use for it.

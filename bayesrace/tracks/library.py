@@ -1,22 +1,22 @@
-"""One way to any track: a built-in name, ``random:SEED`` or a CSV file."""
+"""One way to any track: a built-in name, ``random:SEED``, ``random10:SEED`` or a CSV file."""
 
 from pathlib import Path
 
 from bayesrace.errors import InputError
 from bayesrace.tracks.builtin import builtin_track, builtin_tracks
 from bayesrace.tracks.files import default_car_width_m, read_track
-from bayesrace.tracks.generator import random_track
+from bayesrace.tracks.generator import RANDOM_TRACKS, random_track
 from bayesrace.tracks.track import Track
 
 __all__ = ["load_track"]
 
-_RANDOM = "random:"
 _MAPS = (".yaml", ".yml")
 _SEED_DIGITS = 18
 
 
 def load_track(name_or_path: str | Path, car_width_m: float | None = None) -> Track:
-    """The built-in track of that name, ``random:SEED``, or the track in that CSV file.
+    """The built-in track of that name, ``random:SEED`` or ``random10:SEED`` (for 1:43 and 1:10
+    cars), or the track in that CSV file.
 
     ``car_width_m``: least width of a track from a file; default: the default car's. Raises
     InputError saying what there is instead.
@@ -24,13 +24,14 @@ def load_track(name_or_path: str | Path, car_width_m: float | None = None) -> Tr
     text = str(name_or_path)
     if text in builtin_tracks():
         return _wide_enough(builtin_track(text), car_width_m)
-    if text.startswith(_RANDOM):
-        return _wide_enough(random_track(_seed(text)), car_width_m)
+    kind, colon, seed = text.partition(":")
+    if colon and kind in RANDOM_TRACKS:
+        return _wide_enough(random_track(_seed(text, seed), kind), car_width_m)
     path = Path(name_or_path)
     if not path.is_file():
         raise InputError(
             f"no track '{text}': neither a file nor built in; "
-            f"built in: {', '.join(builtin_tracks())}, random:SEED"
+            f"built in: {', '.join(builtin_tracks())}, random:SEED, random10:SEED (1:10)"
         )
     if path.suffix in _MAPS:
         raise InputError(
@@ -40,8 +41,7 @@ def load_track(name_or_path: str | Path, car_width_m: float | None = None) -> Tr
     return read_track(path, car_width_m)
 
 
-def _seed(text: str) -> int:
-    digits = text[len(_RANDOM) :]
+def _seed(text: str, digits: str) -> int:
     if not (digits.isascii() and digits.isdigit() and len(digits) <= _SEED_DIGITS):
         raise InputError(
             f"'{text[:40]}': the seed must be a whole number from 0 on, of at most {_SEED_DIGITS} "

@@ -45,6 +45,9 @@ _LOOKS: Final[Mapping[str, Look]] = {
     "bayesrace-updated": Look(
         "BayesRace updated", "#009E73", "GPs updated with BayesRace's own laps"
     ),
+    "bayesrace-updated-twice": Look(
+        "BayesRace updated twice", "#56B4E9", "GPs updated with the laps of the update, too"
+    ),
     "bayesrace-limit": Look(
         "BayesRace at the limit", "#E69F00", "maximises progress, GPs updated after each run"
     ),

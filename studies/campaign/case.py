@@ -28,7 +28,10 @@ __all__ = [
     "software_identity",
 ]
 
-Controller = Literal["worstcase", "bayesrace", "bayesrace-updated", "bayesrace-limit", "bestcase"]
+Controller = Literal[
+    "worstcase", "bayesrace", "bayesrace-updated", "bayesrace-updated-twice", "bayesrace-limit",
+    "bestcase",
+]  # fmt: skip
 CONTROLLERS: Final[tuple[Controller, ...]] = get_args(Controller)
 PAPER: Final[tuple[Controller, ...]] = ("worstcase", "bayesrace", "bayesrace-updated", "bestcase")
 

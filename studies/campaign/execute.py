@@ -47,6 +47,9 @@ FAILED: Final = "failed"
 
 _MODELS: Final[tuple[PredictionModel, ...]] = ("e_kinematic", "dynamic")
 
+_LEARNED_FROM: Final[tuple[Controller, ...]] = ("bayesrace", "bayesrace-updated")
+"""Whose laps others learn from."""
+
 _one_at_a_time = threading.Lock()
 """Expressions of CasADi are not safe between threads, which a worker may have several of."""
 
@@ -120,19 +123,20 @@ class _Runs:
 
     def __init__(self, case: Case) -> None:
         self._case, self._settings = case, case.settings
-        self._samples: list[Dataset] = []
+        self._runs: dict[Controller, Driven] = {}
 
     def drive(self, controller: Controller) -> list[Row]:
         """The rows of the controller's laps; of ``bayesrace-limit``, those of its last run."""
         weights = self._weights(controller)
         begun = time.perf_counter()
         driven = self._driven(controller, weights)
-        if controller == "bayesrace":
-            self._samples = [*self._trained_on, driven.samples()]
+        if controller in _LEARNED_FROM:
+            self._runs[controller] = driven
         if controller == "bayesrace-limit" and weights is not None:
+            samples = self._samples_of("bayesrace")
             for _ in range(self._settings.progress_runs - 1):
-                self._samples.append(driven.samples())
-                weights = self._learned(weights)
+                samples.append(driven.samples())
+                weights = self._learned(samples, weights)
                 driven = self._driven(controller, weights)
         run = {
             "controller": controller,
@@ -155,23 +159,26 @@ class _Runs:
     def _weights(self, controller: Controller) -> GpWeights | None:
         if controller == "bayesrace":
             return read_weights(self._files.weights)
+        if controller == "bayesrace-updated-twice":
+            return self._learned(self._samples_of("bayesrace", "bayesrace-updated"), self._updated)
         return self._updated if controller in ("bayesrace-updated", "bayesrace-limit") else None
 
-    @property
-    def _trained_on(self) -> list[Dataset]:
-        training = self._files.training
-        return [] if training is None else [training.samples]
+    def _samples_of(self, *controllers: Controller) -> list[Dataset]:
+        """Those of the training drive, and of the laps of these controllers."""
+        if (training := self._files.training) is None:
+            raise RuntimeError("there is no training drive to learn from")
+        for one in controllers:
+            if one not in self._runs:
+                raise RuntimeError(f"there are no laps of '{one}' to learn from")
+        return [training.samples, *(self._runs[one].samples() for one in controllers)]
 
     @cached_property
     def _updated(self) -> GpWeights:
         """Learned from training drive and laps, beginning with the weights of the laps."""
-        if not self._samples or self._files.training is None:
-            raise RuntimeError("there are no laps of 'bayesrace' to learn from")
-        return self._learned(read_weights(self._files.weights))
+        return self._learned(self._samples_of("bayesrace"), read_weights(self._files.weights))
 
-    def _learned(self, before: GpWeights) -> GpWeights:
-        """From all samples so far."""
-        return read_weights(updated_weights(self._samples, self._settings, before))
+    def _learned(self, samples: list[Dataset], before: GpWeights) -> GpWeights:
+        return read_weights(updated_weights(samples, self._settings, before))
 
     def _artefact(self, controller: Controller) -> Path:
         if controller == "bayesrace-limit":

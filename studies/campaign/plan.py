@@ -49,8 +49,12 @@ __all__ = ["Campaign", "read_plan", "spread"]
 _MOST_CASES: Final = 1_000_000
 _SPAN: Final = re.compile(r"(.*?)(\d{1,9})\.\.(\d{1,9})")
 _TRAINING: Final = ("train_track", "seed", "collect_s", "points", "kernels")
-_LEARN_FROM_LAPS: Final = ("bayesrace-updated", "bayesrace-limit")
-_RANDOM_TRACK: Final = re.compile(r"random:\d{1,18}")
+_LEARN_FROM_LAPS: Final[dict[Controller, Controller]] = {
+    "bayesrace-updated": "bayesrace",
+    "bayesrace-updated-twice": "bayesrace-updated",
+    "bayesrace-limit": "bayesrace",
+}
+_RANDOM_TRACK: Final = re.compile(r"random(10)?:\d{1,18}")
 
 
 class _Draw(BaseModel):
@@ -281,8 +285,9 @@ def _check_controllers(plan: _Plan) -> None:
             f"controllers: '{learning}' learns from a training drive, which there is none of "
             "with given weights; leave it or the weights out"
         )
-    if learning and "bayesrace" not in plan.controllers:
-        raise InputError(f"controllers: '{learning}' learns from the laps of 'bayesrace'; add that")
+    for one, before in _LEARN_FROM_LAPS.items():
+        if one in plan.controllers and before not in plan.controllers:
+            raise InputError(f"controllers: '{one}' learns from the laps of '{before}'; add that")
 
 
 def _check_runs(case: Case) -> None:
