@@ -197,6 +197,16 @@ def test_a_measured_centreline_is_smoothed_and_its_deviation_shown(
     np.testing.assert_allclose(measured.width_left_m, 0.3)
 
 
+@pytest.mark.parametrize(("noise_m", "count"), [(0.003, 400), (0.004, 300), (0.003, 250)])
+def test_noise_that_makes_a_centreline_zigzag_is_refused_with_the_remedy(
+    tmp_path: Path, noise_m: float, count: int
+) -> None:
+    message = refusal(written(tmp_path, noisy(noise_m, count)))
+    assert "zigzags: it turns by " in message
+    assert "smooth them ('bayesrace tracks FILE --smooth" in message
+    read_track(written(tmp_path, noisy(0.0, count)))
+
+
 def test_what_no_smoothing_mends_is_refused(tmp_path: Path, cli: Cli) -> None:
     path = written(tmp_path, rows()[:7])
     refused(cli("tracks", path, "--smooth"), "too few points (7)")

@@ -32,10 +32,16 @@ _MOST_WIDTHS = 2_500.0
 """Length of the longest plausible track over its width; the Nordschleife has 2,300."""
 _FARTHEST_WIDTHS = 10_000.0
 """Largest coordinate over the track's width: controllers count positions from the origin."""
+_SMOOTH = "smooth them ('bayesrace tracks FILE --smooth --out smooth.csv')"
 _IN_ORDER = (
     "give the points in driving order; if they are measured and lie closer than their noise, "
-    "smooth them ('bayesrace tracks FILE --smooth --out smooth.csv')"
+    f"{_SMOOTH}"
 )
+_CORNERS = 50
+"""Points of a centreline that may be a polygon's corners; more are to follow a curve ..."""
+_ZIGZAG_RAD, _ALTERNATING = 0.1, -0.25
+"""... and do not, if they turn by this much (RMS) with this correlation of one turn with the next.
+That of noise is -2/3, that of published tracks 0.84 and more."""
 _UNITS = {"millimetres": 1e3, "centimetres": 1e2}
 _CHUNK = 512
 
@@ -139,7 +145,24 @@ def _find_shape_fault(points: Floats) -> Fault | None:
             f"{_IN_ORDER}; bridges are not supported",
             other=crossing[0],
         )
-    return None
+    return _find_noise_fault(edge, before)
+
+
+def _find_noise_fault(edge: Floats, before: Floats) -> Fault | None:
+    if len(edge) <= _CORNERS:
+        return None
+    across = before[:, 0] * edge[:, 1] - before[:, 1] * edge[:, 0]
+    turn = np.arctan2(across, np.sum(edge * before, axis=1))
+    variance = float(np.mean(turn**2))
+    alternating = float(np.mean(turn * np.roll(turn, 1))) / max(variance, 1e-30)
+    if variance < _ZIGZAG_RAD**2 or alternating > _ALTERNATING:
+        return None
+    return Fault(
+        None,
+        f"the centreline zigzags: it turns by {np.degrees(variance**0.5):.0f}° (RMS) to one side "
+        "and the other from point to point",
+        f"if the points are measured with noise, {_SMOOTH}",
+    )
 
 
 def find_scale_fault(
