@@ -25,9 +25,8 @@ DrivingStyle = Literal["limit", "calm", "weave"]
 waves about the line, at its speed."""
 
 _SCALES: Final[dict[DrivingStyle, float]] = {"limit": 1.1, "calm": 0.9, "weave": 1.0}
-"""Mean speed of each style over the line's ..."""
-_SWAY: Final = 0.15
-"""... and how far it sways about that, so that each place is passed at several speeds."""
+"""Mean speed of each style over the line's; it sways about that, so that each place is passed at
+several speeds."""
 _SLOWER: Final = 0.6
 """Share of the speed that is taken off at the end of the room beside the line."""
 _SLIPPING: Final = 0.65
@@ -200,7 +199,8 @@ class PurePursuit:
         car, tuning = self._car, self._tuning
         ahead = self._ahead(place.nearest, vx * tuning.preview_s)
         phase = 2 * math.pi * self._steps * self._settings.step_s / tuning.sway_s
-        scale = self._settings.scale * (1 + _SWAY * math.sin(phase))
+        sway = math.sin(phase)
+        scale = self._settings.scale * (1 + (tuning.faster if sway > 0 else tuning.slower) * sway)
         wanted = scale * (1 - _SLOWER * place.aside) * float(self._speeds[ahead])
         wanted = min(max(wanted, tuning.speed_min_mps), limit_mps)
         acceleration = scale**2 * float(self._acceleration[ahead])

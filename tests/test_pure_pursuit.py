@@ -84,6 +84,19 @@ def test_the_seed_and_nothing_else_decides_the_disturbance() -> None:
     assert np.abs(runs[0] - runs[2]).max() > 1e-3
 
 
+def test_the_target_speed_sways_as_the_cars_tuning_says() -> None:
+    quiet = PurePursuitSettings(speed_scale=1.0, excite_d=0.0, excite_delta_rad=0.0)
+
+    def speeds(slower: float) -> tuple[float, float]:
+        pursuit = CAR.tuning.pursuit.model_copy(update={"faster": 0.1, "slower": slower})
+        car = CAR.model_copy(update={"tuning": CAR.tuning.model_copy(update={"pursuit": pursuit})})
+        vx = drive(PurePursuit(car, *oval(), quiet), 0, 9.0).x[200:, 3]
+        return float(vx.min()), float(vx.max())
+
+    assert speeds(0.15) == pytest.approx((0.85 * 1.5, 1.1 * 1.5), abs=0.05)
+    assert speeds(0.6) == pytest.approx((0.4 * 1.5, 1.1 * 1.5), abs=0.1)
+
+
 def test_a_mirrored_line_is_driven_with_mirrored_steering() -> None:
     quiet = PurePursuitSettings(excite_d=0.0, excite_delta_rad=0.0)
     x, y, v = oval()

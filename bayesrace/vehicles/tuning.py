@@ -274,6 +274,10 @@ class PursuitTuning(_Section):
         0.1, COMMAND, "standard deviation of the disturbance of the drive command [command]"
     )
     sway_s: float = _number(3.7, TIME, "period in which the target speed rises and falls [s]")
+    faster: float = _number(
+        0.15, NONE, "share of its mean by which the target speed rises [-]", ge=0, lt=1
+    )
+    slower: float = _number(0.15, NONE, "share by which it falls [-]", ge=0, lt=1)
     speed_min_mps: float = _number(0.4, SPEED, "target speed is never below [m/s]")
     keep_m: float = _number(0.12, LENGTH, "distance of the driven line from the track's edges [m]")
     preview_s: float = _number(0.12, TIME, "how far ahead the line's speed is taken [s]")
