@@ -134,6 +134,22 @@ def test_a_margin_is_kept_and_costs_time() -> None:
     assert lap.lap_s > limit_on("paddock").lap_s
 
 
+def test_a_largest_lateral_speed_is_kept_and_costs_time() -> None:
+    lap = limit_on("paddock", lateral_speed_mps=0.3)
+    assert np.abs(lap.x[:, 4]).max() == pytest.approx(0.3, abs=1e-4)
+    assert lap.lap_s > limit_on("paddock").lap_s
+
+
+@pytest.mark.parametrize(
+    ("name", "lateral_speed_mps", "published_s"), [("ethz", 0.5, 7.06), ("ethzmobil", 0.7, 5.14)]
+)
+def test_without_slides_it_is_what_was_published(
+    name: str, lateral_speed_mps: float, published_s: float
+) -> None:
+    lap = limit_on(name, lateral_speed_mps=lateral_speed_mps)
+    assert lap.lap_s == pytest.approx(published_s, rel=0.003)
+
+
 @pytest.mark.parametrize(
     ("name", "standing", "published_s"),
     [("ethz", True, 7.21), ("ethz", False, 7.06), ("ethzmobil", True, 5.40),
@@ -199,6 +215,10 @@ def test_the_command_prints_and_writes_it_and_keeps_it_in_the_cache(
     assert f"standing lap {lap.lap_s:.3f} s" in printed.out
     assert f"{lap.intervals}, solved in {lap.solve_s:.1f} s" in printed.out
     assert read_limit(out).lap_s == lap.lap_s
+    kept = limit_on("paddock", lateral_speed_mps=0.3)
+    printed = cli("limit", "paddock", "--lateral-speed", 0.3)
+    assert f"flying lap {kept.lap_s:.3f} s, centre of gravity" in printed.out
+    assert "at most 0.3 m/s sideways" in printed.out
 
 
 def test_a_start_speed_is_that_of_a_standing_lap(cli: Cli) -> None:

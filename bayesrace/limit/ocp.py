@@ -152,13 +152,18 @@ def _car_within(car: CarParameters, layout: _Layout) -> Iterator[Piece]:
 
 
 def _bounds(
-    car: CarParameters, gates: Gates, layout: _Layout, start_mps: float | None
+    car: CarParameters,
+    gates: Gates,
+    layout: _Layout,
+    start_mps: float | None,
+    lateral_mps: float | None,
 ) -> tuple[Floats, Floats]:
     """Of x."""
     count, top = len(gates.place_m), car.tuning.raceline.speed_bound_mps
+    aside = top if lateral_mps is None else lateral_mps
     spin = 20 * layout.scale[4]
-    low = np.tile([0, 0, 0, -top, -spin, -car.delta_max_rad, car.d_min, 0.0], (count, 1))
-    high = np.tile([0, 0, top, top, spin, car.delta_max_rad, car.d_max, 0.0], (count, 1))
+    low = np.tile([0, 0, 0, -aside, -spin, -car.delta_max_rad, car.d_min, 0.0], (count, 1))
+    high = np.tile([0, 0, top, aside, spin, car.delta_max_rad, car.d_max, 0.0], (count, 1))
     low[:, 7], high[:, 7] = -car.delta_rate_max_radps, car.delta_rate_max_radps
     low[:, 0], high[:, 0] = gates.n_min_m, gates.n_max_m
     low[:, 1], high[:, 1] = gates.heading_rad - _ASIDE_RAD, gates.heading_rad + _ASIDE_RAD
@@ -175,20 +180,22 @@ def optimise(
     *,
     interval_s: float,
     start_mps: float | None,
+    lateral_mps: float | None,
     outline: Outline | None,
     options: dict[str, Any],
 ) -> tuple[Lap, Solution]:
     """The fastest lap, and how the optimisation ended.
 
     ``interval_s``: usual duration of an interval; ``start_mps``: speed at the first gate of a lap
-    from the start pose, None for a flying one; ``outline``: to keep within the track, its edges as
-    they are beside the guess; ``options``: of IPOPT.
+    from the start pose, None for a flying one; ``lateral_mps``: largest |vy|, None for any;
+    ``outline``: to keep within the track, its edges as they are beside the guess; ``options``: of
+    IPOPT.
     """
     layout = _Layout(gates, model.car, interval_s)
     pieces = [_interval(model, gates, layout), *_car_within(model.car, layout)]
     if outline is not None:
         pieces.append(outline.piece(gates, guess.states, layout.gate, layout.scale))
-    bounds = _bounds(model.car, gates, layout, start_mps)
+    bounds = _bounds(model.car, gates, layout, start_mps, lateral_mps)
     start = layout.packed(guess.states, guess.durations_s)
     solution = minimise(pieces, *bounds, np.clip(start, *bounds), options)
     return layout.lap(solution.x), solution

@@ -18,4 +18,7 @@ class LimitSettings(BaseModel):
     body: bool = Field(
         False, description="the car's outline keeps the margin; otherwise its centre of gravity"
     )
+    lateral_speed_mps: float | None = Field(
+        None, gt=0, description="largest |vy|, for a lap without slides; None: any"
+    )
     max_iterations: int = Field(300, ge=1, description="iteration limit of the optimiser")

@@ -120,6 +120,7 @@ class _Limit:
             guess,
             interval_s=self._interval_s,
             start_mps=self._start_mps,
+            lateral_mps=self._settings.lateral_speed_mps,
             outline=self._outline,
             options={"max_iter": self._settings.max_iterations, **options},
         )

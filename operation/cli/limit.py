@@ -41,6 +41,16 @@ def limit(
             help="Speed at the start of a standing lap [m/s].",
         ),
     ] = None,
+    lateral_speed: Annotated[
+        float | None,
+        typer.Option(
+            metavar="V",
+            min=0.001,
+            max=100,
+            show_default="any",
+            help="Largest lateral speed of the car [m/s], for a lap without slides.",
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -66,12 +76,15 @@ def limit(
     if tyres is not None:
         parameters = parameters.on_tyres(tyres.value)
     speed = {} if start_speed is None else {"start_speed_mps": start_speed}
-    settings = LimitSettings(standing=standing, margin_m=margin, body=body, **speed)
+    settings = LimitSettings(
+        standing=standing, margin_m=margin, body=body, lateral_speed_mps=lateral_speed, **speed
+    )
     lap = cached_limit(load_track(track, parameters.width_m), parameters, settings)
     typer.echo(
         f"{'standing' if standing else 'flying'} lap {lap.lap_s:.3f} s, "
         f"{'outline' if body else 'centre of gravity'} on the track"
         + (f" less {margin:g} m" if margin else "")
+        + (f", at most {lateral_speed:g} m/s sideways" if lateral_speed else "")
         + f"; {100 * lap.mesh_change:.3f} % from half the intervals to {lap.intervals}, "
         f"solved in {lap.solve_s:.1f} s" + ("" if out is None else f": {out}")
     )
