@@ -137,7 +137,7 @@ class TurnTuning(_Section):
     """Turning round, for a slow car that points away from its line."""
 
     slow_mps: float = _number(0.2, SPEED, "a turn begins below this speed [m/s]")
-    away_rad: float = _number(0.6, NONE, "and if the line is farther than this to one side [rad]")
+    away_rad: float = _number(1.0, NONE, "and if the line is farther than this to one side [rad]")
     faced_rad: float = _number(0.3, NONE, "a turn ends within this angle [rad]")
     ahead_m: float = _number(0.5, LENGTH, "point of the line that the car turns to, ahead [m]")
     tangent_m: float = _number(
