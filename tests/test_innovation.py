@@ -106,6 +106,21 @@ def test_new_weights_and_a_new_run_begin_with_their_own_band(
         assert drive(step, circuit, off, 1)[0] == [1.0]
 
 
+def test_what_slows_another_car_down_in_one_bend_is_remembered_in_the_next(
+    step: NativeStep, car: CarParameters, circuit: Circuit
+) -> None:
+    """The reference rises again more slowly in the measure that the band is widened by over 4."""
+    _, states, inputs = drive(step, circuit, np.array([0.1, 0.1, 3.0]), 30)
+    slow, widening = step.info.pace, step.info.widening
+    assert slow < 0.9
+    assert widening > 8
+    step.set_parameters(car, CAUTIOUS.model_copy(update={"constraints": False}))
+    assert step.step(states[-1], inputs[-1]).usable
+    rise = step.info.pace / slow - 1
+    faster = car.tuning.caution.faster_ps * STEP_S
+    assert rise == pytest.approx(faster / (step.info.widening / 4), rel=1e-6)
+
+
 @pytest.mark.parametrize("duration_s", [0.0, -0.1, 1.5, np.nan])
 def test_a_duration_that_is_none_is_refused(step: NativeStep, duration_s: float) -> None:
     with pytest.raises(InputError, match="a time"):
@@ -147,9 +162,7 @@ def test_a_car_that_has_lost_grip_since_it_was_learned_stays_on_the_track() -> N
     slippery = settings.model_copy(update={"true_grip": 0.8}).true_car
     samples = []
     for mpc in (MpcSettings(caution=0.0), MpcSettings()):
-        controller = compiled_controller(
-            files.artefacts[0], settings.car, on, line, weights, mpc
-        )  # fmt: skip
+        controller = compiled_controller(files.artefacts[0], settings.car, on, line, weights, mpc)
         loop = ClosedLoop(settings.car, on, line, controller, built_in_car(slippery))
         samples.append(int((loop.drive(2).off_track_m > 0).sum()))
     assert samples[0] > 10
