@@ -194,6 +194,7 @@ MEASURED: Final = (
     ("time_s", "double", "plant time since the start of the run"),
     ("x", "states", "as measured"),
     ("u_applied", "inputs", "acted during the period before"),
+    ("averaged", "int", "1: that is their mean; 0: it is what acts now, as far as that is known"),
     ("lockstep", "int", "1: the plant waits for the answer"),
     ("delays", "int", "how many delays follow"),
     ("delays_s", "delays", "from the decision on an input to its acting, since the last state"),

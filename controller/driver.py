@@ -187,7 +187,7 @@ class Driver:
         measured, delays_s = self._measured, state.actuation_delays[2::3]
         self._write_measured(
             measured, 0, state.epoch, state.run, state.seq, state.time_s, *state.x,
-            *state.u_applied, state.lockstep, len(delays_s),
+            *state.u_applied, True, state.lockstep, len(delays_s),
         )  # fmt: skip
         if delays_s:
             measured.delays_s[: len(delays_s)] = delays_s

@@ -32,8 +32,11 @@ class Drive:
 def result(step: NativeStep) -> bytes:
     """All of the last step that is not about preparation."""
     step.read_plan()
-    names = ("iterations", "qp_iterations", "regularised", "shortened", "shifts", "cost", "pace")
-    numbers = [float(getattr(step.info, name)) for name in (*names, "stationarity", "defect")]
+    names = (
+        *("iterations", "qp_iterations", "regularised", "shortened", "shifts", "cost", "pace"),
+        *("widening", "stationarity", "defect"),
+    )
+    numbers = [float(getattr(step.info, name)) for name in names]
     parts = (step.u, step.plan_x, step.plan_u, step.read_tube(), np.array(numbers))
     return b"".join(part.tobytes() for part in parts)
 

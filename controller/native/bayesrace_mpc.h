@@ -108,7 +108,7 @@ BR_API double br_mpc_monotonic(void *context);
 
 /* --- the control loop --- */
 
-/* Forgets the previous plan, working set and position on the line. */
+/* Forgets the previous plan, working set and position on the line, and what slowed the car down. */
 BR_API void br_mpc_reset(br_mpc *mpc);
 
 /* One control step: projects the car on the racing line, makes the reference, solves, checks.
@@ -148,11 +148,14 @@ BR_API br_mpc_error br_mpc_solve(br_mpc *mpc, const double x[BR_NX], const doubl
                                  const br_mpc_reference reference[BR_N], double u[BR_NU],
                                  br_mpc_status *status, br_mpc_info *info);
 
-/* What the car has done between two measured states, under an input that acted on average:
- * tells whether the residual's standard deviations cover its errors. Where they do not, caution
- * widens them, from the step after the next on (info->widening). For consecutive states of a car
- * that moves; the newest counts. Never needed. BR_ERROR_TIME: over BR_PREDICT_MAX_S, or not above
- * 0. */
+/* What the car did between two measured states, with the mean of the inputs that acted meanwhile:
+ * it tells whether the residual's standard deviations cover its errors. Where they do not, caution
+ * widens them from the step after the next on (info->widening), until br_mpc_reset or other
+ * weights. For consecutive states of a car that moves, about a stage apart, by the thread that
+ * steps; the newest before a step counts. Never needed; without caution it changes nothing.
+ * BR_ERROR_TIME for a duration that is not above 0 and at most BR_PREDICT_MAX_S, BR_ERROR_STATE as
+ * for br_mpc_predict.
+ */
 BR_API br_mpc_error br_mpc_observe(br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
                                    double duration_s, const double x_next[BR_NX]);
 

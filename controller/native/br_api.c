@@ -14,7 +14,7 @@ br_mpc_error br_mpc_init(void *memory, size_t size, br_mpc **out) {
     br_gp_clear(&mpc->gp[1]);
     br_qp_init(&mpc->qp);
     br_weights_init(mpc);
-    mpc->caution.pace = 1;
+    mpc->caution.pace = mpc->caution.widening = 1;
     br_innovation_reset(&mpc->innovation);
     mpc->code = br_fastest_code();
     *out = mpc;
@@ -62,7 +62,7 @@ void br_mpc_reset(br_mpc *mpc) {
     mpc->ahead = mpc->prepared = mpc->prepared_iterations = 0;
     mpc->path.known = 0;
     mpc->caution.known = mpc->caution.active = 0;
-    mpc->caution.pace = 1;
+    mpc->caution.pace = mpc->caution.widening = 1;
     mpc->innovation.newest.duration = 0;
     br_innovation_reset(&mpc->innovation);
     mpc->turn = 0;
@@ -73,7 +73,7 @@ br_mpc_error br_mpc_observe(br_mpc *mpc, const double x[BR_NX], const double u[B
                             double duration_s, const double x_next[BR_NX]) {
     if (!mpc || !x || !u || !x_next) return BR_ERROR_NULL;
     if (!(duration_s > 0 && duration_s <= BR_PREDICT_MAX_S)) return BR_ERROR_TIME;
-    if (!br_all_finite(x, BR_NX) || !br_all_finite(u, BR_NU) || !br_all_finite(x_next, BR_NX))
+    if (!br_plausible_state(x) || !br_plausible_state(x_next) || !br_plausible_input(u))
         return BR_ERROR_STATE;
     br_transition *newest = &mpc->innovation.newest;
     newest->duration = duration_s;

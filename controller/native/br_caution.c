@@ -22,7 +22,7 @@
 
 #include "br_internal.h"
 
-#define ANOTHER_CAR 4.0 /* widening from which on it is one */
+#define WIDE 4.0 /* widening from which on the reference recovers more slowly */
 
 /* Weight of a deviation or effort of this size as 1. */
 static double weight_of(double size) { return 1.0 / (size * size); }
@@ -168,28 +168,29 @@ void br_caution_tighten(br_mpc *mpc, int k, br_stage_terms *terms) {
     }
 }
 
-/* By what the deviations of any output are widened, the largest. */
-static double widest(const br_mpc *mpc) {
+void br_caution_report(br_mpc *mpc) {
+    mpc->info.pace = mpc->caution.pace;
+    mpc->info.widening = mpc->caution.widening;
+}
+
+/* The largest factor on an output's standard deviations. */
+static double largest_widening(const br_mpc *mpc) {
     double largest = 1;
     for (int j = 0; j < BR_NE && mpc->caution.active; ++j)
         largest = fmax(largest, br_innovation_widening(&mpc->innovation, j));
     return largest;
 }
 
-void br_caution_report(br_mpc *mpc) {
-    mpc->info.pace = mpc->caution.pace;
-    mpc->info.widening = widest(mpc);
-}
-
 /* After a step: the speed of the next reference as a share of the line's. It falls where
  * uncertainty takes more than BR_CAUTION_SHARE of the room at a stage, or is not finite, by at most
  * BR_CAUTION_SLOWER per second, and rises elsewhere by at most BR_CAUTION_FASTER, also when nothing
- * is uncertain any more: a reference that leaps ahead spoils the plan. A car that is another one
- * than was learned slides in the next bend as it did in this one: its reference rises more slowly
- * in the measure that the band had to be widened. */
+ * is uncertain any more: a reference that leaps ahead spoils the plan. A car that has changed since
+ * it was learned errs in the next bend as in this one, so the wider its band has become, the more
+ * slowly the reference rises. */
 void br_caution_pace(br_mpc *mpc, double elapsed) {
     br_caution *caution = &mpc->caution;
     double worst = 0;
+    caution->widening = largest_widening(mpc);
     mpc->info.tube_m = 0;
     for (int k = 0; k < BR_N; ++k) {
         worst = br_worse(worst, caution->share[k]);
@@ -198,7 +199,7 @@ void br_caution_pace(br_mpc *mpc, double elapsed) {
     memcpy(mpc->answer_tube, caution->tube, sizeof mpc->answer_tube);
 #if BR_HAS_PATH
     const double excess = worst / BR_CAUTION_SHARE - 1;
-    const double faster = BR_CAUTION_FASTER / fmax(widest(mpc) / ANOTHER_CAR, 1);
+    const double faster = BR_CAUTION_FASTER / fmax(caution->widening / WIDE, 1);
     const double rate = excess <= 0 ? faster * fmin(-2 * excess, 1)
                                     : -BR_CAUTION_SLOWER * fmin(excess, 1); /* NaN, too */
     const double pace = caution->pace * (1 + rate * fmin(elapsed, BR_TS));

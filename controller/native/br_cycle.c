@@ -11,6 +11,14 @@
 #define JUMP_BY 0.01     /* and so much more */
 #define LEAST_BUDGET 0.1 /* what a step gets however late its cycle began: share of the budget */
 
+#define LEAST_STAGES 0.5 /* of a transition by which the model is judged; ... */
+#define MOST_STAGES 2    /* ... and at most */
+
+/* What the car has done since a measured state, for br_mpc_observe. */
+typedef struct {
+    double duration_s, x[BR_NX], u[BR_NU]; /* 0: nothing yet; mean input */
+} br_shown;
+
 struct br_cycle {
     br_controller controller;
     br_mpc *mpc; /* the compiled controller's, and what its last step reported; NULL: another's */
@@ -20,6 +28,7 @@ struct br_cycle {
     br_mpc_clock clock;
     void *context;
     br_stream stream;
+    br_shown shown;
     br_delay delay;
     br_fallback fallback;
     br_counters counters;
@@ -145,11 +154,31 @@ static void forget_delay(br_cycle *cycle) {
         settings->compensation == BR_COMPENSATION_FIXED ? settings->delay_s : 0;
 }
 
-/* The compiled controller learns how well it predicts; a standing car shows nothing of that. */
-static void show(br_cycle *cycle, const br_measured *before, const br_measured *state) {
-    if (!cycle->mpc || !(fabs(before->x[BR_INDEX_VX]) > cycle->settings.standing_mps)) return;
-    br_mpc_observe(cycle->mpc, before->x, state->u_applied, state->time_s - before->time_s,
-                   state->x);
+/* Shows the compiled controller what the car does from stage to stage: states that come more often
+ * are taken together, and where one is lost, or the mean input is not known, it begins anew. A
+ * standing car shows nothing. */
+static void observe_transition(br_cycle *cycle, const br_measured *before,
+                               const br_measured *state) {
+    br_shown *shown = &cycle->shown;
+    const double step_s = state->time_s - before->time_s;
+    const int next = (uint64_t)state->seq == (uint64_t)before->seq + 1;
+    if (!cycle->mpc || !next || !state->averaged || !(step_s > 0)) {
+        shown->duration_s = 0;
+        return;
+    }
+    if (shown->duration_s == 0) {
+        memcpy(shown->x, before->x, sizeof shown->x);
+        memset(shown->u, 0, sizeof shown->u);
+    }
+    const double duration_s = shown->duration_s + step_s;
+    for (int i = 0; i < BR_NU; ++i)
+        shown->u[i] += (state->u_applied[i] - shown->u[i]) * step_s / duration_s;
+    shown->duration_s = duration_s;
+    if (duration_s < LEAST_STAGES * BR_TS) return;
+    shown->duration_s = 0;
+    if (duration_s <= MOST_STAGES * BR_TS &&
+        fabs(shown->x[BR_INDEX_VX]) > cycle->settings.standing_mps)
+        br_mpc_observe(cycle->mpc, shown->x, shown->u, duration_s, state->x);
 }
 
 br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state) {
@@ -170,8 +199,9 @@ br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state) {
             forget_delay(cycle); /* but for simulated time, which reports its own */
         cycle->controller.reset(cycle->controller.self);
         cycle->stepped = cycle->stopping = cycle->reckoned = 0;
+        cycle->shown.duration_s = 0;
     } else {
-        show(cycle, &before, state);
+        observe_transition(cycle, &before, state);
     }
     br_delay_observe(&cycle->delay, &cycle->settings, state, &cycle->counters.delay_s);
     return BR_STATE_NEW;

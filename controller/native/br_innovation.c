@@ -1,31 +1,34 @@
-/* The band against what the car does: where one-step errors are larger than the residual's standard
- * deviations say, these are widened.
+/* The residual's standard deviations against what the car does: where errors from one measured
+ * state to the next are larger than these say, they are widened.
  *
- * A posterior knows how far the plan is from its samples, and nothing of a car that has become
- * another one since, on a damp track for instance: there it is wrong and sure of itself. What tells
- * is the innovation, the difference between the state measured and the one predicted from the state
- * before (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation",
- * 2001, section 5.4, the test of consistency). For each output, the mean of |error| / sigma over
- * WIDEN stages says by how much the band is too narrow. The largest of these means counts, and is
- * forgotten over NARROW stages, some laps' worth of bends: on a straight nothing is wrong. A band
- * that is wide enough stays what it is.
+ * A posterior knows how far the plan is from its samples. It does not know that the car has changed
+ * since, on a damp track for instance: there it is wrong and sure of itself. What tells is the
+ * innovation, the difference between the state measured and the one predicted from the state before
+ * (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001,
+ * section 5.4, the test of consistency). For each output the mean of |error| / sigma over RECENT
+ * stages is compared with what it comes to at most where sigma is right. The largest mean counts
+ * and is forgotten over HELD stages, some laps' worth of bends, because on a straight nothing is
+ * wrong.
  *
- * A step uses what has been observed until the step before it began, so that it is the same with
- * and without a preparation.
+ * A step uses what was observed before the step before it, so that it is the same with and without
+ * a preparation.
  */
 #include <math.h>
 
 #include "br_internal.h"
 
-#define WIDEN 10.0          /* time constants, in stages */
-#define NARROW 500.0        /* ten seconds of the 1:43 car */
-#define SIGMA_PER_MEAN 1.25 /* of normally distributed errors: standard deviation / mean size */
-#define LARGEST 1e3         /* standard deviations: of a band that says nothing */
+/* In stages, as the plan counts time. */
+#define RECENT 10.0
+#define HELD 500.0
+/* Errors in a row resemble each other: where sigma was right, largest means were 0.7 to 2.3. */
+#define USUAL 3.0
+#define SIGMA_PER_MEAN 1.25 /* standard deviation over mean size, of normally distributed errors \
+                             */
+#define LARGEST 200.0       /* standard deviations: no single wrong measurement counts more */
 
 void br_innovation_reset(br_innovation *innovation) {
     innovation->due.duration = innovation->judged = 0;
-    for (int j = 0; j < BR_NE; ++j)
-        innovation->misfit.recent[j] = innovation->misfit.held[j] = 1 / SIGMA_PER_MEAN;
+    for (int j = 0; j < BR_NE; ++j) innovation->misfit.recent[j] = innovation->misfit.held[j] = 1;
 }
 
 void br_innovation_advance(br_innovation *innovation) {
@@ -43,11 +46,11 @@ void br_innovation_undo(br_innovation *innovation) {
 }
 
 double br_innovation_widening(const br_innovation *innovation, int output) {
-    return fmax(SIGMA_PER_MEAN * innovation->misfit.held[output], 1);
+    return 1 + SIGMA_PER_MEAN * fmax(innovation->misfit.held[output] - USUAL, 0);
 }
 
-/* The state that shows most of this output. */
-static int shown_by(const br_stage *stage, int output) {
+/* The state that this output changes most. */
+static int most_changed(const br_stage *stage, int output) {
     int most = 0;
     for (int i = 1; i < BR_NX; ++i)
         if (fabs(stage->in_e[i][output]) > fabs(stage->in_e[most][output])) most = i;
@@ -64,12 +67,12 @@ void br_innovation_judge(br_mpc *mpc, const double variance[BR_NE]) {
     innovation->before = *misfit;
     if (br_predict(mpc, due->x, due->u, due->duration, predicted)) return;
     for (int j = 0; j < BR_NE; ++j) {
-        if (!(variance[j] > 0)) continue; /* nothing is known of this output */
-        const int i = shown_by(&mpc->stage[0], j);
-        const double share = mpc->stage[0].in_e[i][j] * stages;
-        const double error = fabs((due->x_next[i] - predicted[i]) / share);
+        const int i = most_changed(&mpc->stage[0], j);
+        const double share = fabs(mpc->stage[0].in_e[i][j]) * stages;
+        if (!(share > 0 && variance[j] > 0)) continue; /* nothing is known of this output */
+        const double error = fabs(due->x_next[i] - predicted[i]) / share;
         const double sigmas = fmin(error / sqrt(variance[j]), LARGEST);
-        misfit->recent[j] += fmin(stages / WIDEN, 1) * (sigmas - misfit->recent[j]);
-        misfit->held[j] = fmax(misfit->recent[j], misfit->held[j] * fmax(1 - stages / NARROW, 0));
+        misfit->recent[j] += fmin(stages / RECENT, 1) * (sigmas - misfit->recent[j]);
+        misfit->held[j] = fmax(misfit->recent[j], misfit->held[j] * fmax(1 - stages / HELD, 0));
     }
 }

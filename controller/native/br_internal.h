@@ -189,6 +189,7 @@ typedef struct {
     double tube[BR_N];                    /* by how much the rows are uncertain, */
     double share[BR_N];                   /* as a share of the room that they leave */
     double pace;                          /* of the reference, as a share of the line's speed */
+    double widening;                      /* of the last step's standard deviations, the largest */
     BR_ALIGNED double correlations[BR_GP_ROOT][BR_COLUMNS];
 } br_caution;
 
@@ -394,6 +395,7 @@ BR_PART br_mpc_status br_sqp_iterate(br_mpc *mpc, int warm, int first_of_warm);
 
 /* br_prepare.c: in step with time */
 BR_PART int br_plausible_state(const double x[BR_NX]);
+BR_PART int br_plausible_input(const double u[BR_NU]);
 BR_PART int br_shifts_due(double *lag);
 BR_PART void br_align(br_mpc *mpc, int shifts);
 BR_PART void br_undo_preparation(br_mpc *mpc);

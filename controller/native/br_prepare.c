@@ -9,6 +9,12 @@ int br_plausible_state(const double x[BR_NX]) {
     return 1;
 }
 
+int br_plausible_input(const double u[BR_NU]) {
+    for (int c = 0; c < BR_NU; ++c)
+        if (!(fabs(u[c]) <= BR_INPUT_LIMIT[c])) return 0;
+    return 1;
+}
+
 /* Whole stages that a plan behind by *lag, which is below the horizon, has to be shifted; *lag is
  * what remains, at most half a stage to either side. */
 int br_shifts_due(double *lag) {
@@ -32,13 +38,13 @@ void br_undo_preparation(br_mpc *mpc) {
         mpc->caution.known = 0;
     }
     mpc->ahead = mpc->looked = 0;
+    br_innovation_undo(&mpc->innovation);
 }
 
 /* Of other weights or code; the preparation's new last stage was predicted with those before. */
 void br_forget_linearisation(br_mpc *mpc) {
     br_undo_preparation(mpc);
     mpc->linearised = mpc->qp.factorised = mpc->caution.known = 0;
-    br_innovation_undo(&mpc->innovation);
 }
 
 /* Time for an iteration, and what follows it: restoring the best plan, shift and factorisation,

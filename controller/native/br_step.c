@@ -179,12 +179,6 @@ static void solve(br_mpc *mpc, double u[BR_NU], br_mpc_status *status, br_mpc_in
     if (info) *info = mpc->info;
 }
 
-static int plausible_input(const double u[BR_NU]) {
-    for (int c = 0; c < BR_NU; ++c)
-        if (!(fabs(u[c]) <= BR_INPUT_LIMIT[c])) return 0;
-    return 1;
-}
-
 typedef struct {
     const double *x, *u_before;
     double elapsed_s, budget_s;
@@ -206,7 +200,7 @@ static br_mpc_error begin(br_mpc *mpc, const request *r, int *plausible) {
     mpc->elapsed = r->elapsed_s;
     mpc->lag += r->elapsed_s;
     mpc->path.age += r->elapsed_s;
-    *plausible = br_plausible_state(r->x) && plausible_input(r->u_before);
+    *plausible = br_plausible_state(r->x) && br_plausible_input(r->u_before);
     if (!*plausible) return BR_OK;
     memcpy(mpc->x0, r->x, sizeof mpc->x0);
     memcpy(mpc->u_before, r->u_before, sizeof mpc->u_before);

@@ -82,6 +82,7 @@ static int read_state(const char *line, br_measured *state, int *final) {
     *final = numbers[2] != 0;
     memcpy(state->x, numbers + 3, sizeof state->x);
     memcpy(state->u_applied, numbers + 3 + BR_NX, sizeof state->u_applied);
+    state->averaged = 1;
     for (at = end; state->delays < BR_DELAYS; at = end) {
         const double delay_s = strtod(at, &end);
         if (end == at) break;

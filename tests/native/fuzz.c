@@ -184,6 +184,7 @@ static void check_answer(const double u[BR_NU], br_mpc_status status, const br_m
     CHECK(status >= BR_CONVERGED && status <= BR_TIME_LIMIT);
     CHECK(info->iterations <= limit + (BR_COLD_GUESSES + 1) * BR_SECOND_START_ITERATIONS);
     CHECK(info->pace > 0 && info->pace <= 1);
+    CHECK(info->widening >= 1 && info->widening <= 250);
     if (status > BR_ACCEPTABLE) {
         CHECK(u[0] == -9 && u[1] == -9);
         return;
@@ -225,6 +226,7 @@ static void step(controller *c, int count, int own_reference, double budget) {
     if (count == 2) {
         CHECK(status[0] == status[1] && memcmp(u[0], u[1], sizeof u[0]) == 0);
         CHECK(info[0].iterations == info[1].iterations && info[0].shifts == info[1].shifts);
+        CHECK(info[0].pace == info[1].pace && info[0].widening == info[1].widening);
     }
     if (status[0] > BR_ACCEPTABLE || br_mpc_predict(c[0].mpc, x, u[0], BR_TS, x) != BR_OK) {
         const double start[BR_NX] = {RADIUS_M, 0, 1.5707963267948966, 1.5, 0, 0, 0};
