@@ -18,6 +18,7 @@ from bayesrace.tracks import (
     StartLine,
     Track,
     builtin_tracks,
+    is_random_track,
     load_track,
     random_track,
 )
@@ -293,8 +294,9 @@ def test_circuits_for_larger_cars_have_the_same_shape() -> None:
     assert larger.length_m == pytest.approx(4.3 * track.length_m, rel=1e-9)
 
 
-@pytest.mark.parametrize("name", ["random:", "random:-1", "random:x", "random:1.5"])
+@pytest.mark.parametrize("name", ["random:", "random:-1", "random:x", "random:1.5", "random10:x"])
 def test_bad_seeds_are_refused(name: str) -> None:
+    assert not is_random_track(name)
     with pytest.raises(InputError, match="seed must be a whole number"):
         load_track(name)
     with pytest.raises(InputError, match="negative"):

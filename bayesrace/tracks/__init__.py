@@ -3,7 +3,7 @@
 from bayesrace.tracks.builtin import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK, builtin_tracks
 from bayesrace.tracks.files import read_smoothed, read_track, write_track
 from bayesrace.tracks.generator import random_track
-from bayesrace.tracks.library import load_track
+from bayesrace.tracks.library import is_random_track, load_track
 from bayesrace.tracks.startline import Crossing, StartLine
 from bayesrace.tracks.track import PathProjection, Projection, Track
 
@@ -16,6 +16,7 @@ __all__ = [
     "StartLine",
     "Track",
     "builtin_tracks",
+    "is_random_track",
     "load_track",
     "random_track",
     "read_smoothed",

@@ -8,10 +8,16 @@ from bayesrace.tracks.files import default_car_width_m, read_track
 from bayesrace.tracks.generator import RANDOM_TRACKS, random_track
 from bayesrace.tracks.track import Track
 
-__all__ = ["load_track"]
+__all__ = ["is_random_track", "load_track"]
 
 _MAPS = (".yaml", ".yml")
 _SEED_DIGITS = 18
+
+
+def is_random_track(name: str) -> bool:
+    """Whether the name is that of a generated circuit: ``random:SEED`` or ``random10:SEED``."""
+    kind, _, seed = name.partition(":")
+    return kind in RANDOM_TRACKS and _is_seed(seed)
 
 
 def load_track(name_or_path: str | Path, car_width_m: float | None = None) -> Track:
@@ -42,12 +48,16 @@ def load_track(name_or_path: str | Path, car_width_m: float | None = None) -> Tr
 
 
 def _seed(text: str, digits: str) -> int:
-    if not (digits.isascii() and digits.isdigit() and len(digits) <= _SEED_DIGITS):
+    if not _is_seed(digits):
         raise InputError(
             f"'{text[:40]}': the seed must be a whole number from 0 on, of at most {_SEED_DIGITS} "
             "digits, as in random:7"
         )
     return int(digits)
+
+
+def _is_seed(digits: str) -> bool:
+    return digits.isascii() and digits.isdigit() and len(digits) <= _SEED_DIGITS
 
 
 def _wide_enough(track: Track, car_width_m: float | None) -> Track:

@@ -17,6 +17,7 @@ from operation.settings import RaceSettings
 
 __all__ = [
     "CONTROLLERS",
+    "LEARNS_FROM",
     "PAPER",
     "Case",
     "Controller",
@@ -34,6 +35,13 @@ Controller = Literal[
 ]  # fmt: skip
 CONTROLLERS: Final[tuple[Controller, ...]] = get_args(Controller)
 PAPER: Final[tuple[Controller, ...]] = ("worstcase", "bayesrace", "bayesrace-updated", "bestcase")
+LEARNS_FROM: Final[Mapping[Controller, tuple[Controller, ...]]] = {
+    "bayesrace-updated": ("bayesrace",),
+    "bayesrace-updated-twice": ("bayesrace", "bayesrace-updated"),
+    "bayesrace-limit": ("bayesrace",),
+}
+"""Whose laps a controller's weights are learned from beside the training drive. Training begins
+with the weights of the last one named."""
 
 _FIXED: Final = (
     *("mode", "fmu", "fmu_map", "simulator", "threads", "limit"),
@@ -50,9 +58,10 @@ _SOURCES: Final = (
     "bayesrace/vehicles", "codegen", "codegen/problems", "controller", "controller/native",
     "learning", "plant", "operation/analysis/laps.py", "operation/closed_loop.py",
     "operation/collect.py", "operation/drive.py", "operation/preparation.py",
-    "operation/settings.py", "operation/training_line.py", "studies/campaign/execute.py",
+    "operation/settings.py", "operation/training_line.py", "studies/campaign/case.py",
+    "studies/campaign/execute.py",
 )  # fmt: skip
-_PACKAGES: Final = ("casadi", "mcap", "numpy", "scipy", "scikit-learn")
+_PACKAGES: Final = ("casadi", "mcap", "numpy", "scipy")
 
 
 @cache

@@ -8,7 +8,7 @@ import platform
 import threading
 import time
 from functools import cached_property, lru_cache
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -35,7 +35,7 @@ from operation.preparation import (
 from operation.settings import PreparationSettings, RaceSettings
 from operation.terminal.progress import stages_on
 from plant.simulator import Simulator
-from studies.campaign.case import Case, Controller, Files, software_identity
+from studies.campaign.case import LEARNS_FROM, Case, Controller, Files, software_identity
 
 __all__ = ["FAILED", "Row", "run_case"]
 
@@ -47,7 +47,7 @@ FAILED: Final = "failed"
 
 _MODELS: Final[tuple[PredictionModel, ...]] = ("e_kinematic", "dynamic")
 
-_LEARNED_FROM: Final[tuple[Controller, ...]] = ("bayesrace", "bayesrace-updated")
+_LEARNED_FROM: Final = frozenset(chain.from_iterable(LEARNS_FROM.values()))
 """Whose laps others learn from."""
 
 _one_at_a_time = threading.Lock()
@@ -124,6 +124,8 @@ class _Runs:
     def __init__(self, case: Case) -> None:
         self._case, self._settings = case, case.settings
         self._runs: dict[Controller, Driven] = {}
+        self._updates: dict[tuple[Controller, ...], GpWeights] = {}
+        """Weights that are learned from laps, by whose."""
 
     def drive(self, controller: Controller) -> list[Row]:
         """The rows of the controller's laps; of ``bayesrace-limit``, those of its last run."""
@@ -133,7 +135,7 @@ class _Runs:
         if controller in _LEARNED_FROM:
             self._runs[controller] = driven
         if controller == "bayesrace-limit" and weights is not None:
-            samples = self._samples_of("bayesrace")
+            samples = self._samples_of(LEARNS_FROM[controller])
             for _ in range(self._settings.progress_runs - 1):
                 samples.append(driven.samples())
                 weights = self._learned(samples, weights)
@@ -157,13 +159,21 @@ class _Runs:
         return _prepared(needed, self._settings.track, models, self._case.weights)
 
     def _weights(self, controller: Controller) -> GpWeights | None:
-        if controller == "bayesrace":
-            return read_weights(self._files.weights)
-        if controller == "bayesrace-updated-twice":
-            return self._learned(self._samples_of("bayesrace", "bayesrace-updated"), self._updated)
-        return self._updated if controller in ("bayesrace-updated", "bayesrace-limit") else None
+        if controller == "bayesrace" or controller in LEARNS_FROM:
+            return self._trained(controller)
+        return None
 
-    def _samples_of(self, *controllers: Controller) -> list[Dataset]:
+    def _trained(self, controller: Controller) -> GpWeights:
+        """The weights of a controller that has some."""
+        if controller not in LEARNS_FROM:
+            return read_weights(self._files.weights)
+        sources = LEARNS_FROM[controller]
+        if sources not in self._updates:
+            samples = self._samples_of(sources)
+            self._updates[sources] = self._learned(samples, self._trained(sources[-1]))
+        return self._updates[sources]
+
+    def _samples_of(self, controllers: tuple[Controller, ...]) -> list[Dataset]:
         """Those of the training drive, and of the laps of these controllers."""
         if (training := self._files.training) is None:
             raise RuntimeError("there is no training drive to learn from")
@@ -171,11 +181,6 @@ class _Runs:
             if one not in self._runs:
                 raise RuntimeError(f"there are no laps of '{one}' to learn from")
         return [training.samples, *(self._runs[one].samples() for one in controllers)]
-
-    @cached_property
-    def _updated(self) -> GpWeights:
-        """Learned from training drive and laps, beginning with the weights of the laps."""
-        return self._learned(self._samples_of("bayesrace"), read_weights(self._files.weights))
 
     def _learned(self, samples: list[Dataset], before: GpWeights) -> GpWeights:
         return read_weights(updated_weights(samples, self._settings, before))

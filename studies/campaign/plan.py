@@ -30,11 +30,12 @@ from bayesrace.cache import digest
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_text, read_whole
 from bayesrace.gp.weights import decode_weights
-from bayesrace.tracks import builtin_tracks, load_track
+from bayesrace.tracks import builtin_tracks, is_random_track, load_track
 from bayesrace.vehicles import CarParameters, get_car
 from operation.settings import RaceSettings
 from studies.campaign.case import (
     CONTROLLERS,
+    LEARNS_FROM,
     PAPER,
     Case,
     Controller,
@@ -49,12 +50,6 @@ __all__ = ["Campaign", "read_plan", "spread"]
 _MOST_CASES: Final = 1_000_000
 _SPAN: Final = re.compile(r"(.*?)(\d{1,9})\.\.(\d{1,9})")
 _TRAINING: Final = ("train_track", "seed", "collect_s", "points", "kernels")
-_LEARN_FROM_LAPS: Final[dict[Controller, Controller]] = {
-    "bayesrace-updated": "bayesrace",
-    "bayesrace-updated-twice": "bayesrace-updated",
-    "bayesrace-limit": "bayesrace",
-}
-_RANDOM_TRACK: Final = re.compile(r"random(10)?:\d{1,18}")
 
 
 class _Draw(BaseModel):
@@ -256,8 +251,10 @@ class _Reader:
 
     def _track(self, name: Any) -> str:
         if not isinstance(name, str):
-            raise InputError(f"{_short(name)} is no track; give a name, random:SEED or a CSV file")
-        if name in builtin_tracks() or _RANDOM_TRACK.fullmatch(name):
+            raise InputError(
+                f"{_short(name)} is no track; give a name, random:SEED, random10:SEED or a CSV file"
+            )
+        if name in builtin_tracks() or is_random_track(name):
             return name
         path = self._folder / name
         load_track(path if path.is_file() else name, 0.0)
@@ -279,15 +276,18 @@ class _Reader:
 
 
 def _check_controllers(plan: _Plan) -> None:
-    learning = next((one for one in plan.controllers if one in _LEARN_FROM_LAPS), None)
+    learning = next((one for one in plan.controllers if one in LEARNS_FROM), None)
     if learning and plan.weights is not None:
         raise InputError(
             f"controllers: '{learning}' learns from a training drive, which there is none of "
             "with given weights; leave it or the weights out"
         )
-    for one, before in _LEARN_FROM_LAPS.items():
-        if one in plan.controllers and before not in plan.controllers:
-            raise InputError(f"controllers: '{one}' learns from the laps of '{before}'; add that")
+    for one in plan.controllers:
+        for other in LEARNS_FROM.get(one, ()):
+            if other not in plan.controllers:
+                raise InputError(
+                    f"controllers: '{one}' learns from the laps of '{other}'; add that"
+                )
 
 
 def _check_runs(case: Case) -> None:
