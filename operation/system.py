@@ -156,11 +156,11 @@ def started_system(
         endpoints = used.endpoints("director")
         process = stack.enter_context(child(line, folder / "plant.log"))
         recording = session = stack.enter_context(
-            open_session(endpoints, "director", explains=False)
+            open_session(endpoints, "director", peers_follow=True)
         )
         if lockstep:
             fast = endpoints.model_copy(update={"low_latency": True})
-            recording = stack.enter_context(open_session(fast, "director", explains=False))
+            recording = stack.enter_context(open_session(fast, "director", peers_follow=True))
         stack.callback(process.stop)  # before the sessions, so that its end is seen
         system = System(session, recording, car, folder, options)
         system.children["plant"] = process

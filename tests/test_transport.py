@@ -1,5 +1,6 @@
 """Sessions, publishers, the inbox and requests, over real loopback links within one process."""
 
+import json
 import threading
 import time
 from collections.abc import Iterator
@@ -8,6 +9,7 @@ from functools import partial
 from typing import Any
 
 import pytest
+import zenoh
 
 from bayesrace.errors import InputError
 from bayesrace.messages import (
@@ -378,20 +380,32 @@ def test_a_malformed_endpoint_is_refused_by_name(endpoint: str) -> None:
         pass
 
 
-def test_a_session_that_has_started_its_peers_itself_does_not_wait_for_them_to_open() -> None:
-    begin_s = time.monotonic()
+@pytest.mark.parametrize("peers_follow", [True, False])
+def test_opening_a_session_waits_only_for_peers_that_may_be_there(
+    peers_follow: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[zenoh.Config] = []
+
+    def recorded(config: zenoh.Config) -> zenoh.Session:
+        opened.append(config)
+        return really(config)
+
+    really = zenoh.open
+    monkeypatch.setattr("bayesrace.transport.session.zenoh.open", recorded)
     with (
         private_endpoints("absent") as ends,
-        open_session(Endpoints(connect=tuple(ends)), explains=False),
+        open_session(Endpoints(connect=tuple(ends)), peers_follow=peers_follow),
     ):
-        assert time.monotonic() - begin_s < 0.4  # Zenoh waits for 0.5 s otherwise
+        (config,) = opened
+        waits = json.loads(config.get_json("open/return_conditions/connect_scouted"))
+        assert waits is not peers_follow
 
 
 def test_each_unix_socket_is_a_link_of_its_own() -> None:
     with (
         private_endpoints("here", "nowhere") as ends,
         open_session(Endpoints(listen=(ends[0],))),
-        open_session(wanted := Endpoints(connect=tuple(ends)), explains=False) as session,
+        open_session(wanted := Endpoints(connect=tuple(ends)), peers_follow=True) as session,
     ):
         assert wait_linked(session, wanted, ends[:1], PATIENCE_S)
         assert unlinked(session, wanted) == ends[1:]

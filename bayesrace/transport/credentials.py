@@ -163,7 +163,7 @@ def _check_private(key: Path) -> None:
 
 def _verified(folder: Path) -> tuple[str, float]:
     """Name and end of the certificate, after a handshake with itself; InputError if that fails."""
-    import ssl  # two megabytes, which a process without certificates does not need
+    import ssl  # 1.4 MB, which a process without certificates does not need
 
     authority, files = folder / AUTHORITY, (folder / CERTIFICATE, folder / KEY)
     try:

@@ -49,10 +49,11 @@ _FILTERS: Final[list[dict[str, list[str]]]] = [
 _ROUTER: Final = {"south": [{"filters": [one]} for one in _FILTERS]}
 
 
-def zenoh_config(endpoints: Endpoints, role: Role, *, waits: bool = True) -> Any:
+def zenoh_config(endpoints: Endpoints, role: Role, *, peers_follow: bool = False) -> Any:
     """Zenoh's configuration of such a process; InputError for a setting that it does not have.
 
-    ``waits``: opening the session takes half a second where nobody answers yet.
+    ``peers_follow``: the peers start after the session, so that opening it does not wait half a
+    second for their answer.
     """
     config = zenoh.Config()
     region = role if role in _REGIONS else "observer"
@@ -67,7 +68,7 @@ def zenoh_config(endpoints: Endpoints, role: Role, *, waits: bool = True) -> Any
         "connect/timeout_ms": -1,
         "connect/exit_on_failure": False,
         "connect/retry": _RETRY,
-        "open/return_conditions/connect_scouted": waits,
+        "open/return_conditions/connect_scouted": not peers_follow,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/link/tx/lease": round(1e3 * limits.lease_s),
@@ -115,21 +116,27 @@ def _security(credentials: Credentials) -> dict[str, Any]:
 
 @contextmanager
 def open_session(
-    endpoints: Endpoints, role: Role = "viewer", *, explains: bool = True, grace_s: float = 0.0
+    endpoints: Endpoints,
+    role: Role = "viewer",
+    *,
+    peers_follow: bool = False,
+    grace_s: float = 0.0,
 ) -> Iterator[Any]:
     """A Zenoh session of a process in that role, closed at the end of the block.
 
     Raises InputError if an endpoint is malformed, open to others without protection, or cannot be
     listened on; if the certificate is not for the role; if a link is refused, here or at its other
-    end. An absent peer is no error: the session connects as soon as it appears, and says in the log
-    that it waits, unless it is not to ``explains`` because it has just started its peers itself:
-    then it neither says so nor waits for them here. See :class:`.Inbox` for waiting with a limit.
+    end. An absent peer is no error: the session connects as soon as it appears, and the log says
+    that it waits. See :class:`.Inbox` for waiting with a limit.
+
+    ``peers_follow``: the caller has just started the peers, or is about to. Nobody can answer yet,
+    so opening the session does not wait for them, and the log does not say that they are absent.
 
     Where the process's certificate expires (``grace_s`` later) or turns out to be revoked, the main
     thread gets a SIGINT, and the end of the block raises InputError with the reason.
     """
     os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)
-    absent = _checked(endpoints, role, explains)
+    absent = _checked(endpoints, role, peers_follow)
     if endpoints.exposed:
         _log.warning(
             "INSECURE: links by %s are open to everyone in that network, who could drive the car; "
@@ -138,10 +145,10 @@ def open_session(
     watch: LinkWatch | None = None
     try:
         with ExitStack() as stack:
-            session = stack.enter_context(_opened(endpoints, role, explains))
+            session = stack.enter_context(_opened(endpoints, role, peers_follow))
             known = _join(session, endpoints, absent, stack)
-            if endpoints.credentials is not None or (endpoints.connect and explains):
-                watch = LinkWatch(session, endpoints, known, explains, grace_s)
+            if endpoints.credentials is not None or (endpoints.connect and not peers_follow):
+                watch = LinkWatch(session, endpoints, known, not peers_follow, grace_s)
                 stack.callback(watch.close)
             yield session
     except (InputError, KeyboardInterrupt) as error:
@@ -181,26 +188,26 @@ def try_links(endpoints: Endpoints, role: Role) -> None:
             pass
 
 
-def _checked(endpoints: Endpoints, role: Role, explains: bool = True) -> list[Finding]:
+def _checked(endpoints: Endpoints, role: Role, peers_follow: bool = False) -> list[Finding]:
     """Where nobody is now, which is logged; InputError for what waiting cannot help."""
     endpoints.check()
     credentials = endpoints.credentials
     if credentials is not None:
         credentials.check(role)
-    elif not explains:
+    elif peers_follow:
         return []
     found = probe_all(endpoints.connect, credentials, greets=credentials is not None)
     if lasting := [finding.text for finding in found if finding.lasting]:
         raise InputError("; ".join(lasting))
-    if explains:
+    if not peers_follow:
         report(found)
     return found
 
 
 @contextmanager
-def _opened(endpoints: Endpoints, role: Role, waits: bool) -> Iterator[Any]:
+def _opened(endpoints: Endpoints, role: Role, peers_follow: bool) -> Iterator[Any]:
     try:
-        session = zenoh.open(zenoh_config(endpoints, role, waits=waits))
+        session = zenoh.open(zenoh_config(endpoints, role, peers_follow=peers_follow))
     except zenoh.ZError as error:
         text = re.sub(r" at /\S+", "", str(error).splitlines()[0])  # places in Zenoh's source
         cause = re.search(r"[^:\[]+ \(os error \d+\)", text)

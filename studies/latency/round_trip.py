@@ -79,7 +79,7 @@ def _answer(endpoint: str) -> None:
 def _send(endpoint: str, path: str, period_ns: int, begin_ns: int) -> None:
     """One message each period; the file has what came back, however this process ends."""
     taken_ns = np.lib.format.open_memmap(path, mode="r+")
-    with open_session(Endpoints(connect=(endpoint,)), explains=False) as session:
+    with open_session(Endpoints(connect=(endpoint,)), peers_follow=True) as session:
         back, there = _receiver(session, "back"), _sender(session, "there")
         while not there.matching_status.matching:
             time.sleep(_LOOK_S)
