@@ -55,7 +55,7 @@ class Errors(NamedTuple):
         return np.asarray((np.abs(self.error) <= quantile * self.sigma).mean(axis=0))
 
     def one_sided(self, quantile: float) -> Floats:
-        """Share beyond them neither above nor below: the smaller of both, (3,)."""
+        """Share of the errors below the upper bound or above the lower one, the smaller, (3,)."""
         within = [(side * self.error <= quantile * self.sigma).mean(axis=0) for side in (1, -1)]
         return np.asarray(np.minimum(*within))
 

@@ -26,7 +26,9 @@ class PreparationSettings(BaseModel):
 
     car: CarSetting = Field(default_factory=default_car)
     train_track: str = Field(
-        "", description="training track: name, random:SEED or CSV file; empty: the car's"
+        "",
+        description="training track: name, random:SEED, random10:SEED or CSV file; "
+        "empty: the car's",
     )
     fmu: Path | None = Field(
         None, description="FMU that simulates the car; the built-in car without"
@@ -116,7 +118,7 @@ class RaceSettings(PreparationSettings):
     """Settings of ``bayesrace race``; defaults are the shown run."""
 
     track: str = Field(
-        "", description="race track: name, random:SEED or CSV file; empty: the car's"
+        "", description="race track: name, random:SEED, random10:SEED or CSV file; empty: the car's"
     )
     laps: int = Field(
         2, ge=1, le=100, description="laps a controller drives: one from standstill, then flying"

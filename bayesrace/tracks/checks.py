@@ -38,10 +38,11 @@ _IN_ORDER = (
     f"{_SMOOTH}"
 )
 _CORNERS = 50
-"""Points of a centreline that may be a polygon's corners; more are to follow a curve ..."""
+"""So few points may be the corners of a polygon; more of them are taken for samples of a curve."""
 _ZIGZAG_RAD, _ALTERNATING = 0.1, -0.25
-"""... and do not, if they turn by this much (RMS) with this correlation of one turn with the next.
-That of noise is -2/3, that of published tracks 0.84 and more."""
+"""A centreline zigzags if its turns from point to point exceed the first (RMS) and the correlation
+of each turn with the next is below the second. Noise alone has a correlation of -2/3, published
+tracks have 0.84 and more."""
 _UNITS = {"millimetres": 1e3, "centimetres": 1e2}
 _CHUNK = 512
 

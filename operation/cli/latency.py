@@ -57,7 +57,8 @@ def latency(
         str | None,
         typer.Option(
             metavar="TRACK",
-            help="Built-in name, random:SEED or CSV file; with --attach or --log, that run's.",
+            help="Built-in name, random:SEED, random10:SEED or CSV file; with --attach or --log, "
+            "that run's.",
         ),
     ] = None,
     fifo: Annotated[

@@ -76,7 +76,10 @@ def validate(
     ] = None,
     track: Annotated[
         str | None,
-        typer.Option(metavar="TRACK", help="Track for track.png: name, random:SEED or CSV file."),
+        typer.Option(
+            metavar="TRACK",
+            help="Track for track.png: name, random:SEED, random10:SEED or CSV file.",
+        ),
     ] = None,
     threshold: Annotated[
         float,

@@ -15,7 +15,10 @@ __all__ = ["limit"]
 
 def limit(
     track: Annotated[
-        str, typer.Argument(metavar="TRACK", help="Built-in name, random:SEED or CSV file.")
+        str,
+        typer.Argument(
+            metavar="TRACK", help="Built-in name, random:SEED, random10:SEED or CSV file."
+        ),
     ],
     car: Car = DEFAULT_CAR,
     tyres: Tyres = None,

@@ -128,7 +128,7 @@ TrackName = Annotated[
     typer.Option(
         metavar="TRACK",
         show_default="the car's",
-        help="Built-in name, random:SEED or CSV file.",
+        help="Built-in name, random:SEED, random10:SEED or CSV file.",
     ),
 ]
 RaceLineFile = Annotated[

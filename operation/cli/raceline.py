@@ -36,7 +36,10 @@ _BAYESIAN: Final = (
 def raceline(
     context: typer.Context,
     track: Annotated[
-        str, typer.Argument(metavar="TRACK", help="Built-in name, random:SEED or CSV file.")
+        str,
+        typer.Argument(
+            metavar="TRACK", help="Built-in name, random:SEED, random10:SEED or CSV file."
+        ),
     ],
     out: OutFile = Path("raceline.csv"),
     car: Car = DEFAULT_CAR,

@@ -23,7 +23,7 @@ def tracks(
         typer.Argument(
             metavar="TRACK",
             show_default="all built in",
-            help="Built-in name, random:SEED, CSV file or ROS map (YAML).",
+            help="Built-in name, random:SEED, random10:SEED, CSV file or ROS map (YAML).",
         ),
     ] = None,
     out: Annotated[
