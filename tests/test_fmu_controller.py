@@ -159,6 +159,27 @@ def test_parameters_act_and_limits_can_be_tuned_during_the_run(
     assert (tuned[1:, 3] == Level.SOLUTION).all()  # the first has the car jump back
 
 
+@pytest.mark.parametrize("connected", [False, True])
+def test_it_is_as_cautious_as_in_lockstep(
+    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit, connected: bool
+) -> None:
+    """Also about errors that its band does not cover, which it learns from its own outputs."""
+    run = lockstep()
+    cautious = RACING.model_copy(update={"caution": 0.95})
+    run.native.set_parameters(run.car, cautious)
+    run.run(circuit.start(v_mps=0.1), 150)
+    values = {"caution_sigmas": cautious.caution_sigmas, "d_applied_connected": float(connected)}
+    controller = exported.slave(exported.fmu(3), values)
+    rows = []
+    for k, x in enumerate(run.x):
+        controller.set({"d_applied": run.u[k - 1][0] if k else 0.0})
+        rows.append(answers(controller, [x])[0])
+    same(np.array(rows), run)
+    assert run.driver.output is not None
+    assert controller.get("widening") == [run.driver.output.widening]
+    assert run.driver.output.widening > 1
+
+
 def test_a_speed_limit_slows_down_along_the_line_to_standstill(
     exported: Exported, circuit: Circuit
 ) -> None:

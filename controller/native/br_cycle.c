@@ -11,8 +11,9 @@
 #define JUMP_BY 0.01     /* and so much more */
 #define LEAST_BUDGET 0.1 /* what a step gets however late its cycle began: share of the budget */
 
-#define LEAST_STAGES 0.5 /* of a transition by which the model is judged; ... */
-#define MOST_STAGES 2    /* ... and at most */
+#define LEAST_STAGES 0.5    /* of a transition by which the model is judged; ... */
+#define STAGE_ROUNDING 1e-6 /* share of a stage: times that are added up differ by so much */
+#define MOST_STAGES 2       /* ... and at most */
 
 /* What the car has done since a measured state, for br_mpc_observe. */
 typedef struct {
@@ -177,8 +178,10 @@ static void observe_transition(br_cycle *cycle, const br_measured *before,
     if (duration_s < LEAST_STAGES * BR_TS) return;
     shown->duration_s = 0;
     if (duration_s <= MOST_STAGES * BR_TS &&
-        fabs(shown->x[BR_INDEX_VX]) > cycle->settings.standing_mps)
-        br_mpc_observe(cycle->mpc, shown->x, shown->u, duration_s, state->x);
+        fabs(shown->x[BR_INDEX_VX]) > cycle->settings.standing_mps) {
+        const int stage = fabs(duration_s - BR_TS) < STAGE_ROUNDING * BR_TS;
+        br_mpc_observe(cycle->mpc, shown->x, shown->u, stage ? BR_TS : duration_s, state->x);
+    }
 }
 
 br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state) {

@@ -22,8 +22,7 @@
 #define HELD 500.0
 /* Errors in a row resemble each other: where sigma was right, largest means were 0.7 to 2.3. */
 #define USUAL 3.0
-#define SIGMA_PER_MEAN 1.25 /* standard deviation over mean size, of normally distributed errors \
-                             */
+#define SIGMA_PER_MEAN 1.25 /* of normally distributed errors: standard deviation / mean size */
 #define LARGEST 200.0       /* standard deviations: no single wrong measurement counts more */
 
 void br_innovation_reset(br_innovation *innovation) {

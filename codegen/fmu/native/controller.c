@@ -113,20 +113,23 @@ static bool due(controller *c, double time_s, double period_s) {
 }
 
 /* The inputs of the FMU as a received state. If the importer connects the input that acts and there
- * is no delay, nothing has to be predicted, and the outputs of the last control step have acted. */
+ * is no delay, nothing has to be predicted. Without a delay, the outputs of the last control step
+ * have acted since; with one, what has acted is not known. */
 static br_measured measured(fmu_instance *instance) {
     controller *c = instance->model;
     const double *v = instance->value;
-    const bool connected = v[FMU_V_d_applied_connected] != 0;
-    const bool at_once = connected && v[FMU_V_delay] == 0;
+    const bool connected = v[FMU_V_d_applied_connected] != 0, at_once = v[FMU_V_delay] == 0;
     br_measured state = {
         .seq = c->cycles++,
         .time_s = v[FMU_V_time],
-        .u_applied = {[BR_INDEX_DUTY] = connected ? v[FMU_V_d_applied] : 0,
-                      [BR_INDEX_DELTA_RATE] = at_once ? v[FMU_V_delta_rate] : 0},
         .averaged = at_once,
-        .lockstep = at_once,
+        .lockstep = connected && at_once,
     };
+    if (connected)
+        state.u_applied[BR_INDEX_DUTY] = v[FMU_V_d_applied];
+    else if (at_once)
+        state.u_applied[BR_INDEX_DUTY] = v[FMU_V_d];
+    if (at_once) state.u_applied[BR_INDEX_DELTA_RATE] = v[FMU_V_delta_rate];
     memcpy(state.x, &v[FMU_V_x], sizeof state.x);
     return state;
 }
