@@ -8,6 +8,7 @@ every whole chunk, also where the file ends without its index.
 import json
 import struct
 import time
+from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -17,7 +18,7 @@ from typing import IO, Any, Final, Generic, NamedTuple, TypeVar, cast
 import lz4.frame
 import zstandard
 from mcap.exceptions import EndOfFile, McapError
-from mcap.records import Channel, Chunk, Metadata
+from mcap.records import Channel, Chunk, Footer, Metadata
 from mcap.records import Message as Record
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import Writer
@@ -134,17 +135,21 @@ class _Place:
 
     offset: int = 0
     unpacked: int = 0
-    """Bytes of all chunks."""
+    """Bytes of all whole chunks."""
+    pending: deque[Any] = field(default_factory=deque)
+    """Records of the last chunk that have not been taken yet."""
     ended: bool = False
     """The end mark has been read."""
     channels: dict[int, _Channel] = field(default_factory=dict)
+    refused: int = 0
+    """Messages that could not be decoded."""
 
 
 class LogReader:
     """Reads a log in order of arrival, also one that was cut off, or is being written.
 
-    After an iteration, ``refused`` and ``last_reason`` say what could not be decoded, and
-    ``truncated`` whether the file ends without its end mark.
+    After an iteration, ``refused`` and ``last_reason`` say what could not be decoded on its way
+    from the beginning of the log, and ``truncated`` whether the file ends without its end mark.
     """
 
     def __init__(self, path: Path) -> None:
@@ -166,15 +171,24 @@ class LogReader:
         return {record.topic for record in self._records(_Place()) if isinstance(record, Channel)}
 
     def messages(self, topics: Collection[Topic[Any]] = TOPICS) -> Iterator[Entry[Any]]:
-        """The messages of these topics, typed; those that cannot be decoded are counted."""
-        self._place, self.refused = _Place(), 0
-        yield from self.newer(topics)
+        """The messages of these topics, typed; those that cannot be decoded are counted.
+
+        They are read from the beginning, whatever :meth:`newer` has returned.
+        """
+        return self._entries(_Place(), topics)
 
     def newer(self, topics: Collection[Topic[Any]] = TOPICS) -> Iterator[Entry[Any]]:
-        """The messages of these topics in what has been added to the log since the last call."""
-        channels = self._place.channels
+        """The messages of these topics in what has been added to the log since the last call.
+
+        Where an iteration was left early, the next call continues after the last message taken.
+        """
+        return self._entries(self._place, topics)
+
+    def _entries(self, place: _Place, topics: Collection[Topic[Any]]) -> Iterator[Entry[Any]]:
+        self.refused = place.refused
+        channels = place.channels
         wanted = {number: one for number, one in channels.items() if one.topic in topics}
-        for record in self._records(self._place):
+        for record in self._records(place):
             if isinstance(record, Channel):
                 topic = topic_of(record.topic)
                 if topic is None:
@@ -188,7 +202,8 @@ class LogReader:
                 try:
                     message = channel.decode(channel.topic.message, record.data)
                 except InputError as error:
-                    self.refused += 1
+                    place.refused += 1
+                    self.refused = place.refused
                     self.last_reason = str(error)
                     continue
                 yield Entry(channel.key, record.log_time, message)
@@ -200,6 +215,8 @@ class LogReader:
     def _records(self, place: _Place) -> Iterator[Any]:
         """What follows that place, which moves on with each whole record or chunk."""
         self.truncated = False
+        while place.pending:
+            yield place.pending.popleft()
         if place.ended:
             return
         with self.path.open("rb") as file:
@@ -207,31 +224,36 @@ class LogReader:
             if not _MCAP_MAGIC.startswith(head):
                 raise InputError(f"{self.path} is not an MCAP log; give the log of a run")
             file.seek(place.offset)
-            whole = cast(Any, _Whole(file))
-            most = _MOST_UNPACKED + _RATIO * self.path.stat().st_size
             reader = StreamReader(
-                whole,
+                cast(Any, _Whole(file)),
                 skip_magic=place.offset > 0,
                 emit_chunks=True,
                 record_size_limit=_LARGEST_RECORD,
             )
             try:
                 for record in reader.records:
-                    if isinstance(record, Chunk):
-                        place.unpacked += record.uncompressed_size
-                        if place.unpacked > most:
-                            raise InputError(
-                                f"{self.path} would unpack to many times its size: no log of a run"
-                            )
-                        yield from breakup_chunk(_unpacked(record), validate_crc=True)
-                    else:
-                        yield record
-                    place.offset = file.tell()
+                    place.pending.extend(self._parts(record, place))
+                    # Not beyond the footer: the end mark behind it may not be written yet.
+                    if not isinstance(record, Footer):
+                        place.offset = file.tell()
+                    while place.pending:
+                        yield place.pending.popleft()
                 place.ended = True
             except InputError:
                 raise
             except _DAMAGED:
                 self.truncated = True
+
+    def _parts(self, record: Any, place: _Place) -> list[Any]:
+        """The records of a chunk, which are counted if it is whole; any other record itself."""
+        if not isinstance(record, Chunk):
+            return [record]
+        total = place.unpacked + record.uncompressed_size
+        if total > _MOST_UNPACKED + _RATIO * self.path.stat().st_size:
+            raise InputError(f"{self.path} would unpack to many times its size: no log of a run")
+        records: list[Any] = breakup_chunk(_unpacked(record), validate_crc=True)
+        place.unpacked = total
+        return records
 
 
 def _unpacked(chunk: Chunk) -> Chunk:

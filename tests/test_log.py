@@ -96,6 +96,78 @@ def test_a_log_that_is_being_written_gives_what_was_added_once(tmp_path: Path) -
     assert reader.select(STATE) == [state(seq) for seq in range(6)]
 
 
+def appended(path: Path, data: bytes) -> None:
+    with path.open("ab") as file:
+        file.write(data)
+
+
+def test_a_log_that_grows_byte_by_byte_gives_each_message_once(tmp_path: Path) -> None:
+    """Its end, from within the last chunk to the last byte, seen once or at each byte."""
+    path, growing = tmp_path / "whole.mcap", tmp_path / "growing.mcap"
+    writer = LogWriter(path)
+    for seq in range(4):
+        writer.write(KEY, encode(state(seq)), time.monotonic_ns(), seq)
+        writer.flush()
+        if seq == 2:
+            begin = path.stat().st_size
+    writer.close()
+    whole = path.read_bytes()
+    appended(growing, whole[:begin])
+    patient, found = LogReader(growing), []
+
+    def newer(reader: LogReader) -> tuple[list[int], bool]:
+        return [entry.message.seq for entry in reader.newer()], reader.truncated
+
+    for size in range(begin, len(whole)):
+        cut = tmp_path / f"{size}.mcap"
+        appended(cut, whole[:size])
+        hasty = LogReader(cut)
+        early, cut_off = newer(hasty)
+        assert cut_off
+        appended(cut, whole[size:])
+        assert newer(hasty) == ([0, 1, 2, 3][len(early) :], False)
+        more, cut_off = newer(patient)
+        assert cut_off
+        found += more
+        assert found == early == list(range(len(early)))
+        appended(growing, whole[size : size + 1])
+    assert newer(patient) == ([], False)
+    assert found == [0, 1, 2, 3]
+
+
+def test_reading_from_the_beginning_does_not_change_what_is_new(tmp_path: Path) -> None:
+    write(tmp_path / "log.mcap")
+    reader = LogReader(tmp_path / "log.mcap")
+    first = next(reader.newer((STATE,)))
+    assert first.message.seq == 0
+    assert len(reader.select(STATE)) == 50
+    assert reader.refused == 1
+    # The iteration was left after one message; the next one continues there.
+    assert [entry.message.seq for entry in reader.newer((STATE,))] == list(range(1, 50))
+    assert reader.refused == 1
+    assert list(reader.newer((STATE,))) == []
+    assert len(list(reader.messages((STATE,)))) == 50
+
+
+def test_a_damaged_chunk_can_be_tried_any_number_of_times(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only what has been unpacked counts towards the most that a log may unpack to."""
+    monkeypatch.setattr("bayesrace.log._MOST_UNPACKED", 1 << 15)
+    monkeypatch.setattr("bayesrace.log._RATIO", 0)
+    path = tmp_path / "log.mcap"
+    write(path)
+    whole = path.read_bytes()
+    at = whole.index(b"\x28\xb5\x2f\xfd") + 40  # within the chunk, behind the magic of zstd
+    path.write_bytes(whole[:at] + bytes([whole[at] ^ 0xFF]) + whole[at + 1 :])
+    reader = LogReader(path)
+    for _ in range(10):
+        assert list(reader.newer()) == []
+        assert reader.truncated
+    path.write_bytes(whole)
+    assert [entry.message.seq for entry in reader.newer((STATE,))] == list(range(50))
+
+
 def test_other_mcap_tools_read_json_with_schemas_and_an_index(tmp_path: Path) -> None:
     """With the mcap package alone: what viewers such as Foxglove need, they find."""
     write(tmp_path / "log.mcap")
