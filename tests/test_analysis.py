@@ -4,8 +4,9 @@ import hashlib
 import io
 import json
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from bayesrace.vehicles.models import dynamic
 from operation.analysis.between import positions_between
 from operation.analysis.laps import Trajectory, time_laps
 from operation.analysis.race import analyse, read_race, read_result, write_result
+from operation.analysis.recording import RecordingReader, RunRecord, read_recording
 from operation.analysis.results import LapResult, RaceResult
 from operation.report import render_report
 from operation.terminal.race_table import COLUMNS, print_table
@@ -218,6 +220,38 @@ def test_without_bestcase_or_weights_there_are_no_gp_metrics(tmp_path: Path) -> 
     assert analyse(write_race(tmp_path / "a", [drive], weights=False)).gp == {}
     other = Drive("bayesrace", circle(TWO_LAPS, 1.0))
     assert analyse(write_race(tmp_path / "b", [other])).gp == {}
+
+
+def stored(run: RunRecord) -> list[Any]:
+    return [getattr(run, one.name) for one in fields(run)]
+
+
+@pytest.mark.parametrize("truth", [True, False])
+def test_a_recording_read_in_pieces_is_that_of_the_whole_log(tmp_path: Path, truth: bool) -> None:
+    """Also of a log without truth, and whatever has been computed of what was read before."""
+    drives = [Drive("worstcase", circle(TWO_LAPS, 1.1)), Drive("bayesrace", circle(TWO_LAPS, 1.0))]
+    log = write_race(tmp_path, drives, truth=truth) / "run.mcap"
+    whole = log.read_bytes()
+    expected = read_recording(tmp_path)
+    log.write_bytes(whole[: len(whole) // 3])
+    reader = RecordingReader(tmp_path)
+    first = reader.runs()[1]
+    samples, rows = len(first.states), len(first.x)
+    log.write_bytes(whole[: 2 * len(whole) // 3])
+    early = reader.recording()
+    assert len(early.runs[1].x) < len(expected.runs[1].x)
+    log.write_bytes(whole)
+    for recording in (reader.recording(), reader.recording()):
+        assert recording.truth is expected.truth is truth
+        assert not recording.truncated
+        for run, other in zip(recording.runs, expected.runs, strict=True):
+            assert stored(run) == stored(other)
+            np.testing.assert_array_equal(run.x, other.x)
+            np.testing.assert_array_equal(run.solve_us, other.solve_us)
+    # What was returned before has not changed.
+    assert (len(first.states), len(first.x)) == (samples, rows)
+    assert len(early.runs[1].states) < len(expected.runs[1].states)
+    assert reader.runs()[2].states == expected.runs[1].states
 
 
 def test_real_time_factor_is_that_of_lockstep_runs(tmp_path: Path) -> None:

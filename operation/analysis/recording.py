@@ -95,6 +95,13 @@ class RunRecord(Trajectory):
         if not (isinstance(message, CarSample) and found and found[-1].time_s == message.time_s):
             found.append(message)
 
+    def copy(self) -> "RunRecord":
+        """A record that stays as it is while messages are added to this one."""
+        copies: dict[str, Any] = {
+            one.name: list(getattr(self, one.name)) for one in fields(self)[1:]
+        }
+        return replace(self, **copies)
+
     @property
     def moments(self) -> Sequence[CarSample]:  # type: ignore[override]
         """The truth, sample by sample."""
@@ -238,20 +245,21 @@ class RecordingReader:
         return _RunsOfLog(self._directory / "run.mcap")
 
     def runs(self) -> dict[int, RunRecord]:
-        """What has been recorded up to now of each run, by its number; InputError if there is no
-        log."""
-        return self._log.read()
+        """What has been recorded up to now of each run, by its number, without what later calls
+        find; InputError if there is no log."""
+        self._log.read()
+        return self._log.runs()
 
     def recording(self) -> Recording:
         """The run directory as it is now; InputError if it is none of a race."""
         settings = _read_settings(self._directory / "settings.json")
         track, line = _driven_on(self._directory, settings, "track", "race")
         self._log.read()
-        planned, reader = self._log.planned, self._log.reader
+        planned, reader = self._log.planned(), self._log.reader
         training, whole = _read_training(self._directory, settings)
         return Recording(
-            directory=self._directory, settings=settings, track=track, line=line, runs=planned,
-            truth=_with_truth(planned), training=training,
+            directory=self._directory, settings=settings, track=track, line=line,
+            runs=_with_truth(planned), truth=_has_truth(planned), training=training,
             truncated=reader.truncated or not whole, refused=reader.refused,
             started_ns=self._log.started_ns,
         )  # fmt: skip
@@ -286,10 +294,9 @@ def _read_training(run_dir: Path, settings: dict[str, Any]) -> tuple[TrainingRec
     except InputError as error:
         _log.warning("the training drive is left out: %s", error)
         return None, False
-    planned = runs.planned
+    planned = _with_truth(runs.planned())
     if not planned:
         return None, False
-    _with_truth(planned)
     whole = not (runs.reader.truncated or runs.reader.refused)
     return TrainingRecord(planned[-1], track, line), whole
 
@@ -303,13 +310,16 @@ class _RunsOfLog:
         """Calendar time of the first message [ns since 1970]."""
         self._runs: dict[int, RunRecord] = {}
 
-    @property
-    def planned(self) -> list[RunRecord]:
-        """The runs that were announced, in order."""
-        return [record for _, record in sorted(self._runs.items()) if record.plan.controller]
+    def runs(self) -> dict[int, RunRecord]:
+        """Copies of all runs, by their number."""
+        return {run: record.copy() for run, record in self._runs.items()}
 
-    def read(self) -> dict[int, RunRecord]:
-        """Takes in what has been added to the log; all runs by their number."""
+    def planned(self) -> list[RunRecord]:
+        """Copies of the runs that were announced, in order."""
+        return [record for _, record in sorted(self.runs().items()) if record.plan.controller]
+
+    def read(self) -> None:
+        """Takes in what has been added to the log."""
         for entry in self.reader.newer([topic for topic in TOPICS if topic is not HEARTBEAT]):
             if self.started_ns is None:
                 self.started_ns = entry.log_time_ns
@@ -321,16 +331,21 @@ class _RunsOfLog:
                 record.add(message)
             else:  # a state can overtake it, since it comes from another process
                 record.plan = plan
-        return self._runs
 
 
-def _with_truth(planned: Sequence[RunRecord]) -> bool:
-    """Whether the runs have a truth; measurements take its place where none has."""
-    truth = any(record.truth for record in planned)
-    for record in planned if not truth else ():
-        names = [one.name for one in fields(Truth)]
-        record.truth = [Truth(**{n: getattr(state, n) for n in names}) for state in record.states]
-    return truth
+def _has_truth(runs: Sequence[RunRecord]) -> bool:
+    return any(record.truth for record in runs)
+
+
+def _with_truth(runs: Sequence[RunRecord]) -> list[RunRecord]:
+    """The runs; measurements take the place of the truth where none has one."""
+    if _has_truth(runs):
+        return list(runs)
+    names = [one.name for one in fields(Truth)]
+    return [
+        replace(run, truth=[Truth(**{n: getattr(one, n) for n in names}) for one in run.states])
+        for run in runs
+    ]
 
 
 def _read_settings(path: Path) -> dict[str, Any]:
