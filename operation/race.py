@@ -234,14 +234,18 @@ class _Drives:
         return self.drive(controller)
 
     def samples(self, plan: RunPlan) -> Dataset:
-        """What can be learned from a run, from the log."""
+        """What can be learned from a run, from the log; InputError names both."""
         self._recorder.drain(at_most_s=20.0)
+        named = f"{self._race.out / FILES.log}, run {plan.run} ({plan.controller})"
         record = self.reader.runs().get(plan.run)
         if record is None:
-            raise InputError(f"run {plan.run} ({plan.controller}) is not in the log")
+            raise InputError(f"{named}: the log does not hold it")
         step_s = self._race.settings.discretisation.step_s
         fallback = fallback_cycles(record.telemetry)
-        return dataset_from_messages(record.states, fallback, self._race.car, step_s)
+        try:
+            return dataset_from_messages(record.states, fallback, self._race.car, step_s)
+        except InputError as error:
+            raise InputError(f"{named}: {error}") from error
 
 
 def race(settings: RaceSettings, out: Path, stages: Stages) -> Recording:

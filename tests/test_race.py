@@ -8,11 +8,14 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from rich.console import Console
 
+from bayesrace.errors import InputError
 from bayesrace.gp.weights import read_weights, write_weights
 from bayesrace.vehicles import default_car, read_car, write_car
 from codegen.build import build
@@ -20,6 +23,7 @@ from codegen.settings import BuildSettings
 from operation import race as driving
 from operation.analysis.race import analyse
 from operation.analysis.results import RaceResult, read_result
+from operation.drive import RunPlan
 from operation.preparation import Prepared, prepare, updated_weights
 from operation.settings import RaceSettings
 from operation.terminal.progress import stages_on
@@ -28,6 +32,7 @@ from tests.command_line import Cli, refused
 from tests.foreign_fmu import FOREIGN_MAP, build_foreign_fmu
 from tests.programs import Race, leftovers
 from tests.reference import reference_file
+from tests.synthetic_race import Drive, circle, write_race
 
 pytestmark = pytest.mark.unmeasured
 
@@ -320,6 +325,18 @@ def test_report_makes_the_same_again_from_the_log(
     table = [line for line in done.out.splitlines() if line.split()[:1] == ["bestcase"]]
     assert table
     assert table[0] in peanut_race.process.stdout
+
+
+def test_a_run_that_cannot_be_learned_from_is_named_with_its_log(tmp_path: Path) -> None:
+    write_race(tmp_path, [Drive("worstcase", circle(np.zeros(1), 1.0))])
+    recorder: Any = SimpleNamespace(drain=lambda at_most_s: None)
+    race: Any = SimpleNamespace(out=tmp_path, settings=RaceSettings(), car=default_car())
+    unused: Any = None
+    drives = driving._Drives(race, unused, unused, recorder)
+    for run, reason in ((1, "no two states follow one another"), (2, "the log does not hold it")):
+        plan = RunPlan(run, "worstcase", 2, 10.0, True, 0.0)
+        with pytest.raises(InputError, match=rf"run\.mcap, run {run} \(worstcase\): {reason}"):
+            drives.samples(plan)
 
 
 def test_a_run_directory_is_never_overwritten(peanut_race: Race, cli: Cli) -> None:
