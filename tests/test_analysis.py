@@ -23,7 +23,7 @@ from operation.analysis.laps import Trajectory, time_laps
 from operation.analysis.race import analyse, read_race, read_result, write_result
 from operation.analysis.recording import RecordingReader, RunRecord, read_recording
 from operation.analysis.results import LapResult, RaceResult
-from operation.report import render_report
+from operation.report import write_report
 from operation.terminal.race_table import COLUMNS, print_table
 from plant.simulator import Simulator, plant_discretisation
 from tests.synthetic_race import LAP_S, LINE_M, STEP_S, Drive, circle, track, write_race
@@ -304,7 +304,7 @@ def test_runs_of_one_controller_are_numbered(tmp_path: Path) -> None:
     text = io.StringIO()
     print_table(result, Console(file=text, width=80))
     assert "\nbayesrace-limit 2 " in text.getvalue()
-    page = render_report(tmp_path).read_text()
+    page = write_report(tmp_path).read_text()
     assert "BayesRace at the limit, 2</b>" in page
     assert "BestCase</b>" in page
 
@@ -322,7 +322,7 @@ def test_refused_weights_are_a_row_with_the_reason(tmp_path: Path) -> None:
     rows = [line.split() for line in text.getvalue().splitlines()]
     assert ["bayesrace-updated", "refused", "–"] in [row[:3] for row in rows]
     assert "bayesrace-updated: refused: absurd over the car's range" in text.getvalue()
-    page = render_report(tmp_path).read_text()
+    page = write_report(tmp_path).read_text()
     assert '<div class="time">refused</div>' in page
     assert "absurd over the car&#39;s range" in page
 

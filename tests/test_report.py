@@ -1,9 +1,15 @@
 """The report: one file with the numbers of the result, from whatever a race has left."""
 
+import io
+import logging
+import os
 import re
 import shutil
+import signal
+import sys
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +17,9 @@ import pytest
 from operation.analysis.published import compare_gp, compare_laps
 from operation.analysis.race import analyse, read_race
 from operation.analysis.results import RaceResult
-from operation.report import render_report
+from operation.report import render, write_report
+from operation.report.fork import forked
+from operation.report.maps import LapMaps
 from operation.terminal.race_table import COLUMNS
 from tests.synthetic_race import LAP_S, Drive, circle, write_race
 from tests.test_analysis import TWO_LAPS, race
@@ -56,7 +64,7 @@ def parse(page: Path) -> _Tables:
 def rendered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RaceResult]:
     path = race(tmp_path_factory.mktemp("race"))
     analysis = read_race(path)
-    return render_report(path, analysis), analysis.result
+    return write_report(path, analysis), analysis.result
 
 
 def test_the_page_needs_nothing_but_itself(rendered: tuple[Path, RaceResult]) -> None:
@@ -89,6 +97,76 @@ def test_a_picture_lies_beside_the_page(rendered: tuple[Path, RaceResult]) -> No
     assert not list(rendered[0].parent.glob("*.part*"))
 
 
+def test_a_report_does_not_need_the_process_that_draws_its_maps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = os.getpid()
+    path = write_race(tmp_path, [Drive("bestcase", circle(TWO_LAPS, 1.0))])
+    text = write_report(path).read_bytes()
+    picture = (path / "lap.png").read_bytes()
+    (path / "lap.png").unlink()
+
+    class Killed(LapMaps):
+        def __init__(self, *given: Any) -> None:
+            if os.getpid() != here:
+                os.kill(os.getpid(), signal.SIGKILL)
+            super().__init__(*given)
+
+    monkeypatch.setattr(render, "LapMaps", Killed)
+    assert write_report(path).read_bytes() == text
+    assert (path / "lap.png").read_bytes() == picture
+
+
+@pytest.mark.parametrize("part", ["_maps", "_panels"])
+def test_where_drawing_fails_the_report_before_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str
+) -> None:
+    path = write_race(tmp_path, [Drive("bestcase", circle(TWO_LAPS, 1.0))])
+    write_report(path)
+    before = {file.name: file.stat().st_mtime_ns for file in path.iterdir()}
+
+    def failing(*_: object) -> None:
+        raise ArithmeticError
+
+    monkeypatch.setattr(render, part, failing)
+    with pytest.raises(ArithmeticError):
+        write_report(path)
+    assert {file.name: file.stat().st_mtime_ns for file in path.iterdir()} == before
+
+
+def test_a_copy_of_the_process_ignores_interrupts_and_leaves_streams_alone(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    here = os.getpid()
+
+    class Locked(io.StringIO):
+        """In a copy of the process, as a stream whose lock another thread held at the fork."""
+
+        def write(self, text: str) -> int:
+            self.flush()
+            return super().write(text)
+
+        def flush(self) -> None:
+            if os.getpid() != here:
+                os.kill(os.getpid(), signal.SIGKILL)
+
+    def work() -> str:
+        if os.getpid() == here:
+            return "by this process"
+        os.kill(os.getpid(), signal.SIGINT)
+        sys.stdout.write("drawing")
+        logging.getLogger("bayesrace.report").warning("drawn")
+        return "by a copy"
+
+    monkeypatch.setattr(sys, "stdout", Locked())
+    monkeypatch.setattr(sys, "stderr", Locked())
+    handler = logging.StreamHandler(sys.stderr)
+    monkeypatch.setattr(logging.getLogger("bayesrace.report"), "handlers", [handler])
+    with forked(work) as result:
+        assert result() == "by a copy"
+    assert capfd.readouterr() == ("", "")
+
+
 def test_the_papers_numbers_stand_only_beside_laps_on_its_track(
     rendered: tuple[Path, RaceResult],
 ) -> None:
@@ -111,7 +189,7 @@ def test_a_race_that_was_cut_off_still_gets_its_page(tmp_path: Path) -> None:
     path = race(tmp_path)
     data = (path / "run.mcap").read_bytes()
     (path / "run.mcap").write_bytes(data[: int(0.3 * len(data))])
-    page = render_report(path)
+    page = write_report(path)
     text = page.read_text(encoding="utf-8")
     assert "The log is not complete" in text
     assert "DNF" in text
@@ -132,22 +210,22 @@ def test_a_damaged_log_of_the_training_drive_leaves_the_race_its_page(
     assert result.complete == (share == 1)
     assert (result.training is not None) == shown
     assert len(result.laps) == len(analyse(training).laps)
-    assert render_report(path).is_file()
+    assert write_report(path).is_file()
 
 
 @pytest.mark.parametrize("states", [0, 1, 2])
 def test_a_race_that_hardly_began_still_gets_its_page(tmp_path: Path, states: int) -> None:
     drive = Drive("bestcase", circle(TWO_LAPS[:states], 1.0), ended=None)
     path = write_race(tmp_path, [drive])
-    assert render_report(path).is_file()
+    assert write_report(path).is_file()
     path = write_race(tmp_path / "empty", [])
-    assert render_report(path).is_file()
+    assert write_report(path).is_file()
 
 
 def test_names_from_files_are_text_not_markup(tmp_path: Path) -> None:
     drive = Drive("<script>alert(1)</script>", circle(TWO_LAPS, 1.0), ended="<b>over</b>")
     path = write_race(tmp_path, [drive])
-    tags = parse(render_report(path)).tags
+    tags = parse(write_report(path)).tags
     assert "script" not in tags
 
 
@@ -178,7 +256,6 @@ def test_nothing_but_tables_is_wider_than_a_telephone(rendered: tuple[Path, Race
 
 
 def test_a_car_that_wanders_off_does_not_shrink_the_track(tmp_path: Path) -> None:
-    from operation.report.maps import LapMaps
     from operation.report.style import figure_style
 
     far = circle(TWO_LAPS[:100], np.linspace(1.0, 50.0, 100))

@@ -21,7 +21,7 @@ from controller.pure_pursuit import DrivingStyle, PurePursuitSettings
 from operation.analysis.race import analyse
 from operation.closed_loop import Driven, built_in_car
 from operation.collect import collect
-from operation.report import render_report
+from operation.report import write_report
 from operation.terminal.race_table import print_table
 from operation.training_line import drive_length_s, training_line, training_margin_m
 from tests.command_line import Cli
@@ -138,7 +138,7 @@ def test_a_race_reports_its_training_drive(
     said = f"none of 601 samples off the track, up to {training.speed_max_mps:.2f} m/s"
     assert f"training drive on paddock: laps {one.laps_s[0]:.3f}" in text.getvalue()
     assert said in text.getvalue()
-    page = render_report(run).read_text()
+    page = write_report(run).read_text()
     assert said in page
     section = page.split('<section id="training">')[1].split("</section>")[0]
     assert section.count("<svg ") == 4  # the map, and three pictures of the states

@@ -149,11 +149,11 @@ def race(
         with stages.stage("result and report"):
             # They take a second to import, which the race does while its controllers start.
             from operation.analysis.race import RaceAnalysis
-            from operation.report import render_report
+            from operation.report import write_report
             from operation.terminal.race_table import print_table
 
             analysis = RaceAnalysis(recording)
-            report = render_report(out, analysis)
+            report = write_report(out, analysis)
     print_table(analysis.result, console)
     console.print(f"{report}", highlight=False, soft_wrap=True)
 
@@ -167,13 +167,13 @@ def report(
     """Compute result.json, the table and report.html again from a run's log."""
 
     from operation.analysis.race import read_race
-    from operation.report import render_report
+    from operation.report import write_report
     from operation.terminal.race_table import print_table
     from operation.terminal.terminal import Terminal
 
     with _uncollected():
         analysis = read_race(run)
-        page = render_report(run, analysis)
+        page = write_report(run, analysis)
     print_table(analysis.result, Terminal())
     typer.echo(str(page))
 

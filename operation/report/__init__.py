@@ -1,5 +1,5 @@
 """The report of a race: one self-contained HTML file, and one picture. Imports matplotlib."""
 
-from operation.report.render import render_report
+from operation.report.render import write_report
 
-__all__ = ["render_report"]
+__all__ = ["write_report"]

@@ -8,9 +8,9 @@ from typing import Final
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bayesrace.files import replacing
+from bayesrace.files import replacing, write_whole
 
-__all__ = ["PANEL_WIDTH", "inline_svg", "panel", "write_pdf", "write_png"]
+__all__ = ["PANEL_WIDTH", "inline_svg", "panel", "png", "write_pdf", "write_png"]
 
 PANEL_WIDTH: Final = 5.2
 """Of a panel [inch]: legible on a telephone, and two beside each other on a wide page."""
@@ -57,7 +57,13 @@ def write_pdf(figure: Figure, path: Path) -> None:
         figure.savefig(partial, format="pdf", metadata={"CreationDate": None})
 
 
+def png(figure: Figure, dpi: int = 120) -> bytes:
+    """The content of a PNG file with the figure."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
+    return buffer.getvalue()
+
+
 def write_png(figure: Figure, path: Path, dpi: int = 120) -> None:
     """Writes the figure as a PNG file, whole or not at all."""
-    with replacing(path) as partial:
-        figure.savefig(partial, format="png", dpi=dpi, metadata={"Software": None})
+    write_whole(path, png(figure, dpi))

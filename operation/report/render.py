@@ -1,14 +1,13 @@
-"""The report page: figures and tables put into the template."""
+"""The report: figures and tables put into the template, and the files beside the page."""
 
 import platform
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
-from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Final
+from typing import Final, NamedTuple
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from matplotlib.figure import Figure
@@ -19,8 +18,9 @@ from bayesrace.manifest import Manifest
 from operation.analysis.published import LIMIT, SOURCE, compare_gp, compare_laps
 from operation.analysis.race import DrivenRun, RaceAnalysis, read_race, write_result
 from operation.analysis.results import RaceResult
-from operation.report.canvas import inline_svg, write_png
+from operation.report.canvas import inline_svg, png
 from operation.report.coverage import coverage_figures
+from operation.report.fork import forked
 from operation.report.gp import gp_figures
 from operation.report.maps import LapMaps
 from operation.report.style import figure_style, look, numbered
@@ -36,37 +36,36 @@ from operation.report.traces import (
 from operation.terminal.notation import UNCERTAIN
 from operation.terminal.race_table import COLUMNS, GP_COLUMNS, drive_text, gp_cells
 
-__all__ = ["PICTURE", "REPORT", "render_report", "template"]
+__all__ = ["PICTURE", "REPORT", "RESULT", "template", "write_report"]
 
+RESULT: Final = "result.json"
 REPORT: Final = "report.html"
 PICTURE: Final = "lap.png"
-RESULT: Final = "result.json"
 
 _TEMPLATE: Final = "report.html.j2"
 _PACKAGES: Final = ("bayesrace", "casadi", "numpy", "scipy", "eclipse-zenoh")
 
 
-def render_report(run_dir: Path, analysis: RaceAnalysis | None = None) -> Path:
-    """Writes ``result.json``, ``report.html`` and ``lap.png`` into the run directory; returns the
+def write_report(run_dir: Path, analysis: RaceAnalysis | None = None) -> Path:
+    """Writes ``result.json``, ``lap.png`` and ``report.html`` into the run directory; returns the
     page's path.
 
-    ``analysis`` saves reading the log a second time. InputError if it is no run directory.
-
-    Laps on the track are half of the drawing: a copy of this process does that, while this one
-    computes the result and draws the rest.
+    ``analysis`` saves reading the log a second time. Nothing is written before everything has been
+    computed and drawn: an earlier report stays as it is otherwise. InputError if it is no run
+    directory.
     """
     run_dir = Path(run_dir)
     analysis = analysis or read_race(run_dir)
-    shared = analysis, run_dir / PICTURE
-    with ProcessPoolExecutor(1, get_context("fork"), _share, shared) as pool:
-        maps = pool.submit(_maps)
-        write_result(run_dir / RESULT, analysis.result)
+    # Laps on the track are half of the drawing: one process does that, another one the rest.
+    with forked(partial(_maps, analysis)) as wait_for_maps:
         with figure_style():
             figures = _svg(_panels(analysis, analysis.result))
-        page = _page(run_dir, analysis, figures | maps.result())
-    path = run_dir / REPORT
-    write_whole(path, page)
-    return path
+        maps = wait_for_maps()
+    page = _page(run_dir, analysis, figures | maps.figures)
+    write_result(run_dir / RESULT, analysis.result)
+    write_whole(run_dir / PICTURE, maps.picture)
+    write_whole(run_dir / REPORT, page)
+    return run_dir / REPORT
 
 
 def _page(run_dir: Path, analysis: RaceAnalysis, figures: Mapping[str, Sequence[str]]) -> str:
@@ -161,21 +160,18 @@ def _uncertain(analysis: RaceAnalysis) -> list[tuple[str, int, int]]:
     ]
 
 
-_shared: list[Any] = []
-"""In the process that draws maps: the analysis, and the file of the picture."""
+class _Maps(NamedTuple):
+    figures: dict[str, list[str]]
+    """Name to panels as SVG: laps on the track, and the training drive."""
+    picture: bytes
+    """Of the laps, as PNG."""
 
 
-def _share(*values: Any) -> None:
-    _shared[:] = values
-
-
-def _maps() -> dict[str, list[str]]:
-    """Name to panels as SVG: laps on the track, and the training drive; writes the picture, too."""
-    analysis, picture = _shared
+def _maps(analysis: RaceAnalysis) -> _Maps:
     driven = _driven(analysis)
     with figure_style():
         maps = LapMaps(driven, analysis.track, analysis.line)
-        write_png(maps.picture(), picture)
+        picture = png(maps.picture())
         figures = {"laps": maps.figures()}
         if (found := analysis.recording.training) is not None and analysis.training is not None:
             training = LapMaps([analysis.training], found.track, found.line)
@@ -183,7 +179,7 @@ def _maps() -> dict[str, list[str]]:
                 *training.figures(),
                 *coverage_figures(analysis.training, driven),
             ]
-        return _svg(figures)
+        return _Maps(_svg(figures), picture)
 
 
 def _panels(analysis: RaceAnalysis, result: RaceResult) -> dict[str, list[Figure]]:
