@@ -1,5 +1,6 @@
 """The command line as a program: help that reads well, its start, its output on any terminal."""
 
+import gc
 import re
 import subprocess
 import sys
@@ -86,6 +87,12 @@ def test_without_a_command_help_is_shown(cli: Cli) -> None:
     outcome = cli()
     assert "Usage: bayesrace" in outcome.out + outcome.err
     assert "bayesrace: \n" not in outcome.err
+
+
+def test_a_call_from_python_leaves_its_objects_to_garbage_collection(cli: Cli) -> None:
+    before = gc.get_freeze_count()
+    cli("--version")
+    assert gc.get_freeze_count() == before
 
 
 def test_version(cli: Cli) -> None:

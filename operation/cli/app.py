@@ -1,5 +1,6 @@
 """The Typer application: subcommands grouped by task, and errors as one line."""
 
+import atexit
 import gc
 import io
 import logging
@@ -93,6 +94,8 @@ def _options(
 
 def main() -> None:
     """Runs the command line; bad input and lost processes end in one line, not in a traceback."""
+    # At the very end the interpreter looks for cyclic garbage once more, 0.05 s and longer.
+    atexit.register(gc.freeze)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal may lack characters that we print
             stream.reconfigure(errors="replace")
@@ -102,7 +105,6 @@ def main() -> None:
             code = app(standalone_mode=False, prog_name="bayesrace")
             if code == _INTERRUPTED:
                 raise KeyboardInterrupt
-        gc.freeze()  # the process ends: nothing is worth looking for
         sys.exit(code)
     except (typer.Abort, KeyboardInterrupt):
         _fail("interrupted", _INTERRUPTED)
