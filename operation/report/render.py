@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from pydantic import ValidationError
 
 from bayesrace.files import write_whole
+from bayesrace.interrupts import raise_if_interrupted
 from bayesrace.manifest import Manifest
 from operation.analysis.published import LIMIT, SOURCE, compare_gp, compare_laps
 from operation.analysis.race import DrivenRun, RaceAnalysis, read_race, write_result
@@ -62,6 +63,7 @@ def write_report(run_dir: Path, analysis: RaceAnalysis | None = None) -> Path:
             figures = _svg(_panels(analysis, analysis.result))
         maps = wait_for_maps()
     page = _page(run_dir, analysis, figures | maps.figures)
+    raise_if_interrupted()
     write_result(run_dir / RESULT, analysis.result)
     write_whole(run_dir / PICTURE, maps.picture)
     write_whole(run_dir / REPORT, page)
