@@ -54,6 +54,7 @@ SETTINGS = MpcSettings(
     iterations=1,
     iterations_cold=30,
 )
+CAUTIOUS = SETTINGS.model_copy(update={"caution": 0.95})
 """Written out, so that tuning the defaults does not change what is tested."""
 
 TRUTH = Discretisation(scheme="rk4", step_s=0.02, substeps=20)
@@ -274,15 +275,26 @@ def drive(
     return problems, np.array(inputs)
 
 
+def ready(
+    artefact: Path,
+    car: CarParameters,
+    weights: GpWeights,
+    circuit: Circuit,
+    settings: MpcSettings,
+) -> NativeStep:
+    """A GP controller on the circuit."""
+    step = NativeStep(artefact, car, settings)
+    step.set_weights(weights)
+    step.set_path(circuit.table)
+    return step
+
+
 @pytest.fixture
 def native(
     kinematic_artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit
 ) -> NativeStep:
     """A ready GP controller on the circuit."""
-    step = NativeStep(kinematic_artefact, car, SETTINGS)
-    step.set_weights(weights)
-    step.set_path(circuit.table)
-    return step
+    return ready(kinematic_artefact, car, weights, circuit, SETTINGS)
 
 
 @pytest.fixture(scope="session")

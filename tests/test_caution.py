@@ -25,26 +25,11 @@ from operation.closed_loop import ClosedLoop, built_in_car
 from operation.preparation import prepare
 from operation.settings import RaceSettings
 from operation.terminal.progress import stages_on
-from tests.conftest import SETTINGS, Circuit, discrete, fit_weights, smooth_drive
-
-CAUTIOUS = SETTINGS.model_copy(update={"caution": 0.95})
+from tests.conftest import CAUTIOUS, SETTINGS, Circuit, discrete, fit_weights, ready, smooth_drive
 
 
 def first_points(output: GpOutput, count: int) -> GpOutput:
     return replace(output, inputs=output.inputs[:count], alpha=output.alpha[:count])
-
-
-def ready(
-    artefact: Path,
-    car: CarParameters,
-    weights: GpWeights,
-    circuit: Circuit,
-    settings: MpcSettings = CAUTIOUS,
-) -> NativeStep:
-    step = NativeStep(artefact, car, settings)
-    step.set_weights(weights)
-    step.set_path(circuit.table)
-    return step
 
 
 @pytest.fixture
@@ -127,7 +112,7 @@ def test_the_tube_adds_correlated_errors_up_along_the_plan(
     kinematic_artefact: Path, car: CarParameters, unsure: GpWeights, circuit: Circuit
 ) -> None:
     """Against NumPy: regulator, propagation, and the share of each stage's normal."""
-    step = ready(kinematic_artefact, car, unsure, circuit)
+    step = ready(kinematic_artefact, car, unsure, circuit, CAUTIOUS)
     plant, x, u = discrete(dynamic(car)), circuit.start(), np.zeros(2)
     for _ in range(25):
         assert step.step(x, u).usable
@@ -194,7 +179,7 @@ def test_the_reference_does_not_leap_when_nothing_is_uncertain_any_more(
     kinematic_artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit
 ) -> None:
     """As after a rollback to no weights."""
-    step = ready(kinematic_artefact, car, noisy(weights, 100), circuit)
+    step = ready(kinematic_artefact, car, noisy(weights, 100), circuit, CAUTIOUS)
     x, u, paces = driven(step, car, circuit, 40)
     assert step.step(np.full(7, np.nan), u) is StepStatus.BAD_STATE
     assert step.info.pace == paces[-1]  # also that of a step that plans nothing
@@ -211,7 +196,7 @@ def test_the_plan_keeps_its_uncertainty_away_from_the_edge(
     side: int, bound: int,
 ) -> None:  # fmt: skip
     """Of a track that ends 1 cm beside the line, on either side."""
-    step = ready(kinematic_artefact, car, weights, circuit)
+    step = ready(kinematic_artefact, car, weights, circuit, CAUTIOUS)
     x, u, _ = driven(step, car, circuit, 25)
     line = step.read_reference()
     along = np.sum(line[:, 2:4] * line[:, :2], axis=1)

@@ -24,21 +24,16 @@ from operation.closed_loop import ClosedLoop, built_in_car
 from operation.preparation import prepare
 from operation.settings import RaceSettings
 from operation.terminal.progress import stages_on
-from tests.conftest import SETTINGS, Circuit
+from tests.conftest import CAUTIOUS, Circuit, ready
 from tests.cycle_rig import state
 
-CAUTIOUS = SETTINGS.model_copy(update={"caution": 0.95})
 STEP_S = PREDICTION.step_s
 
 
 @pytest.fixture
-def step(
-    kinematic_artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit
-) -> NativeStep:
-    step = NativeStep(kinematic_artefact, car, CAUTIOUS)
-    step.set_weights(weights)
-    step.set_path(circuit.table)
-    return step
+def step(native: NativeStep, car: CarParameters) -> NativeStep:
+    native.set_parameters(car, CAUTIOUS)
+    return native
 
 
 def drive(
@@ -91,9 +86,7 @@ def test_the_preparation_changes_nothing(
     """Also if parameters are set between it and the step."""
     ends = []
     for prepared in (False, True):
-        step = NativeStep(kinematic_artefact, car, CAUTIOUS)
-        step.set_weights(weights)
-        step.set_path(circuit.table)
+        step = ready(kinematic_artefact, car, weights, circuit, CAUTIOUS)
         first, _, _ = drive(step, circuit, np.array([0.03, 0.01, 1.0]), 20, prepared)
         step.set_parameters(car, CAUTIOUS.model_copy(update={"caution": 0.9}))
         again, states, inputs = drive(step, circuit, np.zeros(3), 5, prepared)
@@ -145,9 +138,7 @@ def test_twice_the_error_in_twice_the_time_counts_twice(
     """In the mean over time: the error of each stage is the same."""
     last = []
     for stages in (1, 2):
-        step = NativeStep(kinematic_artefact, car, CAUTIOUS)
-        step.set_weights(weights)
-        step.set_path(circuit.table)
+        step = ready(kinematic_artefact, car, weights, circuit, CAUTIOUS)
         x, u = circuit.start(), np.zeros(2)
         for _ in range(3):
             assert step.step(x, u).usable

@@ -129,8 +129,8 @@ def open_session(
     end. An absent peer is no error: the session connects as soon as it appears, and the log says
     that it waits. See :class:`.Inbox` for waiting with a limit.
 
-    ``peers_follow``: the caller has just started the peers, or is about to. Nobody can answer yet,
-    so opening the session does not wait for them, and the log does not say that they are absent.
+    ``peers_follow``: the caller starts the peers itself, just before or after this call. Opening
+    the session then does not wait for them, and the log does not say that they are absent.
 
     Where the process's certificate expires (``grace_s`` later) or turns out to be revoked, the main
     thread gets a SIGINT, and the end of the block raises InputError with the reason.

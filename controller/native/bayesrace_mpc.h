@@ -148,9 +148,9 @@ BR_API br_mpc_error br_mpc_solve(br_mpc *mpc, const double x[BR_NX], const doubl
                                  const br_mpc_reference reference[BR_N], double u[BR_NU],
                                  br_mpc_status *status, br_mpc_info *info);
 
-/* What the car did between two measured states, with the mean of the inputs that acted meanwhile:
- * it tells whether the residual's standard deviations cover its errors. Where they do not, caution
- * widens them from the step after the next on (info->widening), until br_mpc_reset or other
+/* Compares what the car did between two measured states, under the mean of the inputs that acted
+ * meanwhile, with the prediction. Where the residual's standard deviations do not cover the errors,
+ * caution widens them from the step after the next on (info->widening), until br_mpc_reset or other
  * weights. For consecutive states of a car that moves, about a stage apart, by the thread that
  * steps; the newest before a step counts. Never needed; without caution it changes nothing.
  * BR_ERROR_TIME for a duration that is not above 0 and at most BR_PREDICT_MAX_S, BR_ERROR_STATE as

@@ -1,14 +1,14 @@
 /* The residual's standard deviations against what the car does: where errors from one measured
  * state to the next are larger than these say, they are widened.
  *
- * A posterior knows how far the plan is from its samples. It does not know that the car has changed
- * since, on a damp track for instance: there it is wrong and sure of itself. What tells is the
- * innovation, the difference between the state measured and the one predicted from the state before
- * (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001,
- * section 5.4, the test of consistency). For each output the mean of |error| / sigma over RECENT
- * stages is compared with what it comes to at most where sigma is right. The largest mean counts
- * and is forgotten over HELD stages, some laps' worth of bends, because on a straight nothing is
- * wrong.
+ * The posterior variance grows with the distance of the plan from the samples. It stays small near
+ * the samples when the car has changed since, on a damp track for instance, although the mean is
+ * wrong there. The innovation shows it, the difference between the state measured and the one
+ * predicted from the state before (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to
+ * Tracking and Navigation", 2001, section 5.4, the test of consistency). For each output the mean
+ * of |error| / sigma over RECENT stages is compared with what it comes to at most where sigma is
+ * right. The largest mean counts and is forgotten over HELD stages, some laps' worth of bends,
+ * because on a straight nothing is wrong.
  *
  * A step uses what was observed before the step before it, so that it is the same with and without
  * a preparation.
