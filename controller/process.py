@@ -62,6 +62,12 @@ _REHEARSAL_NS: Final = 700_000
 _COLD_NS: Final = 5_000_000
 """Periods from which on caches are cold at each release; at higher rates there is no rehearsal."""
 
+_WAY: Final = 0.05
+"""How long after a cycle the preparation begins (fraction of the period): the threads that take the
+actuation to the plant need the CPU first ..."""
+_WAY_NS: Final = 1_000_000
+"""... and at most."""
+
 _ROOM: Final = 2.0
 """Time that a late cycle must still have within the budget, in times of the cycle before it. It
 takes longer than that one: no preparation has gone before."""
@@ -277,6 +283,7 @@ class ControllerProcess:
         """New weights, and the preparation of the next cycle, in what is left of the budget."""
         if self._adoption is not None:
             self._adoption.between_cycles(self._next_cycle)
+        time.sleep(min(_WAY * self._schedule.period_ns, _WAY_NS) * 1e-9)
         left_s = (self._budget_end_ns - time.monotonic_ns()) * 1e-9
         if left_s > 0:
             until_next_ns = self._schedule.deadline_ns - self._timing.released_ns

@@ -1,11 +1,13 @@
 """Sessions, publishers, the inbox and requests, over real loopback links within one process."""
 
 import json
+import re
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -465,3 +467,20 @@ def test_an_inbox_takes_several_topics_each_with_its_own_depth_and_decoder(
             lockstep=True,
         )
         assert {take(receiver, Kind.MESSAGE).name for _ in range(2)} == {"state", "event"}
+
+
+@pytest.mark.skipif(
+    not Path("/proc/self/sched").exists() or "se.slice" not in Path("/proc/self/sched").read_text(),
+    reason="this kernel does not tell slices: before Linux 6.12, or not Linux",
+)
+def test_threads_of_the_transport_have_shorter_slices_than_their_owner() -> None:
+    """So that a message that wakes them does not wait for the thread that computes."""
+    with private_endpoints("slices") as (endpoint,), open_session(Endpoints(listen=(endpoint,))):
+        slices_ns = {
+            (task / "comm").read_text()[:3]: int(re.findall(r"se\.slice\D*(\d+)", text)[0])
+            for task in Path("/proc/self/task").iterdir()
+            for text in [(task / "sched").read_text()]
+        }
+    owner = int(re.findall(r"se\.slice\D*(\d+)", Path("/proc/thread-self/sched").read_text())[0])
+    assert {"app", "net"} <= slices_ns.keys()
+    assert max(slices_ns["app"], slices_ns["net"]) < owner

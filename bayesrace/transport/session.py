@@ -18,6 +18,7 @@ import zenoh
 
 from bayesrace.errors import InputError
 from bayesrace.messages import Role
+from bayesrace.realtime import short_slices
 from bayesrace.transport.access import access_control
 from bayesrace.transport.credentials import AUTHORITY, CERTIFICATE, KEY, Credentials
 from bayesrace.transport.endpoints import Endpoints, leaves
@@ -207,7 +208,8 @@ def _checked(endpoints: Endpoints, role: Role, peers_follow: bool = False) -> li
 @contextmanager
 def _opened(endpoints: Endpoints, role: Role, peers_follow: bool) -> Iterator[Any]:
     try:
-        session = zenoh.open(zenoh_config(endpoints, role, peers_follow=peers_follow))
+        with short_slices():
+            session = zenoh.open(zenoh_config(endpoints, role, peers_follow=peers_follow))
     except zenoh.ZError as error:
         text = re.sub(r" at /\S+", "", str(error).splitlines()[0])  # places in Zenoh's source
         cause = re.search(r"[^:\[]+ \(os error \d+\)", text)
