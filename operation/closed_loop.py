@@ -9,12 +9,13 @@ import gc
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from bayesrace.arrays import Floats
@@ -195,7 +196,7 @@ class ClosedLoop:
         plan = RunPlan(self._run, name, laps, max_time_s, True, start_speed_mps)
         request = run_request(self._track, plan)
         if x0 is not None:
-            request = replace(request, x0=tuple(map(float, x0)))
+            request = structs.replace(request, x0=tuple(map(float, x0)))
         sensors = Sensors(self._noise, self._seed)
         run = CarRun(request, self._vehicle, _EPOCH, sensors, 2 * self._delay_s)
         self._states: list[State] = []

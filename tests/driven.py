@@ -1,7 +1,6 @@
 """Driven samples that need no track: smooth random inputs, as arrays, messages and log files."""
 
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_type_hints
 
@@ -44,7 +43,7 @@ def drive(model: Model, count: int, seed: int, substeps: int = 10, vx: float = 1
 def blank(kind: type[M], /, **known: Any) -> M:
     """A message of this kind; fields that are not ``known`` are zero or empty."""
     kinds = get_type_hints(kind, include_extras=True)
-    names = {one.name for one in fields(kind)} - set(known)
+    names = set(kind.__struct_fields__) - set(known)
     return kind(**known, **{name: get_args(kinds[name])[0]() for name in names})
 
 
@@ -77,7 +76,7 @@ def write_log(
     for one in logged(data, 0):
         log.write(f"bayesrace/{name}/state", encode(one), 1 + one.seq, one.seq)
     for one in [] if truth is None else logged(truth, 0):
-        sample = Truth(**{field.name: getattr(one, field.name) for field in fields(Truth)})
+        sample = Truth(**{name: getattr(one, name) for name in Truth.__struct_fields__})
         log.write(f"bayesrace/{name}/truth", encode(sample), 1 + one.seq, one.seq)
     log.close()
     return path

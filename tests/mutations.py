@@ -7,16 +7,27 @@ gets as far as the field that it is in. Everything follows from the seed.
 import math
 import random
 from collections.abc import Callable, Iterator
-from typing import Any, Final, get_args, get_type_hints
+from typing import Any, Final
 
 import msgpack
 
 from bayesrace.gp.weights import encode_weights
 from bayesrace.messages import SERVICES, TOPICS, Message
-from bayesrace.messages.rules import Choice, Flag, Integer, Real, Rule, Scalars, Text, Vector
+from bayesrace.messages.codec import schema_version
+from bayesrace.messages.rules import (
+    Choice,
+    Flag,
+    Integer,
+    Real,
+    Rule,
+    Scalars,
+    Text,
+    Vector,
+    rules_of,
+)
 from tests.test_gp_weights import BODY, make_weights, reseal
 
-__all__ = ["KINDS", "FRAGMENTS", "MessageMutator", "WeightsMutator", "bombs", "rules_of"]
+__all__ = ["KINDS", "FRAGMENTS", "MessageMutator", "WeightsMutator", "bombs"]
 
 KINDS: Final[tuple[type[Message], ...]] = tuple(
     dict.fromkeys(
@@ -30,12 +41,6 @@ KINDS: Final[tuple[type[Message], ...]] = tuple(
     )
 )
 """Every message of the table."""
-
-
-def rules_of(kind: type[Message]) -> dict[str, Rule]:
-    """Field name to its rule."""
-    hints = get_type_hints(kind, include_extras=True)
-    return {name: get_args(hint)[1] for name, hint in hints.items() if name != "SCHEMA"}
 
 
 def _nested(head: bytes, depth: int) -> bytes:
@@ -209,7 +214,7 @@ class MessageMutator:
 
     def _segments(self, kind: type[Message]) -> Segments:
         values = {name: self.value(rule) for name, rule in self._rules[kind].items()}
-        content = {"schema": kind.SCHEMA, **values}
+        content = {"schema": schema_version(kind), **values}
         return [(msgpack.packb(name), msgpack.packb(value)) for name, value in content.items()]
 
     def _join(self, segments: Segments) -> bytes:

@@ -4,12 +4,13 @@ import hashlib
 import io
 import json
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 from rich.console import Console
 
 from bayesrace.arrays import Floats
@@ -273,7 +274,7 @@ def test_gaps_are_counted(tmp_path: Path) -> None:
 def test_a_forged_number_is_no_gap(tmp_path: Path) -> None:
     drive = Drive("bayesrace", circle(TWO_LAPS, 1.0))
     run = read_race(write_race(tmp_path, [drive])).recording.runs[0]
-    run.actuations.insert(20, replace(run.actuations[20], seq=2**60))
+    run.actuations.insert(20, structs.replace(run.actuations[20], seq=2**60))
     assert run.gaps == 0
 
 

@@ -5,11 +5,11 @@ import shutil
 import socket
 import subprocess
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from bayesrace.gp.weights import GpWeights
 from bayesrace.log import LogReader, LogWriter

@@ -1,7 +1,6 @@
 """The closed loop in one process: the same run, to the bit, as two processes over Zenoh."""
 
 from collections.abc import Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +50,7 @@ def told(log: Path) -> list[dict[str, Any]]:
     messages = [entry.message for entry in reader.messages((STATE, TRUTH, ACTUATION, TELEMETRY))]
     messages.sort(key=lambda one: (type(one).__name__, one.seq))
     rows = [
-        {one.name: getattr(message, one.name) for one in fields(message) if one.name not in CLOCKS}
+        {name: getattr(message, name) for name in message.__struct_fields__ if name not in CLOCKS}
         for message in messages
     ]
     ends = [

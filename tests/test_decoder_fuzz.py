@@ -12,7 +12,7 @@ import tracemalloc
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -41,9 +41,9 @@ def faults(message: Message) -> list[str]:
     """Fields that break the published schema, checked without the rules that let them pass."""
     schema = SCHEMAS[type(message)]
     return [
-        f"{type(message).__name__}.{one.name} = {getattr(message, one.name)!r:.80}"
-        for one in fields(message)
-        if not _valid(getattr(message, one.name), schema[one.name])
+        f"{type(message).__name__}.{name} = {getattr(message, name)!r:.80}"
+        for name in message.__struct_fields__
+        if not _valid(getattr(message, name), schema[name])
     ]
 
 

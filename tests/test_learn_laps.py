@@ -1,11 +1,11 @@
 """Laps and samples as the learning job makes them of messages: the same as from the log."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from bayesrace.messages import Actuation, State
 from bayesrace.tracks import Track

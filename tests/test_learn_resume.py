@@ -18,6 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
+from msgspec import structs
 from rich.console import Console
 
 from bayesrace.arrays import Floats
@@ -170,7 +171,7 @@ def message(value: Message) -> Item:
 def lap_of(data: Dataset, run: int = 1) -> list[State]:
     """A drive that is a lap: the plant counts it at the last state."""
     states = logged(data, run)
-    return [*states[:-1], replace(states[-1], lap=1, final=True)]
+    return [*states[:-1], structs.replace(states[-1], lap=1, final=True)]
 
 
 def rows(*parts: Dataset) -> Floats:
@@ -379,9 +380,10 @@ def test_pending_weights_are_sent_by_the_next_job_and_accepted_ones_by_the_one_a
 
 def test_a_plant_with_another_period_is_said_once_and_noted(tmp_path: Path, jobs: Jobs) -> None:
     """Also where the run ends before its first lap."""
-    slow = [replace(one, time_s=2 * one.time_s) for one in logged(FIRST, run=1)]
+    slow = [structs.replace(one, time_s=2 * one.time_s) for one in logged(FIRST, run=1)]
     twice_as_fast = [
-        [replace(state, time_s=state.time_s / 2) for state in lap_of(FIRST, run)] for run in (2, 3)
+        [structs.replace(state, time_s=state.time_s / 2) for state in lap_of(FIRST, run)]
+        for run in (2, 3)
     ]
     jobs.run(tmp_path, *slow, *itertools.chain(*twice_as_fast), laps=2)
     assert jobs.tasks == []

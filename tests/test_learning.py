@@ -1,11 +1,11 @@
 """Learning: samples, residual, likelihood, training, validation."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from sklearn.gaussian_process.kernels import RBF, Matern
 
 from bayesrace.arrays import Floats

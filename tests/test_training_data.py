@@ -4,7 +4,6 @@ import json
 import sys
 import tracemalloc
 import zipfile
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from bayesrace.errors import InputError
 from bayesrace.integrators import PREDICTION, Discretisation

@@ -3,23 +3,39 @@
 Nothing here executes what it reads. :func:`decode` returns a message whose every field has passed
 its rule, or raises :class:`InputError`, and nothing else. Input longer than the longest valid
 message of its class is refused unread, so invalid input costs no more time and memory than valid.
+
+msgspec reads what :func:`encode` writes, in a microsecond. It takes an integer for a float, and
+knows neither rows nor maps of scalars; so what it has read counts only if it encodes to the same
+bytes. All else, from other encoders or damaged, is read by msgpack and checked rule by rule, which
+also says what is wrong.
 """
 
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
-from operator import attrgetter
-from typing import Any, Final, Generic, TypeVar, get_args, get_type_hints
+from typing import Any, Final, Generic, TypeVar, cast
 
 import msgpack
+import msgspec
 
 from bayesrace.errors import InputError
-from bayesrace.messages.rules import Integer, Rule, Scalars, Text, Vector, wire_bytes
+from bayesrace.messages.rules import (
+    Choice,
+    Integer,
+    Rule,
+    Scalars,
+    Text,
+    Vector,
+    rules_of,
+    wire_bytes,
+)
 from bayesrace.messages.types import Message
 
-__all__ = ["Decoder", "checked", "decode", "encode", "largest_bytes", "peek_seq"]
+__all__ = [
+    "Decoder", "checked", "decode", "encode", "largest_bytes", "peek_seq", "schema_version",
+]  # fmt: skip
 
 M = TypeVar("M", bound=Message)
 
@@ -31,18 +47,20 @@ _LOG_PERIOD_NS: Final = 1_000_000_000
 """Between two lines of a decoder in the log."""
 
 _MALFORMED: Final = (ValueError, TypeError, OverflowError, msgpack.UnpackException)
+"""What msgpack raises; msgspec's own errors are ValueErrors."""
 
 
 @dataclass(frozen=True)
 class _Spec:
     """A message class prepared for fast coding."""
 
-    rules: dict[str, Rule]
-    names: tuple[str, ...]
-    """Names on the wire, in their order: ``schema`` and the fields."""
+    schema: int
     keys: frozenset[str]
-    values_of: Callable[[Any], tuple[Any, ...]]
-    """Their values in a message."""
+    """Names on the wire: ``schema`` and the fields."""
+    read: Callable[[bytes], Any] | None
+    """msgspec's reader; None for a class with a rule of which it knows nothing."""
+    rows: tuple[tuple[str, int], ...]
+    """Vectors of rows, and the length of a row."""
     checks: tuple[tuple[str, Callable[[Any], Any]], ...]
     wire_bytes: int
     """Most bytes of a valid message."""
@@ -54,8 +72,7 @@ class _Specs(dict[type[Message], _Spec]):
     """Makes the specification of a class at its first use."""
 
     def __missing__(self, kind: type[Message]) -> _Spec:
-        hints = get_type_hints(kind, include_extras=True)
-        rules: dict[str, Rule] = {one.name: get_args(hints[one.name])[1] for one in fields(kind)}
+        rules = rules_of(kind)
         content = {"schema": Integer(), **rules}
         sizes = (_NAME_HEAD_BYTES + len(name) + wire_bytes(rule) for name, rule in content.items())
         arrays = [rule.most for rule in rules.values() if isinstance(rule, Vector)]
@@ -70,15 +87,23 @@ class _Specs(dict[type[Message], _Spec]):
             max_bin_len=0,
             max_ext_len=0,
         )
-        checks = tuple((name, rule.check) for name, rule in rules.items())
-        values_of, limit = attrgetter("SCHEMA", *rules), _NAME_HEAD_BYTES + sum(sizes)
         self[kind] = spec = _Spec(
-            rules, tuple(content), frozenset(content), values_of, checks, limit, unpack
+            schema=schema_version(kind),
+            keys=frozenset(content),
+            read=msgspec.msgpack.Decoder(kind).decode if _readable(rules) else None,
+            rows=tuple((n, r.length) for n, r in rules.items() if isinstance(r, Vector) and r.rows),
+            checks=tuple((name, rule.check) for name, rule in rules.items()),
+            wire_bytes=_NAME_HEAD_BYTES + sum(sizes),
+            unpack=unpack,
         )
         return spec
 
 
 _SPECS: Final = _Specs()
+
+
+def _readable(rules: dict[str, Rule]) -> bool:
+    return not any(isinstance(rule, Choice | Scalars) for rule in rules.values())
 
 
 def _distinct(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
@@ -89,18 +114,23 @@ def _distinct(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """msgpack's fallback: read-only maps become maps; anything else is a programming error."""
+    """msgspec's fallback: read-only maps become maps; anything else is a programming error."""
     if hasattr(value, "items"):
         return dict(value)
     raise TypeError(f"a {type(value).__name__} cannot be part of a message")
 
 
+_encode: Final = msgspec.msgpack.Encoder(enc_hook=_plain).encode
+
+
 def encode(message: Message) -> bytes:
-    """The message as a msgpack map, fields in the order of the dataclass after ``schema``."""
-    spec = _SPECS[type(message)]
-    content = dict(zip(spec.names, spec.values_of(message), strict=True))
-    packed: bytes = msgpack.packb(content, default=_plain)
-    return packed
+    """The message as a msgpack map, fields in the order of the class after ``schema``."""
+    return _encode(message)
+
+
+def schema_version(kind: type[Message]) -> int:
+    """The version of a class's fields."""
+    return cast(int, kind.__struct_config__.tag)
 
 
 def decode(kind: type[M], data: bytes) -> M:
@@ -112,11 +142,26 @@ def decode(kind: type[M], data: bytes) -> M:
     spec, title = _SPECS[kind], kind.__name__
     if len(data) > spec.wire_bytes:
         raise InputError(f"{title}: {len(data)} bytes, at most {spec.wire_bytes} allowed")
+    message: M | None = _read(spec, data)
+    if message is not None:
+        return message
     try:
         content = spec.unpack(data)
     except _MALFORMED as error:
         raise InputError(f"{title}: not a message ({error or 'malformed'})") from None
     return checked(kind, content)
+
+
+def _read(spec: _Spec, data: bytes) -> Any:
+    """The message, if the bytes are exactly those that :func:`encode` makes of one."""
+    if spec.read is None:
+        return None
+    try:
+        message = spec.read(data)
+    except _MALFORMED:
+        return None
+    whole = all(len(getattr(message, name)) % length == 0 for name, length in spec.rows)
+    return message if whole and _encode(message) == data else None
 
 
 def checked(kind: type[M], content: Any) -> M:
@@ -127,11 +172,11 @@ def checked(kind: type[M], content: Any) -> M:
     spec, title = _SPECS[kind], kind.__name__
     if type(content) is not dict:
         raise InputError(f"{title}: not a message (no map)")
-    version = content.get("schema", kind.SCHEMA)  # first: it explains other fields
-    if type(version) is not int or version != kind.SCHEMA:
+    version = content.get("schema", spec.schema)  # first: it explains other fields
+    if type(version) is not int or version != spec.schema:
         raise InputError(
             f"{title}: schema version {version!r:.40}, this program reads "
-            f"{kind.SCHEMA}; use the same release on both sides"
+            f"{spec.schema}; use the same release on both sides"
         )
     if content.keys() != spec.keys:
         odd = sorted(repr(name)[:40] for name in content.keys() ^ spec.keys)

@@ -5,16 +5,25 @@ Floats keep their bits. NaN and infinities, which no valid message holds, become
 """
 
 from collections.abc import Mapping
-from dataclasses import fields
 from itertools import chain
-from typing import Any, Final, NamedTuple, TypeVar, get_args, get_type_hints
+from typing import Any, Final, NamedTuple, TypeVar
 
 import msgpack
 import pydantic_core
 
 from bayesrace.errors import InputError
-from bayesrace.messages.codec import checked
-from bayesrace.messages.rules import Choice, Flag, Integer, Real, Rule, Scalars, Text, Vector
+from bayesrace.messages.codec import checked, schema_version
+from bayesrace.messages.rules import (
+    Choice,
+    Flag,
+    Integer,
+    Real,
+    Rule,
+    Scalars,
+    Text,
+    Vector,
+    rules_of,
+)
 from bayesrace.messages.types import Message
 
 __all__ = ["decode_json", "json_schema", "to_json"]
@@ -37,8 +46,7 @@ class _Forms(dict[type[Message], _Form]):
     """Prepares a class at its first use."""
 
     def __missing__(self, kind: type[Message]) -> _Form:
-        hints = get_type_hints(kind, include_extras=True)
-        rules: dict[str, Rule] = {one.name: get_args(hints[one.name])[1] for one in fields(kind)}
+        rules = rules_of(kind)
         vectors = tuple((name, rule) for name, rule in rules.items() if isinstance(rule, Vector))
         reals = tuple(name for name, rule in rules.items() if isinstance(rule, Real))
         self[kind] = _Form(rules, frozenset(("schema", *rules)), vectors, reals)
@@ -107,7 +115,7 @@ def _float(value: Any) -> Any:
 def json_schema(kind: type[Message]) -> dict[str, Any]:
     """JSON schema of a class of messages, in the subset that viewers such as Foxglove read:
     every value has one type, every object its properties."""
-    properties = {"schema": {"type": "integer", "const": kind.SCHEMA}}
+    properties = {"schema": {"type": "integer", "const": schema_version(kind)}}
     properties |= {name: _schema(rule) for name, rule in _FORMS[kind].rules.items()}
     summary = (kind.__doc__ or "").split("\n")[0]
     return {"title": kind.__name__, "description": summary, **_object(properties)}

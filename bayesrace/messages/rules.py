@@ -2,18 +2,21 @@
 
 A rule's ``check`` returns the value as the message keeps it, or raises ``ValueError`` with what is
 wrong; the codec adds the names of message and field. Comparisons are written so that NaN fails
-them. :func:`wire_bytes` is the size of a rule's largest value in msgpack's widest form: the codec
-refuses longer input unread. :func:`rule_schema` is the rule as JSON schema.
+them. :func:`meta` puts a rule into the annotation of a field, where msgspec finds as much of it as
+it can check by itself, and :func:`rules_of` finds the whole. :func:`wire_bytes` is the size of a
+rule's largest value in msgpack's widest form: the codec refuses longer input unread.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any
+from typing import Any, get_args, get_type_hints
+
+from msgspec import Meta
 
 __all__ = [
     "Choice", "Flag", "Integer", "Real", "Rule", "Scalar", "Scalars", "Text", "Vector",
-    "wire_bytes",
+    "meta", "rules_of", "wire_bytes",
 ]  # fmt: skip
 
 Scalar = bool | int | float | str
@@ -100,12 +103,13 @@ class Vector:
 
     Exactly ``length`` of them; or, with ``rows``, any whole number of rows up to that many.
     ``names`` of the numbers (of a row) are for JSON, where an array without names stays one.
+    The limit is that of the numbers' own annotation.
     """
 
     length: int
-    limit: float = 1e6
     rows: int | None = None
     names: tuple[str, ...] = ()
+    limit: float = _REAL_MAX
 
     def check(self, value: Any) -> tuple[float, ...]:
         """The numbers; ValueError if one is no float in range, or their count is wrong."""
@@ -164,6 +168,36 @@ def _is_scalar(value: Any) -> bool:
 
 
 Rule = Integer | Real | Flag | Text | Choice | Vector | Scalars
+
+
+def meta(rule: Rule) -> Meta:
+    """The rule for a field's annotation, ``Annotated[type, meta(rule)]``.
+
+    msgspec itself checks ranges of numbers and lengths of texts and vectors.
+    """
+    extra = {"rule": rule}
+    match rule:
+        case Integer(low, high) | Real(low, high):
+            return Meta(ge=low, le=high, extra=extra)
+        case Text(longest):
+            return Meta(max_length=longest, extra=extra)
+        case Vector(length, rows):
+            return Meta(min_length=0 if rows else length, max_length=rule.most, extra=extra)
+    return Meta(extra=extra)
+
+
+def rules_of(kind: type) -> dict[str, Rule]:
+    """The rules of a class's fields, by name."""
+    hints = get_type_hints(kind, include_extras=True)
+    return {name: _rule(hint) for name, hint in hints.items() if hasattr(hint, "__metadata__")}
+
+
+def _rule(hint: Any) -> Rule:
+    value, annotation = get_args(hint)
+    rule: Rule = annotation.extra["rule"]
+    if isinstance(rule, Vector):
+        return replace(rule, limit=get_args(get_args(value)[0])[1].le)
+    return rule
 
 
 def wire_bytes(rule: Rule) -> int:

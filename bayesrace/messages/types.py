@@ -1,4 +1,4 @@
-"""The message types: immutable dataclasses, each field with its rule.
+"""The message types: immutable structures of msgspec, each field with its rule.
 
 Clocks: ``source_time_ns`` is the sender's ``time.monotonic_ns()``, comparable only between
 processes of one machine. ``time_s`` is plant time, which starts with the run; plant and controller
@@ -6,10 +6,21 @@ express all delays in it.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Annotated, ClassVar, Final
+from typing import Annotated, Final
 
-from bayesrace.messages.rules import Choice, Flag, Integer, Real, Scalar, Scalars, Text, Vector
+from msgspec import Struct
+
+from bayesrace.messages.rules import (
+    Choice,
+    Flag,
+    Integer,
+    Real,
+    Scalar,
+    Scalars,
+    Text,
+    Vector,
+    meta,
+)
 
 __all__ = [
     "END_REASONS", "PHASES", "Actuation", "CarSample", "Command",
@@ -30,27 +41,29 @@ regular end the run had more than one controller, so its actuations cannot be at
 PHASES: Final = ("idle", "running", "waiting", "ready", "driving", "fallback", "stopped")
 """Phases of a process, see :class:`Status`."""
 
-Count = Annotated[int, Integer()]
-Signed = Annotated[int, Integer(-(2**31), 2**31 - 1)]
-Seconds = Annotated[float, Real(0.0, 1e9)]
-Metre = Annotated[float, Real(-1e6, 1e6)]
-Width = Annotated[float, Real(0.0, 1e3)]
-Short = Annotated[str, Text(200)]
-Long = Annotated[str, Text(2000)]
-DataMap = Annotated[Mapping[str, Scalar], Scalars()]
+Count = Annotated[int, meta(Integer())]
+Signed = Annotated[int, meta(Integer(-(2**31), 2**31 - 1))]
+Seconds = Annotated[float, meta(Real(0.0, 1e9))]
+Number = Annotated[float, meta(Real(-1e6, 1e6))]
+Width = Annotated[float, meta(Real(0.0, 1e3))]
+Short = Annotated[str, meta(Text(200))]
+Long = Annotated[str, meta(Text(2000))]
+DataMap = Annotated[Mapping[str, Scalar], meta(Scalars())]
 
 _CAR_STATE: Final = ("x", "y", "psi", "vx", "vy", "omega", "delta")
 _INPUT: Final = ("d", "delta_rate")
-CarState = Annotated[tuple[float, ...], Vector(7, names=_CAR_STATE)]
-Input = Annotated[tuple[float, ...], Vector(2, names=_INPUT)]
+CarState = Annotated[tuple[Number, ...], meta(Vector(7, names=_CAR_STATE))]
+Input = Annotated[tuple[Number, ...], meta(Vector(2, names=_INPUT))]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Message:
-    """The fields that every message starts with."""
+class Message(
+    Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="schema", tag=1
+):
+    """The fields that every message starts with.
 
-    SCHEMA: ClassVar[int] = 1
-    """Version of the message's fields; the decoder refuses any other."""
+    The ``tag`` of a class is its schema version, which msgspec writes before the fields; the
+    decoder refuses any other.
+    """
 
     seq: Count
     """Number of the message, counted by its sender for each key, from 0 without gaps."""
@@ -58,8 +71,7 @@ class Message:
     """Sender's monotonic clock when the message was made [ns]."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CarSample(Message):
+class CarSample(Message, frozen=True, kw_only=True):
     """The car at one moment, measured or true; ``source_time_ns`` is that moment."""
 
     epoch: Count
@@ -76,42 +88,35 @@ class CarSample(Message):
     """Start-line crossings so far, forwards minus backwards."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class State(CarSample):
+class State(CarSample, frozen=True, kw_only=True, tag=2):
     """Measured state of the car, on ``bayesrace/{car}/state``.
 
     The only input of controller and learning.
     """
 
-    SCHEMA: ClassVar[int] = 2
-
-    lockstep: Annotated[bool, Flag()]
+    lockstep: Annotated[bool, meta(Flag())]
     """True if the plant waits for the actuation that answers this very message."""
     actuation_delays: Annotated[
-        tuple[float, ...],
-        Vector(3, limit=1e15, rows=64, names=("state_seq", "arrival_s", "acting_s")),
+        tuple[Annotated[float, meta(Real(-1e15, 1e15))], ...],
+        meta(Vector(3, rows=64, names=("state_seq", "arrival_s", "acting_s"))),
     ]
     """Delays of the actuations received since the previous state, row by row: ``seq`` of the state
     that each answers, time from that state to the actuation's arrival [s], and from its
     ``decided_at_s`` to its application [s] (-1: superseded, never applied). Empty in lockstep."""
-    final: Annotated[bool, Flag()]
+    final: Annotated[bool, meta(Flag())]
     """True in the last state of a run: no answer to it is applied. After a fault of the plant it
     repeats the previous state with its time."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Truth(CarSample):
+class Truth(CarSample, frozen=True, kw_only=True):
     """True state behind the :class:`State` of the same ``seq``, on ``bayesrace/{car}/truth``.
 
     For logs and evaluation; a real car sends none.
     """
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Actuation(Message):
+class Actuation(Message, frozen=True, kw_only=True, tag=2):
     """The controller's answer to one state, on ``bayesrace/{car}/actuation``."""
-
-    SCHEMA: ClassVar[int] = 2
 
     epoch: Count
     run: Count
@@ -121,26 +126,23 @@ class Actuation(Message):
     """Plant time at which the controller decided on the input: in lockstep ``time_s`` of the state;
     in real time the controller's estimate, from the arrival times of the states, of the plant time
     when its cycle began."""
-    u: Annotated[tuple[float, ...], Vector(2, limit=1e3, names=_INPUT)]
+    u: Annotated[tuple[Annotated[float, meta(Real(-1e3, 1e3))], ...], meta(Vector(2, names=_INPUT))]
     """d [command], delta_rate [rad/s]; the plant applies the car's own, narrower limits."""
     weights_version: Short
     """Version of the GP weights in use; empty without any."""
-    status: Annotated[int, Integer(0, 255)]
+    status: Annotated[int, meta(Integer(0, 255))]
     """Status code of the controller's step; 0: converged."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Telemetry(Message):
+class Telemetry(Message, frozen=True, kw_only=True, tag=4):
     """Plan, residuals and timing of one control cycle, on ``bayesrace/{car}/telemetry``."""
-
-    SCHEMA: ClassVar[int] = 4
 
     run: Count
     state_seq: Count
-    status: Annotated[int, Integer(0, 255)]
-    fallback: Annotated[int, Integer(0, 9)]
+    status: Annotated[int, meta(Integer(0, 255))]
+    fallback: Annotated[int, meta(Integer(0, 9))]
     """0 solution, 1 shifted previous plan, 2 braking with the last safe steering, 3 stop."""
-    iterations: Annotated[int, Integer(0, 100_000)]
+    iterations: Annotated[int, meta(Integer(0, 100_000))]
     tick: Count
     """Number of the cycle's release since the process started; missing numbers are releases passed
     over. A late cycle, which answers a state that came after its window, has that of the cycle
@@ -149,7 +151,7 @@ class Telemetry(Message):
     """Monotonic clock when the cycle began, with its state received."""
     received_ns: Count
     """Monotonic clock when the control thread received the state."""
-    missed: Annotated[bool, Flag()]
+    missed: Annotated[bool, meta(Flag())]
     """The actuation was sent after the deadline, the next release."""
     wake_us: Seconds
     """Wake-up error before this cycle [us, as all below]; 0 in lockstep and of a late cycle."""
@@ -161,92 +163,87 @@ class Telemetry(Message):
     """Feedback phase: execution time of the controller's step."""
     encode_us: Seconds
     """Encoding and sending the actuation."""
-    delay_s: Annotated[float, Real(0.0, 1e3)]
+    delay_s: Annotated[float, meta(Real(0.0, 1e3))]
     """Delay from ``Actuation.decided_at_s`` to application, over which the state is predicted; 0
     without."""
-    plan_x: Annotated[tuple[float, ...], Vector(7, rows=501, names=_CAR_STATE)]
+    plan_x: Annotated[tuple[Number, ...], meta(Vector(7, rows=501, names=_CAR_STATE))]
     """Predicted states row by row, N + 1 rows of 7, to 1e-6; empty without a prediction."""
-    plan_u: Annotated[tuple[float, ...], Vector(2, rows=500, names=_INPUT)]
+    plan_u: Annotated[tuple[Number, ...], meta(Vector(2, rows=500, names=_INPUT))]
     """Planned inputs row by row, N rows of 2, to 1e-6."""
-    tube_m: Annotated[tuple[float, ...], Vector(1, rows=500)]
+    tube_m: Annotated[tuple[Number, ...], meta(Vector(1, rows=500))]
     """By how much the car may be off to either side at the plan's stages 1 to N, at the probability
     that the controller is set to, because its model is uncertain; empty without a prediction."""
-    pace: Annotated[float, Real(0.0, 1.0)]
+    pace: Annotated[float, meta(Real(0.0, 1.0))]
     """Speed of the reference as a share of the racing line's; below 1 where the model is too
     uncertain about the plan."""
-    widening: Annotated[float, Real(0.0, 1e6)]
+    widening: Annotated[float, meta(Real(0.0, 1e6))]
     """Factor by which the model's standard deviations have been widened because its one-step errors
     exceeded them; 1 where they cover these."""
-    residual_dynamics: Annotated[float, Real(-1.0, 1e12)]
+    residual_dynamics: Annotated[float, meta(Real(-1.0, 1e12))]
     """Largest dynamics defect of the plan; -1: unknown or not finite (as below)."""
-    residual_bounds: Annotated[float, Real(-1.0, 1e12)]
+    residual_bounds: Annotated[float, meta(Real(-1.0, 1e12))]
     """Largest violation of a bound."""
-    residual_stationarity: Annotated[float, Real(-1.0, 1e12)]
+    residual_stationarity: Annotated[float, meta(Real(-1.0, 1e12))]
     """Norm of the gradient of the Lagrangian."""
-    cost: Annotated[float, Real(-1.0, 1e12)]
+    cost: Annotated[float, meta(Real(-1.0, 1e12))]
     """Objective of the plan."""
-    cost_shifted: Annotated[float, Real(-1.0, 1e12)]
+    cost_shifted: Annotated[float, meta(Real(-1.0, 1e12))]
     """Objective of the shifted previous plan for the same state and reference; a plan that costs
     much more has jumped to another local minimum."""
-    second_start: Annotated[int, Integer(0, 2)]
+    second_start: Annotated[int, meta(Integer(0, 2))]
     """1: the previous plan was doubtful, and a second start gave no better one; 2: the plan of the
     second start is used."""
-    s_ref_m: Annotated[float, Real(-1e6, 1e6)]
+    s_ref_m: Number
     """Arc length of the reference point on the racing line."""
-    n_ref_m: Annotated[float, Real(-1e6, 1e6)]
+    n_ref_m: Number
     """Lateral offset from the racing line, positive to the left."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Event(Message):
+class Event(Message, frozen=True, kw_only=True):
     """An occurrence for operators and logs, on ``bayesrace/{car}/event/{source}``."""
 
     run: Count
-    source: Annotated[str, Choice(("plant", "controller", "race", "recorder"))]
+    source: Annotated[str, meta(Choice(("plant", "controller", "race", "recorder")))]
     kind: Short
     text: Long
     data: DataMap
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RunRequest(Message):
+class RunRequest(Message, frozen=True, kw_only=True):
     """Request on ``bayesrace/{car}/plant/run`` to start a run; the answer is a :class:`Reply`."""
 
     run: Count
-    lockstep: Annotated[bool, Flag()]
+    lockstep: Annotated[bool, meta(Flag())]
     """True: the plant advances only on the matching actuation; False: in real time."""
     x0: CarState
     """Start state, as in :class:`State`."""
-    line_x_m: Metre
-    line_y_m: Metre
-    line_heading_rad: Annotated[float, Real(-1e3, 1e3)]
+    line_x_m: Number
+    line_y_m: Number
+    line_heading_rad: Annotated[float, meta(Real(-1e3, 1e3))]
     """Direction of driving across the start line."""
     line_left_m: Width
     line_right_m: Width
     """Length of the start line from its point to each side, margin included."""
-    laps: Annotated[int, Integer(0, 100_000)]
+    laps: Annotated[int, meta(Integer(0, 100_000))]
     """The run ends at this many crossings; 0: no limit."""
-    max_time_s: Annotated[float, Real(0.0, 1e6)]
-    actuation_timeout_s: Annotated[float, Real(0.001, 600.0)]
+    max_time_s: Annotated[float, meta(Real(0.0, 1e6))]
+    actuation_timeout_s: Annotated[float, meta(Real(0.001, 600.0))]
     """Lockstep: the run ends after so long without an answer. Free-running: the plant brakes when
     its newest actuation is older."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StopRequest(Message):
+class StopRequest(Message, frozen=True, kw_only=True):
     """Request on ``bayesrace/{car}/plant/stop`` to end the current run."""
 
     text: Long
     """The reason, for the ``run_ended`` event."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StatusRequest(Message):
+class StatusRequest(Message, frozen=True, kw_only=True):
     """Request on ``bayesrace/{car}/{source}/status`` for the :class:`Status` of a process."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RollbackRequest(Message):
+class RollbackRequest(Message, frozen=True, kw_only=True):
     """Request on ``bayesrace/{car}/controller/rollback`` to restore the previous weights.
 
     The answer is a :class:`Reply`.
@@ -256,34 +253,29 @@ class RollbackRequest(Message):
     """The reason, for the event."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Command(Message):
+class Command(Message, frozen=True, kw_only=True):
     """Request on ``bayesrace/{car}/controller/command``; the answer is a :class:`Reply`."""
 
-    command: Annotated[str, Choice(("stop", "go"))]
+    command: Annotated[str, meta(Choice(("stop", "go")))]
     """stop: brake to standstill and stay there; go: drive (again)."""
     text: Long
     """The reason, for the controller's status."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Reply(Message):
+class Reply(Message, frozen=True, kw_only=True):
     """Answer to a request that changes the state of a process."""
 
-    accepted: Annotated[bool, Flag()]
+    accepted: Annotated[bool, meta(Flag())]
     text: Long
     """The reason of a refusal, or what follows."""
     data: DataMap
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Status(Message):
+class Status(Message, frozen=True, kw_only=True, tag=2):
     """State of a process, on ``bayesrace/{car}/status/{source}`` at 10 Hz and on request."""
 
-    SCHEMA: ClassVar[int] = 2
-
-    source: Annotated[str, Choice(("plant", "controller"))]
-    phase: Annotated[str, Choice(PHASES)]
+    source: Annotated[str, meta(Choice(("plant", "controller")))]
+    phase: Annotated[str, meta(Choice(PHASES))]
     """plant: idle, running; controller: waiting (for a state), ready (for ``go``), driving,
     fallback, stopped (on command)."""
     epoch: Count
@@ -295,11 +287,11 @@ class Status(Message):
     track: Short
     """Controller: :attr:`bayesrace.tracks.Track.identity` of the track that it drives; empty: a
     plant, or a control law that names none."""
-    rate_hz: Annotated[float, Real(0.0, 1e5)]
+    rate_hz: Annotated[float, meta(Real(0.0, 1e5))]
     """Set rate of the loop; 0 in lockstep."""
-    state_age_s: Annotated[float, Real(-1.0, 1e9)]
+    state_age_s: Annotated[float, meta(Real(-1.0, 1e9))]
     """Time since the newest state was received (controller) or sent (plant); -1: none yet."""
-    delay_s: Annotated[float, Real(0.0, 1e3)]
+    delay_s: Annotated[float, meta(Real(0.0, 1e3))]
     """Controller: the measured delay, which it predicts over; plant: the delay set to be added."""
     counters: DataMap
     """All counters since the process started."""

@@ -341,7 +341,7 @@ def _with_truth(runs: Sequence[RunRecord]) -> list[RunRecord]:
     """The runs; measurements take the place of the truth where none has one."""
     if _has_truth(runs):
         return list(runs)
-    names = [one.name for one in fields(Truth)]
+    names = Truth.__struct_fields__
     return [
         replace(run, truth=[Truth(**{n: getattr(one, n) for n in names}) for one in run.states])
         for run in runs

@@ -6,7 +6,6 @@ obeys lines on stdin (``start``, ``state``, ``status SOURCE``, ``stop``) and ans
 line of JSON; the end of stdin ends it, and the current run.
 """
 
-import dataclasses
 import json
 import math
 import subprocess
@@ -17,6 +16,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Protocol
 
+import msgspec.structs
 import zenoh
 
 from bayesrace.errors import InputError
@@ -57,7 +57,7 @@ def drive_on(follower: Follower, away_m: float = 0.8) -> None:
 
 
 def _fields(message: Any) -> dict[str, Any]:
-    return {field.name: getattr(message, field.name) for field in dataclasses.fields(message)}
+    return msgspec.structs.asdict(message)
 
 
 class Observer:
@@ -78,7 +78,7 @@ class Observer:
         """Starts a run without end, in real time, once both processes are there."""
         self.director.wait_for(("plant", "controller"), PATIENCE_S)
         plan = RunPlan(run, "test", 1, _ENDLESS_S, lockstep=False)
-        request = dataclasses.replace(run_request(self._track, plan), laps=0)
+        request = msgspec.structs.replace(run_request(self._track, plan), laps=0)
         self.director.start(request)
         return run
 

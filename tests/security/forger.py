@@ -6,7 +6,6 @@ It knows the car's epoch and run, and has a certificate that should not allow an
 "forging" when it begins, and on the end of stdin how many messages it has handed over.
 """
 
-import dataclasses
 import itertools
 import select
 import socket
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import zenoh
+from msgspec.structs import replace
 
 from bayesrace.messages import (
     ACTUATION,
@@ -57,9 +57,9 @@ def forgeries(car: str, epoch: int, run: int) -> Iterator[tuple[str, bytes]]:
     ]  # fmt: skip
     for seq in itertools.count():
         changes: list[Any] = [
-            dataclasses.replace(state, seq=seq, time_s=0.02 * seq),
-            dataclasses.replace(actuation, seq=seq, state_seq=seq, decided_at_s=0.02 * seq),
-            dataclasses.replace(end, seq=seq), dataclasses.replace(status, seq=seq),
+            replace(state, seq=seq, time_s=0.02 * seq),
+            replace(actuation, seq=seq, state_seq=seq, decided_at_s=0.02 * seq),
+            replace(end, seq=seq), replace(status, seq=seq),
         ]  # fmt: skip
         yield from ((key, encode(one)) for key, one in zip(keys, changes, strict=True))
 

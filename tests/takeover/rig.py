@@ -5,12 +5,13 @@ import struct
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from bayesrace.gp.weights import GpWeights, encode_weights, write_weights
 from bayesrace.log import LogReader
