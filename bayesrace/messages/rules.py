@@ -187,16 +187,20 @@ def meta(rule: Rule) -> Meta:
 
 
 def rules_of(kind: type) -> dict[str, Rule]:
-    """The rules of a class's fields, by name."""
+    """The rules of a class's fields, by name; TypeError if a field has none."""
     hints = get_type_hints(kind, include_extras=True)
-    return {name: _rule(hint) for name, hint in hints.items() if hasattr(hint, "__metadata__")}
+    return {name: _rule(f"{kind.__name__}.{name}", hint) for name, hint in hints.items()}
 
 
-def _rule(hint: Any) -> Rule:
-    value, annotation = get_args(hint)
-    rule: Rule = annotation.extra["rule"]
+def _rule(name: str, hint: Any) -> Rule:
+    value, *annotations = get_args(hint) or [hint]
+    rules = [one.extra["rule"] for one in annotations if isinstance(one, Meta) and one.extra]
+    if not rules:
+        raise TypeError(f"{name} has no rule: Annotated[type, meta(rule)]")
+    rule: Rule = rules[0]
     if isinstance(rule, Vector):
-        return replace(rule, limit=get_args(get_args(value)[0])[1].le)
+        number = _rule(f"a number of {name}", get_args(value)[0])
+        return replace(rule, limit=number.high) if isinstance(number, Real) else rule
     return rule
 
 

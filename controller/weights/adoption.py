@@ -5,6 +5,7 @@ interpreter's lock or wakes another thread either: that would cost a hundred tim
 """
 
 import math
+import struct
 import time
 from collections import deque
 from collections.abc import Callable
@@ -26,6 +27,9 @@ __all__ = ["RECORDED", "Adoption", "Offer", "WeightsPort", "limits_at", "slowed_
 
 RECORDED: Final = 8192
 """States kept: 16 s at 500 Hz, which is more than the validator looks back."""
+_RECORD: Final = struct.Struct("=5q10d2b")
+"""One of them, packed: as objects they would take five times the memory, and the process would grow
+for minutes."""
 
 _PATIENCE_S: Final = 2.0
 """How long lockstep waits for the watch. Without waiting, one run would differ from the next."""
@@ -85,7 +89,8 @@ class Adoption:
     def __init__(self, adopt: Callable[[str], None]) -> None:
         """``adopt`` puts what is staged into use, under its version's name."""
         self._adopt = adopt
-        self._states: list[StateRecord | None] = [None] * RECORDED
+        # Written once, so that all of it is resident from the start.
+        self._states = bytearray(b"\xff") * (RECORDED * _RECORD.size)
         self.recorded = 0
         """Number of states recorded so far."""
         self.offers: deque[Offer] = deque(maxlen=1)
@@ -105,9 +110,11 @@ class Adoption:
 
     def record(self, state: State, fallen_back: bool | None) -> None:
         """Keeps a state; ``fallen_back``: see :class:`StateRecord`."""
-        head = self.recorded, state.epoch, state.run, state.seq, state.time_s, time.monotonic_ns()
-        record = StateRecord(*head, state.x, state.u_applied, state.lockstep, fallen_back)
-        self._states[self.recorded % RECORDED] = record
+        _RECORD.pack_into(
+            self._states, self.recorded % RECORDED * _RECORD.size,
+            self.recorded, state.epoch, state.run, state.seq, time.monotonic_ns(), state.time_s,
+            *state.x, *state.u_applied, state.lockstep, -1 if fallen_back is None else fallen_back,
+        )  # fmt: skip
         self.recorded += 1
 
     def limits(self, vx_mps: float) -> Environment | None:
@@ -118,7 +125,16 @@ class Adoption:
         """For the manager: at most so many states from number ``begin`` on, or the oldest kept."""
         begin = max(begin, self.recorded - RECORDED)
         numbers = range(begin, min(begin + most, self.recorded))
-        return [one for number in numbers if (one := self._states[number % RECORDED])]
+        return [self._state(number) for number in numbers]
+
+    def _state(self, number: int) -> StateRecord:
+        at = number % RECORDED * _RECORD.size
+        number, epoch, run, seq, at_ns, time_s, *x_u, lockstep, fallen_back = _RECORD.unpack_from(
+            self._states, at
+        )
+        known = None if fallen_back < 0 else bool(fallen_back)
+        x, u = tuple(x_u[:7]), tuple(x_u[7:])
+        return StateRecord(number, epoch, run, seq, time_s, at_ns, x, u, bool(lockstep), known)
 
     def between_cycles(self, cycle: int, lockstep: bool = False) -> None:
         """Adopts what is offered; ``cycle``: number of the next one.
