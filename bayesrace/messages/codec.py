@@ -12,7 +12,7 @@ also says what is wrong.
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final, Generic, TypeVar, cast
@@ -34,7 +34,8 @@ from bayesrace.messages.rules import (
 from bayesrace.messages.types import Message
 
 __all__ = [
-    "Decoder", "checked", "decode", "encode", "largest_bytes", "peek_seq", "schema_version",
+    "Decoder", "checked", "decode", "encode", "is_readable", "largest_bytes", "peek_seq",
+    "schema_version",
 ]  # fmt: skip
 
 M = TypeVar("M", bound=Message)
@@ -90,7 +91,7 @@ class _Specs(dict[type[Message], _Spec]):
         self[kind] = spec = _Spec(
             schema=schema_version(kind),
             keys=frozenset(content),
-            read=msgspec.msgpack.Decoder(kind).decode if _readable(rules) else None,
+            read=msgspec.msgpack.Decoder(kind).decode if is_readable(rules) else None,
             rows=tuple((n, r.length) for n, r in rules.items() if isinstance(r, Vector) and r.rows),
             checks=tuple((name, rule.check) for name, rule in rules.items()),
             wire_bytes=_NAME_HEAD_BYTES + sum(sizes),
@@ -102,7 +103,8 @@ class _Specs(dict[type[Message], _Spec]):
 _SPECS: Final = _Specs()
 
 
-def _readable(rules: dict[str, Rule]) -> bool:
+def is_readable(rules: Mapping[str, Rule]) -> bool:
+    """Whether msgspec can check these rules, but for whole rows."""
     return not any(isinstance(rule, Choice | Scalars) for rule in rules.values())
 
 

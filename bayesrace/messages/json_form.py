@@ -5,14 +5,16 @@ Floats keep their bits. NaN and infinities, which no valid message holds, become
 """
 
 from collections.abc import Mapping
+from contextlib import suppress
 from itertools import chain
 from typing import Any, Final, NamedTuple, TypeVar
 
 import msgpack
+import msgspec
 import pydantic_core
 
 from bayesrace.errors import InputError
-from bayesrace.messages.codec import checked, schema_version
+from bayesrace.messages.codec import checked, is_readable, schema_version
 from bayesrace.messages.rules import (
     Choice,
     Flag,
@@ -30,7 +32,15 @@ __all__ = ["decode_json", "json_schema", "to_json"]
 
 M = TypeVar("M", bound=Message)
 
-_MALFORMED = (ValueError, TypeError, KeyError, OverflowError, msgpack.UnpackException)
+_MALFORMED = (
+    ValueError,
+    TypeError,
+    KeyError,
+    OverflowError,
+    RecursionError,
+    msgpack.UnpackException,
+)
+_read: Final = msgspec.json.Decoder().decode
 
 
 class _Form(NamedTuple):
@@ -40,6 +50,8 @@ class _Form(NamedTuple):
     keys: frozenset[str]
     vectors: tuple[tuple[str, Vector], ...]
     reals: tuple[str, ...]
+    readable: bool
+    """msgspec knows all of its rules, but for whole rows, of which JSON has columns."""
 
 
 class _Forms(dict[type[Message], _Form]):
@@ -49,7 +61,7 @@ class _Forms(dict[type[Message], _Form]):
         rules = rules_of(kind)
         vectors = tuple((name, rule) for name, rule in rules.items() if isinstance(rule, Vector))
         reals = tuple(name for name, rule in rules.items() if isinstance(rule, Real))
-        self[kind] = _Form(rules, frozenset(("schema", *rules)), vectors, reals)
+        self[kind] = _Form(rules, frozenset(("schema", *rules)), vectors, reals, is_readable(rules))
         return self[kind]
 
 
@@ -81,9 +93,12 @@ def decode_json(kind: type[M], data: bytes) -> M:
     """
     form = _FORMS[kind]
     try:
-        content = pydantic_core.from_json(data)
+        content = _read(data)
         for name, rule in form.vectors:
             content[name] = _flat(rule, content[name])
+        if form.readable:
+            with suppress(msgspec.ValidationError):  # for which the checks below have better words
+                return msgspec.convert(content, kind)
         for name in form.reals:
             content[name] = _float(content[name])
     except _MALFORMED as error:
