@@ -1,11 +1,11 @@
 """Real-time priority, CPU affinity and memory locking; refusals are reported, and the work goes on.
 
-They need rights that few processes have. :func:`short_slices` needs none: with it the threads of
-the transport run as soon as a message wakes them.
+Most of them need rights that few processes have. :func:`short_slices` needs none: threads of the
+transport that are started in it run as soon as a message wakes them.
 
-Only the calling thread is scheduled and bound, so call it from the control thread once the
-transport has started its own: with the whole process at real-time priority, message latency
-doubles on two cores.
+:func:`prepare_thread` schedules and binds the calling thread alone, so call it from the control
+thread once the transport has started its own: with the whole process at real-time priority,
+message latency doubles on two cores.
 """
 
 import ctypes
@@ -83,8 +83,8 @@ def short_slices() -> Iterator[None]:
 
     Linux, from 6.12 on, lets a thread with a shorter slice preempt one with a longer slice when it
     wakes, though in the long run it gets no more of the CPU. Without that, a message waits until
-    whoever computes on its CPU sleeps, or for the next scheduler tick, up to 4 ms later. No effect
-    on other systems, and on threads that have a policy of their own.
+    the thread that runs on its CPU sleeps, or for a tick of the scheduler (4 ms at 250 Hz). No
+    effect on other systems, where the kernel refuses it, and on threads with a policy of their own.
     """
     before = _scheduling()
     if before is None or before.policy != os.SCHED_OTHER:
@@ -95,7 +95,7 @@ def short_slices() -> Iterator[None]:
     try:
         yield
     finally:
-        before.runtime = slice_ns
+        before.runtime = slice_ns  # 0, the system's own, would lose one that was set before
         _schedule(before)
 
 

@@ -280,12 +280,14 @@ class ControllerProcess:
         return None
 
     def _prepare(self) -> None:
-        """New weights, and the preparation of the next cycle, in what is left of the budget."""
+        """New weights; after a pause (:data:`_WAY`) the preparation of the next cycle, in what is
+        left of the budget."""
         if self._adoption is not None:
             self._adoption.between_cycles(self._next_cycle)
-        time.sleep(min(_WAY * self._schedule.period_ns, _WAY_NS) * 1e-9)
-        left_s = (self._budget_end_ns - time.monotonic_ns()) * 1e-9
-        if left_s > 0:
+        pause_s = min(_WAY * self._schedule.period_ns, _WAY_NS) * 1e-9
+        if self._left_s > pause_s:
+            time.sleep(pause_s)
+        if (left_s := self._left_s) > 0:
             until_next_ns = self._schedule.deadline_ns - self._timing.released_ns
             self._cycle.prepare(until_next_ns * 1e-9, left_s)
 
@@ -339,6 +341,11 @@ class ControllerProcess:
         if newest is None:
             return 0
         return self._schedule.missing(newest.time_s, self._driver.interval_s)
+
+    @property
+    def _left_s(self) -> float:
+        """Of the budget."""
+        return (self._budget_end_ns - time.monotonic_ns()) * 1e-9
 
     @property
     def _budget_end_ns(self) -> int:

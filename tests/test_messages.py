@@ -3,9 +3,10 @@
 import json
 import logging
 import math
-from typing import Any, get_type_hints
+from typing import Annotated, Any, get_type_hints
 
 import msgpack
+import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
@@ -40,6 +41,7 @@ from bayesrace.messages.rules import (
     Scalars,
     Text,
     Vector,
+    meta,
     rules_of,
 )
 from tests.mutations import KINDS
@@ -57,6 +59,10 @@ STATE = State(
     lockstep=True,
     actuation_delays=(2.0, 4e-4, 1e-3),
     final=False,
+)
+
+EVENT = Event(
+    seq=0, source_time_ns=0, run=0, source="plant", kind="kind", text="text", data={"a": 1.0}
 )
 
 _text = st.text(st.characters(codec="utf-8"), max_size=30)
@@ -104,6 +110,27 @@ def test_every_message_survives_the_wire(message: Message) -> None:
     content = {"schema": schema_version(type(message)), **fields}
     assert data == msgpack.packb(content)
     assert checked(type(message), msgpack.unpackb(data)) == message
+
+
+def test_numpys_floats_and_texts_are_written_as_pythons() -> None:
+    """A control law or vehicle of one's own may return them."""
+    x = tuple(np.array(X0))
+    odd = replace(STATE, time_s=np.float64(0.5), x=x)
+    assert encode(odd) == encode(STATE)
+    assert encode(EVENT) == encode(replace(EVENT, text=np.str_("text"), data={"a": np.float64(1)}))
+
+
+def test_a_field_without_a_complete_rule_is_named() -> None:
+    class Bare(Message, frozen=True, kw_only=True):
+        number: Annotated[float, Real(0.0, 1.0)]
+
+    class Lopsided(Message, frozen=True, kw_only=True):
+        numbers: Annotated[tuple[Annotated[float, meta(Real(0.0, 1.0))], ...], meta(Vector(2))]
+
+    with pytest.raises(TypeError, match=r"Bare\.number has no rule"):
+        largest_bytes(Bare)
+    with pytest.raises(TypeError, match=r"Lopsided\.numbers: annotate its numbers"):
+        largest_bytes(Lopsided)
 
 
 @settings(deadline=None)
@@ -314,6 +341,23 @@ def test_every_message_survives_json_to_the_bit_and_is_as_its_schema_says(messag
     assert read == message
     assert encode(read) == encode(message)  # -0.0 is not 0.0
     assert conforms(json.loads(text), json_schema(kind))
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (b'"schema":2,', b""), (b'"schema":2', b'"schema":1'), (b'"schema":2', b'"schema":2.0'),
+        (b'"final":false', b'"final":0'), (b'"lap":0', b'"lap":false'), (b'"lap":0', b'"lap":0.5'),
+        (b'"time_s":0.5', b'"time_s":"0.5"'), (b'"time_s":0.5', b'"time_s":true'),
+        (b'"arrival_s":[0.0004]', b'"arrival_s":[]'), (b'"lap":0', b'"lap":0,"more":0'),
+    ],
+)  # fmt: skip
+def test_json_is_refused_unless_it_is_exactly_a_message(old: bytes, new: bytes) -> None:
+    text = to_json(State, encode(STATE))
+    assert text is not None
+    assert text.count(old) == 1
+    with pytest.raises(InputError, match="State"):
+        decode_json(State, text.replace(old, new))
 
 
 def test_json_names_the_numbers_of_states_and_inputs() -> None:

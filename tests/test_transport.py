@@ -476,17 +476,24 @@ def test_an_inbox_takes_several_topics_each_with_its_own_depth_and_decoder(
     not Path("/proc/self/sched").exists() or "se.slice" not in Path("/proc/self/sched").read_text(),
     reason="this kernel does not tell slices: before Linux 6.12, or not Linux",
 )
-def test_threads_of_the_transport_have_shorter_slices_than_their_owner() -> None:
+def test_threads_of_the_transport_have_shorter_slices_than_their_owner(
+    pair: tuple[Any, Any],
+) -> None:
     """So that a message that wakes them does not wait for the thread that computes."""
-    with private_endpoints("slices") as (endpoint,), open_session(Endpoints(listen=(endpoint,))):
-        slices_ns = {
-            (task / "comm").read_text()[:3]: int(re.findall(r"se\.slice\D*(\d+)", text)[0])
-            for task in Path("/proc/self/task").iterdir()
-            for text in [(task / "sched").read_text()]
-        }
-    owner = int(re.findall(r"se\.slice\D*(\d+)", Path("/proc/thread-self/sched").read_text())[0])
-    assert {"app", "net"} <= slices_ns.keys()
-    assert max(slices_ns["app"], slices_ns["net"]) < owner
+
+    def slice_ns(task: Path) -> int:
+        return int(re.findall(r"se\.slice\D*(\d+)", (task / "sched").read_text())[0])
+
+    sender, receiver = Inbox(pair[0], "orca"), Inbox(pair[1], "orca")
+    receiver.subscribe(STATE)
+    meet(sender, receiver)
+    Publisher(pair[0], STATE, "orca").put(state(0), lockstep=True)
+    take(receiver, Kind.MESSAGE)
+    owner = Path(f"/proc/self/task/{threading.get_native_id()}")
+    names = {task: (task / "comm").read_text()[:3] for task in owner.parent.iterdir()}
+    transport = {task: name for task, name in names.items() if name in ("app", "net", "rx-", "tx-")}
+    assert {"net", "rx-"} <= set(transport.values())
+    assert max(map(slice_ns, transport)) < slice_ns(owner)
 
 
 def test_a_peer_that_polls_sleeps_while_no_answer_can_be_there(

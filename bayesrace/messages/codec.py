@@ -2,9 +2,10 @@
 
 Nothing here executes what it reads. :func:`decode` returns a message whose every field has passed
 its rule, or raises :class:`InputError`, and nothing else. Input longer than the longest valid
-message of its class is refused unread, so invalid input costs no more time and memory than valid.
+message of its class is refused unread, so invalid input costs little more time and memory than the
+longest valid one.
 
-msgspec reads what :func:`encode` writes, in a microsecond. It takes an integer for a float, and
+msgspec reads what :func:`encode` writes, a state in 1.6 us. It takes an integer for a float, and
 knows neither rows nor maps of scalars; so what it has read counts only if it encodes to the same
 bytes. All else, from other encoders or damaged, is read by msgpack and checked rule by rule, which
 also says what is wrong.
@@ -104,7 +105,7 @@ _SPECS: Final = _Specs()
 
 
 def is_readable(rules: Mapping[str, Rule]) -> bool:
-    """Whether msgspec can check these rules, but for whole rows."""
+    """Whether msgspec checks all of these rules; of vectors of rows it checks the length alone."""
     return not any(isinstance(rule, Choice | Scalars) for rule in rules.values())
 
 
@@ -116,7 +117,11 @@ def _distinct(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """msgspec's fallback: read-only maps become maps; anything else is a programming error."""
+    """msgspec's fallback: NumPy's floats become floats, read-only maps become maps; anything else
+    is a programming error."""
+    for kind in (float, int, str):
+        if isinstance(value, kind):
+            return kind(value)
     if hasattr(value, "items"):
         return dict(value)
     raise TypeError(f"a {type(value).__name__} cannot be part of a message")

@@ -51,7 +51,7 @@ class _Form(NamedTuple):
     vectors: tuple[tuple[str, Vector], ...]
     reals: tuple[str, ...]
     readable: bool
-    """msgspec knows all of its rules, but for whole rows, of which JSON has columns."""
+    """msgspec checks all of its rules. Rows are whole if their columns are of one length."""
 
 
 class _Forms(dict[type[Message], _Form]):
@@ -61,7 +61,9 @@ class _Forms(dict[type[Message], _Form]):
         rules = rules_of(kind)
         vectors = tuple((name, rule) for name, rule in rules.items() if isinstance(rule, Vector))
         reals = tuple(name for name, rule in rules.items() if isinstance(rule, Real))
-        self[kind] = _Form(rules, frozenset(("schema", *rules)), vectors, reals, is_readable(rules))
+        whole = all(one.names or one.rows is None or one.length == 1 for _, one in vectors)
+        keys = frozenset(("schema", *rules))
+        self[kind] = _Form(rules, keys, vectors, reals, whole and is_readable(rules))
         return self[kind]
 
 
@@ -96,8 +98,8 @@ def decode_json(kind: type[M], data: bytes) -> M:
         content = _read(data)
         for name, rule in form.vectors:
             content[name] = _flat(rule, content[name])
-        if form.readable:
-            with suppress(msgspec.ValidationError):  # for which the checks below have better words
+        if form.readable and content.keys() == form.keys:
+            with suppress(msgspec.ValidationError):  # the checks below say more about the fault
                 return msgspec.convert(content, kind)
         for name in form.reals:
             content[name] = _float(content[name])

@@ -7,6 +7,7 @@ it can check by itself, and :func:`rules_of` finds the whole. :func:`wire_bytes`
 rule's largest value in msgpack's widest form: the codec refuses longer input unread.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -103,13 +104,13 @@ class Vector:
 
     Exactly ``length`` of them; or, with ``rows``, any whole number of rows up to that many.
     ``names`` of the numbers (of a row) are for JSON, where an array without names stays one.
-    The limit is that of the numbers' own annotation.
+    ``limit`` comes from the numbers' own annotation, whose range must be symmetric.
     """
 
     length: int
     rows: int | None = None
     names: tuple[str, ...] = ()
-    limit: float = _REAL_MAX
+    limit: float = math.nan
 
     def check(self, value: Any) -> tuple[float, ...]:
         """The numbers; ValueError if one is no float in range, or their count is wrong."""
@@ -198,10 +199,15 @@ def _rule(name: str, hint: Any) -> Rule:
     if not rules:
         raise TypeError(f"{name} has no rule: Annotated[type, meta(rule)]")
     rule: Rule = rules[0]
-    if isinstance(rule, Vector):
-        number = _rule(f"a number of {name}", get_args(value)[0])
-        return replace(rule, limit=number.high) if isinstance(number, Real) else rule
-    return rule
+    return _limited(name, rule, get_args(value)[0]) if isinstance(rule, Vector) else rule
+
+
+def _limited(name: str, rule: Vector, number_hint: Any) -> Vector:
+    """The rule with the limit of the numbers' annotation, the only place to state it."""
+    number = _rule(f"a number of {name}", number_hint)
+    if not (isinstance(number, Real) and number.low == -number.high and math.isnan(rule.limit)):
+        raise TypeError(f"{name}: annotate its numbers with meta(Real(-limit, limit))")
+    return replace(rule, limit=number.high)
 
 
 def wire_bytes(rule: Rule) -> int:

@@ -39,17 +39,16 @@ NEWEST: Final = 1024
 """Messages of the control path that wait at most; a thread this far behind needs the newest."""
 
 LOCKSTEP_SPIN_S: Final = 0.002
-"""How long a lockstep peer polls for the answer before it sleeps. Waking an idle CPU takes longer
-than the answer: measured, the round trip falls from 270 to 90 us."""
+"""How long a lockstep peer polls for an answer that is due before it sleeps. Waking an idle CPU
+takes longer than the answer: measured, the round trip falls from 270 to 90 us."""
 
 _AHEAD_S: Final = 1e-4
-"""How long before the soonest that an answer can be there a lockstep peer begins to poll: until
-then it sleeps, since it polls at the expense of whoever works on the answer. Longer than a sleep
-overshoots."""
+"""A lockstep peer sleeps until this long before the earliest answer that it expects, because
+polling takes CPU time from the process that computes the answer. A sleep ends some 0.06 ms late."""
 _LATER: Final = 2e-6
-"""By how much the soonest may be later from one message to the next [s] ..."""
+"""Largest increase of the expected time from one message to the next [s]."""
 _SOONER: Final = 0.9
-"""... and what becomes of it where the message was there before the sleep had ended."""
+"""Factor on the expected time if a message had arrived before the sleep ended."""
 
 POLL_S: Final = 5e-5
 """Shortest sleep between two looks ..."""
@@ -122,8 +121,8 @@ class Inbox:
         """Requests rejected because too many waited."""
         self.spin_s = 0.0
         """How long :meth:`get` polls before it sleeps; 0 wherever others need the CPU."""
-        self._soonest_s = 0.0
-        """After how long an item may be there, while it polls."""
+        self._expected_s = 0.0
+        """After how long the earliest message is expected, in lockstep."""
 
     def subscribe(
         self,
@@ -197,30 +196,38 @@ class Inbox:
         if self._stamping or not self._channels:
             return self._from_queue(timeout_s)
         begin = time.monotonic()
-        if self.spin_s and (item := self._in_turn() or self._rest(begin)) is not None:
+        if (item := self._in_turn()) is not None:
             return item
+        rested_s = self._rest(timeout_s) if self.spin_s else 0.0
+        was_there = rested_s > 0
         while True:
             if (item := self._in_turn()) is not None:
-                self._soonest_s = min(time.monotonic() - begin, self._soonest_s + _LATER)
+                if self.spin_s and item.kind is Kind.MESSAGE:
+                    self._expect(time.monotonic() - begin, was_there)
                 return item
+            was_there = False
             waited_s = time.monotonic() - begin
             if waited_s >= timeout_s:
                 return None
-            if waited_s < self.spin_s:
+            if waited_s - rested_s < self.spin_s:
                 os.sched_yield()  # the thread that receives may be waiting for this very CPU
                 continue
             sleep_s = min(max(_SHARE * waited_s, POLL_S), _IDLE_S)
             time.sleep(min(sleep_s, timeout_s - waited_s))
 
-    def _rest(self, begin: float) -> Item | None:
-        """Sleeps until shortly before an item can be there; returns one that was sooner."""
-        if self._soonest_s <= _AHEAD_S:
-            return None
-        time.sleep(self._soonest_s - _AHEAD_S)
-        item = self._in_turn()
-        if item is not None:
-            self._soonest_s *= _SOONER
-        return item
+    def _rest(self, timeout_s: float) -> float:
+        """Sleeps until shortly before a message is expected; returns the length of that sleep."""
+        rest_s = max(min(self._expected_s - _AHEAD_S, timeout_s), 0.0)
+        if rest_s:
+            time.sleep(rest_s)
+        return rest_s
+
+    def _expect(self, waited_s: float, was_there: bool) -> None:
+        """Learns from a message that took so long, or ``was_there`` when the sleep ended."""
+        if was_there:
+            self._expected_s *= _SOONER
+        else:
+            self._expected_s = min(waited_s, self._expected_s + _LATER)
 
     def poll(self, until_ns: int) -> Item | None:
         """The next message of the channels, looked for until the monotonic clock is ``until_ns``.

@@ -1,7 +1,8 @@
 """The control thread's part in new weights: it records states and adopts weights between cycles.
 
-In real time nothing here decodes, compares, copies, waits or takes a lock. Nothing releases the
-interpreter's lock or wakes another thread either: that would cost a hundred times the adoption.
+In real time nothing here decodes, compares, copies more than a state, waits or takes a lock.
+Nothing releases the interpreter's lock or wakes another thread either: that would cost a hundred
+times the adoption.
 """
 
 import math

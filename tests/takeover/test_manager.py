@@ -11,13 +11,16 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from msgspec import structs
 
 from bayesrace.gp.weights import GpWeights
 from controller.weights.adoption import RECORDED, Adoption
+from controller.weights.prediction import StateRecord
 from controller.weights.settings import GateSettings
 from controller.weights.store import History, Store
 from operation.learn.publishing import in_words
@@ -104,8 +107,26 @@ def test_the_newest_states_are_kept_for_the_validator() -> None:
     assert [(one.seq, one.fallen_back) for one in newest] == [
         (RECORDED + 998, True), (RECORDED + 999, False)
     ]  # fmt: skip
-    assert (newest[0].x, newest[0].u_applied) == (a_state(0).x, a_state(0).u_applied)
     assert adoption.states(RECORDED + 1000, 64) == []
+
+
+@pytest.mark.parametrize("fallen_back", [None, False, True])
+def test_a_state_is_kept_as_it_was(fallen_back: bool | None) -> None:
+    adoption, state = Adoption(lambda _: None), a_state(5)
+    odd = structs.replace(
+        state, epoch=2**62 + 1, run=3, time_s=0.1 + 0.2, x=(1.5, 2.5, 3.5, 4.5, 5.5, 6.5, 0.1),
+        u_applied=(7.5, 8.5), lockstep=not state.lockstep,
+    )  # fmt: skip
+    adoption.record(state, None)
+    before_ns = time.monotonic_ns()
+    adoption.record(odd, fallen_back)
+    (kept,) = adoption.states(1, 64)
+    assert before_ns <= kept.recorded_ns <= time.monotonic_ns()
+    assert kept == StateRecord(
+        1, odd.epoch, odd.run, odd.seq, odd.time_s, kept.recorded_ns, odd.x, odd.u_applied,
+        odd.lockstep, fallen_back,
+    )  # fmt: skip
+    assert type(kept.lockstep) is bool
 
 
 def test_a_rollback_needs_no_validator(course: Course, good: GpWeights, again: GpWeights) -> None:
