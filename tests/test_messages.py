@@ -270,27 +270,11 @@ def test_the_decoder_counts_drops_and_logs_at_a_limited_rate(
 def test_a_map_holds_few_finite_scalars(entries: dict[str, Any], fault: str) -> None:
     """The name in the refusal is quoted: it comes from outside and may end on a terminal."""
     with pytest.raises(InputError, match=fault):
-        decode(
-            Event,
-            encode(
-                Event(
-                    seq=0,
-                    source_time_ns=0,
-                    run=0,
-                    source="plant",
-                    kind="kind",
-                    text="text",
-                    data=entries,
-                )
-            ),
-        )
+        decode(Event, encode(replace(EVENT, data=entries)))
 
 
 def test_maps_in_messages_are_read_only() -> None:
-    event = Event(
-        seq=0, source_time_ns=0, run=0, source="plant", kind="kind", text="text", data={"a": 1}
-    )
-    read = decode(Event, encode(event))
+    read = decode(Event, encode(EVENT))
     with pytest.raises(TypeError):
         read.data["a"] = 2  # type: ignore[index]
 

@@ -29,6 +29,7 @@ from tests.conftest import (
     drive,
     mirrored_line,
     mirrored_weights,
+    ready,
 )
 
 EXACT = SETTINGS.model_copy(update={"iterations": 60, "iterations_cold": 60, "tolerance": 1e-11})
@@ -343,9 +344,7 @@ def test_the_same_inputs_give_the_same_bits(
     weights: GpWeights,
     circuit: Circuit,
 ) -> None:
-    other = NativeStep(kinematic_artefact, car, SETTINGS)
-    other.set_weights(weights)
-    other.set_path(circuit.table)
+    other = ready(kinematic_artefact, car, weights, circuit, SETTINGS)
     first, second = drive(native, circuit, 60)[1], drive(other, circuit, 60)[1]
     assert first.tobytes() == second.tobytes()
 

@@ -195,39 +195,25 @@ class Inbox:
             self._empty_channels()
         if self._stamping or not self._channels:
             return self._from_queue(timeout_s)
-        begin = time.monotonic()
-        if (item := self._in_turn()) is not None:
-            return item
-        rested_s = self._rest(timeout_s) if self.spin_s else 0.0
-        was_there = rested_s > 0
-        while True:
-            if (item := self._in_turn()) is not None:
-                if self.spin_s and item.kind is Kind.MESSAGE:
-                    self._expect(time.monotonic() - begin, was_there)
-                return item
-            was_there = False
-            waited_s = time.monotonic() - begin
+        begin, misses, rested_s = time.monotonic(), 0, 0.0
+        while (item := self._in_turn()) is None:
+            waited_s, misses = time.monotonic() - begin, misses + 1
             if waited_s >= timeout_s:
                 return None
-            if waited_s - rested_s < self.spin_s:
+            if misses == 1 and self.spin_s and self._expected_s > _AHEAD_S:
+                rested_s = min(self._expected_s - _AHEAD_S, timeout_s)
+                time.sleep(rested_s)
+            elif waited_s - rested_s < self.spin_s:
                 os.sched_yield()  # the thread that receives may be waiting for this very CPU
-                continue
-            sleep_s = min(max(_SHARE * waited_s, POLL_S), _IDLE_S)
-            time.sleep(min(sleep_s, timeout_s - waited_s))
-
-    def _rest(self, timeout_s: float) -> float:
-        """Sleeps until shortly before a message is expected; returns the length of that sleep."""
-        rest_s = max(min(self._expected_s - _AHEAD_S, timeout_s), 0.0)
-        if rest_s:
-            time.sleep(rest_s)
-        return rest_s
-
-    def _expect(self, waited_s: float, was_there: bool) -> None:
-        """Learns from a message that took so long, or ``was_there`` when the sleep ended."""
-        if was_there:
-            self._expected_s *= _SOONER
-        else:
-            self._expected_s = min(waited_s, self._expected_s + _LATER)
+            else:
+                sleep_s = min(max(_SHARE * waited_s, POLL_S), _IDLE_S)
+                time.sleep(min(sleep_s, timeout_s - waited_s))
+        if misses and self.spin_s and item.kind is Kind.MESSAGE:
+            if misses == 1 and rested_s:
+                self._expected_s *= _SOONER
+            else:
+                self._expected_s = min(time.monotonic() - begin, self._expected_s + _LATER)
+        return item
 
     def poll(self, until_ns: int) -> Item | None:
         """The next message of the channels, looked for until the monotonic clock is ``until_ns``.
