@@ -10,8 +10,11 @@ import json
 import logging
 import os
 import re
+import socket
+import struct
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import Any, Final
 
 import zenoh
@@ -25,6 +28,7 @@ from bayesrace.transport.endpoints import Endpoints, leaves
 from bayesrace.transport.links import nodes_at, wait_linked
 from bayesrace.transport.membership import refusals, serve_access
 from bayesrace.transport.probe import Finding, probe_all
+from bayesrace.transport.requests import in_transport_thread
 from bayesrace.transport.watch import LinkWatch, report
 
 __all__ = ["open_session", "try_links", "zenoh_config"]
@@ -218,5 +222,28 @@ def _opened(endpoints: Endpoints, role: Role, peers_follow: bool) -> Iterator[An
             f"{(cause[0] if cause else text[:300]).strip()}; "
             "choose another endpoint or end the process that uses it"
         ) from None
-    with session:
+    on_link = in_transport_thread(lambda _: _close_without_waiting())
+    with session, session.info.declare_link_events_listener(on_link):
+        _close_without_waiting()  # links that stand already; to list them, low-latency, panics
         yield session
+
+
+def _close_without_waiting() -> None:
+    """Switches SO_LINGER off on this process's sockets; the system still delivers what was sent.
+
+    Zenoh lets each of its TCP sockets linger for 10 s, in a thread that serves all links: where the
+    other end has stopped reading, closing its link would hold up the messages of all others for so
+    long (eclipse-zenoh/zenoh#2350).
+    """
+    for path in Path("/dev/fd").iterdir():
+        try:
+            one = socket.socket(fileno=int(path.name))
+        except OSError:  # no socket, or closed since
+            continue
+        try:
+            if struct.unpack("ii", one.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, 8))[0]:
+                one.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))
+        except OSError:  # a socket without such an option, or closed since
+            continue
+        finally:
+            one.detach()

@@ -1,7 +1,9 @@
 """A TCP connection that can be broken: a relay between a port of its own and another one."""
 
+import math
 import socket
 import threading
+import time
 from contextlib import suppress
 
 from bayesrace.transport import free_endpoint
@@ -17,7 +19,9 @@ def _address(endpoint: str) -> tuple[str, int]:
 class Proxy:
     """Relays to the endpoint ``target`` whatever connects to :attr:`endpoint`."""
 
-    def __init__(self, target: str) -> None:
+    def __init__(self, target: str, bytes_per_s: float = math.inf) -> None:
+        """``bytes_per_s``: how fast it takes what is sent, in each direction."""
+        self._bytes_per_s = bytes_per_s
         self.endpoint = free_endpoint()
         self._target = target
         self._lock = threading.Lock()
@@ -65,11 +69,12 @@ class Proxy:
                     source.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                     threading.Thread(target=self._relay, args=(source, sink), daemon=True).start()
 
-    @staticmethod
-    def _relay(source: socket.socket, sink: socket.socket) -> None:
+    def _relay(self, source: socket.socket, sink: socket.socket) -> None:
+        slow = math.isfinite(self._bytes_per_s)
         with suppress(OSError):
-            while data := source.recv(1 << 16):
+            while data := source.recv(1 << (10 if slow else 16)):
                 sink.sendall(data)
+                time.sleep(len(data) / self._bytes_per_s)
         for one in (source, sink):
             with suppress(OSError):
                 one.shutdown(socket.SHUT_RDWR)

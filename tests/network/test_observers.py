@@ -1,0 +1,133 @@
+"""Control never waits for observers: those that stop reading, read slowly or vanish.
+
+Zenoh's sockets linger for 10 s when they are closed, in a thread that serves all links. Without
+``session._close_without_waiting`` the plant gets no commands for 9 s once the lease of such a link
+is over.
+"""
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from bayesrace.configuration import read_configuration
+from bayesrace.transport import free_endpoint
+from tests.network.cars import Course, gentle_course, start_controller, start_plant
+from tests.network.hosts import PLANT_IP, Host, Network
+from tests.network.observer import observing, observing_from
+from tests.network.proxy import Proxy
+from tests.programs import ROOT, environment, until
+from tests.security.authority import Bundles, bundles
+from tests.security.rig import secured
+
+__all__ = ["bundles"]
+
+pytestmark = [pytest.mark.wall_clock, pytest.mark.unmeasured]
+
+LEASE_S = 5.0
+MOST_BRAKED = 25
+"""Periods without a command: the machine stalls now and then."""
+
+
+@pytest.fixture(scope="module")
+def course(tmp_path_factory: pytest.TempPathFactory) -> Course:
+    return gentle_course(tmp_path_factory.mktemp("course"))
+
+
+@contextmanager
+def bystanders(
+    count: int, where: Sequence[str], bundle: Path | str = "-", host: Host | None = None
+) -> Iterator[subprocess.Popen[str]]:
+    """That many observers in a process of their own, which hear the car."""
+    words = [sys.executable, "-m", "tests.network.bystander", str(count), str(bundle), *where]
+    process = subprocess.Popen(
+        words if host is None else host.command(*words),
+        stdout=subprocess.PIPE, text=True, cwd=ROOT, env=environment(),
+    )  # fmt: skip
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "linked\n"
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def check_driven(braked: Callable[[], int], trouble: Callable[[], None]) -> None:
+    """The car is driven until long after the leases of links in trouble are over."""
+    before = braked()
+    trouble()
+    time.sleep(LEASE_S + 5.0)
+    assert braked() - before <= MOST_BRAKED
+
+
+def stopped(process: subprocess.Popen[str]) -> Callable[[], None]:
+    return lambda: process.send_signal(signal.SIGSTOP)
+
+
+@pytest.mark.parametrize(
+    "count",
+    [5, pytest.param(1, marks=pytest.mark.check), pytest.param(50, marks=pytest.mark.check)],
+)
+def test_observers_that_are_stopped(tmp_path: Path, course: Course, count: int) -> None:
+    with driving(tmp_path, course) as (where, braked), bystanders(count, where) as process:
+        check_driven(braked, stopped(process))
+
+
+@pytest.mark.check
+def test_observers_that_read_slowly(tmp_path: Path, course: Course) -> None:
+    with driving(tmp_path, course) as (where, braked):
+        plant, controller = (Proxy(one, bytes_per_s=1e4) for one in where)
+        with plant, controller, bystanders(5, (plant.endpoint, controller.endpoint)):
+            check_driven(braked, lambda: None)
+
+
+@pytest.mark.check
+def test_observers_that_are_stopped_at_secured_links(
+    tmp_path: Path, course: Course, bundles: Bundles
+) -> None:
+    with secured(tmp_path, course, bundles) as rig:
+        rig.drive(1, lockstep=False, laps=0)
+        until(lambda: rig.phase() == "driving", "driving")
+        where = read_configuration(rig.config).endpoints("viewer").connect
+        with bystanders(5, where, bundles.path("viewer")) as process:
+            check_driven(lambda: int(str(rig.count("plant", "braked")["braked"])), stopped(process))
+
+
+@pytest.mark.check
+def test_observers_that_vanish(tmp_path: Path, course: Course, net: Network) -> None:
+    with (
+        driving(tmp_path, course, net.plant) as (where, braked),
+        bystanders(5, where, host=net.controller),
+    ):
+        check_driven(braked, net.link.cut)
+
+
+@contextmanager
+def driving(
+    folder: Path, course: Course, host: Host | None = None
+) -> Iterator[tuple[tuple[str, str], Callable[[], int]]]:
+    """A car that drives; where plant and controller listen, and the count of periods braked."""
+    where = (free_endpoint(), free_endpoint())
+    if host is not None:
+        where = (f"tcp/{PLANT_IP}:7447", f"tcp/{PLANT_IP}:7448")
+    log = folder / "run.mcap"
+    follow = (
+        observing(where, "orca", course.track, log)
+        if host is None
+        else observing_from(host, where, "orca", course.track_file, log)
+    )
+    with (
+        start_plant(folder, where[0], host=host),
+        start_controller(folder, course, *where, host=host),
+        follow as observer,
+    ):
+        observer.start(1)
+        until(lambda: bool(observer.state()), "a first state")
+        yield where, lambda: observer.status("plant")["counters"]["braked"]
+        observer.stop()
