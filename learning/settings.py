@@ -7,7 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from learning.kernels import DEFAULT_KERNELS, Kernel
 
-__all__ = ["MIN_SAMPLES", "TOLERANCE", "Progress", "TrainingSettings"]
+__all__ = ["MIN_SAMPLES", "TOLERANCE", "WIDEN", "Progress", "TrainingSettings"]
 
 Progress = Callable[[float, str], None]
 """Called from the training's own thread with the share done (0 to 1) and what was done."""
@@ -16,6 +16,9 @@ MIN_SAMPLES: Final = 20
 
 TOLERANCE: Final = 1e-7
 """Relative gain of the likelihood per iteration at which the optimiser stops."""
+
+WIDEN: Final = 1.45
+"""Of first weights: what first laps on many tracks take for a band that holds."""
 
 
 class TrainingSettings(BaseModel):
@@ -40,7 +43,7 @@ class TrainingSettings(BaseModel):
         10, ge=2, description="parts of the drive, or of the track, each held out in turn"
     )
     widen: float = Field(
-        1.45,
+        WIDEN,
         ge=1,
         le=100,
         description="factor on the standard deviations of weights that begin with no others: what "

@@ -18,7 +18,7 @@ from bayesrace.gp.weights import GpWeights, encode_weights, read_weights, write_
 from bayesrace.integrators import Discretisation
 from bayesrace.log import LogReader
 from bayesrace.messages import STATE, TELEMETRY
-from bayesrace.raceline import RaceLine, RaceLineError, RaceLineSettings, read_raceline
+from bayesrace.raceline import RaceLine, RaceLineError, RaceLineSettings, read_raceline_for
 from bayesrace.raceline.cached import raceline_file, racing_line
 from bayesrace.tracks import Track, load_track, write_track
 from bayesrace.vehicles import CarParameters
@@ -139,22 +139,22 @@ def prepare(
     """Everything that is needed to drive on ``tracks`` by controllers that predict with ``models``,
     made or taken from the cache, but for the files that are given.
 
-    Raises InputError for a track or car that cannot be used, RaceLineError, CompileError, and
+    Raises InputError for a track, car or line that cannot be used, RaceLineError, CompileError, and
     FmuFault if the FMU fails in the training drive.
     """
     if artefact is None:
         find_compiler()  # what is missing is reported now, not after the training
     car = settings.driven_car
     driven_on = [load_track(name, car.width_m) for name in tracks]
+    prepared_tracks = []
+    for track in driven_on:
+        with stages.stage(f"racing line, {track.name}"):
+            prepared_tracks.append(_prepared_track(track, car, settings.raceline, raceline))
     training = None
     if weights is None:
         train_track = load_track(settings.train_track, car.width_m)
         with stages.stage(f"training line, {train_track.name}"):
             training_track = _training_track(train_track, car, settings.raceline)
-    prepared_tracks = []
-    for track in driven_on:
-        with stages.stage(f"racing line, {track.name}"):
-            prepared_tracks.append(_prepared_track(track, car, settings.raceline, raceline))
     artefacts = [] if artefact is None else [artefact]
     if artefact is None:
         with stages.stage("build the controllers"):
@@ -173,7 +173,10 @@ def _prepared_track(
 ) -> PreparedTrack:
     """The racing line computed, from the cache, or from the file that is given."""
     cached = raceline_file(track, car, settings)
-    line = racing_line(track, car, settings) if line_file is None else read_raceline(line_file)
+    if line_file is None:
+        line = racing_line(track, car, settings)
+    else:
+        line = read_raceline_for(line_file, track, car)
     track_file = cached.with_name(_TRACK)
     track_file.parent.mkdir(parents=True, exist_ok=True)
     with replacing(track_file) as partial:
@@ -252,6 +255,7 @@ def training_settings(settings: PreparationSettings) -> TrainingSettings:
         kernels=settings.kernels,
         capacity=settings.points,
         seed=settings.seed,
+        widen=settings.widen,
         threads=settings.threads,
     )
 

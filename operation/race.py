@@ -87,7 +87,7 @@ class _Race:
         fmu, fmu_map = self.fmu_files
         settings = self.settings.model_copy(update={"fmu": fmu, "fmu_map": fmu_map})
         with _faults_named():
-            prepared = prepare(settings, (settings.track,), self.stages, self.models)
+            prepared = prepare(settings, (settings.track,), self.stages, self.models, settings.line)
         if prepared.training is not None:
             self._keep_files(prepared.training.driven_on, "train")
             shutil.copyfile(prepared.training.log, self.out / FILES.collect_log)

@@ -12,6 +12,7 @@ from codegen.settings import ProblemName
 from controller.pure_pursuit import PurePursuitSettings
 from controller.settings import MpcSettings
 from learning.kernels import DEFAULT_KERNELS, Kernel
+from learning.settings import WIDEN
 from plant.sensors import SensorNoise
 from plant.simulator import PLANT
 from plant.vehicle import SimulatorName
@@ -61,6 +62,9 @@ class PreparationSettings(BaseModel):
     points: int = Field(400, ge=20, le=1024, description="training points per output")
     kernels: tuple[Kernel, ...] = Field(
         DEFAULT_KERNELS, min_length=1, description="candidates of the GPs; held-out errors decide"
+    )
+    widen: float = Field(
+        WIDEN, ge=1, le=100, description="factor on the standard deviations of first weights"
     )
     threads: int = Field(
         0, ge=0, description="of the training, which they do not change; 0: one per core"
@@ -119,6 +123,9 @@ class RaceSettings(PreparationSettings):
 
     track: str = Field(
         "", description="race track: name, random:SEED, random10:SEED or CSV file; empty: the car's"
+    )
+    line: Path | None = Field(
+        None, description="racing line to drive on the race track (CSV); computed without"
     )
     laps: int = Field(
         2, ge=1, le=100, description="laps a controller drives: one from standstill, then flying"

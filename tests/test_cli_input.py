@@ -116,7 +116,8 @@ def test_a_line_for_another_car_is_refused_wherever_it_would_be_driven(
     write_raceline(tmp_path / "line.csv", replace(circuit.line, made_for=made))
     course = ("--track", "track.csv", "--raceline", "line.csv")
     export = ("fmu", "export", "--controller", "--artefact", kinematic_artefact, "--out", "x.fmu")
-    for command in (("controller", "--artefact", kinematic_artefact), ("collect",), export):
+    race = ("race", "--out", "run", "--no-limit")
+    for command in (("controller", "--artefact", kinematic_artefact), ("collect",), export, race):
         refused(cli(*command, *course), "line.csv", "friction of 0.5", "has 0.75")
     write_car(tmp_path / "wet.toml", car)
     assert cli("collect", *course, "--duration", "1", "--car", "wet.toml").code == 0

@@ -241,7 +241,9 @@ def test_a_race_repeats_the_settings_of_another(
     StopError.__module__ = "operation.race"
     monkeypatch.setattr("operation.race.race", record)
     first = ("--laps", "5", "--seed", "3", "--style", "calm", "--no-constraints", "--delay", "20")
-    cli("race", *first, "--track", "paddock", "--noise", "speed_mps=0.5")
+    line = ("--raceline", "line.csv")
+    cli("race", *first, *line, "--track", "paddock", "--noise", "speed_mps=0.5")
+    assert seen[0].line == Path("line.csv")
     path = tmp_path / "settings.json"
     path.write_text(seen[0].model_dump_json())
     cli("race", "--settings", path)

@@ -55,8 +55,8 @@ def preparing(
 
 
 STAGES = [
-    "training line, random",
     "racing line, random",
+    "training line, random",
     "build the controllers",
     "training drive (pure pursuit)",
     "train the residual",

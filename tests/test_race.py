@@ -17,6 +17,7 @@ from rich.console import Console
 
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import read_weights, write_weights
+from bayesrace.raceline import read_raceline, write_raceline
 from bayesrace.vehicles import default_car, read_car, write_car
 from codegen.build import build
 from codegen.settings import BuildSettings
@@ -134,6 +135,18 @@ def test_another_car_seed_and_problem_are_driven_and_reported(
     assert cli("report", race.out).code == 0
     assert (race.out / "result.json").read_text() == text
     assert read_result(race.out / "result.json").settings.car == "mine"
+
+
+@pytest.mark.check
+def test_a_given_line_is_driven(peanut_race: Race, short: ShortRace, tmp_path: Path) -> None:
+    """The same path, at two thirds of the speed."""
+    line = read_raceline(peanut_race.out / "race_raceline.csv", "peanut")
+    write_raceline(tmp_path / "slow.csv", replace(line, vx_mps=2 / 3 * line.vx_mps))
+    race = short("line", "--raceline", tmp_path / "slow.csv")()
+    kept = race.out / "race_raceline.csv"
+    assert kept.read_bytes() == (tmp_path / "slow.csv").read_bytes()
+    fast, slow = (one.lap("bayesrace")["flying_lap_time_s"] for one in (peanut_race, race))
+    assert slow == pytest.approx(1.5 * fast, rel=0.1)
 
 
 @pytest.mark.check

@@ -23,6 +23,7 @@ from operation.cli.options import (
     Endpoint,
     FmuFile,
     FmuMap,
+    GivenLine,
     Noise,
     ProblemChoice,
     Seed,
@@ -76,6 +77,7 @@ def race(
             metavar="TRACK", show_default="the car's", help="Track of the training drive."
         ),
     ] = "",
+    raceline: GivenLine = None,
     train_time: DriveTime = None,
     style: Style = "limit",
     laps: Annotated[
@@ -133,6 +135,7 @@ def race(
     settings = settings_of(RaceSettings, context, settings_file, {
         "car": {"car": driven}, "tyres": {"car": driven}, "track": {"track": track},
         "train_track": {"train_track": train_track}, "laps": {"laps": laps},
+        "raceline": {"line": raceline},
         "mode": {"mode": mode.value}, "style": {"pursuit": {"style": style}},
         "train_time": {"collect_s": train_time}, "seed": {"seed": seed}, "fmu": {"fmu": fmu},
         "fmu_map": {"fmu_map": fmu_map}, "simulator": {"simulator": simulator},

@@ -10,7 +10,15 @@ from bayesrace.defaults import DEFAULT_CAR
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from operation.cli.configured import connect_to, realtime
-from operation.cli.options import Car, CarName, Endpoint, SettingsFile, settings_of, writable
+from operation.cli.options import (
+    Car,
+    CarName,
+    Endpoint,
+    GivenLine,
+    SettingsFile,
+    settings_of,
+    writable,
+)
 from operation.cli.parts import LockMemory
 
 __all__ = ["latency"]
@@ -78,9 +86,7 @@ def latency(
         Path | None,
         typer.Option(metavar="DIR", show_default="built", help="Folder of 'bayesrace build'."),
     ] = None,
-    raceline: Annotated[
-        Path | None, typer.Option(metavar="FILE", show_default="computed", help="Racing line.")
-    ] = None,
+    raceline: GivenLine = None,
     attach: Annotated[
         bool, typer.Option("--attach", help="Measure a run that has been started elsewhere.")
     ] = False,

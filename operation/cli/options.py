@@ -24,6 +24,7 @@ __all__ = [
     "Endpoint",
     "FmuFile",
     "FmuMap",
+    "GivenLine",
     "LowLatency",
     "Noise",
     "OutFile",
@@ -135,6 +136,15 @@ RaceLineFile = Annotated[
     Path,
     typer.Option(
         "--raceline", metavar="FILE", help="Racing line, as 'bayesrace raceline' writes it."
+    ),
+]
+GivenLine = Annotated[
+    Path | None,
+    typer.Option(
+        "--raceline",
+        metavar="FILE",
+        show_default="computed",
+        help="Racing line to drive, as 'bayesrace raceline' writes it.",
     ),
 ]
 Endpoint = Annotated[

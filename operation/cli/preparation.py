@@ -17,6 +17,7 @@ from operation.cli.options import (
     DriveTime,
     FmuFile,
     FmuMap,
+    GivenLine,
     OutFile,
     ProblemChoice,
     RaceLineFile,
@@ -285,9 +286,7 @@ def build(
 def export(
     out: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write into.")],
     track: TrackName = "",
-    raceline: Annotated[
-        Path | None, typer.Option(metavar="FILE", show_default="computed", help="Racing line.")
-    ] = None,
+    raceline: GivenLine = None,
     weights: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="GP weights; without them, the uncorrected model."),

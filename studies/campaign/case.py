@@ -44,13 +44,13 @@ LEARNS_FROM: Final[Mapping[Controller, tuple[Controller, ...]]] = {
 with the weights of the last one named."""
 
 _FIXED: Final = (
-    *("mode", "fmu", "fmu_map", "simulator", "threads", "limit"),
+    *("mode", "fmu", "fmu_map", "simulator", "threads", "limit", "line"),
     *("discretisation.step_s", "pursuit.step_s", "pursuit.seed"),
 )
 """Settings that a campaign does not vary: it drives the built-in car in lockstep, in the plant's
 period, and ``seed`` is the one seed."""
 
-_LEFT_OUT: Final = {"car", "threads", "fmu", "fmu_map", "simulator"}
+_LEFT_OUT: Final = {"car", "threads", "fmu", "fmu_map", "simulator", "line"}
 """Settings that a row has in other columns, or that no campaign has."""
 
 _SOURCES: Final = (

@@ -49,7 +49,7 @@ __all__ = ["Campaign", "read_plan", "spread"]
 
 _MOST_CASES: Final = 1_000_000
 _SPAN: Final = re.compile(r"(.*?)(\d{1,9})\.\.(\d{1,9})")
-_TRAINING: Final = ("train_track", "seed", "collect_s", "points", "kernels")
+_TRAINING: Final = ("train_track", "seed", "collect_s", "points", "kernels", "widen")
 
 
 class _Draw(BaseModel):
