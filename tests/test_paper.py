@@ -2,28 +2,38 @@
 
 import json
 import re
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 from rich.progress import TaskID
 
 from bayesrace.errors import InputError
 from bayesrace.integrators import PREDICTION
+from bayesrace.vehicles import CarParameters, builtin_cars, files, get_car
 from bayesrace.vehicles.models import dynamic
+from bayesrace.vehicles.tuning import PursuitTuning
 from learning.hyperparameters import maximise, starts
 from learning.likelihood import PairDistances
 from learning.residual import residual
-from operation.terminal.progress import Stage
-from studies.paper import kernels
+from operation.settings import RaceSettings
+from operation.terminal.progress import Stage, stages_on
+from studies.paper import kernels, make
+from studies.paper.experiment import Experiment
 from studies.paper.finding import Finding, at_most
 from studies.paper.kernels import kernel_section, smoothness
+from studies.paper.line import line_section, published_line
 from studies.paper.make import DRIVES, PaperSettings
 from studies.paper.models import model_section
 from studies.paper.residual import gains
+from studies.paper.tenth import tenth_section
 from tests.command_line import Cli, refused
+from tests.conftest import Circuit
 from tests.driven import CAR, drive
 from tests.programs import peanut
+from tests.reference import reference_file
 
 QUIET = Stage(None, TaskID(0))
 
@@ -116,11 +126,87 @@ def test_a_folder_without_the_files_is_refused(cli: Cli, tmp_path: Path) -> None
 def test_the_tenth_car_takes_the_papers_track_where_there_is_one(tmp_path: Path) -> None:
     for name in ("ethz", "ethzmobil"):
         peanut(tmp_path / f"{name}.csv")
-    assert PaperSettings(tracks=tmp_path).tenth[1] == "workshop"
+    assert PaperSettings(tracks=tmp_path).tenth.track == "workshop"
     (tmp_path / "f110_map2.csv").touch()
-    settings, race = PaperSettings(tracks=tmp_path).tenth
-    assert settings.train_track == race == str(tmp_path / "f110_map2.csv")
+    settings = PaperSettings(tracks=tmp_path).tenth
+    assert settings.train_track == settings.track == str(tmp_path / "f110_map2.csv")
     assert settings.driven_car.friction == 1.0
+
+
+# What is frozen ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("car", ["orca", "f1tenth"])
+def test_every_setting_is_frozen(car: str) -> None:
+    frozen = json.loads(Path(make.__file__).with_name(f"{car}.json").read_text())
+    assert RaceSettings.model_validate(frozen).model_dump(mode="json") == frozen
+
+
+def test_a_cars_tuning_may_change_and_what_is_published_stays(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """In the car's file and in the defaults of all cars."""
+    before = PaperSettings().orca, PaperSettings().tenth
+    changed = {"reference": 0.9, "dimension": [0.0, 0.0, 0.0]}
+    monkeypatch.setattr(PursuitTuning.model_fields["slower"], "json_schema_extra", changed)
+    cars = {
+        name: CarParameters.model_validate(one.model_dump(exclude={"tuning"}))
+        for name, one in builtin_cars().items()
+    }
+    monkeypatch.setattr(files, "builtin_cars", lambda: cars)
+    assert get_car("f1tenth").tuning.pursuit.slower == 0.9
+    assert (PaperSettings().orca, PaperSettings().tenth) == before
+
+
+@pytest.mark.check
+@pytest.mark.parametrize("seed", range(3))
+def test_the_small_car_laps_as_the_paper_says(seed: int) -> None:
+    """Appendix B, on its own track: with correction, and not without."""
+    tracks = reference_file("tracks/f110_map2.csv").parent
+    with stages_on(Console(quiet=True)) as stages:
+        one = Experiment(PaperSettings(tracks, seed=seed).tenth, stages, ("e_kinematic",))
+        verdicts = [found.verdict for found in tenth_section(one).findings]
+    assert verdicts == ["agrees", "agrees", "differs"]
+
+
+# The published line --------------------------------------------------------------------------
+
+
+def published_file(path: Path, circuit: Circuit) -> Path:
+    """A lap from standstill and 1 m more, faster, in the published form; the first again is left
+    out of the track by 1 cm, as a line that was not closed is."""
+    line = circuit.line
+    more = int(np.searchsorted(line.s_m, 1.0))
+    first = np.column_stack([line.s_m, line.xy_m, np.minimum(line.vx_mps, 4 * line.s_m)])
+    again = np.column_stack([line.s_m + line.length_m, line.xy_m, line.vx_mps])[:more]
+    again[:, 1:3] *= 1.01
+    rows = np.concatenate([first, again])
+    np.savetxt(path, np.column_stack([rows, rows[:, 0]]), delimiter=",", header="s,x,y,v,t")
+    return path
+
+
+def test_a_published_line_is_closed_and_at_speed_from_its_start(
+    circuit: Circuit, tmp_path: Path
+) -> None:
+    file = published_file(tmp_path / "published.csv", circuit)
+    line = published_line(file, circuit.track, CAR)
+    off_m = np.linalg.norm(line.xy_m[:, None] - circuit.line.xy_m, axis=2).min(axis=1)
+    assert off_m.max() < 0.02
+    assert line.length_m == pytest.approx(circuit.line.length_m, rel=1e-3)
+    there = np.interp(line.s_m, circuit.line.s_m, circuit.line.vx_mps)
+    assert line.vx_mps == pytest.approx(there, rel=0.05)
+
+
+@pytest.mark.check
+def test_on_the_papers_line_our_laps_take_as_long_as_the_published_ones() -> None:
+    file = reference_file("tracks/ethz_published_raceline.csv")
+    with stages_on(Console(quiet=True)) as stages:
+        one = Experiment(PaperSettings(file.parent).orca, stages)
+    weights = {"bayesrace": one.weights, "bestcase": None}
+    pairs = product(weights, (True, False))
+    laps = {(name, on): one.drive(name, weights[name], on) for name, on in pairs}
+    section = line_section(one, published_line(file, one.track, one.car), laps)
+    assert [found.verdict for found in section.findings] == ["agrees"] * 4
 
 
 # The page ------------------------------------------------------------------------------------
@@ -128,9 +214,10 @@ def test_the_tenth_car_takes_the_papers_track_where_there_is_one(tmp_path: Path)
 
 @pytest.mark.check
 @pytest.mark.unmeasured
-def test_the_quick_page_is_whole(cli: Cli, tmp_path: Path) -> None:
+def test_the_quick_page_is_whole(cli: Cli, circuit: Circuit, tmp_path: Path) -> None:
     for name in ("ethz", "ethzmobil"):
         peanut(tmp_path / f"{name}.csv")
+    published_file(tmp_path / "ethz_published_raceline.csv", circuit)
     out = tmp_path / "out"
     made = cli("paper", "--quick", "--tracks", tmp_path, "--out", out)
     assert made.code == 0, made.err

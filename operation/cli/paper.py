@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from operation.cli.options import GivenLine
+
 __all__ = ["paper"]
 
 
@@ -14,7 +16,8 @@ def paper(
         typer.Option(
             metavar="DIR",
             show_default="built-in tracks",
-            help="Folder with ethz.csv and ethzmobil.csv, and f110_map2.csv if you have it.",
+            help="Folder with ethz.csv and ethzmobil.csv, and f110_map2.csv and "
+            "ethz_published_raceline.csv if you have them.",
         ),
     ] = None,
     data: Annotated[
@@ -26,6 +29,7 @@ def paper(
             "DYN-NMPC-ETHZ.npz.",
         ),
     ] = None,
+    raceline: GivenLine = None,
     out: Annotated[
         Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for page and figures.")
     ] = Path("runs/paper"),
@@ -49,7 +53,7 @@ def paper(
     from studies.paper.make import PaperSettings, make_paper
 
     console = Terminal()
-    settings = PaperSettings(tracks=tracks, data=data, quick=quick, seed=seed)
+    settings = PaperSettings(tracks, data, raceline, quick, seed)
     with stages_on(console) as stages:
         page, sections = make_paper(settings, out, stages)
     for finding in (one for section in sections for one in section.findings):

@@ -16,15 +16,15 @@ from bayesrace.files import read_text
 from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.log import LogReader, LogWriter
 from bayesrace.messages import EVENT, STATE, TELEMETRY, TRUTH
+from bayesrace.raceline import RaceLine
 from controller.assembly import compiled_controller
-from controller.settings import MpcSettings
 from learning.dataset import Dataset
 from learning.logs import dataset_from_messages, fallback_cycles
 from operation.analysis.race import DrivenRun
 from operation.analysis.recording import PlannedRun, RunRecord
 from operation.closed_loop import ClosedLoop, built_in_car
 from operation.preparation import PredictionModel, prepare, updated_weights
-from operation.settings import PreparationSettings
+from operation.settings import RaceSettings
 from operation.terminal.progress import Stages
 from studies.campaign.case import software_identity
 
@@ -35,13 +35,13 @@ class Experiment:
     """One car on one track: training drive, weights, and laps from standstill."""
 
     def __init__(
-        self, settings: PreparationSettings, track: str, stages: Stages,
+        self, settings: RaceSettings, stages: Stages,
         models: Sequence[PredictionModel] = ("e_kinematic", "dynamic"),
     ) -> None:  # fmt: skip
         """``models``: that laps are predicted by. Raises as
         :func:`~operation.preparation.prepare`."""
         self.settings, self.car = settings, settings.driven_car
-        prepared = prepare(settings, (track,), stages, models)
+        prepared = prepare(settings, (settings.track,), stages, models, settings.line)
         if prepared.training is None:
             raise RuntimeError("without given weights there is a training drive")
         self.track, self._line = prepared.first.track, prepared.first.line
@@ -52,15 +52,16 @@ class Experiment:
 
     def drive(
         self, controller: str, weights: GpWeights | None = None, constraints: bool = True,
-        speed: float = 1.0,
+        speed: float = 1.0, line: RaceLine | None = None,
     ) -> DrivenRun:  # fmt: skip
         """A lap from standstill, or up to where the car is farther off than the track is wide.
 
-        ``speed``: share of the racing line's that is planned.
+        ``line``: the prepared one without. ``speed``: share of its speed that is planned.
         """
-        line = replace(self._line, vx_mps=speed * self._line.vx_mps)
+        line = line or self._line
+        line = replace(line, vx_mps=speed * line.vx_mps)
         artefact = self._artefacts[controller == "bestcase"]
-        mpc = MpcSettings(constraints=constraints, caution=0.0)
+        mpc = self.settings.mpc.model_copy(update={"constraints": constraints})
         law = compiled_controller(artefact, self.car, self.track, line, weights, mpc)
         record = RunRecord(PlannedRun(1, controller, law.weights_version))
         with TemporaryDirectory() as folder:

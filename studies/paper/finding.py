@@ -1,11 +1,14 @@
 """A published result beside ours, and what a stated criterion says of the two."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from matplotlib.figure import Figure
 
-__all__ = ["Figures", "Finding", "Section", "at_most"]
+__all__ = ["ELSEWHERE", "Figures", "Finding", "Section", "at_most"]
+
+ELSEWHERE: Final = "another track than the paper's, see --tracks"
+"""Why a lap is not compared."""
 
 
 class Finding(NamedTuple):
@@ -47,7 +50,7 @@ def at_most(
     left = f"{published:{form}} {unit}".strip()
     right = "none" if ours is None else f"{ours:{form}} {unit}".strip()
     if not comparable:
-        return Finding(what, left, right, "", None, "another track than the paper's, see --tracks")
+        return Finding(what, left, right, "", None, ELSEWHERE)
     holds = ours is not None and bool(ours <= published)
     return Finding(what, left, right, "ours is at most the published one", holds, reason)
 

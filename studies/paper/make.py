@@ -8,22 +8,22 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from bayesrace.errors import InputError
-from bayesrace.files import write_whole
+from bayesrace.files import read_text, write_whole
 from bayesrace.integrators import PREDICTION
-from bayesrace.raceline import RaceLineSettings
-from bayesrace.vehicles import CarParameters, get_car
+from bayesrace.raceline import RaceLineSettings, write_raceline
 from learning.arrays import dataset_from_npz
 from operation.analysis.published import SOURCE
 from operation.preparation import training_settings
 from operation.report.canvas import inline_svg, write_pdf
 from operation.report.render import template
 from operation.report.style import figure_style
-from operation.settings import PreparationSettings
+from operation.settings import PreparationSettings, RaceSettings
 from operation.terminal.progress import Stages
 from studies.bench import BenchResult, BenchSettings, run_bench
 from studies.paper.experiment import Experiment, stored
 from studies.paper.finding import Finding, Section
 from studies.paper.kernels import kernel_section, smoothness
+from studies.paper.line import line_section, published_line
 from studies.paper.loop import loop_sections
 from studies.paper.models import model_section
 from studies.paper.residual import Learned, learned, learning_sections
@@ -35,6 +35,9 @@ _TRACKS: Final = "ethzmobil.csv", "ethz.csv"
 """Training and race track of the paper's 1:43 car."""
 _TENTH_TRACK: Final = "f110_map2.csv"
 """Track of appendix B, which may be missing."""
+_LINE: Final = "ethz_published_raceline.csv"
+"""The line that the paper's laps follow, which may be missing; closed, it is written beside the
+page as a racing line of ours."""
 DRIVES: Final = "DYN-PP-ETHZMobil.npz", "DYN-GPMPC-ETHZ.npz", "DYN-NMPC-ETHZ.npz"
 """Published drives: pure pursuit, BayesRace's lap, BestCase's lap."""
 _SAMPLES: Final = 400
@@ -48,11 +51,13 @@ _FIGURES: Final = "figures"
 class PaperSettings(NamedTuple):
     """Folders of tracks and published drives, if there are any; InputError for missing files.
 
-    ``quick``: fewer kernels, points, seeds and problems. ``seed``: of training drives and GPs.
+    ``raceline``: driven by the 1:43 car in place of the computed one. ``quick``: fewer kernels,
+    points, seeds and problems. ``seed``: of training drives and GPs.
     """
 
     tracks: Path | None = None
     data: Path | None = None
+    raceline: Path | None = None
     quick: bool = False
     seed: int = 0
 
@@ -62,33 +67,45 @@ class PaperSettings(NamedTuple):
         return _files(self.data, DRIVES, "--data")
 
     @property
-    def orca(self) -> tuple[PreparationSettings, str]:
-        """Of the 1:43 car, and its race track."""
-        train, race = _files(self.tracks, _TRACKS, "--tracks") or ("", "")
-        car = _as_published("orca")
-        return self._of(car=car, train_track=str(train)), str(race) or car.race_track
+    def orca(self) -> RaceSettings:
+        """Of the 1:43 car."""
+        train, race = map(str, _files(self.tracks, _TRACKS, "--tracks") or ("", ""))
+        return self._of("orca", train_track=train, track=race, line=self.raceline)
 
     @property
-    def tenth(self) -> tuple[PreparationSettings, str]:
-        """Of the 1:10 car, and its race track; the paper's is trained on, too.
+    def tenth(self) -> RaceSettings:
+        """Of the 1:10 car; the paper's track is trained on, too.
 
         There the racing line assumes a friction of 1, as published.
         """
-        car = _as_published("f1tenth")
         race = (self.tracks or Path()) / _TENTH_TRACK
         if self.tracks is None or not race.is_file():
-            return self._of(car=car), car.race_track
+            return self._of("f1tenth")
         line = RaceLineSettings(friction=1.0)
-        return self._of(car=car, train_track=str(race), raceline=line), str(race)
+        return self._of("f1tenth", train_track=str(race), track=str(race), raceline=line)
 
-    def _of(self, **others: Any) -> PreparationSettings:
+    @property
+    def line(self) -> Path | None:
+        """File of the published racing line, if there is one."""
+        path = (self.tracks or Path()) / _LINE
+        return path if self.tracks is not None and path.is_file() else None
+
+    def _of(self, car: str, **others: Any) -> RaceSettings:
         fewer: Any = {"kernels": ("matern25",), "points": 150} if self.quick else {}
-        return PreparationSettings(seed=self.seed, **fewer, **others)
+        return RaceSettings.model_validate(
+            _as_published(car) | {"seed": self.seed} | fewer | others
+        )
 
 
-def _as_published(name: str) -> CarParameters:
-    """The built-in car, which learns from its own samples alone, without their mirror images."""
-    return get_car(name).model_copy(update={"mirrored_samples": False})
+def _as_published(car: str) -> dict[str, Any]:
+    """Frozen settings of a race, the car's tuning included, by which the paper is reproduced.
+
+    They hold every setting: a car's file and the defaults may change, the reproduction does not.
+    As published there are no mirrored samples, no widened bands (``widen`` 1) and no caution.
+    """
+    path = Path(__file__).with_name(f"{car}.json")
+    settings: dict[str, Any] = json.loads(read_text(path, "the frozen settings"))
+    return settings
 
 
 def _files(folder: Path | None, names: Iterable[str], option: str) -> tuple[Path, ...]:
@@ -105,9 +122,9 @@ def make_paper(settings: PaperSettings, out: Path, stages: Stages) -> tuple[Path
 
     Raises InputError for missing files, and as :func:`~operation.preparation.prepare`.
     """
-    (orca, race), tenth, drives = settings.orca, settings.tenth, settings.drives
+    orca, tenth, drives = settings.orca, settings.tenth, settings.drives
     out.mkdir(parents=True, exist_ok=True)
-    one = Experiment(orca, race, stages)
+    one = Experiment(orca, stages)
     weights = {"bayesrace": one.weights, "worstcase": None, "bestcase": None}
     with stages.stage("drive the laps"):
         pairs = product(weights, (True, False))
@@ -115,6 +132,12 @@ def make_paper(settings: PaperSettings, out: Path, stages: Stages) -> tuple[Path
     with stages.stage("update the residual, drive again"):
         after, updated = one.updated(laps["bayesrace", True]), "bayesrace-updated"
         laps |= {(updated, on): one.drive(updated, after, on) for on in (True, False)}
+    published = []
+    if settings.line is not None:
+        with stages.stage("drive the published racing line"):
+            line = published_line(settings.line, one.track, one.car)
+            write_raceline(out / _LINE, line)
+            published = [line_section(one, line, laps)]
     tracks, test = (one.train_track, one.track), one.samples(laps["bestcase", True])
     every = [Learned("our", one.training, test, tracks, (one.weights, after))]
     if drives:
@@ -127,22 +150,25 @@ def make_paper(settings: PaperSettings, out: Path, stages: Stages) -> tuple[Path
     for data in every:
         with stages.stage(f"smoothness of the kernel, {data.name} data") as stage:
             smooth.append(smoothness(*data[:3], points, seeds, stage))
-    bench = BenchSettings(**dict(orca), tracks=(race,), problems=problems, peers=peers)
+    prepared = orca.model_dump(include=set(PreparationSettings.model_fields))
+    bench = BenchSettings(**prepared, tracks=(orca.track,), problems=problems, peers=peers)
     with stages.stage("solve times"):
         key = bench.model_dump_json()
         solved = stored("bench", [key], lambda: run_bench(bench, stages).model_dump())
-    small = Experiment(*tenth, stages, ("e_kinematic",))
+    small = Experiment(tenth, stages, ("e_kinematic",))
     with figure_style(), stages.stage("figures and page"):
         sections = [
             model_section(one.car),
             *learning_sections(every),
             *loop_sections(laps, one),
+            *published,
             kernel_section(smooth, points),
             tenth_section(small),
             _solving(BenchResult.model_validate(solved)),
         ]
         how = f"{'quick' if settings.quick else 'in full'}, seed {settings.seed}"
         facts = {"tracks": f"{one.train_track.name}, {one.track.name}", "how": how}
+        facts |= {"racing line": settings.raceline.name} if settings.raceline else {}
         return _write(out, sections, facts), sections
 
 
