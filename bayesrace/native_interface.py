@@ -10,6 +10,8 @@ from typing import Final
 
 __all__ = [
     "ABI",
+    "BRAKING",
+    "BRAKING_ROWS",
     "COMPENSATIONS",
     "COUNTERS",
     "DECISION",
@@ -17,6 +19,7 @@ __all__ = [
     "DRIVING",
     "ENVIRONMENT",
     "ERRORS",
+    "FAULTS",
     "INFO",
     "INSTRUCTIONS",
     "LEVELS",
@@ -138,6 +141,7 @@ INSTRUCTIONS: Final = (
 """Instruction sets that a library has code for, from 0 on: name, meaning."""
 
 NO_STEP: Final = (
+    ("DOUBTED", 251, "the states contradict each other, for longer than they may be old"),
     ("UNPREDICTABLE", 252, "the state cannot be predicted to the moment of acting"),
     ("HALTED", 253, "the car is not to be driven"),
     ("NO_STATE", 254, "the newest state is too old"),
@@ -161,6 +165,22 @@ PHASES: Final = (
     ("STOPPED", "stop has been said: the car brakes to standstill, and stays"),
 )
 """Life cycle of a controller, from 0 on: name, meaning."""
+
+FAULTS: Final = (
+    ("NONE", "the state is believed"),
+    ("FROZEN", "it is equal to the state before, though the car moves"),
+    ("TIME", "its time does not follow from its number"),
+    ("POSITION", "the position does not follow from the velocities"),
+    ("HEADING", "the heading does not follow from the yaw rate"),
+    ("VELOCITY", "the velocity changes faster than tyres can make it"),
+    ("YAW_RATE", "the yaw rate changes faster than tyres can make it"),
+    ("STEERING", "the steering angle does not follow from the steering rate"),
+    ("ELSEWHERE", "the states agree with each other again, but not with where the car must be"),
+)
+"""Why a measured state is not believed, from 0 on: name, meaning; see br_monitor.c."""
+
+BRAKING_ROWS: Final = 192
+"""Most rows of a braking plan."""
 
 RECEPTIONS: Final = (
     ("NEW", "it is now the newest one"),
@@ -216,6 +236,7 @@ DRIVING: Final = (
     ("delay_s", "double", "the fixed one"),
     ("longest_s", "double", "no prediction goes farther"),
     ("stale_s", "double", "age from which a state is fallen back from"),
+    ("sensor_tolerance", "double", "multiple of the bounds of br_monitor.c; 0: no monitor"),
 )
 """Settings of the control cycle: name, type, meaning."""
 
@@ -243,8 +264,18 @@ DECISION: Final = (
     ("delay_s", "double", "prediction from there to the moment of acting"),
     ("step_us", "double", "execution time of the step; 0 without a clock"),
     ("late_s", "double", "how much later than its budget it was made; not above 0: in time"),
+    ("fault", "int", "br_fault of that state"),
 )
 """What one cycle decides: name, type, meaning."""
+
+BRAKING: Final = (
+    ("rows", "int", "of the plan"),
+    ("begins_s", "double", "plant time from which the first row acts"),
+    ("step_s", "double", "time from one row to the next"),
+    ("duty", "braking", "drive command of each row"),
+    ("delta_rad", "braking", "steering angle at its end"),
+)
+"""What the car's guard does if nothing more comes: name, type, meaning."""
 
 COUNTERS: Final = (
     ("levels", "levels", "cycles by level of the fallback; those on command are not among them"),
@@ -253,18 +284,21 @@ COUNTERS: Final = (
     ("cost_jumps", "int64", "steps whose plan costs much more than to go on with the one before"),
     ("stale", "int64", "states of the current run that were not newer than one before"),
     ("foreign", "int64", "states of another plant or run, or far ahead, that were not driven on"),
+    ("faults", "faults", "states by what speaks against them"),
+    ("fault", "int", "br_fault of the newest state"),
     ("phase", "int", "life cycle of the controller, at this moment"),
     ("delay_s", "double", "delay that is compensated, at this moment"),
     ("interval_s", "double", "plant time between two states in a row; 0: not known"),
 )
 """What a control cycle has counted: name, type, meaning."""
 
-_FUNCTIONS: Final = 10
+_FUNCTIONS: Final = 11
 """Version of the functions in the public headers: increase it with each change of a signature."""
 
 _TABLES: Final = (
     SOLVER, INFO, STATUSES, ERRORS, INSTRUCTIONS, NO_STEP, LEVELS, PHASES, RECEPTIONS,
-    COMPENSATIONS, DELAYS, ENVIRONMENT, MEASURED, DRIVING, SOLUTION, DECISION, COUNTERS, _FUNCTIONS,
+    COMPENSATIONS, FAULTS, DELAYS, ENVIRONMENT, MEASURED, DRIVING, SOLUTION, DECISION, BRAKING,
+    BRAKING_ROWS, COUNTERS, _FUNCTIONS,
 )  # fmt: skip
 
 ABI: Final = zlib.crc32(repr(_TABLES).encode()) & 0x7FFFFFFF
@@ -276,6 +310,8 @@ _ARRAYS: Final = {
     "plan": ("double", "BR_N * BR_NU"),
     "delays": ("double", str(DELAYS)),
     "levels": ("int64_t", str(len(LEVELS))),
+    "faults": ("int64_t", str(len(FAULTS))),
+    "braking": ("double", str(BRAKING_ROWS)),
 }
 
 
@@ -320,11 +356,13 @@ def c_interface() -> str:
         "#include <stdint.h>",
         f"#define BR_ABI {ABI}",
         f"#define BR_DELAYS {DELAYS}",
+        f"#define BR_BRAKING_ROWS {BRAKING_ROWS}",
         *_enum("", _numbered(ERRORS), "br_mpc_error"),
         *_enum("", statuses, "br_mpc_status"),
         *_enum("", _numbered(INSTRUCTIONS), "br_instructions"),
         *_enum("", NO_STEP, "br_no_step"),
         *_enum("", _numbered(LEVELS), "br_level"),
+        *_enum("FAULT_", _numbered(FAULTS), "br_fault"),
         *_enum("PHASE_", _numbered(PHASES), "br_phase"),
         *_enum("STATE_", _numbered(RECEPTIONS), "br_reception"),
         *_enum("COMPENSATION_", _numbered(COMPENSATIONS), "br_compensation"),
@@ -334,6 +372,7 @@ def c_interface() -> str:
         *_struct(DRIVING, "br_driving"),
         *_struct(SOLUTION, "br_solution"),
         *_struct(DECISION, "br_decision"),
+        *_struct(BRAKING, "br_braking"),
         *_struct(COUNTERS, "br_counters"),
         f"#define BR_SOLVER_FIELDS(REAL, WHOLE) {_each(SOLVER)}",
         f"#define BR_DRIVING_FIELDS(REAL, WHOLE) {_each(DRIVING)}",

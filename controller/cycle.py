@@ -32,6 +32,7 @@ class Cycle:
             settings.compensation,
             settings.stale_s,
             settings.hold,
+            settings.sensor_tolerance,
         )
         self.timing = Timing()
         self._controller = controller

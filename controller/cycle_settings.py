@@ -52,6 +52,7 @@ def cycle_values(
     fallback: FallbackSettings,
     compensation: CompensationSettings,
     stale_s: float,
+    sensor_tolerance: float,
 ) -> dict[str, float]:
     """The numbers of :data:`bayesrace.native_interface.DRIVING` by name, limits left out."""
     return {
@@ -65,6 +66,7 @@ def cycle_values(
         "delay_s": compensation.delay_s,
         "longest_s": compensation.longest_s,
         "stale_s": stale_s,
+        "sensor_tolerance": sensor_tolerance,
     }
 
 

@@ -6,10 +6,11 @@ say otherwise, so lockstep and free-running mode are the same here.
 """
 
 import ctypes as ct
+import time
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 
-from bayesrace.messages import State
+from bayesrace.messages import SENSOR_FAULTS, BrakingPlan, State
 from bayesrace.native_interface import NO_STEP, RECEPTIONS
 from bayesrace.transport import Numbering
 from bayesrace.vehicles.parameters import CarParameters
@@ -23,6 +24,7 @@ from controller.interface import Controller, Environment, StepOutput
 from controller.native_library import EnvironmentStructure, Layout, aligned_memory
 
 __all__ = [
+    "DOUBTED",
     "HALTED",
     "NO_STATE",
     "STEP_FAILED",
@@ -33,7 +35,7 @@ __all__ = [
     "Phase",
 ]
 
-UNPREDICTABLE, HALTED, NO_STATE, STEP_FAILED = (number for _, number, _ in NO_STEP)
+DOUBTED, UNPREDICTABLE, HALTED, NO_STATE, STEP_FAILED = (number for _, number, _ in NO_STEP)
 """Statuses of a cycle without a result of a step: see there."""
 
 
@@ -74,6 +76,8 @@ class Decision:
     """Prediction from there to the moment of acting."""
     step_us: float = 0.0
     """Execution time of the step."""
+    fault: int = 0
+    """What speaks against the state: :data:`bayesrace.native_interface.FAULTS`; 0: nothing."""
     stepped: bool = False
     """Whether a step was made; :attr:`Driver.output` has its results."""
 
@@ -89,9 +93,11 @@ class Driver:
         compensation: CompensationSettings,
         stale_s: float,
         hold: bool = False,
+        sensor_tolerance: float = 1.0,
     ) -> None:
         """``stale_s``: age from which a state is no longer predicted forward but fallen back
-        from. ``hold``: wait for :meth:`go`. InputError if the controller's artefact drives no car.
+        from. ``hold``: wait for :meth:`go`. ``sensor_tolerance``: see :class:`.ControllerSettings`.
+        InputError if the controller's artefact drives no car.
         """
         self.controller = controller
         artefact = controller.artefact
@@ -101,7 +107,9 @@ class Driver:
         self._cycle = ct.c_void_p()
         size = library.br_cycle_memory_size()
         artefact.check(controller.begin_cycle(memory, size, hold, self._cycle), "control cycle")
-        values = cycle_values(car, fallback, compensation, stale_s) | input_limits(car)
+        values = cycle_values(
+            car, fallback, compensation, stale_s, sensor_tolerance
+        ) | input_limits(car)
         settings = ct.byref(artefact.Driving(**values))
         artefact.check(library.br_cycle_set_driving(self._cycle, settings), "cycle settings")
         clock = ct.cast(library.br_mpc_monotonic, ct.c_void_p)
@@ -110,8 +118,10 @@ class Driver:
         self._measured, self._decided = artefact.Measured(), artefact.Decision()
         self._measured_at = ct.addressof(self._measured)
         self._decided_address = ct.addressof(self._decided)
+        self._braking = artefact.Braking()
+        self._braking_address = ct.addressof(self._braking)
         self._write_measured = Layout(artefact.Measured, "delays").write
-        self._read_decided = Layout(artefact.Decision, "step_us").read
+        self._read_decided = Layout(artefact.Decision, "fault").read
         self._decide = library.br_cycle_decide
         self._refused: State | None = None
         self.last_error = ""
@@ -149,6 +159,17 @@ class Driver:
     def count(self, name: str) -> int:
         """One of the counters of :data:`bayesrace.native_interface.COUNTERS`."""
         return int(getattr(self._counters, name))
+
+    @property
+    def faults(self) -> dict[str, int]:
+        """States by what speaks against them: :data:`bayesrace.messages.SENSOR_FAULTS`."""
+        return dict(zip(SENSOR_FAULTS[1:], self._counters.faults[1:], strict=True))
+
+    @property
+    def fault(self) -> str:
+        """What speaks against the newest state; empty: nothing."""
+        fault: int = self._counters.fault
+        return SENSOR_FAULTS[fault]
 
     @property
     def output(self) -> StepOutput | None:
@@ -225,11 +246,29 @@ class Driver:
         decision.d, decision.delta_rate = decided.u0, decided.u1
         decision.level, decision.status = _LEVELS[decided.level], decided.status
         decision.decided_at_s, decision.delay_s = decided.decided_at_s, decided.delay_s
+        decision.fault = decided.fault
         decision.step_us, decision.stepped = decided.step_us, bool(decided.stepped)
         if decision.status == STEP_FAILED:
             text = self._library.br_mpc_error_text(decided.error).decode()
             self.last_error = self.controller.last_error or text
         return decision
+
+    def braking(self, seq: int) -> BrakingPlan | None:
+        """What the car's guard shall do if nothing more comes; None for a car that is halted or
+        whose controller knows no line."""
+        plan, newest = self._braking, self.newest
+        if newest is None or self._library.br_cycle_brake(self._cycle, self._braking_address):
+            return None
+        return BrakingPlan(
+            seq=seq,
+            source_time_ns=time.monotonic_ns(),
+            epoch=newest.epoch,
+            run=newest.run,
+            begins_s=max(plan.begins_s, 0.0),
+            step_s=plan.step_s,
+            d=tuple(round(one, 6) for one in plan.duty[: plan.rows]),
+            delta=tuple(round(one, 6) for one in plan.delta_rad[: plan.rows]),
+        )
 
     def prepare(self, period_s: float, budget_s: float = 0.0) -> None:
         """Preparation phase for a state that is expected a period after the last one."""

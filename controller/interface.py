@@ -41,7 +41,7 @@ class StepOutput:
     u: Floats
     """Shape (2,): d [-], delta_rate [rad/s]. Looked at only if ``status`` is 0."""
     status: int = 0
-    """0: usable. Else the controller's own code (1 to 251): the fallback takes over."""
+    """0: usable. Else the controller's own code (1 to 250): the fallback takes over."""
     iterations: int = 0
     plan_x: Floats = field(default_factory=lambda: _NO_STATES)
     """Shape (N + 1, 7) or (0, 7): predicted states."""

@@ -16,11 +16,14 @@ from bayesrace.errors import InputError
 from bayesrace.manifest import Manifest, ProblemInfo, check_library, read_manifest
 from bayesrace.native_interface import (
     ABI,
+    BRAKING,
+    BRAKING_ROWS,
     COUNTERS,
     DECISION,
     DELAYS,
     DRIVING,
     ENVIRONMENT,
+    FAULTS,
     INFO,
     LEVELS,
     MEASURED,
@@ -70,6 +73,8 @@ _TYPES: Final[dict[str, Any]] = {
     "int64": ct.c_int64,
     "delays": ct.c_double * DELAYS,
     "levels": ct.c_int64 * len(LEVELS),
+    "faults": ct.c_int64 * len(FAULTS),
+    "braking": ct.c_double * BRAKING_ROWS,
 }
 
 
@@ -180,7 +185,7 @@ class Artefact:
     """A compiled problem: its manifest, its library, and the structures of its size.
 
     The structures are those of :mod:`bayesrace.native_interface`: ``Measured``, ``Driving``,
-    ``Solution``, ``Decision``, ``Counters``.
+    ``Solution``, ``Decision``, ``Braking``, ``Counters``.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -202,6 +207,7 @@ class Artefact:
     Driving: Any
     Solution: Any
     Decision: Any
+    Braking: Any
     Counters: Any
 
     def check_cycle(self) -> None:
@@ -223,6 +229,7 @@ _STRUCTURES: Final = {
     "Driving": DRIVING,
     "Solution": SOLUTION,
     "Decision": DECISION,
+    "Braking": BRAKING,
     "Counters": COUNTERS,
 }
 
@@ -284,6 +291,7 @@ def _declare(library: ct.CDLL) -> None:
         "cycle_observe": [pointer] * 2,
         "cycle_decide": [pointer, pointer, *[real] * 3, pointer],
         "cycle_prepare": [pointer, real, real],
+        "cycle_brake": [pointer] * 2,
         "cycle_counters": [pointer],
         **{f"cycle_{name}": [pointer] for name in ("rehearse", "stop", "go", "end", "forget")},
     }

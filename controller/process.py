@@ -16,6 +16,7 @@ from typing import Any, Final
 from bayesrace.clock import die_with_parent, sleep_until_ns
 from bayesrace.messages import (
     ACTUATION,
+    BRAKING,
     STATE,
     TELEMETRY,
     Actuation,
@@ -76,6 +77,9 @@ _SERVE_NS: Final = 40_000_000
 """Between two requests that are served while driving: each takes as long as a cycle, and a
 flood of requests must not hold up the loop."""
 
+_BRAKING_NS: Final = 15_000_000
+"""Between two braking plans: one a stage is enough, and takes as long as several steps."""
+
 _SWITCH_S: Final = 1e-4
 
 
@@ -89,6 +93,7 @@ class ControllerProcess:
         self._driver, self._timing = self._cycle.driver, self._cycle.timing
         self._actuations = Publisher(session, ACTUATION, self.name)
         self._telemetry = Publisher(session, TELEMETRY, self.name)
+        self._braking = Publisher(session, BRAKING, self.name)
         self._schedule = Schedule(settings.rate_hz)
         self._arrived_ns = 0
         self._serve_ns = 0
@@ -159,7 +164,8 @@ class ControllerProcess:
         return self._recorded(item.value, item.received_ns)
 
     def _recorded(self, state: State, arrived_ns: int) -> State:
-        if self._adoption is not None:
+        self._service.report_fault()
+        if self._adoption is not None and not self._driver.fault:
             self._adoption.record(state, self._driver.fallen_back)
         self._arrived_ns = self._service.arrived_ns = arrived_ns
         return state
@@ -287,9 +293,17 @@ class ControllerProcess:
         pause_s = min(_WAY * self._schedule.period_ns, _WAY_NS) * 1e-9
         if self._left_s > pause_s:
             time.sleep(pause_s)
+        self._plan_braking()
         if (left_s := self._left_s) > 0:
             until_next_ns = self._schedule.deadline_ns - self._timing.released_ns
             self._cycle.prepare(until_next_ns * 1e-9, left_s)
+
+    def _plan_braking(self) -> None:
+        """Sends what the car's guard shall do if nothing more comes."""
+        sent_ns = self._braking.sent_ns
+        due = sent_ns is None or time.monotonic_ns() - sent_ns > _BRAKING_NS
+        if due and (plan := self._driver.braking(self._braking.next_seq)) is not None:
+            self._braking.put(plan, lockstep=False)
 
     def _next_state(self) -> State | None:
         """Sleeps until shortly before the release, then looks for the state that is due."""

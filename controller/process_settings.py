@@ -28,6 +28,13 @@ class ControllerSettings(BaseModel):
     stale_s: float = Field(
         default=0.06, gt=0, le=60, description="age from which a state is not predicted forward"
     )
+    sensor_tolerance: float = Field(
+        default=1.0,
+        ge=0,
+        le=1e3,
+        description="multiple of the contradictions in measured states that noise of motion "
+        "capture causes; beyond, a state is not believed; 0: every state is",
+    )
     hold: bool = Field(False, description="wait for 'go' before driving")
     gate: GateSettings = GateSettings()
     realtime: RealtimeSettings = RealtimeSettings()

@@ -12,7 +12,7 @@ import numpy as np
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
-from controller.driver import STEP_FAILED, UNPREDICTABLE
+from controller.driver import DOUBTED, STEP_FAILED
 from controller.interface import ControlLaw, Environment, StepOutput
 from controller.native_library import Artefact
 
@@ -37,6 +37,7 @@ class _Functions(ct.Structure):
         ("rehearse", _REHEARSE),
         ("predict", _PREDICT),
         ("reset", _RESET),
+        ("steer", ct.c_void_p),
     ]
 
 
@@ -64,6 +65,7 @@ class PythonController:
             _REHEARSE(lambda _: None),
             _PREDICT(self._predict),
             _RESET(self._reset),
+            None,  # braking, its steering is held
         )
 
     def begin_cycle(self, memory: ct.c_void_p, size: int, hold: bool, cycle: ct.c_void_p) -> int:
@@ -120,8 +122,8 @@ class PythonController:
             around = Environment(environment[0], environment[1])
             output = self.law.step(_array(x, 7), _array(u_before, 2), around, elapsed_s, budget_s)
             self._fill(self.artefact.Solution.from_address(solution), output)
-            if not 0 <= output.status < UNPREDICTABLE:
-                raise ValueError(f"status {output.status} is not from 0 to {UNPREDICTABLE - 1}")
+            if not 0 <= output.status < DOUBTED:
+                raise ValueError(f"status {output.status} is not from 0 to {DOUBTED - 1}")
         except BaseException as error:
             self._caught(error)
             return STEP_FAILED

@@ -3,7 +3,7 @@
 import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Final
 
 from bayesrace.errors import InputError
 from bayesrace.messages import (
@@ -16,11 +16,15 @@ from bayesrace.messages import (
     Scalar,
     Status,
 )
+from bayesrace.native_interface import FAULTS
 from bayesrace.transport import Heartbeat, Inbox, Item, Kind, Publisher, Request, decode_request
 from controller.driver import Driver, Level
 from controller.interface import Controller
 
 __all__ = ["Service"]
+
+_REMEDY: Final = "the car stops along the line; look at the sensors, then 'bayesrace go'"
+_FAULT_TEXTS: Final = {name.lower(): text for name, text in FAULTS}
 
 
 class Service:
@@ -51,6 +55,7 @@ class Service:
         self._text = "waiting for the plant"
         self._publishing = threading.Lock()
         self._weights_refused = 0
+        self._fault_reported = False
         self._takes_weights = takes_weights
         self.stopping = False
         """The process has received a signal to end."""
@@ -67,6 +72,17 @@ class Service:
     def beat(self) -> None:
         """Publishes the status when it is due."""
         self._heartbeat.beat(self.status)
+
+    def report_fault(self) -> None:
+        """Publishes that states are not believed any more, or are again."""
+        fault = self._driver.fault
+        if bool(fault) == self._fault_reported:
+            return
+        self._fault_reported = bool(fault)
+        if fault:
+            self.announce("sensor_fault", f"{fault}: {_FAULT_TEXTS[fault]}", {"fault": fault})
+        else:
+            self.announce("sensor_recovered", "the measured states are believed again", {})
 
     def react(self, item: Item) -> None:
         """Serves an item that is no message."""
@@ -105,6 +121,8 @@ class Service:
 
     def _words(self) -> str:
         driver, words = self._driver, [self._text]
+        if fault := driver.fault:
+            words.append(f"sensor fault '{fault}': {_FAULT_TEXTS[fault]}; {_REMEDY}")
         failed = driver.count("failed")
         if failed:
             words.append(f"{failed} step(s) failed, the last {driver.last_error}")
@@ -176,5 +194,6 @@ class Service:
             "raised": driver.count("failed"),
             "second_starts": driver.count("second_starts"),
             "cost_jumps": driver.count("cost_jumps"),
+            **{f"sensor_{name}": count for name, count in driver.faults.items() if count},
             **({} if self._takes_weights else {"weights_refused": self._weights_refused}),
         }

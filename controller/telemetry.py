@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bayesrace.arrays import Floats
-from bayesrace.messages import State, Telemetry
+from bayesrace.messages import SENSOR_FAULTS, State, Telemetry
 from controller.driver import Decision
 from controller.interface import NO_PLAN, StepOutput
 
@@ -83,6 +83,7 @@ def telemetry_of(
         second_start=output.second_start,
         s_ref_m=output.s_ref_m if math.isfinite(output.s_ref_m) else 0.0,
         n_ref_m=output.n_ref_m if math.isfinite(output.n_ref_m) else 0.0,
+        sensor_fault=SENSOR_FAULTS[decision.fault],
     )
 
 

@@ -6,7 +6,7 @@ import os
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from pydantic import ValidationError
@@ -18,7 +18,19 @@ from bayesrace.messages import STATE, TELEMETRY, TRUTH, CarSample, Telemetry, ca
 from bayesrace.vehicles import CarParameters, described_car
 from learning.dataset import Dataset, filter_dataset, tolerances
 
-__all__ = ["LogFacts", "dataset_from_log", "dataset_from_messages", "fallback_cycles", "log_facts"]
+__all__ = [
+    "LogFacts",
+    "cycles_left_out",
+    "dataset_from_log",
+    "dataset_from_messages",
+    "fallback_cycles",
+    "log_facts",
+]
+
+
+_DOUBTFUL: Final = 16
+"""States up to one that is not believed which may be wrong as well: the controller looks back as
+far (controller/native/br_monitor.c)."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +73,22 @@ def log_facts(path: str | os.PathLike[str]) -> LogFacts:
 
 
 def fallback_cycles(telemetry: Iterable[Telemetry]) -> set[tuple[int, int]]:
-    """Run and number of the states in whose cycles the fallback acted."""
-    return {(message.run, message.state_seq) for message in telemetry if message.fallback > 0}
+    """Run and number of the states in whose cycles the fallback acted, or that were not believed;
+    those just before such a state may be as wrong."""
+    cycles = ((one.run, one.state_seq, one.fallback, one.sensor_fault) for one in telemetry)
+    return cycles_left_out(cycles)
+
+
+def cycles_left_out(cycles: Iterable[tuple[int, int, int, object]]) -> set[tuple[int, int]]:
+    """The same by run, number of the state, level of the fallback, and what speaks against the
+    state, if anything."""
+    found: set[tuple[int, int]] = set()
+    for run, seq, level, fault in cycles:
+        if fault:
+            found |= {(run, seq - n) for n in range(_DOUBTFUL)}
+        elif level > 0:
+            found.add((run, seq))
+    return found
 
 
 def dataset_from_messages(

@@ -46,7 +46,7 @@ from controller.driver import Decision
 from controller.interface import Controller, Environment
 from controller.process_settings import ControllerSettings
 from learning.dataset import Dataset
-from learning.logs import dataset_from_messages
+from learning.logs import cycles_left_out, dataset_from_messages
 from operation.analysis.laps import LapTimes, Trajectory, time_laps
 from operation.drive import RunPlan, announcement, run_request
 from plant.lockstep import CarRun, End, drive_lockstep, truth_behind
@@ -80,6 +80,8 @@ class Driven(Trajectory):
     """Of the controller's steps, shape (m,); m is n - 1, or n if the car failed or left."""
     levels: NDArray[np.int64]
     """Of the fallback, shape (m,); see :class:`controller.driver.Level`."""
+    faults: NDArray[np.int64]
+    """What speaks against each state, shape (m,); see :attr:`controller.driver.Decision.fault`."""
     step_us: Floats
     """Execution times of the steps that were made, shape (at most m,)."""
     second_starts: int
@@ -125,11 +127,13 @@ class Driven(Trajectory):
     def samples(self) -> Dataset:
         """What can be learned from the measurements, as from the run's log.
 
-        Cycles driven by the fallback are left out. InputError if the run ended before its second
-        state.
+        Cycles driven by the fallback, and states that are not believed, are left out. InputError if
+        the run ended before its second state.
         """
-        cycles = zip(self.states, self.levels, strict=False)
-        fallback = {(state.run, state.seq) for state, level in cycles if level > 0}
+        cycles = zip(self.states, self.levels, self.faults, strict=False)
+        fallback = cycles_left_out(
+            (state.run, state.seq, level, fault) for state, level, fault in cycles
+        )
         return dataset_from_messages(self.states, fallback, self.car, self.step_s)
 
     def __str__(self) -> str:
@@ -164,11 +168,14 @@ class ClosedLoop:
     ) -> None:
         """``vehicle``: what plays the car; the built-in equations without. ``log``: gets the
         messages that a race records. ``settings``: of the controller process, as far as they
-        concern lockstep. ``noise`` of the sensors with its ``seed``, and ``delay_s`` of states
-        and of actuations each: those of the plant process."""
+        concern lockstep; by default a tolerance that fits the noise. ``noise`` of the sensors with
+        its ``seed``, and ``delay_s`` of states and of actuations each: those of the plant process.
+        """
         self._car, self._track, self._line = car, track, line
         self._vehicle = vehicle or built_in_car(car)
-        self._cycle = Cycle(controller, car, settings or ControllerSettings(car=car))
+        tolerance = car.tuning.monitor.tolerance_for((noise or SensorNoise()).deviations)
+        settings = settings or ControllerSettings(car=car, sensor_tolerance=tolerance)
+        self._cycle = Cycle(controller, car, settings)
         self._controller = controller
         self._log = None if log is None else _Messages(log, car.name)
         self._noise, self._seed, self._delay_s = noise, seed, delay_s
@@ -201,7 +208,7 @@ class ClosedLoop:
         run = CarRun(request, self._vehicle, _EPOCH, sensors, 2 * self._delay_s)
         self._states: list[State] = []
         self._true_x: list[tuple[float, ...]] = []
-        self._decided: list[tuple[int, int]] = []
+        self._decided: list[tuple[int, int, int]] = []
         self._step_us: list[float] = []
         second_starts = self._cycle.driver.count("second_starts")
         if self._log is not None:
@@ -218,7 +225,7 @@ class ClosedLoop:
         if len(states) > 1 and states[-1].time_s == states[-2].time_s:
             states.pop()  # a fault of the plant repeats the last state
             true_x.pop()
-        decided = np.array(self._decided, dtype=np.int64).reshape(-1, 2)
+        decided = np.array(self._decided, dtype=np.int64).reshape(-1, 3)
         return Driven(
             self._car,
             self._track,
@@ -227,6 +234,7 @@ class ClosedLoop:
             true_x,
             decided[:, 0],
             decided[:, 1],
+            decided[:, 2],
             np.array(self._step_us),
             self._cycle.driver.count("second_starts") - second_starts,
             end,
@@ -250,7 +258,7 @@ class ClosedLoop:
 
     def _send(self, state: State, decision: Decision) -> None:
         self._answer = decision.d, decision.delta_rate
-        self._decided.append((decision.status, int(decision.level)))
+        self._decided.append((decision.status, int(decision.level), decision.fault))
         if decision.stepped:
             self._step_us.append(decision.step_us)
         if self._log is not None:

@@ -205,6 +205,7 @@ class _Drives:
         options = [
             "--car", race.car_file, "--artefact", str(artefact), "--track", str(track.track_file),
             "--raceline", str(track.line_file), "--settings", str(settings_file),
+            "--sensor-tolerance", str(race.settings.sensor_tolerance),
         ]  # fmt: skip
         if weights is not None:
             options += ["--weights", str(weights)]

@@ -92,6 +92,11 @@ class PreparationSettings(BaseModel):
         return self.car if grip is None else self.car.model_copy(update={"friction": grip})
 
     @property
+    def sensor_tolerance(self) -> float:
+        """Of the controllers, which know how noisy their sensors are."""
+        return self.car.tuning.monitor.tolerance_for(self.noise.deviations)
+
+    @property
     def true_car(self) -> CarParameters:
         """What the plant simulates and BestCase knows: the driven car with its true tyres."""
         car = self.driven_car

@@ -15,6 +15,7 @@ from bayesrace.clock import die_with_parent
 from bayesrace.errors import InputError
 from bayesrace.messages import (
     ACTUATION,
+    BRAKING,
     EVENT,
     RUN,
     STATE,
@@ -128,6 +129,7 @@ class PlantProcess:
         """Since when the certificate has expired, as noticed."""
         inbox = self.inbox = Inbox(session, self.name)
         self._decoder = inbox.subscribe(ACTUATION, newest=NEWEST, logger=_log)
+        inbox.subscribe(BRAKING, newest=1, logger=_log)
         for service in (RUN, STOP):
             inbox.serve(service)
         inbox.serve(STATUS, "plant")
@@ -207,7 +209,7 @@ class PlantProcess:
 
     def _overheard(self, item: Item) -> None:
         """Count an actuation that arrives when no run drives; it has no effect."""
-        if item.value is not None:
+        if item.value is not None and item.name == ACTUATION.name:
             self._numbering.note(item.value.seq)
 
     def _controller_there(self) -> bool:

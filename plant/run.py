@@ -8,17 +8,24 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from bayesrace.clock import sleep_until_ns
-from bayesrace.messages import Actuation, Decoder, RunRequest, State, Truth
+from bayesrace.messages import ACTUATION, Actuation, BrakingPlan, Decoder, RunRequest, State, Truth
 from bayesrace.transport import LOCKSTEP_SPIN_S, Inbox, Item, Kind, Numbering, Publisher
+from plant.braking import planned_at
 from plant.fmu.faults import FmuFault
 from plant.lockstep import CarRun, End, drive_lockstep, fault_end, truth_behind
 from plant.sensors import Sensors
+from plant.simulator import Command
 from plant.vehicle import Vehicle
 
 __all__ = ["Run", "RunCounters"]
 
 _REMEMBERED: Final = 1024
 """States to which an actuation may refer; one for an older state is stale."""
+
+_OVERDUE: Final = 1.5
+"""Times the interval of the commands after which the next one is overdue ..."""
+_LONGEST_S: Final = 0.1
+"""... which counts as no longer than this [s]."""
 
 _MOST_DELAYS: Final = 64
 """Rows of ``State.actuation_delays`` that one message has room for."""
@@ -89,6 +96,8 @@ class Run:
         self._sampled_ns: dict[int, int] = {}
         self._waiting: list[_Waiting] = []
         self._held: Actuation | None = None
+        self._held_since_s = self._interval_s = 0.0
+        self._braking: BrakingPlan | None = None
 
     @property
     def laps(self) -> int:
@@ -134,7 +143,7 @@ class Run:
                 return self._timed_out(seq)
             if item.kind is Kind.MESSAGE:
                 actuation: Actuation | None = item.value
-                if actuation is None:
+                if actuation is None or item.name != ACTUATION.name:
                     continue
                 self._numbering.note(actuation.seq)
                 answered = (actuation.epoch, actuation.run, actuation.state_seq)
@@ -208,8 +217,11 @@ class Run:
                 actuation = item.value
                 if actuation is None:
                     continue
-                self._numbering.note(actuation.seq)
                 mine = (actuation.epoch, actuation.run) == (self._epoch, self.request.run)
+                if item.name != ACTUATION.name:
+                    self._braking = actuation if mine and self.takes_commands else self._braking
+                    continue
+                self._numbering.note(actuation.seq)
                 # one from the future would never grow old, and every later one would be overtaken
                 ahead = actuation.decided_at_s > self._simulator.time_s + 2 * self._simulator.step_s
                 known = actuation.state_seq in self._sampled_ns
@@ -230,7 +242,7 @@ class Run:
         """Drive one period of zero-order hold: ``State.actuation_delays``, and a fault if any."""
         simulator = self._simulator
         substep_ns = simulator.step_s * 1e9 / simulator.substeps
-        commands: list[tuple[int, tuple[float, ...] | None]] = []
+        commands: list[tuple[int, Command]] = []
         delays: list[float] = []
         done = 0
         while self._waiting and self._waiting[0].acts_ns < end_ns:
@@ -244,8 +256,11 @@ class Run:
             at = min(max(-int((begin_ns - acts_ns) // substep_ns), done), simulator.substeps)
             if at > done:
                 commands.append((at - done, self._fresh(done)))
+            before_s = new.decided_at_s if self._held is None else self._held.decided_at_s
+            self._interval_s = min(new.decided_at_s - before_s, _LONGEST_S)
             self._held, done = new, at
-            acting_s = simulator.time_s + at * substep_ns * 1e-9 - new.decided_at_s
+            self._held_since_s = simulator.time_s + at * substep_ns * 1e-9
+            acting_s = self._held_since_s - new.decided_at_s
             delays += (float(new.state_seq), arrival_s, acting_s)
         if done < simulator.substeps:
             commands.append((simulator.substeps - done, self._fresh(done)))
@@ -258,11 +273,17 @@ class Run:
             self._counters.late += 1
         return tuple(delays[: 3 * _MOST_DELAYS]), end
 
-    def _fresh(self, substep: int) -> tuple[float, ...] | None:
-        """The held command, or None (brake) if what it was made from is too old."""
+    def _fresh(self, substep: int) -> Command:
+        """The held command while the next one is not overdue; then the braking plan, or as long as
+        there is none the held command for a while, or None: brake."""
         if self._held is None:
             return None
         simulator = self._simulator
         now_s = simulator.time_s + substep * simulator.step_s / simulator.substeps
+        overdue_s = _OVERDUE * max(self._interval_s, simulator.step_s)
+        if now_s - self._held_since_s <= overdue_s:
+            return self._held.u
+        if (planned := planned_at(self._braking, now_s)) is not None:
+            return planned
         age_s = now_s - self._held.decided_at_s
         return self._held.u if age_s <= self.request.actuation_timeout_s else None

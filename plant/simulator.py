@@ -17,12 +17,14 @@ from bayesrace.errors import InputError
 from bayesrace.integrators import PLANT_SCHEME, PLANT_SUBSTEP_HZ, Discretisation
 from bayesrace.vehicles.models import Model
 from bayesrace.vehicles.parameters import CarParameters
+from plant.braking import Planned
 
 if TYPE_CHECKING:
     import casadi as ca
 
 __all__ = [
     "PLANT",
+    "Command",
     "Compile",
     "GuardCounters",
     "PlantGuard",
@@ -31,6 +33,9 @@ __all__ = [
     "hold_in_turn",
     "plant_discretisation",
 ]
+
+Command = Sequence[float] | Planned | None
+"""Drive command and steering rate, what the braking plan makes of them, or None: brake."""
 
 Compile = Callable[["ca.Function"], "ca.Function"]
 """Makes machine code of a function, to the same bits."""
@@ -68,8 +73,10 @@ class GuardCounters:
     """Commands that were not finite; the car braked instead."""
     clipped: int = 0
     """Commands beyond a limit of drive command, steering rate or steering angle."""
+    planned: int = 0
+    """Periods, or parts of one, driven by the controller's braking plan."""
     braked: int = 0
-    """Periods without a usable command."""
+    """Periods, or parts of one, with neither a usable command nor a braking plan."""
 
 
 class PlantGuard:
@@ -82,13 +89,16 @@ class PlantGuard:
         self._brake_fade_mps, self._brake_d, self._brake_slow = car.brake_numbers.values()
         self.counters = GuardCounters()
 
-    def apply(self, u: Sequence[float] | None, x: Floats, duration_s: float) -> tuple[float, float]:
+    def apply(self, u: Command, x: Floats, duration_s: float) -> tuple[float, float]:
         """Drive command and steering rate [rad/s] that act so long for the command ``u`` in state
         ``x`` (7,); None brakes."""
         vx_mps, delta_rad = float(x[3]), float(x[6])
         lowest = self._drive.braking(vx_mps, self._d_min, duration_s)
         if u is None:
             return self._brake(vx_mps, lowest)
+        if isinstance(u, Planned):
+            self.counters.planned += 1
+            u = u.command(delta_rad, duration_s)
         d, rate = float(u[0]), float(u[1])
         if not (math.isfinite(d) and math.isfinite(rate)):
             self.counters.rejected += 1
@@ -134,9 +144,9 @@ def checked_start(x0: Sequence[float], car: CarParameters) -> Floats:
 
 def hold_in_turn(
     x: Floats,
-    commands: Sequence[tuple[int, Sequence[float] | None]],
+    commands: Sequence[tuple[int, Command]],
     substeps: int,
-    hold: Callable[[Sequence[float] | None, int], tuple[float, float]],
+    hold: Callable[[Command, int], tuple[float, float]],
 ) -> tuple[float, float]:
     """One period of (substeps, command) in order of time; the mean of what acted.
 
@@ -229,12 +239,12 @@ class Simulator:
         self.u_applied = (0.0, 0.0)
         self.steps = 0
 
-    def step(self, u: Sequence[float] | None) -> None:
+    def step(self, u: Command) -> None:
         """Hold the command ``u`` = (d, delta_rate) for one period; None brakes."""
         self.u_applied = self._hold(u, self.substeps)
         self.steps += 1
 
-    def step_switched(self, commands: Sequence[tuple[int, Sequence[float] | None]]) -> None:
+    def step_switched(self, commands: Sequence[tuple[int, Command]]) -> None:
         """One period in which the command changes: (substeps, command) in order of time.
 
         The substeps must add up to :attr:`substeps`.
@@ -245,7 +255,7 @@ class Simulator:
         self.u_applied = hold_in_turn(self.x, commands, self.substeps, self._hold)
         self.steps += 1
 
-    def _hold(self, u: Sequence[float] | None, count: int) -> tuple[float, float]:
+    def _hold(self, u: Command, count: int) -> tuple[float, float]:
         """For so many substeps; what acted."""
         x, duration_s = self.x, self.step_s * count / self.substeps
         delta = float(x[6])

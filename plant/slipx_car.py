@@ -23,7 +23,7 @@ from bayesrace.errors import InputError
 from bayesrace.vehicles.models import STATES
 from bayesrace.vehicles.parameters import CarParameters
 from plant.fmu.faults import FmuFault
-from plant.simulator import PlantGuard, checked_start, hold_in_turn, plant_discretisation
+from plant.simulator import Command, PlantGuard, checked_start, hold_in_turn, plant_discretisation
 
 __all__ = ["SlipxSimulator"]
 
@@ -86,16 +86,16 @@ class SlipxSimulator:
         self.u_applied = (0.0, 0.0)
         self.steps = 0
 
-    def step(self, u: Sequence[float] | None) -> None:
+    def step(self, u: Command) -> None:
         """Hold the command ``u`` = (d, delta_rate) for one period; None brakes."""
         self.step_switched([(self.substeps, u)])
 
-    def step_switched(self, commands: Sequence[tuple[int, Sequence[float] | None]]) -> None:
+    def step_switched(self, commands: Sequence[tuple[int, Command]]) -> None:
         """One period in which the command changes: (substeps, command) in order of time."""
         self.u_applied = hold_in_turn(self.x, commands, self.substeps, self._hold)
         self.steps += 1
 
-    def _hold(self, u: Sequence[float] | None, count: int) -> tuple[float, float]:
+    def _hold(self, u: Command, count: int) -> tuple[float, float]:
         """For so many substeps; what acted."""
         substep_s = self.step_s / self.substeps
         d, rate = self.guard.apply(u, self.x, count * substep_s)

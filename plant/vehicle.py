@@ -9,7 +9,7 @@ from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.vehicles.models import dynamic
 from bayesrace.vehicles.parameters import CarParameters
-from plant.simulator import Compile, PlantGuard, Simulator, plant_discretisation
+from plant.simulator import Command, Compile, PlantGuard, Simulator, plant_discretisation
 
 __all__ = ["SimulatorName", "Vehicle", "open_vehicle"]
 
@@ -49,10 +49,10 @@ class Vehicle(Protocol):
         InputError if it cannot be in it, FmuFault if the car fails at that.
         """
 
-    def step(self, u: Sequence[float] | None) -> None:
+    def step(self, u: Command) -> None:
         """Hold the command ``u`` = (d, delta_rate) for one period; None brakes."""
 
-    def step_switched(self, commands: Sequence[tuple[int, Sequence[float] | None]]) -> None:
+    def step_switched(self, commands: Sequence[tuple[int, Command]]) -> None:
         """One period in which the command changes: (substeps, command) in order of time."""
 
 

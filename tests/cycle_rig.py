@@ -61,6 +61,7 @@ def scripted_driver(
         fallback or FallbackSettings(),
         compensation or CompensationSettings(),
         stale_s,
+        sensor_tolerance=0,  # the states of these rigs follow no kinematics
     )
 
 

@@ -60,6 +60,8 @@ class Lockstep:
     native: NativeStep
     car: CarParameters
     delay_s: float = 0.0
+    tolerance: float = 1.0
+    """Of the sensors; 0: every state is believed."""
     x: list[Floats] = field(default_factory=list)
     u: list[Floats] = field(default_factory=list)
     said: list[tuple[int, int]] = field(default_factory=list)
@@ -68,7 +70,9 @@ class Lockstep:
     def __post_init__(self) -> None:
         compensation = CompensationSettings(mode="fixed", delay_s=self.delay_s)
         controller = PredictiveController(self.native)
-        self.driver = Driver(controller, self.car, FALLBACK, compensation, 0.06)
+        self.driver = Driver(
+            controller, self.car, FALLBACK, compensation, 0.06, False, self.tolerance
+        )
         self.plant = Simulator(dynamic(self.car))
 
     def answer(self, seq: int, x: Floats) -> Floats:
@@ -159,13 +163,13 @@ def exported_controllers(
 def lockstep_runs(
     kinematic_artefact: Path, car: CarParameters, circuit: Circuit, weights: GpWeights
 ) -> Callable[..., Lockstep]:
-    """Makes a :class:`Lockstep` on the circuit, of the delay that it is given."""
+    """Makes a :class:`Lockstep` on the circuit, of the delay and tolerance that it is given."""
 
-    def make(delay_s: float = 0.0) -> Lockstep:
+    def make(delay_s: float = 0.0, tolerance: float = 1.0) -> Lockstep:
         native = NativeStep(kinematic_artefact, car, RACING)
         native.set_weights(weights)
         native.set_path(circuit.table)
-        return Lockstep(native, car, delay_s)
+        return Lockstep(native, car, delay_s, tolerance)
 
     return make
 

@@ -59,7 +59,7 @@ def data(
     folder = tmp_path_factory.mktemp("data")
     process = ControllerSettings()
     values = SETTINGS.parameters(car) | cycle_values(
-        car, process.fallback, process.compensation, process.stale_s
+        car, process.fallback, process.compensation, process.stale_s, process.sensor_tolerance
     )
     table = circuit.table
     export(folder, read_manifest(kinematic_artefact), table.rows, table.spacing_m, values, weights)

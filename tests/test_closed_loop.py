@@ -1,6 +1,5 @@
 """The closed loop in one process: the same run, to the bit, as two processes over Zenoh."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,7 @@ from operation.collect import collect
 from operation.drive import RunPlan, execute
 from plant.fmu.faults import FmuFault
 from plant.sensors import SensorNoise
-from plant.simulator import Simulator
+from plant.simulator import Command, Simulator
 from tests.conftest import Circuit
 from tests.network.cars import gentle_course, start_controller, start_plant
 from tests.programs import PATIENCE_S
@@ -126,7 +125,7 @@ def test_a_run_is_that_of_two_processes_over_zenoh_to_the_bit(
 class Failing(Simulator):
     """A car that fails after a second."""
 
-    def step(self, u: Sequence[float] | None) -> None:
+    def step(self, u: Command) -> None:
         """As the built-in car, 50 times."""
         if self.steps == 50:
             raise FmuFault("it has crashed")

@@ -9,7 +9,7 @@ from fmpy.validation import validate_fmu
 
 from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import STATES
-from controller.driver import UNPREDICTABLE, Level
+from controller.driver import DOUBTED, UNPREDICTABLE, Level
 from controller.native_step import StepStatus
 from tests.conftest import Circuit
 from tests.fmu_lockstep import (  # noqa: F401 - fixtures are used by name
@@ -100,13 +100,13 @@ def test_inputs_on_their_way_and_states_that_nothing_follows_from_are_compensate
     exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit
 ) -> None:
     """A delay of two and a half periods; a state that is no state cannot be predicted from."""
-    run = lockstep(delay_s=2.5 * STEP_S)
+    run = lockstep(delay_s=2.5 * STEP_S, tolerance=0.0)
     for k, x in enumerate(lockstep().run(circuit.start(v_mps=1.0), 120, strewn).x):
         d, delta_rate = run.u[k - 3] if k >= 3 else (0.0, 0.0)
         run.plant.u_applied = (float(d), float(delta_rate))
         run.answer(k, x)
     assert {status for status, _ in run.said} >= {StepStatus.CONVERGED, UNPREDICTABLE}
-    controller = exported.slave(exported.fmu(3), {"delay": 2.5 * STEP_S})
+    controller = exported.slave(exported.fmu(3), {"delay": 2.5 * STEP_S, "sensor_tolerance": 0.0})
     same(answers(controller, run.x), run, tolerance=1e-10)  # a master's time is a sum
 
 
@@ -114,14 +114,14 @@ def test_inputs_on_their_way_and_states_that_nothing_follows_from_are_compensate
 def test_bad_states_are_answered_as_in_lockstep_and_nothing_bad_comes_out(
     exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit, version: Literal[2, 3]
 ) -> None:
-    run = lockstep().run(circuit.start(v_mps=1.0), 320, strewn)
+    run = lockstep(tolerance=0.0).run(circuit.start(v_mps=1.0), 320, strewn)
     statuses, levels = ({said[i] for said in run.said} for i in (0, 1))
     assert statuses >= {0, StepStatus.INFEASIBLE, StepStatus.BAD_STATE}
     assert levels == set(Level)
-    controller = exported.slave(exported.fmu(version))
+    controller = exported.slave(exported.fmu(version), {"sensor_tolerance": 0.0})
     same(answers(controller, run.x), run)
     controller.reset()
-    controller.initialise({"d_applied_connected": 1.0, "delay": 0.03})
+    controller.initialise({"d_applied_connected": 1.0, "delay": 0.03, "sensor_tolerance": 0.0})
     outputs = [v.name for v in controller.description.modelVariables if v.causality == "output"]
     limits = np.array([get_car("orca").d_max, get_car("orca").delta_rate_max_radps])
     poison, unplanned = (np.nan, np.inf, -np.inf, -1.0, 1e300), 0
@@ -142,6 +142,16 @@ def test_bad_states_are_answered_as_in_lockstep_and_nothing_bad_comes_out(
     assert controller.messages == []
 
 
+def test_a_sensor_that_freezes_stops_the_car_on_its_line(
+    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit
+) -> None:
+    run = lockstep().run(circuit.start(v_mps=1.0), 60)
+    controller = exported.slave(exported.fmu(3))
+    said = answers(controller, [*run.x, *[run.x[-1]] * 20])[61:]
+    assert (said[3:, 2] == DOUBTED).all()
+    assert (said[-10:, 3] >= Level.BRAKE).all()
+
+
 def test_parameters_act_and_limits_can_be_tuned_during_the_run(
     exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit
 ) -> None:
@@ -152,7 +162,8 @@ def test_parameters_act_and_limits_can_be_tuned_during_the_run(
     run.run(start, 100)
     controller = exported.slave(exported.fmu(3), {"r_duty": 0.05, "margin_m": 0.03})
     same(answers(controller, run.x), run)
-    controller.set({"d_max": 0.2, "delta_rate_max_radps": 1.0})
+    # The states are those of other inputs.
+    controller.set({"d_max": 0.2, "delta_rate_max_radps": 1.0, "sensor_tolerance": 0.0})
     tuned = answers(controller, run.x)
     assert tuned[:, 0].max() == 0.2
     assert np.abs(tuned[:, 1]).max() == 1.0

@@ -10,7 +10,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from bayesrace.messages import Actuation, Decoder, RunRequest, State, Truth
+from bayesrace.messages import Actuation, BrakingPlan, Decoder, RunRequest, State, Truth
 from bayesrace.transport import Inbox, Item, Kind, Numbering, Publisher
 from bayesrace.vehicles import get_car
 from plant.run import Run, RunCounters
@@ -52,6 +52,8 @@ class Controller:
                 "run": state.run, "state_seq": state.seq, "decided_at_s": state.time_s,
                 "u": (1.0, 0.0), "weights_version": "", "status": 0,
             }  # fmt: skip
+            if (plan := changes.pop("plan", None)) is not None:
+                self._items.append(Item(Kind.MESSAGE, "braking", plan, time.monotonic_ns()))
             actuation = Actuation(**(values | changes))
             self._items.append(Item(Kind.MESSAGE, "actuation", actuation, time.monotonic_ns()))
 
@@ -169,6 +171,27 @@ def test_an_overtaken_answer_is_reported_and_does_not_act() -> None:
     rows = np.array([row for state in states for row in state.actuation_delays]).reshape(-1, 3)
     assert (rows[:, 2] == -1).sum() == counters.stale > 5
     assert states[-1].x[3] > 1.0
+
+
+@pytest.mark.parametrize(("run", "planned"), [(1, 6), (2, 0)])
+def test_a_plan_is_carried_out_when_answers_are_overdue(run: int, planned: int) -> None:
+    """With its steering, until answers take over again; none of another run."""
+
+    def answer(state: State) -> list[dict[str, Any]]:
+        if 3 <= state.seq < 10:
+            return []
+        plan = BrakingPlan(
+            seq=0, source_time_ns=0, epoch=EPOCH, run=run, begins_s=state.time_s, step_s=0.02,
+            d=(-0.1,) * 20, delta=tuple(0.01 * i for i in range(20)),
+        )  # fmt: skip
+        return [{"plan": plan}]
+
+    states, _, guarded = execute(answer)
+    assert guarded.planned == pytest.approx(planned, abs=3 if planned else 0)
+    if planned:
+        assert max(state.x[6] for state in states[:11]) == pytest.approx(0.07, abs=0.025)
+        assert states[9].u_applied[0] < 0
+    assert states[-1].u_applied[0] > 0.9
 
 
 def test_without_fresh_answers_the_plant_brakes() -> None:

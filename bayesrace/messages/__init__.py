@@ -11,6 +11,7 @@ from bayesrace.messages.table import (
     ACTUATION,
     ALIVE,
     ALIVE_SOURCES,
+    BRAKING,
     COMMAND,
     EVENT,
     EVERYTHING,
@@ -36,7 +37,9 @@ from bayesrace.messages.table import (
     is_car_name,
 )
 from bayesrace.messages.types import (
+    SENSOR_FAULTS,
     Actuation,
+    BrakingPlan,
     CarSample,
     Command,
     Event,
@@ -53,10 +56,11 @@ from bayesrace.messages.types import (
 )
 
 __all__ = [
-    "ACTUATION", "ALIVE", "ALIVE_SOURCES", "COMMAND", "EVENT", "EVERYTHING", "HEARTBEAT",
-    "RECORDERS", "ROLE_OF", "ROLLBACK", "RUN", "SERVICES", "STATE", "STATUS", "STOP", "TELEMETRY",
-    "TOPICS", "TRUTH", "WEIGHTS", "Actuation", "CarSample", "Command", "Decoder", "Event",
-    "Message", "Qos", "Reply", "Role", "RollbackRequest", "RunRequest", "Scalar", "Service",
-    "Source", "State", "Status", "StatusRequest", "StopRequest", "Telemetry", "Topic", "Truth",
-    "car_key", "decode", "decode_json", "encode", "is_car_name", "json_schema", "to_json",
+    "ACTUATION", "ALIVE", "ALIVE_SOURCES", "BRAKING", "COMMAND", "EVENT", "EVERYTHING", "HEARTBEAT",
+    "RECORDERS", "ROLE_OF", "ROLLBACK", "RUN", "SENSOR_FAULTS", "SERVICES", "STATE", "STATUS",
+    "STOP", "TELEMETRY", "TOPICS", "TRUTH", "WEIGHTS", "Actuation", "BrakingPlan", "CarSample",
+    "Command", "Decoder", "Event", "Message", "Qos", "Reply", "Role", "RollbackRequest",
+    "RunRequest", "Scalar", "Service", "Source", "State", "Status", "StatusRequest", "StopRequest",
+    "Telemetry", "Topic", "Truth", "car_key", "decode", "decode_json", "encode", "is_car_name",
+    "json_schema", "to_json",
 ]  # fmt: skip

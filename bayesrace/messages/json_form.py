@@ -98,7 +98,7 @@ def decode_json(kind: type[M], data: bytes) -> M:
         content = _read(data)
         for name, rule in form.vectors:
             content[name] = _flat(rule, content[name])
-        if form.readable and content.keys() == form.keys:
+        if form.readable and type(content) is dict and content.keys() == form.keys:
             with suppress(msgspec.ValidationError):  # the checks below say more about the fault
                 return msgspec.convert(content, kind)
         for name in form.reals:

@@ -13,6 +13,7 @@ from typing import Any, Final, Generic, Literal, TypeVar
 from bayesrace.errors import InputError
 from bayesrace.messages.types import (
     Actuation,
+    BrakingPlan,
     Command,
     Event,
     Message,
@@ -28,7 +29,7 @@ from bayesrace.messages.types import (
 )
 
 __all__ = [
-    "ACTUATION", "ALIVE", "ALIVE_SOURCES", "COMMAND", "EVENT", "EVERYTHING", "HEARTBEAT",
+    "ACTUATION", "ALIVE", "ALIVE_SOURCES", "BRAKING", "COMMAND", "EVENT", "EVERYTHING", "HEARTBEAT",
     "RECORDERS", "ROLE_OF", "ROLLBACK", "RUN", "SERVICES", "STATE", "STATUS", "STOP", "TELEMETRY",
     "TOPICS", "TRUTH", "WEIGHTS", "Qos", "Role", "Service", "Source", "Topic", "car_key",
     "is_car_name",
@@ -121,6 +122,10 @@ TELEMETRY: Final = Topic(
     "telemetry", "bayesrace/{car}/telemetry", Telemetry, ("controller",), _WATCHING, "each cycle",
     _REPORT,
 )  # fmt: skip
+BRAKING: Final = Topic(
+    "braking", "bayesrace/{car}/braking", BrakingPlan, ("controller",), ("plant", *_WATCHING),
+    "each cycle in real time, at most one a stage", _CONTROL,
+)  # fmt: skip
 EVENT: Final = Topic(
     "event", "bayesrace/{car}/event/{source}", Event, ("plant", "controller", "race", "recorder"),
     _WATCHING, "when something happens", _NEWS,
@@ -129,7 +134,9 @@ HEARTBEAT: Final = Topic(
     "heartbeat", "bayesrace/{car}/status/{source}", Status, ("plant", "controller"), _WATCHING,
     "10 Hz", _REPORT,
 )  # fmt: skip
-TOPICS: Final[tuple[Topic[Any], ...]] = (STATE, TRUTH, ACTUATION, TELEMETRY, EVENT, HEARTBEAT)
+TOPICS: Final[tuple[Topic[Any], ...]] = (
+    STATE, TRUTH, ACTUATION, BRAKING, TELEMETRY, EVENT, HEARTBEAT
+)  # fmt: skip
 
 RUN: Final = Service(
     "run", "bayesrace/{car}/plant/run", RunRequest, Reply, ("plant",), ("director",), 20.0, False

@@ -21,9 +21,10 @@ from bayesrace.messages.rules import (
     Vector,
     meta,
 )
+from bayesrace.native_interface import BRAKING_ROWS, FAULTS
 
 __all__ = [
-    "END_REASONS", "PHASES", "Actuation", "CarSample", "Command",
+    "END_REASONS", "PHASES", "SENSOR_FAULTS", "Actuation", "BrakingPlan", "CarSample", "Command",
     "Event", "Message", "Reply", "RollbackRequest", "RunRequest", "State", "Status",
     "StatusRequest", "StopRequest", "Telemetry", "Truth",
 ]  # fmt: skip
@@ -40,6 +41,9 @@ regular end the run had more than one controller, so its actuations cannot be at
 
 PHASES: Final = ("idle", "running", "waiting", "ready", "driving", "fallback", "stopped")
 """Phases of a process, see :class:`Status`."""
+
+SENSOR_FAULTS: Final = ("", *(name.lower() for name, _ in FAULTS[1:]))
+"""What can speak against a measured state, in the order of the native interface."""
 
 Count = Annotated[int, meta(Integer())]
 Signed = Annotated[int, meta(Integer(-(2**31), 2**31 - 1))]
@@ -134,7 +138,7 @@ class Actuation(Message, frozen=True, kw_only=True, tag=2):
     """Status code of the controller's step; 0: converged."""
 
 
-class Telemetry(Message, frozen=True, kw_only=True, tag=4):
+class Telemetry(Message, frozen=True, kw_only=True, tag=5):
     """Plan, residuals and timing of one control cycle, on ``bayesrace/{car}/telemetry``."""
 
     run: Count
@@ -197,6 +201,26 @@ class Telemetry(Message, frozen=True, kw_only=True, tag=4):
     """Arc length of the reference point on the racing line."""
     n_ref_m: Number
     """Lateral offset from the racing line, positive to the left."""
+    sensor_fault: Annotated[str, meta(Choice(SENSOR_FAULTS))]
+    """What speaks against the measured state, in whose place the model's prediction counts; empty:
+    nothing (:data:`bayesrace.native_interface.FAULTS`)."""
+
+
+class BrakingPlan(Message, frozen=True, kw_only=True):
+    """What the car's guard does if no actuation comes any more, on ``bayesrace/{car}/braking``: the
+    newest input, the plan for as long as the controller would drive on it, then braking along the
+    line to standstill. In real time only."""
+
+    epoch: Count
+    run: Count
+    begins_s: Annotated[float, meta(Real(0.0, 1e6))]
+    """Plant time from which the first row acts."""
+    step_s: Annotated[float, meta(Real(1e-3, 1.0))]
+    """Time from one row to the next."""
+    d: Annotated[tuple[Number, ...], meta(Vector(1, rows=BRAKING_ROWS))]
+    """Drive command of each row."""
+    delta: Annotated[tuple[Number, ...], meta(Vector(1, rows=BRAKING_ROWS))]
+    """Steering angle at the end of each row [rad]."""
 
 
 class Event(Message, frozen=True, kw_only=True):

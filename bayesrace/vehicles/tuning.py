@@ -12,6 +12,7 @@ acceleration: full throttle of the reference car is about its usable acceleratio
 none of them in its file.
 """
 
+from collections.abc import Sequence
 from typing import Any, Final, NamedTuple, Self
 
 from pydantic import Field
@@ -21,9 +22,11 @@ from bayesrace.vehicles.parts import GRAVITY_MPS2, Part
 __all__ = [
     "REFERENCE_ACCELERATION_MPS2",
     "REFERENCE_WHEELBASE_M",
+    "BrakingTuning",
     "CautionTuning",
     "DrivingTuning",
     "GateTuning",
+    "MonitorTuning",
     "ObjectiveTuning",
     "PathTuning",
     "PlausibleTuning",
@@ -153,6 +156,63 @@ class TurnTuning(_Section):
     throttle_spm: float = _number(
         2.0, COMMAND_PER_SPEED, "drive command per speed below the pace [command s/m]"
     )
+
+
+class BrakingTuning(_Section):
+    """Steering along the line while braking to standstill, when something has failed."""
+
+    lookahead_m: float = _number(0.16, LENGTH, "distance of the target at standstill [m]")
+    lookahead_s: float = _number(0.05, TIME, "distance added per speed [s]")
+    preview_s: float = _number(0.04, TIME, "how far ahead the line's curvature is taken [s]")
+    understeer_s2pm: float = _number(
+        0.008, (0.0, -1.0, 0.0), "steering angle added per acceleration in a bend [rad s^2/m]"
+    )
+    damping_s: float = _number(0.02, TIME, "steering angle per excess of the yaw rate [s]")
+    slow_mps: float = _number(0.4, SPEED, "slower, slip angles are those at this speed [m/s]")
+    chord_m: float = _number(0.08, LENGTH, "chord that the line's direction is taken from [m]")
+    centre: float = _number(
+        0.5, NONE, "share of the way from the line to the middle of the track, at standstill [-]",
+        ge=0, le=1,
+    )  # fmt: skip
+
+
+class MonitorTuning(_Section):
+    """Largest contradictions in measured states that noise of motion capture and any driving cause.
+
+    Measured: at most 12 mm, 0.06 rad, 0.002 rad, and with the velocities' noise 0.5 m/s and
+    3.6 rad/s from one state to the next (1 mm, 0.5 degrees, 0.05 m/s, 0.2 rad/s; slides included).
+    """
+
+    position_m: float = _number(
+        0.022, LENGTH, "between the position and the way that the velocities make [m]"
+    )
+    heading_rad: float = _number(
+        0.12, NONE, "between the heading and the angle that the yaw rate makes [rad]"
+    )
+    steering_rad: float = _number(
+        0.012, NONE, "between the steering angle and what the steering rate makes of it [rad]"
+    )
+    memory_s: float = _number(0.2, TIME, "over which these ways are reckoned [s]")
+    speed_mps: float = _number(0.5, SPEED, "change of the velocity without acceleration [m/s]")
+    acceleration_mps2: float = _number(12.0, ACCELERATION, "largest acceleration [m/s^2]")
+    yaw_rate_radps: float = _number(2.5, YAW_RATE, "change of the yaw rate at once [rad/s]")
+    yaw_acceleration_radps2: float = _number(
+        250.0, YAW_ACCELERATION, "largest yaw acceleration [rad/s^2]"
+    )
+    drift: float = _number(0.06, NONE, "error of the prediction of a braking car, per distance [-]")
+
+    def tolerance_for(self, deviations: Sequence[float]) -> float:
+        """The multiple of these bounds that sensors take whose noise has such standard deviations,
+        of the state [x, y, psi, vx, vy, omega, delta]; 1 up to that of motion capture."""
+        x, y, psi, vx, vy, omega, delta = deviations
+        return max(
+            1.0,
+            20 * max(x, y) / self.position_m,
+            13 * psi / self.heading_rad,
+            9 * max(vx, vy) / self.speed_mps,
+            11 * omega / self.yaw_rate_radps,
+            20 * delta / self.steering_rad,
+        )
 
 
 class PlausibleTuning(_Section):
@@ -350,6 +410,8 @@ class Tuning(_Section):
     raceline: RacelineTuning
     path: PathTuning
     turn: TurnTuning
+    braking: BrakingTuning
+    monitor: MonitorTuning
     plausible: PlausibleTuning
     scale: ScaleTuning
     objective: ObjectiveTuning

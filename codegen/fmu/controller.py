@@ -36,7 +36,10 @@ _FALLBACK: Final = (
 )
 """Name in the settings, name here, unit, whether it must be above 0, meaning."""
 
-_NAMED: Final = {"UNPREDICTABLE": "not predictable", "HALTED": "none yet", "STEP_FAILED": "refused"}
+_NAMED: Final = {
+    "DOUBTED": "states contradict each other", "UNPREDICTABLE": "not predictable",
+    "HALTED": "none yet", "STEP_FAILED": "refused",
+}  # fmt: skip
 """Of :data:`bayesrace.native_interface.NO_STEP`, those of an FMU, and what they mean here."""
 
 _STATUSES: Final = (  # a step without a budget is never out of time, which is the last
@@ -148,6 +151,7 @@ def _parameters(
         "communication step if the importer steps plant and controller side by side"
     )
     connected = "d_applied is connected"
+    believed = "multiple of the contradictions beyond which a state is not believed; 0: each is"
     return [
         *(tunable(one.name, one.text, _value(settings, one.name), unit=one.unit, max=one.high,
                   min=0.0 if one.positive else one.low, exclusive=one.positive)
@@ -159,6 +163,7 @@ def _parameters(
           for key, name, unit, positive, text in _FALLBACK),
         tunable("recover_cycles", recover, _value(fallback, "recover_cycles"), kind="integer",
                 min=1, max=100),
+        tunable("sensor_tolerance", believed, 1.0, unit="1", min=0.0, max=1e3),
         Variable("period", "parameter", period, unit="s", start=manifest.step_s, min=0.0, max=1.0),
         Variable("delay", "parameter", delay, unit="s", start=0.0, min=0.0, max=0.5),
         Variable("d_applied_connected", "parameter", connected, kind="boolean", start=0.0),

@@ -82,10 +82,15 @@ def _states(tuning: Tuning) -> tuple[State, ...]:
     )
 
 
-def _planner(tuning: Tuning) -> dict[str, float]:
-    """What the planner in C is compiled with: sections path, turn and caution of the tuning."""
-    sections = {"path": tuning.path, "turn": tuning.turn}
+def _constants(car: CarParameters) -> dict[str, float]:
+    """What C is compiled with: sections of the car's tuning, and its wheelbase."""
+    tuning = car.tuning
+    sections = {
+        "path": tuning.path, "turn": tuning.turn, "braking": tuning.braking,
+        "monitor": tuning.monitor,
+    }  # fmt: skip
     numbers = {f"{n}_{key}": value for n, one in sections.items() for key, value in one}
+    numbers["wheelbase_m"] = car.wheelbase_m
     return numbers | {f"caution_{key}": value for key, value in tuning.caution.pace}
 
 
@@ -153,9 +158,9 @@ def driving_problem(
         reached=reached,
         valid=d_max - d_min,
         path={
-            "x": "x", "y": "y", "psi": "psi", "vx": "vx", "vy": "vy", "delta": "delta",
-            "duty": "d", "delta_rate": "delta_rate",
+            "x": "x", "y": "y", "psi": "psi", "vx": "vx", "vy": "vy", "omega": "omega",
+            "delta": "delta", "duty": "d", "delta_rate": "delta_rate",
         },
-        constants=_planner(car.tuning),
+        constants=_constants(car),
         follows_plan=bool(follows),
     )  # fmt: skip

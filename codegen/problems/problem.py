@@ -152,8 +152,8 @@ class Problem:
     valid: ca.SX
     """Above zero in all components for parameters that fit each other; of theta."""
     path: Mapping[str, str] = field(default_factory=dict)
-    """Roles (x, y, psi, vx, vy, delta; duty, delta_rate) to names, for a planner that follows a
-    path; empty: there is none, and the stage parameters are always the caller's."""
+    """Roles (x, y, psi, vx, vy, omega, delta; duty, delta_rate) to names, for a planner that
+    follows a path; empty: there is none, and the stage parameters are always the caller's."""
 
     follows_plan: bool = False
     """Whether the planner takes the stage parameters from where the plan itself is on the path, and

@@ -26,7 +26,7 @@ extern "C" {
  * functions. None may block; self comes back as it was given. */
 typedef struct {
     void *self;
-    /* 0, or a status of its own (1 to 251, or BR_STEP_FAILED) that says why solution is not usable.
+    /* 0, or a status of its own (1 to 250, or BR_STEP_FAILED) that says why solution is not usable.
      * Arguments as of br_mpc_step. */
     int (*step)(void *self, const double x[BR_NX], const double u_before[BR_NU],
                 const br_environment *environment, double elapsed_s, double budget_s,
@@ -37,6 +37,10 @@ typedef struct {
     int (*predict)(void *self, const double x[BR_NX], const double u[BR_NU], double duration_s,
                    double x_next[BR_NX]);
     void (*reset)(void *self);
+    /* How to steer while braking along the line, as br_mpc_steer; NULL: it knows no line, and the
+     * steering is held. */
+    int (*steer)(void *self, const double x[BR_NX], double *s_m, double *angle_rad,
+                 double *outside_m);
 } br_controller;
 
 typedef struct br_cycle br_cycle;
@@ -62,7 +66,9 @@ BR_API br_mpc_error br_cycle_set_driving(br_cycle *cycle, const br_driving *sett
  * controller; NULL for none. */
 BR_API br_mpc_error br_cycle_set_clock(br_cycle *cycle, br_mpc_clock clock, void *context);
 
-/* A state has arrived. A run is one stream of states: one plant (epoch), one run number, rising
+/* A state has arrived. One that contradicts those before it (br_monitor.c) counts with what the
+ * model predicts in place of what it says; after settings.stale_s the car brakes along the line, by
+ * that prediction, and drives on once states agree with it again. A run is one stream of states: one plant (epoch), one run number, rising
  * numbers. Another stream is followed once the run has ended (br_cycle_end), once nothing has come
  * for long (br_cycle_forget), or once it has sent several states in a row while the former one was
  * silent: no single message locks out the plant. */
@@ -86,10 +92,16 @@ BR_API br_mpc_error br_cycle_answer(br_cycle *cycle, const br_measured *state,
 /* br_mpc_prepare for a state that is expected a period after the last one, where one is. */
 BR_API void br_cycle_prepare(br_cycle *cycle, double period_s, double budget_s);
 
+/* What the car's guard shall do if nothing more comes: the newest input, then the plan for as long
+ * as the fallback drives on it, then braking along the line to standstill. To be sent after the
+ * decision. BR_ERROR_NOT_READY for a car that is halted, or a controller that knows no line. */
+BR_API br_mpc_error br_cycle_brake(const br_cycle *cycle, br_braking *braking);
+
 /* The way of a cycle without effect, so that its code and data are in the caches. */
 BR_API void br_cycle_rehearse(br_cycle *cycle);
 
-/* From the next cycle on slow down along the line to standstill, and stay; or drive. */
+/* From the next cycle on slow down along the line to standstill, and stay; or drive, and believe
+ * the next state. */
 BR_API void br_cycle_stop(br_cycle *cycle);
 BR_API void br_cycle_go(br_cycle *cycle);
 

@@ -176,6 +176,15 @@ BR_API br_mpc_error br_mpc_prepare(br_mpc *mpc, double elapsed_s, double budget_
 BR_API br_mpc_error br_mpc_predict(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
                                    double duration_s, double x_next[BR_NX]);
 
+#if BR_HAS_PATH
+/* The steering angle that keeps a car in state x by its line while it brakes to standstill.
+ * *s_m: arc length of the line near which x is sought, below 0 for anywhere; that of x on return.
+ * *outside_m: how far x is outside of the track less its margin, negative inside. Changes nothing
+ * in mpc. */
+BR_API br_mpc_error br_mpc_steer(const br_mpc *mpc, const double x[BR_NX], double *s_m,
+                                 double *angle_rad, double *outside_m);
+#endif
+
 /* Does over what br_mpc_prepare has done, to the same bits, so that caches and branch predictors
  * are warm when the state arrives: after 20 ms of other work a step takes half as long again.
  * Nothing if nothing is prepared. */

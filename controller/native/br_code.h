@@ -28,6 +28,9 @@ typedef struct {
     br_mpc_error (*prepare)(br_mpc *, double, double);
     br_mpc_error (*rehearse)(br_mpc *);
     br_mpc_error (*predict)(const br_mpc *, const double *, const double *, double, double *);
+#if BR_HAS_PATH
+    br_mpc_error (*steer)(const br_mpc *, const double *, double *, double *, double *);
+#endif
     br_mpc_error (*variance)(br_mpc *, const double *, double *);
     br_mpc_error (*evaluate)(const br_mpc *, const double *, const double *, double *, double *,
                              double *);

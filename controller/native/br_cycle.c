@@ -11,9 +11,8 @@
 #define JUMP_BY 0.01     /* and so much more */
 #define LEAST_BUDGET 0.1 /* what a step gets however late its cycle began: share of the budget */
 
-#define LEAST_STAGES 0.5    /* of a transition by which the model is judged; ... */
-#define STAGE_ROUNDING 1e-6 /* share of a stage: times that are added up differ by so much */
-#define MOST_STAGES 2       /* ... and at most */
+#define LEAST_STAGES 0.5 /* of a transition by which the model is judged; ... */
+#define MOST_STAGES 2    /* ... and at most */
 
 /* What the car has done since a measured state, for br_mpc_observe. */
 typedef struct {
@@ -29,6 +28,7 @@ struct br_cycle {
     br_mpc_clock clock;
     void *context;
     br_stream stream;
+    br_monitor monitor;
     br_shown shown;
     br_delay delay;
     br_fallback fallback;
@@ -43,6 +43,8 @@ struct br_cycle {
     double vx_mps; /* the newest that is known */
     int reckoned;  /* where the car may be, and when, without a state */
     double reckoned_s, reckoned_x[BR_NX];
+    int acting; /* the newest input begins to act in state acting_x, as far as that is known */
+    double acting_s, acting_x[BR_NX];
 };
 
 size_t br_cycle_memory_size(void) { return sizeof(br_cycle); }
@@ -94,6 +96,11 @@ static int mpc_predict(void *self, const double x[BR_NX], const double u[BR_NU],
     return br_mpc_predict(((br_cycle *)self)->mpc, x, u, duration_s, x_next) ? -1 : 0;
 }
 
+static int mpc_steer(void *self, const double x[BR_NX], double *s_m, double *angle_rad,
+                     double *outside_m) {
+    return br_mpc_steer(((br_cycle *)self)->mpc, x, s_m, angle_rad, outside_m) ? -1 : 0;
+}
+
 static void mpc_reset(void *self) { br_mpc_reset(((br_cycle *)self)->mpc); }
 
 br_mpc_error br_cycle_drive_mpc(void *memory, size_t size, br_mpc *mpc, int hold, br_cycle **out) {
@@ -103,6 +110,7 @@ br_mpc_error br_cycle_drive_mpc(void *memory, size_t size, br_mpc *mpc, int hold
         .prepare = mpc_prepare,
         .rehearse = mpc_rehearse,
         .predict = mpc_predict,
+        .steer = mpc_steer,
         .reset = mpc_reset,
     };
     if (!mpc) return BR_ERROR_NULL;
@@ -123,12 +131,12 @@ br_mpc_error br_cycle_set_driving(br_cycle *cycle, const br_driving *s) {
     if (!cycle || !s) return BR_ERROR_NULL;
     const double positive[] = {s->brake_fade_mps, s->brake_d, s->stop_mps2, s->longest_s,
                                s->stale_s};
-    const double others[] = {s->brake_slow, s->standing_mps, s->shifted_s, s->limit_tolerance,
-                             s->delay_s};
+    const double others[] = {s->brake_slow,      s->standing_mps, s->shifted_s,
+                             s->limit_tolerance, s->delay_s,      s->sensor_tolerance};
     int valid = s->recover_cycles >= 1 && s->compensation >= BR_COMPENSATION_OFF &&
                 s->compensation <= BR_COMPENSATION_FIXED && s->longest_s <= BR_PREDICT_MAX_S;
-    for (int i = 0; i < 5; ++i)
-        valid &= isfinite(positive[i]) && positive[i] > 0 && isfinite(others[i]) && others[i] >= 0;
+    for (int i = 0; i < 5; ++i) valid &= isfinite(positive[i]) && positive[i] > 0;
+    for (int i = 0; i < 6; ++i) valid &= isfinite(others[i]) && others[i] >= 0;
     for (int i = 0; i < BR_NU; ++i)
         valid &= isfinite(s->u_low[i]) && isfinite(s->u_high[i]) && s->u_low[i] < s->u_high[i];
     if (!valid) return BR_ERROR_PARAMETERS;
@@ -184,6 +192,14 @@ static void observe_transition(br_cycle *cycle, const br_measured *before,
     }
 }
 
+/* What counts of the newest state: what was measured, or the prediction where that is doubtful. */
+static void believe(br_cycle *cycle, double interval_s) {
+    br_counters *counters = &cycle->counters;
+    counters->fault = br_monitor_check(&cycle->monitor, &cycle->settings, &cycle->controller,
+                                       interval_s, &cycle->stream.newest);
+    counters->faults[counters->fault] += counters->fault != BR_FAULT_NONE;
+}
+
 br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state) {
     if (!cycle || !state) return BR_STATE_FOREIGN;
     if (!isfinite(state->time_s)) {
@@ -191,6 +207,7 @@ br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state) {
         return BR_STATE_FOREIGN;
     }
     const br_measured before = cycle->stream.newest;
+    const double interval_s = cycle->counters.interval_s;
     const int begins =
         !cycle->stream.has_newest || before.epoch != state->epoch || before.run != state->run;
     const br_reception reception = br_stream_accept(&cycle->stream, state, &cycle->counters);
@@ -203,9 +220,14 @@ br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state) {
         cycle->controller.reset(cycle->controller.self);
         cycle->stepped = cycle->stopping = cycle->reckoned = 0;
         cycle->shown.duration_s = 0;
-    } else {
-        observe_transition(cycle, &before, state);
+        br_monitor_restart(&cycle->monitor);
     }
+    const br_fault doubted = cycle->counters.fault;
+    believe(cycle, interval_s);
+    if (doubted || cycle->counters.fault)
+        cycle->shown.duration_s = 0;
+    else if (!begins)
+        observe_transition(cycle, &before, state);
     br_delay_observe(&cycle->delay, &cycle->settings, state, &cycle->counters.delay_s);
     return BR_STATE_NEW;
 }
@@ -227,7 +249,9 @@ void br_cycle_stop(br_cycle *cycle) {
 }
 
 void br_cycle_go(br_cycle *cycle) {
-    if (cycle) cycle->halted = cycle->stopping = 0;
+    if (!cycle) return;
+    cycle->halted = cycle->stopping = 0;
+    br_monitor_restart(&cycle->monitor); /* whoever says go has looked at the sensors */
 }
 
 /* --- one cycle --- */
@@ -261,7 +285,7 @@ static int slowing(br_cycle *cycle, double decided_at_s, br_environment *environ
 static void halt(br_cycle *cycle, double acting_s) {
     br_decision *decision = &cycle->decision;
     if (cycle->stepped) cycle->controller.reset(cycle->controller.self);
-    cycle->stepped = 0;
+    cycle->stepped = cycle->acting = 0;
     br_fallback_brake(&cycle->fallback, &cycle->settings, cycle->stream.newest.x[BR_INDEX_VX],
                       acting_s, decision->u);
     decision->level = BR_STOP;
@@ -287,6 +311,8 @@ static void reckon(br_cycle *cycle, double decided_at_s) {
     if (controller->predict(controller->self, x, cycle->decision.u, duration_s, x)) return;
     cycle->reckoned_s = decided_at_s;
     cycle->vx_mps = x[BR_INDEX_VX];
+    memcpy(cycle->acting_x, x, sizeof cycle->acting_x);
+    cycle->acting = 1;
 }
 
 static void count(br_cycle *cycle, int status) {
@@ -297,18 +323,26 @@ static void count(br_cycle *cycle, int status) {
         cycle->counters.cost_jumps += solution->cost > JUMP * solution->shifted_cost + JUMP_BY;
 }
 
+/* The state in which the new input begins to act, and what acts until then; -1: not known. */
+static int at_acting(br_cycle *cycle, double u[BR_NU]) {
+    const br_measured *newest = &cycle->stream.newest;
+    double *x = cycle->acting_x;
+    if (newest->lockstep && cycle->counters.delay_s == 0 &&
+        newest->time_s == cycle->decision.decided_at_s) { /* at once */
+        memcpy(x, newest->x, sizeof newest->x);
+        memcpy(u, newest->u_applied, sizeof newest->u_applied);
+        return 0;
+    }
+    return br_delay_at_acting(&cycle->delay, &cycle->settings, &cycle->controller, newest,
+                              cycle->decision.decided_at_s, cycle->counters.delay_s, x, u);
+}
+
 static int step(br_cycle *cycle, const br_environment *environment, double acting_s,
                 double budget_s) {
-    const br_measured *newest = &cycle->stream.newest;
     const br_controller *controller = &cycle->controller;
-    double x[BR_NX], u[BR_NU];
-    if (newest->lockstep && cycle->counters.delay_s == 0) { /* it acts at once */
-        memcpy(x, newest->x, sizeof x);
-        memcpy(u, newest->u_applied, sizeof u);
-    } else if (br_delay_at_acting(&cycle->delay, &cycle->settings, controller, newest,
-                                  cycle->decision.decided_at_s, cycle->counters.delay_s, x, u)) {
-        return BR_UNPREDICTABLE;
-    }
+    double u[BR_NU];
+    if (at_acting(cycle, u)) return BR_UNPREDICTABLE;
+    cycle->acting = 1;
     /* Where the delay measured has fallen, the moment of acting may even go back. */
     const double elapsed_s = cycle->stepped ? fmax(acting_s - cycle->stepped_s, 0) : 0;
     cycle->stepped = 1;
@@ -317,12 +351,23 @@ static int step(br_cycle *cycle, const br_environment *environment, double actin
     solution->rows = solution->second_start = 0;
     solution->cost = solution->shifted_cost = -1;
     const double begin_s = now(cycle);
-    const int status =
-        controller->step(controller->self, x, u, environment, elapsed_s, budget_s, solution);
+    const int status = controller->step(controller->self, cycle->acting_x, u, environment,
+                                        elapsed_s, budget_s, solution);
     cycle->decision.step_us = (now(cycle) - begin_s) * 1e6;
     cycle->decision.stepped = status != BR_STEP_FAILED;
     count(cycle, status);
     return status;
+}
+
+/* Braking follows the line where the controller knows it and the model the state. */
+static void brake_along_line(br_cycle *cycle, double u[BR_NU]) {
+    const br_controller *controller = &cycle->controller;
+    const double *x = cycle->acting_x;
+    double s_m = -1, angle_rad, outside_m;
+    if (!cycle->acting || !controller->steer || cycle->vx_mps <= cycle->settings.brake_fade_mps ||
+        controller->steer(controller->self, x, &s_m, &angle_rad, &outside_m))
+        return;
+    br_fallback_brake_to(&cycle->settings, cycle->vx_mps, x[BR_INDEX_DELTA], angle_rad, BR_TS, u);
 }
 
 /* The input of a car that is to be driven: the solution's, or the fallback's. */
@@ -333,9 +378,16 @@ static void drive(br_cycle *cycle, const br_environment *environment, double act
     const br_measured *newest = &cycle->stream.newest;
     /* Where states come seldom, the next one is no sooner to be had. */
     const double stale_s = fmax(cycle->settings.stale_s, 2 * cycle->counters.interval_s);
+    const double doubted_s = newest->time_s - cycle->monitor.trusted_s;
+    cycle->acting = 0;
     if (decision->decided_at_s - newest->time_s > stale_s) {
         decision->status = BR_NO_STATE;
         reckon(cycle, decision->decided_at_s);
+    } else if (cycle->counters.fault && doubted_s > stale_s + STAGE_ROUNDING * BR_TS) {
+        double u[BR_NU];
+        decision->status = BR_DOUBTED;
+        cycle->acting = !at_acting(cycle, u);
+        cycle->vx_mps = newest->x[BR_INDEX_VX];
     } else {
         cycle->reckoned = 0;
         cycle->vx_mps = newest->x[BR_INDEX_VX];
@@ -346,6 +398,7 @@ static void drive(br_cycle *cycle, const br_environment *environment, double act
     decision->level = br_fallback_decide(&cycle->fallback, &cycle->settings,
                                          decision->status ? NULL : &cycle->solution, cycle->vx_mps,
                                          acting_s, fmax(decision->late_s, 0), decision->u);
+    if (decision->level >= BR_BRAKE) brake_along_line(cycle, decision->u);
     cycle->counters.levels[decision->level] += 1;
     const int driving = decision->level == BR_SOLUTION ? BR_PHASE_DRIVING : BR_PHASE_FALLBACK;
     cycle->counters.phase = cycle->halted ? cycle->halted : driving;
@@ -359,6 +412,8 @@ br_mpc_error br_cycle_decide(br_cycle *cycle, const br_environment *environment,
     if (!isfinite(decided_at_s) || !isfinite(budget_s) || !isfinite(spent_s)) return BR_ERROR_TIME;
     br_decision *decision = &cycle->decision;
     const br_measured *newest = &cycle->stream.newest;
+    if (cycle->counters.fault) /* the caller takes its time from states that may be dated ahead */
+        decided_at_s -= fmax(cycle->monitor.measured_s - newest->time_s, 0);
     decision->epoch = newest->epoch;
     decision->run = newest->run;
     decision->seq = newest->seq;
@@ -366,7 +421,8 @@ br_mpc_error br_cycle_decide(br_cycle *cycle, const br_environment *environment,
     decision->delay_s = cycle->counters.delay_s;
     decision->stepped = decision->error = 0;
     decision->step_us = decision->late_s = 0;
-    const double acting_s = decided_at_s + decision->delay_s;
+    decision->fault = cycle->counters.fault;
+    const double acting_s = cycle->acting_s = decided_at_s + decision->delay_s;
     br_environment around = {.speed_limit_mps = INFINITY};
     if (environment) around = *environment;
     if (cycle->halted && !slowing(cycle, decided_at_s, &around))
@@ -384,6 +440,19 @@ br_mpc_error br_cycle_answer(br_cycle *cycle, const br_measured *state,
     if (!cycle || !state || !decision) return BR_ERROR_NULL;
     if (br_cycle_observe(cycle, state) != BR_STATE_NEW) return BR_ERROR_STATE;
     return br_cycle_decide(cycle, environment, decided_at_s, budget_s, spent_s, decision);
+}
+
+br_mpc_error br_cycle_brake(const br_cycle *cycle, br_braking *braking) {
+    if (!cycle || !braking) return BR_ERROR_NULL;
+    if (!cycle->acting || !cycle->controller.steer) return BR_ERROR_NOT_READY;
+    br_rollout from = {.controller = &cycle->controller,
+                       .settings = &cycle->settings,
+                       .fallback = &cycle->fallback,
+                       .time_s = cycle->acting_s};
+    memcpy(from.x, cycle->acting_x, sizeof from.x);
+    memcpy(from.u, cycle->decision.u, sizeof from.u);
+    br_braking_plan(&from, braking);
+    return BR_OK;
 }
 
 /* A car is being driven: a step has been made, and no halt since. */

@@ -4,6 +4,8 @@
 
 #include "bayesrace_cycle.h"
 
+#define STAGE_ROUNDING 1e-6 /* share of a stage: times that are added up differ by so much */
+
 /* --- br_stream.c: which states count --- */
 
 typedef struct {
@@ -54,5 +56,48 @@ br_level br_fallback_decide(br_fallback *fallback, const br_driving *settings,
                             double late_s, double u[BR_NU]);
 br_level br_fallback_brake(const br_fallback *fallback, const br_driving *settings, double vx_mps,
                            double time_s, double u[BR_NU]);
+void br_fallback_plan(const br_fallback *fallback, const br_driving *settings, double time_s,
+                      double u[BR_NU]);
+void br_fallback_brake_to(const br_driving *settings, double vx_mps, double delta_rad,
+                          double angle_rad, double duration_s, double u[BR_NU]);
+
+/* --- br_monitor.c: whether a measured state can be believed --- */
+
+#define BR_BELIEVED 16
+
+typedef struct {
+    double x[BR_NX], u[BR_NU], dt_s; /* u acted for dt_s before */
+    double ways;                     /* share of the bounds */
+} br_believed;
+
+typedef struct {
+    int count, next;                          /* of the newest states believed */
+    br_believed believed[BR_BELIEVED], since; /* since: what has been believed after them */
+    int64_t seq;                              /* of the newest state, believed or not, */
+    double measured_s, before[BR_NX];         /* its time, and what it says */
+    double way[BR_NX];                  /* position, heading and steering that should follow */
+    int agreeing;                       /* states in a row without contradiction */
+    br_fault distrusted;                /* since when on the prediction counts: */
+    double time_s, trusted_s, x[BR_NX]; /* its time, that of the last state believed, */
+    int doubts;                         /* there have been some: */
+    double doubted_s, doubt_ended_s;    /* when the last ones began and ended */
+    double gone_m;                      /* and how far it has gone */
+} br_monitor;
+
+void br_monitor_restart(br_monitor *monitor);
+br_fault br_monitor_check(br_monitor *monitor, const br_driving *settings,
+                          const br_controller *controller, double interval_s, br_measured *state);
+
+/* --- br_braking_plan.c: what the car's guard does if nothing more comes --- */
+
+typedef struct {
+    const br_controller *controller;
+    const br_driving *settings;
+    const br_fallback *fallback;
+    double time_s; /* when u begins to act, in state x */
+    double x[BR_NX], u[BR_NU];
+} br_rollout;
+
+void br_braking_plan(const br_rollout *from, br_braking *braking);
 
 #endif

@@ -75,6 +75,13 @@ br_mpc_error br_mpc_predict(const br_mpc *mpc, const double x[BR_NX], const doub
     return mpc ? mpc->code->predict(mpc, x, u, duration_s, x_next) : BR_ERROR_NULL;
 }
 
+#if BR_HAS_PATH
+br_mpc_error br_mpc_steer(const br_mpc *mpc, const double x[BR_NX], double *s_m, double *angle_rad,
+                          double *outside_m) {
+    return mpc ? mpc->code->steer(mpc, x, s_m, angle_rad, outside_m) : BR_ERROR_NULL;
+}
+#endif
+
 br_mpc_error br_mpc_variance(br_mpc *mpc, const double v[BR_NV], double variance[BR_NE]) {
     return mpc ? mpc->code->variance(mpc, v, variance) : BR_ERROR_NULL;
 }

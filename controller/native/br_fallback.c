@@ -48,16 +48,34 @@ static int row_due(const br_fallback *fallback, double time_s) {
     return !(row > 0) ? 0 : row >= BR_N ? BR_N : (int)row;
 }
 
+/* Drive command that brakes: what the car can hold without a controller, fading to none. */
+static double braking(const br_driving *s, double vx_mps) {
+    const double share = fmin(fmax(vx_mps / s->brake_fade_mps, 0), 1);
+    const double held = s->brake_d + s->brake_slow / fmax(vx_mps * vx_mps, SLOWEST);
+    return isfinite(vx_mps) ? fmax(s->u_low[BR_INDEX_DUTY], -held) * share : 0;
+}
+
+/* Brakes, and steers to an angle within that time. */
+void br_fallback_brake_to(const br_driving *s, double vx_mps, double delta_rad, double angle_rad,
+                          double duration_s, double u[BR_NU]) {
+    u[BR_INDEX_DUTY] = braking(s, vx_mps);
+    u[BR_INDEX_DELTA_RATE] = (angle_rad - delta_rad) / duration_s;
+    limited(s, u, u);
+}
+
+/* The plan's input that is due. */
+void br_fallback_plan(const br_fallback *fallback, const br_driving *s, double time_s,
+                      double u[BR_NU]) {
+    const int row = row_due(fallback, time_s);
+    limited(s, fallback->plan[row < fallback->rows ? row : fallback->rows - 1], u);
+}
+
 br_level br_fallback_brake(const br_fallback *fallback, const br_driving *s, double vx_mps,
                            double time_s, double u[BR_NU]) {
     const int row = row_due(fallback, time_s), rolling = vx_mps > s->brake_fade_mps;
     const double nothing[BR_NU] = {0};
     limited(s, rolling && row < fallback->rows ? fallback->plan[row] : nothing, u);
-    const double share = fmin(fmax(vx_mps / s->brake_fade_mps, 0), 1);
-    /* What the car can hold without a controller. */
-    const double held = s->brake_d + s->brake_slow / fmax(vx_mps * vx_mps, SLOWEST);
-    const double brake = fmax(s->u_low[BR_INDEX_DUTY], -held);
-    u[BR_INDEX_DUTY] = isfinite(vx_mps) ? brake * share : 0;
+    u[BR_INDEX_DUTY] = braking(s, vx_mps);
     return rolling ? BR_BRAKE : BR_STOP;
 }
 

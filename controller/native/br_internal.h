@@ -116,6 +116,14 @@ typedef struct {
     double age;                           /* time since then */
 } br_path;
 
+/* Where a state is beside the line. */
+typedef struct {
+    double left_m;    /* of the line */
+    double middle_m;  /* of the track, to the left of the line */
+    double outside_m; /* of the track less its margin; negative inside */
+    double speed_mps; /* of the line */
+} br_beside;
+
 typedef struct {
     int factorised; /* g, h, and y, scale, m of the rows before BR_ROW_LATE fit the linearisation */
     int regularised;  /* the exact Hessian was not positive definite */
@@ -315,6 +323,10 @@ BR_PART void br_path_follow(br_mpc *mpc);
 #else
 static inline void br_path_follow(br_mpc *mpc) { (void)mpc; }
 #endif
+BR_PART void br_path_beside(const br_path *path, const double x[BR_NX], double *s_m,
+                            br_beside *beside);
+BR_PART double br_path_heading(const br_path *path, double s);
+BR_PART double br_path_curvature(const br_path *path, double s);
 BR_PART void br_path_ahead(const br_path *path, double distance, double point[2]);
 
 /* br_turnaround.c */
@@ -401,7 +413,8 @@ BR_PART void br_align(br_mpc *mpc, int shifts);
 BR_PART void br_undo_preparation(br_mpc *mpc);
 BR_PART void br_forget_linearisation(br_mpc *mpc);
 
-/* br_step.c, br_prepare.c, br_predict.c, br_inspect.c: functions of the interface, see br_code.h */
+/* br_step.c, br_prepare.c, br_predict.c, br_braking.c, br_inspect.c: functions of the interface,
+ * see br_code.h */
 BR_PART br_mpc_error br_step(br_mpc *mpc, const double x[BR_NX], const double u_before[BR_NU],
                              const br_environment *environment, double elapsed_s, double budget_s,
                              double u[BR_NU], br_mpc_status *status, br_mpc_info *info);
@@ -413,6 +426,8 @@ BR_PART br_mpc_error br_prepare(br_mpc *mpc, double elapsed_s, double budget_s);
 BR_PART br_mpc_error br_rehearse(br_mpc *mpc);
 BR_PART br_mpc_error br_predict(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
                                 double duration_s, double x_next[BR_NX]);
+BR_PART br_mpc_error br_steer(const br_mpc *mpc, const double x[BR_NX], double *s_m,
+                              double *angle_rad, double *outside_m);
 BR_PART br_mpc_error br_variance(br_mpc *mpc, const double v[BR_NV], double variance[BR_NE]);
 BR_PART br_mpc_error br_evaluate(const br_mpc *mpc, const double v[BR_NV],
                                  const double lambda[BR_NX], double x_next[BR_NX],

@@ -85,8 +85,9 @@ static int nearest_anywhere(const br_path *path, const double x[BR_NX]) {
     return best;
 }
 
-static int nearest_in_window(const br_path *path, const double x[BR_NX]) {
-    const int start = (int)((path->s - BR_PATH_WINDOW_BACK_M) / path->spacing);
+/* The same near arc length s. */
+static int nearest_near(const br_path *path, double s, const double x[BR_NX]) {
+    const int start = (int)((s - BR_PATH_WINDOW_BACK_M) / path->spacing);
     int count = (int)((BR_PATH_WINDOW_BACK_M + BR_PATH_WINDOW_AHEAD_M) / path->spacing) + 1,
         best = start;
     if (count > path->n) count = path->n;
@@ -128,13 +129,45 @@ void br_path_ahead(const br_path *path, double distance, double point[2]) {
     point[1] = row[Y];
 }
 
+/* Where a state is beside the line, sought near *s_m, which follows; below 0: anywhere. */
+void br_path_beside(const br_path *path, const double x[BR_NX], double *s_m, br_beside *beside) {
+    double row[BR_PATH_COLUMNS];
+    const int nearest = *s_m < 0 ? nearest_anywhere(path, x) : nearest_near(path, *s_m, x);
+    project(path, nearest, x, s_m, &beside->left_m);
+    path_at(path, *s_m, row);
+    const double norm = hypot(row[NORMAL_X], row[NORMAL_Y]);
+    const double heading = br_path_heading(path, *s_m);
+    const double leftwards = row[NORMAL_Y] * cos(heading) - row[NORMAL_X] * sin(heading);
+    const double line = row[NORMAL_X] * row[X] + row[NORMAL_Y] * row[Y];
+    const double car = row[NORMAL_X] * x[BR_INDEX_X] + row[NORMAL_Y] * x[BR_INDEX_Y];
+    const double middle = (row[LOWER] + row[UPPER]) / 2 - line;
+    beside->middle_m = copysign(1, leftwards) * middle / norm;
+    beside->outside_m = fmax(row[LOWER] - car, car - row[UPPER]) / norm;
+    beside->speed_mps = row[SPEED];
+}
+
+/* Direction of the line, by a chord. */
+double br_path_heading(const br_path *path, double s) {
+    double a[BR_PATH_COLUMNS], b[BR_PATH_COLUMNS];
+    path_at(path, s - BR_BRAKING_CHORD_M / 2, a);
+    path_at(path, s + BR_BRAKING_CHORD_M / 2, b);
+    return atan2(b[Y] - a[Y], b[X] - a[X]);
+}
+
+/* Its curvature, by two of them. */
+double br_path_curvature(const br_path *path, double s) {
+    const double h = BR_BRAKING_CHORD_M / 2;
+    const double turned = br_path_heading(path, s + h) - br_path_heading(path, s - h);
+    return remainder(turned, 2 * M_PI) / (2 * h);
+}
+
 /* Where the car is on the line: path->s, and its distance to the left. */
 void br_path_project(br_path *path, const double x[BR_NX], double *lateral) {
     double s, row[BR_PATH_COLUMNS];
     const double moved = path->age * hypot(x[BR_INDEX_VX], x[BR_INDEX_VY]);
     if (moved > 0.8 * BR_PATH_WINDOW_AHEAD_M) path->known = 0; /* may have left the window */
     path->age = 0;
-    project(path, path->known ? nearest_in_window(path, x) : nearest_anywhere(path, x), x, &s,
+    project(path, path->known ? nearest_near(path, path->s, x) : nearest_anywhere(path, x), x, &s,
             lateral);
     path_at(path, s, row);
     if (path->known && fabs(*lateral) > row[UPPER] - row[LOWER]) /* lost: off by a track's width */

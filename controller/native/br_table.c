@@ -10,6 +10,9 @@ const br_code BR_CODE = {.step = br_step,
                          .prepare = br_prepare,
                          .rehearse = br_rehearse,
                          .predict = br_predict,
+#if BR_HAS_PATH
+                         .steer = br_steer,
+#endif
                          .variance = br_variance,
                          .evaluate = br_evaluate,
                          .load = br_gp_load};

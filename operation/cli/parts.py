@@ -154,6 +154,16 @@ def controller(
     hold: Annotated[
         bool, typer.Option("--hold", help="Do not drive before 'bayesrace go'.")
     ] = False,
+    sensor_tolerance: Annotated[
+        float,
+        typer.Option(
+            metavar="X",
+            min=0,
+            max=1000,
+            help="Contradictions in measured states beyond which they are not believed, as a "
+            "multiple of those by noise of motion capture; 0: every state is.",
+        ),
+    ] = 1.0,
     cpu: Cpu = None,
     fifo: Fifo = None,
     lock_memory: LockMemory = False,
@@ -181,6 +191,7 @@ def controller(
         budget=budget,
         compensation=_compensation(delay),
         hold=hold,
+        sensor_tolerance=sensor_tolerance,
         gate=read_settings(gate, GateSettings),
         realtime=realtime(cpu, fifo, lock_memory),
         parent_pid=parent_pid,

@@ -319,7 +319,8 @@ def export(
     manifest = read_manifest(folder)
     manifest.check_car(parameters, folder)
     mpc = read_settings(settings, MpcSettings).parameters(parameters, manifest.problem.name)
-    values = mpc | cycle_values(parameters, process.fallback, process.compensation, process.stale_s)
+    cycle = process.fallback, process.compensation, process.stale_s, process.sensor_tolerance
+    values = mpc | cycle_values(parameters, *cycle)
     learned = None if weights is None else read_weights(weights)
     write(out, manifest, table.rows, table.spacing_m, values, learned)
     typer.echo(f"{track}, {parameters.name}: {out}")

@@ -18,7 +18,7 @@ from plant.fmu.map import wire
 from plant.fmu.map_file import FmuMap, read_map
 from plant.fmu.package import read_description
 from plant.fmu.wiring import Wiring
-from plant.simulator import PlantGuard, checked_start, hold_in_turn, plant_discretisation
+from plant.simulator import Command, PlantGuard, checked_start, hold_in_turn, plant_discretisation
 
 __all__ = ["FmuSimulator", "communication_step", "open_fmu"]
 
@@ -98,17 +98,17 @@ class FmuSimulator:
         self.u_applied = (0.0, 0.0)
         self.steps = 0
 
-    def step(self, u: Sequence[float] | None) -> None:
+    def step(self, u: Command) -> None:
         """Hold the command ``u`` = (d, delta_rate) for one period; None brakes."""
         self.u_applied = self._hold(u, self.substeps)
         self.steps += 1
 
-    def step_switched(self, commands: Sequence[tuple[int, Sequence[float] | None]]) -> None:
+    def step_switched(self, commands: Sequence[tuple[int, Command]]) -> None:
         """One period in which the command changes: (substeps, command) in order of time."""
         self.u_applied = hold_in_turn(self.x, commands, self.substeps, self._hold)
         self.steps += 1
 
-    def _hold(self, u: Sequence[float] | None, count: int) -> tuple[float, float]:
+    def _hold(self, u: Command, count: int) -> tuple[float, float]:
         """Holds a command for ``count`` communication steps; what acted."""
         delta = float(self.x[6])
         guard, wiring, part_s = self.guard, self._wiring, self._part_s

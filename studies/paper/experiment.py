@@ -18,6 +18,7 @@ from bayesrace.log import LogReader, LogWriter
 from bayesrace.messages import EVENT, STATE, TELEMETRY, TRUTH
 from bayesrace.raceline import RaceLine
 from controller.assembly import compiled_controller
+from controller.process_settings import ControllerSettings
 from learning.dataset import Dataset
 from learning.logs import dataset_from_messages, fallback_cycles
 from operation.analysis.race import DrivenRun
@@ -67,7 +68,10 @@ class Experiment:
         with TemporaryDirectory() as folder:
             path = Path(folder) / "lap.mcap"
             log = LogWriter(path)
-            ClosedLoop(self.car, self.track, line, law, self._vehicle, log).drive(1)
+            # As published, every state is believed.
+            process = ControllerSettings(car=self.car, sensor_tolerance=0)
+            loop = ClosedLoop(self.car, self.track, line, law, self._vehicle, log, process)
+            loop.drive(1)
             log.close()
             for entry in LogReader(path).messages((STATE, TRUTH, TELEMETRY, EVENT)):
                 record.add(entry.message)

@@ -61,7 +61,8 @@ static br_mpc_error use_parameters(controller *c, const double *v) {
         .compensation = BR_COMPENSATION_FIXED,
         .delay_s = v[FMU_V_delay],
         .longest_s = v[FMU_V_delay] > 0 ? v[FMU_V_delay] : 1,
-        .stale_s = 1, /* every step has its state */
+        .stale_s = 0.06, /* every step has its state, but it may be in doubt */
+        .sensor_tolerance = v[FMU_V_sensor_tolerance],
     };
     const br_mpc_error error = br_mpc_set_parameters(c->mpc, &parameters);
     return error ? error : br_cycle_set_driving(c->cycle, &driving);

@@ -1,0 +1,229 @@
+/* Whether a measured state can be believed: what it says of position and velocity must fit, and
+ * both must follow from the state before.
+ *
+ * Position, heading and steering angle are compared with the way that the measured velocities, yaw
+ * rate and applied steering rate have made since they last agreed; the comparison forgets over
+ * BR_MONITOR_MEMORY_S, so noise averages and a lasting contradiction adds up. Velocity and yaw rate
+ * may change no faster than tyres make them. That is kinematics and holds for any model, sliding or
+ * not. A state that contradicts is replaced by the prediction of the corrected model from the last
+ * state beyond doubt. States are believed again once several in a row agree with each other and
+ * with the prediction. The bounds (BR_MONITOR_...) are the car's, from its file. */
+#include <math.h>
+#include <string.h>
+
+#include "br_cycle.h"
+
+#if BR_HAS_PATH
+
+#define AGREEING 3       /* states in a row that end the distrust */
+#define BEYOND_DOUBT 0.1 /* share of the bounds */
+#define OFTEN 0.75       /* of a stage */
+#define GAP_S 0.5        /* after a longer one nothing can be compared */
+#define IN_TIME 0.5      /* share of the interval by which a time may be wrong */
+#define RECOVER_S 0.25   /* of doubt, from its beginning on; what lasts longer is no glitch */
+#define CLOSE 0.4        /* share of the bound of velocity changes, between state and prediction */
+#define QUIET_S 1.0      /* without doubt: the next one is another */
+
+typedef struct {
+    double x, y;
+} vector;
+
+static vector world_velocity(const double x[BR_NX]) {
+    const double c = cos(x[BR_INDEX_PSI]), s = sin(x[BR_INDEX_PSI]);
+    const double vx = x[BR_INDEX_VX], vy = x[BR_INDEX_VY];
+    return (vector){c * vx - s * vy, s * vx + c * vy};
+}
+
+static double turned(double to, double from) { return remainder(to - from, 2 * M_PI); }
+
+void br_monitor_restart(br_monitor *monitor) { memset(monitor, 0, sizeof *monitor); }
+
+static void begin(br_monitor *monitor, const br_measured *state) {
+    memcpy(monitor->before, state->x, sizeof state->x);
+    memcpy(monitor->way, state->x, sizeof state->x);
+    monitor->seq = state->seq;
+    monitor->measured_s = state->time_s;
+}
+
+/* Contradictions between the state and those before, as shares of their bounds. */
+typedef struct {
+    double share;  /* the largest one of those: */
+    br_fault kind; /* which */
+    double ways;   /* the largest one between what is measured and the way there */
+} br_contradiction;
+
+static br_contradiction compare(br_monitor *monitor, const br_driving *settings,
+                                const br_measured *state, double dt_s) {
+    const double *x = state->x, *before = monitor->before;
+    double *way = monitor->way;
+    const vector v0 = world_velocity(before), v1 = world_velocity(x);
+    const double turning = (before[BR_INDEX_OMEGA] + x[BR_INDEX_OMEGA]) / 2;
+    way[BR_INDEX_X] += dt_s * (v0.x + v1.x) / 2;
+    way[BR_INDEX_Y] += dt_s * (v0.y + v1.y) / 2;
+    way[BR_INDEX_PSI] += dt_s * turning;
+    way[BR_INDEX_DELTA] += dt_s * state->u_applied[BR_INDEX_DELTA_RATE];
+    if (!state->averaged || state->seq != monitor->seq + 1) /* what acted is not known */
+        way[BR_INDEX_DELTA] = x[BR_INDEX_DELTA];
+    const double dx = x[BR_INDEX_X] - way[BR_INDEX_X], dy = x[BR_INDEX_Y] - way[BR_INDEX_Y];
+    const double dpsi = turned(x[BR_INDEX_PSI], way[BR_INDEX_PSI]);
+    const double ddelta = x[BR_INDEX_DELTA] - way[BR_INDEX_DELTA];
+    const double within = dt_s * dt_s / 8; /* of the trapezoidal rule */
+    const double shares[] = {
+        [BR_FAULT_POSITION] =
+            hypot(dx, dy) / (BR_MONITOR_POSITION_M + BR_MONITOR_ACCELERATION_MPS2 * within),
+        [BR_FAULT_HEADING] =
+            fabs(dpsi) / (BR_MONITOR_HEADING_RAD + BR_MONITOR_YAW_ACCELERATION_RADPS2 * within),
+        [BR_FAULT_VELOCITY] = hypot(v1.x - v0.x, v1.y - v0.y) /
+                              (BR_MONITOR_SPEED_MPS + BR_MONITOR_ACCELERATION_MPS2 * dt_s),
+        [BR_FAULT_YAW_RATE] =
+            fabs(x[BR_INDEX_OMEGA] - before[BR_INDEX_OMEGA]) /
+            (BR_MONITOR_YAW_RATE_RADPS + BR_MONITOR_YAW_ACCELERATION_RADPS2 * dt_s),
+        [BR_FAULT_STEERING] = fabs(ddelta) / BR_MONITOR_STEERING_RAD,
+    };
+    br_contradiction found = {.kind = BR_FAULT_POSITION};
+    for (int i = BR_FAULT_POSITION; i <= BR_FAULT_STEERING; ++i) {
+        const int of_change = i == BR_FAULT_VELOCITY || i == BR_FAULT_YAW_RATE;
+        const double share = shares[i] / settings->sensor_tolerance;
+        if (!of_change && share > found.ways) found.ways = share;
+        if (share <= found.share || isnan(found.share)) continue;
+        found.share = share;
+        found.kind = (br_fault)i;
+    }
+    const double gain = 1 - exp(-dt_s / BR_MONITOR_MEMORY_S);
+    way[BR_INDEX_X] += gain * dx;
+    way[BR_INDEX_Y] += gain * dy;
+    way[BR_INDEX_PSI] += gain * dpsi;
+    way[BR_INDEX_DELTA] += gain * ddelta;
+    return found;
+}
+
+/* Equal to the bit in everything that is measured, though the car moves. */
+static int frozen(const br_monitor *monitor, const br_driving *settings, const double x[BR_NX]) {
+    const double speed = hypot(x[BR_INDEX_VX], x[BR_INDEX_VY]);
+    return speed > settings->standing_mps && !memcmp(x, monitor->before, sizeof monitor->before);
+}
+
+/* States that come more often than stages are taken together. */
+static void remember(br_monitor *monitor, const br_measured *state, double dt_s, double ways) {
+    br_believed *since = &monitor->since;
+    since->dt_s += dt_s;
+    since->ways = fmax(since->ways, ways);
+    for (int i = 0; i < BR_NU && since->dt_s > 0; ++i)
+        since->u[i] += (state->u_applied[i] - since->u[i]) * dt_s / since->dt_s;
+    if (monitor->count && since->dt_s < OFTEN * BR_TS) return;
+    memcpy(since->x, state->x, sizeof since->x);
+    monitor->believed[monitor->next] = *since;
+    monitor->next = (monitor->next + 1) % BR_BELIEVED;
+    if (monitor->count < BR_BELIEVED) monitor->count += 1;
+    memset(since, 0, sizeof *since);
+}
+
+static const br_believed *ago(const br_monitor *monitor, int n) {
+    return &monitor->believed[(monitor->next + BR_BELIEVED - 1 - n) % BR_BELIEVED];
+}
+
+static void advance(br_monitor *monitor, const br_controller *controller, const double u[BR_NU],
+                    double dt_s) {
+    double *x = monitor->x;
+    const int stage = fabs(dt_s - BR_TS) < STAGE_ROUNDING * BR_TS; /* times are differences */
+    controller->predict(controller->self, x, u, stage ? BR_TS : fmin(dt_s, BR_PREDICT_MAX_S), x);
+    monitor->gone_m += dt_s * hypot(x[BR_INDEX_VX], x[BR_INDEX_VY]);
+}
+
+/* The prediction begins at the newest state beyond doubt: a contradiction may have added up. */
+static void distrust(br_monitor *monitor, const br_controller *controller) {
+    int n = 0;
+    while (n + 1 < monitor->count && ago(monitor, n)->ways > BEYOND_DOUBT) ++n;
+    monitor->gone_m = 0;
+    memcpy(monitor->x, ago(monitor, n)->x, sizeof monitor->x);
+    while (n-- > 0) advance(monitor, controller, ago(monitor, n)->u, ago(monitor, n)->dt_s);
+    advance(monitor, controller, monitor->since.u, monitor->since.dt_s);
+}
+
+/* Whether the state is where the prediction may be wrong by its drift alone. */
+static int near(const br_monitor *monitor, const br_driving *settings, const double x[BR_NX]) {
+    const double *expected = monitor->x, drift_m = BR_MONITOR_DRIFT * monitor->gone_m;
+    const double off_m =
+        hypot(x[BR_INDEX_X] - expected[BR_INDEX_X], x[BR_INDEX_Y] - expected[BR_INDEX_Y]);
+    const double off_rad = fabs(turned(x[BR_INDEX_PSI], expected[BR_INDEX_PSI]));
+    const vector v = world_velocity(x), w = world_velocity(expected);
+    const double tolerance = settings->sensor_tolerance;
+    return off_m <= tolerance * BR_MONITOR_POSITION_M + drift_m &&
+           off_rad <= tolerance * BR_MONITOR_HEADING_RAD + drift_m / BR_WHEELBASE_M &&
+           hypot(v.x - w.x, v.y - w.y) <= CLOSE * tolerance * BR_MONITOR_SPEED_MPS &&
+           fabs(x[BR_INDEX_OMEGA] - expected[BR_INDEX_OMEGA]) <=
+               tolerance * BR_MONITOR_YAW_RATE_RADPS &&
+           fabs(x[BR_INDEX_DELTA] - expected[BR_INDEX_DELTA]) <=
+               tolerance * BR_MONITOR_STEERING_RAD;
+}
+
+static void believe(br_monitor *monitor, const br_measured *state, double dt_s, double ways) {
+    remember(monitor, state, dt_s, ways);
+    monitor->distrusted = BR_FAULT_NONE;
+    monitor->time_s = monitor->trusted_s = state->time_s;
+}
+
+/* Nothing is known of what was before. */
+static void begin_anew(br_monitor *monitor, const br_measured *state) {
+    monitor->count = monitor->agreeing = 0;
+    memset(&monitor->since, 0, sizeof monitor->since);
+    begin(monitor, state);
+    believe(monitor, state, 0, 0);
+}
+
+/* What contradicts, and since when the state before was: due_s ago by its number. */
+static br_fault examine(br_monitor *monitor, const br_driving *settings, const br_measured *state,
+                        double due_s, double *dt_s, double *ways) {
+    const int in_time = due_s <= 0 || fabs(*dt_s - due_s) <= IN_TIME * due_s;
+    const br_contradiction found = compare(monitor, settings, state, fmax(*dt_s, 0));
+    *ways = found.ways;
+    if (frozen(monitor, settings, state->x)) return BR_FAULT_FROZEN;
+    if (found.share <= 1 && *dt_s > 0) return BR_FAULT_NONE;
+    if (in_time && *dt_s > 0) return found.kind;
+    *dt_s = due_s;
+    return BR_FAULT_TIME;
+}
+
+br_fault br_monitor_check(br_monitor *monitor, const br_driving *settings,
+                          const br_controller *controller, double interval_s, br_measured *state) {
+    if (settings->sensor_tolerance == 0) return BR_FAULT_NONE;
+    double dt_s = state->time_s - monitor->measured_s, ways;
+    if (!monitor->count || (dt_s > GAP_S && !monitor->distrusted)) {
+        begin_anew(monitor, state);
+        return BR_FAULT_NONE;
+    }
+    const double due_s = interval_s * (double)(state->seq - monitor->seq);
+    const br_fault fault = examine(monitor, settings, state, due_s, &dt_s, &ways);
+    if (fault) begin(monitor, state); /* what follows is compared with this one, true or not */
+    memcpy(monitor->before, state->x, sizeof state->x);
+    monitor->seq = state->seq;
+    monitor->measured_s = state->time_s;
+    monitor->agreeing = fault ? 0 : monitor->agreeing + 1;
+    monitor->time_s += dt_s;
+    if (!fault && !monitor->distrusted) {
+        believe(monitor, state, dt_s, ways);
+        return BR_FAULT_NONE;
+    }
+    if (!monitor->distrusted) {
+        distrust(monitor, controller);
+        if (monitor->time_s - monitor->doubt_ended_s > QUIET_S || !monitor->doubts)
+            monitor->doubted_s = monitor->time_s;
+        monitor->doubts = 1;
+    }
+    if (fault) monitor->distrusted = fault;
+    advance(monitor, controller, state->u_applied, dt_s);
+    if (monitor->agreeing >= AGREEING) {
+        const int glitch = monitor->time_s - monitor->doubted_s <= RECOVER_S;
+        if (glitch && near(monitor, settings, state->x)) {
+            begin_anew(monitor, state);
+            monitor->doubt_ended_s = state->time_s;
+            return BR_FAULT_NONE;
+        }
+        monitor->distrusted = BR_FAULT_ELSEWHERE;
+    }
+    memcpy(state->x, monitor->x, sizeof monitor->x);
+    state->time_s = monitor->time_s;
+    return monitor->distrusted;
+}
+
+#endif
