@@ -49,21 +49,22 @@ def test_accepted_while_driving(rig: Rig) -> None:
     assert rig.version() == "driven"
 
 
-def test_refused_says_why(rig: Rig, cli: Cli) -> None:
-    before = rig.version()
+def test_what_are_no_weights_is_said_before_a_controller_is_looked_for(rig: Rig, cli: Cli) -> None:
     damaged = bytearray(encode_weights(read_weights(rig.course.weights_file)))
     damaged[len(damaged) // 2] ^= 1
-    path = rig.folder / "damaged.bin"
-    path.write_bytes(bytes(damaged))
-    refused(cli("publish", path, *rig.endpoints), "refused", "checksum", code=1)
-    assert rig.version() == before
+    for content, why in ((bytes(damaged), "checksum"), (b"text" * 20, "not a weights file")):
+        path = rig.folder / "damaged.bin"
+        path.write_bytes(content)
+        refused(cli("publish", path), "damaged.bin", why)  # nobody is at the default endpoints
 
 
 def test_another_model_is_refused(rig: Rig, cli: Cli) -> None:
+    before = rig.version()
     weights: GpWeights = read_weights(rig.course.weights_file)
     path = rig.folder / "foreign.bin"
     write_weights(path, replace(weights, discretisation="bicycle/eulerx1-pose/0.02s/abc"))
     refused(cli("publish", path, "--car", "orca", *rig.endpoints), "refused", code=1)
+    assert rig.version() == before
 
 
 def test_what_is_no_file_is_said_in_a_line(rig: Rig, cli: Cli) -> None:

@@ -258,7 +258,10 @@ def _output(fields: Any) -> GpOutput:
 def _body(data: bytes) -> Any:
     """The msgpack body as plain values, after size, magic, schema and checksum are checked."""
     if not _BODY_START <= len(data) <= MAX_BYTES:
-        raise InputError(f"GP weights: {len(data)} bytes is not the size of a weights file")
+        raise InputError(
+            f"GP weights: {len(data)} bytes is not the size of a weights file; make one with "
+            "'bayesrace train'"
+        )
     magic, schema = _HEAD.unpack_from(data)
     if magic != _MAGIC:
         raise InputError("GP weights: not a weights file; make one with 'bayesrace train'")

@@ -35,11 +35,12 @@ Name = Annotated[
     ),
 ]
 Timeout = Annotated[
-    float,
+    float | None,
     typer.Option(
         metavar="S",
         min=0.1,
         max=600.0,
+        show_default="5 and 20",
         help="Time limit [s], once for finding the controller and once for its answer.",
     ),
 ]
@@ -47,7 +48,7 @@ WeightsFile = Annotated[
     Path,
     typer.Argument(metavar="WEIGHTS", help="Weights file, as 'bayesrace train' writes it."),
 ]
-_TIMEOUT_S = 20.0
+_FINDING_S, _ANSWER_S = 5.0, 20.0
 
 
 def validate(
@@ -141,26 +142,25 @@ def publish(
     weights: WeightsFile,
     name: Name = "",
     endpoint: Endpoint = None,
-    timeout: Timeout = _TIMEOUT_S,
+    timeout: Timeout = None,
 ) -> None:
     """Send new weights to a running controller, and wait for its answer.
 
     Exit code 0 once it drives with them, 1 if it refuses them (the message says if a later attempt
     can succeed), 2 if it cannot be reached.
     """
-    from bayesrace.files import read_whole
-    from bayesrace.gp.weights import MAX_BYTES
+    from bayesrace.gp.weights import encode_weights, read_weights
     from bayesrace.transport import open_session, send_weights
 
-    data = read_whole(weights, "weights file", MAX_BYTES)
+    data = encode_weights(read_weights(weights))
     endpoints = connect_to(endpoint, "learning")
     name = endpoints.car_named(name)
     with open_session(endpoints, "learning") as session:
         # Imports that take as long as all before: whether there is a link is said first.
         from operation.learn.publishing import NotTakenOverError, in_words
 
-        car = _controller(session, endpoints, name, timeout)
-        reply = send_weights(session, car, data, timeout)
+        car = _controller(session, endpoints, name, timeout or _FINDING_S)
+        reply = send_weights(session, car, data, timeout or _ANSWER_S)
     if not reply.accepted:
         raise NotTakenOverError(f"{car}: {in_words(reply)}")
     typer.echo(f"{car}: {reply.data.get('version', '')} {in_words(reply)}")
@@ -172,7 +172,7 @@ def rollback(
     reason: Annotated[
         str, typer.Option(metavar="TEXT", help="Reason, for the controller's event.")
     ] = "",
-    timeout: Timeout = _TIMEOUT_S,
+    timeout: Timeout = None,
 ) -> None:
     """Let a controller return to the weights before those in use.
 
@@ -185,8 +185,8 @@ def rollback(
     with open_session(endpoints, "learning") as session:
         from operation.learn.publishing import NotTakenOverError, in_words
 
-        car = _controller(session, endpoints, name, timeout)
-        reply = send_rollback(session, car, reason or "bayesrace rollback", timeout)
+        car = _controller(session, endpoints, name, timeout or _FINDING_S)
+        reply = send_rollback(session, car, reason or "bayesrace rollback", timeout or _ANSWER_S)
     if not reply.accepted:
         raise NotTakenOverError(f"{car}: {in_words(reply)}")
     before = reply.data.get("from_version")
