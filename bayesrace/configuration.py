@@ -5,9 +5,9 @@ it, or the option ``--config``, which sets that variable: so processes that a co
 the same file. Options of a command override it.
 """
 
+import itertools
 import json
 import os
-import tomllib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from bayesrace.defaults import CONFIGURATION_VARIABLE
 from bayesrace.errors import InputError, faults_in
-from bayesrace.files import read_text
+from bayesrace.files import parse_toml, read_text
 from bayesrace.messages import Role
 from bayesrace.realtime import RealtimeSettings
 from bayesrace.transport.credentials import COVERS, MEMBERS, Credentials
@@ -27,6 +27,7 @@ from bayesrace.transport.endpoints import (
     Endpoints,
     LinkLimits,
     ZenohSettings,
+    address_of,
 )
 
 __all__ = [
@@ -37,6 +38,13 @@ __all__ = [
 
 class _Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+def _port(endpoint: str) -> tuple[str, int, bool]:
+    """What one process alone can listen on."""
+    address = address_of(endpoint)
+    host = "127.0.0.1" if address.host == "localhost" else address.host
+    return host or endpoint, address.port, address.protocol in ("udp", "quic")
 
 
 class NetworkSettings(_Section):
@@ -64,6 +72,16 @@ class NetworkSettings(_Section):
     def _router_named(self) -> Self:
         if self.mode == "router" and not self.router:
             raise ValueError("mode 'router' needs an endpoint: name one, as router = [\"tcp/…\"]")
+        return self
+
+    @model_validator(mode="after")
+    def _one_each(self) -> Self:
+        """Where all connect to a router, plant and controller do not listen."""
+        listening = ("router",) if self.by_router else ("plant", "controller", "router")
+        where = [(one, name) for name in listening for one in getattr(self, name)]
+        for (one, name), (other, second) in itertools.combinations(where, 2):
+            if _port(one) == _port(other):
+                raise ValueError(f"{name} and {second} both listen at {one}: give each its own")
         return self
 
     @property
@@ -156,15 +174,12 @@ def configured() -> Configuration:
 def read_configuration(path: Path) -> Configuration:
     """A file's content; paths in it are relative to its folder. InputError names every fault."""
     remedy = "write one with 'bayesrace config example'"
-    text = read_text(path, "configuration", remedy)
-    try:
-        content = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path} is no TOML: {error}; {remedy}") from None
+    content = parse_toml(read_text(path, "configuration", remedy), path, remedy)
     try:
         found = Configuration.model_validate(content)
     except ValidationError as error:
-        raise InputError(f"{path}: {faults_in(error, 'the file')}; {remedy}") from None
+        faults = faults_in(error, "the file", Configuration)
+        raise InputError(f"{path}: {faults}; all are in 'bayesrace config example'") from None
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     folder = found.tls.folder
@@ -176,30 +191,35 @@ def read_configuration(path: Path) -> Configuration:
 
 
 def as_toml(configuration: Configuration, explained: bool = False) -> str:
-    """The content of a file with these settings; ``explained``: with what each one means."""
+    """The content of a file with these settings; ``explained``: to be filled in.
+
+    That has what each setting means, and the settings as comments: what is added below them cannot
+    be there twice.
+    """
     lines: list[str] = []
+    mark = "#" if explained else ""
     for name, field in Configuration.model_fields.items():
         section = getattr(configuration, name)
         is_model = isinstance(section, BaseModel)
         if explained:
             words = (type(section).__doc__ or "").splitlines()[0] if is_model else field.description
             lines += [f"# {words}"]
-        lines += [f"[{name}]"]
+        lines += [f"{mark}[{name}]"]
         if is_model:
-            lines += _fields(section, explained)
+            lines += _fields(section, explained, mark)
         else:
-            lines += [f"{_text(key)} = {_value(value)}" for key, value in section.items()]
+            lines += [f"{mark}{_text(key)} = {_value(value)}" for key, value in section.items()]
         lines += [""]
     return "\n".join(lines[:-1]) + "\n"
 
 
-def _fields(section: BaseModel, explained: bool) -> Iterator[str]:
+def _fields(section: BaseModel, explained: bool, mark: str) -> Iterator[str]:
     for name, field in type(section).model_fields.items():
         value = getattr(section, name)
         if explained:
             yield f"# {field.description}"
         # TOML has no null: what is not set is a comment.
-        yield f"# {name} =" if value is None else f"{name} = {_value(value)}"
+        yield f"#{name} =" if value is None else f"{mark}{name} = {_value(value)}"
 
 
 def _value(value: Any) -> str:

@@ -3,11 +3,13 @@
 import errno
 import fcntl
 import os
+import re
 import time
+import tomllib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from bayesrace.errors import InputError
 
@@ -15,6 +17,7 @@ __all__ = [
     "claimed",
     "clear_partials",
     "held",
+    "parse_toml",
     "read_text",
     "read_whole",
     "replacing",
@@ -49,6 +52,24 @@ def read_text(path: Path, what: str, remedy: str = "give an existing file") -> s
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(f"{what} {path} is not text in UTF-8; {remedy}") from None
+
+
+def parse_toml(text: str, name: object, remedy: str) -> dict[str, Any]:
+    """The content of a TOML file of that name; InputError if it is none."""
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        why = str(error)
+    twice = re.match(r"Cannot (?:declare .* twice|overwrite a value) \(at (?:line (\d+)|end)", why)
+    heads = [line.partition("#")[0].partition("=")[0].strip() for line in text.split("\n")]
+    again = int(twice[1] or len(heads)) if twice else 1
+    earlier = [n for n, head in enumerate(heads[: again - 1], 1) if head == heads[again - 1]]
+    if not earlier:
+        raise InputError(f"{name} is no TOML: {why}; {remedy}")
+    raise InputError(
+        f"{name}: {heads[again - 1]} stands in line {earlier[-1]} and again in line {again}: write "
+        "all of it in one of these places, and remove the other"
+    )
 
 
 @contextmanager

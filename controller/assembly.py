@@ -31,7 +31,9 @@ def read_settings(path: Path | None, form: type[Settings]) -> Settings:
         return form.model_validate_json(read_whole(path, "the settings"))
     except ValidationError as error:
         where = form.__module__.replace(".", "/")
-        raise InputError(f"{path}: {faults_in(error)}; {where}.py has the form") from None
+        raise InputError(
+            f"{path}: {faults_in(error, 'the file', form)}; {where}.py has the form"
+        ) from None
 
 
 def compiled_controller(

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from pydantic import ValidationError
 
-from bayesrace.errors import InputError
+from bayesrace.errors import InputError, faults_in
 from bayesrace.integrators import Discretisation
 from bayesrace.log import LogReader, topic_of
 from bayesrace.messages import STATE, TELEMETRY, TRUTH, CarSample, Telemetry, car_key
@@ -68,7 +68,9 @@ def log_facts(path: str | os.PathLike[str]) -> LogFacts:
         )
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    except (ValueError, AttributeError, ValidationError) as error:
+    except ValidationError as error:
+        raise InputError(f"{path}: discretisation in its settings: {faults_in(error)}") from None
+    except (ValueError, AttributeError) as error:
         raise InputError(f"{path}: its settings cannot be read ({error})") from error
 
 

@@ -43,7 +43,7 @@ def read(tmp_path: Path, weights: GpWeights) -> Read:
     ("text", "words"),
     [
         ("grid = [", ("is no TOML", "docs/campaigns.md")),
-        ("laps = 2", ("laps = 2 is unknown", "a plan has controllers")),
+        ("laps = 2", ("unknown setting 'laps'", "there are controllers")),
         ('controllers = ["me"]', ("controllers.0 = 'me'", "bestcase")),
         ('controllers = ["bayesrace-updated"]', ("learns from the laps of 'bayesrace'",)),
         ('controllers = ["bayesrace-limit"]', ("learns from the laps of 'bayesrace'",)),

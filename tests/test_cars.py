@@ -107,7 +107,7 @@ def test_every_value_of_a_car_has_its_place_in_the_file_and_a_unit() -> None:
         (
             "mirrored_samples = true",
             "mirrored_samples = 1",
-            ("learning.mirrored_samples = 1", "boolean"),
+            ("learning.mirrored_samples = 1", "true or false"),
         ),
         ("[limits]", "[tuning.turn]\nslow = 1\n[limits]", ("tuning.turn.slow = 1", "slow_mps")),
     ],

@@ -2,7 +2,9 @@
 
 import json
 import os
+import re
 import stat
+import textwrap
 import tomllib
 from pathlib import Path
 
@@ -18,7 +20,7 @@ from operation.cli.help import TaskGroup
 from operation.settings import RaceSettings
 from operation.system import CONFIGURATION, started_system
 from tests.command_line import Cli, refused
-from tests.programs import finish, start
+from tests.programs import ROOT, finish, start
 
 BEYOND = "tcp/0.0.0.0:7447"
 
@@ -38,7 +40,18 @@ def test_the_example_holds_every_setting_with_its_meaning(cli: Cli, tmp_path: Pa
         for setting, one in getattr(field.annotation, "model_fields", {}).items():
             assert f"{setting} =" in text
             assert f"# {one.description}" in text
+    settings = re.sub(r"^#(?! )(.*[^=\n])$", r"\1", text, flags=re.MULTILINE)
+    assert tomllib.loads(settings) == tomllib.loads(as_toml(Configuration()))
     refused(cli("config", "example", "--out", "bayesrace.toml"), "exists")
+
+
+def test_what_the_docs_show_can_be_written_below_the_example(cli: Cli, tmp_path: Path) -> None:
+    path, page = tmp_path / "bayesrace.toml", (ROOT / "docs" / "security.md").read_text()
+    shown = page.partition("In `bayesrace.toml`")[2].partition("\n\n")[2].partition("\n\n")[0]
+    path.write_text(cli("config", "example").out + textwrap.dedent(shown))
+    found = read_configuration(path)
+    assert found.network.plant == ("tls/PLANT:7447",)
+    assert found.tls.folder == tmp_path / "certs"
 
 
 def test_what_is_written_is_read_back() -> None:
@@ -55,9 +68,25 @@ def test_what_is_written_is_read_back() -> None:
     ("text", "words"),
     [
         ("[network]\nplant = ['tcp/nowhere']", ("network.plant.0", "protocol/address:port")),
-        ("[network]\nplants = []", ("network.plants", "not permitted")),
+        ("[network]\nplants = []", ("unknown setting 'network.plants'", "did you mean 'plant'")),
+        ("[network]\nx = []", ("unknown setting 'network.x'", "there are mode, plant, ")),
+        ("[network]\nmode = 'x'", ("network.mode = 'x': has to be 'direct' or 'router'",)),
+        ("[network]\ninsecure = 'ja'", ("network.insecure = 'ja': has to be true or false",)),
+        ("[network]\nplant = 3", ("network.plant = 3: has to be a list",)),
+        ("limits = 3", ("limits = 3: has to be a table",)),
+        ("[limits]\npending = 2.5", ("limits.pending = 2.5: has to be a whole number",)),
+        ("[tls]\n[network]\nmode = 'x'\n[tls]\n", ("[tls] stands in line 1 and again in line 4",)),
+        ("[tls]\nfolder = 'a'\nfolder = 'b'", ("folder stands in line 2 and again in line 3",)),
+        (
+            "[network]\nplant = ['tcp/127.0.0.1:1']\ncontroller = ['tcp/localhost:1']",
+            ("network: plant and controller both listen at tcp/127.0.0.1:1",),
+        ),
+        (
+            "[network]\nmode = 'direct'\nrouter = ['tcp/127.0.0.1:7448']",
+            ("network: controller and router both listen at tcp/127.0.0.1:7448",),
+        ),
         ("[network]\nmode = 'router'", ("network", "mode 'router' needs an endpoint")),
-        ("[limits]\nlease_s = -1", ("limits.lease_s", "greater than 0")),
+        ("[limits]\nlease_s = -1", ("limits.lease_s = -1: has to be greater than 0 (silence",)),
         ("[limits]\nlease_s = nan", ("limits.lease_s",)),
         ("[tls]\nuse = { driver = 'x' }", ("tls.use.driver",)),
         ("[zenoh.access_control]\nenabled = false", ("zenoh", "access_control/enabled")),

@@ -25,7 +25,7 @@ from tests.fmu_variables import OWN, description, given, own_fmu, taken, variabl
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("[outputs\n", "not TOML"),
+        ("[outputs\n", "no TOML"),
         ("[fmu]\nstep_s = -1", "fmu.step_s"),
         ("[fmu]\nplace = true", "fmu.place"),
         ("[outputs]\nyaw = 'h'", "'psi'"),

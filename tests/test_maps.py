@@ -176,7 +176,7 @@ def test_a_track_too_narrow_for_the_car_is_refused_with_its_place(tmp_path: Path
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        ({"resolution": None}, ("resolution", "required")),
+        ({"resolution": None}, ("resolution is missing",)),
         ({"resolution": -0.1}, ("resolution", "greater than 0")),
         ({"origin": [0, 0]}, ("origin",)),
         ({"image": "gone.png"}, ("gone.png", "beside the YAML file")),

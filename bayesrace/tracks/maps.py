@@ -49,7 +49,7 @@ class _Description(BaseModel):
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
 
     image: str = Field(min_length=1)
-    resolution: float = Field(gt=0, description="[m/pixel]")
+    resolution: float = Field(gt=0, description="size of a pixel [m]")
     origin: tuple[float, float, float]
     negate: bool
     occupied_thresh: float = Field(gt=0, le=1)
@@ -99,7 +99,9 @@ def read_map(path: Path | str) -> RosMap:
         reason = " ".join(str(error).split())[:200]
         raise InputError(f"the map {path} is no YAML: {reason}; {remedy}") from None
     except ValidationError as error:
-        raise InputError(f"the map {path}: {faults_in(error)}; correct the file") from None
+        raise InputError(
+            f"the map {path}: {faults_in(error, 'the file', _Description)}; correct the file"
+        ) from None
     picture = path.parent / description.image
     brightness = _brightness(picture, path)
     probability = brightness / 255 if description.negate else (255 - brightness) / 255

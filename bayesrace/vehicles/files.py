@@ -7,7 +7,6 @@ of. Numbers are in SI units; their names, bounds and meanings are those of
 """
 
 import re
-import tomllib
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
@@ -16,8 +15,8 @@ from typing import Annotated, Any, Final
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 
 from bayesrace.defaults import DEFAULT_CAR
-from bayesrace.errors import InputError
-from bayesrace.files import read_text, write_whole
+from bayesrace.errors import InputError, fault_in_words
+from bayesrace.files import parse_toml, read_text, write_whole
 from bayesrace.vehicles.parameters import CarParameters
 from bayesrace.vehicles.parts import AccelerationDrive, DcMotor, LinearTyres, PacejkaTyres, Part
 from bayesrace.vehicles.tuning import Tuning
@@ -134,10 +133,7 @@ def read_car(path: Path | str) -> CarParameters:
     """
     path = Path(path)
     text = read_text(path, "the car's file", f"{_REMEDY}; built-in cars have no suffix")
-    try:
-        content = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path} is no TOML: {error}; {_REMEDY}") from None
+    content = parse_toml(text, path, _REMEDY)
     try:
         return CarParameters.model_validate(_flat(content))
     except InputError as error:
@@ -210,9 +206,8 @@ def _fault(one: Any) -> str:
         form: Any = known.annotation if known is not None else None
         names = ", ".join(form.model_fields) if _is_model(form) else ""
         return f"{place} = {str(one['input'])[:40]} is unknown; {where} has {names}"
-    message = str(one["msg"])[:1].lower() + str(one["msg"])[1:]
     value = str(one["input"])[:40]
-    return f"{place} = {value}{units}: {message}; correct it in {where} ({meaning})"
+    return f"{place} = {value}{units}: {fault_in_words(one)}; correct it in {where} ({meaning})"
 
 
 def _is_model(form: Any) -> bool:

@@ -208,7 +208,7 @@ def settings_of(
         try:
             content = kind.model_validate_json(text).model_dump()
         except ValidationError as error:
-            raise InputError(f"{file}: {faults_in(error, 'the file')}") from None
+            raise InputError(f"{file}: {faults_in(error, 'the file', kind)}") from None
     for option, fields in values.items():
         source = options.get_parameter_source(option)
         if file is None or (source is not None and source.name == "COMMANDLINE"):
@@ -255,10 +255,8 @@ def sensor_noise(given: list[str] | None) -> "SensorNoise":
     try:
         return SensorNoise.model_validate(pairs)
     except ValidationError as error:
-        names = ", ".join(SensorNoise.model_fields)
-        raise InputError(
-            f"--noise: {faults_in(error, 'the noise')}; give NAME=STD, where NAME is one of {names}"
-        ) from None
+        faults = faults_in(error, "the noise", SensorNoise)
+        raise InputError(f"--noise: {faults}; give NAME=STD") from None
 
 
 FmuFile = Annotated[

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from pydantic import ValidationError
 
-from bayesrace.errors import InputError
+from bayesrace.errors import InputError, faults_in
 from bayesrace.files import clear_partials, write_whole
 from bayesrace.gp.weights import OUTPUTS, GpWeights, write_weights
 from learning.dataset import Dataset, concatenate
@@ -178,9 +179,10 @@ def _open(path: Path) -> tuple[sqlite3.Connection, Record, dict[str, bytes]]:
         database.executescript(_SCHEMA)
         content: dict[str, Any] = dict(database.execute("SELECT name, data FROM content"))
         return database, Record.model_validate_json(content.pop("record", "{}")), content
-    except (sqlite3.Error, ValueError) as error:  # pydantic's are ValueErrors
+    except (sqlite3.Error, ValidationError) as error:
         database.close()
-        why = f"{path} cannot be read ({str(error).splitlines()[0]}); restore it"
+        fault = faults_in(error) if isinstance(error, ValidationError) else error
+        why = f"{path} cannot be read ({fault}); restore it"
         if getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_BUSY:
             why = f"another learning job runs in {path.parent}; end it first"
         raise InputError(f"{why}, or choose another folder") from None

@@ -5,7 +5,6 @@ for inputs and start values; the scale follows from the unit unless it is given.
 """
 
 import math
-import tomllib
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -13,8 +12,8 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import pydantic
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from bayesrace.errors import InputError
-from bayesrace.files import read_text
+from bayesrace.errors import InputError, faults_in
+from bayesrace.files import parse_toml, read_text
 from plant.fmu.wiring import COMMANDS, STARTS
 
 __all__ = ["Driven", "FmuMap", "Pick", "Value", "parse_map", "read_map"]
@@ -193,17 +192,12 @@ class FmuMap(_Section):
 
 def parse_map(text: str, name: str = "map") -> FmuMap:
     """The map written in TOML; InputError naming ``name`` and every fault."""
+    content = parse_toml(text, name, "names with dots need quotes")
     try:
-        return FmuMap.model_validate(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{name} is not TOML: {error}; names with dots need quotes") from None
+        return FmuMap.model_validate(content)
     except pydantic.ValidationError as error:
-        faults = [
-            f"{'.'.join(str(part) for part in one['loc'] if part not in ('driven', 'constant'))}: "
-            f"{one['msg'].removeprefix('Value error, ')}"
-            for one in error.errors()
-        ]
-        raise InputError(f"{name}: {'; '.join(faults)}; docs/fmu.md has the form") from None
+        faults = faults_in(error, "the map", FmuMap, ("driven", "constant"))
+        raise InputError(f"{name}: {faults}; docs/fmu.md has the form") from None
 
 
 def read_map(path: Path) -> FmuMap:

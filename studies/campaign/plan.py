@@ -17,7 +17,6 @@ import itertools
 import json
 import math
 import re
-import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,8 +26,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from bayesrace.cache import digest
-from bayesrace.errors import InputError, faults_in
-from bayesrace.files import read_text, read_whole
+from bayesrace.errors import InputError, fault_in_words, faults_in
+from bayesrace.files import parse_toml, read_text, read_whole
 from bayesrace.gp.weights import decode_weights
 from bayesrace.tracks import builtin_tracks, is_random_track, load_track
 from bayesrace.vehicles import CarParameters, get_car
@@ -110,32 +109,15 @@ def read_plan(path: Path) -> Campaign:
     Raises InputError naming file, field, value and remedy.
     """
     text = read_text(path, "the plan", "give a TOML file as docs/campaigns.md shows")
+    content = parse_toml(text, path, "docs/campaigns.md has an example")
     try:
-        plan = _Plan.model_validate(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path} is no TOML: {error}; docs/campaigns.md has an example") from None
+        plan = _Plan.model_validate(content)
     except ValidationError as error:
-        raise InputError(f"{path}: {_faults(error)}") from None
+        raise InputError(f"{path}: {faults_in(error, 'the plan', _Plan)}") from None
     try:
         return _Reader(plan, path.parent).campaign(text)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-
-
-def _faults(error: ValidationError) -> str:
-    def one(fault: Any) -> str:
-        place = ".".join(str(part) for part in fault["loc"])
-        if fault["type"] == "extra_forbidden":
-            names = ", ".join(_Plan.model_fields)
-            return f"{place} = {_short(fault['input'])} is unknown; a plan has {names}"
-        about = _Plan.model_fields[str(fault["loc"][0])].description
-        return f"{place} = {_short(fault['input'])}: {_lower(fault['msg'])} ({about})"
-
-    return "; ".join(one(fault) for fault in error.errors())
-
-
-def _lower(text: str) -> str:
-    return text[:1].lower() + text[1:]
 
 
 def _short(value: Any) -> str:
@@ -215,7 +197,7 @@ class _Reader:
                 draw = _Draw.model_validate(given)
             except ValidationError as error:
                 raise InputError(
-                    f"random.{name} = {_short(given)}: {faults_in(error, 'the values')}; "
+                    f"random.{name} = {_short(given)}: {faults_in(error, 'the values', _Draw)}; "
                     "write { low = NUMBER, high = NUMBER }, with log = true for even logarithms"
                 ) from None
             for bound in (draw.low, draw.high):
@@ -235,7 +217,7 @@ class _Reader:
             RaceSettings.model_validate(nested({name: value}))
         except ValidationError as error:
             about = factors()[name].description
-            fault = "; ".join(_lower(one["msg"]) for one in error.errors())
+            fault = "; ".join(map(fault_in_words, error.errors()))
             raise InputError(f"{place} = {_short(value)}: {fault} ({about})") from None
         except InputError as error:
             raise InputError(f"{place}: {error}") from None
