@@ -43,6 +43,8 @@ def read(tmp_path: Path, weights: GpWeights) -> Read:
     ("text", "words"),
     [
         ("grid = [", ("is no TOML", "docs/campaigns.md")),
+        ("", ("names no races", "docs/campaigns.md")),
+        ("controllers = ['worstcase']\n[grid]", ("names no races", "[grid]")),
         ("laps = 2", ("unknown setting 'laps'", "there are controllers")),
         ('controllers = ["me"]', ("controllers.0 = 'me'", "bestcase")),
         ('controllers = ["bayesrace-updated"]', ("learns from the laps of 'bayesrace'",)),
@@ -95,7 +97,7 @@ def test_what_cannot_be_is_refused_with_field_value_and_remedy(
 
 
 def test_controllers_drive_in_the_order_in_which_they_learn(read: Read) -> None:
-    plan = 'controllers = ["bestcase", "bayesrace-limit", "bayesrace"]'
+    plan = 'controllers = ["bestcase", "bayesrace-limit", "bayesrace"]\n[grid]\nseed = 0'
     (case,) = read(plan).cases.values()
     assert case.controllers == ("bayesrace", "bayesrace-limit", "bestcase")
 

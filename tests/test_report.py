@@ -21,6 +21,7 @@ from operation.report import render, write_report
 from operation.report.fork import forked
 from operation.report.maps import LapMaps
 from operation.terminal.race_table import COLUMNS
+from tests.command_line import Cli, refused
 from tests.synthetic_race import LAP_S, Drive, circle, write_race
 from tests.test_analysis import TWO_LAPS, race
 
@@ -220,6 +221,18 @@ def test_a_race_that_hardly_began_still_gets_its_page(tmp_path: Path, states: in
     assert write_report(path).is_file()
     path = write_race(tmp_path / "empty", [])
     assert write_report(path).is_file()
+
+
+def test_the_command_takes_a_directory_or_its_log_but_none_without_a_run(
+    cli: Cli, tmp_path: Path
+) -> None:
+    path = race(tmp_path / "race")
+    done = cli("report", path / "run.mcap")
+    assert done.code == 0, done.err
+    assert done.out.splitlines()[-1] == str(path / "report.html")
+    empty = write_race(tmp_path / "empty", [])
+    refused(cli("report", empty), str(empty), "no run in its log", "bayesrace race")
+    assert not (empty / "report.html").exists()
 
 
 def test_names_from_files_are_text_not_markup(tmp_path: Path) -> None:

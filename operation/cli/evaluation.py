@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from bayesrace.defaults import DEFAULT_CAR
+from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from operation.cli.configured import connect_to
 from operation.cli.options import (
@@ -164,7 +165,9 @@ def race(
 def report(
     run: Annotated[
         Path,
-        typer.Argument(metavar="DIR", help="Run directory, also of a race that was interrupted."),
+        typer.Argument(
+            metavar="DIR", help="Run directory, or its log; also of a race that was interrupted."
+        ),
     ],
 ) -> None:
     """Compute result.json, the table and report.html again from a run's log."""
@@ -174,8 +177,12 @@ def report(
     from operation.terminal.race_table import print_table
     from operation.terminal.terminal import Terminal
 
+    if run.suffix == ".mcap" and run.is_file():
+        run = run.parent
     with _uncollected():
         analysis = read_race(run)
+        if not analysis.runs:
+            raise InputError(f"{run}: no run in its log; drive again with 'bayesrace race'")
         page = write_report(run, analysis)
     print_table(analysis.result, Terminal())
     typer.echo(str(page))

@@ -149,6 +149,11 @@ class _Reader:
         if not drawn and plan.draws > 1:
             raise InputError(f"draws = {plan.draws}: there is nothing to draw; add [random]")
         _check_effect(plan, {**grid, **drawn})
+        if not grid and not drawn:
+            raise InputError(
+                "the plan names no races: give tracks or other settings, such as track = 'harbour' "
+                "in [grid] (docs/campaigns.md)"
+            )
         count = math.prod(map(len, grid.values())) * plan.draws
         if count > _MOST_CASES:
             raise InputError(
