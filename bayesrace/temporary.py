@@ -19,11 +19,14 @@ _NEW_S: Final = 60.0
 
 
 @contextmanager
-def temporary_folder() -> Iterator[Path]:
-    """A new folder that only this user may enter, deleted at the block's end."""
-    _clear_abandoned(Path(tempfile.gettempdir()))
+def temporary_folder(parent: str | None = None) -> Iterator[Path]:
+    """A new folder that only this user may enter, deleted at the block's end; in ``TMPDIR``, or
+    in ``parent``."""
+    _clear_abandoned(Path(parent or tempfile.gettempdir()))
     with (
-        tempfile.TemporaryDirectory(prefix=_PREFIX, ignore_cleanup_errors=True) as folder,
+        tempfile.TemporaryDirectory(
+            prefix=_PREFIX, dir=parent, ignore_cleanup_errors=True
+        ) as folder,
         ExitStack() as stack,
     ):
         with suppress(OSError):  # without locks: there, nothing is cleared either

@@ -1,10 +1,12 @@
 """Where a process listens and connects, and how its links are limited and secured."""
 
 import ipaddress
+import os
 import re
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
+from tempfile import gettempdir
 from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue
@@ -38,8 +40,9 @@ _ENDPOINT: Final = re.compile(
 )
 
 
-_LONGEST: Final = 90
-"""Characters of a folder's name; the system allows 108 of a socket's."""
+_SOCKETS: Final = re.compile(r"[^\s#?]{1,65}")
+"""Folders in which sockets can be made; the system allows 108 characters of a socket's name."""
+_OTHER_PLACES: Final = ("/tmp", "/dev/shm")  # noqa: S108 (a folder of one's own is made there)
 
 
 class Address(BaseModel):
@@ -219,11 +222,16 @@ def free_endpoint(protocol: Literal["tcp", "tls"] = "tcp") -> str:
 
 @contextmanager
 def private_endpoints(*names: str) -> Iterator[list[str]]:
-    """Unix sockets of these names in a folder that only this user may enter, for the block."""
-    with temporary_folder() as folder:
-        if len(str(folder)) > _LONGEST or not re.fullmatch(r"[^\s#?]+", str(folder)):
-            raise InputError(
-                f"no sockets can be made in {folder}: set TMPDIR to a folder whose name has "
-                f"{_LONGEST - 25} characters at most, without blanks, '#' and '?'"
-            )
+    """Unix sockets of these names in a folder that only this user may enter, for the block.
+
+    It is in TMPDIR, or elsewhere if the path of that folder cannot be part of an endpoint.
+    """
+    places = (gettempdir(), *_OTHER_PLACES)
+    usable = (one for one in places if _SOCKETS.fullmatch(one) and os.access(one, os.W_OK))
+    if (parent := next(usable, None)) is None:
+        raise InputError(
+            f"no sockets can be made in {', '.join(places)}: set TMPDIR to a folder whose name has "
+            "65 characters at most, without blanks, '#' and '?'"
+        )
+    with temporary_folder(parent) as folder:
         yield [f"unixsock-stream/{folder}/{name}" for name in names]
