@@ -111,7 +111,7 @@ def test_windows_line_ends_count_rows_the_same(tmp_path: Path) -> None:
         ("1,2,,4", "row 6: '' is not a number"),
         ("1,nan,.2,.3", "row 6: a value is not finite"),
         ("1,2,inf,.3", "row 6: a value is not finite"),
-        ("1e300,2,.2,.3", "row 6: a value is not finite or beyond 1000000"),
+        ("1e300,2,.2,.3", "row 6: a value is not finite or beyond 1e+08"),
         ("1,2_0,.2,.3", "row 6: '2_0' is not a number"),
         ("-.5,.866,-.1,.3", "row 6: a width is negative"),
         ("-.5,.866,.02,.02", "row 6: the track is 0.04 m wide, the car 0.05 m"),
@@ -153,16 +153,25 @@ def test_a_track_in_another_unit_is_refused_with_its_likely_unit(
     read_track(path, car_width_m=0.0)
 
 
-def test_a_track_far_from_the_origin_is_refused_with_the_remedy(tmp_path: Path) -> None:
+@pytest.mark.parametrize("to_m", [(1e5, 0.0), (5e5, 5.3e6)])
+def test_a_track_far_from_the_origin_is_refused_with_the_remedy(
+    tmp_path: Path, cli: Cli, to_m: tuple[float, float]
+) -> None:
     circle = np.array([row.split(",") for row in scaled(1.0)], dtype=float)
 
-    def moved(by_m: float) -> Path:
-        moved = circle + np.array([by_m, 0, 0, 0])
+    def moved(*by_m: float) -> Path:
+        moved = circle + np.array([*by_m, 0, 0])
         return written(tmp_path, [",".join(map(str, row)) for row in moved.tolist()])
 
-    message = refusal(moved(1e5))
-    assert "the track is 1e+05 m from the origin and 0.5 m wide; subtract the coord" in message
-    read_track(moved(1e3))
+    read_track(moved(1e3, 0.0))
+    path, local = moved(*to_m), tmp_path / "local.csv"
+    far = f"the track is {max(to_m):.3g} m from the origin and 0.5 m wide; make its first point the"
+    assert far in refusal(path)
+    done = cli("tracks", path, "--recentre", "--out", local)
+    assert done.code == 0, done.err
+    assert f"the origin is at x = {to_m[0] + circle[0, 0]}, y = {to_m[1]} of the file" in done.out
+    nodes = np.column_stack([(found := read_track(local)).x_m, found.y_m])
+    np.testing.assert_allclose(nodes, circle[:, :2] - circle[0, :2], atol=1e-8)
 
 
 def noisy(noise_m: float, count: int) -> list[str]:

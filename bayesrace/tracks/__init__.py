@@ -1,7 +1,7 @@
 """Tracks: centrelines with widths, projection on them, files, built-in and random circuits."""
 
 from bayesrace.tracks.builtin import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK, builtin_tracks
-from bayesrace.tracks.files import read_smoothed, read_track, write_track
+from bayesrace.tracks.files import read_recentred, read_smoothed, read_track, write_track
 from bayesrace.tracks.generator import random_track
 from bayesrace.tracks.library import is_random_track, load_track
 from bayesrace.tracks.startline import Crossing, StartLine
@@ -19,6 +19,7 @@ __all__ = [
     "is_random_track",
     "load_track",
     "random_track",
+    "read_recentred",
     "read_smoothed",
     "read_track",
     "write_track",

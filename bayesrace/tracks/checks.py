@@ -184,7 +184,7 @@ def find_scale_fault(
         return Fault(
             None,
             f"the track is {farthest_m:.3g} m from the origin and {width_m:.3g} m wide",
-            "subtract the coordinates of its first point from all x and y",
+            "make its first point the origin: 'bayesrace tracks FILE --recentre --out local.csv'",
         )
     if width_m <= (_WIDEST_M if car_width_m is None else _MOST_CARS * car_width_m):
         return None

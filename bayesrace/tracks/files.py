@@ -17,12 +17,12 @@ from bayesrace.tracks.checks import Fault, find_fault, find_scale_fault, find_va
 from bayesrace.tracks.smoothing import smooth
 from bayesrace.tracks.track import Track, drop_repeated
 
-__all__ = ["read_smoothed", "read_table", "read_track", "write_track"]
+__all__ = ["read_recentred", "read_smoothed", "read_table", "read_track", "write_track"]
 
 _MOST_POINTS: Final = 20_000
 """Rows of a file: a point each centimetre of a track ten times as long as any here."""
-_LARGEST: Final = 1e6
-"""Of the numbers in a file: above it, no SI unit of a track or a racing line makes sense."""
+_LARGEST: Final = 1e8
+"""Of the numbers in a file: more than any map's coordinates in metres."""
 
 COLUMNS = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")
 
@@ -34,11 +34,25 @@ def read_track(path: Path | str, car_width_m: float | None = None) -> Track:
     default: at least as wide as the default car, of any scale that is usual in metres. Raises
     InputError naming file, row (line number in the file) and remedy.
     """
-    path = Path(path)
-    points, right, left, rows = _read_points(path)
-    _refuse(path, rows, find_fault(points, right, left, default_car_width_m(car_width_m)))
-    if car_width_m != 0:
-        _refuse(path, rows, find_scale_fault(points, right, left, car_width_m))
+    return _checked(Path(path), *_read_points(Path(path)), car_width_m)
+
+
+def read_recentred(path: Path | str, car_width_m: float | None = None) -> tuple[Track, Floats]:
+    """The same of a file with a map's coordinates, such as UTM's: the first point is the origin.
+
+    And where that is in the file, (2,) [m].
+    """
+    points, right, left, rows = _read_points(Path(path))
+    origin = points[:1].sum(axis=0)  # zero without a point
+    return _checked(Path(path), points - origin, right, left, rows, car_width_m), origin
+
+
+def _checked(
+    path: Path, points: Floats, right: Floats, left: Floats, rows: list[int], width_m: float | None
+) -> Track:
+    _refuse(path, rows, find_fault(points, right, left, default_car_width_m(width_m)))
+    if width_m != 0:
+        _refuse(path, rows, find_scale_fault(points, right, left, width_m))
     return Track._from_checked(path.stem, points, right, left)
 
 
@@ -181,7 +195,7 @@ def _numbers(path: Path, row: int, cells: list[str], columns: tuple[str, ...]) -
         ) from None
     if not all(abs(number) <= _LARGEST for number in numbers):
         raise InputError(
-            f"{path}, row {row}: a value is not finite or beyond {_LARGEST:.0f}; "
+            f"{path}, row {row}: a value is not finite or beyond {_LARGEST:g}; "
             "give every value as a finite number in SI units"
         )
     return numbers

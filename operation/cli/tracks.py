@@ -11,6 +11,7 @@ from operation.cli.options import writable
 
 if TYPE_CHECKING:
     from bayesrace.tracks import Track
+    from bayesrace.tracks.maps import RosMap
 
 __all__ = ["tracks"]
 
@@ -48,6 +49,9 @@ def tracks(
     smooth: Annotated[
         bool, typer.Option("--smooth", help="Take the noise off the points of a measured CSV file.")
     ] = False,
+    recentre: Annotated[
+        bool, typer.Option("--recentre", help="Make the first point of a CSV file the origin.")
+    ] = False,
     car: Annotated[
         str, typer.Option(metavar="CAR", show_default="of any", help="Car whose scale to check.")
     ] = "",
@@ -55,31 +59,22 @@ def tracks(
     """List the built-in tracks, check a track, turn a ROS map into one, write or draw it."""
     from rich.table import Table
 
-    from bayesrace.tracks import builtin_tracks, load_track, write_track
+    from bayesrace.tracks import builtin_tracks, write_track
     from bayesrace.vehicles import get_car
     from operation.terminal.terminal import Terminal
 
-    if name is None and (out or picture or start or reverse or smooth):
-        text = "--out, --picture, --start, --reverse and --smooth need the name of the track"
-        raise InputError(text)
+    if name is None and (out or picture or start or reverse or smooth or recentre):
+        options = "--out, --picture, --start, --reverse, --smooth and --recentre"
+        raise InputError(f"{options} need the name of the track")
     if picture is not None:
         from operation.report.track_picture import check_picture, write_picture
 
         check_picture(picture)
-    place, remark = _point(start), ""
+    place = _point(start)
     car_width_m = get_car(car).width_m if car else None
     table = Table("track", "length m", "width m", "tightest radius m", "points")
     for one in [name] if name else builtin_tracks():
-        grid = None
-        if smooth:
-            track, remark = _smoothed(one, car_width_m)
-        elif Path(one).suffix in _MAPS:
-            from bayesrace.tracks.maps import read_map, track_of_map
-
-            grid = read_map(one)
-            track = track_of_map(grid, car_width_m)
-        else:
-            track = load_track(one, car_width_m)
+        track, grid, remark = _loaded(one, car_width_m, smooth, recentre)
         if place is not None or reverse:
             track = track.driven_from(place, reverse)
         table.add_row(*_cells(track))
@@ -92,20 +87,46 @@ def tracks(
         typer.echo(remark)
 
 
-def _smoothed(name: str, car_width_m: float | None) -> "tuple[Track, str]":
+def _loaded(
+    name: str, car_width_m: float | None, smooth: bool, recentre: bool
+) -> "tuple[Track, RosMap | None, str]":
+    """The track, the map that it was found in, and what was done to its points."""
+    from bayesrace.tracks import load_track
+
+    is_map = Path(name).suffix in _MAPS
+    if smooth and recentre:
+        raise InputError("--recentre and --smooth are a step each: smooth the file of the first")
+    if (smooth or recentre) and (is_map or not Path(name).is_file()):
+        option = "--smooth" if smooth else "--recentre"
+        raise InputError(f"{option} is for a CSV file of measured points, not for '{name}'")
+    if is_map:
+        from bayesrace.tracks.maps import read_map, track_of_map
+
+        grid = read_map(name)
+        return track_of_map(grid, car_width_m), grid, ""
+    if smooth:
+        return _smoothed(name, car_width_m)
+    return _recentred(name, car_width_m) if recentre else (load_track(name, car_width_m), None, "")
+
+
+def _smoothed(name: str, car_width_m: float | None) -> "tuple[Track, None, str]":
     """The smooth track in a file of measured points, and how far these are away from it."""
     import numpy as np
 
     from bayesrace.tracks import read_smoothed
 
-    if Path(name).suffix in _MAPS or not Path(name).is_file():
-        raise InputError(f"--smooth is for a CSV file of measured points, not for '{name}'")
     track, away_m = read_smoothed(name, car_width_m)
     rms_m, largest_m = float(np.sqrt(np.mean(away_m**2))), float(away_m.max())
-    return track, (
-        f"{len(away_m)} points are {1e3 * rms_m:.1f} mm (RMS) and at most {1e3 * largest_m:.1f} mm "
-        "away from the smooth centreline"
-    )
+    remark = f"{1e3 * rms_m:.1f} mm (RMS) and at most {1e3 * largest_m:.1f} mm away from the smooth"
+    return track, None, f"{len(away_m)} points are {remark} centreline"
+
+
+def _recentred(name: str, car_width_m: float | None) -> "tuple[Track, None, str]":
+    """The track in a file, about its first point, and where that is in the file."""
+    from bayesrace.tracks import read_recentred
+
+    track, origin = read_recentred(name, car_width_m)
+    return track, None, "the origin is at x = {}, y = {} of the file".format(*origin.tolist())
 
 
 def _cells(track: "Track") -> tuple[str, ...]:
