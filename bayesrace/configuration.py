@@ -74,15 +74,13 @@ class NetworkSettings(_Section):
             raise ValueError("mode 'router' needs an endpoint: name one, as router = [\"tcp/…\"]")
         return self
 
-    @model_validator(mode="after")
-    def _one_each(self) -> Self:
-        """Where all connect to a router, plant and controller do not listen."""
+    def check(self) -> None:
+        """InputError if two processes are to listen at one endpoint; by a router, only it does."""
         listening = ("router",) if self.by_router else ("plant", "controller", "router")
         where = [(one, name) for name in listening for one in getattr(self, name)]
         for (one, name), (other, second) in itertools.combinations(where, 2):
             if _port(one) == _port(other):
-                raise ValueError(f"{name} and {second} both listen at {one}: give each its own")
-        return self
+                raise InputError(f"{name} and {second} both listen at {one}: give each its own")
 
     @property
     def by_router(self) -> bool:

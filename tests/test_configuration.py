@@ -84,14 +84,6 @@ def test_what_is_written_is_read_back() -> None:
         ("[limits]\npending = 2.5", ("limits.pending = 2.5: has to be a whole number",)),
         ("[tls]\n[network]\nmode = 'x'\n[tls]\n", ("[tls] stands in line 1 and again in line 4",)),
         ("[tls]\nfolder = 'a'\nfolder = 'b'", ("folder stands in line 2 and again in line 3",)),
-        (
-            "[network]\nplant = ['tcp/127.0.0.1:1']\ncontroller = ['tcp/localhost:1']",
-            ("network: plant and controller both listen at tcp/127.0.0.1:1",),
-        ),
-        (
-            "[network]\nmode = 'direct'\nrouter = ['tcp/127.0.0.1:7448']",
-            ("network: controller and router both listen at tcp/127.0.0.1:7448",),
-        ),
         ("[network]\nmode = 'router'", ("network", "mode 'router' needs an endpoint")),
         ("[limits]\nlease_s = -1", ("limits.lease_s = -1: has to be greater than 0 (silence",)),
         ("[limits]\nlease_s = nan", ("limits.lease_s",)),
@@ -117,6 +109,14 @@ def test_a_fault_is_named_with_file_and_field(
         ("[network]\nplant = ['tcp/10.0.0.1:1']", ("tcp/10.0.0.1:1", "'bayesrace certs'")),
         ("[network]\ncontroller = ['tls/127.0.0.1:1']", ("needs a certificate",)),
         ("[zenoh]\nnonsense = 1", ("[zenoh] nonsense = 1",)),
+        (
+            "[network]\nplant = ['tcp/127.0.0.1:1']\ncontroller = ['tcp/localhost:1']",
+            ("plant and controller both listen at tcp/127.0.0.1:1",),
+        ),
+        (
+            "[network]\nmode = 'direct'\nrouter = ['tcp/127.0.0.1:7448']",
+            ("controller and router both listen at tcp/127.0.0.1:7448",),
+        ),
     ],
 )
 def test_what_no_process_would_start_with_is_found_by_the_check(

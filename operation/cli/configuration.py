@@ -49,6 +49,7 @@ def check(
     from bayesrace.configuration import configured, read_configuration
 
     found = configured() if file is None else read_configuration(file)
+    found.network.check()
     typer.echo(f"{file or 'configuration'}: {_certificates(found)}")
 
 

@@ -11,6 +11,7 @@ from typing import Final
 import pytest
 
 from bayesrace.errors import InputError
+from bayesrace.gp.weights import write_weights, zero_weights
 from bayesrace.messages import Role
 from bayesrace.raceline.line import write_raceline
 from bayesrace.tracks import write_track
@@ -156,7 +157,7 @@ def arguments(
     track, line, weights = (tmp_path / name for name in ("t.csv", "l.csv", "w.bin"))
     write_track(track, circuit.track)
     write_raceline(line, circuit.line)
-    weights.write_bytes(b"")
+    write_weights(weights, zero_weights("orca", "any"))
     drives = ("--artefact", kinematic_artefact, "--track", track, "--raceline", line)
     return {
         "controller": drives,
