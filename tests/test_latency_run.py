@@ -10,11 +10,13 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from hdrh.log import HistogramLogReader
 
+from bayesrace.errors import InputError
 from bayesrace.log import LogReader
 from bayesrace.messages import STATE
 from bayesrace.tracks import Track
@@ -24,9 +26,10 @@ from operation.preparation import Prepared, prepare
 from operation.settings import PreparationSettings
 from operation.terminal.progress import stages_on
 from studies.latency.legs import BESIDE, LEGS
+from studies.latency.measure import _wait_for_run
 from studies.latency.series import new_histogram
 from tests.command_line import Cli, refused
-from tests.programs import COMMAND, ROOT, environment, finish, leftovers, peanut, run, start, until
+from tests.programs import COMMAND, ROOT, environment, finish, leftovers, peanut, start, until
 from tests.shared import session_folder
 
 pytestmark = pytest.mark.wall_clock
@@ -251,10 +254,8 @@ def _process(line: list[str]) -> Iterator[None]:
 
 
 @contextmanager
-def _driving(
-    files: Prepared, track: Track, prefix: list[str]
-) -> Iterator[tuple[list[str], Director]]:
-    """A running system, the plant started by way of ``prefix``: its endpoints and its director."""
+def _system(files: Prepared, prefix: list[str]) -> Iterator[tuple[list[str], Director]]:
+    """A system, the plant started by way of ``prefix``: its endpoints and its director."""
     plant, controller = free_endpoint(), free_endpoint()
     with ExitStack() as stack:
         stack.enter_context(
@@ -270,13 +271,19 @@ def _driving(
         session = stack.enter_context(open_session(Endpoints(connect=(plant, controller))))
         director = Director(session, "other")
         director.wait_for(("plant", "controller"), 60.0)
-        director.start(run_request(track, RunPlan(1, "test", 0, 1e5, lockstep=False)))
         yield [plant, controller], director
 
 
-def _attached(endpoints: list[str], out: Path) -> dict[str, Any]:
+def _attached(endpoints: list[str], director: Director, track: Track, out: Path) -> dict[str, Any]:
+    """A measurement that begins before the run does."""
     ends = [word for endpoint in endpoints for word in ("--endpoint", endpoint)]
-    done = run("latency", "--attach", *ends, "--name", "other", "--duration", "2", "--out", out)
+    process = start(
+        "latency", "--attach", *ends, "--name", "other", "--duration", "2", "--out", out
+    )
+    assert process.stdout is not None
+    assert any("wait for a run" in line for line in process.stdout), finish(process).stderr
+    director.start(run_request(track, RunPlan(1, "test", 0, 1e5, lockstep=False)))
+    done = finish(process)
     assert done.returncode == 0, done.stderr
     content: dict[str, Any] = json.loads((out / "latency.json").read_text())
     return content
@@ -284,8 +291,8 @@ def _attached(endpoints: list[str], out: Path) -> dict[str, Any]:
 
 @pytest.mark.check
 def test_a_running_system_is_measured_and_left_running(files: Prepared, tmp_path: Path) -> None:
-    with _driving(files, files.first.track, []) as (endpoints, director):
-        result = _attached(endpoints, tmp_path / "run")
+    with _system(files, []) as (endpoints, director):
+        result = _attached(endpoints, director, files.first.track, tmp_path / "run")
         assert director.status("plant").phase == "running"
         until(lambda: director.status("controller").phase == "driving", "driven, as before")
     assert result["attached"] is True
@@ -301,6 +308,23 @@ def test_nothing_to_attach_to_is_an_error(cli: Cli, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(Director, "wait_for", lambda self, whom, _: patient(self, whom, 0.3))
     outcome = cli("latency", "--attach", "--endpoint", free_endpoint(), "--out", "run")
     refused(outcome, "no controller and no plant")
+
+
+def test_a_run_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a run for so long, that is said."""
+    phases = iter(["idle", "running", "running", "idle"])
+    rates = iter([50.0, 0.0, 50.0, 50.0])  # none in lockstep
+    director: Any = SimpleNamespace(
+        status=lambda name: (
+            SimpleNamespace(phase=next(phases))
+            if name == "plant"
+            else SimpleNamespace(rate_hz=next(rates))
+        )
+    )
+    _wait_for_run(director, "orca")
+    monkeypatch.setattr("studies.latency.measure._RUN_S", 0.0)
+    with pytest.raises(InputError, match=r"plant: idle.*bayesrace drive --mode realtime"):
+        _wait_for_run(director, "orca")
 
 
 def _time_namespaces() -> str:
@@ -321,8 +345,8 @@ def test_clock_of_another_host_is_found_and_corrected(files: Prepared, tmp_path:
     if why_not := _time_namespaces():
         pytest.skip(f"time namespaces are not allowed here: {why_not}")
     prefix = ["unshare", "--time", "--monotonic=1000", "--fork", "--kill-child"]
-    with _driving(files, files.first.track, prefix) as (endpoints, _):
-        result = _attached(endpoints, tmp_path / "run")
+    with _system(files, prefix) as (endpoints, director):
+        result = _attached(endpoints, director, files.first.track, tmp_path / "run")
     clocks = result["clocks"]
     assert clocks["shared"] is False
     assert abs(clocks["offset_us"] + 1e9) <= clocks["uncertainty_us"]

@@ -88,7 +88,7 @@ def latency(
     ] = None,
     raceline: GivenLine = None,
     attach: Annotated[
-        bool, typer.Option("--attach", help="Measure a run that has been started elsewhere.")
+        bool, typer.Option("--attach", help="Measure a run started elsewhere, or wait for one.")
     ] = False,
     endpoint: Endpoint = None,
     log: Annotated[

@@ -34,8 +34,11 @@ __all__ = ["LatencyError", "Run", "measure"]
 _LOG: Final = "run.mcap"
 
 _ATTACH_S: Final = 10.0
+_RUN_S: Final = 120.0
+"""How long a system that is attached to may take to begin a run."""
 _AFTERWARDS_S: Final = 60.0
 """The run's own time limit is this much later than its end by request."""
+_LOOK_S: Final = 0.1
 _SAMPLE_S: Final = 0.5
 """Between two samples of the memory of the processes."""
 _MEMORY_S: Final = 60.0
@@ -138,12 +141,9 @@ def _record(
                 session = stack.enter_context(open_session(settings.attach, "director"))
                 director = Director(session, run.car)
                 director.wait_for(("plant", "controller"), _ATTACH_S)
-            rate_hz, phase = director.status("controller").rate_hz, director.status("plant").phase
-            if not start and (phase != "running" or not rate_hz):
-                raise InputError(
-                    f"car '{run.car}' is not driving in real time (plant: {phase}); "
-                    "start a run with 'bayesrace drive --mode realtime'"
-                )
+                with stages.stage(f"wait for a run, {_RUN_S:g} s at most"):
+                    _wait_for_run(director, run.car)
+            rate_hz = director.status("controller").rate_hz
             about = {"latency": {"settings": settings.model_dump_json()}}
             recorder = stack.enter_context(Recorder(session, run.car, out / _LOG, about))
             if track is not None and start:
@@ -164,6 +164,21 @@ def _record(
     run.round_trip = read_round_trips(out, rate_hz)
     run.notes += [] if run.bare else ["no bare loop to compare the misses with: it was lost"]
     run.notes += [] if run.round_trip else ["no bare round trip of messages: it was lost"]
+
+
+def _wait_for_run(director: Director, car: str) -> None:
+    """Returns while a run in real time is driven; InputError if none begins in time."""
+    deadline = time.monotonic() + _RUN_S
+    while True:
+        phase, rate_hz = director.status("plant").phase, director.status("controller").rate_hz
+        if phase == "running" and rate_hz:
+            return
+        if time.monotonic() > deadline:
+            raise InputError(
+                f"car '{car}' does not drive in real time within {_RUN_S:g} s (plant: {phase}); "
+                "start a run with 'bayesrace drive --mode realtime'"
+            )
+        time.sleep(_LOOK_S)
 
 
 def _files(settings: LatencySettings, stages: Stages) -> Prepared:
