@@ -3,6 +3,7 @@
 import hashlib
 import io
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -308,6 +309,8 @@ def test_runs_of_one_controller_are_numbered(tmp_path: Path) -> None:
     page = write_report(tmp_path).read_text()
     assert "BayesRace at the limit, 2</b>" in page
     assert "BestCase</b>" in page
+    tops = re.findall('class="card" style="border-top-color: (#[0-9a-fA-F]{6})"', page)
+    assert len(tops) == len(set(tops)) == 3
 
 
 def test_refused_weights_are_a_row_with_the_reason(tmp_path: Path) -> None:

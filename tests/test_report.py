@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 import signal
+import subprocess
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
@@ -91,6 +92,23 @@ def test_the_page_shows_the_results_numbers(rendered: tuple[Path, RaceResult]) -
     assert gp[0][4:6] == [f"{result.gp['vx'].r2:.4f}", f"{result.gp['vx'].coverage:.3f}"]
     for lap in result.laps:
         assert lap.trajectory_sha256 in page.read_text(encoding="utf-8")
+
+
+def test_printed_it_has_few_pages_and_nothing_cut_off(
+    rendered: tuple[Path, RaceResult], tmp_path: Path
+) -> None:
+    chromium = next(filter(None, map(shutil.which, ("chromium", "chrome", "google-chrome"))), None)
+    if chromium is None or shutil.which("pdftotext") is None:
+        pytest.skip("needs chromium, and pdftotext of poppler-utils")
+    pdf = tmp_path / "report.pdf"
+    options = ("--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path}")
+    command = [chromium, *options, f"--print-to-pdf={pdf}", rendered[0].as_uri()]
+    subprocess.run(command, check=True, capture_output=True, timeout=120)
+    done = subprocess.run(["pdftotext", "-layout", pdf, "-"], capture_output=True, check=True)
+    text = done.stdout.decode()
+    assert text.count("\f") <= 6  # ends of pages, of a report with three runs
+    ends = COLUMNS[0].title, COLUMNS[-1].title
+    assert any(all(one in line for one in ends) for line in text.splitlines())
 
 
 def test_a_picture_lies_beside_the_page(rendered: tuple[Path, RaceResult]) -> None:

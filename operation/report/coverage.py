@@ -26,7 +26,7 @@ def coverage_figures(training: DrivenRun, runs: Sequence[DrivenRun]) -> list[Fig
     for title, across, up, values in rows:
         figure, axes = panel(3.2)
         for run, size in ((training, 5.0), *((run, 1.6) for run in shown)):
-            appearance = look(run.controller)
+            appearance = look(run.controller, run.number)
             x, y = values(run).T
             axes.plot(
                 x, y, "o", color=appearance.colour, markersize=size, alpha=0.5,

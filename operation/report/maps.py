@@ -24,7 +24,6 @@ from operation.report.style import (
     WARNING,
     gain_map,
     look,
-    numbered,
     speed_map,
 )
 
@@ -138,9 +137,8 @@ class LapMaps:
         off = everything[run.off_track[counted]]
         axes.plot(off[:, 0], off[:, 1], "x", color=WARNING, markersize=3.6, zorder=5)
         show_all(axes, self._corners)
-        colour = look(run.controller).colour
+        name, colour, _ = look(run.controller, run.number)
         time = f"{run.laps.times_s[0]:.3f} s" if run.finished else "did not finish"
-        name = numbered(run.controller, run.number)
         axes.set_title(name, color=colour, fontweight="bold")
         axes.set_title(f"{time} · {int(run.off_track.sum())} off track", loc="right", color=INK)
 

@@ -24,7 +24,7 @@ from operation.report.coverage import coverage_figures
 from operation.report.fork import forked
 from operation.report.gp import gp_figures
 from operation.report.maps import LapMaps
-from operation.report.style import figure_style, look, numbered
+from operation.report.style import figure_style, look
 from operation.report.timing import solve_figure
 from operation.report.traces import (
     caution_figures,
@@ -79,7 +79,6 @@ def _page(run_dir: Path, analysis: RaceAnalysis, figures: Mapping[str, Sequence[
         gp_cells=gp_cells,
         drive_text=drive_text,
         look=look,
-        numbered=numbered,
         best=result.lap("bestcase"),
         facts=_facts(analysis, result),
         versions=_versions(run_dir),

@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from typing import Any, Final, NamedTuple, cast
 
 import matplotlib as mpl
-from matplotlib.colors import Colormap, LinearSegmentedColormap
+from matplotlib.colors import Colormap, LinearSegmentedColormap, to_hex, to_rgb
 
 __all__ = [
     "INK",
@@ -17,7 +17,6 @@ __all__ = [
     "figure_style",
     "gain_map",
     "look",
-    "numbered",
     "speed_map",
 ]
 
@@ -56,15 +55,19 @@ _LOOKS: Final[Mapping[str, Look]] = {
 }
 
 
-def look(controller: str) -> Look:
-    """Name, colour and description of a controller."""
-    return _LOOKS.get(controller, Look(controller, "#56B4E9", ""))
+_SHADES: Final = (0.0, 0.3, 0.52, -0.35, -0.6)
+"""Of the runs of one controller: shares of black in its colour, below zero of white."""
 
 
-def numbered(controller: str, number: int | None) -> str:
-    """Name of a controller, with the number of its run if there are several."""
-    name = look(controller).name
-    return name if number is None else f"{name}, {number}"
+def look(controller: str, number: int | None = None) -> Look:
+    """Name, colour and description of a controller, or of one of its runs, counted from 1."""
+    own = _LOOKS.get(controller, Look(controller, "#56B4E9", ""))
+    if number is None:
+        return own
+    share = _SHADES[(number - 1) % len(_SHADES)]
+    towards = 1.0 if share < 0 else 0.0
+    red, green, blue = ((1 - abs(share)) * one + abs(share) * towards for one in to_rgb(own.colour))
+    return own._replace(name=f"{own.name}, {number}", colour=to_hex((red, green, blue)))
 
 
 def speed_map() -> Colormap:

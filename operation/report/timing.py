@@ -8,7 +8,7 @@ from matplotlib.ticker import LogLocator, NullLocator
 
 from operation.analysis.race import DrivenRun
 from operation.report.canvas import PANEL_WIDTH
-from operation.report.style import INK, look, numbered
+from operation.report.style import INK, look
 
 __all__ = ["solve_figure"]
 
@@ -26,12 +26,13 @@ def solve_figure(runs: Sequence[DrivenRun]) -> Figure:
     times = [np.maximum(run.record.solve_us, 1e-3) for run in timed]
     bins = np.geomspace(0.98 * min(map(np.min, times)), 1.02 * max(map(np.max, times)), 90)
     for axes, run, values in zip(grid, timed, times, strict=True):
-        colour, (p50, p99) = look(run.controller).colour, np.percentile(values, [50, 99])
+        name, colour, _ = look(run.controller, run.number)
+        p50, p99 = np.percentile(values, [50, 99])
         axes.hist(values, bins=list(bins), histtype="stepfilled", color=colour, alpha=0.75)
         axes.axvline(p50, color=INK, linewidth=1.2)
         axes.axvline(p99, color=INK, linewidth=1.0, linestyle=(0, (3, 2)))
         axes.set(xscale="log", yticks=[], xlim=(bins[0], bins[-1]))
-        axes.set_title(numbered(run.controller, run.number), color=colour, weight="bold")
+        axes.set_title(name, color=colour, weight="bold")
         axes.set_title(f"p50 {p50:.0f} · p99 {p99:.0f} · max {values.max():.0f} µs", loc="right")
         axes.spines["left"].set_visible(False)
     grid[-1].set_xlabel("execution time of one step [µs], logarithmic")

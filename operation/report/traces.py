@@ -17,7 +17,7 @@ from bayesrace.vehicles.parts import GRAVITY_MPS2
 from operation.analysis.race import DrivenRun
 from operation.report.canvas import panel
 from operation.report.laps import Lap, first_laps, flying_laps, reference_of
-from operation.report.style import INK, MUTED, look, numbered
+from operation.report.style import INK, MUTED, look
 
 __all__ = [
     "caution_figures",
@@ -47,7 +47,7 @@ def _plot(axes: Axes, lap: Lap, values: Floats) -> None:
     """Values (n,) of the lap's samples; a leap to another piece of the track is left open."""
     leaps = np.flatnonzero(np.abs(np.diff(lap.s_m)) > _LEAP_M) + 1
     s, y = (np.insert(np.asarray(one, dtype=float), leaps, np.nan) for one in (lap.s_m, values))
-    axes.plot(s, y, color=look(lap.run.controller).colour, linewidth=1.1)
+    axes.plot(s, y, color=look(lap.run.controller, lap.run.number).colour, linewidth=1.1)
 
 
 def _both(runs: Sequence[DrivenRun], track: Track) -> dict[str, list[Lap]]:
@@ -67,13 +67,15 @@ def time_figures(runs: Sequence[DrivenRun], track: Track) -> list[Figure]:
         reference = reference_of(finished)
         if reference is None or len(finished) < 2:
             continue
-        name = numbered(reference.run.controller, reference.run.number)
+        name = look(reference.run.controller, reference.run.number).name
         figure, axes = _panel(track, f"{title}: time behind {name}", "Δt [ms]", 2.4)
         near_ms = [0.1]
         for lap in finished:
             s, behind_s = lap.behind(reference)
             behind_ms = 1e3 * behind_s
-            axes.plot(s, behind_ms, color=look(lap.run.controller).colour, linewidth=1.3)
+            axes.plot(
+                s, behind_ms, color=look(lap.run.controller, lap.run.number).colour, linewidth=1.3
+            )
             if abs(behind_ms[-1]) < _NEAR_MS:
                 near_ms.extend(behind_ms)
         room = 0.05 * (max(near_ms) - min(near_ms))
