@@ -1,8 +1,10 @@
 """Input that cannot be used is refused before the work, in a line that names it and the remedy."""
 
 import os
+import resource
 import socket
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -16,6 +18,7 @@ from bayesrace.transport import Director, free_endpoint
 from bayesrace.vehicles import get_car, write_car
 from tests.command_line import Cli, course_files, refused
 from tests.conftest import Circuit
+from tests.programs import finish, start
 
 
 @pytest.fixture
@@ -207,6 +210,25 @@ def test_settings_that_are_nested_without_end_are_refused(
     settings.write_text("[" * 100_000)
     arguments = ("controller", "--artefact", kinematic_artefact, *course)
     refused(cli(*arguments, "--settings", settings), "mpc.json")
+
+
+@pytest.mark.parametrize(
+    ("command", "limits", "said"),
+    [
+        (("status", "--timeout", "0.1"), (16, 16), "may open 16 files and connections at once"),
+        (("race",), (16, 16), "may open 16 files and connections at once"),
+        (("status", "--timeout", "0.1"), (16, 64), "no connection to"),  # the limit can be raised
+    ],
+)
+def test_too_few_descriptors_are_said_before_the_work(
+    command: tuple[str, ...], limits: tuple[int, int], said: str
+) -> None:
+    limited = partial(resource.setrlimit, resource.RLIMIT_NOFILE, limits)
+    end = ("--endpoint", free_endpoint()) if command[0] == "status" else ()
+    done = finish(start(*command, *end, preexec_fn=limited))
+    assert done.returncode == 2
+    assert said in done.stderr.splitlines()[-1]
+    assert "panicked" not in done.stderr
 
 
 def test_devices_are_not_read_without_end(cli: Cli, tmp_path: Path) -> None:

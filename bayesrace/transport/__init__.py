@@ -25,6 +25,7 @@ from bayesrace.transport.endpoints import (
     Endpoint,
     Endpoints,
     LinkLimits,
+    check_descriptors,
     free_endpoint,
     private_endpoints,
 )
@@ -38,7 +39,7 @@ __all__ = [
     "CONTROLLER_ENDPOINT", "HEARTBEAT_S", "LOCKSTEP_SPIN_S", "NEWEST", "PLANT_ENDPOINT", "POLL_S",
     "Answers", "Credentials", "Director", "Endpoint", "Endpoints", "Heartbeat", "Inbox", "Item",
     "Kind", "LinkLimits", "Member", "Members", "Numbering", "Publisher", "RefusedError", "Request",
-    "ask", "ask_all", "count_processes", "decisive", "declare_service", "decode_request",
-    "free_endpoint", "open_session", "private_endpoints", "send_rollback", "send_weights",
-    "try_links",
+    "ask", "ask_all", "check_descriptors", "count_processes", "decisive",
+    "declare_service", "decode_request", "free_endpoint", "open_session", "private_endpoints",
+    "send_rollback", "send_weights", "try_links",
 ]  # fmt: skip

@@ -3,9 +3,10 @@
 import ipaddress
 import os
 import re
+import resource
 import socket
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from tempfile import gettempdir
 from typing import Annotated, Any, Final, Literal
 
@@ -17,7 +18,8 @@ from bayesrace.transport.credentials import Credentials
 
 __all__ = [
     "CONTROLLER_ENDPOINT", "PLANT_ENDPOINT", "Address", "Endpoint", "Endpoints", "LinkLimits",
-    "ZenohSettings", "address_of", "free_endpoint", "leaves", "private_endpoints",
+    "ZenohSettings", "address_of", "check_descriptors", "free_endpoint", "leaves",
+    "private_endpoints",
 ]  # fmt: skip
 
 PLANT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
@@ -43,6 +45,27 @@ _ENDPOINT: Final = re.compile(
 _SOCKETS: Final = re.compile(r"[^\s#?]{1,65}")
 """Folders in which sockets can be made; the system allows 108 characters of a socket's name."""
 _OTHER_PLACES: Final = ("/tmp", "/dev/shm")  # noqa: S108 (a folder of one's own is made there)
+
+
+_DESCRIPTORS: Final = 64
+"""Files and connections of a process with sessions: a race has up to 40 at once."""
+
+
+def check_descriptors() -> None:
+    """Lets this process, and those that it starts, open as many files and connections as they may.
+
+    InputError if those are too few for a session, where Zenoh would panic.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft != hard:
+        with suppress(OSError, ValueError):  # the system has another limit yet
+            resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+            soft = hard
+    if 0 <= soft < _DESCRIPTORS:
+        raise InputError(
+            f"this process may open {soft} files and connections at once, and needs "
+            f"{_DESCRIPTORS}: raise the limit (ulimit -n, or LimitNOFILE of a systemd unit)"
+        )
 
 
 class Address(BaseModel):

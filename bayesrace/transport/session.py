@@ -24,7 +24,7 @@ from bayesrace.messages import Role
 from bayesrace.realtime import short_slices
 from bayesrace.transport.access import access_control
 from bayesrace.transport.credentials import AUTHORITY, CERTIFICATE, KEY, Credentials
-from bayesrace.transport.endpoints import Endpoints, leaves
+from bayesrace.transport.endpoints import Endpoints, check_descriptors, leaves
 from bayesrace.transport.links import nodes_at, wait_linked
 from bayesrace.transport.membership import refusals, serve_access
 from bayesrace.transport.probe import Finding, probe_all
@@ -195,6 +195,7 @@ def try_links(endpoints: Endpoints, role: Role) -> None:
 
 def _checked(endpoints: Endpoints, role: Role, peers_follow: bool = False) -> list[Finding]:
     """Where nobody is now, which is logged; InputError for what waiting cannot help."""
+    check_descriptors()
     endpoints.check()
     credentials = endpoints.credentials
     if credentials is not None:

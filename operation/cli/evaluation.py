@@ -126,12 +126,14 @@ def race(
     result.json and report.html.
     """
 
+    from bayesrace.transport import check_descriptors
     from bayesrace.vehicles import get_car
     from operation.race import race as drive_all
     from operation.settings import RaceSettings
     from operation.terminal.progress import stages_on
     from operation.terminal.terminal import Terminal
 
+    check_descriptors()  # before the preparation, which takes a while
     driven = get_car(car) if tyres is None else get_car(car).on_tyres(tyres)
     settings = settings_of(RaceSettings, context, settings_file, {
         "car": {"car": driven}, "tyres": {"car": driven}, "track": {"track": track},
