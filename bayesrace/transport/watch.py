@@ -9,6 +9,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterable
+from types import FrameType
 from typing import Any, Final
 
 import zenoh
@@ -42,6 +43,12 @@ def report(findings: Iterable[Finding]) -> None:
         _said[finding.endpoint] = finding.text
 
 
+def _only_ours(_number: int, _frame: FrameType | None) -> None:
+    """Handler in a process that ignored SIGINT: the interrupts of others stay ignored."""
+    if _interrupting.locked():
+        raise KeyboardInterrupt
+
+
 class LinkWatch:
     """Watches the links of a session, in a thread."""
 
@@ -61,6 +68,10 @@ class LinkWatch:
         self._ends_process = threading.current_thread() is threading.main_thread()
         if self._ends_process and _interrupting.locked():
             _interrupting.release()
+        before = signal.getsignal(signal.SIGINT)
+        self._ignored = self._ends_process and before is signal.SIG_IGN
+        if self._ignored:  # as in a background job of a script
+            signal.signal(signal.SIGINT, _only_ours)
         self._missing: list[str] = []
         self._remind_s = 0.0
         self._over = threading.Event()
@@ -71,6 +82,8 @@ class LinkWatch:
         """Ends it."""
         self._over.set()
         self._thread.join()
+        if self._ignored:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def _watch(self) -> None:
         first, wait_s = True, _FIRST_S

@@ -1,6 +1,9 @@
 """A certificate that ends while processes run: each says so and ends, and the car stands before."""
 
 import re
+import signal
+import subprocess
+import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -15,7 +18,7 @@ from bayesrace.transport import Endpoints, free_endpoint, open_session
 from operation.certificates import add, init, revoke
 from tests.network.cars import Course, Program
 from tests.network.journey import STANDING_MPS
-from tests.programs import PATIENCE_S, until
+from tests.programs import PATIENCE_S, ROOT, until
 from tests.security.authority import CAR, Bundles, bundles, written
 from tests.security.intruder import bare_session
 from tests.security.rig import course, secured
@@ -153,6 +156,31 @@ def test_a_process_is_interrupted_once(bundles: Bundles) -> None:
     with pytest.raises(InputError, match="has expired"):
         work()
     assert ended == ["in order"]
+
+
+IGNORING = """
+import signal, sys, time
+from pathlib import Path
+from bayesrace.transport import Credentials, Endpoints, open_session
+
+own = Credentials.read(Path(sys.argv[1])).model_copy(update={"ends_s": time.time() + 2.0})
+with open_session(Endpoints(connect=(sys.argv[2],), credentials=own), "director"):
+    signal.raise_signal(signal.SIGINT)  # of somebody else, which counts as little as before
+    print("goes on", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_process_that_ignores_interrupts_ends_as_well(bundles: Bundles) -> None:
+    """As a background job of a script does."""
+    done = subprocess.run(
+        [sys.executable, "-c", IGNORING, bundles.path("director"),
+         free_endpoint("tls")],
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN), cwd=ROOT,
+        capture_output=True, text=True, check=False, timeout=30,
+    )  # fmt: skip
+    assert done.stdout == "goes on\n"
+    assert "InputError: certificate 'director' has expired" in done.stderr
 
 
 def test_another_member_cannot_end_a_process(tmp_path: Path, bundles: Bundles) -> None:
