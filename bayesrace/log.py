@@ -1,8 +1,9 @@
 """The MCAP file with the messages of a run: writer and reader.
 
 Messages are JSON, one channel a key, with a JSON schema for each kind of message, in compressed
-chunks with an index: Foxglove, Lichtblick and PlotJuggler open the file. :class:`LogReader` reads
-every whole chunk, also where the file ends without its index.
+chunks with an index: Foxglove, Lichtblick and PlotJuggler open the file, and play it as fast as the
+car drove, also what was simulated faster. :class:`LogReader` reads every whole chunk, also where
+the file ends without its index.
 """
 
 import json
@@ -24,7 +25,18 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import Writer
 
 from bayesrace.errors import InputError
-from bayesrace.messages import TOPICS, Message, Topic, decode, decode_json, json_schema, to_json
+from bayesrace.messages import (
+    ACTUATION,
+    STATE,
+    TELEMETRY,
+    TOPICS,
+    Message,
+    Topic,
+    decode,
+    decode_json,
+    json_schema,
+    to_json,
+)
 
 __all__ = ["Entry", "LogReader", "LogWriter", "topic_of"]
 
@@ -37,6 +49,8 @@ _DAMAGED: Final = (
     McapError, struct.error, ValueError, OverflowError, RuntimeError, zstandard.ZstdError
 )  # fmt: skip
 """What unpacking raises at a file that is cut off or spoilt."""
+_LONGEST_GAP_NS: Final = 10_000_000_000
+"""Between two states of a run; a longer one is no driving."""
 _MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
 _BY_PREFIX: Final = {topic.key.split("/")[2]: topic for topic in TOPICS}
 
@@ -51,9 +65,46 @@ def topic_of(key: str) -> Topic[Any] | None:
     return topic if len(parts) == 3 or parts[3] in topic.sources else None
 
 
+class _CarClock:
+    """Car time on one line through all runs of a log, from the calendar time of its first message.
+
+    A run begins where the one before has ended, in real time at its own calendar time.
+    """
+
+    def __init__(self) -> None:
+        self._run: tuple[int, int] | None = None
+        self._begin_ns = self._newest_ns = self._decided_ns = 0
+
+    def time_ns(self, topic: Topic[Any] | None, data: bytes, wall_ns: int) -> int:
+        """Of a state its own time, of actuation and telemetry that of the decision; of all else the
+        newest state's. ``wall_ns``: calendar time of its arrival."""
+        self._newest_ns = self._newest_ns or wall_ns
+        if topic is TELEMETRY:  # follows its actuation, from the same process
+            return self._decided_ns or self._newest_ns
+        if topic is not STATE and topic is not ACTUATION:
+            return self._newest_ns
+        try:
+            message = decode(topic.message, data)
+        except InputError:
+            return self._newest_ns
+        run, state = (message.epoch, message.run), topic is STATE
+        own_ns: int = round(1e9 * (message.time_s if state else message.decided_at_s))
+        time_ns = self._begin_ns + own_ns
+        goes_on = run == self._run and abs(time_ns - self._newest_ns) <= _LONGEST_GAP_NS
+        if not state:  # it can overtake the first state of a run
+            self._decided_ns = time_ns if goes_on else self._newest_ns
+            return self._decided_ns
+        if not goes_on:
+            time_ns = self._newest_ns if message.lockstep else max(self._newest_ns, wall_ns)
+            self._run, self._begin_ns = run, time_ns - own_ns
+        self._newest_ns = max(self._newest_ns, time_ns)
+        return time_ns
+
+
 class LogWriter:
     """Appends messages and metadata to an MCAP file. One thread only.
 
+    ``log_time`` is car time (:class:`_CarClock`), ``publish_time`` calendar time of the arrival.
     What is not a message of its key's topic stays as it was received, on a channel with the message
     encoding ``msgpack`` and no schema.
     """
@@ -69,6 +120,7 @@ class LogWriter:
         self._schemas: dict[str, int] = {}
         # MCAP tools show calendar time; intervals stay those of the monotonic clock.
         self._epoch_ns = time.time_ns() - time.monotonic_ns()
+        self._clock = _CarClock()
         for name, values in (metadata or {}).items():
             self.add_metadata(name, values)
         self.flush()
@@ -86,9 +138,10 @@ class LogWriter:
             encoding = "msgpack" if text is None else "json"
             schema = 0 if topic is None or text is None else self._schema(topic.message)
             self._channels[place] = self._writer.register_channel(key, encoding, schema)
-        time_ns = self._epoch_ns + received_ns
+        wall_ns = self._epoch_ns + received_ns
+        time_ns = self._clock.time_ns(topic, data, wall_ns)
         self._writer.add_message(
-            self._channels[place], time_ns, data if text is None else text, time_ns, seq
+            self._channels[place], time_ns, data if text is None else text, wall_ns, seq
         )
 
     def _schema(self, kind: type[Message]) -> int:
@@ -117,6 +170,8 @@ class Entry(Generic[M]):
 
     key: str
     log_time_ns: int
+    """Car time: what was driven until then, after the log's first message [ns since 1970]."""
+    wall_ns: int
     """Calendar time at the recorder [ns since 1970]."""
     message: M
 
@@ -206,7 +261,7 @@ class LogReader:
                     self.refused = place.refused
                     self.last_reason = str(error)
                     continue
-                yield Entry(channel.key, record.log_time, message)
+                yield Entry(channel.key, record.log_time, record.publish_time, message)
 
     def select(self, topic: Topic[M]) -> list[M]:
         """All messages of one topic."""

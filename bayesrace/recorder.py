@@ -52,8 +52,8 @@ class RecorderCounters:
 class Recorder:
     """Writes every message of a car (``bayesrace/{car}/**``) from a thread of its own.
 
-    Log times are those of writing, some milliseconds after arrival; the messages carry the times
-    at which they were made.
+    ``publish_time`` in the log is that of writing, some milliseconds after arrival; the messages
+    carry the times at which they were made.
     Its channel holds more than any stall needs and then blocks the senders: in lockstep it never
     loses a message. ``with`` it; on the way out it waits for stragglers and finishes the file.
     """

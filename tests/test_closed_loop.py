@@ -1,5 +1,6 @@
 """The closed loop in one process: the same run, to the bit, as two processes over Zenoh."""
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ import pytest
 
 from bayesrace.gp.weights import read_weights
 from bayesrace.log import LogReader, LogWriter
-from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY, TRUTH, Event
+from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY, TRUTH, Event, State
 from bayesrace.raceline import read_raceline
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import load_track
@@ -62,6 +63,20 @@ def told(log: Path) -> list[dict[str, Any]]:
     return rows + ends
 
 
+def assert_played_as_driven(log: Path, begin_ns: int) -> None:
+    """The log plays as long as the car drove; each cycle has the time of its state. When each
+    message came is beside it."""
+    entries = list(LogReader(log).messages((STATE, ACTUATION, TELEMETRY)))
+    states = {entry.message.seq: entry for entry in entries if isinstance(entry.message, State)}
+    first, last = (states[seq] for seq in (min(states), max(states)))
+    driven_s = sum(one.message.time_s for one in states.values() if one.message.final)
+    assert (last.log_time_ns - first.log_time_ns) * 1e-9 == pytest.approx(driven_s, abs=1e-6)
+    for entry in entries:
+        seq = getattr(entry.message, "state_seq", entry.message.seq)
+        assert entry.log_time_ns == states[seq].log_time_ns
+        assert begin_ns < entry.wall_ns < time.time_ns()
+
+
 NOISE = ("--noise", "position_m=0.002", "--noise", "speed_mps=0.02", "--seed", "3")
 
 
@@ -79,7 +94,7 @@ NOISE = ("--noise", "position_m=0.002", "--noise", "speed_mps=0.02", "--seed", "
 def test_a_run_is_that_of_two_processes_over_zenoh_to_the_bit(
     tmp_path: Path, car: CarParameters, options: tuple[str, ...], disturbances: dict[str, Any]
 ) -> None:
-    course = gentle_course(tmp_path, speed_mps=2.5)
+    course, begin_ns = gentle_course(tmp_path, speed_mps=2.5), time.time_ns()
     track, line = load_track(course.track_file, car.width_m), read_raceline(course.line_file)
     at_plant, at_controller = free_endpoint(), free_endpoint()
     with (
@@ -106,6 +121,8 @@ def test_a_run_is_that_of_two_processes_over_zenoh_to_the_bit(
     ]
     log.close()
     assert told(tmp_path / "own.mcap") == told(tmp_path / "zenoh.mcap")
+    for name in ("own", "zenoh"):
+        assert_played_as_driven(tmp_path / f"{name}.mcap", begin_ns)
     first, second = driven
     assert (first.end.reason, second.end.reason) == ("laps", "max_time")
     assert len(first.laps_s) == first.lap[-1] == 1

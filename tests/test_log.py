@@ -13,12 +13,26 @@ import zstandard
 from mcap.reader import make_reader
 from mcap.records import Chunk
 from mcap.writer import CompressionType, Writer
+from msgspec import structs
 
 from bayesrace.errors import InputError
 from bayesrace.log import LogReader, LogWriter, _unpacked
-from bayesrace.messages import EVENT, HEARTBEAT, STATE, Event, State, Status, encode
+from bayesrace.messages import (
+    EVENT,
+    HEARTBEAT,
+    STATE,
+    Actuation,
+    Event,
+    Message,
+    State,
+    Status,
+    Telemetry,
+    Truth,
+    encode,
+)
 from bayesrace.recorder import Recorder
 from bayesrace.transport import Endpoints, Inbox, Publisher, free_endpoint, open_session
+from tests.driven import blank
 from tests.programs import ROOT, until
 from tests.test_messages import conforms
 
@@ -73,7 +87,44 @@ def test_a_log_gives_back_typed_messages_and_metadata(tmp_path: Path) -> None:
     assert len(log.select(STATE)) == 50
     assert log.refused == 1
     assert "State" in log.last_reason
-    assert abs(entries[0].log_time_ns - time.time_ns()) < 60e9
+    assert abs(entries[0].wall_ns - time.time_ns()) < 60e9
+
+
+@pytest.mark.parametrize("lockstep", [True, False])
+def test_log_time_is_car_time(tmp_path: Path, lockstep: bool) -> None:
+    """On one line through all runs; in real time a run begins at its calendar time. A state that
+    claims to be years away moves nothing."""
+
+    def sample(run: int, time_s: float) -> State:
+        return structs.replace(state(0), run=run, time_s=time_s, lockstep=lockstep)
+
+    def decided(at_s: float) -> Actuation:
+        return blank(Actuation, run=1, u=(0.0, 0.0), decided_at_s=at_s)
+
+    second_s = 0.04 if lockstep else 60.0
+    telemetry = blank(Telemetry, run=1)
+    sent: list[tuple[str, Message, float, float]] = [  # with times of arrival and in the log [s]
+        ("state", sample(1, 0.0), 0.0, 0.0),
+        ("state", sample(1, 0.02), 0.001, 0.02),
+        ("actuation", decided(0.0), 0.002, 0.0),  # overtaken by the next state
+        ("telemetry", telemetry, 0.002, 0.0),
+        ("actuation", decided(0.04), 0.003, 0.04),  # has overtaken its state
+        ("state", sample(1, 0.04), 0.004, 0.04),
+        ("telemetry", telemetry, 0.004, 0.04),
+        ("state", sample(1, 1e9), 0.005, 0.04),
+        ("truth", blank(Truth, run=1, x=(0.0,) * 7, u_applied=(0.0, 0.0)), 0.005, 0.04),
+        ("state", sample(2, 0.0), 60.0, second_s),
+        ("state", sample(2, 0.02), 60.001, second_s + 0.02),
+    ]
+    writer, now_ns = LogWriter(tmp_path / "log.mcap"), time.monotonic_ns()
+    for name, message, arrival_s, _ in sent:
+        writer.write(f"bayesrace/orca/{name}", encode(message), now_ns + round(1e9 * arrival_s))
+    writer.close()
+    entries = list(LogReader(tmp_path / "log.mcap").messages())
+    begin_ns = entries[0].wall_ns
+    for entry, (name, _, arrival_s, log_time_s) in zip(entries, sent, strict=True):
+        assert entry.wall_ns - begin_ns == round(1e9 * arrival_s), name
+        assert entry.log_time_ns - begin_ns == round(1e9 * log_time_s), name
 
 
 def test_a_log_that_is_being_written_gives_what_was_added_once(tmp_path: Path) -> None:
@@ -169,7 +220,8 @@ def test_a_damaged_chunk_can_be_tried_any_number_of_times(
 
 
 def test_other_mcap_tools_read_json_with_schemas_and_an_index(tmp_path: Path) -> None:
-    """With the mcap package alone: what viewers such as Foxglove need, they find."""
+    """With the mcap package alone: what viewers such as Foxglove need, they find. It plays as fast
+    as the car drove."""
     write(tmp_path / "log.mcap")
     with (tmp_path / "log.mcap").open("rb") as file:
         reader = make_reader(file)
@@ -179,6 +231,8 @@ def test_other_mcap_tools_read_json_with_schemas_and_an_index(tmp_path: Path) ->
     assert summary is not None
     assert summary.statistics is not None
     assert summary.statistics.message_count == 53
+    played_ns = summary.statistics.message_end_time - summary.statistics.message_start_time
+    assert played_ns == 49 * 20_000_000
     assert summary.chunk_indexes
     assert {index.compression for index in summary.chunk_indexes} == {"zstd"}
     assert late[1:4] == [49, 48, 47]

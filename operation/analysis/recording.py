@@ -322,7 +322,7 @@ class _RunsOfLog:
         """Takes in what has been added to the log."""
         for entry in self.reader.newer([topic for topic in TOPICS if topic is not HEARTBEAT]):
             if self.started_ns is None:
-                self.started_ns = entry.log_time_ns
+                self.started_ns = entry.wall_ns
             message = entry.message
             plan = PlannedRun.from_event(message) if isinstance(message, Event) else None
             run = message.run if plan is None else plan.run

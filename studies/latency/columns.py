@@ -52,7 +52,7 @@ def read_tables(
     tables = {table: array("d") for table in _COLUMNS}
     end_ns, cycles = float("inf"), 0
     for n, entry in enumerate(reader.messages()):
-        at, message = entry.log_time_ns, entry.message
+        at, message = entry.wall_ns, entry.message
         if cycles >= MOST_CYCLES or at > end_ns:
             break
         if entry.key.split("/")[1] != name:
