@@ -1,59 +1,81 @@
-"""The compiled step beside the paper's formulation in CasADi + IPOPT, on the same problems.
+"""The control step as it is driven, and the paper's formulation in CasADi + IPOPT beside it.
 
-Closed loops on several tracks, with hairpins, give the problems; the weights come from another one.
-Each is solved by the real-time step, which is timed, by a copy that is prepared beforehand and
-timed from the state to the input, and by one that iterates to convergence, from which the first
-input's and the cost's distance are taken. Evenly spread among them, ``peers`` are solved as the
-published code does: forward Euler, expanded to scalars, IPOPT with its default options, from zeros.
-(With our discretisation, whose pose depends on the GP too, that takes four times as long: no fair
-peer.)
+A case is a problem (tracking, progress) with a caution (the default, none). Its states are those of
+drives on several tracks, with hairpins, by the controller as in real time; the weights come from
+another track. The control cycle gets these states again, with nothing else between: without any
+preparation, which gives the inputs of lockstep, and prepared as in real time. Either goes on from
+its own plan before. Then once more: before a step the controller's memory is copied, the step is
+iterated to convergence, and the memory put back. So each first input is compared with the solution
+that the same plan, with the same caution about it, leads to.
+
+Evenly spread among the steps of tracking without caution, ``peers`` are solved as the published
+code does: forward Euler, expanded to scalars, IPOPT with its default options, from zeros. (With our
+discretisation, whose pose depends on the GP too, that takes four times as long: no fair peer.)
 """
 
-import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Final
+import ctypes as ct
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, Field
 from rich.console import Console
-from rich.table import Table
 
 from bayesrace.arrays import Floats
 from bayesrace.gp.corrected import corrected_function
 from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.integrators import PREDICTION, Discretisation
-from bayesrace.manifest import read_manifest
-from bayesrace.tracks import DEFAULT_RACE_TRACK
+from bayesrace.messages import State
+from bayesrace.tracks import DEFAULT_RACE_TRACK, Track
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import e_kinematic
 from codegen.ocp import OcpNlp
 from codegen.problems.tracking import tracking
+from codegen.settings import ProblemName
 from controller.assembly import compiled_controller
-from controller.interface import Environment, StepOutput
+from controller.cycle import Cycle
+from controller.mpc import PredictiveController
 from controller.native_step import NativeStep, StepStatus
-from controller.python_controller import PythonController
+from controller.process_settings import ControllerSettings
 from controller.settings import MpcSettings
-from operation.closed_loop import ClosedLoop
-from operation.preparation import prepare
+from operation.closed_loop import built_in_car
+from operation.drive import RunPlan, run_request
+from operation.preparation import prepare, progress_artefact
 from operation.settings import PreparationSettings
 from operation.terminal.progress import Stages
+from operation.terminal.terminal import plain_table
+from plant.lockstep import CarRun, drive_lockstep
 from plant.simulator import PLANT
+from plant.vehicle import Vehicle
 
 __all__ = ["BenchResult", "BenchSettings", "run_bench"]
 
+Case = tuple[ProblemName, float]
+"""Problem and caution."""
+Part = Literal["whole step", "preparation", "feedback"]
 
-_NOMINAL: Final = MpcSettings(caution=0.0)
-"""The problem that IPOPT and acados solve knows no uncertainty."""
+_PUBLISHED: Final[Case] = ("tracking", 0.0)
+"""What IPOPT solves: it knows no uncertainty."""
+_PUBLISHED_STEP: Final = Discretisation(scheme="euler", step_s=PREDICTION.step_s)
+"""The published controller predicts with forward Euler; the mean changes the velocities alone."""
 
 _PREPARATION_S: Final = 0.8 * PLANT.step_s
 """Budget of a preparation in real time."""
+_WARM_UP: Final = 50
+"""Steps that are not timed."""
 
-_CONVERGED: Final = MpcSettings(
-    caution=0.0, iterations=100, iterations_cold=100, tolerance=1e-9, early_stop_tol=0
-)
-_PUBLISHED: Final = Discretisation(scheme="euler", step_s=PREDICTION.step_s)
-"""The published controller predicts with forward Euler; the mean changes the velocities alone."""
+_CONVERGED: Final[dict[ProblemName, tuple[float, int]]] = {
+    "tracking": (1e-9, 1), "progress": (1e-6, 6)
+}  # fmt: skip
+"""KKT residual of a converged solution, and of every how many steps one is sought. That of
+progress, which takes hundreds of iterations, has the steering rate to 0.05 rad/s."""
+
+_STRICT: Final = {
+    "tol": 1e-12, "constr_viol_tol": 1e-12, "compl_inf_tol": 1e-15, "bound_relax_factor": 0.0,
+    "mu_init": 1e-9,
+}  # fmt: skip
+"""Of IPOPT as a check: a barrier left at its usual size would push weakly active bounds inwards."""
 
 
 class BenchError(RuntimeError):
@@ -66,7 +88,8 @@ class BenchSettings(PreparationSettings):
     tracks: tuple[str, ...] = Field(
         (), description="driven on; none: the car's race track, and two beside the 1:43 one"
     )
-    problems: int = Field(900, ge=10, description="control steps in closed loop, all tracks")
+    published: bool = Field(False, description="tracking without caution alone, as published")
+    problems: int = Field(900, ge=10, description="control steps of a case, all tracks")
     peers: int = Field(25, ge=1, description="of these, solved by IPOPT")
 
     @property
@@ -76,9 +99,19 @@ class BenchSettings(PreparationSettings):
         more = ("random:11", "random:15") if race == DEFAULT_RACE_TRACK else ()
         return self.tracks or (race, *more)
 
+    @property
+    def cases(self) -> tuple[Case, ...]:
+        """What is driven; not progress on linear tyres, which have no limit."""
+        caution = MpcSettings().caution
+        progress: tuple[Case, ...] = ("progress", caution), ("progress", 0.0)
+        both: tuple[Case, ...] = ("tracking", caution), _PUBLISHED
+        if self.published:
+            return (_PUBLISHED,)
+        return both if self.car.tyres.model == "linear" else both + progress
+
 
 class Times(BaseModel):
-    """Of one solver, in microseconds."""
+    """In microseconds."""
 
     p50: float
     p90: float
@@ -93,273 +126,281 @@ class Errors(BaseModel):
     p99: float
 
 
-class InputErrors(BaseModel):
-    """Of the first input: duty cycle [-], steering rate [rad/s]."""
+class Row(BaseModel):
+    """A part of the control step in one case."""
 
-    d: Errors
-    delta_rate: Errors
+    problem: ProblemName
+    caution: float
+    part: Part
+    """The whole step, not prepared; the preparation, with the budget of real time; what is left of
+    the step after it, which a state waits for."""
+    us: Times
+    d: Errors | None
+    """Of this part's own first input, drive command; None: it gives no input."""
+    delta_rate: Errors | None
+    """The same of the steering rate [rad/s]."""
+    compared: int
+    """Steps behind the errors: usable, and with a converged solution, which was sought ..."""
+    sought: int
+    """... for so many."""
 
 
-class CostGap(BaseModel):
-    """Objective of the planned inputs, rolled out through the model, over the optimum, less 1."""
+class Peer(BaseModel):
+    """IPOPT, on some of the published problems."""
 
-    p50: float
-    p95: float
+    us: Times
+    peers: int
+    solved: int
+    """Peers for which IPOPT reported success."""
+    speedup_p50: float
+    """Of our whole step."""
+    agreement: float
+    """Largest difference of first inputs between IPOPT, started from our converged plan, and it."""
 
 
 class BenchResult(BaseModel):
     """What ``bayesrace bench --json`` writes."""
 
-    step_us: Times
-    """The whole step, without preparation."""
-    feedback_us: Times
-    """The same steps, to the same bits, after their preparation: from the state to the input."""
-    ipopt_us: Times
-    speedup_p50: float
-    u0_error: InputErrors
-    cost_gap: CostGap
     gp_points: int
     problems: int
-    peers: int
-    ipopt_solved: int
-    """Peers for which IPOPT reported success."""
-    unconverged: int
-    """Problems without a converged solution to compare with; left out of the errors."""
-    second_starts: int
-    """Steps that looked for another plan beside the one that went on from before."""
-    ipopt_agreement: float
-    """Largest difference of first inputs between IPOPT, started from our converged plan, and it."""
+    """Steps behind the times of each row."""
+    rows: tuple[Row, ...]
+    ipopt: Peer
+
+    @property
+    def published(self) -> Row:
+        """Our whole step on the problems that IPOPT solves."""
+        return next(row for row in self.rows if (row.problem, row.caution) == _PUBLISHED)
 
     def print(self, console: Console) -> None:
         """A table for a person."""
-        table = Table(title=f"one GP-MPC step, N = 20, 3 x {self.gp_points} points")
-        for name in ("solver", "problems", "p50 us", "p90 us", "p99 us", "max us"):
-            table.add_column(name, justify="left" if name == "solver" else "right")
-        rows = (("compiled step", self.problems, self.step_us),
-                ("after preparation", self.problems, self.feedback_us),
-                ("CasADi + IPOPT, expanded, cold", self.peers, self.ipopt_us))  # fmt: skip
-        for name, count, t in rows:
-            times = (f"{us:.0f}" for us in (t.p50, t.p90, t.p99, t.max))
-            table.add_row(name, str(count), *times)
+        known = min(row.compared / row.sought for row in self.rows)
+        table = plain_table(
+            "problem at caution", "time\np50", "µs\np90", "\np99", "\nmax",
+            "steering\np95", "rad/s\np99", "command\np95", "\np99", padding=0,
+        )  # fmt: skip
+        for row in self.rows:
+            if row.part == "whole step":
+                table.add_row(f"{row.problem} at {row.caution:g}")
+            errors = [e for one in (row.delta_rate, row.d) if one for e in (one.p95, one.p99)]
+            table.add_row(f"  {row.part}", *_texts(row.us), *(f"{e:.2g}" for e in errors))
+        table.add_row("paper's, in IPOPT", *_texts(self.ipopt.us))
         console.print(table)
-        d, rate = self.u0_error.d, self.u0_error.delta_rate
         console.print(
-            f"{self.speedup_p50:.0f} times faster (p50). First input against the converged "
-            f"solution: d p95 {d.p95:.2g}, p99 {d.p99:.2g}; delta_rate p95 {rate.p95:.2g}, "
-            f"p99 {rate.p99:.2g} rad/s. Cost gap p50 {self.cost_gap.p50:.1e}, "
-            f"p95 {self.cost_gap.p95:.1e}. IPOPT from the converged plan differs by at most "
-            f"{self.ipopt_agreement:.1e}. Second starts: {self.second_starts}.",
+            f"{self.problems} steps a case, 3 x {self.gp_points} points. Whole step: not prepared, "
+            "with the inputs of lockstep. Preparation and feedback: in real time; feedback is what "
+            "a state waits for. Steering, command: error of the line's own first input against the "
+            f"converged solution, known for {known:.0%} of the steps or more. IPOPT: the paper's "
+            "formulation in CasADi, expanded, cold, on "
+            f"{self.ipopt.peers} steps of tracking without caution; our whole step is "
+            f"{self.ipopt.speedup_p50:.0f} times as fast (p50). From our converged plans IPOPT "
+            f"differs by {self.ipopt.agreement:.1e} at most.",
             highlight=False,
         )
 
 
-@dataclass
-class _Problem:
-    """One control step: what was asked, what the real-time step and the converged one answered."""
+def _texts(times: Times) -> list[str]:
+    return [f"{us:.0f}" for us in (times.p50, times.p90, times.p99, times.max)]
+
+
+class _Solution(NamedTuple):
+    """A control step, solved to convergence."""
 
     x: Floats
-    d_previous: float
+    d_before: float
     reference: Floats
     plan: tuple[Floats, Floats]
-    converged: tuple[Floats, Floats]
-    converged_cost: float
-    has_converged: bool
 
 
-@dataclass
-class _Recording:
-    problems: list[_Problem] = field(default_factory=list)
-    step_us: list[float] = field(default_factory=list)
-    feedback_us: list[float] = field(default_factory=list)
-    second_starts: int = 0
+class _Steps(NamedTuple):
+    """The steps of a drive, made in one way."""
 
-    def __iadd__(self, other: "_Recording") -> "_Recording":
-        self.problems += other.problems
-        self.step_us += other.step_us
-        self.feedback_us += other.feedback_us
-        self.second_starts += other.second_starts
-        return self
+    step_us: Floats
+    prepare_us: Floats
+    error: Floats
+    """Of the first input, shape (compared, 2)."""
+    solutions: list[_Solution]
+    sought: int
 
 
 def run_bench(settings: BenchSettings, stages: Stages) -> BenchResult:
-    """Measures; takes about a minute, most of it IPOPT's."""
+    """Measures; takes some three minutes."""
     car = settings.driven_car
     prepared = prepare(settings, settings.driven_on, stages)
-    weights, artefact = read_weights(prepared.weights), prepared.artefacts[0]
-    horizon = read_manifest(artefact).horizon
-    with stages.stage("closed loop"):
-        recording = _Recording()
-        for one in prepared.tracks:
-            steps = (
-                compiled_controller(artefact, car, one.track, one.line, weights, mpc).native
-                for mpc in (_NOMINAL, _NOMINAL, _CONVERGED)
-            )
-            recorder = _Recorder(*steps)
-            controller = PythonController(artefact, recorder)
-            loop = ClosedLoop(car, one.track, one.line, controller)
-            for count in (50, -(-settings.problems // len(prepared.tracks))):
-                recorder.recording = _Recording()  # without those that warm up
-                loop.drive(0, count * PLANT.step_s)
-            recording += recorder.recording
-    with stages.stage("IPOPT, expanded (builds for some 15 s)") as stage:
-        peers = _peers(recording, settings.peers)
-        problem = tracking(e_kinematic(car), PREDICTION)
-        published = corrected_function(e_kinematic(car), _PUBLISHED, weights, check_identity=False)
-        times, solved = _published(
-            OcpNlp(problem, published, horizon, expand=True), car, peers, stage.update
-        )
-    with stages.stage("check against IPOPT"):
-        # A barrier left at its usual size would push weakly active bounds inwards.
-        strict = {
-            "tol": 1e-12,
-            "constr_viol_tol": 1e-12,
-            "compl_inf_tol": 1e-15,
-            "bound_relax_factor": 0.0,
-            "mu_init": 1e-9,
-        }
-        f = corrected_function(e_kinematic(car), PREDICTION, weights)
-        oracle = OcpNlp(problem, f, horizon, options=strict)
-        agreement = _agreement(oracle, car, peers)
-        gaps = [_gap(oracle, car, recorder.whole, p) for p in recording.problems if p.has_converged]
-    return _result(settings, weights, recording, times, solved, agreement, gaps)
-
-
-class _Recorder:
-    """Drives by the real-time step, whole and unprepared; two copies solve the same problems: one
-    that is prepared as in the control loop, and one that iterates to convergence."""
-
-    def __init__(self, whole: NativeStep, prepared: NativeStep, converged: NativeStep) -> None:
-        self.whole, self._prepared, self._converged = whole, prepared, converged
-        self.recording = _Recording()
-
-    def reset(self) -> None:
-        """All start cold."""
-        for step in (self.whole, self._prepared, self._converged):
-            step.reset()
-
-    def predict(self, x: Floats, u: Floats, duration_s: float) -> Floats:
-        """By the model of all."""
-        return self.whole.predict(x, u, duration_s)
-
-    def step(
-        self,
-        x: Floats,
-        u_previous: Floats,
-        environment: Environment,
-        elapsed_s: float,
-        budget_s: float = 0.0,
-    ) -> StepOutput:
-        """Records the problem and the answers."""
-        step, converged, recording = self.whole, self._converged, self.recording
-        begin_ns = time.perf_counter_ns()
-        status = step.step(x, u_previous, elapsed_s=elapsed_s, budget_s=budget_s)
-        recording.step_us.append((time.perf_counter_ns() - begin_ns) * 1e-3)
-        step.read_plan()
-        self._prepared.rehearse()
-        begin_ns = time.perf_counter_ns()
-        self._prepared.step(x, u_previous, elapsed_s=elapsed_s, budget_s=budget_s)
-        recording.feedback_us.append((time.perf_counter_ns() - begin_ns) * 1e-3)
-        self._prepared.prepare(elapsed_s, _PREPARATION_S)
-        recording.second_starts += step.info.second_start > 0
-        other = converged.step(x, u_previous, elapsed_s=elapsed_s)
-        converged.read_plan()
-        recording.problems.append(
-            _Problem(
-                x.copy(),
-                float(u_previous[0]),
-                step.read_reference(),
-                (step.plan_x.copy(), step.plan_u.copy()),
-                (converged.plan_x.copy(), converged.plan_u.copy()),
-                converged.info.cost,
-                status.usable and other is StepStatus.CONVERGED,
-            )
-        )
-        return StepOutput(
-            step.u,
-            0 if status.usable else status,
-            plan_u=step.plan_u,
-            plan_step_s=step.manifest.step_s,
-        )
-
-
-def _peers(recording: _Recording, count: int) -> list[_Problem]:
-    rows = np.linspace(0, len(recording.problems) - 1, count).round().astype(int)
-    return [recording.problems[row] for row in dict.fromkeys(rows.tolist())]
-
-
-def _parameters(car: CarParameters) -> dict[str, float]:
-    return _NOMINAL.parameters(car)
-
-
-def _published(
-    ocp: OcpNlp, car: CarParameters, problems: list[_Problem], progress: Callable[[float], None]
-) -> tuple[list[float], int]:
-    times: list[float] = []
-    solved = 0
-    for problem in problems:
-        progress(len(times) / len(problems))
-        out = ocp.solve(problem.x, problem.d_previous, problem.reference, _parameters(car))
-        times.append(out.seconds * 1e6)
-        solved += out.success
-    return times, solved
-
-
-def _agreement(oracle: OcpNlp, car: CarParameters, problems: list[_Problem]) -> float:
-    differences = []
-    for p in (p for p in problems if p.has_converged):
-        out = oracle.solve(p.x, p.d_previous, p.reference, _parameters(car), p.converged)
-        if out.success:
-            differences.append(float(np.abs(out.u[0] - p.converged[1][0]).max()))
-    if not differences:
-        raise BenchError("IPOPT solved none of the problems that it was to check")
-    return max(differences)
-
-
-def _gap(oracle: OcpNlp, car: CarParameters, step: NativeStep, problem: _Problem) -> float:
-    """What the planned inputs really cost, relative to the optimum."""
-    x = [problem.x]
-    for u in problem.plan[1]:
-        x.append(step.evaluate(np.concatenate([x[-1], u]), np.zeros(7))[0])
-    cost = oracle.cost(
-        np.array(x),
-        problem.plan[1],
-        problem.d_previous,
-        problem.reference,
-        _parameters(car),
+    weights, count = read_weights(prepared.weights), -(-settings.problems // len(prepared.tracks))
+    vehicle, artefacts = built_in_car(car), {"tracking": prepared.artefacts[0]}
+    if ("progress", 0.0) in settings.cases:
+        with stages.stage("build the controller of progress"):
+            artefacts["progress"] = progress_artefact(settings)
+    rows: list[Row] = []
+    published: list[_Solution] = []
+    for problem, caution in settings.cases:
+        with stages.stage(f"{problem}, caution {caution:g}"):
+            mpc = MpcSettings(caution=caution)
+            whole, fast = [], []
+            for one in prepared.tracks:
+                files = artefacts[problem], car, one.track, one.line, weights, mpc
+                drive = _Drive(problem, car, mpc, partial(compiled_controller, *files))
+                drive.record(one.track, vehicle, count)
+                whole.append(drive.steps(None))
+                fast.append(drive.steps(_PREPARATION_S))
+            parts: tuple[tuple[Part, list[_Steps]], ...] = (
+                ("whole step", whole), ("preparation", fast), ("feedback", fast)
+            )  # fmt: skip
+            rows += [_row(problem, caution, part, steps) for part, steps in parts]
+        if (problem, caution) == _PUBLISHED:
+            published = [solution for one in whole for solution in one.solutions]
+            step_us = rows[-3].us
+    return BenchResult(
+        gp_points=max(weights.counts),
+        problems=count * len(prepared.tracks),
+        rows=tuple(rows),
+        ipopt=_peer(settings, weights, published, step_us.p50, stages),
     )
-    return cost / problem.converged_cost - 1.0
 
 
-def _times(values: list[float]) -> Times:
-    p50, p90, p99, most = np.percentile(values, [50, 90, 99, 100])
-    return Times(p50=float(p50), p90=float(p90), p99=float(p99), max=float(most))
+class _Drive:
+    """A drive on one track, whose steps can be made again."""
+
+    def __init__(
+        self,
+        problem: ProblemName,
+        car: CarParameters,
+        mpc: MpcSettings,
+        make: Callable[[], PredictiveController],
+    ) -> None:
+        """``make``: a new controller for this problem with these settings."""
+        tolerance, self._every = _CONVERGED[problem]
+        endless = {"iterations": 1000, "iterations_cold": 1000, "early_stop_tol": 0.0}
+        self._exact = mpc.model_copy(update=endless | {"tolerance": tolerance})
+        self._car, self._make = car, make
+        self.states: list[State] = []
+
+    def _cycle(self, controller: PredictiveController) -> Cycle:
+        return Cycle(controller, self._car, ControllerSettings(car=self._car))
+
+    def record(self, track: Track, vehicle: Vehicle, count: int) -> None:
+        """Drives so many steps from the start line, prepared as in real time."""
+        cycle = self._cycle(self._make())
+
+        def exchange(state: State, _: tuple[float, ...]) -> tuple[float, float]:
+            self.states.append(state)
+            cycle.driver.observe(state)
+            decision = cycle.decide(state.time_s)
+            cycle.prepare(PLANT.step_s, _PREPARATION_S)
+            return decision.d, decision.delta_rate
+
+        request = run_request(track, RunPlan(1, "", 0, count * PLANT.step_s, lockstep=True))
+        drive_lockstep(CarRun(request, vehicle, epoch=1), 0, exchange)
+        self.states.pop()  # nothing answers the last one
+
+    def steps(self, budget_s: float | None) -> _Steps:
+        """All of them, each prepared with that budget; None: none is prepared."""
+        controller, found = self._make(), {}
+        self._replay(controller, self.states[:_WARM_UP], budget_s)
+        *_, step_us, prepare_us = self._replay(controller, self.states, budget_s).T
+        sought = range(0, len(self.states), self._every)
+
+        def solve(k: int) -> None:
+            if k in sought and (solution := self._converged(controller.native, self.states[k])):
+                found[k] = solution
+
+        d, delta_rate, usable, *_ = self._replay(controller, self.states, budget_s, solve).T
+        own = np.column_stack((d, delta_rate))
+        pairs = [(own[k], one.plan[1][0]) for k, one in found.items() if usable[k]]
+        error = np.array([np.abs(u - exact) for u, exact in pairs]).reshape(-1, 2)
+        return _Steps(step_us, prepare_us, error, list(found.values()), len(sought))
+
+    def _replay(
+        self,
+        controller: PredictiveController,
+        states: Sequence[State],
+        budget_s: float | None,
+        before: Callable[[int], None] = lambda k: None,
+    ) -> Floats:
+        """Of each step a row: drive command, steering rate, usable, time of step and preparation.
+
+        ``before`` is called with the number of a state before its step.
+        """
+        cycle, rows = self._cycle(controller), []
+        for k, state in enumerate(states):
+            cycle.driver.observe(state)
+            before(k)
+            one = cycle.decide(state.time_s)
+            row = one.d, one.delta_rate, one.status == 0, one.step_us
+            if budget_s is not None:
+                cycle.prepare(PLANT.step_s, budget_s)
+            rows.append((*row, cycle.timing.prepare_us))
+        return np.array(rows)
+
+    def _converged(self, native: NativeStep, state: State) -> _Solution | None:
+        """What the next step would iterate to; leaves the controller as it was."""
+        size = native.artefact.library.br_mpc_memory_size()
+        memory = ct.string_at(native.handle, size)
+        native.set_parameters(self._car, self._exact)
+        x = np.array(state.x)
+        status = native.step(x, state.u_applied)
+        plan_x, plan_u = native.read_plan()
+        plan = plan_x.copy(), plan_u.copy()
+        solution = _Solution(x, state.u_applied[0], native.read_reference(), plan)
+        ct.memmove(native.handle, memory, size)
+        return solution if status is StepStatus.CONVERGED else None
+
+
+def _row(problem: ProblemName, caution: float, part: Part, steps: list[_Steps]) -> Row:
+    """One line: the steps of all drives."""
+    gives_input = part != "preparation"
+    us = np.concatenate([one.step_us if gives_input else one.prepare_us for one in steps])
+    error = np.concatenate([one.error for one in steps])
+    if not len(error):
+        raise BenchError(f"{problem}, caution {caution:g}: no step has a converged solution")
+    d, delta_rate = map(_errors, error.T) if gives_input else (None, None)
+    return Row(
+        problem=problem, caution=caution, part=part, us=_times(us), d=d, delta_rate=delta_rate,
+        compared=len(error), sought=sum(one.sought for one in steps),
+    )  # fmt: skip
+
+
+def _peer(
+    settings: BenchSettings, weights: GpWeights, solutions: list[_Solution], step_p50: float,
+    stages: Stages,
+) -> Peer:  # fmt: skip
+    """IPOPT, on steps evenly spread among these."""
+    car, horizon = settings.driven_car, len(solutions[0].reference)
+    chosen = np.linspace(0, len(solutions) - 1, settings.peers).round().astype(int)
+    steps = [solutions[k] for k in dict.fromkeys(chosen.tolist())]
+    model, parameters = e_kinematic(car), MpcSettings(caution=0.0).parameters(car)
+    problem, solved = tracking(model, PREDICTION), 0
+    times: list[float] = []
+    apart: list[float] = []
+    with stages.stage("IPOPT, expanded (builds for some 15 s)") as stage:
+        f = corrected_function(model, _PUBLISHED_STEP, weights, check_identity=False)
+        ocp = OcpNlp(problem, f, horizon, expand=True)
+        for step in steps:
+            stage.update(len(times) / len(steps))
+            out = ocp.solve(step.x, step.d_before, step.reference, parameters)
+            times.append(out.seconds * 1e6)
+            solved += out.success
+    with stages.stage("check against IPOPT"):
+        f = corrected_function(model, PREDICTION, weights)
+        oracle = OcpNlp(problem, f, horizon, options=_STRICT)
+        for step in steps:
+            out = oracle.solve(step.x, step.d_before, step.reference, parameters, step.plan)
+            if out.success:
+                apart.append(float(np.abs(out.u[0] - step.plan[1][0]).max()))
+    if not apart:
+        raise BenchError("IPOPT solved none of the problems that it was to check")
+    us = _times(np.array(times))
+    return Peer(
+        us=us, peers=len(steps), solved=solved, speedup_p50=us.p50 / step_p50, agreement=max(apart)
+    )
+
+
+def _times(values: Floats) -> Times:
+    p50, p90, p99, most = np.percentile(values, [50, 90, 99, 100]).tolist()
+    return Times(p50=p50, p90=p90, p99=p99, max=most)
 
 
 def _errors(values: Floats) -> Errors:
-    p95, p99 = np.percentile(values, [95, 99])
-    return Errors(p95=float(p95), p99=float(p99))
-
-
-def _result(
-    settings: BenchSettings, weights: GpWeights, recording: _Recording, ipopt_us: list[float],
-    solved: int, agreement: float, gaps: list[float],
-) -> BenchResult:  # fmt: skip
-    good = [p for p in recording.problems if p.has_converged]
-    error = np.abs([p.plan[1][0] - p.converged[1][0] for p in good])
-    step, ipopt = _times(recording.step_us), _times(ipopt_us)
-    p50, p95 = np.percentile(gaps, [50, 95])
-    return BenchResult(
-        step_us=step,
-        feedback_us=_times(recording.feedback_us),
-        ipopt_us=ipopt,
-        speedup_p50=ipopt.p50 / step.p50,
-        u0_error=InputErrors(d=_errors(error[:, 0]), delta_rate=_errors(error[:, 1])),
-        cost_gap=CostGap(p50=float(p50), p95=float(p95)),
-        gp_points=max(weights.counts),
-        problems=len(recording.problems),
-        peers=len(ipopt_us),
-        ipopt_solved=solved,
-        unconverged=len(recording.problems) - len(good),
-        second_starts=recording.second_starts,
-        ipopt_agreement=agreement,
-    )
+    p95, p99 = np.percentile(values, [95, 99]).tolist()
+    return Errors(p95=p95, p99=p99)
