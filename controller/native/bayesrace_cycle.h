@@ -68,10 +68,11 @@ BR_API br_mpc_error br_cycle_set_clock(br_cycle *cycle, br_mpc_clock clock, void
 
 /* A state has arrived. One that contradicts those before it (br_monitor.c) counts with what the
  * model predicts in place of what it says; after settings.stale_s the car brakes along the line, by
- * that prediction, and drives on once states agree with it again. A run is one stream of states: one plant (epoch), one run number, rising
- * numbers. Another stream is followed once the run has ended (br_cycle_end), once nothing has come
- * for long (br_cycle_forget), or once it has sent several states in a row while the former one was
- * silent: no single message locks out the plant. */
+ * that prediction, and drives on once states agree with it again. A run is one stream of states:
+ * one plant (epoch), one run number, rising numbers. Another stream is followed once the run has
+ * ended (br_cycle_end), once nothing has come for long (br_cycle_forget), or once it has sent
+ * several states in a row while the former one was silent: no single message locks out the plant.
+ */
 BR_API br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state);
 
 /* The input by the newest state, decided at plant time decided_at_s. environment: as of

@@ -43,7 +43,8 @@ static double roll_out(const br_rollout *from, int first, br_braking *braking) {
 void br_braking_plan(const br_rollout *from, br_braking *braking) {
     const br_fallback *fallback = from->fallback;
     const double left_s = fallback->plan_s + from->settings->shifted_s - from->time_s;
-    int first = fallback->rows && !fallback->to_recover ? (int)(left_s / BR_TS + STAGE_ROUNDING) : 0;
+    int first =
+        fallback->rows && !fallback->to_recover ? (int)(left_s / BR_TS + STAGE_ROUNDING) : 0;
     braking->begins_s = from->time_s;
     braking->step_s = BR_TS;
     double outside_m = roll_out(from, first, braking);
