@@ -54,7 +54,7 @@ def test_the_guard_stays_in_front_of_the_fmu(host: FmuHost) -> None:
     assert car.u_applied == pytest.approx((CAR.d_max, 0.05 / 0.02))
     car.step((math.nan, 0.0))
     assert car.u_applied == pytest.approx((CAR.d_min, 0.0), abs=0)
-    assert asdict(car.guard.counters) == {"rejected": 1, "clipped": 1, "braked": 1}
+    assert asdict(car.guard.counters) == {"rejected": 1, "clipped": 1, "braked": 1, "planned": 0}
     assert (car.steps, car.time_s) == (2, 0.04)
     with pytest.raises(InputError, match="steering angle"):
         car.reset((0, 0, 0, 0, 0, 0, 0.5))

@@ -169,9 +169,9 @@ class TestCycle:
 
     @pytest.fixture
     def loop(self, step: NativeStep, car: CarParameters) -> Driver:
-        return Driver(
-            PredictiveController(step), car, FallbackSettings(), CompensationSettings(), 0.1
-        )
+        """Its sensors are trusted: what these states say contradicts itself."""
+        settings = FallbackSettings(), CompensationSettings(), 0.1
+        return Driver(PredictiveController(step), car, *settings, sensor_tolerance=0)
 
     @staticmethod
     def widening(driver: Driver, states: list[State]) -> float:

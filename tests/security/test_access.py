@@ -19,7 +19,7 @@ from tests.security.intruder import ALIVE_KEYS, FORGED, KEYS, SERVICE_KEYS, TOPI
 
 __all__ = ["bundles"]
 
-ALL_TOPICS: Final = "state truth actuation telemetry event/* status/*"
+ALL_TOPICS: Final = "state truth actuation braking telemetry event/* status/*"
 
 
 class Rights(NamedTuple):
@@ -34,16 +34,16 @@ class Rights(NamedTuple):
 
 RIGHTS: Final[dict[str, Rights]] = {
     "plant": Rights(
-        "state truth event/plant status/plant", "actuation", "*/status",
+        "state truth event/plant status/plant", "actuation braking", "*/status",
         "plant/run plant/stop plant/status", "alive/plant",
     ),
     "controller": Rights(
-        "actuation telemetry event/controller status/controller", "state", "",
+        "actuation braking telemetry event/controller status/controller", "state", "",
         "controller/status controller/weights controller/rollback controller/command",
         "alive/controller",
     ),
     "learning": Rights(
-        "", "state actuation telemetry event/* status/*",
+        "", "state actuation braking telemetry event/* status/*",
         "*/status controller/weights controller/rollback",
     ),
     "director": Rights(
