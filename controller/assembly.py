@@ -16,6 +16,8 @@ from controller.native_step import NativeStep, pack_weights
 from controller.path_table import PathTable, make_path_table
 from controller.settings import MpcSettings
 from controller.weights.adoption import WeightsPort
+from controller.weights.checks import Checks
+from controller.weights.settings import GateSettings
 from controller.weights.store import AcceptedWeights, History, Store, digest_of
 
 __all__ = ["compiled_controller", "predictive_controller", "read_settings"]
@@ -67,11 +69,13 @@ def predictive_controller(
     settings: Path | None = None,
     weights: Path | None = None,
     store: Path | None = None,
+    gate: GateSettings | None = None,
 ) -> PredictiveController:
     """The compiled controller of ``artefact`` on a track, ready to drive.
 
     ``store``: folder of the weights that it accepts; the newest of an earlier life are in use from
-    the start, whatever ``weights`` are. Raises InputError naming the file that cannot be used.
+    the start, whatever ``weights`` are. ``gate``: thresholds that ``weights`` must pass; those in
+    the store have. Raises InputError naming the file that cannot be used.
     """
     loaded = None if weights is None else read_weights(weights)
     driven_on = load_track(track, car.width_m)
@@ -79,6 +83,11 @@ def predictive_controller(
     mpc = read_settings(settings, MpcSettings)
     step = compiled_controller(artefact, car, driven_on, line, loaded, mpc).native
     version, data = ("", b"") if loaded is None else (loaded.version, encode_weights(loaded))
+    if data:
+        try:
+            Checks(gate or GateSettings(), artefact, car).check_start(data)
+        except InputError as error:
+            raise InputError(f"{weights}: {error}") from None
     first = AcceptedWeights(
         number=0,
         version=version,

@@ -59,6 +59,9 @@ _CONSTANT: Final = 1e-9
 _THINNED: Final = 3
 """One in so many samples shows where the optimum is."""
 
+_CHECKED: Final = 200
+"""Samples that go with the weights, for a controller to check them by."""
+
 
 @dataclass(frozen=True, eq=False)
 class Training:
@@ -129,6 +132,7 @@ def fit(
             choices += costs
             metrics |= measured
             report(0.9 + 0.1 * (i + 1) / len(targets), f"{target.name}: {chosen.kind} chosen")
+    checked = evenly(len(dataset), _CHECKED)
     weights = GpWeights(
         version="unnamed",
         car=dataset.car.name,
@@ -136,6 +140,8 @@ def fit(
         outputs=(outputs[0], outputs[1], outputs[2]),
         dataset_digest=dataset.digest(),
         metrics=metrics,
+        sample_features=dataset.features[checked],
+        sample_residuals=residual(dataset, discretisation)[checked],
     )
     return Training(_named(weights), tuple(kernels), tuple(choices))
 

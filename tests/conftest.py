@@ -145,6 +145,8 @@ def fit_weights(
         version="-".join(kinds),
         car=car.name,
         discretisation=identity,
+        sample_features=z,
+        sample_residuals=residual,
         outputs=(vx, vy, omega),
     )
 
@@ -156,7 +158,13 @@ def mirrored_weights(weights: GpWeights) -> GpWeights:
         replace(o, inputs=o.inputs * signs, alpha=o.alpha * sign, y_mean=o.y_mean * sign)
         for o, sign in zip(weights.outputs, _MIRROR_OUTPUT, strict=True)
     )
-    return replace(weights, version=f"{weights.version}-mirrored", outputs=(vx, vy, omega))
+    return replace(
+        weights,
+        version=f"{weights.version}-mirrored",
+        sample_features=weights.sample_features * signs,
+        sample_residuals=weights.sample_residuals * np.array(_MIRROR_OUTPUT),
+        outputs=(vx, vy, omega),
+    )
 
 
 def mirrored_line(line: RaceLine) -> RaceLine:

@@ -68,7 +68,7 @@ _MAX_PARTS: Final = 1000
 """Maps and arrays in the encoded form at most; a file has some forty. Without a limit, 16 MB of
 empty arrays would take a second for every 2 MB, and 80 times their size in memory."""
 
-SCHEMA: Final = 2
+SCHEMA: Final = 3
 """Version of the encoded form; any other version is refused, older ones included: train again."""
 
 _MAGIC: Final = b"BRACEGP\n"
@@ -96,7 +96,8 @@ def _printable(text: str) -> str:
 
 _Array = Annotated[Floats, PlainValidator(_read_only)]
 _Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-_Positive = Annotated[_Number, Field(gt=0)]
+# Variances and scales far beyond any car's, whose products are still finite.
+_Positive = Annotated[_Number, Field(gt=0, le=1e30)]
 # A version must fit into an actuation message, whose texts have this limit.
 _Text = Annotated[str, Field(strict=True, max_length=200), AfterValidator(_printable)]
 _Name = Annotated[_Text, Field(min_length=1)]
@@ -180,7 +181,9 @@ class GpWeights:
     the residual was made with: a controller that predicts otherwise must refuse these weights.
     ``metrics`` maps a group to named numbers: an output's name to the scores on held-out samples
     (rmse, r2, coverage, log_density, …), "training vx" and so on to how it was learned. ``program``
-    is the program and version that trained. Two objects are equal if they encode to the same bytes.
+    is the program and version that trained. ``sample_features`` (m, 6) and ``sample_residuals``
+    (m, 3) are driven samples of the training data, by which a controller checks the weights before
+    they drive. Two objects are equal if they encode to the same bytes.
     """
 
     version: _Name
@@ -190,10 +193,19 @@ class GpWeights:
     created_utc_ns: Annotated[int, Field(strict=True, ge=0, lt=2**63)] = 0
     metrics: Mapping[_Name, Mapping[_Name, _Number]] = field(default_factory=dict)
     program: _Text = ""
+    sample_features: _Array = field(default_factory=lambda: np.zeros((0, len(FEATURES))))
+    sample_residuals: _Array = field(default_factory=lambda: np.zeros((0, len(OUTPUTS))))
     outputs: _Outputs
 
     def __post_init__(self) -> None:
         _validate(self)
+        features, residuals = self.sample_features, self.sample_residuals
+        shapes = (len(features), len(FEATURES)), (len(features), len(OUTPUTS))
+        if (features.shape, residuals.shape) != shapes:
+            raise InputError(
+                f"GP weights: sample_features and sample_residuals have the shapes "
+                f"{features.shape} and {residuals.shape}, expected {shapes[0]} and {shapes[1]}"
+            )
 
     @property
     def kernels(self) -> tuple[str, ...]:
@@ -296,7 +308,8 @@ def decode_weights(data: bytes) -> GpWeights:
     try:
         made_for = body.pop("features"), body.pop("output_names")
         outputs: Any = tuple(map(_output, body.pop("outputs")))
-        weights = GpWeights(**body, outputs=outputs)
+        samples = {name: _array(body[name]) for name in ("sample_features", "sample_residuals")}
+        weights = GpWeights(**body | samples, outputs=outputs)
     except InputError:
         raise
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:

@@ -23,6 +23,8 @@ __all__ = ["Checks", "Comparison", "Ruling", "Verdict", "Watch"]
 
 _CLOCKS_APART_S: Final = 3600.0
 """By which the clock of the training host may be ahead."""
+_ONE_SIDED: Final = 0.5
+"""Share of the nominal errors that the mean error on a file's own samples may have."""
 _HOPELESS: Final = 0.8
 """Share of cycles without a solution from which on no car can drive."""
 
@@ -90,6 +92,7 @@ class Checks:
             facts["version"] = model.weights.version
             self._check_origin(model.weights)
             self._check_bounds(model, samples)
+            self._check_own_samples(model)
             facts |= {"samples": len(samples), "probation": probation}
             text = f"on probation: {len(samples)} recent samples are too few to compare"
             if not probation:
@@ -140,6 +143,45 @@ class Checks:
                     f"weights are absurd {where}: they correct accelerations (m/s^2, m/s^2, "
                     f"rad/s^2) by up to {worst}, and {most} is the most; train again"
                 )
+
+    def check_start(self, data: bytes) -> None:
+        """InputError unless a weights file may drive from the start, before the car has moved."""
+        weights = self._model(data).weights
+        if weights is not None and any(weights.counts) and not len(weights.sample_features):
+            raise InputError(
+                f"weights '{weights.version}' hold no samples that they can be checked by; train "
+                "again, or start without them and use 'bayesrace publish'"
+            )
+        verdict = self.judge(data, ())
+        if not verdict.packed:
+            raise InputError(verdict.text)
+
+    def _check_own_samples(self, model: OneStepModel) -> None:
+        """The weights must predict the samples that they were learned from."""
+        weights = model.weights
+        if weights is None or not len(weights.sample_features):
+            return
+        samples = self._driven(weights.sample_features, weights.sample_residuals)
+        errors, nominal = model.errors(samples), self.nominal.errors(samples)
+        without = np.sqrt((nominal**2).mean(axis=0))
+        # A posterior mean fits its own samples: neither do errors grow, nor are they one-sided.
+        better = np.sqrt((errors**2).mean(axis=0)) <= without + self._slack
+        better &= np.abs(errors.mean(axis=0)) <= _ONE_SIDED * without + self._slack
+        worse = " and ".join(name for name, good in zip(OUTPUTS, better, strict=True) if not good)
+        if worse:
+            raise InputError(
+                f"weights '{weights.version}' predict {worse} worse than no correction does, on "
+                "the samples that they were learned from: they are damaged; train again"
+            )
+
+    def _driven(self, features: Floats, residuals: Floats) -> list[Sample]:
+        """Samples of driving, from features (n, 6) and residuals (n, 3) of the nominal model."""
+        x = np.hstack([np.zeros((len(features), 3)), features[:, :4]])
+        u = features[:, 4:]
+        still = [Sample(0, self.step_s, *pair, pair[0]) for pair in zip(x, u, strict=True)]
+        after = x.copy()
+        after[:, 3:6] = self.nominal.velocities(still) + residuals
+        return [one._replace(x_next=end) for one, end in zip(still, after, strict=True)]
 
     def compare(self, new: Floats, others: Sequence[Floats], nominal: Floats) -> Comparison:
         """Errors (n, 3) over the same samples; for each output the best of the others counts.

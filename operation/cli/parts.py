@@ -196,7 +196,9 @@ def controller(
         realtime=realtime(cpu, fifo, lock_memory),
         parent_pid=parent_pid,
     )
-    driver = predictive_controller(artefact, parameters, track, raceline, settings, weights, store)
+    driver = predictive_controller(
+        artefact, parameters, track, raceline, settings, weights, store, process.gate
+    )
     raise typer.Exit(main(process, driver))
 
 

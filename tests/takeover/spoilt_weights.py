@@ -2,7 +2,9 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final
+
+import numpy as np
 
 from bayesrace.gp.weights import GpOutput, GpWeights
 
@@ -38,6 +40,7 @@ SPOILT: Final[dict[str, Callable[[Outputs], Outputs]]] = {
 
 
 def spoilt(weights: GpWeights, what: str) -> GpWeights:
-    """The same, spoilt, under a name that says so."""
+    """The same, spoilt, under a name that says so, and without the samples that would tell."""
     version = f"{weights.version}-{what.replace(' ', '-')}"
-    return replace(weights, version=version, outputs=SPOILT[what](weights.outputs))
+    none: Any = {"sample_features": np.zeros((0, 6)), "sample_residuals": np.zeros((0, 3))}
+    return replace(weights, version=version, outputs=SPOILT[what](weights.outputs), **none)

@@ -18,7 +18,8 @@ import numpy as np
 import pytest
 
 from bayesrace.arrays import Floats
-from bayesrace.gp.weights import GpOutput, GpWeights, encode_weights
+from bayesrace.errors import InputError
+from bayesrace.gp.weights import GpOutput, GpWeights, encode_weights, zero_weights
 from bayesrace.vehicles import CarParameters, get_car
 from controller.weights.checks import Checks, Verdict, Watch
 from controller.weights.prediction import Sample, Sampler, StateRecord, plausible_samples
@@ -112,6 +113,27 @@ def test_spoilt_weights_are_refused_in_favour_of_none(
     checks: Checks, honest: GpWeights, drive: list[Sample], what: str
 ) -> None:
     assert not judged(checks, spoilt(honest, what), None, drive).packed
+
+
+@pytest.mark.parametrize("what", SPOILT)
+def test_spoilt_weights_do_not_drive_from_the_start(
+    checks: Checks, honest: GpWeights, what: str
+) -> None:
+    """There is no recent driving yet: they are checked by the samples in their file."""
+    checks.check_start(file(honest))
+    with pytest.raises(InputError, match=r"worse than no correction|absurd"):
+        checks.check_start(file(replace(honest, outputs=SPOILT[what](honest.outputs))))
+
+
+def test_weights_that_nothing_can_check_do_not_drive_from_the_start(
+    checks: Checks, honest: GpWeights
+) -> None:
+    checks.check_start(file(zero_weights(honest.car, honest.discretisation)))
+    without = replace(honest, sample_features=np.zeros((0, 6)), sample_residuals=np.zeros((0, 3)))
+    with pytest.raises(InputError, match="hold no samples that they can be checked by"):
+        checks.check_start(file(without))
+    with pytest.raises(InputError, match="y_scale"):  # its square would not be finite
+        replace(honest.outputs[0], y_scale=1e300)
 
 
 def test_good_weights_count_beside_those_in_use_that_may_be_bad(
