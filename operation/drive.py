@@ -1,7 +1,6 @@
 """Directs one run of a waiting plant and controller, from the start line to the last lap."""
 
 import time
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -17,9 +16,6 @@ __all__ = ["RunPlan", "announcement", "execute", "run_request"]
 _ABSENCE_S = 10.0
 """In real time a process may be away for so long: a link comes back, a controller is started
 again, and the car waits at standstill."""
-
-_UNDRIVEN = 0.5
-"""Share of periods without a command from which a run has not been one of the controller."""
 
 _REGULAR = ("laps", "max_time", "left_world")
 """Ends of a run that the car's driving, not a fault, has brought about."""
@@ -90,17 +86,16 @@ def execute(
 ) -> Event:
     """Announces and starts the run and waits for its end; the plant's ``run_ended`` event.
 
-    InputError if the controller drives another track, the plant refuses, the recorder fails, the
-    car was not driven, or the run ended by anything but its laps, its time limit or the car's
-    leaving the world, or several plants or controllers of one name are there, before or after;
-    KeyboardInterrupt on a signal.
+    How the car was driven is for :func:`operation.analysis.verdict.judge`. InputError if the
+    controller drives another track, the plant refuses, the recorder fails, or the run ended by
+    anything but its laps, its time limit or the car's leaving the world, or several plants or
+    controllers of one name are there, before or after; KeyboardInterrupt on a signal.
     """
     director.check_alone()
     controller = director.status("controller")
     _check_track(track, controller.track)
     announced = announcement(plan, publisher.next_seq, controller.weights_version)
     publisher.put(announced, lockstep=True)
-    before = director.status("plant").counters
     try:
         director.start(run_request(track, plan))
         # In lockstep simulated time passes faster than real time, but that is no promise.
@@ -119,7 +114,6 @@ def execute(
         raise
     if end.data.get("reason") not in _REGULAR:
         raise InputError(f"run {plan.run} ({plan.controller}) ended early: {end.text}")
-    _check_driven(plan, end, before)
     director.check_alone()
     return end
 
@@ -131,20 +125,3 @@ def _check_track(track: Track, controllers: str) -> None:
             f"the controller drives the track '{controllers}', this run is on '{track.identity}': "
             "name the controller's track here (--track), or start a controller with this one"
         )
-
-
-def _check_driven(plan: RunPlan, end: Event, before: Mapping[str, Scalar]) -> None:
-    """InputError if the car, for want of commands, braked in most periods."""
-    braked, states = (
-        _number(end.data.get(name)) - _number(before.get(name))
-        for name in ("braked", "states_sent")
-    )
-    if braked > _UNDRIVEN * states:
-        raise InputError(
-            f"run {plan.run} ({plan.controller}): the car was not driven in {braked} of {states} "
-            "periods, for want of commands that were new enough; see the controller's status"
-        )
-
-
-def _number(value: Scalar | None) -> int:
-    return value if type(value) is int else 0

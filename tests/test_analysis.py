@@ -425,7 +425,7 @@ def test_the_table_shows_the_results_numbers_within_80_columns(tmp_path: Path) -
         shown = [column for column in COLUMNS if column.narrow]
         assert row.split() == [column.cell(lap) for column in shown]
         assert not lap.weights_version or f"weights {lap.weights_version}" in text.getvalue()
-    assert "worstcase did not finish" in text.getvalue()
+    assert "worstcase failed: 0 of 2 laps driven" in text.getvalue()
     assert sum(line.split()[:1] == ["updated"] for line in lines) == 3
 
 

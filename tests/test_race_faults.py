@@ -79,7 +79,7 @@ class Racing:
         done = run("report", self.out)
         assert done.returncode == 0, done.stderr
         laps = json.loads((self.out / "result.json").read_text())["laps"]
-        assert f"{laps[-1]['controller']} did not finish" in done.stdout
+        assert f"{laps[-1]['controller']} failed: 0 of " in done.stdout
         assert laps[-1]["ended"]
         assert sum(lap["samples"] for lap in laps) >= ENOUGH
         assert (self.out / "report.html").stat().st_size > 10_000

@@ -37,6 +37,7 @@ from operation.analysis.results import (
     read_result,
     write_result,
 )
+from operation.analysis.verdict import Cycles, judge
 from operation.limits import limits_in
 
 __all__ = [
@@ -141,20 +142,17 @@ class DrivenRun:
         off = depth[depth > 0]
         return int(whole.sum()) * places.shape[1] + len(off), float(np.max(off, initial=0.0))
 
-    @property
-    def ended(self) -> str:
-        """Why the run ended."""
-        if self.laps.cut_at is None:
-            return self.record.ended
-        time_s = float(self.record.time_s[self.laps.cut_at])
-        return f"{self.record.ended}; at {time_s:.2f} s the car left out a piece of the track"
-
     def digest(self) -> str:
         """sha256 of the trajectory up to the first sample after the last counted crossing."""
         return trajectory_digest(self.record.x, self.laps)
 
-    def result(self, limit_s: Mapping[str, float] | None = None) -> LapResult:
-        """The run in numbers; ``limit_s``: the limits of a standing and of a flying lap."""
+    def result(self, laps: int = 0, limit_s: Mapping[str, float] | None = None) -> LapResult:
+        """The run in numbers; ``laps``: that it was to have, 0: any number; ``limit_s``: the limits
+        of a standing and of a flying lap."""
+        cycles = Cycles(self.record.telemetry)
+        verdict = judge(
+            self.record.truth, self.on_track.off_track_m[self.counted], self.laps, cycles, laps
+        )
         depth = self.on_track.off_track_m[self.counted]
         between = self.off_track_between()
         deviation = np.abs(self.offset_m[self.counted])
@@ -178,11 +176,13 @@ class DrivenRun:
             slip_max_rad=self._largest(self.record.slip_rad),
             speed_max_mps=self._largest(self.record.x[:, 3]),
             solve_us=_percentiles(self.record.solve_us),
-            fallbacks=self.record.fallbacks,
+            cycles=cycles.counts,
+            passed=verdict.passed,
+            verdict=verdict.text,
             weights_version=self.record.weights_version,
             trajectory_sha256=self.digest(),
             samples=len(self.record.truth),
-            ended=self.ended,
+            ended=self.record.ended,
             refused=self.record.plan.refused,
             remarks=self.record.remarks,
         )
@@ -263,9 +263,10 @@ class RaceAnalysis:
         gaps = sum(run.record.gaps for run in self.runs)
         recording = self.recording
         limit_s = limits_in(recording.directory)
+        laps = int(recording.settings.get("laps", 0))
         return RaceResult(
             settings=_summary(recording),
-            laps=[run.result(limit_s) for run in self.runs],
+            laps=[run.result(laps, limit_s) for run in self.runs],
             limit_s=limit_s,
             training=None if self.training is None else self.training.result(),
             gp=self._metrics("bayesrace"),

@@ -113,11 +113,6 @@ class RunRecord(Trajectory):
         return np.array([message.solve_us for message in self.telemetry], dtype=np.float64)
 
     @property
-    def fallbacks(self) -> int:
-        """Cycles that the fallback drove."""
-        return sum(message.fallback > 0 for message in self.telemetry)
-
-    @property
     def lockstep(self) -> bool:
         """Whether the plant waited for the controller."""
         return bool(self.states) and self.states[0].lockstep

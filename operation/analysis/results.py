@@ -68,7 +68,14 @@ class LapResult(_Frozen):
     )
     speed_max_mps: float | None = Field(None, description="largest speed along the car's axis")
     solve_us: Percentiles | None = Field(description="null without telemetry")
-    fallbacks: int = Field(description="cycles that the fallback drove")
+    cycles: dict[str, int] = Field(
+        description="number of the controller's cycles at each level: solution, and of the "
+        "fallback shifted_plan, brake, stop"
+    )
+    passed: bool = Field(
+        description="all laps were driven on the track, and by solutions for most of the time"
+    )
+    verdict: str = Field(description="whether the run passed, with the facts, in one sentence")
     weights_version: str = Field(description="of the weights that drove; empty without any")
     trajectory_sha256: str = Field(
         description="over all states as little-endian float64, up to and with the first sample "
@@ -83,6 +90,11 @@ class LapResult(_Frozen):
     remarks: list[str] = Field(
         [], description="of the controller in mid-run: weights rolled back, speed limited"
     )
+
+    @property
+    def fallbacks(self) -> int:
+        """Cycles that the fallback drove."""
+        return sum(self.cycles.values()) - self.cycles.get("solution", 0)
 
     @property
     def name(self) -> str:

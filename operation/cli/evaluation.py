@@ -123,7 +123,8 @@ def race(
 
     Computes racing lines, drives the training track by pure pursuit, trains the GPs, builds the
     controllers, and drives them as two processes over Zenoh. Leaves a run directory with the log,
-    result.json and report.html.
+    result.json and report.html. Exit code 1 if no run passes: all its laps on the track, driven by
+    the controller's solutions.
     """
 
     from bayesrace.transport import check_descriptors
@@ -162,6 +163,8 @@ def race(
             report = write_report(out, analysis)
     print_table(analysis.result, console)
     console.print(f"{report}", highlight=False, soft_wrap=True)
+    if not any(run.passed for run in analysis.result.laps):
+        raise typer.Exit(1)
 
 
 def report(
@@ -206,12 +209,17 @@ def drive(
     car: Car = DEFAULT_CAR,
     name: CarName = "",
 ) -> None:
-    """Start a run on a plant and a controller that are already running, and record it."""
+    """Start a run on a plant and a controller that are already running, and record it.
+
+    Exit code 0 if all laps were driven on the track, by the controller's solutions; 1 if not; 2 if
+    the run could not be driven to its end.
+    """
     from bayesrace.messages import EVENT, Event
     from bayesrace.recorder import Recorder
     from bayesrace.tracks import load_track
     from bayesrace.transport import Director, Publisher, open_session
     from bayesrace.vehicles import car_text, get_car
+    from operation.analysis.verdict import judge_log
     from operation.drive import RunPlan, execute
 
     parameters = get_car(car)
@@ -230,7 +238,10 @@ def drive(
         number = director.status("plant").run + 1
         plan = RunPlan(number, "manual", laps, max_time, mode is Mode.lockstep)
         end = execute(director, publisher, course, plan, recorder)
-    typer.echo(f"{end.text}; log: {log}")
+    verdict = judge_log(log, number, course, laps)
+    typer.echo(f"{end.text}; log: {log}\n{verdict.text}")
+    if not verdict.passed:
+        raise typer.Exit(1)
 
 
 def bench(

@@ -271,11 +271,9 @@ def _print_notes(result: RaceResult, console: Console) -> None:
             console.print(Text(f"{lap.name}: {remark}", style="yellow"))
         if lap.refused:
             console.print(Text(f"{lap.name}: refused: {lap.refused}", style="red"))
-        elif not lap.finished:
-            console.print(Text(f"{lap.name} did not finish: {lap.ended}", style="red"))
-        elif (count := len(lap.lap_times_s)) < result.settings.laps:
-            text = f"{lap.name} finished {count} of {result.settings.laps} laps: {lap.ended}"
-            console.print(Text(text, style="yellow"))
+        elif not lap.passed:
+            text = f"{lap.name} {lap.verdict}; {lap.ended}"
+            console.print(Text(text, style="yellow" if lap.finished else "red"))
     if result.judged_by == "measurement":
         text = "the log holds no truth: laps and GPs are judged by the measurements"
         console.print(Text(text, style="yellow"))

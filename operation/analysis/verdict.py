@@ -1,0 +1,116 @@
+"""The verdict on a run: whether it did what was asked, by the truth and by what drove the car."""
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from bayesrace.arrays import Floats
+from bayesrace.log import LogReader
+from bayesrace.messages import STATE, TELEMETRY, TRUTH, CarSample, Telemetry, Truth
+from bayesrace.tracks import Track
+from controller.driver import Level
+from operation.analysis.laps import LapTimes, time_laps
+
+__all__ = ["Cycles", "Verdict", "judge", "judge_log"]
+
+_DRIVEN: Final = 0.5
+"""Share of a run's time that solutions must have driven."""
+
+_HELD_S: Final = 0.1
+"""An input drives until the next one, and no longer than this."""
+
+
+class Verdict(NamedTuple):
+    """The verdict and the facts that it follows from, in one sentence."""
+
+    passed: bool
+    text: str
+
+
+class Cycles:
+    """The controller's cycles in one run: the state that each answered, and at which level."""
+
+    def __init__(self, telemetry: Sequence[Telemetry] = ()) -> None:
+        self._levels: dict[int, int] = {}
+        for message in telemetry:
+            self.add(message)
+
+    def add(self, message: Telemetry) -> None:
+        """Takes in one cycle; of several for one state the newest counts."""
+        self._levels[message.state_seq] = message.fallback
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of cycles by the name of their level, of all levels."""
+        found = Counter(self._levels.values())
+        return {level.name.lower(): found[level] for level in Level}
+
+    def driven_s(self, seqs: Sequence[int], time_s: Floats) -> float:
+        """Time for which solutions have driven, of a run with these states."""
+        answered = [k for k, seq in enumerate(seqs) if seq in self._levels]
+        if not answered:
+            return 0.0
+        begins = time_s[answered]
+        held = np.minimum(np.diff(np.append(begins, time_s[-1])), _HELD_S)
+        solved = [self._levels[seqs[k]] == Level.SOLUTION for k in answered]
+        return float(held[solved].sum())
+
+
+def judge(
+    samples: Sequence[CarSample], off_track_m: Floats, laps: LapTimes, cycles: Cycles, asked: int
+) -> Verdict:
+    """Judges a run of which ``asked`` laps were wanted; 0: none.
+
+    ``samples``: the truth, or the measurements of a car that knows none. ``off_track_m``: how far
+    outside of the track the counted ones are.
+    """
+    faults: list[str] = []
+    if not samples:
+        return Verdict(False, "failed: there is no state of the run")
+    if len(laps.times_s) < asked:
+        fault = f"{len(laps.times_s)} of {asked} laps driven"
+        if laps.cut_at is not None:
+            cut_s = samples[laps.cut_at].time_s
+            fault += f": at {cut_s:.2f} s the car left out a piece of the track"
+        faults.append(fault)
+    if (off := int((off_track_m > 0).sum())) > 0:
+        faults.append(f"{off} samples off the track, up to {off_track_m.max():.3f} m")
+    time_s = np.array([one.time_s for one in samples])
+    lasted_s = float(time_s[-1] - time_s[0])
+    driven_s = cycles.driven_s([one.seq for one in samples], time_s)
+    by_level = ", ".join(
+        f"{count} {name.replace('_', ' ')}" for name, count in cycles.counts.items() if count
+    )
+    by_level = f"cycles: {by_level or 'none'}"
+    if driven_s < _DRIVEN * lasted_s:
+        faults.append(f"solutions drove the car for {driven_s:.2f} of {lasted_s:.2f} s")
+    if faults:
+        return Verdict(False, f"failed: {'; '.join(faults)} ({by_level})")
+    times = ", ".join(f"{time:.3f}" for time in laps.times_s)
+    count = f"{len(laps.times_s)} lap{'s' if len(laps.times_s) > 1 else ''}"
+    done = f"{count} in {times} s" if times else f"{lasted_s:.2f} s driven"
+    return Verdict(True, f"passed: {done}, on the track throughout ({by_level})")
+
+
+def judge_log(log: Path, run: int, track: Track, asked: int) -> Verdict:
+    """Judges a run in a log; only what the verdict needs is kept in memory."""
+    samples: dict[bool, list[CarSample]] = {True: [], False: []}
+    cycles = Cycles()
+    for entry in LogReader(log).messages((STATE, TRUTH, TELEMETRY)):
+        message = entry.message
+        if message.run != run:
+            continue
+        if isinstance(message, Telemetry):
+            cycles.add(message)
+        else:
+            samples[isinstance(message, Truth)].append(message)
+    known = samples[True] or samples[False]
+    xy = np.array([one.x[:2] for one in known]).reshape(-1, 2)
+    time_s = np.array([one.time_s for one in known])
+    projected = track.project_path(xy)
+    laps = time_laps(track, time_s, xy, projected.s_m)
+    counted = laps.after[-1] if laps.after else len(known)
+    return judge(known, projected.off_track_m[:counted], laps, cycles, asked)
