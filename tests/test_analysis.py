@@ -200,7 +200,7 @@ def test_a_short_cut_is_no_lap(tmp_path: Path) -> None:
     angle = np.concatenate([np.linspace(0, 2, 40), np.linspace(4.5, 2 * np.pi + 1, 60)])
     lap = only_lap(write_race(tmp_path, [Drive("worstcase", circle(angle, 1.0))]))
     assert not lap.finished
-    assert "at 0.80 s the car left out a piece of the track" in lap.ended
+    assert "at 0.80 s the car left out a piece of the track" in lap.verdict
 
 
 def test_laps_before_a_short_cut_count(tmp_path: Path) -> None:
