@@ -10,7 +10,10 @@ import sys
 import time
 from typing import Any, Final
 
-__all__ = ["die_with_parent", "sleep_until_ns"]
+__all__ = ["SUSPENDED_S", "die_with_parent", "sleep_until_ns", "suspension"]
+
+SUSPENDED_S: Final = 1.0
+"""A wait that ends so much later than it should: the process has not run."""
 
 _PR_SET_PDEATHSIG: Final = 1
 _CLOCK_MONOTONIC: Final = 1
@@ -42,6 +45,14 @@ def sleep_until_ns(deadline_ns: int) -> None:
     left_ns = deadline_ns - time.monotonic_ns()
     if left_ns > 0:
         time.sleep(left_ns * 1e-9)
+
+
+def suspension(seconds: float) -> str:
+    """What to report of a process that has not run for so long."""
+    return (
+        f"this process did not run for {seconds:.0f} s: the machine was suspended, or its "
+        "processes were stopped"
+    )
 
 
 def die_with_parent(pid: int | None) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from bayesrace.clock import die_with_parent
+from bayesrace.clock import die_with_parent, suspension
 from bayesrace.errors import InputError
 from bayesrace.messages import (
     ACTUATION,
@@ -59,6 +59,9 @@ _log = logging.getLogger("bayesrace.plant")
 _ABANDONED_S = 10.0
 """A run ends when its director has been gone for so long; a link may come back before."""
 
+
+_RELINKED_S = 2.0
+"""After a suspension links are there again in less."""
 
 _STATUS_S = 1.0
 """How long a controller may take to answer before a run begins, and after it has ended."""
@@ -125,6 +128,8 @@ class PlantProcess:
         self._stopping = False
         self._director_gone_ns: int | None = None
         """Since when the director is gone; None: it is there, or never was."""
+        self._news: tuple[float, str, str, dict[str, Scalar]] | None = None
+        """An event that is published once links that have expired are there again."""
         self._expired_ns: int | None = None
         """Since when the certificate has expired, as noticed."""
         inbox = self.inbox = Inbox(session, self.name)
@@ -197,6 +202,7 @@ class PlantProcess:
                 numbering=self._numbering,
                 react=self._react,
                 beat=self._beat,
+                suspended=self._suspended,
                 epoch=self._epoch,
                 delay_s=self._settings.delay_s,
                 sensors=Sensors(self._settings.noise, self._settings.seed),
@@ -300,9 +306,18 @@ class PlantProcess:
             **asdict(self._simulator.guard.counters),
         }
 
+    def _suspended(self, seconds: float) -> None:
+        text = f"{suspension(seconds)}; the run goes on where it was"
+        _log.warning("%s", text)
+        self._news = (time.monotonic() + _RELINKED_S, "suspended", text, {"seconds": seconds})
+
     def _beat(self) -> End | None:
         """Publishes the status when it is due; returns what ends the current run, if anything."""
         self._heartbeat.beat(self._status)
+        if self._news is not None and time.monotonic() > self._news[0]:
+            _, *event = self._news
+            self._news = None
+            self._publish_event(*event)
         self._check_certificate()
         now_ns = time.monotonic_ns()
         for since_ns, what in (

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from bayesrace.clock import sleep_until_ns
+from bayesrace.clock import SUSPENDED_S, sleep_until_ns
 from bayesrace.messages import ACTUATION, Actuation, BrakingPlan, Decoder, RunRequest, State, Truth
 from bayesrace.transport import LOCKSTEP_SPIN_S, Inbox, Item, Kind, Numbering, Publisher
 from plant.braking import planned_at
@@ -41,6 +41,8 @@ class RunCounters:
     """Actuations for another plant, run or state than the current one, or overtaken ones."""
     overruns: int = 0
     """Periods that the plant itself finished more than a period too late."""
+    suspended: int = 0
+    """Times that the process did not run for a second or more; plant time stood still meanwhile."""
 
 
 class _Waiting(NamedTuple):
@@ -72,11 +74,13 @@ class Run:
         numbering: Numbering,
         react: Callable[[Item], End | None],
         beat: Callable[[], End | None],
+        suspended: Callable[[float], None],
         epoch: int,
         delay_s: float = 0.0,
         sensors: Sensors | None = None,
     ) -> None:
-        """``delay_s``: added to states and actuations alike. ``sensors``: exact without."""
+        """``suspended`` is called when the process has not run for so many seconds in real time.
+        ``delay_s``: added to states and actuations alike. ``sensors``: exact without."""
         self.request = request
         self._car = CarRun(request, simulator, epoch, sensors, 2 * delay_s)
         self._epoch = epoch
@@ -88,6 +92,7 @@ class Run:
         self._counters = counters
         self._react = react
         self._beat = beat
+        self._suspended = suspended
         self._numbering = numbering
         self.takes_commands = True
         """Actuations count; else the car brakes, or in lockstep the run ends for want of them."""
@@ -167,13 +172,18 @@ class Run:
         period_ns = round(self._simulator.step_s * 1e9)
         seq = self._states.next_seq
         first = self._car.sample(seq)
-        start_ns = first[0].source_time_ns
+        start_ns, late_ns = first[0].source_time_ns, 0
         self._enqueue(*first)
         while True:
             begin_ns = start_ns + self._simulator.steps * period_ns
             self._sleep_and_send(begin_ns + period_ns)
-            if time.monotonic_ns() > begin_ns + 2 * period_ns:
-                self._counters.overruns += 1
+            before_ns, late_ns = late_ns, time.monotonic_ns() - begin_ns - period_ns
+            if late_ns - before_ns > SUSPENDED_S * 1e9:
+                # Not to be made up for: nobody could have driven the car meanwhile.
+                self._counters.suspended += 1
+                self._suspended(late_ns * 1e-9)
+                start_ns, begin_ns, late_ns = start_ns + late_ns, begin_ns + late_ns, 0
+            self._counters.overruns += late_ns > period_ns
             end = self._receive()
             if end is not None:
                 return end

@@ -98,8 +98,11 @@ class PlantGuard:
             return self._brake(vx_mps, lowest)
         if isinstance(u, Planned):
             self.counters.planned += 1
-            u = u.command(delta_rad, duration_s)
-        d, rate = float(u[0]), float(u[1])
+            d, rate = u.command(delta_rad, duration_s)
+            if d < 0:  # the car may stand sooner than the model that planned
+                d = max(d, self._braking(vx_mps, lowest))
+        else:
+            d, rate = float(u[0]), float(u[1])
         if not (math.isfinite(d) and math.isfinite(rate)):
             self.counters.rejected += 1
             return self._brake(vx_mps, lowest)
@@ -111,11 +114,15 @@ class PlantGuard:
         return d_safe, rate_safe
 
     def _brake(self, vx_mps: float, lowest: float) -> tuple[float, float]:
-        """What the car can hold while it rolls, fading to none at standstill; steering held."""
+        """Braking with the steering held."""
         self.counters.braked += 1
+        return self._braking(vx_mps, lowest), 0.0
+
+    def _braking(self, vx_mps: float, lowest: float) -> float:
+        """The drive command that the car can hold while it rolls, fading to none at standstill."""
         held = self._brake_d + self._brake_slow / max(vx_mps * vx_mps, _SLOWEST)
         share = min(max(vx_mps / self._brake_fade_mps, 0.0), 1.0)
-        return max(max(self._d_min, -held) * share, lowest), 0.0
+        return max(max(self._d_min, -held) * share, lowest)
 
     def _steerable(self, rate: float, delta_rad: float, duration_s: float) -> float:
         """The nearest rate within its limit that leaves the angle within its own at the end."""

@@ -89,6 +89,7 @@ def execute(
 ) -> tuple[list[State], RunCounters, GuardCounters]:
     """A run of .3 s in which a state is answered by actuations with these changes."""
     controller, counters, simulator = Controller(answer), RunCounters(), VEHICLE
+    suspensions: list[float] = []
     if flooded:
         controller.ask_again(Item(Kind.REQUEST, "status", None, 0))
     simulator.guard.counters = GuardCounters()
@@ -111,9 +112,10 @@ def execute(
         request, simulator, cast(Inbox, controller), states=cast(Publisher[State], controller),
         truths=cast(Publisher[Truth], controller), decoder=Decoder(Actuation), counters=counters,
         numbering=Numbering(), react=controller.ask_again, beat=lambda: None, epoch=EPOCH,
-        delay_s=delay_s,
+        suspended=suspensions.append, delay_s=delay_s,
     )  # fmt: skip
     run.execute()
+    assert len(suspensions) == counters.suspended
     return controller.states, counters, simulator.guard.counters
 
 
@@ -198,3 +200,19 @@ def test_without_fresh_answers_the_plant_brakes() -> None:
     states, _, guarded = execute(lambda state: [{}] if state.seq < 3 else [])
     assert guarded.braked > 4
     assert states[-1].x[3] < max(state.x[3] for state in states)
+
+
+def test_plant_time_stands_still_while_the_process_does_not_run() -> None:
+    """Bug guarded: after a suspension the plant drove through all periods missed, uncontrolled."""
+
+    def answer(state: State) -> list[dict[str, Any]]:
+        if state.seq == 5:
+            time.sleep(1.3)
+        return [{}]
+
+    states, counters, guarded = execute(answer)
+    assert counters.suspended == 1
+    assert counters.overruns < 3
+    assert guarded.braked < 8
+    assert states[-1].time_s == pytest.approx(0.3)
+    assert states[-1].x[3] > 1.0

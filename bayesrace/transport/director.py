@@ -1,9 +1,11 @@
 """Starting and following runs of one car from outside."""
 
+import logging
 import time
 from collections.abc import Callable, Collection
-from typing import Any
+from typing import Any, Final
 
+from bayesrace.clock import SUSPENDED_S, suspension
 from bayesrace.errors import InputError
 from bayesrace.messages import (
     EVENT,
@@ -21,6 +23,12 @@ from bayesrace.transport.client import ask, count_processes, send_rollback, send
 from bayesrace.transport.inbox import Inbox, Item, Kind
 
 __all__ = ["Director", "RefusedError"]
+
+_log = logging.getLogger("bayesrace.director")
+
+_AFTER_SUSPENSION: Final = (
+    "a run in real time goes on, one in lockstep has to be started again if links have expired"
+)
 
 
 class RefusedError(InputError):
@@ -122,18 +130,27 @@ class Director:
         """
         deadline = last = time.monotonic() + timeout_s
         lost: set[str] = set()
+        returned = False
         with self.inbox.receive_signals():
             while (left_s := deadline - time.monotonic()) > 0:
-                item = self.inbox.get(min(left_s, 1.0))
+                waits_s, begin_s = min(left_s, 1.0), time.monotonic()
+                item = self.inbox.get(waits_s)
+                if (late_s := time.monotonic() - begin_s - waits_s) > SUSPENDED_S:
+                    _log.warning("%s; %s", suspension(late_s), _AFTER_SUSPENSION)
+                    deadline, last = deadline + late_s, last + late_s
                 if why_not := trouble():
                     raise InputError(f"run {run} is aborted: {why_not}")
                 _raise_on_signal(item)
                 if item is None:
+                    if returned:
+                        self._check_running(run)
+                    returned = False
                     continue
                 if item.kind is Kind.GONE:
                     lost.add(item.name)
                     deadline = min(deadline, time.monotonic() + absence_s)
                 elif item.kind is Kind.ALIVE:
+                    returned |= item.name == "plant" and item.name in lost
                     lost.discard(item.name)
                     deadline = deadline if lost else last
                 event = item.value
@@ -143,6 +160,12 @@ class Director:
             gone = " and ".join(f"the {one} of car '{self._car}' vanished" for one in sorted(lost))
             raise InputError(f"{gone} during run {run}")
         raise InputError(f"run {run} of car '{self._car}' did not end in {timeout_s:g} s")
+
+    def _check_running(self, run: int) -> None:
+        """InputError if the run has ended while the link to the plant was down, with its event."""
+        status = self.status("plant")
+        if (status.run, status.phase) != (run, "running"):
+            raise InputError(f"run {run} ended while the link to the plant was down: {status.text}")
 
 
 def _accepted(what: str, reply: Reply) -> Reply:
