@@ -70,6 +70,7 @@ check: export TEST_SESSION = $(CURDIR)/build/session
 check: tools $(VENV)/.ready-dev
 	@rm -rf build/coverage build/session
 	@$(MAKE) --no-print-directory lint
+	$(BIN)/python -m benchmarks.numbers check
 	@$(MAKE) --no-print-directory test RUNNER='$(RUNNER)'
 	@$(MAKE) --no-print-directory rest RUNNER='$(RUNNER)'
 	@$(MAKE) --no-print-directory coverage

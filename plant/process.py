@@ -128,8 +128,9 @@ class PlantProcess:
         self._stopping = False
         self._director_gone_ns: int | None = None
         """Since when the director is gone; None: it is there, or never was."""
-        self._news: tuple[float, str, str, dict[str, Scalar]] | None = None
-        """An event that is published once links that have expired are there again."""
+        self._news: tuple[float, str, dict[str, Scalar]] | None = None
+        """When and what to report of a suspension: links that have expired are there again by
+        then."""
         self._expired_ns: int | None = None
         """Since when the certificate has expired, as noticed."""
         inbox = self.inbox = Inbox(session, self.name)
@@ -309,15 +310,15 @@ class PlantProcess:
     def _suspended(self, seconds: float) -> None:
         text = f"{suspension(seconds)}; the run goes on where it was"
         _log.warning("%s", text)
-        self._news = (time.monotonic() + _RELINKED_S, "suspended", text, {"seconds": seconds})
+        self._news = time.monotonic() + _RELINKED_S, text, {"seconds": seconds}
 
     def _beat(self) -> End | None:
         """Publishes the status when it is due; returns what ends the current run, if anything."""
         self._heartbeat.beat(self._status)
         if self._news is not None and time.monotonic() > self._news[0]:
-            _, *event = self._news
+            _, text, data = self._news
             self._news = None
-            self._publish_event(*event)
+            self._publish_event("suspended", text, data)
         self._check_certificate()
         now_ns = time.monotonic_ns()
         for since_ns, what in (

@@ -1,0 +1,290 @@
+"""The numbers of README and docs: each stands in docs/numbers.json, which a command writes.
+
+    python -m benchmarks.numbers measure [NAME ...]   runs the commands; writes docs/numbers.json
+    python -m benchmarks.numbers fill                 writes the numbers into README.md and docs/
+    python -m benchmarks.numbers check                compares pages and file; says what is older
+
+A page marks a number with its name: ``6.606 s<!--=race.laps.bayesrace.flying_lap_time_s-->``; unit
+and any other words may stand between. Pages round: a number keeps the decimals that the page gives
+it. The first part of the name is the measurement, the rest the path within what its command writes,
+where a list's items go by their ``controller``, ``name`` or place. ``facts`` are counted anew at
+each check.
+
+A number is older than what it depends on if commits since its own have changed that. 'check' fails
+where page and file differ or a name is unknown; what is older it prints.
+"""
+
+import argparse
+import json
+import platform
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+ROOT: Final = Path(__file__).parents[1]
+FILE: Final = ROOT / "docs" / "numbers.json"
+_RAW: Final = ROOT / "build" / "numbers"
+"""What the commands have written, in full."""
+
+_STEP: Final = ("bayesrace", "codegen", "controller/native", "controller/settings.py")
+_RACE: Final = (*_STEP, "controller", "learning", "plant", "operation/race.py")
+
+_MARKED: Final = re.compile(
+    r"(?P<number>[-−+]?\d[\d ]*(?:\.\d+)?(?:e-?\d+)?)"
+    r"(?P<words>[^\d<\n]{0,30})<!--=(?P<name>[\w.%-]+)-->"
+)
+
+
+class Measurement(NamedTuple):
+    """A command, the JSON file that it leaves in ``{out}``, and what its numbers depend on."""
+
+    command: str
+    file: str
+    depends: tuple[str, ...]
+
+
+MEASUREMENTS: Final = {
+    "race": Measurement("bayesrace race --out {out}", "result.json", _RACE),
+    "f1tenth": Measurement("bayesrace race --car f1tenth --out {out}", "result.json", _RACE),
+    "ethz": Measurement(
+        "bayesrace race --track {tracks}/ethz.csv --train-track {tracks}/ethzmobil.csv --out {out}",
+        "result.json", _RACE,
+    ),
+    "ethzmobil": Measurement(
+        "bayesrace race --track {tracks}/ethzmobil.csv --train-track {tracks}/ethz.csv --out {out}",
+        "result.json", _RACE,
+    ),
+    "bench": Measurement("bayesrace bench --json {out}/bench.json", "bench.json", _STEP),
+    "latency50": Measurement(
+        "bayesrace latency --rate 50 --json {out}/latency.json", "latency.json",
+        (*_STEP, "controller", "plant"),
+    ),
+    "latency500": Measurement(
+        "bayesrace latency --rate 500 --json {out}/latency.json", "latency.json",
+        (*_STEP, "controller", "plant"),
+    ),
+    "paper": Measurement(
+        "bayesrace paper --tracks {tracks} --data {data} --out {out}", "numbers.json",
+        (*_RACE, "studies/paper"),
+    ),
+}  # fmt: skip
+"""``{tracks}`` and ``{data}``: the paper's own files, by --tracks and --data."""
+
+
+def facts() -> dict[str, Any]:
+    """What can be counted in the tree."""
+    from tests.takeover.spoilt_weights import SPOILT
+    from tests.test_sensor_faults import FAULTS
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    return {
+        "controller_packages": len(project["dependencies"]),
+        "spoilt_weights": len(SPOILT),
+        "sensor_faults": len(FAULTS),
+    }
+
+
+@dataclass
+class Measured:
+    """One measurement in docs/numbers.json."""
+
+    command: str
+    commit: str
+    date: str
+    machine: str
+    depends: list[str]
+    numbers: dict[str, float] = field(default_factory=dict)
+
+
+def flat(value: Any, path: str = "") -> Iterator[tuple[str, float]]:
+    """The numbers of a JSON value with their paths."""
+    if isinstance(value, bool):
+        return
+    if isinstance(value, int | float):
+        yield path, value
+        return
+    items: list[tuple[str, Any]] = []
+    if isinstance(value, dict):
+        items = list(value.items())
+    elif isinstance(value, list):
+        items = [(_key(one, place), one) for place, one in enumerate(value)]
+    for key, one in items:
+        yield from flat(one, f"{path}.{key}" if path else key)
+
+
+def _key(item: Any, place: int) -> str:
+    """How an item of a list is named."""
+    if isinstance(item, dict):
+        for name in ("controller", "name"):
+            if isinstance(item.get(name), str):
+                number = item.get("number")
+                words = item[name] if number is None else f"{item[name]}-{number}"
+                return re.sub(r"[^\w%-]+", "-", words)
+    return str(place)
+
+
+def pages() -> list[Path]:
+    """README and docs, without decisions, which are dated."""
+    return [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def wanted() -> dict[str, set[str]]:
+    """Names that the pages use, by their measurement."""
+    names: dict[str, set[str]] = {}
+    for page in pages():
+        for found in re.finditer(r"<!--=([\w.%-]+)-->", page.read_text()):
+            measurement, _, path = found[1].partition(".")
+            names.setdefault(measurement, set()).add(path)
+    return names
+
+
+def read() -> dict[str, Measured]:
+    """docs/numbers.json."""
+    if not FILE.is_file():
+        return {}
+    return {name: Measured(**content) for name, content in json.loads(FILE.read_text()).items()}
+
+
+def known() -> Callable[[str], float]:
+    """Looks up a number by its whole name; KeyError if there is none."""
+    measured, counted = read(), dict(flat(facts()))
+
+    def look_up(name: str) -> float:
+        measurement, _, path = name.partition(".")
+        return counted[path] if measurement == "facts" else measured[measurement].numbers[path]
+
+    return look_up
+
+
+def _git(*words: str) -> str:
+    done = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True)
+    return done.stdout.strip()
+
+
+def _machine() -> str:
+    """Processor, number of CPUs, kernel."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.is_file() else []
+    model = next((line.split(":")[1].strip() for line in lines if "model name" in line), "")
+    count = sum("processor" in line for line in lines)
+    return f"{model or platform.machine()}, {count} CPUs, Linux {platform.release()}"
+
+
+def measure(names: list[str], given: dict[str, str]) -> None:
+    """Runs the commands and writes their numbers, those that the pages use."""
+    if _git("status", "--porcelain", "--untracked-files=no"):
+        sys.exit("numbers: commit first, so that the numbers have a commit")
+    for name in names or list(MEASUREMENTS):
+        one, out = MEASUREMENTS[name], _RAW / name
+        if any(f"{{{key}}}" in one.command and not value for key, value in given.items()):
+            print(f"{name}: left out, it needs --tracks and --data")
+            continue
+        subprocess.run(["rm", "-rf", str(out)], check=True)
+        out.mkdir(parents=True)
+        words = [part.format(out=out, **given) for part in shlex.split(one.command)]
+        print(f"{name}: {shlex.join(words)}", flush=True)
+        subprocess.run([Path(sys.executable).parent / words[0], *words[1:]], check=True)
+        content = Measured(
+            command=one.command.replace(" --out {out}", "").replace("{out}/", ""),
+            commit=_git("rev-parse", "--short", "HEAD"),
+            date=datetime.now(UTC).date().isoformat(),
+            machine=_machine(),
+            depends=list(one.depends),
+        )
+        take(name, content)
+
+
+def take(name: str, content: Measured) -> None:
+    """Writes those numbers of a measurement that the pages use."""
+    raw = json.loads((_RAW / name / MEASUREMENTS[name].file).read_text())
+    found = dict(flat(raw))
+    paths = sorted(wanted().get(name, set()))
+    content.numbers = {path: found[path] for path in paths if path in found}
+    for path in set(paths) - set(found):
+        print(f"{name}: its command writes no '{path}'")
+    everything = read() | {name: content}
+    text = {key: asdict(one) for key, one in sorted(everything.items())}
+    FILE.write_text(json.dumps(text, indent=1) + "\n")
+
+
+def _shown(value: float, like: str) -> str:
+    """The number with the decimals of another."""
+    digits = like.replace(" ", "").replace("−", "-")
+    decimals = len(digits.partition(".")[2])
+    if "e" in digits:
+        return f"{value:.0e}".replace("e-0", "e-").replace("e+0", "e")
+    sign = "+" if digits.startswith("+") else ""
+    text = f"{value:{sign}.{decimals}f}"
+    return text.replace("-", "−") if "−" in like else text
+
+
+def fill(write: bool) -> list[str]:
+    """Differences between pages and file; ``write``: puts the file's numbers into the pages."""
+    look_up, faults = known(), []
+    for page in pages():
+        text, marked = page.read_text(), 0
+
+        def replaced(found: re.Match[str], page: Path = page) -> str:
+            nonlocal marked
+            marked += 1
+            try:
+                number = _shown(look_up(found["name"]), found["number"])
+            except KeyError:
+                faults.append(f"{page.name}: no number is called '{found['name']}'")
+                return found[0]
+            if number != found["number"]:
+                faults.append(f"{page.name}: {found['name']} is {number}, not {found['number']}")
+            return f"{number}{found['words']}<!--={found['name']}-->"
+
+        new = _MARKED.sub(replaced, text)
+        if (count := text.count("<!--=")) != marked:
+            faults.append(f"{page.name}: {count - marked} marks have no number before them")
+        if write and new != text:
+            page.write_text(new)
+    return faults
+
+
+def older() -> list[str]:
+    """Measurements whose commit is behind changes of what they depend on."""
+    lines = []
+    for name, one in read().items():
+        try:
+            log = _git("log", "--oneline", f"{one.commit}..HEAD", "--", *one.depends)
+        except subprocess.CalledProcessError:
+            log = "its commit is not in this history"
+        if log:
+            count = len(log.splitlines())
+            lines.append(f"{name}: measured at {one.commit} ({one.date}), {count} commits ago")
+    return lines
+
+
+def main() -> int:
+    """The program; returns its exit code."""
+    parser = argparse.ArgumentParser(prog="benchmarks.numbers", description=__doc__)
+    parser.add_argument("action", choices=("measure", "fill", "check"))
+    parser.add_argument("names", nargs="*", metavar="NAME", help="measurements; default: all")
+    parser.add_argument("--tracks", default="", help="folder of the paper's tracks")
+    parser.add_argument("--data", default="", help="folder of the paper's data")
+    given = parser.parse_args()
+    if given.action == "measure":
+        measure(given.names, {"tracks": given.tracks, "data": given.data})
+        return 0
+    faults = fill(write=given.action == "fill")
+    if given.action == "fill":
+        faults = [fault for fault in faults if " is " not in fault]
+    for line in older():
+        print(f"older than what it depends on: {line}")
+    for fault in faults:
+        print(fault)
+    return 1 if faults else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
