@@ -169,7 +169,7 @@ def _take_over(rig: Rig) -> None:
     _log.info("taken over after %.2f s, at %.2f m/s", waited_s, acted.x[3])
     speeds = [one.x[3] for one in journey.between(killed_ns, acted.source_time_ns)]
     assert speeds[-1] < max(speeds)  # by how much depends on how fast the successor starts
-    assert plant_counters["braked"] > 0
+    assert plant_counters["planned"] + plant_counters["braked"] > 0
     assert plant_counters["refused"] == plant_counters["rejected"] == 0
     # It takes the car as it finds it.
     assert counters["raised"] == counters["states_stale"] == counters["refused"] == 0
@@ -358,7 +358,7 @@ def _assert_went_on(
     rig.observer.stop()
     for program in programs:
         program.end()
-    assert counters["braked"] > 0
+    assert counters["planned"] + counters["braked"] > 0
     assert counters["refused"] == counters["rejected"] == 0
     journey = rig.journey()
     meanwhile = journey.between(broken_ns, joined_ns)
