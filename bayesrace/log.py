@@ -11,6 +11,7 @@ import struct
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -26,11 +27,11 @@ from mcap.writer import Writer
 
 from bayesrace.errors import InputError
 from bayesrace.messages import (
-    ACTUATION,
-    STATE,
-    TELEMETRY,
     TOPICS,
+    Actuation,
     Message,
+    State,
+    Telemetry,
     Topic,
     decode,
     decode_json,
@@ -75,23 +76,20 @@ class _CarClock:
         self._run: tuple[int, int] | None = None
         self._begin_ns = self._newest_ns = self._decided_ns = 0
 
-    def time_ns(self, topic: Topic[Any] | None, data: bytes, wall_ns: int) -> int:
+    def time_ns(self, message: Message | None, wall_ns: int) -> int:
         """Of a state its own time, of actuation and telemetry that of the decision; of all else the
         newest state's. ``wall_ns``: calendar time of its arrival."""
         self._newest_ns = self._newest_ns or wall_ns
-        if topic is TELEMETRY:  # follows its actuation, from the same process
+        if isinstance(message, Telemetry):  # follows its actuation, from the same process
             return self._decided_ns or self._newest_ns
-        if topic is not STATE and topic is not ACTUATION:
+        if not isinstance(message, State | Actuation):
             return self._newest_ns
-        try:
-            message = decode(topic.message, data)
-        except InputError:
-            return self._newest_ns
-        run, state = (message.epoch, message.run), topic is STATE
-        own_ns: int = round(1e9 * (message.time_s if state else message.decided_at_s))
+        run = message.epoch, message.run
+        own_s = message.time_s if isinstance(message, State) else message.decided_at_s
+        own_ns = round(1e9 * own_s)
         time_ns = self._begin_ns + own_ns
         goes_on = run == self._run and abs(time_ns - self._newest_ns) <= _LONGEST_GAP_NS
-        if not state:  # it can overtake the first state of a run
+        if isinstance(message, Actuation):  # it can overtake the first state of a run
             self._decided_ns = time_ns if goes_on else self._newest_ns
             return self._decided_ns
         if not goes_on:
@@ -129,20 +127,26 @@ class LogWriter:
         """A named map of texts, such as the settings or the manifest."""
         self._writer.add_metadata(name, dict(values))
 
-    def write(self, key: str, data: bytes, received_ns: int, seq: int = 0) -> None:
-        """One message as received on ``key`` at monotonic time ``received_ns``."""
-        topic = topic_of(key)
-        text = None if topic is None else to_json(topic.message, data)
-        place = key, text is None
+    def write(self, key: str, data: bytes, received_ns: int) -> int | None:
+        """One message as received on ``key`` at monotonic time ``received_ns``.
+
+        Returns its number; None if it is not a message of the key's topic.
+        """
+        topic, message = topic_of(key), None
+        with suppress(InputError):
+            message = decode(topic.message, data) if topic else None
+        place = key, message is None
         if place not in self._channels:
-            encoding = "msgpack" if text is None else "json"
-            schema = 0 if topic is None or text is None else self._schema(topic.message)
+            encoding = "msgpack" if message is None else "json"
+            schema = 0 if message is None else self._schema(type(message))
             self._channels[place] = self._writer.register_channel(key, encoding, schema)
         wall_ns = self._epoch_ns + received_ns
-        time_ns = self._clock.time_ns(topic, data, wall_ns)
-        self._writer.add_message(
-            self._channels[place], time_ns, data if text is None else text, wall_ns, seq
-        )
+        time_ns = self._clock.time_ns(message, wall_ns)
+        seq = None if message is None else message.seq
+        content = data if message is None else to_json(message)
+        number = 0 if seq is None else seq & 0xFFFFFFFF
+        self._writer.add_message(self._channels[place], time_ns, content, wall_ns, number)
+        return seq
 
     def _schema(self, kind: type[Message]) -> int:
         name = kind.__name__

@@ -17,7 +17,6 @@ import zenoh
 from bayesrace.errors import InputError
 from bayesrace.log import LogWriter, topic_of
 from bayesrace.messages import EVENT, EVERYTHING, HEARTBEAT, Event, car_key, encode
-from bayesrace.messages.codec import peek_seq
 from bayesrace.transport.numbering import Numbering
 
 __all__ = ["FLUSH_PERIOD_S", "Recorder", "RecorderCounters"]
@@ -44,7 +43,7 @@ class RecorderCounters:
     missing: int = 0
     """Messages that were sent, by their numbers (:class:`.Numbering`), and did not arrive."""
     unnumbered: int = 0
-    """Messages without a readable number; they are written all the same."""
+    """What is not a message of its key's topic; it is written all the same."""
     unrecorded: int = 0
     """Messages that are not written, since they came on too many keys that are not in the table."""
 
@@ -160,12 +159,11 @@ class Recorder:
                 self.counters.unrecorded += 1
                 return
             self._other_keys.add(key)
-        seq = peek_seq(data)
         if self.failed:
             return
         try:
             with self._lock:
-                self._writer.write(key, data, now_ns, 0 if seq is None else seq & 0xFFFFFFFF)
+                seq = self._writer.write(key, data, now_ns)
             self._count(key, seq)
         except Exception as error:
             self._fail(error)

@@ -290,7 +290,7 @@ class _Messages:
 
     def write(self, topic: Topic[Any], message: Message, source: str = "") -> None:
         key = car_key(topic.key, self._car, source)
-        self._log.write(key, encode(message), message.source_time_ns, message.seq)
+        self._log.write(key, encode(message), message.source_time_ns)
 
     def begins(self, plan: RunPlan, weights_version: str) -> None:
         self.write(EVENT, announcement(plan, self._runs, weights_version), "race")

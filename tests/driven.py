@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
 
@@ -42,9 +42,9 @@ def drive(model: Model, count: int, seed: int, substeps: int = 10, vx: float = 1
 
 def blank(kind: type[M], /, **known: Any) -> M:
     """A message of this kind; fields that are not ``known`` are zero or empty."""
-    kinds = get_type_hints(kind, include_extras=True)
+    kinds = get_type_hints(kind)
     names = set(kind.__struct_fields__) - set(known)
-    return kind(**known, **{name: get_args(kinds[name])[0]() for name in names})
+    return kind(**known, **{name: kinds[name]() for name in names})
 
 
 def state(run: int, seq: int, x: Floats, u: Floats, **known: Any) -> State:
@@ -74,9 +74,9 @@ def write_log(
     """A log of one unbroken drive, as a plant's states and, if it is given, their truth."""
     log = LogWriter(path, metadata)
     for one in logged(data, 0):
-        log.write(f"bayesrace/{name}/state", encode(one), 1 + one.seq, one.seq)
+        log.write(f"bayesrace/{name}/state", encode(one), 1 + one.seq)
     for one in [] if truth is None else logged(truth, 0):
         sample = Truth(**{name: getattr(one, name) for name in Truth.__struct_fields__})
-        log.write(f"bayesrace/{name}/truth", encode(sample), 1 + one.seq, one.seq)
+        log.write(f"bayesrace/{name}/truth", encode(sample), 1 + one.seq)
     log.close()
     return path

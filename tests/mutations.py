@@ -10,24 +10,13 @@ from collections.abc import Callable, Iterator
 from typing import Any, Final
 
 import msgpack
+from msgspec import inspect
 
 from bayesrace.gp.weights import encode_weights
-from bayesrace.messages import SERVICES, TOPICS, Message
-from bayesrace.messages.codec import schema_version
-from bayesrace.messages.rules import (
-    Choice,
-    Flag,
-    Integer,
-    Real,
-    Rule,
-    Scalars,
-    Text,
-    Vector,
-    rules_of,
-)
+from bayesrace.messages import SERVICES, TOPICS, Message, schema_version
 from tests.test_gp_weights import BODY, make_weights, reseal
 
-__all__ = ["KINDS", "FRAGMENTS", "MessageMutator", "WeightsMutator", "bombs"]
+__all__ = ["KINDS", "FRAGMENTS", "MessageMutator", "WeightsMutator", "bombs", "values"]
 
 KINDS: Final[tuple[type[Message], ...]] = tuple(
     dict.fromkeys(
@@ -93,6 +82,40 @@ Segments = list[tuple[bytes, bytes]]
 """Name and value of each field as they are on the wire."""
 
 
+def values(kind: type[Message], pick: random.Random) -> dict[str, Any]:
+    """Valid values of a class's fields, by name, at their limits more often than by chance.
+
+    AssertionError if a field has no limits: it would let NaN in, or texts without end.
+    """
+    described = inspect.type_info(kind)
+    assert isinstance(described, inspect.StructType)
+    return {field.name: _value(field.type, pick) for field in described.fields}
+
+
+def _value(form: inspect.Type, pick: random.Random, row: int = 1) -> Any:
+    match form:
+        case inspect.Metadata(extra_json_schema={"enum": words}):
+            return pick.choice(words)
+        case inspect.Metadata(type=inner, extra=extra):
+            return _value(inner, pick, len(extra["names"]) if extra else 1)
+        case inspect.IntType(ge=int() as low, le=int() as high):
+            return pick.choice((low, high, pick.randint(low, high)))
+        case inspect.FloatType(ge=float() as low, le=float() as high):
+            return pick.choice((low, high, max(low, -0.0), pick.uniform(low, high)))
+        case inspect.BoolType():
+            return pick.random() < 0.5
+        case inspect.StrType(max_length=int() as most):
+            return pick.choice(_TEXTS)[:most]
+        case inspect.UnionType(types=kinds):
+            return _value(pick.choice(kinds), pick)
+        case inspect.DictType(value_type=content, max_length=int()):
+            return {f"n{i}": _value(content, pick) for i in range(pick.randint(0, 7))}
+        case inspect.VarTupleType(item_type=number, min_length=least, max_length=int()):
+            count = least or row * pick.choice((0, 1, 3))
+            return tuple(_value(number, pick) for _ in range(count))
+    raise AssertionError(f"{form} without limits")
+
+
 def _wide_map(count: int) -> bytes:
     return bytes([0x80 | count]) if count < 16 else b"\xde" + count.to_bytes(2, "big")
 
@@ -148,7 +171,6 @@ class MessageMutator:
     def __init__(self, seed: int) -> None:
         self._random = random.Random(seed)
         self._damage = _Damage(seed + 1)
-        self._rules = {kind: rules_of(kind) for kind in KINDS}
         self._pool = {kind: [self._segments(kind) for _ in range(40)] for kind in KINDS}
         self._edits: tuple[Callable[[Segments], None], ...] = (
             self._replace, self._replace, self._replace_part, self._replace_part, self._remove,
@@ -181,40 +203,18 @@ class MessageMutator:
 
     def with_each_fragment(self, kind: type[Message]) -> Iterator[bytes]:
         """A message of that kind with one field replaced: each field by each fragment."""
-        for at in range(len(self._rules[kind]) + 1):
+        for at in range(len(kind.__struct_fields__) + 1):
             for fragment in FRAGMENTS:
                 segments = self._segments(kind)
                 segments[at] = (segments[at][0], fragment)
                 yield self._join(segments)
-
-    def value(self, rule: Rule) -> Any:
-        """Something that the rule accepts, its limits more often than by chance."""
-        pick = self._random
-        match rule:
-            case Integer():
-                return pick.choice((rule.low, rule.high, pick.randint(rule.low, rule.high)))
-            case Real():
-                return pick.choice((rule.low, rule.high, pick.uniform(rule.low, rule.high)))
-            case Flag():
-                return pick.random() < 0.5
-            case Text():
-                return pick.choice(_TEXTS)[: rule.longest]
-            case Choice():
-                return pick.choice(rule.words)
-            case Scalars():
-                return {f"n{i}": self._scalar() for i in range(pick.getrandbits(3))}
-            case Vector():
-                rows = 1 if rule.rows is None else pick.choice((0, 1, 3))
-                return [pick.uniform(-rule.limit, rule.limit) for _ in range(rows * rule.length)]
-        raise AssertionError(rule)
 
     def _scalar(self) -> Any:
         pick = self._random
         return pick.choice((True, pick.getrandbits(62), pick.uniform(-1e12, 1e12), "text"))
 
     def _segments(self, kind: type[Message]) -> Segments:
-        values = {name: self.value(rule) for name, rule in self._rules[kind].items()}
-        content = {"schema": schema_version(kind), **values}
+        content = {"schema": schema_version(kind), **values(kind, self._random)}
         return [(msgpack.packb(name), msgpack.packb(value)) for name, value in content.items()]
 
     def _join(self, segments: Segments) -> bytes:

@@ -126,4 +126,4 @@ class Loop:
         self.beats += 1
 
     def _write(self, key: str, message: Message, seq: int) -> None:
-        self.log.write(f"bayesrace/orca/{key}", encode(message), self.sampled_ns(seq), message.seq)
+        self.log.write(f"bayesrace/orca/{key}", encode(message), self.sampled_ns(seq))

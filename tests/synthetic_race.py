@@ -92,7 +92,7 @@ class _Log:
         return self._next[key]
 
     def put(self, key: str, message: Message) -> None:
-        self._writer.write(f"bayesrace/orca/{key}", encode(message), self.now_ns, message.seq)
+        self._writer.write(f"bayesrace/orca/{key}", encode(message), self.now_ns)
 
     def event(self, run: int, source: str, kind: str, text: str, data: dict[str, object]) -> None:
         key = f"event/{source}"

@@ -58,7 +58,7 @@ def state(seq: int) -> State:
 def write(path: Path, count: int = 50) -> None:
     writer = LogWriter(path, {"settings": {"track": "ethz"}})
     for seq in range(count):
-        writer.write(KEY, encode(state(seq)), time.monotonic_ns(), seq)
+        writer.write(KEY, encode(state(seq)), time.monotonic_ns())
     event = Event(
         seq=0,
         source_time_ns=0,
@@ -132,13 +132,13 @@ def test_a_log_that_is_being_written_gives_what_was_added_once(tmp_path: Path) -
     writer = LogWriter(path)
     reader, found = LogReader(path), []
     for seq in range(6):
-        writer.write(KEY, encode(state(seq)), time.monotonic_ns(), seq)
+        writer.write(KEY, encode(state(seq)), time.monotonic_ns())
         if seq % 2:
             writer.flush()
         found.append([entry.message.seq for entry in reader.newer((STATE,))])
         assert reader.truncated
     assert found == [[], [0, 1], [], [2, 3], [], [4, 5]]
-    writer.write(KEY, b"junk", time.monotonic_ns(), 6)
+    writer.write(KEY, b"junk", time.monotonic_ns())
     writer.close()
     for _ in range(2):  # nothing follows the end
         assert list(reader.newer()) == []
@@ -157,7 +157,7 @@ def test_a_log_that_grows_byte_by_byte_gives_each_message_once(tmp_path: Path) -
     path, growing = tmp_path / "whole.mcap", tmp_path / "growing.mcap"
     writer = LogWriter(path)
     for seq in range(4):
-        writer.write(KEY, encode(state(seq)), time.monotonic_ns(), seq)
+        writer.write(KEY, encode(state(seq)), time.monotonic_ns())
         writer.flush()
         if seq == 2:
             begin = path.stat().st_size
@@ -254,7 +254,7 @@ def test_a_log_cut_anywhere_gives_all_that_was_flushed(tmp_path: Path) -> None:
     log = tmp_path / "log.mcap"
     writer, flushed = LogWriter(log, {"settings": {"track": "ethz"}}), [log.stat().st_size]
     for seq in range(20):
-        writer.write(KEY, encode(state(seq)), time.monotonic_ns(), seq)
+        writer.write(KEY, encode(state(seq)), time.monotonic_ns())
         writer.flush()
         flushed.append(log.stat().st_size)
     writer.close()

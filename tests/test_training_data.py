@@ -213,11 +213,11 @@ def test_the_plans_in_a_log_are_not_kept(tmp_path: Path, driven: Dataset) -> Non
     path, plan = write_log(tmp_path / "a.mcap", driven), (0.5,) * 147
     log = LogWriter(tmp_path / "b.mcap")
     for entry in LogReader(path).messages():
-        log.write(entry.key, encode(entry.message), 1, entry.message.seq)
+        log.write(entry.key, encode(entry.message), 1)
     for cycle in range(1000):
         fallback = int(cycle in (3, 4))
         message = replace(telemetry(0, cycle, fallback), plan_x=plan)
-        log.write("bayesrace/orca/telemetry", encode(message), 1, cycle)
+        log.write("bayesrace/orca/telemetry", encode(message), 1)
     log.close()
     tracemalloc.start()
     data = dataset_from_log(tmp_path / "b.mcap", CAR, STEP_S)

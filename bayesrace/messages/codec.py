@@ -1,205 +1,90 @@
-"""Bytes to messages and back: msgpack maps with a schema version, refused unless exactly right.
+"""Messages as bytes: MessagePack between processes, JSON in logs. msgspec reads and writes both.
 
-Nothing here executes what it reads. :func:`decode` returns a message whose every field has passed
-its rule, or raises :class:`InputError`, and nothing else. Input longer than the longest valid
-message of its class is refused unread, so invalid input costs little more time and memory than the
-longest valid one.
-
-msgspec reads what :func:`encode` writes, a state in 1.6 us. It takes an integer for a float, and
-knows neither rows nor maps of scalars; so what it has read counts only if it encodes to the same
-bytes. All else, from other encoders or damaged, is read by msgpack and checked rule by rule, which
-also says what is wrong.
+Nothing here executes what it reads. :func:`decode` and :func:`decode_json` return a message whose
+every field is of its type and within its limits, or raise :class:`InputError`, and nothing else.
+What other encoders write differently is read as well: fields in another order, wider numbers, an
+integer where a float belongs; of a field that occurs twice, the last counts.
 """
 
 import logging
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Callable
+from functools import cache
+from itertools import chain
 from typing import Any, Final, Generic, TypeVar, cast
 
-import msgpack
 import msgspec
+from msgspec import inspect
 
 from bayesrace.errors import InputError
-from bayesrace.messages.rules import (
-    Choice,
-    Integer,
-    Rule,
-    Scalars,
-    Text,
-    Vector,
-    rules_of,
-    wire_bytes,
-)
 from bayesrace.messages.types import Message
 
 __all__ = [
-    "Decoder", "checked", "decode", "encode", "is_readable", "largest_bytes", "peek_seq",
-    "schema_version",
+    "LARGEST_BYTES", "Decoder", "decode", "decode_json", "encode", "json_schema", "schema_version",
+    "to_json",
 ]  # fmt: skip
 
 M = TypeVar("M", bound=Message)
 
-_NAME_HEAD_BYTES: Final = 5
-_UNKNOWN_NAMES: Final = 20
-"""More fields than a message has are still read, to be named in the refusal."""
+LARGEST_BYTES: Final = 1 << 17
+"""Longer input is refused unread: no message is as long."""
 
 _LOG_PERIOD_NS: Final = 1_000_000_000
 """Between two lines of a decoder in the log."""
 
-_MALFORMED: Final = (ValueError, TypeError, OverflowError, msgpack.UnpackException)
-"""What msgpack raises; msgspec's own errors are ValueErrors."""
-
-
-@dataclass(frozen=True)
-class _Spec:
-    """A message class prepared for fast coding."""
-
-    schema: int
-    keys: frozenset[str]
-    """Names on the wire: ``schema`` and the fields."""
-    read: Callable[[bytes], Any] | None
-    """msgspec's reader; None for a class with a rule of which it knows nothing."""
-    rows: tuple[tuple[str, int], ...]
-    """Vectors of rows, and the length of a row."""
-    checks: tuple[tuple[str, Callable[[Any], Any]], ...]
-    wire_bytes: int
-    """Most bytes of a valid message."""
-    unpack: Callable[[bytes], Any]
-    """msgpack's reader, with limits so that it does not begin to read a larger value."""
-
-
-class _Specs(dict[type[Message], _Spec]):
-    """Makes the specification of a class at its first use."""
-
-    def __missing__(self, kind: type[Message]) -> _Spec:
-        rules = rules_of(kind)
-        content = {"schema": Integer(), **rules}
-        sizes = (_NAME_HEAD_BYTES + len(name) + wire_bytes(rule) for name, rule in content.items())
-        arrays = [rule.most for rule in rules.values() if isinstance(rule, Vector)]
-        maps = [rule.most for rule in rules.values() if isinstance(rule, Scalars)]
-        texts = [wire_bytes(rule) for rule in rules.values() if isinstance(rule, Text | Scalars)]
-        unpack = partial(
-            msgpack.unpackb,
-            object_pairs_hook=_distinct,
-            max_array_len=max(arrays, default=0),
-            max_map_len=max([len(rules) + _UNKNOWN_NAMES, *maps]),
-            max_str_len=max(texts, default=100),
-            max_bin_len=0,
-            max_ext_len=0,
-        )
-        self[kind] = spec = _Spec(
-            schema=schema_version(kind),
-            keys=frozenset(content),
-            read=msgspec.msgpack.Decoder(kind).decode if is_readable(rules) else None,
-            rows=tuple((n, r.length) for n, r in rules.items() if isinstance(r, Vector) and r.rows),
-            checks=tuple((name, rule.check) for name, rule in rules.items()),
-            wire_bytes=_NAME_HEAD_BYTES + sum(sizes),
-            unpack=unpack,
-        )
-        return spec
-
-
-_SPECS: Final = _Specs()
-
-
-def is_readable(rules: Mapping[str, Rule]) -> bool:
-    """Whether msgspec checks all of these rules; of vectors of rows it checks the length alone."""
-    return not any(isinstance(rule, Choice | Scalars) for rule in rules.values())
-
-
-def _distinct(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
-    mapping = dict(pairs)
-    if len(mapping) != len(pairs):
-        raise ValueError("a name occurs twice")
-    return mapping
-
 
 def _plain(value: Any) -> Any:
-    """msgspec's fallback: NumPy's floats become floats, read-only maps become maps; anything else
-    is a programming error."""
+    """NumPy's floats and texts as Python's; anything else is a programming error."""
     for kind in (float, int, str):
         if isinstance(value, kind):
             return kind(value)
-    if hasattr(value, "items"):
-        return dict(value)
     raise TypeError(f"a {type(value).__name__} cannot be part of a message")
 
 
 _encode: Final = msgspec.msgpack.Encoder(enc_hook=_plain).encode
+_encode_json: Final = msgspec.json.Encoder(enc_hook=_plain).encode
+_decode_json: Final = msgspec.json.Decoder().decode
 
 
 def encode(message: Message) -> bytes:
-    """The message as a msgpack map, fields in the order of the class after ``schema``."""
+    """The message as a MessagePack map, fields in the order of the class after ``schema``."""
     return _encode(message)
 
 
-def schema_version(kind: type[Message]) -> int:
-    """The version of a class's fields."""
-    return cast(int, kind.__struct_config__.tag)
+@cache
+def _reader(kind: type[Message]) -> Callable[[bytes], Any]:
+    return msgspec.msgpack.Decoder(kind, strict=True).decode
 
 
 def decode(kind: type[M], data: bytes) -> M:
     """The message of class ``kind`` in ``data``.
 
-    Raises InputError for anything but exactly one such message: other bytes, another schema
-    version, a missing, repeated or unknown field, a value of another type, length or range.
+    Raises InputError for anything but one such message: other bytes, another schema version, a
+    missing or unknown field, a value of another type, length or range.
     """
-    spec, title = _SPECS[kind], kind.__name__
-    if len(data) > spec.wire_bytes:
-        raise InputError(f"{title}: {len(data)} bytes, at most {spec.wire_bytes} allowed")
-    message: M | None = _read(spec, data)
-    if message is not None:
-        return message
+    if len(data) > LARGEST_BYTES:
+        raise InputError(f"{kind.__name__}: {len(data)} bytes, at most {LARGEST_BYTES} allowed")
     try:
-        content = spec.unpack(data)
-    except _MALFORMED as error:
-        raise InputError(f"{title}: not a message ({error or 'malformed'})") from None
-    return checked(kind, content)
+        return cast(M, _reader(kind)(data))
+    except ValueError as error:
+        raise _refusal(kind, error) from None
 
 
-def _read(spec: _Spec, data: bytes) -> Any:
-    """The message, if the bytes are exactly those that :func:`encode` makes of one."""
-    if spec.read is None:
-        return None
-    try:
-        message = spec.read(data)
-    except _MALFORMED:
-        return None
-    whole = all(len(getattr(message, name)) % length == 0 for name, length in spec.rows)
-    return message if whole and _encode(message) == data else None
-
-
-def checked(kind: type[M], content: Any) -> M:
-    """The message of class ``kind`` with this content, a map of its fields and its schema version.
-
-    Raises InputError for anything else.
-    """
-    spec, title = _SPECS[kind], kind.__name__
-    if type(content) is not dict:
-        raise InputError(f"{title}: not a message (no map)")
-    version = content.get("schema", spec.schema)  # first: it explains other fields
-    if type(version) is not int or version != spec.schema:
-        raise InputError(
-            f"{title}: schema version {version!r:.40}, this program reads "
-            f"{spec.schema}; use the same release on both sides"
+def _refusal(kind: type[Message], error: Exception) -> InputError:
+    """What is wrong, in printable characters: it may name fields from outside."""
+    reason = str(error) if isinstance(error, ValueError) else repr(error)
+    reason = "".join(one if one.isprintable() else "?" for one in reason[:200])
+    if reason.endswith("`$.schema`"):
+        reason += (
+            f"; this program reads schema version {schema_version(kind)}, use the same release on "
+            "both sides"
         )
-    if content.keys() != spec.keys:
-        odd = sorted(repr(name)[:40] for name in content.keys() ^ spec.keys)
-        raise InputError(f"{title}: missing or unknown fields: {', '.join(odd[:5])}")
-    values = {}
-    for name, check in spec.checks:
-        try:
-            values[name] = check(content[name])
-        except ValueError as error:
-            raise InputError(f"{title}.{name}: {error}") from None
-    return kind(**values)
+    return InputError(f"{kind.__name__}: {reason}")
 
 
-def largest_bytes(kind: type[Message]) -> int:
-    """Most bytes of a valid message of class ``kind``; longer input is refused unread."""
-    return _SPECS[kind].wire_bytes
+def schema_version(kind: type[Message]) -> int:
+    """The version of a class's fields."""
+    return cast(int, kind.__struct_config__.tag)
 
 
 class Decoder(Generic[M]):
@@ -239,19 +124,55 @@ class Decoder(Generic[M]):
             self._logged, self._next_log_ns = self.refused, now_ns + _LOG_PERIOD_NS
 
 
-def peek_seq(data: bytes) -> int | None:
-    """The ``seq`` of an encoded message without decoding it, for counting; None if it has none.
+@cache
+def _named(kind: type[Message]) -> tuple[tuple[str, tuple[str, ...], bool], ...]:
+    """Vectors whose numbers have names in JSON: field, names, whether it has rows of them."""
+    described = cast(inspect.StructType, inspect.type_info(kind))
+    return tuple(
+        (field.name, field.type.extra["names"], cast(Any, field.type.type).min_length is None)
+        for field in described.fields
+        if isinstance(field.type, inspect.Metadata) and field.type.extra
+    )
 
-    Looks where :func:`encode` puts it, so another encoder's field order gives None.
-    """
-    at = data.find(b"\xa3seq", 0, 24) + 4
-    if at < 4 or at >= len(data):
-        return None
-    code = data[at]
-    if code < 0x80:
-        return code
-    if not 0xCC <= code <= 0xCF:
-        return None
-    size = 1 << (code - 0xCC)
-    number = data[at + 1 : at + 1 + size]
-    return int.from_bytes(number, "big") if len(number) == size else None
+
+def to_json(message: Message) -> bytes:
+    """The message in the form of :func:`json_schema`: the same fields, with names for the numbers
+    of states and inputs; rows of them become columns. Floats keep their bits."""
+    content = {"schema": schema_version(type(message)), **msgspec.structs.asdict(message)}
+    for field, names, rows in _named(type(message)):
+        numbers = content[field]
+        columns = (numbers[i :: len(names)] for i in range(len(names))) if rows else numbers
+        content[field] = dict(zip(names, columns, strict=True))
+    return _encode_json(content)
+
+
+def decode_json(kind: type[M], data: bytes) -> M:
+    """The message of class ``kind`` whose JSON is ``data``, checked as :func:`decode` checks."""
+    try:
+        content = _decode_json(data)
+        for field, names, rows in _named(kind):
+            columns = [content[field][name] for name in names]
+            numbers = chain.from_iterable(zip(*columns, strict=True)) if rows else columns
+            content[field] = list(numbers)
+        return msgspec.convert(content, kind, strict=True)
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        raise _refusal(kind, error) from None
+
+
+def json_schema(kind: type[Message]) -> dict[str, Any]:
+    """JSON schema of a class of messages, in the subset that viewers such as Foxglove read:
+    every value has one type, every object its properties."""
+    schema: dict[str, Any] = msgspec.json.schema(kind)["$defs"][kind.__name__]
+    schema["description"] = schema["description"].split("\n")[0]
+    properties = schema["properties"]
+    properties["schema"] = {"type": "integer", "const": schema_version(kind)}
+    for field, names, rows in _named(kind):
+        number, most = properties[field]["items"], properties[field]["maxItems"] // len(names)
+        column = {"type": "array", "items": number, "maxItems": most}
+        properties[field] = {
+            "type": "object",
+            "properties": dict.fromkeys(names, column if rows else number),
+            "required": list(names),
+            "additionalProperties": False,
+        }
+    return schema

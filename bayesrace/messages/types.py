@@ -1,31 +1,23 @@
-"""The message types: immutable structures of msgspec, each field with its rule.
+"""The message types: immutable structures of msgspec, each field with its type and its limits.
+
+Numbers have a range, which NaN is never in; texts, arrays and maps have a largest length. The
+``tag`` of a class is its schema version.
 
 Clocks: ``source_time_ns`` is the sender's ``time.monotonic_ns()``, comparable only between
 processes of one machine. ``time_s`` is plant time, which starts with the run; plant and controller
 express all delays in it.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Final
 
-from msgspec import Struct
+from msgspec import Meta, Struct
 
-from bayesrace.messages.rules import (
-    Choice,
-    Flag,
-    Integer,
-    Real,
-    Scalar,
-    Scalars,
-    Text,
-    Vector,
-    meta,
-)
 from bayesrace.native_interface import BRAKING_ROWS, FAULTS
 
 __all__ = [
     "END_REASONS", "PHASES", "SENSOR_FAULTS", "Actuation", "BrakingPlan", "CarSample", "Command",
-    "Event", "Message", "Reply", "RollbackRequest", "RunRequest", "State", "Status",
+    "Event", "Message", "Reply", "RollbackRequest", "RunRequest", "Scalar", "State", "Status",
     "StatusRequest", "StopRequest", "Telemetry", "Truth",
 ]  # fmt: skip
 
@@ -45,19 +37,52 @@ PHASES: Final = ("idle", "running", "waiting", "ready", "driving", "fallback", "
 SENSOR_FAULTS: Final = ("", *(name.lower() for name, _ in FAULTS[1:]))
 """What can speak against a measured state, in the order of the native interface."""
 
-Count = Annotated[int, meta(Integer())]
-Signed = Annotated[int, meta(Integer(-(2**31), 2**31 - 1))]
-Seconds = Annotated[float, meta(Real(0.0, 1e9))]
-Number = Annotated[float, meta(Real(-1e6, 1e6))]
-Width = Annotated[float, meta(Real(0.0, 1e3))]
-Short = Annotated[str, meta(Text(200))]
-Long = Annotated[str, meta(Text(2000))]
-DataMap = Annotated[Mapping[str, Scalar], meta(Scalars())]
+
+def _one_of(words: Sequence[str]) -> Meta:
+    """Limits a text to one of these words."""
+    # Not Literal, which cannot be computed and whose refusal does not name the words.
+    # In Python, $ alone would match before a line break at the end, too.
+    pattern = rf"^(?:{'|'.join(words)})(?!\n)$"
+    return Meta(pattern=pattern, extra_json_schema={"enum": list(words)})
+
+
+def _vector(*names: str, rows: int | None = None) -> Meta:
+    """Limits an array to one number for each name, or to ``rows`` rows of them, row by row.
+
+    The names are those of the numbers in JSON. ``__post_init__`` checks that rows are whole.
+    """
+    least = None if rows else len(names)
+    return Meta(min_length=least, max_length=len(names) * (rows or 1), extra={"names": names})
+
+
+Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+Signed = Annotated[int, Meta(ge=-(2**31), le=2**31 - 1)]
+Seconds = Annotated[float, Meta(ge=0.0, le=1e9)]
+Delay = Annotated[float, Meta(ge=0.0, le=1e3)]
+Number = Annotated[float, Meta(ge=-1e6, le=1e6)]
+Width = Annotated[float, Meta(ge=0.0, le=1e3)]
+Measure = Annotated[float, Meta(ge=-1.0, le=1e12)]
+Short = Annotated[str, Meta(max_length=200)]
+Long = Annotated[str, Meta(max_length=2000)]
+StatusCode = Annotated[int, Meta(ge=0, le=255)]
+
+Scalar = (
+    bool
+    | Annotated[int, Meta(ge=1 - 2**63, le=2**63 - 1)]
+    | Annotated[float, Meta(ge=-1e12, le=1e12)]
+    | Long
+)
+"""Value in the data map of an event or a reply."""
+DataMap = Annotated[
+    Mapping[Annotated[str, Meta(max_length=100)], Scalar],
+    Meta(max_length=200, extra_json_schema={"properties": {}}),
+]
 
 _CAR_STATE: Final = ("x", "y", "psi", "vx", "vy", "omega", "delta")
 _INPUT: Final = ("d", "delta_rate")
-CarState = Annotated[tuple[Number, ...], meta(Vector(7, names=_CAR_STATE))]
-Input = Annotated[tuple[Number, ...], meta(Vector(2, names=_INPUT))]
+_DELAYS: Final = ("state_seq", "arrival_s", "acting_s")
+CarState = Annotated[tuple[Number, ...], _vector(*_CAR_STATE)]
+Input = Annotated[tuple[Number, ...], _vector(*_INPUT)]
 
 
 class Message(
@@ -65,8 +90,7 @@ class Message(
 ):
     """The fields that every message starts with.
 
-    The ``tag`` of a class is its schema version, which msgspec writes before the fields; the
-    decoder refuses any other.
+    msgspec writes the schema version before them, and refuses any other than the class's.
     """
 
     seq: Count
@@ -98,18 +122,21 @@ class State(CarSample, frozen=True, kw_only=True, tag=2):
     The only input of controller and learning.
     """
 
-    lockstep: Annotated[bool, meta(Flag())]
+    lockstep: bool
     """True if the plant waits for the actuation that answers this very message."""
     actuation_delays: Annotated[
-        tuple[Annotated[float, meta(Real(-1e15, 1e15))], ...],
-        meta(Vector(3, rows=64, names=("state_seq", "arrival_s", "acting_s"))),
+        tuple[Annotated[float, Meta(ge=-1e15, le=1e15)], ...], _vector(*_DELAYS, rows=64)
     ]
     """Delays of the actuations received since the previous state, row by row: ``seq`` of the state
     that each answers, time from that state to the actuation's arrival [s], and from its
     ``decided_at_s`` to its application [s] (-1: superseded, never applied). Empty in lockstep."""
-    final: Annotated[bool, meta(Flag())]
+    final: bool
     """True in the last state of a run: no answer to it is applied. After a fault of the plant it
     repeats the previous state with its time."""
+
+    def __post_init__(self) -> None:
+        if len(self.actuation_delays) % len(_DELAYS):
+            raise ValueError("actuation_delays: not whole rows of 3")
 
 
 class Truth(CarSample, frozen=True, kw_only=True):
@@ -130,11 +157,11 @@ class Actuation(Message, frozen=True, kw_only=True, tag=2):
     """Plant time at which the controller decided on the input: in lockstep ``time_s`` of the state;
     in real time the controller's estimate, from the arrival times of the states, of the plant time
     when its cycle began."""
-    u: Annotated[tuple[Annotated[float, meta(Real(-1e3, 1e3))], ...], meta(Vector(2, names=_INPUT))]
+    u: Annotated[tuple[Annotated[float, Meta(ge=-1e3, le=1e3)], ...], _vector(*_INPUT)]
     """d [command], delta_rate [rad/s]; the plant applies the car's own, narrower limits."""
     weights_version: Short
     """Version of the GP weights in use; empty without any."""
-    status: Annotated[int, meta(Integer(0, 255))]
+    status: StatusCode
     """Status code of the controller's step; 0: converged."""
 
 
@@ -143,10 +170,10 @@ class Telemetry(Message, frozen=True, kw_only=True, tag=5):
 
     run: Count
     state_seq: Count
-    status: Annotated[int, meta(Integer(0, 255))]
-    fallback: Annotated[int, meta(Integer(0, 9))]
+    status: StatusCode
+    fallback: Annotated[int, Meta(ge=0, le=9)]
     """0 solution, 1 shifted previous plan, 2 braking with the last safe steering, 3 stop."""
-    iterations: Annotated[int, meta(Integer(0, 100_000))]
+    iterations: Annotated[int, Meta(ge=0, le=100_000)]
     tick: Count
     """Number of the cycle's release since the process started; missing numbers are releases passed
     over. A late cycle, which answers a state that came after its window, has that of the cycle
@@ -155,7 +182,7 @@ class Telemetry(Message, frozen=True, kw_only=True, tag=5):
     """Monotonic clock when the cycle began, with its state received."""
     received_ns: Count
     """Monotonic clock when the control thread received the state."""
-    missed: Annotated[bool, meta(Flag())]
+    missed: bool
     """The actuation was sent after the deadline, the next release."""
     wake_us: Seconds
     """Wake-up error before this cycle [us, as all below]; 0 in lockstep and of a late cycle."""
@@ -167,43 +194,47 @@ class Telemetry(Message, frozen=True, kw_only=True, tag=5):
     """Feedback phase: execution time of the controller's step."""
     encode_us: Seconds
     """Encoding and sending the actuation."""
-    delay_s: Annotated[float, meta(Real(0.0, 1e3))]
+    delay_s: Delay
     """Delay from ``Actuation.decided_at_s`` to application, over which the state is predicted; 0
     without."""
-    plan_x: Annotated[tuple[Number, ...], meta(Vector(7, rows=501, names=_CAR_STATE))]
+    plan_x: Annotated[tuple[Number, ...], _vector(*_CAR_STATE, rows=501)]
     """Predicted states row by row, N + 1 rows of 7, to 1e-6; empty without a prediction."""
-    plan_u: Annotated[tuple[Number, ...], meta(Vector(2, rows=500, names=_INPUT))]
+    plan_u: Annotated[tuple[Number, ...], _vector(*_INPUT, rows=500)]
     """Planned inputs row by row, N rows of 2, to 1e-6."""
-    tube_m: Annotated[tuple[Number, ...], meta(Vector(1, rows=500))]
+    tube_m: Annotated[tuple[Number, ...], Meta(max_length=500)]
     """By how much the car may be off to either side at the plan's stages 1 to N, at the probability
     that the controller is set to, because its model is uncertain; empty without a prediction."""
-    pace: Annotated[float, meta(Real(0.0, 1.0))]
+    pace: Annotated[float, Meta(ge=0.0, le=1.0)]
     """Speed of the reference as a share of the racing line's; below 1 where the model is too
     uncertain about the plan."""
-    widening: Annotated[float, meta(Real(0.0, 1e6))]
+    widening: Annotated[float, Meta(ge=0.0, le=1e6)]
     """Factor by which the model's standard deviations have been widened because its one-step errors
     exceeded them; 1 where they cover these."""
-    residual_dynamics: Annotated[float, meta(Real(-1.0, 1e12))]
+    residual_dynamics: Measure
     """Largest dynamics defect of the plan; -1: unknown or not finite (as below)."""
-    residual_bounds: Annotated[float, meta(Real(-1.0, 1e12))]
+    residual_bounds: Measure
     """Largest violation of a bound."""
-    residual_stationarity: Annotated[float, meta(Real(-1.0, 1e12))]
+    residual_stationarity: Measure
     """Norm of the gradient of the Lagrangian."""
-    cost: Annotated[float, meta(Real(-1.0, 1e12))]
+    cost: Measure
     """Objective of the plan."""
-    cost_shifted: Annotated[float, meta(Real(-1.0, 1e12))]
+    cost_shifted: Measure
     """Objective of the shifted previous plan for the same state and reference; a plan that costs
     much more has jumped to another local minimum."""
-    second_start: Annotated[int, meta(Integer(0, 2))]
+    second_start: Annotated[int, Meta(ge=0, le=2)]
     """1: the previous plan was doubtful, and a second start gave no better one; 2: the plan of the
     second start is used."""
     s_ref_m: Number
     """Arc length of the reference point on the racing line."""
     n_ref_m: Number
     """Lateral offset from the racing line, positive to the left."""
-    sensor_fault: Annotated[str, meta(Choice(SENSOR_FAULTS))]
+    sensor_fault: Annotated[str, _one_of(SENSOR_FAULTS)]
     """What speaks against the measured state, in whose place the model's prediction counts; empty:
     nothing (:data:`bayesrace.native_interface.FAULTS`)."""
+
+    def __post_init__(self) -> None:
+        if len(self.plan_x) % len(_CAR_STATE) or len(self.plan_u) % len(_INPUT):
+            raise ValueError("plan_x, plan_u: not whole rows of 7, 2")
 
 
 class BrakingPlan(Message, frozen=True, kw_only=True):
@@ -213,13 +244,13 @@ class BrakingPlan(Message, frozen=True, kw_only=True):
 
     epoch: Count
     run: Count
-    begins_s: Annotated[float, meta(Real(0.0, 1e6))]
+    begins_s: Annotated[float, Meta(ge=0.0, le=1e6)]
     """Plant time from which the first row acts."""
-    step_s: Annotated[float, meta(Real(1e-3, 1.0))]
+    step_s: Annotated[float, Meta(ge=1e-3, le=1.0)]
     """Time from one row to the next."""
-    d: Annotated[tuple[Number, ...], meta(Vector(1, rows=BRAKING_ROWS))]
+    d: Annotated[tuple[Number, ...], Meta(max_length=BRAKING_ROWS)]
     """Drive command of each row."""
-    delta: Annotated[tuple[Number, ...], meta(Vector(1, rows=BRAKING_ROWS))]
+    delta: Annotated[tuple[Number, ...], Meta(max_length=BRAKING_ROWS)]
     """Steering angle at the end of each row [rad]."""
 
 
@@ -227,7 +258,7 @@ class Event(Message, frozen=True, kw_only=True):
     """An occurrence for operators and logs, on ``bayesrace/{car}/event/{source}``."""
 
     run: Count
-    source: Annotated[str, meta(Choice(("plant", "controller", "race", "recorder")))]
+    source: Annotated[str, _one_of(("plant", "controller", "race", "recorder"))]
     kind: Short
     text: Long
     data: DataMap
@@ -237,21 +268,21 @@ class RunRequest(Message, frozen=True, kw_only=True):
     """Request on ``bayesrace/{car}/plant/run`` to start a run; the answer is a :class:`Reply`."""
 
     run: Count
-    lockstep: Annotated[bool, meta(Flag())]
+    lockstep: bool
     """True: the plant advances only on the matching actuation; False: in real time."""
     x0: CarState
     """Start state, as in :class:`State`."""
     line_x_m: Number
     line_y_m: Number
-    line_heading_rad: Annotated[float, meta(Real(-1e3, 1e3))]
+    line_heading_rad: Annotated[float, Meta(ge=-1e3, le=1e3)]
     """Direction of driving across the start line."""
     line_left_m: Width
     line_right_m: Width
     """Length of the start line from its point to each side, margin included."""
-    laps: Annotated[int, meta(Integer(0, 100_000))]
+    laps: Annotated[int, Meta(ge=0, le=100_000)]
     """The run ends at this many crossings; 0: no limit."""
-    max_time_s: Annotated[float, meta(Real(0.0, 1e6))]
-    actuation_timeout_s: Annotated[float, meta(Real(0.001, 600.0))]
+    max_time_s: Annotated[float, Meta(ge=0.0, le=1e6)]
+    actuation_timeout_s: Annotated[float, Meta(ge=0.001, le=600.0)]
     """Lockstep: the run ends after so long without an answer. Free-running: the plant brakes when
     its newest actuation is older."""
 
@@ -280,7 +311,7 @@ class RollbackRequest(Message, frozen=True, kw_only=True):
 class Command(Message, frozen=True, kw_only=True):
     """Request on ``bayesrace/{car}/controller/command``; the answer is a :class:`Reply`."""
 
-    command: Annotated[str, meta(Choice(("stop", "go")))]
+    command: Annotated[str, _one_of(("stop", "go"))]
     """stop: brake to standstill and stay there; go: drive (again)."""
     text: Long
     """The reason, for the controller's status."""
@@ -289,7 +320,7 @@ class Command(Message, frozen=True, kw_only=True):
 class Reply(Message, frozen=True, kw_only=True):
     """Answer to a request that changes the state of a process."""
 
-    accepted: Annotated[bool, meta(Flag())]
+    accepted: bool
     text: Long
     """The reason of a refusal, or what follows."""
     data: DataMap
@@ -298,8 +329,8 @@ class Reply(Message, frozen=True, kw_only=True):
 class Status(Message, frozen=True, kw_only=True, tag=2):
     """State of a process, on ``bayesrace/{car}/status/{source}`` at 10 Hz and on request."""
 
-    source: Annotated[str, meta(Choice(("plant", "controller")))]
-    phase: Annotated[str, meta(Choice(PHASES))]
+    source: Annotated[str, _one_of(("plant", "controller"))]
+    phase: Annotated[str, _one_of(PHASES)]
     """plant: idle, running; controller: waiting (for a state), ready (for ``go``), driving,
     fallback, stopped (on command)."""
     epoch: Count
@@ -311,11 +342,11 @@ class Status(Message, frozen=True, kw_only=True, tag=2):
     track: Short
     """Controller: :attr:`bayesrace.tracks.Track.identity` of the track that it drives; empty: a
     plant, or a control law that names none."""
-    rate_hz: Annotated[float, meta(Real(0.0, 1e5))]
+    rate_hz: Annotated[float, Meta(ge=0.0, le=1e5)]
     """Set rate of the loop; 0 in lockstep."""
-    state_age_s: Annotated[float, meta(Real(-1.0, 1e9))]
+    state_age_s: Annotated[float, Meta(ge=-1.0, le=1e9)]
     """Time since the newest state was received (controller) or sent (plant); -1: none yet."""
-    delay_s: Annotated[float, meta(Real(0.0, 1e3))]
+    delay_s: Delay
     """Controller: the measured delay, which it predicts over; plant: the delay set to be added."""
     counters: DataMap
     """All counters since the process started."""
