@@ -27,12 +27,12 @@ CUT = LapTimes((), (), 155)
 
 def verdict(
     laps: LapTimes = LAP, off_m: float = -0.1, level: Level = Level.SOLUTION, every: int = 1,
-    asked: int = 1,
+    asked: int = 1, fault: str = "",
 ) -> Any:  # fmt: skip
     samples: Any = [SimpleNamespace(seq=k, time_s=k * STEP_S) for k in range(COUNT)]
     cycles = Cycles()
     for k in range(0, COUNT - 1, every):
-        message: Any = SimpleNamespace(state_seq=k, fallback=int(level))
+        message: Any = SimpleNamespace(state_seq=k, fallback=int(level), sensor_fault=fault)
         cycles.add(message)
     off_track_m = np.full(COUNT, -0.1)
     off_track_m[200] = off_m
@@ -47,6 +47,7 @@ def verdict(
         (verdict(asked=2), "1 of 2 laps driven"),
         (verdict(off_m=0.24), "1 samples off the track, up to 0.240 m"),
         (verdict(level=Level.STOP, laps=NONE), "for 0.00 of 8.98 s (cycles: 449 stop)"),
+        (verdict(laps=NONE, fault="frozen"), "449 solution; sensor faults: 449 frozen)"),
         (verdict(every=50), "solutions drove the car for 0.90 of 8.98 s (cycles: 9 solution)"),
         (judge([], np.zeros(0), NONE, Cycles(), 1), "there is no state of the run"),
     ],

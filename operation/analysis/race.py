@@ -177,6 +177,7 @@ class DrivenRun:
             speed_max_mps=self._largest(self.record.x[:, 3]),
             solve_us=_percentiles(self.record.solve_us),
             cycles=cycles.counts,
+            sensor_faults=cycles.sensor_faults,
             passed=verdict.passed,
             verdict=verdict.text,
             weights_version=self.record.weights_version,

@@ -72,6 +72,9 @@ class LapResult(_Frozen):
         description="number of the controller's cycles at each level: solution, and of the "
         "fallback shifted_plan, brake, stop"
     )
+    sensor_faults: dict[str, int] = Field(
+        {}, description="number of measured states that the controller did not believe, by kind"
+    )
     passed: bool = Field(
         description="all laps were driven on the track, and by solutions for most of the time"
     )

@@ -31,22 +31,36 @@ class Verdict(NamedTuple):
 
 
 class Cycles:
-    """The controller's cycles in one run: the state that each answered, and at which level."""
+    """The controller's cycles in one run: the state that each answered, what spoke against that
+    state, and at which level the input was found."""
 
     def __init__(self, telemetry: Sequence[Telemetry] = ()) -> None:
         self._levels: dict[int, int] = {}
+        self._faults: dict[int, str] = {}
         for message in telemetry:
             self.add(message)
 
     def add(self, message: Telemetry) -> None:
         """Takes in one cycle; of several for one state the newest counts."""
         self._levels[message.state_seq] = message.fallback
+        self._faults[message.state_seq] = message.sensor_fault
 
     @property
     def counts(self) -> dict[str, int]:
         """Number of cycles by the name of their level, of all levels."""
         found = Counter(self._levels.values())
         return {level.name.lower(): found[level] for level in Level}
+
+    @property
+    def sensor_faults(self) -> dict[str, int]:
+        """Number of states that were not believed, by kind."""
+        return dict(Counter(filter(None, self._faults.values())))
+
+    def __str__(self) -> str:
+        levels = [f"{count} {name}" for name, count in self.counts.items() if count]
+        faults = [f"{count} {name}" for name, count in self.sensor_faults.items()]
+        text = f"cycles: {', '.join(levels) or 'none'}".replace("_", " ")
+        return text + (f"; sensor faults: {', '.join(faults)}" if faults else "")
 
     def driven_s(self, seqs: Sequence[int], time_s: Floats) -> float:
         """Time for which solutions have driven, of a run with these states."""
@@ -81,18 +95,14 @@ def judge(
     time_s = np.array([one.time_s for one in samples])
     lasted_s = float(time_s[-1] - time_s[0])
     driven_s = cycles.driven_s([one.seq for one in samples], time_s)
-    by_level = ", ".join(
-        f"{count} {name.replace('_', ' ')}" for name, count in cycles.counts.items() if count
-    )
-    by_level = f"cycles: {by_level or 'none'}"
     if driven_s < _DRIVEN * lasted_s:
         faults.append(f"solutions drove the car for {driven_s:.2f} of {lasted_s:.2f} s")
     if faults:
-        return Verdict(False, f"failed: {'; '.join(faults)} ({by_level})")
+        return Verdict(False, f"failed: {'; '.join(faults)} ({cycles})")
     times = ", ".join(f"{time:.3f}" for time in laps.times_s)
     count = f"{len(laps.times_s)} lap{'s' if len(laps.times_s) > 1 else ''}"
     done = f"{count} in {times} s" if times else f"{lasted_s:.2f} s driven"
-    return Verdict(True, f"passed: {done}, on the track throughout ({by_level})")
+    return Verdict(True, f"passed: {done}, on the track throughout ({cycles})")
 
 
 def judge_log(log: Path, run: int, track: Track, asked: int) -> Verdict:
