@@ -2,107 +2,72 @@
 
     python -m benchmarks.lockstep [--laps 3] [--rounds 5] [--track NAME|FILE.csv]
 
-The BayesRace controller drives the same laps over and over: over Zenoh, recorded as in a race; over
-Zenoh, unrecorded; in one process, with a log like the race's; in one process without. The four take
-turns, so that what the machine does meanwhile hits all of them. Prints the median real-time factor
-of each, and how many times as fast as the recorded run it is; ends with an error if the states of
-any two runs differ in a bit.
+The controller with learned weights drives the same laps over and over: over Zenoh, recorded as in a
+race, and not recorded; in one process with a log like the race's, and without one. Ends with an
+error if the states of the two logs differ in a bit. The last row is the controller's memory.
 """
 
-import argparse
 import itertools
-import tempfile
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing, nullcontext
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
-from rich.console import Console
 
-from bayesrace.gp.weights import read_weights
 from bayesrace.log import LogReader, LogWriter
 from bayesrace.messages import TRUTH
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import DEFAULT_RACE_TRACK
-from bayesrace.vehicles import DEFAULT_CAR, get_car
-from controller.assembly import compiled_controller
+from bayesrace.vehicles import default_car
+from benchmarks.harness import Row, arguments, controller, in_turn, prepared, ratio, report
 from operation.closed_loop import ClosedLoop
 from operation.drive import RunPlan
-from operation.preparation import Prepared, prepare
-from operation.settings import PreparationSettings
-from operation.system import System, started_system
-from operation.terminal.progress import stages_on
-
-CAR = DEFAULT_CAR
-LIMIT_S = 1000.0
-
-
-def over_zenoh(system: System, prepared: Prepared, laps: int, run: int, log: Path | None) -> float:
-    """Drives a run by two processes, records it if there is a log; its plant time [s]."""
-    plan = RunPlan(run, "bayesrace", laps, LIMIT_S, lockstep=True)
-    with Recorder(system.recording, CAR, log) if log else ExitStack():
-        end = system.drive(prepared.first.track, plan)
-    return float(end.data["time_s"])
-
-
-def states_of(log: Path) -> np.ndarray:
-    """States (n, 7) of the one run in a log."""
-    return np.array([state.x for state in LogReader(log).select(TRUTH)])
+from operation.system import started_system
 
 
 def main() -> None:
-    """Entry point."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--track", default=DEFAULT_RACE_TRACK)
-    parser.add_argument("--laps", type=int, default=3)
-    parser.add_argument("--rounds", type=int, default=5)
-    options = parser.parse_args()
-    console = Console()
-    with stages_on(Console(stderr=True)) as stages:
-        prepared = prepare(PreparationSettings(), (options.track,), stages)
-    car, first = get_car(CAR), prepared.first
-    weights = read_weights(prepared.weights)
-    controller = compiled_controller(prepared.artefacts[0], car, first.track, first.line, weights)
-    factors: dict[str, list[float]] = {}
+    """Drives in turn, compares the states, prints the factors."""
+    given = arguments(__doc__, track=DEFAULT_RACE_TRACK, laps=3, rounds=5)
+    made, car, runs = prepared(given.track), default_car(), itertools.count(1)
+    first, own = made.first, controller(made)
     with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        system = stack.enter_context(started_system(CAR, folder, lockstep=True))
-        stack.enter_context(system.controller(prepared.arguments))
-        runs = itertools.count(1)
-        zenoh_log, own_log = folder / "zenoh.mcap", folder / "own.mcap"
+        folder = Path(stack.enter_context(TemporaryDirectory()))
+        system = stack.enter_context(started_system(car.name, folder, lockstep=True))
+        stack.enter_context(system.controller(made.arguments))
+        logs = folder / "zenoh.mcap", folder / "own.mcap"
 
-        def in_one_process(log: LogWriter | None) -> float:
-            loop = ClosedLoop(car, first.track, first.line, controller, log=log)
-            return float(loop.drive(options.laps, LIMIT_S).time_s[-1])
+        def over_zenoh(record: bool) -> float:
+            begin_s = time.perf_counter()
+            plan = RunPlan(next(runs), "bayesrace", given.laps, 1e3, lockstep=True)
+            with Recorder(system.recording, car.name, logs[0]) if record else nullcontext():
+                end = system.drive(first.track, plan)
+            return float(end.data["time_s"]) / (time.perf_counter() - begin_s)
 
-        def logged() -> float:
-            log = LogWriter(own_log)
-            try:
-                return in_one_process(log)
-            finally:
-                log.close()
+        def in_one_process(record: bool) -> float:
+            begin_s = time.perf_counter()
+            with closing(LogWriter(logs[1])) if record else nullcontext() as log:
+                loop = ClosedLoop(car, first.track, first.line, own, log=log)
+                driven_s = float(loop.drive(given.laps, 1e3).time_s[-1])
+            return driven_s / (time.perf_counter() - begin_s)
 
-        ways: dict[str, Callable[[], float]] = {
-            "over Zenoh, recorded": lambda: over_zenoh(
-                system, prepared, options.laps, next(runs), zenoh_log
-            ),
-            "over Zenoh": lambda: over_zenoh(system, prepared, options.laps, next(runs), None),
-            "in one process, logged": logged,
-            "in one process": lambda: in_one_process(None),
+        ways = {
+            name + end: partial(drive, record)
+            for name, drive in (("over Zenoh", over_zenoh), ("in one process", in_one_process))
+            for end, record in ((", recorded", True), ("", False))
         }
-        for _ in range(options.rounds):
-            for name, drive in ways.items():
-                begin_s = time.perf_counter()
-                driven_s = drive()
-                factor = driven_s / (time.perf_counter() - begin_s)
-                factors.setdefault(name, []).append(factor)
-            assert np.array_equal(states_of(zenoh_log), states_of(own_log)), "other states"
-    base = np.array(factors["over Zenoh, recorded"])
-    console.print(f"{first.track.name}, {options.laps} laps, {options.rounds} rounds; equal states")
+        factors = in_turn(ways, given.rounds)
+        status = Path(f"/proc/{system.children['controller'].pid}/status").read_text()
+        memory_mb = int(status.partition("VmRSS:")[2].split()[0]) / 1024
+        states = [np.array([truth.x for truth in LogReader(log).select(TRUTH)]) for log in logs]
+    assert np.array_equal(states[0], states[1]), "other states"
+    base, rows = factors["over Zenoh, recorded"], list[Row]()
     for name, values in factors.items():
-        ratio = float(np.median(np.array(values) / base))
-        console.print(f"{name:24} {np.median(values):6.1f} x real time, ratio {ratio:5.2f}")
+        figure = {"way": name, "x real time, or MB": float(np.median(values))}
+        rows.append(figure | ratio(values, base))
+    rows.append({"way": "controller process, resident memory", "x real time, or MB": memory_mb})
+    report(given, f"{first.track.name}, {given.laps} laps, {given.rounds} rounds", rows, states[0])
 
 
 if __name__ == "__main__":

@@ -1,135 +1,38 @@
 """What checks and watch make of good and of spoilt weights, from a standing start.
 
-    python -m benchmarks.spoilt_weights [--car NAME] [--seconds S]
+    python -m benchmarks.spoilt_weights [--car NAME] [--seconds 12]
 
 Weights learned from the car's training drive are spoilt in nine ways
 (tests/takeover/spoilt_weights.py) and sent before the car has driven, on its training track and on
 its race track, where those that were learned are proven. These are sent, too, where none are
-proven. Each run is driven in one process: the watch rules after each state, as it does in lockstep
-for a controller process. Columns: how far the car left the track, with checks and watch and
-without; what became of the weights, at which cycle and speed.
+proven. Prints what became of the weights, at which cycle and speed, and how far the car passed the
+track's edge, with checks and watch and without them.
 """
 
-import argparse
 import math
-from pathlib import Path
-from typing import Final
 
-from bayesrace.gp.weights import GpWeights, encode_weights, read_weights, zero_weights
-from bayesrace.integrators import PREDICTION
-from bayesrace.messages import State
-from bayesrace.raceline.cached import racing_line
-from bayesrace.tracks import load_track
-from bayesrace.vehicles import CarParameters, get_car
-from codegen.build import build
-from codegen.settings import BuildSettings
-from controller.assembly import compiled_controller
-from controller.interface import Environment
-from controller.mpc import PredictiveController
-from controller.weights.adoption import limits_at, slowed_down
-from controller.weights.checks import Checks, Watch
-from controller.weights.prediction import Sampler, StateRecord
-from controller.weights.settings import GateSettings
-from operation.closed_loop import ClosedLoop, Driven
-from operation.preparation import trained_weights, training_samples, training_settings
-from operation.settings import PreparationSettings
+from bayesrace.gp.weights import read_weights
+from bayesrace.vehicles import DEFAULT_CAR, get_car
+from benchmarks.harness import Row, arguments, prepared, report
 from tests.takeover.spoilt_weights import SPOILT, spoilt
-
-_SECONDS: Final = 12.0
-
-
-class WatchedLoop(ClosedLoop):
-    """A closed loop in which weights are watched."""
-
-    def watch(self, checks: Checks, weights: GpWeights, proven: GpWeights | None) -> None:
-        """In the next run, in which the controller has ``weights``, against ``proven`` ones."""
-        back = zero_weights(weights.car, weights.discretisation) if proven is None else proven
-        self._back = encode_weights(back)
-        checks.use(encode_weights(weights), 0, b"" if proven is None else self._back)
-        self._gate, self._sampler = checks.settings, Sampler(checks.step_s, self._car)
-        self._watch: Watch | None = Watch(checks, [])
-        self._slow: Environment | None = None
-        self.found: list[str] = []
-        """What the watch has done, and when."""
-
-    def _limits(self, state: State) -> Environment | None:
-        record = StateRecord(
-            state.seq, state.epoch, state.run, state.seq, state.time_s, 0, state.x,
-            state.u_applied, True,
-        )  # fmt: skip
-        sample, fallen_back = self._sampler.add(record), self._cycle.driver.fallen_back
-        ruling = self._watch.add(fallen_back, sample) if self._watch else None
-        if ruling is not None:
-            self.found.append(f"{ruling.action} at {len(self._states)}, {state.x[3]:.1f} m/s")
-            if ruling.action == "slow":
-                fastest_mps = float(ruling.data["fastest_mps"])
-                self._slow = slowed_down(self._gate, self._car, fastest_mps)
-            else:
-                self._watch = None
-                assert isinstance(self._controller, PredictiveController)
-                self._controller.set_weights(self._back)
-        return None if self._slow is None else limits_at(state.x[3], self._slow)
-
-
-class Course:
-    """A car on a track, and the checks of its controller."""
-
-    def __init__(self, car: CarParameters, track: str, seconds: float) -> None:
-        self._car, self._seconds = car, seconds
-        self._track = load_track(track, car.width_m)
-        self._line = racing_line(self._track, car)
-        self._artefact = build(BuildSettings(car=car))[0]
-        self._checks = Checks(GateSettings(), self._artefact, car)
-
-    def drive(self, weights: GpWeights, proven: GpWeights | None) -> tuple[str, float]:
-        """What became of the weights, and the largest excess over the edge [m]."""
-        self._checks.use(b"", 0, b"")
-        if not self._checks.judge(encode_weights(weights), []).packed:
-            return "refused as absurd", -math.inf
-        loop = WatchedLoop(self._car, self._track, self._line, self._controller(weights))
-        loop.watch(self._checks, weights, proven)
-        run = loop.drive(0, self._seconds)
-        return "; ".join(loop.found) or "kept", _excess_m(run)
-
-    def drive_unwatched(self, weights: GpWeights) -> float:
-        """The largest excess over the edge without checks and watch [m]."""
-        loop = ClosedLoop(self._car, self._track, self._line, self._controller(weights))
-        return _excess_m(loop.drive(0, self._seconds))
-
-    def _controller(self, weights: GpWeights) -> PredictiveController:
-        return compiled_controller(self._artefact, self._car, self._track, self._line, weights)
-
-
-def _excess_m(run: Driven) -> float:
-    return float(run.off_track_m.max())
-
-
-def learned(car: CarParameters) -> GpWeights:
-    """From the training drive, as a race's first weights."""
-    settings = PreparationSettings(car=car)
-    samples = training_samples(settings)
-    path: Path = trained_weights(samples, PREDICTION, training_settings(settings))
-    return read_weights(path)
+from tests.takeover.watched import Course
 
 
 def main() -> None:
-    """Prints a row for each kind of weights and track."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--car", default="orca")
-    parser.add_argument("--seconds", type=float, default=_SECONDS)
-    options = parser.parse_args()
-    car = get_car(options.car)
-    weights = learned(car)
+    """Drives each kind of weights on each track."""
+    given = arguments(__doc__, car=DEFAULT_CAR, seconds=12.0)
+    car, rows = get_car(given.car), list[Row]()
+    weights = read_weights(prepared(car=car).weights)
     for track in dict.fromkeys((car.train_track, car.race_track)):
-        course = Course(car, track, options.seconds)
-        for what in ("as learned", *SPOILT):
-            spoils = what in SPOILT
-            sent, proven = (spoilt(weights, what), weights) if spoils else (weights, None)
-            free_m = course.drive_unwatched(sent)
-            found, watched_m = course.drive(sent, proven)
-            with_m = "   -  " if math.isinf(watched_m) else f"{watched_m:+6.3f}"
-            print(f"{track:10} {what:14} beyond the edge {with_m} m, unwatched {free_m:+6.3f} m"
-                  f"   {found}", flush=True)  # fmt: skip
+        course = Course(car, track, given.seconds)
+        for kind in ("as learned", *SPOILT):
+            good = kind not in SPOILT
+            sent, proven = (weights, None) if good else (spoilt(weights, kind), weights)
+            became, watched_m = course.drive(sent, proven)
+            row = {"track": track, "weights": kind, "became": became}
+            beyond_m = {"beyond the edge [m]": watched_m} if math.isfinite(watched_m) else {}
+            rows.append(row | beyond_m | {"unwatched [m]": course.drive_unwatched(sent)})
+    report(given, car.name, rows)
 
 
 if __name__ == "__main__":

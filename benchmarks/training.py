@@ -1,29 +1,23 @@
 """Training against scikit-learn: the same samples, kernel, starts and bounds.
 
-    python benchmarks/training.py [--points 800] [--restarts 4] [--kernel rbf] [--seed 0]
+    python -m benchmarks.training [--points 800] [--restarts 4] [--kernel rbf] [--seed 0]
 
 scikit-learn's ``GaussianProcessRegressor`` optimises one start after another with its own L-BFGS-B
 and tolerances, on as many BLAS threads as it likes. Ours is all of ``learning.training.fit``:
-optimisation, factorisation, cross-validation. Both start from the same points within the same
-bounds; the best log marginal likelihood per output is compared. Takes minutes, nearly all of them
-scikit-learn's. The samples are those of the pure-pursuit drive that every race begins with, each
-with its mirror image, for both.
+optimisation, factorisation, cross-validation. The samples are those of the pure-pursuit drive that
+every race begins with, each with its mirror image. Takes minutes, nearly all scikit-learn's.
 """
 
-import argparse
-import math
-import os
 import time
 import warnings
 
 import numpy as np
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
 
 from bayesrace.arrays import Floats
 from bayesrace.gp.weights import OUTPUTS
 from bayesrace.integrators import PREDICTION
+from benchmarks.harness import Row, arguments, report
 from learning.hyperparameters import BOUNDS, starts
 from learning.residual import residual
 from learning.settings import TrainingSettings
@@ -31,80 +25,46 @@ from learning.target import Target
 from learning.training import fit
 from operation.preparation import training_samples
 from operation.settings import PreparationSettings
-
-NU = {"matern05": 0.5, "matern15": 1.5, "matern25": 2.5}
-SLACK = 1e-3
-"""Log marginal likelihoods closer than this are the same optimum."""
-
-
-def theirs(kind: str, start: Floats, z: Floats, y: Floats) -> float:
-    """scikit-learn's log marginal likelihood from one start."""
-    low, high = np.exp(BOUNDS).T
-    theta = np.exp(np.clip(start, BOUNDS[:, 0], BOUNDS[:, 1]))
-    lengths = {"length_scale": theta[1:-1], "length_scale_bounds": np.exp(BOUNDS[1:-1])}
-    base = RBF(**lengths) if kind == "rbf" else Matern(nu=NU[kind], **lengths)
-    signal = ConstantKernel(theta[0], (low[0], high[0]))
-    kernel = signal * base + WhiteKernel(theta[-1], (low[-1], high[-1]))
-    gp = GaussianProcessRegressor(kernel, alpha=0.0, optimizer="fmin_l_bfgs_b")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)  # that a parameter ends at its bound
-        return float(gp.fit(z, y).log_marginal_likelihood_value_)
+from tests.scikit import scikit_gp
 
 
 def clocks() -> Floats:
-    """Time and CPU time of all threads [s]."""
+    """Time and CPU time [s]."""
     return np.array([time.perf_counter(), time.process_time()])
 
 
 def main() -> None:
-    """Runs both and prints times, optima and the ratio."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--points", type=int, default=800, help="with the mirror images")
-    parser.add_argument("--restarts", type=int, default=4)
-    parser.add_argument("--kernel", choices=("rbf", *NU), default="rbf")
-    parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args()
-    points, kind = arguments.points, arguments.kernel
-
-    duration_s = (points // 2 + 5) * PREDICTION.step_s
-    settings = PreparationSettings(collect_s=duration_s, seed=arguments.seed)
-    assert settings.car.mirrored_samples, "fit() would learn without the images"
-    samples = training_samples(settings).select(slice(points // 2))
+    """Trains by both, prints times and optima."""
+    warnings.simplefilter("ignore", ConvergenceWarning)  # that a parameter ends at its bound
+    given = arguments(__doc__, points=800, restarts=4, kernel="rbf", seed=0)
+    points, seed = given.points, given.seed
+    drive = PreparationSettings(collect_s=(points // 2 + 5) * PREDICTION.step_s, seed=seed)
+    samples = training_samples(drive).select(slice(points // 2))
     learned = samples.with_mirror_images()
     assert len(learned) == points, f"{len(learned)} samples, not {points}"
-    options = TrainingSettings(
-        kernels=(kind,),
-        restarts=arguments.restarts,
-        seed=arguments.seed,
-        hyper_points=points,
-        capacity=max(points, 1024),
-        iterations=1000,
-    )
-    guesses = starts(arguments.restarts, arguments.seed)
-    print(
-        f"{points} samples, {kind}, {len(guesses)} starts, {len(OUTPUTS)} outputs, "
-        f"{os.cpu_count()} cores"
-    )
-    began = clocks()
-    weights = fit(samples, PREDICTION, options).weights
-    ours_s = clocks() - began
-    ours = [weights.metrics[f"training {output}"]["log_likelihood"] for output in OUTPUTS]
-    print("ours, all of training: {:.2f} s, CPU {:.2f} s".format(*ours_s))
-
+    settings = TrainingSettings(
+        kernels=(given.kernel,), restarts=given.restarts, seed=seed, hyper_points=points,
+        capacity=max(points, 1024), iterations=1000,
+    )  # fmt: skip
+    begun = clocks()
+    weights = fit(samples, PREDICTION, settings).weights
+    ours_s, theirs_s = clocks() - begun, np.zeros(2)
     z, y = learned.features, residual(learned, PREDICTION)
-    theirs_s, same = np.zeros(2), True
+    rows: list[Row] = []
     for i, output in enumerate(OUTPUTS):
-        target = Target.of(output, z, y[:, i], np.zeros(points, dtype=np.int64))
-        found = -math.inf
-        began = clocks()
-        for guess in guesses:
-            found = max(found, theirs(kind, guess, target.z, target.y))
-        theirs_s += clocks() - began
-        same &= abs(ours[i] - found) <= SLACK
-        print(f"{output:6} ours {ours[i]:.5f}, scikit-learn {found:.5f}: {ours[i] - found:+.1e}")
-    print("scikit-learn, optimisation alone: {:.2f} s, CPU {:.2f} s".format(*theirs_s))
-    ratio = "{:.1f} times as fast, by CPU time {:.1f}".format(*(theirs_s / ours_s))
-    print(f"{ratio}; {'the same optima' if same else 'OTHER OPTIMA'}")
+        target = Target.of(output, z, y[:, i], np.zeros(len(z), dtype=np.int64))
+        begun, found = clocks(), []
+        for start in np.clip(starts(given.restarts, seed), *BOUNDS.T):
+            gp = scikit_gp(given.kernel, start, target.z, target.y, BOUNDS)
+            found.append(float(gp.log_marginal_likelihood_value_))
+        theirs_s += clocks() - begun
+        own, best = weights.metrics[f"training {output}"]["log_likelihood"], max(found)
+        both = {"ours": own, "scikit-learn": best, "less, or times as fast": own - best}
+        rows.append({"": f"log likelihood, {output}", **both})
+    for i, name in enumerate(("time [s]", "CPU time [s]")):
+        times = {"ours": float(ours_s[i]), "scikit-learn": float(theirs_s[i])}
+        rows.append({"": name, **times, "less, or times as fast": float(theirs_s[i] / ours_s[i])})
+    report(given, f"{points} samples, {given.kernel}, {len(OUTPUTS)} outputs", rows)
 
 
 if __name__ == "__main__":

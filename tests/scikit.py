@@ -21,8 +21,18 @@ def correlation(kind: str, length_scales: ArrayLike, **bounds: Any) -> Any:
     return Matern(length_scales, nu=_NU[kind], **bounds)
 
 
-def scikit_gp(kind: str, theta: Floats, z: Floats, y: Floats) -> GaussianProcessRegressor:
-    """Fitted with the hyperparameters log [signal variance, length scales (6), noise variance]."""
+def scikit_gp(
+    kind: str, theta: Floats, z: Floats, y: Floats, bounds: Floats | None = None
+) -> GaussianProcessRegressor:
+    """Fitted with the hyperparameters log [signal variance, length scales (6), noise variance].
+
+    ``bounds`` (8, 2): the hyperparameters are optimised within, from ``theta``.
+    """
     signal, *lengths, noise = np.exp(theta)
-    covariance = ConstantKernel(signal) * correlation(kind, lengths) + WhiteKernel(noise)
-    return GaussianProcessRegressor(covariance, alpha=0.0, optimizer=None).fit(z, y)
+    within: Any = ["fixed"] * 3
+    if bounds is not None:
+        within = [np.exp(bounds[0]), np.exp(bounds[1:-1]), np.exp(bounds[-1])]
+    kernel = correlation(kind, lengths, length_scale_bounds=within[1])
+    covariance = ConstantKernel(signal, within[0]) * kernel + WhiteKernel(noise, within[2])
+    optimizer = None if bounds is None else "fmin_l_bfgs_b"
+    return GaussianProcessRegressor(covariance, alpha=0.0, optimizer=optimizer).fit(z, y)

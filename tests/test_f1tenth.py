@@ -14,7 +14,6 @@ from bayesrace.raceline.cached import racing_line
 from bayesrace.tracks import load_track
 from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import dynamic
-from benchmarks.spoilt_weights import Course
 from codegen.build import build
 from codegen.fmu import car_fmu, pack
 from codegen.settings import BuildSettings
@@ -32,6 +31,7 @@ from plant.vehicle import Vehicle, open_vehicle
 from tests.cycle_rig import STEP_S, ScriptedLaw, scripted_driver, state
 from tests.programs import Race
 from tests.takeover.spoilt_weights import SPOILT, spoilt
+from tests.takeover.watched import Course
 
 CAR = get_car("f1tenth")
 SMALL = "workshop"

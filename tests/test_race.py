@@ -268,7 +268,7 @@ def test_one_seed_gives_one_race_to_the_bit(
 def test_the_car_as_an_fmu_gives_the_same_race_to_the_bit(
     peanut_race: Race, short: ShortRace
 ) -> None:
-    """FMI 3.0; test_fmu_export.py has the same bits by FMI 2.0, benchmarks/fmu.py on ETHZ, too."""
+    """FMI 3.0; test_fmu_export.py has the same bits by FMI 2.0."""
     fmu = packed_car()
     race = short("fmu", "--fmu", fmu)()
     for name in CONTROLLERS:

@@ -1,17 +1,12 @@
-"""Bayesian optimisation of the racing line under the published objective, and the direct method.
+"""The racing line under the published objective: by Bayesian optimisation, and the direct method.
 
-    python -m benchmarks.bayesian_line TRACKS [--trials 3] [--evaluations 110]
-
-TRACKS: folder with ethz.csv and ethzmobil.csv, the paper's tracks. The objective is that of Jain
-and Morari (2020) as their program has it: nodes at their points of the centreline, offsets over
-95 % of the width, the path from the start point, at rest and on the centreline, past the end of the
-lap to the first node, on the centreline; friction 1, drive force mu m g lf / (lf + lr). Speeds are
-computed every centimetre, where theirs have 100 points in all: the published line of ETHZ takes
-7.046 s with theirs, 7.08 s here. docs/equations.md holds the results.
+The objective is that of Jain and Morari (2020) as their program has it: nodes at their points of
+the centreline, offsets over 95 % of the width, the path from the start point, at rest and on the
+centreline, past the end of the lap to the first node, on the centreline; friction 1, drive force
+mu m g lf / (lf + lr). Speeds are computed every centimetre, where theirs have 100 points in all:
+the published line of ETHZ takes 7.046 s with theirs, 7.08 s here.
 """
 
-import argparse
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -24,17 +19,16 @@ from bayesrace.arrays import Floats
 from bayesrace.raceline import RaceLineSettings
 from bayesrace.raceline.frame import Frame, frame_at, smooth_centreline
 from bayesrace.raceline.guess import speed_profile
-from bayesrace.raceline.nodes import roughness
 from bayesrace.raceline.ocp import car_limits, optimise
 from bayesrace.tracks import Track, load_track
 from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.parts import GRAVITY_MPS2, DcMotor
-from learning.search import SearchSettings, search
+
+__all__ = ["PUBLISHED", "direct", "objective", "open_frame", "path_time", "unlimited_car"]
 
 _STEP_M: Final = 0.01
 _SHARE: Final = 0.95
 _REST_MPS: Final = 1e-3
-_COUNTS: Final = 20, 30, 40, 50, 110
 
 
 class Published(NamedTuple):
@@ -104,20 +98,19 @@ def objective(folder: Path, name: str) -> Callable[[Floats], float]:
     return of
 
 
-def direct(folder: Path, name: str, step_m: float = 0.03) -> tuple[float, float]:
-    """The least time of any path, found by derivatives, and seconds of processor for it.
+def direct(folder: Path, name: str, step_m: float = 0.03) -> float:
+    """The least time of any path, found by derivatives.
 
     The path begins and ends where those of :func:`objective` do, and starts at rest. It keeps their
     distance from the edges at every point, not at nodes alone. The car can do what the objective
     allows, and steers as fast and as far as it has to.
     """
-    started = time.process_time()
     track, car = load_track(str(folder / f"{name}.csv")), unlimited_car()
     width = float(track.width_left_m[0] + track.width_right_m[0])
     frame = open_frame(track, PUBLISHED[name].nodes[0], (1 - _SHARE) / 2 * width, step_m)
     settings = RaceLineSettings()
     path = optimise(name, frame, car_limits(car, settings), settings, [1.0])
-    return path_time(path.xy_m), time.process_time() - started
+    return path_time(path.xy_m)
 
 
 def unlimited_car() -> CarParameters:
@@ -147,37 +140,3 @@ def open_frame(track: Track, last: int, margin_m: float, step_m: float) -> Frame
         (ends - frame.xy_m[[0, -1]]) * frame.normal[[0, -1]], axis=1
     )
     return replace(frame, n_min_m=low, n_max_m=high, length_m=length, start_mps=_REST_MPS)
-
-
-def main() -> None:
-    """Prints, for each track, best laps against evaluations, mean / best of the trials."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("tracks", type=Path)
-    parser.add_argument("--trials", type=int, default=3)
-    parser.add_argument("--evaluations", type=int, default=110)
-    options = parser.parse_args()
-    for name, published in PUBLISHED.items():
-        function, count = objective(options.tracks, name), len(published.nodes)
-        print(f"{name}: published after 110: random {published.random}, ", end="")
-        print(f"EI {published.improvement}, noisy EI {published.noisy}")
-        for method, initial in (("random", options.evaluations), ("EI", 10)):
-            started, laps = time.process_time(), []
-            for seed in range(options.trials):
-                settings = SearchSettings(
-                    evaluations=options.evaluations, initial=initial, seed=seed
-                )
-                laps.append(search(function, count, settings, roughness(count)).best)
-            table = np.array(laps)
-            taken = (time.process_time() - started) / options.trials
-            rows = [
-                f"{k}: {table[:, k - 1].mean():.3f} / {table[:, k - 1].min():.3f}"
-                for k in _COUNTS
-                if k <= options.evaluations
-            ]
-            print(f"  {method:7}", "  ".join(rows), f"  ({taken:.1f} s of processor)", flush=True)
-        best, taken = direct(options.tracks, name)
-        print(f"  minimum-time line {best:.3f} s ({taken:.1f} s of processor)", flush=True)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,0 +1,93 @@
+"""Execution times of the compiled step on recorded problems.
+
+    python -m benchmarks.step [--problems 900] [--passes 4] [--caution 0.95] [--file FILE]
+
+Drives three tracks, two of them with hairpins, and lets the step solve the problems of these drives
+again: as a whole step, and as the feedback after a preparation, as in lockstep and with the budget
+of real time. Times are CPU times of the thread, and a problem's is the lower quintile of the
+passes, so neither other processes nor stalls count. ``--file`` keeps the problems, or has them.
+"""
+
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from bayesrace.arrays import Floats
+from bayesrace.gp.weights import read_weights
+from bayesrace.tracks import DEFAULT_RACE_TRACK
+from bayesrace.vehicles import default_car
+from bayesrace.vehicles.models import dynamic
+from benchmarks.harness import Row, arguments, controller, percentiles, prepared, report
+from codegen.build import build
+from codegen.settings import BuildSettings
+from controller.native_step import NativeStep
+from controller.path_table import PathTable, make_path_table
+from controller.settings import MpcSettings
+from plant.simulator import PLANT, Simulator
+
+_TRACKS = (DEFAULT_RACE_TRACK, "random:11", "random:15")
+_BUDGETS_S = {"": None, " in lockstep": 0.0, " in real time": 0.016}  # of the preparation
+
+
+def record(count: int) -> Row:
+    """What each step of three drives had to solve."""
+    car, made = default_car(), prepared(*_TRACKS)
+    data: Row = {"x": [], "d": [], "track": [], "weights": str(made.weights)}
+    for number, on in enumerate(made.tracks):
+        path = make_path_table(on.track, on.line, car.tuning.path.spacing_m)
+        data |= {f"path{number}": path.rows, "spacing_m": path.spacing_m}
+        step, simulator = controller(made, number).native, Simulator(dynamic(car))
+        simulator.reset([*on.track.start_pose(), 1.0, 0.0, 0.0, 0.0])
+        for k in range(count // len(_TRACKS)):
+            x, d = simulator.x.copy(), simulator.u_applied[0]
+            usable = step.step(x, d).usable
+            for name, value in (("x", x), ("d", d), ("track", -1 if k else number)):
+                data[name].append(value)
+            simulator.step(step.u.tolist() if usable else None)
+    return data
+
+
+def solve(step: NativeStep, data: Any, budget_s: float | None) -> Floats:
+    """Times of step and preparation [us] and the first input of each problem, (n, 4)."""
+    now, rows = time.thread_time_ns, []
+    for x, d, track in zip(data["x"], data["d"], data["track"], strict=True):
+        if track >= 0:
+            step.set_path(PathTable(data[f"path{track}"], float(data["spacing_m"])))
+            step.reset()
+        begin = now()
+        if budget_s is not None:
+            step.prepare(PLANT.step_s, budget_s)
+        middle = now()
+        step.step(x, float(d))
+        rows.append((1e-3 * (now() - middle), 1e-3 * (middle - begin), *step.u))
+    return np.array(rows)
+
+
+def main() -> None:
+    """Records the problems, solves them pass by pass, prints percentiles."""
+    given = arguments(__doc__, problems=900, passes=4, caution=0.95, file="")
+    with TemporaryDirectory() as folder:
+        file = Path(given.file or Path(folder) / "problems.npz")
+        if not file.exists():
+            np.savez(file, **record(given.problems))
+        data, car = dict(np.load(file)), default_car()
+    artefact = build(BuildSettings(car=car))[0]
+    step = NativeStep(artefact, car, MpcSettings(caution=given.caution))
+    step.set_weights(read_weights(Path(str(data["weights"]))))
+    rows, inputs = [], {}
+    for how, budget_s in _BUDGETS_S.items():
+        solve(step, data, budget_s)  # warms up
+        passes = np.array([solve(step, data, budget_s) for _ in range(given.passes)])
+        step_us, prepare_us, *_ = np.percentile(passes, 20, axis=0).T
+        inputs[how] = passes[-1, :, 2:]
+        named = {"feedback": step_us, "preparation": prepare_us} if how else {"whole step": step_us}
+        rows += [{"us": name + how, **percentiles(us)} for name, us in named.items()]
+    assert np.array_equal(inputs[""], inputs[" in lockstep"]), "a preparation has changed a step"
+    report(given, f"{len(data['d'])} steps, caution {given.caution:g}", rows, inputs[""])
+
+
+if __name__ == "__main__":
+    main()
