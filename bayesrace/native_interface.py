@@ -27,9 +27,12 @@ __all__ = [
     "NO_STEP",
     "PHASES",
     "RECEPTIONS",
+    "SAMPLES",
     "SOLUTION",
     "SOLVER",
     "STATUSES",
+    "WATCH",
+    "WATCHED",
     "c_fields",
     "c_interface",
 ]
@@ -292,13 +295,28 @@ COUNTERS: Final = (
 )
 """What a control cycle has counted: name, type, meaning."""
 
-_FUNCTIONS: Final = 11
+SAMPLES: Final = 512
+"""Samples of what the car has done that a controller keeps."""
+
+WATCHED: Final = 100
+"""The newest of these, on which weights are compared while they are watched."""
+
+WATCH: Final = (
+    ("samples", "int", "of the newest, judged so far"),
+    ("fresh", "double", "samples since the weights in use were adopted"),
+    ("in_use", "outputs", "root mean square error of the weights in use, per stage"),
+    ("proven", "outputs", "of the proven weights"),
+    ("nominal", "outputs", "of the model without correction"),
+)
+"""How weights do beside others: name, type, meaning."""
+
+_FUNCTIONS: Final = 12
 """Version of the functions in the public headers: increase it with each change of a signature."""
 
 _TABLES: Final = (
     SOLVER, INFO, STATUSES, ERRORS, INSTRUCTIONS, NO_STEP, LEVELS, PHASES, RECEPTIONS,
     COMPENSATIONS, FAULTS, DELAYS, ENVIRONMENT, MEASURED, DRIVING, SOLUTION, DECISION, BRAKING,
-    BRAKING_ROWS, COUNTERS, _FUNCTIONS,
+    BRAKING_ROWS, COUNTERS, SAMPLES, WATCHED, WATCH, _FUNCTIONS,
 )  # fmt: skip
 
 ABI: Final = zlib.crc32(repr(_TABLES).encode()) & 0x7FFFFFFF
@@ -312,6 +330,7 @@ _ARRAYS: Final = {
     "levels": ("int64_t", str(len(LEVELS))),
     "faults": ("int64_t", str(len(FAULTS))),
     "braking": ("double", str(BRAKING_ROWS)),
+    "outputs": ("double", "BR_NE"),
 }
 
 
@@ -357,6 +376,8 @@ def c_interface() -> str:
         f"#define BR_ABI {ABI}",
         f"#define BR_DELAYS {DELAYS}",
         f"#define BR_BRAKING_ROWS {BRAKING_ROWS}",
+        f"#define BR_SAMPLES {SAMPLES}",
+        f"#define BR_WATCHED {WATCHED}",
         *_enum("", _numbered(ERRORS), "br_mpc_error"),
         *_enum("", statuses, "br_mpc_status"),
         *_enum("", _numbered(INSTRUCTIONS), "br_instructions"),
@@ -374,6 +395,7 @@ def c_interface() -> str:
         *_struct(DECISION, "br_decision"),
         *_struct(BRAKING, "br_braking"),
         *_struct(COUNTERS, "br_counters"),
+        *_struct(WATCH, "br_mpc_watch"),
         f"#define BR_SOLVER_FIELDS(REAL, WHOLE) {_each(SOLVER)}",
         f"#define BR_DRIVING_FIELDS(REAL, WHOLE) {_each(DRIVING)}",
         f"#define BR_SOLVER_VALID(p) ({' && '.join(f'(p)->{n} {r}' for n, _, _, r in SOLVER)})",

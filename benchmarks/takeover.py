@@ -33,8 +33,6 @@ def main() -> None:
     ):
         director, plan = system.director, RunPlan(1, "", 0, 1e5, lockstep=False)
         director.start(run_request(made.first.track, plan))
-        while not director.status("controller").counters["validator"]:
-            time.sleep(_PAUSE_S)
         for number in range(given.adoptions):
             time.sleep(_PAUSE_S)
             sent = encode_weights(replace(weights, version=f"{weights.version}-{number}"))

@@ -12,7 +12,7 @@ from bayesrace.raceline import RaceLine, read_raceline_for
 from bayesrace.tracks import Track, load_track
 from bayesrace.vehicles import CarParameters
 from controller.mpc import PredictiveController
-from controller.native_step import NativeStep, pack_weights
+from controller.native_step import NativeStep, pack_weights, unpack_weights
 from controller.path_table import PathTable, make_path_table
 from controller.settings import MpcSettings
 from controller.weights.adoption import WeightsPort
@@ -98,7 +98,10 @@ def predictive_controller(
     )
     folder = None if store is None else Store(store, step.manifest.discretisation)
     history = History(entries=[first]) if folder is None else folder.restore(first)
-    if history.in_use is not first:
-        step.set_weights(decode_weights(history.in_use.data))
+    if (proven := history.reference) is not first:
+        step.set_weights(decode_weights(proven.data))
+    if history.in_use is not proven:  # a controller has ended while it watched them
+        step.stage_weights(unpack_weights(history.in_use.packed))
+        step.adopt_weights()
     port = WeightsPort(artefact.resolve(), step, car, history, folder)
     return PredictiveController(step, history.in_use.version, port, driven_on.identity)

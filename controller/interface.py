@@ -100,6 +100,9 @@ class Controller(Protocol):
     def adopt_weights(self, version: str) -> None:
         """Use what has been staged at :attr:`port` from the next step on: within microseconds."""
 
+    def revert_weights(self, version: str) -> None:
+        """Use the proven weights, of that version, again: as fast as an adoption."""
+
     def set_weights(self, data: bytes) -> str:
         """Take over weights (``bayesrace.gp.weights`` file content) from the next step on.
 

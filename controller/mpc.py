@@ -64,6 +64,11 @@ class PredictiveController:
         self.native.adopt_weights()
         self._version = version
 
+    def revert_weights(self, version: str) -> None:
+        """The proven weights, of that version, are used again from the next step on."""
+        self.native.revert_weights()
+        self._version = version
+
     def begin_cycle(self, memory: ct.c_void_p, size: int, hold: bool, cycle: ct.c_void_p) -> int:
         """With the compiled step, called from C."""
         native = self.native

@@ -30,6 +30,7 @@ from bayesrace.native_interface import (
     SOLUTION,
     SOLVER,
     STATUSES,
+    WATCH,
 )
 
 __all__ = [
@@ -185,7 +186,7 @@ class Artefact:
     """A compiled problem: its manifest, its library, and the structures of its size.
 
     The structures are those of :mod:`bayesrace.native_interface`: ``Measured``, ``Driving``,
-    ``Solution``, ``Decision``, ``Braking``, ``Counters``.
+    ``Solution``, ``Decision``, ``Braking``, ``Counters``, ``Watch``.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -198,6 +199,7 @@ class Artefact:
             "states": ct.c_double * nx,
             "inputs": ct.c_double * nu,
             "plan": ct.c_double * (nu * self.manifest.horizon),
+            "outputs": ct.c_double * self.manifest.problem.outputs,
         }
         for name, table in _STRUCTURES.items():
             made = type(name, (ct.Structure,), {"_fields_": _fields(table, sized)})
@@ -209,6 +211,7 @@ class Artefact:
     Decision: Any
     Braking: Any
     Counters: Any
+    Watch: Any
 
     def check_cycle(self) -> None:
         """InputError if it has no control cycle: its problem does not follow a path."""
@@ -231,6 +234,7 @@ _STRUCTURES: Final = {
     "Decision": DECISION,
     "Braking": BRAKING,
     "Counters": COUNTERS,
+    "Watch": WATCH,
 }
 
 
@@ -262,6 +266,7 @@ def _declare(library: ct.CDLL) -> None:
         "mpc_set_path": [pointer, pointer, whole, real],
         "mpc_set_weights": [pointer] * 2,
         "mpc_stage_weights": [pointer] * 2,
+        "mpc_get_samples": [pointer] * 4,
         "mpc_set_clock": [pointer] * 3,
         "mpc_reset": [pointer],
         "mpc_step": [*[pointer] * 4, real, real, *[pointer] * 3],

@@ -7,13 +7,14 @@ those of the artefact's manifest.
 import ctypes as ct
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
-from bayesrace.native_interface import INSTRUCTIONS
+from bayesrace.native_interface import INSTRUCTIONS, SAMPLES
 from controller.interface import Environment
 from controller.native_library import (
     Artefact,
@@ -80,9 +81,17 @@ class NativeProblem:
         self._prepare = self._library.br_mpc_prepare
         self._predict = self._library.br_mpc_predict
         self._rehearse = self._library.br_mpc_rehearse
-        # Holds on to the interpreter's lock, which is not to be had back within a microsecond.
-        self._adopt = ct.PyDLL(self._library._name).br_mpc_adopt_weights
-        self._adopt.argtypes = [ct.c_void_p]
+        # They hold on to the interpreter's lock, which is not to be had back within a microsecond.
+        quick = ct.PyDLL(self._library._name)
+        self._adopt, self._prove, self._revert = (
+            quick.br_mpc_adopt_weights, quick.br_mpc_prove_weights, quick.br_mpc_revert_weights
+        )  # fmt: skip
+        self._get_watch = quick.br_mpc_get_watch
+        for function in (self._adopt, self._prove, self._revert):
+            function.argtypes = [ct.c_void_p]
+        self._get_watch.argtypes = [ct.c_void_p, ct.c_void_p]
+        self._watch = self.artefact.Watch()
+        self._watch_address = ct.addressof(self._watch)
         self._set_clock()
         self.set_zero_weights()
 
@@ -137,8 +146,34 @@ class NativeProblem:
         self._check(self._library.br_mpc_stage_weights(self._mpc, outputs), "weights")
 
     def adopt_weights(self) -> None:
-        """Puts what is staged into use, between two steps; InputError if there is nothing."""
+        """Puts what is staged into use, between two steps; InputError if there is nothing.
+
+        They are on probation: :meth:`watch` compares them with those that were proven before.
+        """
         self._check(self._adopt(self._mpc), "weights")
+
+    def prove_weights(self) -> None:
+        """Ends the probation of the weights in use."""
+        self._check(self._prove(self._mpc), "weights")
+
+    def revert_weights(self) -> None:
+        """Goes back to the proven weights, between two steps."""
+        self._check(self._revert(self._mpc), "weights")
+
+    def watch(self) -> Any:
+        """How the weights in use do beside the proven ones: see WATCH; overwritten by the next."""
+        self._get_watch(self._mpc, self._watch_address)
+        return self._watch
+
+    def samples(self) -> tuple[Floats, Floats]:
+        """The newest samples of what the car has done, by the thread that steps: features (n, nz)
+        and residuals of the model without correction (n, ne), per stage."""
+        problem, count = self.manifest.problem, ct.c_int()
+        features = np.zeros((SAMPLES, len(problem.features)))
+        residuals = np.zeros((SAMPLES, problem.outputs))
+        addresses = _address(features), _address(residuals), ct.addressof(count)
+        self._check(self._library.br_mpc_get_samples(self._mpc, *addresses), "samples")
+        return features[: count.value], residuals[: count.value]
 
     def set_zero_weights(self) -> None:
         """No correction of the model."""

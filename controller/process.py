@@ -111,7 +111,7 @@ class ControllerProcess:
         if controller.port is not None:
             self._weights = WeightUpdateManager(
                 session, self.name, controller.port, settings.gate,
-                adopt=controller.adopt_weights, announce=self._service.announce,
+                user=controller, announce=self._service.announce,
             )  # fmt: skip
             self._adoption = self._weights.adoption
         inbox.watch("plant")
@@ -166,7 +166,7 @@ class ControllerProcess:
     def _recorded(self, state: State, arrived_ns: int) -> State:
         self._service.report_fault()
         if self._adoption is not None and not self._driver.fault:
-            self._adoption.record(state, self._driver.fallen_back)
+            self._adoption.observe(state.x[3], self._driver.fallen_back)
         self._arrived_ns = self._service.arrived_ns = arrived_ns
         return state
 
@@ -212,7 +212,7 @@ class ControllerProcess:
         """The cycle's messages; new weights are adopted before the next cycle is prepared."""
         self._send(state, decision)
         if self._adoption is not None:
-            self._adoption.between_cycles(self._next_cycle, lockstep=True)
+            self._adoption.between_cycles(self._next_cycle)
 
     # Free-running ------------------------------------------------------------------------------
 

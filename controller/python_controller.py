@@ -87,6 +87,10 @@ class PythonController:
         """Never asked."""
         raise InputError("a control law in Python takes no weights")
 
+    def revert_weights(self, version: str) -> None:
+        """Never asked."""
+        raise InputError("a control law in Python takes no weights")
+
     def set_weights(self, data: bytes) -> str:
         """Always refused."""
         raise InputError("a control law in Python takes no weights")

@@ -9,7 +9,7 @@ import pytest
 from bayesrace.messages import STATE, encode
 from bayesrace.transport import Inbox
 from bayesrace.transport import inbox as inbox_module
-from tests.takeover.bench import a_state
+from tests.cycle_rig import state
 
 
 def test_a_peer_that_polls_sleeps_while_no_answer_can_be_there(
@@ -31,7 +31,7 @@ def test_a_peer_that_polls_sleeps_while_no_answer_can_be_there(
         monotonic=lambda: now_s, monotonic_ns=lambda: round(1e9 * now_s), sleep=sleep
     )
     monkeypatch.setattr(inbox_module, "time", clock)
-    sample = SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: encode(a_state(0))))
+    sample = SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: encode(state(0))))
     session = MagicMock()
     session.declare_subscriber().handler.try_recv = look
     box = Inbox(session, "car")

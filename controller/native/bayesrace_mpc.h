@@ -98,6 +98,20 @@ BR_API br_mpc_error br_mpc_set_weights(br_mpc *mpc, const br_mpc_gp outputs[BR_N
 BR_API br_mpc_error br_mpc_stage_weights(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]);
 BR_API br_mpc_error br_mpc_adopt_weights(br_mpc *mpc);
 
+/* Weights that have been adopted are on probation, and what was proven before them is kept.
+ * br_mpc_get_watch, between two calls: the errors of both, and of none, on the newest samples of
+ * what the car did, as br_mpc_observe has been shown it; they are judged in br_mpc_prepare.
+ * br_mpc_prove_weights ends the probation, br_mpc_revert_weights goes back to what is proven, as
+ * fast as an adoption. What br_mpc_set_weights has loaded counts as proven.
+ *
+ * br_mpc_get_samples copies the newest BR_SAMPLES samples, the oldest first: features, and the
+ * residual per stage that the weights are to explain. All by the thread that steps. */
+BR_API br_mpc_error br_mpc_get_watch(const br_mpc *mpc, br_mpc_watch *watch);
+BR_API br_mpc_error br_mpc_prove_weights(br_mpc *mpc);
+BR_API br_mpc_error br_mpc_revert_weights(br_mpc *mpc);
+BR_API br_mpc_error br_mpc_get_samples(const br_mpc *mpc, double features[BR_SAMPLES * BR_NZ],
+                                       double residuals[BR_SAMPLES * BR_NE], int *count);
+
 /* The clock that budgets are measured with, NULL for none (then there are no budgets). It is read
  * from within br_mpc_step, br_mpc_solve and br_mpc_prepare only, in their thread. */
 BR_API br_mpc_error br_mpc_set_clock(br_mpc *mpc, br_mpc_clock clock, void *context);

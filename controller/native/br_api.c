@@ -10,8 +10,7 @@ br_mpc_error br_mpc_init(void *memory, size_t size, br_mpc **out) {
     if (size < sizeof(br_mpc) || (uintptr_t)memory % 64) return BR_ERROR_MEMORY;
     br_mpc *mpc = memory;
     memset(mpc, 0, offsetof(br_mpc, gp));
-    br_gp_clear(&mpc->gp[0]);
-    br_gp_clear(&mpc->gp[1]);
+    for (int i = 0; i < 3; ++i) br_gp_clear(&mpc->gp[i]);
     br_qp_init(&mpc->qp);
     br_weights_init(mpc);
     mpc->caution.pace = mpc->caution.widening = 1;
@@ -80,6 +79,7 @@ br_mpc_error br_mpc_observe(br_mpc *mpc, const double x[BR_NX], const double u[B
     memcpy(newest->x, x, sizeof newest->x);
     memcpy(newest->u, u, sizeof newest->u);
     memcpy(newest->x_next, x_next, sizeof newest->x_next);
+    mpc->watch.newest = *newest;
     return BR_OK;
 }
 

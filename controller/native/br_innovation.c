@@ -49,7 +49,7 @@ double br_innovation_widening(const br_innovation *innovation, int output) {
 }
 
 /* The state that this output changes most. */
-static int most_changed(const br_stage *stage, int output) {
+int br_most_changed(const br_stage *stage, int output) {
     int most = 0;
     for (int i = 1; i < BR_NX; ++i)
         if (fabs(stage->in_e[i][output]) > fabs(stage->in_e[most][output])) most = i;
@@ -66,7 +66,7 @@ void br_innovation_judge(br_mpc *mpc, const double variance[BR_NE]) {
     innovation->before = *misfit;
     if (br_predict(mpc, due->x, due->u, due->duration, predicted)) return;
     for (int j = 0; j < BR_NE; ++j) {
-        const int i = most_changed(&mpc->stage[0], j);
+        const int i = br_most_changed(&mpc->stage[0], j);
         const double share = fabs(mpc->stage[0].in_e[i][j]) * stages;
         if (!(share > 0 && variance[j] > 0)) continue; /* nothing is known of this output */
         const double error = fabs(due->x_next[i] - predicted[i]) / share;

@@ -178,6 +178,24 @@ typedef struct {
     double x[BR_NX], u[BR_NU], x_next[BR_NX];
 } br_transition;
 
+/* What a residual learns from, and the errors on it: see br_watch.c. */
+typedef struct {
+    double z[BR_NZ], residual[BR_NE];
+} br_sample;
+
+typedef struct {
+    int64_t number;         /* of the sample, from 1 on; 0: not judged */
+    double error[2][BR_NE]; /* of the weights in use, of the proven ones */
+} br_judged;
+
+typedef struct {
+    br_transition newest; /* not taken yet */
+    int64_t count;        /* samples so far; the last BR_SAMPLES are kept */
+    int64_t since;        /* of these, before the weights in use were adopted */
+    br_sample sample[BR_SAMPLES];
+    br_judged judged[BR_WATCHED]; /* the newest */
+} br_watch;
+
 /* Of each output, by how many standard deviations the residual errs: see br_innovation.c. */
 typedef struct {
     double recent[BR_NE], held[BR_NE]; /* mean of the newest; the largest, slowly forgotten */
@@ -211,7 +229,7 @@ typedef struct {
     double caution;          /* what the last br_caution_update took */
 } br_timer;
 
-/* The spare one of the two weight buffers, and whose it is. */
+/* The spare one of the weight buffers, and whose it is. */
 enum {
     BR_SPARE_FREE = 0, /* not in use */
     BR_SPARE_TAKEN,    /* one thread writes it, or exchanges the two */
@@ -223,8 +241,8 @@ struct br_mpc {
     br_mpc_parameters parameters;
     int has_parameters;
     br_path path;
-    int gp_in_use; /* written by the thread that has taken the spare buffer, in the control thread
-                    */
+    int gp_in_use, gp_proven; /* written by the control thread; equal: nothing is watched */
+    int gp_spare;             /* written by the control thread once it has taken the buffer */
     atomic_int spare;
     /* the problem */
     double u_before[BR_NU];
@@ -263,6 +281,7 @@ struct br_mpc {
     br_timer timer;
     br_caution caution;
     br_innovation innovation;
+    br_watch watch;
     br_stage stage[BR_N];
     BR_ALIGNED br_gp_row kernels[BR_NE * BR_GP_BLOCKS * BR_N]; /* see br_gp_evaluate */
     br_qp qp;
@@ -270,7 +289,8 @@ struct br_mpc {
     double merit;   /* ... beside its cost */
     double worth;   /* cost, to first order, once the defects are gone: costates price them */
     br_mpc_info info;
-    br_gp gp[2]; /* last: what of it no weights are loaded into is never touched */
+    br_gp gp[3]; /* in use, proven, spare; last: what of it no weights are loaded into is never
+                    touched */
 };
 
 /* br_gp.c */
@@ -285,6 +305,9 @@ BR_PART void br_gp_curvature(const br_gp *gp, int stages, double (*z)[BR_NZ], br
 BR_PART void br_gp_clear(br_gp *gp);
 BR_PART void br_gp_mean(const br_gp *gp, const double z[BR_NZ], double mean[BR_NE]);
 BR_PART br_mpc_error br_gp_load(br_gp *gp, const br_mpc_gp outputs[BR_NE]);
+
+/* br_watch.c */
+BR_PART void br_watch_update(br_mpc *mpc); /* in the preparation */
 
 /* br_variance.c */
 /* Of one output whose weights are loaded. */
@@ -304,6 +327,7 @@ BR_PART void br_innovation_reset(br_innovation *innovation);
 /* A step has been made: what was observed before it is due. */
 BR_PART void br_innovation_advance(br_innovation *innovation);
 /* By what the standard deviations of the output are to be multiplied. */
+BR_PART int br_most_changed(const br_stage *stage, int output); /* state, by this output */
 BR_PART double br_innovation_widening(const br_innovation *innovation, int output);
 BR_PART int br_innovation_due(const br_innovation *innovation);
 /* As if what is due had not been judged: parameters or code are others now. */
@@ -341,10 +365,12 @@ BR_PART void br_stages_linearise(const br_gp *gp, int stages, double (*x)[BR_NX]
 /* Hessians of all linearised stages, at the same x and u; of each slot there is one. */
 BR_PART void br_stages_curve(const br_gp *gp, int stages, double (*x)[BR_NX], double (*u)[BR_NU],
                              double (*lambda)[BR_NX], br_gp_row *kernels, br_stage *stage);
+BR_PART void br_stage_features(const double x[BR_NX], const double u[BR_NU], double z[BR_NZ]);
 /* Of at most BR_N + 1 states and inputs. */
 BR_PART void br_stages_variances(const br_gp *gp, int stages, double (*x)[BR_NX],
                                  double (*u)[BR_NU], double (*work)[BR_COLUMNS],
                                  double (*variance)[BR_NE]);
+/* gp NULL: without correction. */
 BR_PART void br_stage_next(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
                            double x_next[BR_NX]);
 BR_PART void br_stage_advance(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
@@ -426,6 +452,9 @@ BR_PART br_mpc_error br_prepare(br_mpc *mpc, double elapsed_s, double budget_s);
 BR_PART br_mpc_error br_rehearse(br_mpc *mpc);
 BR_PART br_mpc_error br_predict(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
                                 double duration_s, double x_next[BR_NX]);
+/* The same by these weights; gp NULL: without correction. */
+BR_PART br_mpc_error br_predict_by(const br_mpc *mpc, const br_gp *gp, const double x[BR_NX],
+                                   const double u[BR_NU], double duration_s, double x_next[BR_NX]);
 BR_PART br_mpc_error br_steer(const br_mpc *mpc, const double x[BR_NX], double *s_m,
                               double *angle_rad, double *outside_m);
 BR_PART br_mpc_error br_variance(br_mpc *mpc, const double v[BR_NV], double variance[BR_NE]);

@@ -30,3 +30,4 @@
 #include "br_timer.c"
 #include "br_turnaround.c"
 #include "br_variance.c"
+#include "br_watch.c"

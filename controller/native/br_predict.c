@@ -7,9 +7,9 @@
 #define PART_MIN 1e-9 /* a remainder below this part of a stage is rounding */
 
 /* x <- the state after a duration of at most a stage. */
-static void advance(const br_mpc *mpc, double x[BR_NX], const double u[BR_NU], double duration) {
+static void advance(const br_mpc *mpc, const br_gp *gp, double x[BR_NX], const double u[BR_NU],
+                    double duration) {
     const double *theta = br_theta(&mpc->parameters);
-    const br_gp *gp = &mpc->gp[mpc->gp_in_use];
     double acting[BR_NU], unlimited[BR_NX];
     const casadi_real *arg[br_acting_SZ_ARG + br_reached_SZ_ARG] = {x, u, &duration, theta};
     casadi_real *res[br_acting_SZ_RES + br_reached_SZ_RES] = {acting};
@@ -29,6 +29,11 @@ static void advance(const br_mpc *mpc, double x[BR_NX], const double u[BR_NU], d
 
 br_mpc_error br_predict(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
                         double duration_s, double x_next[BR_NX]) {
+    return br_predict_by(mpc, &mpc->gp[mpc->gp_in_use], x, u, duration_s, x_next);
+}
+
+br_mpc_error br_predict_by(const br_mpc *mpc, const br_gp *gp, const double x[BR_NX],
+                           const double u[BR_NU], double duration_s, double x_next[BR_NX]) {
     if (!x || !u || !x_next) return BR_ERROR_NULL;
     if (!mpc->has_parameters) return BR_ERROR_NOT_READY;
     if (!(duration_s >= 0 && duration_s <= BR_PREDICT_MAX_S)) return BR_ERROR_TIME;
@@ -37,10 +42,10 @@ br_mpc_error br_predict(const br_mpc *mpc, const double x[BR_NX], const double u
     memcpy(state, x, sizeof state);
     double left = duration_s;
     for (; left >= BR_TS * (1 - PART_MIN); left -= BR_TS) {
-        advance(mpc, state, u, BR_TS);
+        advance(mpc, gp, state, u, BR_TS);
         if (!br_plausible_state(state)) return BR_ERROR_STATE;
     }
-    if (left > BR_TS * PART_MIN) advance(mpc, state, u, left);
+    if (left > BR_TS * PART_MIN) advance(mpc, gp, state, u, left);
     if (!br_plausible_state(state)) return BR_ERROR_STATE;
     memcpy(x_next, state, sizeof state);
     return BR_OK;

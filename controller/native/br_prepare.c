@@ -145,6 +145,7 @@ br_mpc_error br_prepare(br_mpc *mpc, double elapsed_s, double budget_s) {
     br_timer_start(&mpc->timer, budget_s);
     if (!mpc->has_parameters) return BR_ERROR_NOT_READY;
     if (!(elapsed_s >= 0 && isfinite(elapsed_s))) return BR_ERROR_TIME;
+    br_watch_update(mpc);
     double lag = mpc->lag + elapsed_s;
     if (!mpc->warm || lag >= BR_HORIZON_S) return BR_OK;
     const int first = !mpc->ahead, shifts = br_shifts_due(&lag);

@@ -62,7 +62,7 @@ static void chain_hessian(br_stage *stage, double hessian[NW][NW], double bend[B
         }
 }
 
-static void features(const double x[BR_NX], const double u[BR_NU], double z[BR_NZ]) {
+void br_stage_features(const double x[BR_NX], const double u[BR_NU], double z[BR_NZ]) {
     for (int a = 0; a < BR_NZ; ++a)
         z[a] = BR_FEATURE[a] < BR_NX ? x[BR_FEATURE[a]] : u[BR_FEATURE[a] - BR_NX];
 }
@@ -72,7 +72,7 @@ void br_stages_linearise(const br_gp *gp, int stages, double (*x)[BR_NX], double
     double z[BR_N][BR_NZ];
     br_correction residual[BR_N];
     if (gp->any) {
-        for (int k = 0; k < stages; ++k) features(x[k], u[k], z[k]);
+        for (int k = 0; k < stages; ++k) br_stage_features(x[k], u[k], z[k]);
         br_gp_evaluate(gp, stages, z, kernels + slot, room, residual);
     } else {
         memset(residual, 0, stages * sizeof residual[0]);
@@ -94,7 +94,7 @@ void br_stages_linearise(const br_gp *gp, int stages, double (*x)[BR_NX], double
 void br_stages_variances(const br_gp *gp, int stages, double (*x)[BR_NX], double (*u)[BR_NU],
                          double (*work)[BR_COLUMNS], double (*variance)[BR_NE]) {
     double z[BR_N + 1][BR_NZ];
-    for (int k = 0; k < stages; ++k) features(x[k], u[k], z[k]);
+    for (int k = 0; k < stages; ++k) br_stage_features(x[k], u[k], z[k]);
     br_gp_variances(gp, stages, z, work, variance);
 }
 
@@ -106,7 +106,7 @@ static void residual_curvature(const br_gp *gp, int stages, double (*x)[BR_NX], 
     const br_correction *residual[BR_N];
     for (int k = 0; k < stages; ++k) {
         const int slot = stage[k].slot;
-        features(x[k], u[k], z[slot]);
+        br_stage_features(x[k], u[k], z[slot]);
         residual[slot] = &stage[k].residual;
         for (int j = 0; j < BR_NE; ++j) {
             weight[slot][j] = 0;
@@ -132,8 +132,8 @@ void br_stages_curve(const br_gp *gp, int stages, double (*x)[BR_NX], double (*u
 void br_stage_next(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
                    double x_next[BR_NX]) {
     double z[BR_NZ], mean[BR_NE] = {0};
-    features(x, u, z);
-    if (gp->any) br_gp_mean(gp, z, mean);
+    br_stage_features(x, u, z);
+    if (gp && gp->any) br_gp_mean(gp, z, mean);
     nominal(x, u, mean, x_next, NULL);
 }
 
@@ -142,8 +142,8 @@ void br_stage_next(const br_gp *gp, const double x[BR_NX], const double u[BR_NU]
 void br_stage_advance(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
                       double duration, double x_next[BR_NX]) {
     double z[BR_NZ], mean[BR_NE] = {0};
-    features(x, u, z);
-    if (gp->any) br_gp_mean(gp, z, mean);
+    br_stage_features(x, u, z);
+    if (gp && gp->any) br_gp_mean(gp, z, mean);
     for (int j = 0; j < BR_NE; ++j) mean[j] *= duration / BR_TS;
     const casadi_real *arg[br_advance_SZ_ARG] = {x, u, mean, &duration};
     casadi_real *res[br_advance_SZ_RES] = {x_next};

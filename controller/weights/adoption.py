@@ -1,40 +1,27 @@
-"""The control thread's part in new weights: it records states and adopts weights between cycles.
+"""The control thread's part in new weights: it adopts them between cycles, and goes back.
 
-In real time nothing here decodes, compares, copies more than a state, waits or takes a lock.
-Nothing releases the interpreter's lock or wakes another thread either: that would cost a hundred
-times the adoption.
+In real time nothing here decodes, waits or takes a lock. Nothing releases the interpreter's lock or
+wakes another thread either: that would cost a hundred times the adoption.
 """
 
 import math
-import struct
 import time
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from bayesrace.errors import InputError
-from bayesrace.messages import State
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.parts import GRAVITY_MPS2
-from controller.interface import Environment
+from controller.interface import Controller, Environment
 from controller.native_step import NativeStep
-from controller.weights.prediction import StateRecord
+from controller.weights.prediction import Samples
 from controller.weights.settings import GateSettings
 from controller.weights.store import History, Store
+from controller.weights.watch import Ruling, Watch
 
-__all__ = ["RECORDED", "Adoption", "Offer", "WeightsPort", "limits_at", "slowed_down"]
-
-RECORDED: Final = 8192
-"""States kept: 16 s at 500 Hz, which is more than the validator looks back."""
-_RECORD: Final = struct.Struct("=5q10d2b")
-"""One of them, packed: as objects they would take five times the memory, and the process would grow
-for minutes."""
-
-_PATIENCE_S: Final = 2.0
-"""How long lockstep waits for the watch. Without waiting, one run would differ from the next."""
-_POLL_S: Final = 5e-5
+__all__ = ["Adoption", "Offer", "WeightsPort", "limits_at", "slowed_down"]
 
 _BEND: Final = 5.0
 """Wheelbases: radius of the bend that a car still takes at its limit where it is slowed down."""
@@ -56,15 +43,17 @@ class Offer:
     """Staged weights; the control thread fills in the result of their adoption."""
 
     version: str
-    keeps_limit: bool = False
-    """The speed limit, if there is one, goes on: nothing better is known."""
+    reverted: int
+    """:attr:`Adoption.reverted` when they were offered: the watch has not gone back since."""
+    watched: bool = True
+    """They are on probation; else they count as proven."""
     done: bool = False
     error: str = ""
     """Why they could not be adopted; else empty."""
     cycle: int = 0
     """First cycle that they can drive."""
-    states: int = 0
-    """States recorded before the adoption."""
+    ruled: int = 0
+    """Rulings of the watch before."""
     us: float = 0.0
     """Time that the adoption has taken."""
 
@@ -87,86 +76,84 @@ def limits_at(vx_mps: float, slow: Environment) -> Environment:
 class Adoption:
     """Holds one offer at most: the update manager makes it, the control thread adopts it."""
 
-    def __init__(self, adopt: Callable[[str], None]) -> None:
-        """``adopt`` puts what is staged into use, under its version's name."""
-        self._adopt = adopt
-        # Written once, so that all of it is resident from the start.
-        self._states = bytearray(b"\xff") * (RECORDED * _RECORD.size)
-        self.recorded = 0
-        """Number of states recorded so far."""
+    def __init__(self, port: WeightsPort, settings: GateSettings, user: Controller) -> None:
+        self._step, self._car, self._settings, self._user = port.step, port.car, settings, user
+        self._version, self._proven = port.history.in_use.version, port.history.reference.version
+        self.watch: Watch | None = None
+        if not port.history.in_use.proven:
+            self.watch = self._new_watch()
         self.offers: deque[Offer] = deque(maxlen=1)
         """The manager appends, and pops what the control thread does not take."""
-        self.validator = False
-        """A validator works; set by the manager."""
-        self.allowed = math.inf
-        """Number of states up to which the watch lets lockstep go on; set by the manager."""
+        self.rulings: deque[tuple[int, Ruling]] = deque()
+        """What the watch has found and the control thread has done, with the next cycle's number;
+        the manager takes them."""
+        self.ruled = self.reverted = 0
+        """Rulings so far; and those by which the watch has gone back."""
+        self.samples_wanted = False
+        """The manager asks for ``samples``, which the control thread copies."""
+        self.samples: Samples | None = None
         self.slow: Environment | None = None
-        """Largest speed with the weights in use, and how fast to slow down to it; set by the
-        manager. None: no limit."""
-        self.awaited_s = -math.inf
-        """Monotonic clock when lockstep has waited for the watch."""
+        """Largest speed with the weights in use, and how fast to slow down to it. None: no
+        limit."""
         self.longest_us = 0.0
-        self.missed = 0
-        """Times that the watch did not keep up in lockstep."""
 
-    def record(self, state: State, fallen_back: bool | None) -> None:
-        """Keeps a state; ``fallen_back``: see :class:`StateRecord`."""
-        _RECORD.pack_into(
-            self._states, self.recorded % RECORDED * _RECORD.size,
-            self.recorded, state.epoch, state.run, state.seq, time.monotonic_ns(), state.time_s,
-            *state.x, *state.u_applied, state.lockstep, -1 if fallen_back is None else fallen_back,
-        )  # fmt: skip
-        self.recorded += 1
+    def _new_watch(self) -> Watch:
+        return Watch(self._settings, self._car, self._step.manifest.step_s)
+
+    def observe(self, vx_mps: float, fallen_back: bool | None) -> None:
+        """A state; ``fallen_back``: see :meth:`Watch.observe`."""
+        if self.watch is not None:
+            self.watch.observe(vx_mps, fallen_back)
 
     def limits(self, vx_mps: float) -> Environment | None:
         """What limits the car in the next cycle."""
         return None if self.slow is None else limits_at(vx_mps, self.slow)
 
-    def states(self, begin: int, most: int) -> list[StateRecord]:
-        """For the manager: at most so many states from number ``begin`` on, or the oldest kept."""
-        begin = max(begin, self.recorded - RECORDED)
-        numbers = range(begin, min(begin + most, self.recorded))
-        return [self._state(number) for number in numbers]
+    def between_cycles(self, cycle: int) -> None:
+        """Acts on what the watch finds, then on what is offered; ``cycle``: number of the next."""
+        if self.samples_wanted:
+            self.samples, self.samples_wanted = Samples(*self._step.samples()), False
+        if self.watch is not None:
+            ruling = self.watch.look(self._step.watch())
+            if ruling is not None:
+                self._rule(ruling)
+                self.ruled += 1
+                self.rulings.append((cycle, ruling))
+        if self.offers:
+            self._take(cycle)
 
-    def _state(self, number: int) -> StateRecord:
-        at = number % RECORDED * _RECORD.size
-        number, epoch, run, seq, at_ns, time_s, *x_u, lockstep, fallen_back = _RECORD.unpack_from(
-            self._states, at
-        )
-        known = None if fallen_back < 0 else bool(fallen_back)
-        x, u = tuple(x_u[:7]), tuple(x_u[7:])
-        return StateRecord(number, epoch, run, seq, time_s, at_ns, x, u, bool(lockstep), known)
-
-    def between_cycles(self, cycle: int, lockstep: bool = False) -> None:
-        """Adopts what is offered; ``cycle``: number of the next one.
-
-        In lockstep it lets the watch keep up first, as the plant lets the controller.
-        """
-        if lockstep and self.allowed < self.recorded:
-            self._wait_for_watch()
-        if not self.offers:
+    def _rule(self, ruling: Ruling) -> None:
+        if ruling.action == "slow":
+            fastest_mps = float(ruling.data["fastest_mps"])
+            self.slow = slowed_down(self._settings, self._car, fastest_mps)
             return
+        self.watch = None
+        if ruling.action == "proven":
+            self._step.prove_weights()
+            self._proven = self._version
+        else:
+            self.reverted += 1
+            self._user.revert_weights(self._proven)
+            self._version = self._proven
+
+    def _take(self, cycle: int) -> None:
         begin_ns = time.perf_counter_ns()
         try:
             offer = self.offers.popleft()
         except IndexError:  # withdrawn at this moment
             return
         try:
-            self._adopt(offer.version)
-            self.allowed = -1
-            self.slow = self.slow if offer.keeps_limit else None
+            if offer.reverted != self.reverted:
+                raise InputError("the watch has rolled back meanwhile; send them again")
+            self._user.adopt_weights(offer.version)
+            self._version = offer.version
+            if not offer.watched:
+                self._step.prove_weights()
+                self._proven = offer.version
+            self.watch, self.slow = self._new_watch() if offer.watched else None, None
         except InputError as error:
             offer.error = str(error)
-        offer.cycle, offer.states = cycle, self.recorded
+        offer.cycle, offer.ruled = cycle, self.ruled
         offer.us = (time.perf_counter_ns() - begin_ns) * 1e-3
         self.longest_us = max(self.longest_us, offer.us)
         offer.done = True
-
-    def _wait_for_watch(self) -> None:
-        """Returns when the watch allows the next cycle, or when there is an offer."""
-        self.awaited_s = time.monotonic()
-        deadline = self.awaited_s + _PATIENCE_S
-        while self.validator and not self.offers and self.allowed < self.recorded:
-            if time.monotonic() > deadline:  # it is not waited for until it answers again
-                self.missed, self.allowed = self.missed + 1, math.inf
-            time.sleep(_POLL_S)

@@ -1,7 +1,7 @@
 """Takes new weights from a request into the control loop and the store, in a thread of its own.
 
-What takes long is done elsewhere, without the interpreter's lock that the control thread needs: the
-validator process decodes and judges, compiled code copies, a third thread writes the store.
+What takes long is done elsewhere, without the interpreter's lock that the control thread needs:
+another process judges, compiled code copies, a third thread writes the store.
 """
 
 import logging
@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from functools import partial
 from queue import Empty, Full, Queue
 from typing import Any, Final
 
@@ -18,12 +17,14 @@ from bayesrace.errors import InputError
 from bayesrace.messages import ROLLBACK, WEIGHTS, Reply, Scalar
 from bayesrace.transport import Request, declare_service, decode_request
 from bayesrace.vehicles import car_text
+from controller.interface import Controller
 from controller.native_step import unpack_weights
-from controller.weights.adoption import Adoption, Offer, WeightsPort, slowed_down
+from controller.weights.adoption import Adoption, Offer, WeightsPort
+from controller.weights.checks import NO_SAMPLES
+from controller.weights.judge import judged
 from controller.weights.settings import GateSettings
 from controller.weights.store import AcceptedWeights, StoreWriter, digest_of
-from controller.weights.supervisor import Supervisor
-from controller.weights.validator_client import ValidatorClient
+from controller.weights.watch import Ruling
 
 __all__ = ["WeightUpdateManager"]
 
@@ -36,16 +37,13 @@ _ADOPT_S: Final = 2.0
 """The control loop, driving or idle, adopts within a cycle or a heartbeat; this is a stall."""
 _END_S: Final = 2.0
 """For the store when the controller ends."""
-
 _POLL_S: Final = 0.02
 """Between two looks at what is waited for: the control thread wakes no other thread."""
-_LOCKSTEP_POLL_S, _LOCKSTEP_S = 2e-4, 1.0
-"""The same in lockstep, where the control loop waits for the watch; and how long after it has."""
 
 _MOST_WAITING: Final = 32
 """Requests; each may hold a file."""
-_FILE_BYTES: Final = 100_000
-"""Of a weights file, beyond its arrays."""
+_FILE_BYTES: Final = 200_000
+"""Of a weights file, beyond the arrays of its outputs."""
 
 _Data = Mapping[str, Scalar]
 _Answer = tuple[str, _Data]
@@ -65,30 +63,22 @@ class _RefusalError(InputError):
 
 
 class WeightUpdateManager:
-    """Runs from :meth:`start` to :meth:`stop`, with its validator."""
+    """Runs from :meth:`start` to :meth:`stop`."""
 
     def __init__(
         self, session: Any, name: str, port: WeightsPort, settings: GateSettings, *,
-        adopt: Callable[[str], None], announce: Callable[[str, str, _Data], None],
+        user: Controller, announce: Callable[[str, str, _Data], None],
     ) -> None:  # fmt: skip
-        """``adopt``: see :class:`Adoption`. ``announce`` publishes an event (kind, text, data), and
-        is called from several threads."""
+        """``user``: the controller, whose weights the control thread exchanges. ``announce``
+        publishes an event (kind, text, data), and is called from several threads."""
         self._port, self._history, self._settings = port, port.history, settings
-        self._publish, self.adoption = announce, Adoption(adopt)
-        arguments = str(port.artefact), settings.model_dump_json(), car_text(port.car)
-        lost, not_kept = (
-            partial(self._warn, kind) for kind in ("validator_ended", "weights_not_kept")
-        )
-        self._supervisor = Supervisor(arguments, settings.hang_s, lost)
-        self._validator = ValidatorClient(self._supervisor, self.adoption, port.history, self._rule)
+        self._publish, self.adoption = announce, Adoption(port, settings, user)
         self._writer: StoreWriter | None = None
         if port.store is not None:
-            self._writer = StoreWriter(port.store, port.history, not_kept)
-        self._adopted = Offer("")
-        """The newest adoption; at first of the weights at the start."""
-        self._due_s = self._rolled_back_s = -math.inf
-        """Monotonic clock: deadline of the request that is served, but for the store; and when the
-        watch has rolled back."""
+            self._writer = StoreWriter(port.store, port.history, self._not_kept)
+        self._adoption_us, self._entered, self._rolled_back_s = 0.0, 0, -math.inf
+        """Duration of the newest adoption; rulings that are in the history; and the monotonic clock
+        when the watch has last rolled back."""
         self._counts = dict.fromkeys(("accepted", "refused", "rolled_back"), 0)
         self._counting, self._stopping = threading.Lock(), False
         self._waiting: Queue[tuple[float, Request]] = Queue(_MOST_WAITING)
@@ -102,8 +92,7 @@ class WeightUpdateManager:
     @property
     def text(self) -> str:
         """What is wrong; empty while all is well."""
-        parts = self._supervisor, self._writer
-        return "; ".join(part.trouble for part in parts if part and part.trouble)
+        return self._writer.trouble if self._writer else ""
 
     def status(self) -> dict[str, Scalar]:
         """Counters by name."""
@@ -112,11 +101,8 @@ class WeightUpdateManager:
             "weights_number": self._history.in_use.number,
             "weights_watched": not self._history.in_use.proven,
             "weights_slowed": self.adoption.slow is not None,
-            "validator": self._supervisor.ready,
-            "validator_starts": self._supervisor.starts,
-            "adoption_us": self._adopted.us,
+            "adoption_us": self._adoption_us,
             "adoption_longest_us": self.adoption.longest_us,
-            "watch_missed": self.adoption.missed,
         }
 
     def start(self) -> None:
@@ -124,12 +110,11 @@ class WeightUpdateManager:
         self._thread.start()
 
     def stop(self) -> None:
-        """Refuses what is not answered, and ends threads and validator; within seconds, even if
-        the disk of the store hangs."""
+        """Refuses what is not answered, and ends the thread; within seconds, even if the disk of
+        the store hangs."""
         self._stopping = True
         self._thread.join()
         self._refuse_waiting()
-        self._supervisor.close()
         until_s = time.monotonic() + _END_S
         while self._writer and not self._writer.idle and time.monotonic() < until_s:
             time.sleep(_POLL_S)
@@ -163,21 +148,23 @@ class WeightUpdateManager:
     def _run(self) -> None:
         while not self._stopping:
             try:
-                self._validator.follow()
-                self._serve(*self._waiting.get(timeout=self._poll_s))
+                self._follow()
+                self._serve(*self._waiting.get(timeout=_POLL_S))
             except Empty:
                 continue
-            except Exception:  # without this thread bad weights would not be rolled back
+            except Exception:  # without this thread nothing could be published any more
                 _log.exception("weights: a fault of the controller's own")
-                self._supervisor.lose("was ended after a fault of the controller's own")
 
     def _serve(self, arrived_s: float, request: Request) -> None:
         """From a request to its answer."""
-        self._due_s = arrived_s + request.service.timeout_s - _RETURN_S - _STORE_S
-        serve = self._update if request.service is WEIGHTS else self._back
+        self._follow()
+        due_s = arrived_s + request.service.timeout_s - _RETURN_S - _STORE_S
         accepted, text, data = False, "a fault of the controller's own: see its log", _AGAIN
         try:
-            text, data = serve(request, arrived_s)
+            if request.service is WEIGHTS:
+                text, data = self._update(request, due_s)
+            else:
+                text, data = self._back(request, arrived_s, due_s)
             accepted = True
         except InputError as refusal:
             text, data = str(refusal), getattr(refusal, "data", {})
@@ -186,28 +173,29 @@ class WeightUpdateManager:
             if not accepted and request.service is WEIGHTS:
                 self._announce("weights_refused", text, data)
 
-    def _update(self, request: Request, _: float) -> _Answer:
-        """Validates, stages, adopts and keeps the weights of a request."""
+    def _update(self, request: Request, due_s: float) -> _Answer:
+        """Judges, stages, adopts and keeps the weights of a request."""
         data, history, watched = request.payload, self._history, self._settings.watch_s > 0
         if request.size > self._most_bytes:
             raise InputError(f"{request.size} bytes are more than any weights that would fit")
-        verdict = self._judge(data)
+        verdict = self._judge(data, due_s)
         if digest_of(data) in history.withdrawn:
             why_not = "these weights have been rolled back before: they predicted worse than others"
             raise InputError(f"{why_not}; train again")
         if not verdict["packed"]:
             raise _RefusalError(verdict["text"], verdict["data"])
-        offer = self._adopt(verdict["packed"], verdict["data"]["version"], self._due_s)
-        new = history.accept(offer.version, data, verdict["packed"], proven=not watched)
+        version = verdict["data"]["version"]
+        offer = self._adopt(verdict["packed"], version, watched, due_s)
+        new = history.accept(version, data, verdict["packed"], proven=not watched)
         self._counts["accepted"] += 1
         in_use = f"in use from cycle {offer.cycle} on, as number {new.number}"
         text = f"weights {new.version} {in_use}; {verdict['text']}"
         facts = {"number": new.number, "cycle": offer.cycle, "adoption_us": offer.us}
         facts = verdict["data"] | facts
         self._announce("weights_accepted", text, facts)
-        return self._kept(text, facts)
+        return self._kept(text, facts, offer, due_s)
 
-    def _back(self, request: Request, arrived_s: float) -> _Answer:
+    def _back(self, request: Request, arrived_s: float, due_s: float) -> _Answer:
         """Returns to the weights before those in use."""
         message, why_not = decode_request(request)
         if message is None:
@@ -216,21 +204,32 @@ class WeightUpdateManager:
             raise InputError("the watch has rolled back meanwhile")
         if len(entries := self._history.entries) < 2:
             raise InputError("there are no weights before those in use")
+        target = entries[-2]
+        history = self._history.model_copy()
+        history.roll_back(target, withdraw=False)
+        if not target.proven:  # the watch over it goes back to what was proven then
+            proven = history.reference
+            self._adopt(proven.packed, proven.version, False, due_s)
+        offer = self._adopt(target.packed, target.version, not target.proven, due_s)
         why = f"on request: {message.text}"
-        return self._kept(*self._roll_back(entries[-2], "request", why, self._due_s))
+        text, data = self._rolled_back(target, "request", why, offer.cycle)
+        return self._kept(text, data, offer, due_s)
 
-    def _kept(self, text: str, data: _Data) -> _Answer:
+    def _kept(self, text: str, data: _Data, offer: Offer, due_s: float) -> _Answer:
         """Waits for the store; the answer is true when it is sent.
 
         InputError if the watch has rolled back meanwhile.
         """
-        adopted, writer, late = self._adopted, self._keep(), ""
+        writer, late = self._writer, ""
+        if writer:
+            writer.write()
         try:
             why_not = "the store has not been written in time"
-            self._wait(lambda: not writer or writer.idle, self._due_s + _STORE_S, why_not)
+            self._wait(lambda: not writer or writer.idle, due_s + _STORE_S, why_not)
         except _RefusalError as error:
             late = str(error)
-        if self._adopted is not adopted:
+        self._follow()
+        if self.adoption.reverted != offer.reverted:
             now = f"{self._history.in_use.version or 'no weights'} are in use again"
             raise InputError(f"the watch has rolled back meanwhile: {now}; before that, {text}")
         if not_kept := late or (writer.trouble if writer else ""):
@@ -238,111 +237,108 @@ class WeightUpdateManager:
         return text, data
 
     def _wait(self, done: Callable[[], object], until_s: float, why_not: str) -> None:
-        """Follows the validator until ``done``; refuses the request for now when time is over."""
+        """Follows the watch until ``done``; refuses the request for now when time is over."""
         while not done():
             if self._stopping or time.monotonic() > until_s:
                 raise _RefusalError(_ENDS if self._stopping else why_not)
-            time.sleep(self._poll_s)
-            self._validator.follow()
+            time.sleep(_POLL_S)
+            self._follow()
 
-    # Validator -----------------------------------------------------------------------------------
-
-    def _judge(self, data: bytes) -> Mapping[str, Any]:
-        """The validator's verdict, by what is in use when it is given."""
-        validator, late = self._validator, "the validator has not answered in time"
-        validator.check(data)
+    def _judge(self, data: bytes, due_s: float) -> Mapping[str, Any]:
+        """The verdict of another process, by what is in use now."""
+        history, adoption = self._history, self.adoption
+        adoption.samples, adoption.samples_wanted = None, True
+        with suppress(_RefusalError):  # without the car's samples, on probation
+            until_s = min(time.monotonic() + _ADOPT_S, due_s)
+            self._wait(lambda: adoption.samples is not None, until_s, "no samples")
+        question = {
+            "artefact": str(self._port.artefact), "car": car_text(self._port.car),
+            "settings": self._settings.model_dump_json(), "data": data,
+            "recent": adoption.samples or NO_SAMPLES, "in_use": history.in_use.data,
+            "reference": history.reference.data,
+            "accepted_utc_ns": history.in_use.accepted_utc_ns,
+        }  # fmt: skip
         try:
-            self._wait(lambda: validator.verdict or self._supervisor.trouble, self._due_s, late)
-        finally:
-            validator.check(None)
-        if not validator.verdict:
-            raise _RefusalError(f"{self._supervisor.trouble}; send them again in a moment")
-        return validator.verdict
+            verdict: Mapping[str, Any] = judged(question, due_s, self._follow_or_end)
+        except _RefusalError:
+            raise
+        except InputError as error:
+            raise _RefusalError(f"{error}; send them again") from None
+        return verdict
 
-    @property
-    def _poll_s(self) -> float:
-        """Time to the next look at what the control thread and the validator have done."""
-        lockstep = time.monotonic() < self.adoption.awaited_s + _LOCKSTEP_S
-        return _LOCKSTEP_POLL_S if lockstep else _POLL_S
+    def _follow_or_end(self) -> None:
+        self._follow()
+        if self._stopping:
+            raise _RefusalError(_ENDS)
 
-    def _rule(self, action: str, why: str, data: _Data) -> None:
-        """Acts on a :class:`.checks.Ruling` about the weights in use."""
-        in_use = self._history.in_use
-        known: _Data = {"version": in_use.version, "number": in_use.number}
-        if action == "slow":
-            self._slow_down(f"{in_use.version} {why}", {**data, **known})
-            return
-        if action == "proven":
-            self._history.prove()
-            text = f"weights {in_use.version} (number {in_use.number}) are proven"
-            self._announce("weights_proven", text, known)
-        else:
-            why = f"{in_use.version} {why}"
-            try:
-                self._roll_back(self._history.reference, "watch", why, math.inf, data)
-            except InputError as refusal:  # the next validator comes to the same result
-                self._supervisor.lose(f"was ended, as a rollback is not possible now ({refusal})")
-                return
-            self._rolled_back_s = time.monotonic()
-        self._keep()
+    # Adoption and watch --------------------------------------------------------------------------
 
-    def _slow_down(self, why: str, data: _Data) -> None:
-        """Limits the speed until other weights are in use: going back would be no better."""
-        if self.adoption.slow is not None:  # by a validator that has ended meanwhile
-            return
-        slow = slowed_down(self._settings, self._port.car, float(data["fastest_mps"]))
-        self.adoption.slow = slow
-        text = f"at most {slow.speed_limit_mps:.2f} m/s until other weights are in use; {why}"
-        self._announce("weights_slowed", text, {**data, "speed_limit_mps": slow.speed_limit_mps})
-
-    # Adoption and store --------------------------------------------------------------------------
-
-    def _adopt(self, packed: bytes, version: str, due_s: float, keeps_limit: bool = False) -> Offer:
+    def _adopt(self, packed: bytes, version: str, watched: bool, due_s: float) -> Offer:
         """Stages weights and waits until the control thread has adopted them."""
-        offer = Offer(version, keeps_limit)
+        offer = Offer(version, self.adoption.reverted, watched)
         self._port.step.stage_weights(unpack_weights(packed))
         self.adoption.offers.append(offer)
         until_s = min(time.monotonic() + _ADOPT_S, due_s)
         while not offer.done:
-            time.sleep(self._poll_s)
+            time.sleep(_POLL_S)
             if self._stopping or time.monotonic() > until_s:
                 why_not = f"the control loop did not adopt them within {_ADOPT_S:g} s"
                 with suppress(IndexError):  # else the control thread is just adopting them
                     self.adoption.offers.pop()
                     raise _RefusalError(_ENDS if self._stopping else why_not)
+        self._follow(offer.ruled)
         if offer.error:
-            raise InputError(offer.error)
-        self._adopted = offer
+            raise _RefusalError(offer.error)
+        self._adoption_us = offer.us
         return offer
 
-    def _roll_back(
-        self, target: AcceptedWeights, by: str, why: str, due_s: float, data: _Data | None = None
+    def _follow(self, count: float = math.inf) -> None:
+        """Enters into the history what the watch has found and the control thread has done; at
+        most the first ``count`` rulings, as those later are about weights that are not in it."""
+        while self.adoption.rulings and self._entered < count:
+            self._entered += 1
+            self._enter(*self.adoption.rulings.popleft())
+
+    def _enter(self, cycle: int, ruling: Ruling) -> None:
+        in_use = self._history.in_use
+        known: _Data = {"version": in_use.version, "number": in_use.number}
+        if ruling.action == "slow":
+            limit_mps = self.adoption.slow.speed_limit_mps if self.adoption.slow else 0.0
+            text = f"at most {limit_mps:.2f} m/s until other weights are in use"
+            data = {**ruling.data, **known, "speed_limit_mps": limit_mps}
+            self._announce("weights_slowed", f"{text}; {in_use.version} {ruling.text}", data)
+            return
+        if ruling.action == "proven":
+            self._history.prove()
+            text = f"weights {in_use.version} (number {in_use.number}) are proven"
+            self._announce("weights_proven", text, known)
+        else:
+            why = f"{in_use.version} {ruling.text}"
+            self._rolled_back(self._history.reference, "watch", why, cycle, ruling.data)
+            self._rolled_back_s = time.monotonic()
+        if self._writer:
+            self._writer.write()
+
+    def _rolled_back(
+        self, target: AcceptedWeights, by: str, why: str, cycle: int, data: _Data | None = None
     ) -> _Answer:
-        """Returns to earlier weights."""
+        """Enters that earlier weights are in use again."""
         left = self._history.in_use
-        offer = self._adopt(target.packed, target.version, due_s, keeps_limit=by == "watch")
         self._history.roll_back(target, withdraw=by == "watch")
         self._counts["rolled_back"] += 1
         what = target.version or "no weights, as at the start"
-        text = f"back to {what} (number {target.number}) from cycle {offer.cycle} on; {why}"
+        text = f"back to {what} (number {target.number}) from cycle {cycle} on; {why}"
         facts: _Data = {
             **(data or {}), "version": target.version, "number": target.number, "by": by,
-            "cycle": offer.cycle, "from_version": left.version, "from_number": left.number,
+            "cycle": cycle, "from_version": left.version, "from_number": left.number,
         }  # fmt: skip
         self._announce("weights_rolled_back", text, facts)
         return text, facts
 
-    def _keep(self) -> StoreWriter | None:
-        """Has the validator sent what is in use, and the store written."""
-        self._validator.renew(self._adopted.states)
-        if self._writer:
-            self._writer.write()
-        return self._writer
-
-    def _warn(self, kind: str, text: str) -> None:
-        """Reports trouble, in any thread; the car is driven on with what is in use."""
+    def _not_kept(self, text: str) -> None:
+        """Reports that the store cannot be written; the car is driven on with what is in use."""
         _log.warning("%s", text)
-        self._announce(kind, text, {})
+        self._announce("weights_not_kept", text, {})
 
     def _announce(self, kind: str, text: str, data: _Data) -> None:
         """Publishes an event, on which no answer and no rollback depends."""

@@ -1,11 +1,10 @@
-"""An update manager with its validator, in this process: the test is the control thread.
+"""An update manager, in this process: the test is the control thread.
 
 So it decides when an offer is adopted, and what happens meanwhile. Requests go through a Zenoh
 session that has no other peer.
 """
 
 import json
-import os
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -13,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from bayesrace.gp.weights import GpWeights, encode_weights
-from bayesrace.messages import ROLLBACK, WEIGHTS, Reply, RollbackRequest, State
+from bayesrace.messages import ROLLBACK, WEIGHTS, Reply, RollbackRequest
 from bayesrace.transport import Endpoints, ask, open_session
 from bayesrace.vehicles import get_car
 from controller.assembly import predictive_controller
@@ -22,19 +21,10 @@ from controller.weights.manager import WeightUpdateManager
 from controller.weights.settings import GateSettings
 from tests.network.cars import Course
 from tests.programs import until
-from tests.takeover.rig import validators
 
-__all__ = ["Bench", "a_state", "bench"]
+__all__ = ["Bench", "bench"]
 
 CAR = "orca"
-
-
-def a_state(seq: int) -> State:
-    """Of a car that stands, at 50 Hz."""
-    return State(
-        seq=seq, source_time_ns=0, epoch=1, run=1, time_s=0.02 * seq, x=(0.0,) * 7,
-        u_applied=(0.0, 0.0), lap=0, lockstep=False, actuation_delays=(), final=False,
-    )  # fmt: skip
 
 
 class Bench:
@@ -50,7 +40,7 @@ class Bench:
         self.events: list[tuple[str, str]] = []
         """Kind and text."""
         self.manager = WeightUpdateManager(
-            session, CAR, controller.port, gate, adopt=controller.adopt_weights,
+            session, CAR, controller.port, gate, user=controller,
             announce=lambda kind, text, _: self.events.append((kind, text)),
         )  # fmt: skip
         self.adoption = self.manager.adoption
@@ -64,7 +54,7 @@ class Bench:
         """Records as many states; nothing is adopted."""
         for _ in range(cycles):
             self._seq += 1
-            self.adoption.record(a_state(self._seq), fallen_back)
+            self.adoption.observe(0.0, fallen_back)
 
     def send(self, weights: GpWeights) -> "Future[Reply]":
         return self._pool.submit(ask, self._session, WEIGHTS, CAR, encode_weights(weights))
@@ -84,49 +74,21 @@ class Bench:
         return answer.result()
 
     def accept(self, weights: GpWeights) -> Reply:
-        """However often a validator is replaced on a machine that stalls."""
-        for _ in range(20):
-            self.ready()
-            reply = self.reply(self.send(weights))
-            if reply.accepted:
-                return reply
-            assert reply.data.get("again"), reply.text
-        raise AssertionError(reply.text)
+        reply = self.reply(self.send(weights))
+        assert reply.accepted, reply.text
+        return reply
 
     @property
     def version(self) -> str:
         """In use."""
         return self.controller.weights_version
 
-    @property
-    def validator(self) -> int:
-        """Its process number."""
-        found: list[int] = []
-
-        def alone() -> bool:
-            found[:] = validators(os.getpid())
-            return len(found) == 1
-
-        until(alone, "one validator")  # after a stall it may be replaced at this moment
-        return found[0]
-
     def status(self, name: str) -> Any:
         return self.manager.status()[name]
-
-    def ready(self, starts: int = 1) -> None:
-        """A validator works, at least this many have been started."""
-        until(
-            lambda: self.adoption.validator and self.status("validator_starts") >= starts,
-            "a validator that works",
-        )
 
     def offered(self) -> None:
         """Weights wait for the control thread."""
         until(lambda: self.adoption.offers, "an offer")
-
-    def gone(self) -> None:
-        """The end of the validator is noticed."""
-        until(lambda: not self.adoption.validator, "the validator's end is noticed")
 
     def published(self, kind: str) -> list[str]:
         """Texts of the events of a kind."""
@@ -157,7 +119,6 @@ def bench(
         made = Bench(session, controller, gate or GateSettings(), store)
         made.manager.start()
         try:
-            made.ready()
             yield made
         finally:
             made.close()

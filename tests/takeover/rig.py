@@ -32,9 +32,8 @@ from codegen.settings import BuildSettings
 from operation.drive import RunPlan, run_request
 from tests.conftest import fit_weights, offset_line
 from tests.network.cars import Course, Program, start_controller, start_plant
-from tests.programs import until
 
-__all__ = ["DRIVEN_S", "Rig", "digest", "validators", "make_course", "rigged"]
+__all__ = ["DRIVEN_S", "Rig", "digest", "judges", "make_course", "rigged"]
 
 KINDS = ("rbf", "matern25", "matern15")
 _LATE = 5
@@ -84,10 +83,10 @@ class Rig:
         """Data of the answer."""
         return dict(self.director.send_weights(encode_weights(weights)).data)
 
-    def drive_and_send(self, run: int, weights: GpWeights, times: int) -> list[int]:
-        """In lockstep, sending weights so often; the cycles that the answers name."""
-        self.start(run)
-        cycles = [self.send(weights)["cycle"] for _ in range(times)]
+    def drive_and_send(self, run: int, weights: GpWeights, seconds: float) -> list[int]:
+        """In lockstep, sending weights twice; the cycles that the answers name."""
+        self.start(run, seconds=seconds)
+        cycles = [self.send(weights)["cycle"] for _ in range(2)]
         self.director.wait_for_end(run, 60.0)
         return cycles
 
@@ -102,10 +101,6 @@ class Rig:
 
     def counters(self) -> dict[str, Any]:
         return dict(self.status().counters)
-
-    def ready(self) -> None:
-        """Its validator has started."""
-        until(lambda: self.counters()["validator"], "the validator")
 
     def reader(self) -> LogReader:
         self.recorder.drain()
@@ -164,8 +159,8 @@ def digest(states: list[State]) -> str:
     return hashlib.sha256(rows).hexdigest()
 
 
-def validators(of: int) -> list[int]:
-    """Process numbers of a controller's children that are validators."""
+def judges(of: int) -> list[int]:
+    """Process numbers of a controller's children that judge weights."""
     found = []
     for entry in Path("/proc").iterdir():
         try:
@@ -173,6 +168,6 @@ def validators(of: int) -> list[int]:
             parent = int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1])
         except (OSError, ValueError, IndexError):
             continue
-        if b"controller.weights.validator" in words and parent == of:
+        if b"controller.weights.judge" in words and parent == of:
             found.append(int(entry.name))
     return found

@@ -29,31 +29,30 @@ pytestmark = [pytest.mark.wall_clock, pytest.mark.unmeasured]
 
 
 def test_adopting_the_same_weights_changes_no_bit(rig: Rig, good: GpWeights) -> None:
-    rig.drive(1)
+    long_s = 60.0  # a check takes a second
+    rig.drive(1, seconds=long_s)
     for number in range(1, 4):
         answer = rig.send(good)
         assert answer["number"] == number
         assert answer["cycle"] == rig.counters()["ticks"]
-    rig.drive(2)  # watched, for which the controller waits
+    rig.drive(2, seconds=long_s)  # watched
     runs, taken, inside = [1, 2], 3, 0
     while not inside:
         runs.append(runs[-1] + 1)
         assert len(runs) < 8, "no takeover has come before a run was over"
-        cycles = rig.drive_and_send(runs[-1], good, times=5)
+        cycles = rig.drive_and_send(runs[-1], good, long_s)
         ticks = rig.ticks(runs[-1])
         inside = sum(ticks[0] < cycle <= ticks[-1] for cycle in cycles)
         taken += len(cycles)
     first, *others = (digest(rig.states(run)) for run in runs)
     assert others == [first] * len(others)
     assert rig.counters()["weights_accepted"] == taken
-    assert rig.counters()["watch_missed"] == 0
 
 
 def test_inputs_jump_by_what_the_new_model_explains(
     rig: Rig, course: Course, again: GpWeights
 ) -> None:
     """To rounding: the plan goes on, and nothing else of the controller is changed."""
-    rig.ready()
     rig.start(1, seconds=60.0)
     until(lambda: (state := rig.newest()) and state.seq > 60, "a car that drives")
     cycle = rig.send(again)["cycle"]
@@ -199,7 +198,6 @@ def test_each_cycle_names_its_weights_and_the_inputs_do_not_jump(
     little more than between other cycles and by what the new model explains. What they cost in
     time: benchmarks/takeover.py.
     """
-    rig.ready()
     rig.start(1, lockstep=False, seconds=100.0)
     until(lambda: rig.counters()["ticks"] > 150, "three seconds of driving")
     named, weights = {}, {good.version: good}
@@ -249,7 +247,6 @@ def test_each_cycle_names_its_weights_and_the_inputs_do_not_jump(
 
 @pytest.mark.check
 def test_spoilt_weights_are_rolled_back_in_real_time(rig: Rig, good: GpWeights) -> None:
-    rig.ready()
     rig.send(spoilt(good, "flip all"))
     rig.start(1, lockstep=False, seconds=DRIVEN_S)
     end = rig.director.wait_for_end(1, 60.0)

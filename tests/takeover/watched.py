@@ -12,46 +12,46 @@ from codegen.settings import BuildSettings
 from controller.assembly import compiled_controller
 from controller.interface import Environment
 from controller.mpc import PredictiveController
+from controller.native_step import NativeStep, pack_weights, unpack_weights
 from controller.weights.adoption import limits_at, slowed_down
-from controller.weights.checks import Checks, Watch
-from controller.weights.prediction import Sampler, StateRecord
+from controller.weights.checks import Checks
 from controller.weights.settings import GateSettings
+from controller.weights.watch import Ruling, Watch
 from operation.closed_loop import ClosedLoop, Driven
 
 __all__ = ["Course"]
 
 
 class WatchedLoop(ClosedLoop):
-    """A closed loop in which weights are watched: the watch rules after each state."""
+    """A closed loop in which weights are watched: the watch rules between two cycles."""
 
-    def watch(self, checks: Checks, weights: GpWeights, proven: GpWeights | None) -> None:
-        """In the next run, in which the controller has ``weights``, against ``proven`` ones."""
-        back = zero_weights(weights.car, weights.discretisation) if proven is None else proven
-        self._back = encode_weights(back)
-        checks.use(encode_weights(weights), 0, b"" if proven is None else self._back)
-        self._gate, self._sampler = checks.settings, Sampler(checks.step_s, self._car)
-        self._watch: Watch | None = Watch(checks, [])
+    def watch(self, step: NativeStep) -> None:
+        """In the next run, over the weights that ``step`` has adopted."""
+        self._step, self._gate = step, GateSettings()
+        self._watch: Watch | None = Watch(self._gate, self._car, step.manifest.step_s)
         self._slow: Environment | None = None
         self.found: list[str] = []
         """What the watch has done, and when."""
 
     def _limits(self, state: State) -> Environment | None:
-        record = StateRecord(
-            state.seq, state.epoch, state.run, state.seq, state.time_s, 0, state.x,
-            state.u_applied, True,
-        )  # fmt: skip
-        sample, fallen_back = self._sampler.add(record), self._cycle.driver.fallen_back
-        ruling = self._watch.add(fallen_back, sample) if self._watch else None
-        if ruling is not None:
-            self.found.append(f"{ruling.action} at {len(self._states)}, {state.x[3]:.1f} m/s")
-            if ruling.action == "slow":
-                fastest_mps = float(ruling.data["fastest_mps"])
-                self._slow = slowed_down(self._gate, self._car, fastest_mps)
-            else:
-                self._watch = None
-                assert isinstance(self._controller, PredictiveController)
-                self._controller.set_weights(self._back)
+        if self._watch is not None:
+            self._watch.observe(state.x[3], self._cycle.driver.fallen_back)
+            ruling = self._watch.look(self._step.watch())
+            if ruling is not None:
+                self._rule(ruling, state)
         return None if self._slow is None else limits_at(state.x[3], self._slow)
+
+    def _rule(self, ruling: Ruling, state: State) -> None:
+        if ruling.action == "proven":
+            self._watch = None
+            return
+        self.found.append(f"{ruling.action} at {len(self._states)}, {state.x[3]:.1f} m/s")
+        if ruling.action == "slow":
+            fastest_mps = float(ruling.data["fastest_mps"])
+            self._slow = slowed_down(self._gate, self._car, fastest_mps)
+        else:
+            self._watch = None
+            self._step.revert_weights()
 
 
 class Course:
@@ -66,11 +66,14 @@ class Course:
 
     def drive(self, weights: GpWeights, proven: GpWeights | None) -> tuple[str, float]:
         """What became of the weights, and the largest excess over the edge [m]."""
-        self._checks.use(b"", 0, b"")
-        if not self._checks.judge(encode_weights(weights), []).packed:
+        if not self._checks.judge(encode_weights(weights)).packed:
             return "refused as absurd", -math.inf
-        loop = WatchedLoop(self._car, self._track, self._line, self._controller(weights))
-        loop.watch(self._checks, weights, proven)
+        before = proven or zero_weights(weights.car, weights.discretisation)
+        controller, packed = self._controller(before), pack_weights(weights)
+        controller.native.stage_weights(unpack_weights(packed))
+        controller.native.adopt_weights()
+        loop = WatchedLoop(self._car, self._track, self._line, controller)
+        loop.watch(controller.native)
         run = loop.drive(0, self._seconds)
         return "; ".join(loop.found) or "kept", _excess_m(run)
 

@@ -1,0 +1,59 @@
+/* What weights say beside what the car does: the newest samples, and the errors on them of the
+ * weights in use, of the proven ones, and of none.
+ *
+ * A sample is what a Gaussian process learns from: features, and the residual of the nominal model,
+ * per stage. It is taken in the preparation from what br_mpc_observe has been shown, and judged
+ * there: the newest first, then older ones back to before the weights came into use, a few at a
+ * time, so that no preparation takes longer than some microseconds more. */
+#include <math.h>
+#include <string.h>
+
+#include "br_internal.h"
+
+#define AT_ONCE 4   /* samples that one preparation judges */
+#define NEAR_BY 0.5 /* of a stage by which a sample's duration may differ from it */
+
+/* Features and residual of the newest transition; 0 if it tells nothing of an output. */
+static int sample_of(const br_mpc *mpc, const br_transition *seen, br_sample *sample) {
+    const double stages = seen->duration / BR_TS;
+    double nominal[BR_NX];
+    if (fabs(stages - 1) > NEAR_BY) return 0;
+    if (br_predict_by(mpc, NULL, seen->x, seen->u, seen->duration, nominal)) return 0;
+    br_stage_features(seen->x, seen->u, sample->z);
+    for (int j = 0; j < BR_NE; ++j) {
+        const int i = br_most_changed(&mpc->stage[0], j);
+        const double share = mpc->stage[0].in_e[i][j] * stages;
+        if (share == 0) return 0; /* before the first linearisation */
+        sample->residual[j] = (seen->x_next[i] - nominal[i]) / share;
+    }
+    return br_all_finite(sample->residual, BR_NE);
+}
+
+static void judge(br_mpc *mpc, const br_sample *sample, br_judged *judged) {
+    const int of[2] = {mpc->gp_in_use, mpc->gp_proven};
+    for (int which = 0; which < 2; ++which) {
+        const br_gp *gp = &mpc->gp[of[which]];
+        double mean[BR_NE] = {0};
+        if (gp->any) br_gp_mean(gp, sample->z, mean);
+        for (int j = 0; j < BR_NE; ++j) judged->error[which][j] = sample->residual[j] - mean[j];
+    }
+}
+
+void br_watch_update(br_mpc *mpc) {
+    br_watch *watch = &mpc->watch;
+    if (watch->newest.duration > 0) {
+        br_sample *sample = &watch->sample[watch->count % BR_SAMPLES];
+        watch->count += sample_of(mpc, &watch->newest, sample);
+        watch->newest.duration = 0;
+    }
+    if (mpc->gp_in_use == mpc->gp_proven) return;
+    const int64_t oldest = watch->count > BR_WATCHED ? watch->count - BR_WATCHED : 0;
+    int left = AT_ONCE;
+    for (int64_t k = watch->count - 1; k >= oldest && left; --k) {
+        br_judged *judged = &watch->judged[k % BR_WATCHED];
+        if (judged->number == k + 1) continue;
+        judge(mpc, &watch->sample[k % BR_SAMPLES], judged);
+        judged->number = k + 1;
+        left -= 1;
+    }
+}
