@@ -6,6 +6,7 @@ import subprocess
 import zipfile
 from enum import IntEnum
 from functools import cache
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Final
 
@@ -17,12 +18,12 @@ from bayesrace.cache import software
 from bayesrace.vehicles.models import STATES
 from codegen.compiler import find_compiler
 from plant.fmu.host import FmuHost
-from plant.fmu.package import read_description
-from plant.fmu.process import FmuProcess
+from plant.fmu.inspection import inspect as inspect_fmu
 from tests.shared import shared_folder
 
 __all__ = [
-    "PATIENCE_S", "STATES", "Mode", "faulty_fmu", "faulty_host", "faulty_library", "process_of",
+    "PATIENCE_S", "STATES", "Mode", "faulty_fmu", "faulty_host", "faulty_library", "folder_of",
+    "process_of",
 ]  # fmt: skip
 
 SOURCE: Final = Path(__file__).parent / "native" / "faulty_fmu.c"
@@ -88,7 +89,7 @@ def faulty_host(path: Path, outputs: tuple[str, ...] = STATES) -> FmuHost:
     """The FMU in a process of its own."""
     return FmuHost(
         path,
-        read_description(path),
+        inspect_fmu(path),
         ("d", "delta_rate"),
         outputs,
         timeout_s=PATIENCE_S,
@@ -96,10 +97,15 @@ def faulty_host(path: Path, outputs: tuple[str, ...] = STATES) -> FmuHost:
     )
 
 
-def process_of(host: FmuHost) -> FmuProcess:
+def process_of(host: FmuHost) -> SpawnProcess:
     """The process that the FMU runs in."""
     assert host._process is not None
     return host._process
+
+
+def folder_of(process: SpawnProcess) -> Path:
+    """The unpacked FMU of such a process."""
+    return Path(f"/proc/{process.pid}/cwd").readlink()
 
 
 def _description_2(guid: str, attributes: str) -> str:
@@ -150,7 +156,6 @@ def _description_3(guid: str, attributes: str) -> str:
         ("Float64", "instances", 'causality="output"'),
         ("Float32", "soft", 'causality="parameter" start="1"'),
         ("UInt8", "small", 'causality="parameter" start="1"'),
-        ("UInt64", "rows", 'causality="structuralParameter" start="1"'),
     ]
     lines = "\n".join(
         f'<{kind} name="{name}" valueReference="{reference}" {how}/>'

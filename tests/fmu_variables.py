@@ -7,9 +7,16 @@ from typing import Any, Final
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
+from fmpy.model_description import (
+    CoSimulation,
+    Item,
+    ModelDescription,
+    ModelExchange,
+    ModelVariable,
+    SimpleType,
+)
 
 from bayesrace.arrays import Floats
-from plant.fmu.inspection import FmuDescription, Variable
 from plant.fmu.units import unit_of
 from plant.fmu.wiring import STATES, Wiring
 
@@ -18,72 +25,71 @@ __all__ = [
     "our_names", "own_fmu", "read", "replacing", "taken", "values", "variable", "write_fmu",
 ]  # fmt: skip
 
+unit_of("m")  # loads pint, which takes longer than Hypothesis allows an example
+
 _INITIAL: Final = {"input": "exact", "parameter": "exact", "output": "calculated"}
 _VARIABILITY: Final = {"parameter": "fixed"}
 
 
-def variable(
-    name: str, causality: str = "output", unit: str | None = None, **more: Any
-) -> Variable:
-    """A real variable as an FMU would declare it; inputs and parameters start at 0."""
+def variable(name: str, causality: str = "output", unit: str | None = None, **more: Any) -> Any:
+    """A real variable as an FMU would declare it; inputs and parameters start at 0.
+
+    ``items``: makes it an enumeration.
+    """
     settings: dict[str, Any] = {
-        "kind": "real",
-        "fmi_type": "Float64",
+        "type": "Float64",
         "variability": _VARIABILITY.get(causality, "continuous"),
         "initial": _INITIAL.get(causality, "calculated"),
-        "unit_name": unit,
-        "unit": unit_of(unit),
         "start": None if causality == "output" else "0",
     }
-    return Variable(name=name, causality=causality, **(settings | more))
+    items = [Item(one, str(number)) for one, number in more.pop("items", {}).items()]
+    declared = SimpleType(items=items) if items else None
+    settings |= {"unit": unit, "declaredType": declared} | more
+    return ModelVariable(name=name, causality=causality, **settings)
 
 
-def given(name: str, unit: str | None = None, **more: Any) -> Variable:
+def given(name: str, unit: str | None = None, **more: Any) -> Any:
     """An output."""
     return variable(name, "output", unit, **more)
 
 
-def taken(name: str, unit: str | None = None, **more: Any) -> Variable:
+def taken(name: str, unit: str | None = None, **more: Any) -> Any:
     """An input."""
     return variable(name, "input", unit, **more)
 
 
 OWN: Final = (
     *(given(name, unit, initial="exact", start="0") for name, unit in STATES.items()),
-    taken("d", "1", lowest=-0.1, highest=1.0),
+    taken("d", "1", min="-0.1", max="1.0"),
     taken("delta_rate", "rad/s"),
-    variable("mass_kg", "parameter", "kg", start="0.041", lowest=1e-3, description="mass"),
+    variable("mass_kg", "parameter", "kg", start="0.041", min="0.001", description="mass"),
 )
 """The variables of our own FMU."""
 
 
-def description(*variables: Variable, **more: Any) -> FmuDescription:
-    """A Co-Simulation FMU with these variables."""
-    settings: dict[str, Any] = {
-        "model_name": "Paper",
-        "fmi_version": "3.0",
-        "interfaces": ("Co-Simulation",),
-    }
-    return FmuDescription(variables=tuple(variables), **(settings | more))
+def description(*variables: Any, cosimulation: bool = True, name: str = "Paper") -> Any:
+    """An FMU with these variables, for Co-Simulation or else Model Exchange."""
+    fmu = ModelDescription("3.0", name, modelVariables=list(variables))
+    fmu.coSimulation = CoSimulation() if cosimulation else None
+    fmu.modelExchange = None if cosimulation else ModelExchange()
+    return fmu
 
 
-def own_fmu(*replaced: Variable, without: tuple[str, ...] = ()) -> FmuDescription:
+def own_fmu(*replaced: Any, without: tuple[str, ...] = ()) -> Any:
     """Our own FMU less the variables named, with others added."""
     return description(*(one for one in OWN if one.name not in without), *replaced)
 
 
-def write_fmu(
-    path: Path, variables: str, *, version: str = "3.0", kind: str = "CoSimulation", units: str = ""
-) -> Path:
-    """An archive with this XML inside ModelVariables and UnitDefinitions, and an empty binary."""
+def write_fmu(path: Path, variables: str, *, version: str = "3.0", types: str = "") -> Path:
+    """An archive with this XML inside ModelVariables and TypeDefinitions, and an empty binary."""
     token = "guid" if version.startswith("2") else "instantiationToken"
     path.parent.mkdir(parents=True, exist_ok=True)
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr(
             "modelDescription.xml",
             f"<fmiModelDescription fmiVersion={quoteattr(version)} modelName='Paper' {token}='1'>"
-            f"<{kind} modelIdentifier='Paper' canHandleVariableCommunicationStepSize='true'/>"
-            f"<UnitDefinitions>{units}</UnitDefinitions>"
+            "<CoSimulation modelIdentifier='Paper' canHandleVariableCommunicationStepSize='true'/>"
+            f"<TypeDefinitions>{types}</TypeDefinitions>"
             "<DefaultExperiment stepSize='0.004'/>"
             f"<ModelVariables>{variables}</ModelVariables><ModelStructure/>"
             "</fmiModelDescription>",

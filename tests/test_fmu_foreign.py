@@ -8,8 +8,6 @@ import pytest
 
 from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import dynamic
-from plant.fmu.inspection import inspect
-from plant.fmu.proposal import starting_map
 from plant.fmu.simulator import open_fmu
 from plant.simulator import Simulator
 from tests.foreign_fmu import FOREIGN_MAP, build_foreign_fmu
@@ -49,20 +47,3 @@ def test_it_drives_as_the_built_in_car(foreign: Path, tmp_path: Path, settings: 
                 assert np.abs(theirs.x - ours.x).max() < 1e-9, (run, k)
                 assert theirs.u_applied == pytest.approx(ours.u_applied, abs=1e-12)
             assert abs(ours.x[2] - START[2]) > 2 * math.pi
-
-
-def test_the_map_that_inspection_proposes_fits_as_it_is(foreign: Path, tmp_path: Path) -> None:
-    """This tool declares no units; its descriptions state them, signs and zeros."""
-    proposal = starting_map(inspect(foreign))
-    assert "TO FILL IN" not in proposal
-    car = get_car("orca")
-    states = []
-    for i, text in enumerate((FOREIGN_MAP, proposal)):
-        map_ = tmp_path / f"{i}.toml"
-        map_.write_text(text)
-        with open_fmu(car, foreign, map_) as simulator:
-            simulator.reset(START)
-            for _ in range(20):
-                simulator.step((0.5, 0.2))
-            states.append(simulator.x.copy())
-    assert (states[0] == states[1]).all()

@@ -3,19 +3,22 @@
 import contextlib
 import io
 import math
+import zipfile
 from pathlib import Path
+from typing import Any
 
 import pytest
-from fmpy.model_description import BaseUnit
+from fmpy.model_description import Dimension
 from hypothesis import given as those
 from hypothesis import strategies as st
 from rich.console import Console
 
 from bayesrace.errors import InputError
 from operation.terminal.fmu_table import FmuTable
-from plant.fmu.inspection import FmuDescription, inspect
+from plant.fmu.inspection import inspect, is_settable, platforms, range_of, steps_s
 from plant.fmu.map import wire
 from plant.fmu.map_file import parse_map, read_map
+from plant.fmu.template import blank_map
 from plant.fmu.units import parse_quantity, to_si, unit_of
 from tests.fmu_variables import OWN, description, given, own_fmu, taken, variable, write_fmu
 
@@ -38,7 +41,7 @@ from tests.fmu_variables import OWN, description, given, own_fmu, taken, variabl
         ("[parameters]\nm = [1]", "parameters.m"),
         ("[derive]\nomega = 'psy'", "derive.omega"),
         ("[derive]\nvelocity = { world_x = 'a' }", "world_x and world_y"),
-        ("[derive]\nvelocity = { slip = 'a' }", "or speed"),
+        ("[derive]\nvelocity = { slip = 'a' }", "or speed, or slip and speed"),
         ("[derive]\npsi = { cos = 'a' }", "cos and sin"),
         ("[derive]\npsi = { quaternion = { w = 'a', x = 'b', y = 'c' } }", "quaternion.z"),
         ("[derive.psi]\ncos = 'a'\nsin = 'b'\nquaternion = {w='a',x='b',y='c',z='d'}", "either"),
@@ -113,34 +116,21 @@ def test_no_text_breaks_the_reading_of_units(text: str) -> None:
         parse_quantity(text)
 
 
-def test_the_fmus_own_definition_stands_for_unknown_names_and_fills_no_gaps() -> None:
-    ticks = unit_of("ticks", BaseUnit(m=1, factor=0.005))
-    assert ticks is not None
-    assert to_si(ticks, "m") == 0.005
-    nothing = unit_of("km/h", BaseUnit())
-    no_angle = unit_of("deg", BaseUnit(factor=0.0174533))
-    assert nothing is not None
-    assert no_angle is not None
-    assert to_si(nothing, "m/s") == pytest.approx(1 / 3.6, rel=1e-15)
-    assert to_si(no_angle, "rad") == math.pi / 180
-    assert unit_of("degC", BaseUnit(K=1, offset=273.15)) is None
-
-
 # -- maps that do not fit -------------------------------------------------------------------------
 
 MIXED = own_fmu(
-    variable("steps", "parameter", kind="integer", fmi_type="Int32", start="5", highest=9.0),
+    variable("steps", "parameter", type="Int32", start="5", max="9"),
     variable("const", "parameter", variability="constant"),
     variable("calc", "calculatedParameter", variability="fixed", initial="calculated"),
     given("speed_kmh", "km/h"),
-    given("count", kind="integer", fmi_type="Int32"),
-    given("matrix", array=True),
+    given("count", type="Int32"),
+    given("matrix", dimensions=[Dimension("3", 0)]),
     given("odd", "parsec/fortnight²"),
     given("strange", "qwrtz"),
     given("spin", "1/min"),
-    taken("gear", kind="integer", fmi_type="Int32", start="1", lowest=-1.0, highest=6.0),
-    taken("on", kind="boolean", fmi_type="Boolean", start="false"),
-    variable("level", "output", initial="exact", start="1.0", highest=2.0),
+    taken("gear", type="Int32", start="1", min="-1", max="6"),
+    taken("on", type="Boolean", start="false"),
+    variable("level", "output", initial="exact", start="1.0", max="2.0"),
 )
 
 
@@ -150,12 +140,14 @@ MIXED = own_fmu(
         ("[outputs]\nvx = 'sped_kmh'", "no variable 'sped_kmh'; near: 'speed_kmh'"),
         ("[outputs]\nvx = 'count'", "of type Int32"),
         ("[outputs]\nvx = 'matrix'", "an array"),
-        ("[outputs]\nvx = 'd'", "is an input; an output is needed"),
+        ("[outputs]\nvx = 'd'", "is of causality input: give an output"),
         ("[outputs]\ndelta = 'delta_rate'", 'derive] delta = "delta_rate"'),
         ("[outputs]\nx = 'speed_kmh'", "'km/h' does not convert to 'm'"),
         ("[outputs]\nvx = { variable = 'speed_kmh', unit = 'm/s' }", "the FMU declares 'km/h'"),
-        ("[outputs]\nvx = { variable = 'speed_kmh', scale = -1 }", "write sign = -1"),
-        ("[outputs]\nvx = { variable = 'vx', unit = 'qwrtz' }", "unit 'qwrtz' is not known"),
+        (
+            "[outputs]\nvx = { variable = 'vx', unit = 'qwrtz' }",
+            "unit 'qwrtz' of",
+        ),
         ("[outputs]\nvx = 'strange'", "give `unit`, or `scale`"),
         ("[outputs]\nvx = 'odd'", "does not convert|not known"),
         ("[outputs]\nomega = 'spin'", "turns or radians"),
@@ -163,8 +155,8 @@ MIXED = own_fmu(
         ("[outputs]\nx = { variable = 'x', offset = 'nine' }", "not a number with a unit"),
         ("[outputs]\npsi = 'psi'\n[derive]\npsi = { cos = 'x', sin = 'y' }", "give one"),
         ("[inputs]\nd = { from = 'gas' }", "none of d, delta_rate, delta, throttle, brake"),
-        ("[inputs]\nmass_kg = 1.0", "goes into \\[parameters\\]"),
-        ("[inputs]\nx = { from = 'd' }", "'x' is an output, not an input"),
+        ("[inputs]\nmass_kg = 1.0", "only \\[parameters\\]"),
+        ("[inputs]\nx = { from = 'd' }", "'x' is a continuous output: only"),
         ("[inputs]\ndelta_rate = { from = 'delta' }", "'rad/s' does not convert to 'rad'"),
         ("[inputs]\non = 2", "2 does not suit 'on', which is of type Boolean"),
         ("[inputs]\ngear = 1.5", "does not suit"),
@@ -177,12 +169,12 @@ MIXED = own_fmu(
         ("[parameters]\nmass_kg = 'heavy'", "not a number with a unit"),
         ("[parameters]\nmass_kg = '1 m'", "does not convert to 'kg'"),
         ("[parameters]\nsteps = 10", "outside"),
-        ("[parameters]\nconst = 1.0", "is a constant, not a parameter"),
-        ("[parameters]\ncalc = 1.0", "a calculated parameter"),
-        ("[parameters]\ngear = 1", "goes into \\[inputs\\]"),
-        ("[parameters]\nlevel = 1.0", "goes into \\[start\\]"),
-        ("[start]\ngear = 1", "goes into \\[inputs\\]"),
-        ("[start]\nspeed_kmh = 'vx'", "cannot be set before initialisation"),
+        ("[parameters]\nconst = 1.0", "is a constant parameter: it cannot be set"),
+        ("[parameters]\ncalc = 1.0", "is a fixed calculatedParameter: it cannot"),
+        ("[parameters]\ngear = 1", "only \\[inputs\\]"),
+        ("[parameters]\nlevel = 1.0", "only \\[start\\]"),
+        ("[start]\ngear = 1", "only \\[inputs\\]"),
+        ("[start]\nspeed_kmh = 'vx'", "it cannot be set"),
         ("[start]\nlevel = { from = 'velocity' }", "none of x, y, psi"),
         ("[start]\nlevel = 3.0", "outside"),
     ],
@@ -218,7 +210,7 @@ def test_a_scale_switches_the_conversion_off() -> None:
 
 def test_model_exchange_alone_cannot_be_driven() -> None:
     with pytest.raises(InputError, match="export it for Co-Simulation"):
-        wire(description(*OWN, interfaces=("Model Exchange",)))
+        wire(description(*OWN, cosimulation=False))
 
 
 # -- files ----------------------------------------------------------------------------------------
@@ -227,28 +219,19 @@ FMI3 = """
 <Float64 name='time' valueReference='0' causality='independent'/>
 <Float64 name='car.yaw' valueReference='1' causality='output' declaredType='Angle'/>
 <Float32 name='u' valueReference='2' causality='input' start='0' min='-1' max='1' unit='tick'/>
-<Boolean name='on' valueReference='3' causality='input' start='false'/>
 <Float64 name='m' valueReference='4' causality='output'><Dimension start='3'/></Float64>
 <Float64 name='x0' valueReference='5' causality='parameter' start='2' unit='cm'/>
 """
 
 
-def test_inspection_reads_types_units_and_platforms(tmp_path: Path) -> None:
-    units = "<Unit name='tick'><BaseUnit m='1' factor='0.5'/></Unit>"
-    path = write_fmu(tmp_path / "a.fmu", FMI3.replace("declaredType='Angle'", ""), units=units)
+def test_inspection_reads_variables_and_platforms(tmp_path: Path) -> None:
+    path = write_fmu(tmp_path / "a.fmu", FMI3.replace("declaredType='Angle'", ""))
     fmu = inspect(path)
-    assert (fmu.fmi_version, fmu.platforms, fmu.default_step_s) == ("3.0", ("x86_64-linux",), 0.004)
-    assert fmu.co_simulation
-    by_name = {one.name: one for one in fmu.variables}
-    assert "time" not in by_name
-    assert by_name["m"].array
-    assert by_name["on"].kind == "boolean"
-    u = by_name["u"]
-    assert (u.lowest, u.highest) == (-1.0, 1.0)
-    assert u.unit is not None
-    assert to_si(u.unit, "m") == 0.5
-    assert by_name["x0"].settable
-    assert not by_name["car.yaw"].settable
+    assert (fmu.fmiVersion, platforms(path), steps_s(fmu)) == ("3.0", "x86_64-linux", [0, 0.004])
+    variables = {one.name: one for one in fmu.modelVariables}
+    assert variables["m"].dimensions
+    assert range_of(variables["u"]) == (-1.0, 1.0)
+    assert [name for name, one in variables.items() if is_settable(one)] == ["u", "x0"]
 
 
 def test_units_and_ranges_come_from_the_declared_type_too(tmp_path: Path) -> None:
@@ -257,11 +240,10 @@ def test_units_and_ranges_come_from_the_declared_type_too(tmp_path: Path) -> Non
         "<ScalarVariable name='h' valueReference='1' causality='output'>"
         "<Real declaredType='Heading'/></ScalarVariable>",
         version="2.0",
-        units="</UnitDefinitions><TypeDefinitions><SimpleType name='Heading'>"
-        "<Real unit='deg' min='0' max='360'/></SimpleType></TypeDefinitions><UnitDefinitions>",
+        types="<SimpleType name='Heading'><Real unit='deg' min='0' max='360'/></SimpleType>",
     )
-    (h,) = inspect(path).variables
-    assert (h.unit_name, h.lowest, h.highest) == ("deg", 0.0, 360.0)
+    [h] = inspect(path).modelVariables
+    assert (h.unit, *range_of(h)) == ("deg", 0.0, 360.0)
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 but no archive", b"<xml/>"])
@@ -285,19 +267,28 @@ def test_fmi_1_and_broken_descriptions(tmp_path: Path) -> None:
             inspect(write_fmu(tmp_path / f"{name}.fmu", variables, version=version))
 
 
-def printed(fmu: FmuDescription, width: int = 100) -> str:
+def test_a_description_beyond_measure_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "huge.fmu", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("modelDescription.xml", " " * 20_000_000)
+    with pytest.raises(InputError, match=r"huge\.fmu: its modelDescription\.xml has 20 MB"):
+        inspect(tmp_path / "huge.fmu")
+
+
+# -- the table, and the map to fill in ------------------------------------------------------------
+
+
+def printed(fmu: Any) -> str:
     text = io.StringIO()
-    Console(width=width, file=text).print(FmuTable(fmu))
+    Console(width=100, file=text).print(FmuTable(fmu, "linux64"))
     return text.getvalue()
 
 
-def test_the_table_shows_what_a_map_needs(tmp_path: Path) -> None:
+def test_the_table_shows_what_a_map_needs() -> None:
     text = printed(
         description(
             *OWN,
             variable("hidden", "local"),
             given("evil", "m", description="\x1b[31m red [bold]"),
-            platforms=("linux64",),
         )
     )
     for word in ("Co-Simulation", "linux64", "delta_rate", "rad/s", "mass_kg", "0.041", "≥ 0.001"):
@@ -306,4 +297,42 @@ def test_the_table_shows_what_a_map_needs(tmp_path: Path) -> None:
     assert "1 local variable" in text
     assert "\x1b" not in text
     assert "[bold]" in text
-    assert "not this one" in printed(description(*OWN, interfaces=("Model Exchange",)))
+    assert "not this one" in printed(description(*OWN, cosimulation=False))
+
+
+def test_a_map_to_fill_in_has_the_names_and_units_that_agree() -> None:
+    """Our own FMU needs nothing more; of another, what does not agree is left blank."""
+    text = blank_map(own_fmu())
+    wiring, plain = wire(own_fmu(), parse_map(text)), wire(own_fmu())
+    assert (wiring.inputs, wiring.outputs) == (plain.inputs, plain.outputs)
+    assert '# "mass_kg" = 0.041  # [kg] mass' in text.splitlines()
+    others = given("x", "cm"), given("psi", "deg"), taken("gas", "%"), taken("on", type="Boolean")
+    text = blank_map(own_fmu(*others, without=("x", "psi", "d")))
+    lines = text.splitlines()
+    for blank in (
+        '# x = { variable = "", unit = "m" }',
+        '# psi = { variable = "", unit = "rad" }',
+        '# "gas" = { from = "", unit = "%" }  # [%]',
+        '# "on" = 0',
+    ):
+        assert blank in lines
+    assert parse_map(text).outputs.keys() == {"y", "vx", "vy", "omega", "delta"}
+    assert parse_map(text).inputs.keys() == {"delta_rate"}
+
+
+names = st.text(st.characters(codec="utf-8"), min_size=1, max_size=30)
+
+
+@those(
+    name=names | st.sampled_from(["x", "d"]),
+    text=names,
+    start=st.none() | names,
+    kind=st.sampled_from(["Float64", "Int32", "Boolean", "String", "Enumeration", "Binary"]),
+    causality=st.sampled_from(["input", "output", "parameter", "local"]),
+    unit=st.none() | names,
+)
+def test_a_map_to_fill_in_always_parses(
+    name: str, text: str, start: str | None, kind: str, causality: str, unit: str | None
+) -> None:
+    one = variable(name, causality, unit, type=kind, start=start, description=text)
+    parse_map(blank_map(description(one, name=text)))

@@ -173,22 +173,22 @@ def inspect(
     map_file: Annotated[
         Path | None,
         typer.Option(
-            "--map", metavar="FILE", callback=writable, help="Write a map to edit (TOML)."
+            "--map", metavar="FILE", callback=writable, help="Write a map to fill in (TOML)."
         ),
     ] = None,
     every: Annotated[bool, typer.Option("--all", help="Print local variables, too.")] = False,
 ) -> None:
-    """Print an FMU's variables; write a map for 'bayesrace plant --fmu' to edit."""
-
+    """Print an FMU's variables; write a map for 'bayesrace plant --fmu' to fill in."""
     from operation.terminal.fmu_table import FmuTable
     from operation.terminal.terminal import Terminal
     from plant.fmu.inspection import inspect as read
-    from plant.fmu.proposal import starting_map
+    from plant.fmu.inspection import platforms
+    from plant.fmu.template import blank_map
 
     description = read(file)
-    Terminal().print(FmuTable(description, all_=every))
+    Terminal().print(FmuTable(description, platforms(file), all_=every))
     if map_file is not None:
         if map_file.exists():
             raise InputError(f"{map_file} exists already; choose another name or remove it")
-        write_whole(map_file, starting_map(description))
-        typer.echo(f"map to start from: {map_file}")
+        write_whole(map_file, blank_map(description))
+        typer.echo(f"map to fill in: {map_file}")

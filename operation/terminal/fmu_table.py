@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from typing import Final
+from typing import Any, Final
 
 from rich import box
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -10,7 +10,8 @@ from rich.table import Table
 from rich.text import Text
 
 from operation.terminal.printable import printable
-from plant.fmu.inspection import FmuDescription, Variable
+from plant.fmu.inspection import items_of, range_of, steps_s
+from plant.fmu.units import unit_of
 
 __all__ = ["FmuTable"]
 
@@ -29,15 +30,16 @@ class FmuTable:
     Local variables, of which some tools write thousands, are counted; ``all_`` lists them too.
     """
 
-    def __init__(self, description: FmuDescription, *, all_: bool = False) -> None:
-        self._fmu, self._all = description, all_
+    def __init__(self, description: Any, platforms: str, *, all_: bool = False) -> None:
+        """``description``: fmpy's."""
+        self._fmu, self._platforms, self._all = description, platforms, all_
 
     def __rich_console__(
         self, console: Console, options: ConsoleOptions
     ) -> Iterator[RenderableType]:
-        yield from _head(self._fmu)
+        yield from _head(self._fmu, self._platforms)
         yield self._table()
-        hidden = sum(one.causality == "local" for one in self._fmu.variables)
+        hidden = sum(one.causality == "local" for one in self._fmu.modelVariables)
         if hidden and not self._all:
             yield Text(f"and {hidden} local variable(s)", style="dim")
 
@@ -45,7 +47,7 @@ class FmuTable:
         rows = [
             (title, _cells(variable))
             for title, causalities in _SECTIONS.items()
-            for variable in self._fmu.variables
+            for variable in self._fmu.modelVariables
             if variable.causality in causalities and (self._all or title != "locals")
         ]
         titles = [title for title, _ in rows]
@@ -63,36 +65,42 @@ class FmuTable:
         return table
 
 
-def _head(fmu: FmuDescription) -> Iterator[Text]:
-    interfaces = " and ".join(fmu.interfaces) or "no interface"
-    version = f" · FMI {printable(fmu.fmi_version)} {interfaces}"
-    yield Text.assemble((printable(fmu.model_name), "bold"), version)
+def _head(fmu: Any, platforms: str) -> Iterator[Text]:
+    simulation, step_s = fmu.coSimulation, next(filter(None, steps_s(fmu)), None)
+    kinds = {
+        "Co-Simulation": simulation,
+        "Model Exchange": fmu.modelExchange,
+        "Scheduled Execution": fmu.scheduledExecution,
+    }
+    interfaces = " and ".join(name for name, one in kinds.items() if one) or "no interface"
+    version = f" · FMI {printable(fmu.fmiVersion)} {interfaces}"
+    yield Text.assemble((printable(fmu.modelName), "bold"), version)
     if fmu.description:
         yield Text(printable(fmu.description))
-    words = [f"for {', '.join(map(printable, fmu.platforms)) or 'no platform: sources only'}"]
-    if fmu.tool:
-        words.append(f"by {printable(fmu.tool)}")
-    if fmu.default_step_s is not None:
-        words.append(f"step {fmu.default_step_s:g} s")
-    words.append("any step" if fmu.variable_step else "one fixed step")
-    if fmu.needs_tool:
-        words.append("needs the tool it comes from")
-    yield Text(" · ".join(words))
-    if not fmu.co_simulation:
+    any_step = simulation and simulation.canHandleVariableCommunicationStepSize
+    words: list[str | None] = [
+        f"for {printable(platforms)}",
+        fmu.generationTool and f"by {printable(fmu.generationTool)}",
+        f"step {step_s:g} s" if step_s else None,
+        "any step" if any_step else "one fixed step",
+        simulation and simulation.needsExecutionTool and "needs the tool it comes from",
+    ]
+    yield Text(" · ".join(filter(None, words)))
+    if simulation is None:
         yield Text("the plant runs Co-Simulation FMUs only: not this one", style="red")
 
 
-def _cells(variable: Variable) -> list[Text]:
-    unit = variable.unit_name or ""
+def _cells(variable: Any) -> list[Text]:
+    unit = variable.unit or ""
     # A unit that is not known has to be in the map.
-    style = "yellow" if unit not in ("", "-") and variable.unit is None else ""
+    style = "yellow" if unit not in ("", "-") and unit_of(unit) is None else ""
     return [
         Text(printable(variable.name)),
-        Text(variable.fmi_type + ("[]" if variable.array else "")),
+        Text(variable.type + ("[]" if variable.dimensions else "")),
         Text(printable(unit), style=style),
         Text(_short(variable.start)),
         Text(_range(variable)),
-        Text(printable(variable.description)),
+        Text(printable(variable.description or "")),
     ]
 
 
@@ -103,10 +111,10 @@ def _short(start: str | None) -> str:
         return printable(start or "")
 
 
-def _range(variable: Variable) -> str:
-    if variable.items:
-        return printable(", ".join(variable.items))
-    lowest, highest = variable.lowest, variable.highest
+def _range(variable: Any) -> str:
+    if items := items_of(variable):
+        return printable(", ".join(items))
+    lowest, highest = range_of(variable)
     if math.isinf(lowest):
         return "" if math.isinf(highest) else f"≤ {highest:g}"
     return f"≥ {lowest:g}" if math.isinf(highest) else f"{lowest:g} … {highest:g}"

@@ -1,126 +1,59 @@
-"""The content of an FMU's model description, read without running the FMU."""
+"""An FMU file: its description read and its content unpacked, every fault of it an InputError."""
 
 import math
+import re
 import zipfile
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
-from plant.fmu.package import read_description
-from plant.fmu.units import Unit, unit_of
+from fmpy import platform, platform_tuple, read_model_description, sharedLibraryExtension
+from fmpy.simulation import settable_in_instantiated
 
-__all__ = ["FmuDescription", "Variable", "describe", "inspect"]
+from bayesrace.errors import InputError
 
-_KINDS: Final = {
-    "Real": "real", "Float32": "real", "Float64": "real", "Boolean": "boolean",
-    "Enumeration": "enumeration", "String": "string", "Binary": "binary", "Clock": "clock",
-}  # fmt: skip
-"""Of variables by FMI's types; the other types are integers of some width."""
+__all__ = [
+    "extract", "inspect", "is_readable", "is_real", "is_settable", "items_of", "library",
+    "platforms", "range_of", "steps_s",
+]  # fmt: skip
+
+_MOST_BYTES: Final = 2 << 30
+"""Unpacked; an archive that claims more is damaged or an attack on the disk."""
+
+_LARGEST_XML: Final = 16_000_000
+"""Bytes of a model description; a hundred thousand variables."""
 
 
-@dataclass(frozen=True, slots=True)
-class Variable:
-    """One of an FMU's variables."""
+def is_real(variable: Any) -> bool:
+    """Whether it is a real number, or an array of them."""
+    return variable.type in ("Real", "Float32", "Float64")
 
-    name: str
-    kind: str
-    fmi_type: str
-    causality: str
-    variability: str
-    initial: str | None
-    unit_name: str | None = None
-    unit: Unit | None = None
-    """None: not declared, or not known."""
-    lowest: float = -math.inf
-    highest: float = math.inf
-    start: str | None = None
-    description: str = ""
-    array: bool = False
-    items: Mapping[str, int] = field(default_factory=dict)
+
+def is_readable(variable: Any) -> bool:
+    """Whether it can be read while the FMU runs."""
+    return variable.causality in ("output", "local")
+
+
+def is_settable(variable: Any) -> bool:
+    """Whether its start value can be set before initialisation."""
+    return bool(settable_in_instantiated(variable) and variable.variability != "constant")
+
+
+def items_of(variable: Any) -> dict[str, int]:
     """An enumeration's names and values."""
-
-    @property
-    def settable(self) -> bool:
-        """Whether its start value can be set before initialisation."""
-        return self.variability != "constant" and (
-            self.initial in ("exact", "approx") or self.causality == "input"
-        )
-
-    @property
-    def readable(self) -> bool:
-        """Whether it can be read while the FMU runs."""
-        return self.causality in ("output", "local")
-
-    @property
-    def scalar(self) -> bool:
-        """Whether it is a single real number."""
-        return self.kind == "real" and not self.array
+    items = variable.declaredType.items if variable.declaredType else ()
+    return {str(item.name): int(_number(item.value, 0.0)) for item in items}
 
 
-@dataclass(frozen=True, slots=True)
-class FmuDescription:
-    """An FMU's model description, as far as the plant needs it."""
-
-    model_name: str
-    fmi_version: str
-    interfaces: tuple[str, ...]
-    variables: tuple[Variable, ...]
-    description: str = ""
-    tool: str = ""
-    platforms: tuple[str, ...] = ()
-    """Folders of binaries, as the FMI version calls them: linux64, x86_64-linux, …"""
-    variable_step: bool = False
-    internal_step_s: float | None = None
-    experiment_step_s: float | None = None
-    needs_tool: bool = False
-
-    @property
-    def default_step_s(self) -> float | None:
-        """The FMU's own step, if it states one."""
-        return self.internal_step_s or self.experiment_step_s
-
-    @property
-    def co_simulation(self) -> bool:
-        """Whether it brings its own solver; the plant has none for it."""
-        return "Co-Simulation" in self.interfaces
+def range_of(variable: Any) -> tuple[float, float]:
+    """The lowest and the highest value that it declares."""
+    return _number(variable.min, -math.inf), _number(variable.max, math.inf)
 
 
-def inspect(path: Path) -> FmuDescription:
-    """The description of the FMU ``path``; InputError if it is not an FMU 2 or 3."""
-    raw = read_description(path)
-    with zipfile.ZipFile(path) as archive:
-        parts = [PurePosixPath(name.replace("\\", "/")).parts for name in archive.namelist()]
-    platforms = {part[1] for part in parts if len(part) > 2 and part[0] == "binaries"}
-    return describe(raw, tuple(sorted(platforms)))
-
-
-def describe(raw: Any, platforms: tuple[str, ...] = ()) -> FmuDescription:
-    """fmpy's ModelDescription ``raw`` as data of our own."""
-    simulation, experiment = raw.coSimulation, raw.defaultExperiment
-    kinds = {
-        "Co-Simulation": simulation,
-        "Model Exchange": raw.modelExchange,
-        "Scheduled Execution": raw.scheduledExecution,
-    }
-    units = {unit.name: unit_of(unit.name, unit.baseUnit) for unit in raw.unitDefinitions}
-    variables = (one for one in raw.modelVariables if one.causality != "independent")
-    return FmuDescription(
-        model_name=raw.modelName or "?",
-        fmi_version=raw.fmiVersion,
-        interfaces=tuple(name for name, interface in kinds.items() if interface is not None),
-        variables=tuple(_variable(one, units) for one in variables),
-        description=raw.description or "",
-        tool=raw.generationTool or "",
-        platforms=platforms,
-        variable_step=bool(simulation and simulation.canHandleVariableCommunicationStepSize),
-        internal_step_s=_number(simulation and simulation.fixedInternalStepSize),
-        experiment_step_s=_number(experiment and experiment.stepSize),
-        needs_tool=bool(simulation and simulation.needsExecutionTool),
-    )
-
-
-def _number(text: Any, otherwise: Any = None) -> Any:
+def _number(text: Any, otherwise: float) -> float:
+    """A number as the description has it; ``otherwise`` if there is none that is finite."""
     try:
         value = float(text)
     except (TypeError, ValueError):
@@ -128,28 +61,97 @@ def _number(text: Any, otherwise: Any = None) -> Any:
     return value if math.isfinite(value) else otherwise
 
 
-def _variable(raw: Any, units: Mapping[str, Unit | None]) -> Variable:
-    declared = raw.declaredType
+@contextmanager
+def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
+    """The archive; InputError if the file is none, damaged, or encrypted."""
+    if not path.is_file():
+        raise InputError(f"no FMU at {path}; give the path of an .fmu file")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            yield archive
+    except (OSError, RuntimeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(
+            f"{path} is no FMU, or a damaged one ({error}); export or copy it again"
+        ) from None
 
-    def attribute(name: str) -> Any:
-        """Of the variable, or else of its declared type."""
-        own = getattr(raw, name, None)
-        return getattr(declared, name, None) if own is None else own
 
-    unit_name = attribute("unit")
-    return Variable(
-        name=raw.name,
-        kind=_KINDS.get(raw.type, "integer"),
-        fmi_type=raw.type,
-        causality=raw.causality,
-        variability=raw.variability,
-        initial=raw.initial,
-        unit_name=unit_name,
-        unit=units[unit_name] if unit_name in units else unit_of(unit_name),
-        lowest=_number(attribute("min"), -math.inf),
-        highest=_number(attribute("max"), math.inf),
-        start=raw.start,
-        description=raw.description or "",
-        array=bool(raw.dimensions),
-        items={str(i.name): int(_number(i.value, 0)) for i in declared.items} if declared else {},
+def steps_s(fmu: Any) -> list[float]:
+    """Its own communication step and that of its experiment; 0 for one that it does not state."""
+    own = fmu.coSimulation and fmu.coSimulation.fixedInternalStepSize
+    return [_number(own, 0.0), _number(getattr(fmu.defaultExperiment, "stepSize", None), 0.0)]
+
+
+def inspect(path: Path) -> Any:
+    """The ``ModelDescription`` (fmpy) of an FMU 2.0 or 3.0, whatever its kind, without running it.
+
+    What a variable does not declare itself is filled in from its declared type. InputError if the
+    file is no FMU. Small offences against the schema are overlooked.
+    """
+    with _opened(path) as archive:
+        sizes = {one.filename: one.file_size for one in archive.infolist()}
+        size = sizes.get("modelDescription.xml")
+        if size is None:
+            raise InputError(f"{path} is an archive without a modelDescription.xml: no FMU")
+        if size > _LARGEST_XML:
+            raise InputError(
+                f"{path}: its modelDescription.xml has {size / 1e6:.0f} MB, at most "
+                f"{_LARGEST_XML / 1e6:.0f} are read: export it with fewer variables"
+            )
+        head = archive.open("modelDescription.xml").read(1 << 16)
+    stated = re.search(rb"fmiVersion\s*=\s*[\"']([^\"']*)[\"']", head)
+    version = stated.group(1).decode(errors="replace") if stated else "none"
+    if version != "2.0" and not version.startswith("3."):
+        raise InputError(
+            f"{path} is for FMI version {version}; versions 2.0 and 3.0 are read: export it so"
+        )
+    try:
+        fmu = read_model_description(str(path), validate=False)
+    except Exception as error:  # fmpy fails with whatever the first wrong line leads to
+        raise InputError(f"{path}: its modelDescription.xml cannot be read: {error}") from None
+    for one in fmu.modelVariables:
+        for attribute in ("unit", "min", "max"):
+            if one.declaredType and getattr(one, attribute) is None:
+                setattr(one, attribute, getattr(one.declaredType, attribute))
+    return fmu
+
+
+def platforms(path: Path) -> str:
+    """The platforms of its binaries, as the FMI version calls them: linux64, x86_64-linux, …"""
+    with _opened(path) as archive:
+        parts = [PurePosixPath(name.replace("\\", "/")).parts for name in archive.namelist()]
+    there = sorted({part[1] for part in parts if len(part) > 2 and part[0] == "binaries"})
+    has_sources = any(part[0] == "sources" for part in parts)
+    sources = " (its sources are inside)" if has_sources else ""
+    return f"{', '.join(there) or 'no platform at all'}{sources}"
+
+
+def extract(path: Path, folder: Path) -> None:
+    """Unpacks the FMU into an existing folder, and nowhere else; InputError if it cannot be."""
+    with _opened(path) as archive:
+        for name in archive.namelist():
+            if name.startswith("/") or ".." in name.split("/") or "\\" in name or ":" in name:
+                raise InputError(
+                    f"{path} holds '{name[:200]}', a path that leads out of its folder: not "
+                    "unpacked; do not use this file"
+                )
+        if sum(entry.file_size for entry in archive.infolist()) > _MOST_BYTES:
+            raise InputError(f"{path} claims to unpack to more than {_MOST_BYTES >> 30} GiB")
+        archive.extractall(folder)
+
+
+def library(path: Path, folder: Path, fmu: Any) -> Path:
+    """The shared library of the unpacked FMU for this computer.
+
+    InputError that says which platforms the FMU is for, if it is not for this one.
+    """
+    name = f"{fmu.coSimulation.modelIdentifier}{sharedLibraryExtension}"
+    # FMI 2.0 names Intel's platforms alone; for others the names of 3.0 are in use.
+    fits = (platform_tuple, platform) if platform_tuple.startswith("x86") else (platform_tuple,)
+    for fitting in fits:
+        place: Path = folder / "binaries" / fitting / name
+        if place.is_file():
+            return place
+    raise InputError(
+        f"{path} is for {platforms(path)}, not for this computer, {platform_tuple}: export it with "
+        f"binaries/{fits[-1]}/{name}"
     )

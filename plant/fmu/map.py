@@ -1,56 +1,63 @@
 """A map checked against an FMU: what fits becomes a :class:`~plant.fmu.wiring.Wiring`.
 
-One error names all that is missing or wrong, each with what to write into the map instead.
+One error names all that is missing or wrong, each with what to write into the map instead. Units
+become factors here, and constants get the type of their variable.
 """
 
+import difflib
 from collections.abc import Callable, Iterator, Mapping
-from typing import Final
+from typing import Any, Final
+
+import numpy as np
 
 from bayesrace.errors import InputError
-from plant.fmu.checks import a, constant, conversion, find, offset_of, scalar
-from plant.fmu.inspection import FmuDescription
+from plant.fmu.inspection import (
+    is_readable,
+    is_real,
+    is_settable,
+    items_of,
+    range_of,
+)
 from plant.fmu.map_file import Driven, FmuMap, Pick, Value
+from plant.fmu.units import FREQUENCY, parse_quantity, to_si, unit_of
 from plant.fmu.wiring import COMMANDS, READINGS, STARTS, STATES, Link, Wiring
 
 __all__ = ["wire"]
 
-_VELOCITY: Final = " or [derive] velocity = { world_x, world_y } or { speed, slip }"
-_HINTS: Final = {
-    "psi": " or, from a quaternion or cosine and sine, [derive] psi = …",
-    "vx": _VELOCITY,
-    "vy": _VELOCITY,
-    "omega": ' or [derive] omega = "psi", from the change of heading',
-    "delta": ' or [derive] delta = "delta_rate", integrated from the steering rate that acts',
-}
+_VELOCITY: Final = "velocity = { world_x, world_y } or { speed, slip }"
+_RULES: Final = {
+    "psi": "psi = { cos, sin } or { quaternion = { w, x, y, z } }", "vx": _VELOCITY,
+    "vy": _VELOCITY, "omega": 'omega = "psi"', "delta": 'delta = "delta_rate"',
+}  # fmt: skip
+"""What [derive] can say instead of [outputs]."""
 
 _NEEDED: Final = (
-    (("d",), {"d", "throttle"}, "the drive command d or its part `throttle`"),
+    ("the drive command d or its part `throttle`", ["d"], {"d", "throttle"}),
     (
-        ("delta_rate", "delta"),
-        {"delta_rate", "delta"},
         "the steering rate `delta_rate` [rad/s] or angle `delta` [rad]",
+        ["delta_rate", "delta"],
+        {"delta_rate", "delta"},
     ),
 )
-"""Our own names for an input, the quantities of which one must drive an input, and words."""
+"""What an input must take, our own names for it, the quantities of which one must drive it."""
 
 
-def wire(fmu: FmuDescription, map_: FmuMap | None = None, unit: str = "1") -> Wiring:
+def wire(fmu: Any, map_: FmuMap | None = None, unit: str = "1") -> Wiring:
     """The wiring of an FMU by a map; for what the map leaves out, our own names are taken.
 
     ``unit``: of the car's drive command.
 
     Raises InputError with all that is missing or wrong, and what to put into the map.
     """
-    name = fmu.model_name
-    if not fmu.co_simulation:
-        has = " and ".join(fmu.interfaces) or "no interface"
+    name = fmu.modelName
+    if fmu.coSimulation is None:
         raise InputError(
-            f"the FMU '{name}' has {has} only; export it for Co-Simulation to drive it"
+            f"the FMU '{name}' is for Model Exchange only: export it for Co-Simulation"
         )
-    matching = _Matching(fmu, map_ or FmuMap(), unit)
-    matching.match()
+    matching = _Matching(fmu, map_ or FmuMap())
+    wiring = matching.wiring(COMMANDS | dict.fromkeys(("d", "throttle", "brake"), unit))
     if not matching.problems:
-        return matching.wiring()
+        return wiring
     title = f"the map does not fit the FMU '{name}'" if map_ else (
         f"the FMU '{name}' does not have our names and units, and no map says what its own are"
     )  # fmt: skip
@@ -63,42 +70,35 @@ def wire(fmu: FmuDescription, map_: FmuMap | None = None, unit: str = "1") -> Wi
 class _Matching:
     """One pass over a map: each entry becomes a link or a constant, or else a problem."""
 
-    def __init__(self, fmu: FmuDescription, map_: FmuMap, unit: str) -> None:
-        self._commands = COMMANDS | dict.fromkeys(("d", "throttle", "brake"), unit)
+    def __init__(self, fmu: Any, map_: FmuMap) -> None:
+        self._variables = {one.name: one for one in fmu.modelVariables}
         self._map = map_
-        self._variables = {variable.name: variable for variable in fmu.variables}
         self._inputs: list[Link] = []
         self._outputs: list[Link] = []
         self._starts: list[Link] = []
         self._fixed: dict[str, Value] = {}
-        self._heading_offset = 0.0
+        self._heading = (1.0, 0.0)
         self.problems: list[str] = []
 
-    def match(self) -> None:
-        """Take the sections of the map in turn."""
+    def wiring(self, commands: Mapping[str, str]) -> Wiring:
+        """What the entries become; ``commands``: what can drive an input, with units."""
         map_ = self._map
-        self._states()
-        for quantity, where, pick in map_.derive.read():
-            self._try(where, self._output, quantity, pick)
-        for name, entry in map_.inputs.items():
-            self._try(f"[inputs] {name}", self._input, name, entry)
-        self._other_inputs()
-        for name, value in map_.parameters.items():
-            self._try(f"[parameters] {name}", self._parameter, name, value)
-        for name, entry in map_.start.items():
-            self._try(f"[start] {name}", self._start, name, entry)
-        self._try("[derive] psi", self._heading)
-
-    def wiring(self) -> Wiring:
-        """What the entries have become, if there are no problems."""
-        heading = self._map.derive.psi
+        for quantity, pick in self._states():
+            self._try(f"[outputs] {quantity}", self._output, quantity, pick)
+        for quantity, place, pick in map_.derive.picks("[derive] "):
+            self._try(place, self._output, quantity, pick)
+        if rule := map_.derive.psi:
+            self._try("[derive] psi", self._turned, rule.sign, rule.offset)
+        for section, entries, quantities in (
+            ("inputs", map_.inputs | self._own_inputs(), commands),
+            ("parameters", map_.parameters, {}),
+            ("start", map_.start, STARTS),
+        ):
+            for name, entry in entries.items():
+                self._try(f"[{section}] {name}", self._setting, section, name, entry, quantities)
+        starts = [*self._starts, *self._started_outputs()]
         return Wiring(
-            self._inputs,
-            self._outputs,
-            [*self._starts, *self._started_outputs()],
-            self._fixed,
-            heading=(heading.sign if heading else 1.0, self._heading_offset),
-            placed=self._map.fmu.placed,
+            self._inputs, self._outputs, starts, self._fixed, self._heading, map_.fmu.placed
         )
 
     def _try(self, where: str, check: Callable[..., None], *arguments: object) -> None:
@@ -107,71 +107,34 @@ class _Matching:
         except InputError as error:
             self.problems.append(f"{where}: {error}")
 
-    def _states(self) -> None:
+    def _states(self) -> Iterator[tuple[str, Pick]]:
         """[outputs], and our own names where neither it nor [derive] says anything."""
-        derived, picks = self._map.derive.derived(), dict[str, Pick](self._map.outputs.items())
+        derived, outputs = self._map.derive.derived(), dict[str, Pick](self._map.outputs.items())
         for quantity, unit in STATES.items():
             own = self._variables.get(quantity)
             if quantity in derived:
-                if quantity in picks:
+                if quantity in outputs:
                     self.problems.append(f"{quantity} is in [outputs] and in [derive]: give one")
-            elif quantity in picks or (own and own.readable):
-                pick = picks.get(quantity) or Pick(variable=quantity)
-                self._try(f"[outputs] {quantity}", self._output, quantity, pick)
+            elif quantity in outputs or (own and is_readable(own)):
+                yield quantity, outputs.get(quantity, Pick(variable=quantity))
             else:
+                rule = f" or [derive] {_RULES[quantity]}" if quantity in _RULES else ""
                 self.problems.append(
-                    f"nothing gives our {quantity} [{unit}]: add to [outputs] {quantity} = "
-                    f'{{ variable = "…", unit = "{unit}" }}{_HINTS.get(quantity, "")}'
+                    f"nothing gives our {quantity} [{unit}]: add [outputs] {quantity} = "
+                    f'{{ variable = "…", unit = "{unit}" }}{rule}'
                 )
 
-    def _output(self, quantity: str, pick: Pick) -> None:
-        variable = scalar(self._variables, pick.variable)
-        if not variable.readable:
-            hint = f",{_HINTS['delta']}" if quantity == "delta" else ""
-            raise InputError(
-                f"'{variable.name}' is {a(variable.causality)}; an output is needed{hint}"
-            )
-        scale, offset = conversion(pick, variable, READINGS[quantity])
-        self._outputs.append(Link(variable.name, quantity, scale, offset))
-
-    def _heading(self) -> None:
-        if self._map.derive.psi:
-            self._heading_offset = offset_of(self._map.derive.psi.offset, "rad")
-
-    def _link(self, name: str, driven: Driven, quantities: Mapping[str, str]) -> Link:
-        if driven.source not in quantities:
-            raise InputError(f"from = '{driven.source}' is none of {', '.join(quantities)}")
-        variable = scalar(self._variables, name)
-        scale, offset = conversion(driven, variable, quantities[driven.source], outwards=True)
-        return Link(name, driven.source, scale, offset, variable.lowest, variable.highest)
-
-    def _input(self, name: str, entry: Driven | Value) -> None:
-        variable = find(self._variables, name)
-        if variable.causality != "input":
-            remedy = " it goes into [parameters]" if variable.causality == "parameter" else ""
-            raise InputError(f"'{name}' is {a(variable.causality)}, not an input;{remedy}")
-        if isinstance(entry, Driven):
-            self._inputs.append(self._link(name, entry, self._commands))
-        else:
-            self._fixed[name] = constant(variable, entry)
-
-    def _other_inputs(self) -> None:
+    def _own_inputs(self) -> dict[str, Driven | Value]:
         """Drive and steering by our own names; what nothing sets needs a start value of its own."""
-        named = self._map.inputs
-        free = {
-            name: one
-            for name, one in self._variables.items()
-            if one.causality == "input" and name not in named
-        }
+        named, own = self._map.inputs, dict[str, Driven | Value]()
+        inputs = [one for one in self._variables.values() if one.causality == "input"]
+        free = {one.name: one for one in inputs if one.name not in named}
         sources = {entry.source for entry in named.values() if isinstance(entry, Driven)}
-        for names, quantities, words in _NEEDED:
-            own = next((name for name in names if name in free), None)
-            if sources & quantities:
-                continue
-            if own is not None:
-                self._try(f"[inputs] {own}", self._input, own, Driven(source=own))
-                del free[own]
-            else:
+        for words, names, quantities in _NEEDED:
+            ours = next((name for name in names if name in free), None)
+            if sources.isdisjoint(quantities) and ours:
+                own[ours] = Driven(source=ours)
+            elif sources.isdisjoint(quantities):
                 self.problems.append(
                     f"no input of the FMU takes {words}: add to [inputs] "
                     f'variable = {{ from = "{names[0]}", unit = "…" }}'
@@ -180,36 +143,143 @@ class _Matching:
             f"the FMU's input '{name}' has neither a start value nor a place in the map: add a "
             f'constant to [inputs], as "{name}" = 0.0'
             for name, one in free.items()
-            if one.start is None and one.kind not in ("clock", "binary")
+            if name not in own and one.start is None and one.type not in ("Clock", "Binary")
         )
-
-    def _parameter(self, name: str, value: Value) -> None:
-        variable = find(self._variables, name)
-        what = variable.causality if variable.variability != "constant" else "constant"
-        if what != "parameter":
-            section = "inputs" if what == "input" else "start"
-            into = f"; it goes into [{section}]" if variable.settable else ""
-            raise InputError(f"'{name}' is {a(what)}, not a parameter{into}")
-        self._fixed[name] = constant(variable, value)
-
-    def _start(self, name: str, entry: Driven | Value) -> None:
-        variable = find(self._variables, name)
-        if variable.causality == "input":
-            raise InputError(f"'{name}' is an input: a constant goes into [inputs]")
-        if not variable.settable:
-            is_ = a(variable.causality)
-            raise InputError(f"'{name}' is {is_}: it cannot be set before initialisation")
-        if isinstance(entry, Driven):
-            self._starts.append(self._link(name, entry, STARTS))
-        else:
-            self._fixed[name] = constant(variable, entry)
+        return own
 
     def _started_outputs(self) -> Iterator[Link]:
         """Outputs whose start can be set are started, where the map says nothing else."""
         sources = {link.quantity for link in self._starts}
         for link in self._outputs:
             one = self._variables[link.variable]
-            free = link.quantity in STATES and link.quantity not in sources
-            if free and one.initial == "exact" and one.settable and one.name not in self._map.start:
+            taken = link.quantity in sources or one.name in self._map.start
+            starts = one.initial == "exact" and is_settable(one) and not taken
+            if link.quantity in STATES and starts:
                 scale, offset = 1.0 / link.scale, -link.offset / link.scale
-                yield Link(one.name, link.quantity, scale, offset, one.lowest, one.highest)
+                yield Link(one.name, link.quantity, scale, offset, *range_of(one))
+
+    def _output(self, quantity: str, pick: Pick) -> None:
+        variable = self._real(pick.variable)
+        if not is_readable(variable):
+            rule = f", or [derive] {_RULES[quantity]}" if quantity in _RULES else ""
+            raise InputError(
+                f"'{variable.name}' is of causality {variable.causality}: give an output{rule}"
+            )
+        factor = self._factor(pick, variable, READINGS[quantity])
+        offset = _offset(pick.offset, READINGS[quantity])
+        self._outputs.append(Link(variable.name, quantity, pick.sign * factor, offset))
+
+    def _turned(self, sign: float, offset: float | str) -> None:
+        """Turns a derived heading."""
+        self._heading = sign, _offset(offset, "rad")
+
+    def _setting(
+        self, section: str, name: str, entry: Driven | Value, quantities: Mapping[str, str]
+    ) -> None:
+        """A variable that is set: by one of the quantities, or once by a constant."""
+        variable = self._find(name)
+        home = {"input": "inputs", "parameter": "parameters"}.get(variable.causality, "start")
+        if not is_settable(variable):
+            home = ""
+        if section != home and (section, home) != ("start", "parameters"):
+            raise InputError(
+                f"'{name}' is a {variable.variability} {variable.causality}: "
+                + (f"only [{home}] can set it" if home else "it cannot be set")
+            )
+        if not isinstance(entry, Driven):
+            self._fixed[name] = self._constant(variable, entry)
+            return
+        if entry.source not in quantities:
+            raise InputError(f"from = '{entry.source}' is none of {', '.join(quantities)}")
+        wanted, links = quantities[entry.source], self._inputs if home == "inputs" else self._starts
+        scale = self._factor(entry, self._real(name), wanted)
+        scale = scale if entry.scale else 1.0 / scale
+        offset = _offset(entry.offset, wanted, abs(scale))
+        links.append(Link(name, entry.source, entry.sign * scale, offset, *range_of(variable)))
+
+    def _find(self, name: str) -> Any:
+        """The FMU's variable; InputError with names like it if there is none."""
+        if name in self._variables:
+            return self._variables[name]
+        by_lower = {known.lower(): known for known in self._variables}
+        near = difflib.get_close_matches(name.lower(), by_lower, n=3, cutoff=0.6)
+        names = ", ".join(f"'{by_lower[one]}'" for one in near)
+        raise InputError(f"the FMU has no variable '{name}'" + (f"; near: {names}" if near else ""))
+
+    def _real(self, name: str) -> Any:
+        """The same, a single real number."""
+        variable = self._find(name)
+        if variable.dimensions or not is_real(variable):
+            what = "an array" if variable.dimensions else f"of type {variable.type}"
+            raise InputError(f"'{name}' is {what}; a single real number is needed")
+        return variable
+
+    def _factor(self, entry: Pick | Driven, variable: Any, wanted: str) -> float:
+        """The entry's scale, or else that from the variable's unit to ``wanted``; 1 if neither the
+        map nor the FMU names a unit, which is SI then."""
+        if entry.scale is not None:
+            return entry.scale
+        named, declared = unit_of(entry.unit), unit_of(variable.unit)
+        unit, name = (named, entry.unit) if entry.unit is not None else (declared, variable.unit)
+        if unit is None and name not in (None, "", "-"):
+            raise InputError(
+                f"the unit '{name}' of '{variable.name}' is not known; give `unit`, or `scale` "
+                "instead of it"
+            )
+        if named and declared and not (named.agrees(declared) or declared.powers == FREQUENCY):
+            raise InputError(
+                f"the map says '{variable.name}' is in '{named.name}', the FMU declares "
+                f"'{declared.name}'; leave the unit out, or give `scale` if the FMU is wrong"
+            )
+        return to_si(unit, wanted) if unit else 1.0
+
+    def _constant(self, variable: Any, value: Value) -> Value:
+        """``value`` in the variable's type; InputError if it is of another or out of range."""
+        own = unit_of(variable.unit)
+        if isinstance(value, str) and is_real(variable):
+            number, unit = parse_quantity(value)
+            if own is None or own.powers != unit.powers:
+                raise InputError(
+                    f"'{value}' does not convert to "
+                    + (f"'{own.name}'" if own else "a number: the FMU declares no unit of it")
+                )
+            value = number * unit.factor / own.factor
+        result = None if variable.dimensions else _typed(variable, value)
+        lowest, highest = range_of(variable)
+        if result is None:
+            names = f" with {', '.join(items_of(variable))}" if items_of(variable) else ""
+            raise InputError(
+                f"{value!r} does not suit '{variable.name}', which is of type "
+                f"{variable.type}{names}"
+            )
+        if isinstance(result, str) or lowest <= result <= highest:
+            return result
+        raise InputError(
+            f"{value!r} is outside {lowest:g} to {highest:g}, which '{variable.name}' allows"
+        )
+
+
+def _offset(offset: float | str, wanted: str, factor: float = 1.0) -> float:
+    """An offset as a number; a text is in a unit of its own and converts to ``wanted``."""
+    if not isinstance(offset, str):
+        return offset
+    try:
+        number, unit = parse_quantity(offset)
+        return number * to_si(unit, wanted) * factor
+    except InputError as error:
+        raise InputError(f"offset: {error}") from None
+
+
+def _typed(variable: Any, value: Value) -> Value | None:
+    """The value in the variable's type; None if it has no such value."""
+    kind = variable.type
+    if isinstance(value, str):
+        return value if kind == "String" else items_of(variable).get(value)
+    if kind == "Boolean":
+        return bool(value) if value in (0, 1) else None
+    if isinstance(value, bool) or kind in ("String", "Binary", "Clock"):
+        return None
+    if is_real(variable):
+        return float(value)
+    width = np.iinfo({"Integer": "int32", "Enumeration": "int64"}.get(kind, kind.lower()))
+    return int(value) if value == int(value) and width.min <= value <= width.max else None

@@ -40,9 +40,14 @@ class _Section(pydantic.BaseModel):
         frozen=True, extra="forbid", allow_inf_nan=False, populate_by_name=True
     )
 
-    def picks(self) -> Iterator[tuple[str, "Pick"]]:
-        """Field and value of each variable that is given."""
-        return ((name, value) for name, value in self if isinstance(value, Pick))
+    def picks(self, place: str) -> Iterator[tuple[str, str, "Pick"]]:
+        """Quantity, place in the map and variable of what is read."""
+        for name, value in self:
+            at = f"{place}{type(self).model_fields[name].alias or name}"
+            if isinstance(value, Pick):
+                yield name, at, value
+            elif isinstance(value, _Section):
+                yield from value.picks(f"{at}.")
 
 
 class _Affine(_Section):
@@ -116,42 +121,40 @@ class FmuSection(_Section):
     )
 
 
+class _Rule(_Section):
+    forms: ClassVar[tuple[set[str], ...]]
+    """The keys with variables that it may have."""
+
+    @model_validator(mode="after")
+    def _one_form(self) -> Self:
+        if {name for name, value in self if isinstance(value, _Section)} in self.forms:
+            return self
+        forms = ", or ".join(" and ".join(sorted(form)) for form in self.forms)
+        raise ValueError(f"give either {forms}")
+
+
 class _Quaternion(_Section):
-    w: Pick
-    x: Pick
-    y: Pick
-    z: Pick
+    qw: Pick = Field(alias="w")
+    qx: Pick = Field(alias="x")
+    qy: Pick = Field(alias="y")
+    qz: Pick = Field(alias="z")
 
 
-class _Heading(_Section):
+class _Heading(_Rule):
+    forms = ({"quaternion"}, {"cos", "sin"})
     quaternion: _Quaternion | None = Field(None, description="rotation body → world")
     cos: Pick | None = None
     sin: Pick | None = None
     sign: Sign = 1.0
     offset: float | str = 0.0
 
-    @model_validator(mode="after")
-    def _one_source(self) -> Self:
-        if {name for name, _ in self.picks()} == (set() if self.quaternion else {"cos", "sin"}):
-            return self
-        raise ValueError("give either quaternion = { w, x, y, z }, or cos and sin")
 
-
-class _Velocity(_Section):
+class _Velocity(_Rule):
+    forms = ({"world_x", "world_y"}, {"speed"}, {"speed", "slip"})
     world_x: Pick | None = None
     world_y: Pick | None = None
     speed: Pick | None = None
-    slip: Pick | None = None
-
-    @model_validator(mode="after")
-    def _one_source(self) -> Self:
-        given = {name for name, _ in self.picks()}
-        if given in ({"world_x", "world_y"}, {"speed"}, {"speed", "slip"}):
-            return self
-        raise ValueError(
-            "give either world_x and world_y, or speed (and slip; without it the car is taken to "
-            "move where it points)"
-        )
+    slip: Pick | None = Field(None, description="without it the car moves where it points")
 
 
 class Derive(_Section):
@@ -166,17 +169,6 @@ class Derive(_Section):
         """The quantities of [outputs] that follow from others."""
         rules = {name for name, rule in self if rule is not None}
         return rules - {"velocity"} | ({"vx", "vy"} if "velocity" in rules else set())
-
-    def read(self) -> Iterator[tuple[str, str, Pick]]:
-        """Quantity, place in the map and variable of what the rules read."""
-        quaternion = self.psi and self.psi.quaternion
-        for place, prefix, rule in (
-            ("psi", "", self.psi),
-            ("psi.quaternion", "q", quaternion),
-            ("velocity", "", self.velocity),
-        ):
-            for name, pick in rule.picks() if rule else ():
-                yield prefix + name, f"[derive] {place}.{name}", pick
 
 
 class FmuMap(_Section):

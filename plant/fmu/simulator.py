@@ -4,7 +4,7 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -13,10 +13,9 @@ from bayesrace.errors import InputError
 from bayesrace.vehicles.models import STATES
 from bayesrace.vehicles.parameters import CarParameters
 from plant.fmu.host import FmuHost
-from plant.fmu.inspection import FmuDescription, describe
+from plant.fmu.inspection import inspect, steps_s
 from plant.fmu.map import wire
 from plant.fmu.map_file import FmuMap, read_map
-from plant.fmu.package import read_description
 from plant.fmu.wiring import Wiring
 from plant.simulator import Command, PlantGuard, checked_start, hold_in_turn, plant_discretisation
 
@@ -30,9 +29,7 @@ _LIMIT: Final = 1e6
 """Beyond this no number of a state can be sent, nor be a car's."""
 
 
-def communication_step(
-    description: FmuDescription, wanted_s: float | None, period_s: float
-) -> float:
+def communication_step(fmu: Any, wanted_s: float | None, period_s: float) -> float:
     """Step [s] in which an FMU is driven; it divides the plant's period.
 
     That of the map; else 1 ms if the FMU takes any; else the FMU's own, or the period. Raises
@@ -45,19 +42,17 @@ def communication_step(
             f"the map's step_s = {wanted_s:g} does not divide the plant's period of "
             f"{period_s:g} s; set it in [fmu] to a whole part of it, or change --rate"
         )
-    steps_s, otherwise_s = [description.internal_step_s, description.experiment_step_s], period_s
-    if description.variable_step:
-        steps_s, otherwise_s = steps_s[:1], _STEP_S
-        if steps_s[0] is None or _divides(steps_s[0], _STEP_S):
-            return _STEP_S
-    fitting_s = (step_s for step_s in steps_s if step_s and _divides(step_s, period_s))
-    return next(fitting_s, otherwise_s)
+    stated_s, otherwise_s = steps_s(fmu), period_s
+    if (
+        fmu.coSimulation.canHandleVariableCommunicationStepSize
+    ):  # but not finer than its own, nor between its own
+        stated_s, otherwise_s = [one for one in stated_s[:1] if not _divides(one, _STEP_S)], _STEP_S
+    return next((one for one in stated_s if _divides(one, period_s)), otherwise_s)
 
 
 def _divides(step_s: float, period_s: float) -> bool:
-    if not 0 < step_s <= period_s * (1 + 1e-9):
-        return False
-    return abs(round(period_s / step_s) * step_s - period_s) <= 1e-9 * period_s
+    whole = round(period_s / step_s) if 0 < step_s <= period_s * (1 + 1e-9) else 0
+    return abs(whole * step_s - period_s) <= 1e-9 * period_s
 
 
 class FmuSimulator:
@@ -110,16 +105,14 @@ class FmuSimulator:
 
     def _hold(self, u: Command, count: int) -> tuple[float, float]:
         """Holds a command for ``count`` communication steps; what acted."""
-        delta = float(self.x[6])
-        guard, wiring, part_s = self.guard, self._wiring, self._part_s
+        delta, wiring, part_s = float(self.x[6]), self._wiring, self._part_s
         # Whole periods are the period itself, to the bit.
         duration_s = self.step_s if count == self.substeps else count * part_s
-        applied = guard.apply(u, self.x, duration_s)
+        applied = self.guard.apply(u, self.x, duration_s)
         if self._any_size and not wiring.follows_angle:
             part_s, count = duration_s, 1
         times_s = [k * part_s for k in range(1, (count if wiring.follows_angle else 1) + 1)]
-        inputs = wiring.to_inputs(applied, delta, times_s)
-        outputs = self._host.step(inputs, part_s, count)
+        outputs = self._host.step(wiring.to_inputs(applied, delta, times_s), part_s, count)
         self._take(wiring.state(outputs, applied, duration_s))
         return applied
 
@@ -143,14 +136,12 @@ def open_fmu(
     Raises InputError if the FMU, the map, or both together are not usable.
     """
     period_s = plant_discretisation(rate_hz).step_s
-    raw = read_description(path)
-    description = describe(raw)
+    fmu = inspect(Path(path))
     map_ = None if map_path is None else read_map(Path(map_path))
-    wiring = wire(description, map_, car.drive.unit)
-    section = (map_ or FmuMap()).fmu
-    part_s = communication_step(description, section.step_s, period_s)
+    wiring, run = wire(fmu, map_, car.drive.unit), (map_ or FmuMap()).fmu
+    part_s = communication_step(fmu, run.step_s, period_s)
     # A step size that the map asks for is kept, whatever else the FMU could do.
-    any_size = description.variable_step and section.step_s is None
-    limits = {"timeout_s": section.timeout_s, "startup_s": section.startup_s}
-    with closing(FmuHost(Path(path), raw, wiring.inputs, wiring.outputs, **limits)) as host:
+    any_size = run.step_s is None and fmu.coSimulation.canHandleVariableCommunicationStepSize
+    limits = {"timeout_s": run.timeout_s, "startup_s": run.startup_s}
+    with closing(FmuHost(Path(path), fmu, wiring.inputs, wiring.outputs, **limits)) as host:
         yield FmuSimulator(car, host, wiring, period_s=period_s, part_s=part_s, any_size=any_size)

@@ -65,23 +65,23 @@ class Link:
     lowest: float = -math.inf
     highest: float = math.inf
 
-    def start(self, quantities: Mapping[str, float]) -> float:
+    def start(self, ours: Mapping[str, float]) -> float:
         """The FMU's start value; a heading is turned into the declared range.
 
         InputError outside the range.
         """
-        value = self.scale * quantities[self.quantity] + self.offset
+        value = self.scale * ours[self.quantity] + self.offset
         if not self.lowest <= value <= self.highest and self.quantity == "psi":
             turn = abs(self.scale) * TURN
             anchor = self.lowest if math.isfinite(self.lowest) else self.highest - turn
             value = anchor + (value - anchor) % turn
-        if not self.lowest <= value <= self.highest:
-            raise InputError(
-                f"the FMU cannot start with {self.variable} = {value:g} (our {self.quantity} = "
-                f"{quantities[self.quantity]:g}): it allows {self.lowest:g} to {self.highest:g}; "
-                "start elsewhere, or correct unit, sign and offset in the map's [start]"
-            )
-        return value
+        if self.lowest <= value <= self.highest:
+            return value
+        raise InputError(
+            f"the FMU cannot start with {self.variable} = {value:g} (our {self.quantity} = "
+            f"{ours[self.quantity]:g}): it allows {self.lowest:g} to {self.highest:g}; start "
+            "elsewhere, or correct unit, sign and offset in the map's [start]"
+        )
 
 
 class Wiring:
@@ -97,7 +97,6 @@ class Wiring:
         outputs: Sequence[Link],
         starts: Sequence[Link] = (),
         fixed: Mapping[str, Value] | None = None,
-        *,
         heading: tuple[float, float] = (1.0, 0.0),
         placed: bool = False,
     ) -> None:
@@ -111,13 +110,10 @@ class Wiring:
         self.outputs = tuple(link.variable for link in outputs)
         self.follows_angle = any(link.quantity == "delta" for link in inputs)
         """Whether an input changes during a hold because the steering angle does."""
-        self._inputs, self._outputs, self._starts = tuple(inputs), tuple(outputs), tuple(starts)
-        self._fixed = dict(fixed or {})
-        self._sign, self._zero = heading
-        self._placed = placed
-        self._psi = 0.0  # continued, in the FMU's world
-        self._delta = 0.0  # integrated
-        self._turn, self._origin = 0.0, (0.0, 0.0)  # of the FMU's world in ours
+        self._inputs, self._outputs, self._starts = inputs, outputs, starts
+        self._fixed, self._heading, self._placed = dict(fixed or {}), heading, placed
+        self._psi, self._delta = 0.0, 0.0  # continued in the FMU's world, integrated
+        self._turn, self._origin = 0.0, 0j  # of the FMU's world in ours
 
     def start_values(self, x0: Sequence[float] | Floats) -> dict[str, Value]:
         """Values to set before initialisation so that the car starts in ``x0``, (7,).
@@ -125,21 +121,14 @@ class Wiring:
         Parameters, constant inputs, start values, and the inputs of a car whose motor is off and
         whose steering holds still. InputError for a start that the FMU's ranges do not allow.
         """
-        state = dict(zip(STATES, map(float, x0), strict=True))
-        psi, vx, vy = state["psi"], state["vx"], state["vy"]
-        world_vx, world_vy = _rotated(vx, vy, psi)
-        quantities = state | {
-            "speed": math.hypot(vx, vy),
-            "slip": math.atan2(vy, vx),
-            "world_vx": world_vx,
-            "world_vy": world_vy,
-            "qw": math.cos(psi / 2.0),
-            "qx": 0.0,
-            "qy": 0.0,
-            "qz": math.sin(psi / 2.0),
-        }
-        still = dict(zip(self.inputs, self.to_inputs((0.0, 0.0), state["delta"]), strict=True))
-        return self._fixed | still | {one.variable: one.start(quantities) for one in self._starts}
+        ours = dict(zip(STATES, map(float, x0), strict=True))
+        velocity, half = complex(ours["vx"], ours["vy"]), ours["psi"] / 2.0
+        world = velocity * _direction(ours["psi"])
+        ours |= {"speed": abs(velocity), "slip": math.atan2(velocity.imag, velocity.real)}
+        ours |= {"world_vx": world.real, "world_vy": world.imag}
+        ours |= {"qw": math.cos(half), "qx": 0.0, "qy": 0.0, "qz": math.sin(half)}
+        still = dict(zip(self.inputs, self.to_inputs((0.0, 0.0), ours["delta"]), strict=True))
+        return self._fixed | still | {one.variable: one.start(ours) for one in self._starts}
 
     def to_inputs(
         self, u: Sequence[float], delta_rad: float, times_s: Sequence[float] = (0.0,)
@@ -165,14 +154,12 @@ class Wiring:
         Raises InputError if the FMU starts elsewhere, unless it is to be placed.
         """
         asked = [float(value) for value in x0]
-        self._psi = 0.0 if self._placed else asked[2]
-        self._delta = asked[6]
+        self._psi, self._delta = 0.0 if self._placed else asked[2], asked[6]
         ours = self._read(outputs)
         x, y, psi = pose = ours["x"], ours["y"], ours["psi"]
         if self._placed:
             self._turn = asked[2] - psi
-            dx, dy = _rotated(x, y, self._turn)
-            self._origin = asked[0] - dx, asked[1] - dy
+            self._origin = complex(*asked[:2]) - complex(x, y) * _direction(self._turn)
         elif POSE_TOLERANCE < np.abs(np.subtract(pose, asked[:3])).max() < math.inf:
             raise InputError(
                 f"the FMU starts at x = {x:.4g} m, y = {y:.4g} m, psi = {psi:.4g} rad instead of "
@@ -202,27 +189,29 @@ class Wiring:
         if "cos" in ours:
             sine, cosine = ours["sin"], ours["cos"]
             angle = math.nan if sine == cosine == 0.0 else math.atan2(sine, cosine)
-            ours["psi"] = self._sign * angle + self._zero
+            ours["psi"] = self._heading[0] * angle + self._heading[1]
         turns = (self._psi - ours["psi"]) / TURN
         # Nothing is added where the FMU counts turns itself: its value stays to the bit.
-        ours["psi"] = ours["psi"] + TURN * round(turns) if math.isfinite(turns) else math.nan
-        self._psi = ours["psi"]
+        self._psi = ours["psi"] + TURN * round(turns) if math.isfinite(turns) else math.nan
+        velocity = None
         if "world_x" in ours:
-            ours["vx"], ours["vy"] = _rotated(ours["world_x"], ours["world_y"], -ours["psi"])
+            velocity = complex(ours["world_x"], ours["world_y"]) * _direction(-self._psi)
         elif "speed" in ours:
-            ours["vx"], ours["vy"] = _rotated(ours["speed"], 0.0, ours.get("slip", 0.0))
-        return ours
+            velocity = ours["speed"] * _direction(ours.get("slip", 0.0))
+        if velocity is not None:
+            ours |= {"vx": velocity.real, "vy": velocity.imag}
+        return ours | {"psi": self._psi}
 
     def _state(self, ours: Mapping[str, float], omega: float) -> Floats:
-        x, y = _rotated(ours["x"], ours["y"], self._turn)
-        x, y, psi = x + self._origin[0], y + self._origin[1], ours["psi"] + self._turn
-        omega, delta = ours.get("omega", omega), ours.get("delta", self._delta)
-        return np.array((x, y, psi, ours["vx"], ours["vy"], omega, delta))
+        place = complex(ours["x"], ours["y"]) * _direction(self._turn) + self._origin
+        psi, delta = ours["psi"] + self._turn, ours.get("delta", self._delta)
+        omega = ours.get("omega", omega)
+        return np.array((place.real, place.imag, psi, ours["vx"], ours["vy"], omega, delta))
 
 
-def _rotated(x: float, y: float, angle_rad: float) -> tuple[float, float]:
-    """(x, y) turned by the angle; NaN for an angle that is not finite."""
+def _direction(angle_rad: float) -> complex:
+    """The unit vector at this angle as a complex number, NaN for an angle that is not finite: to
+    multiply by it turns a vector."""
     if not math.isfinite(angle_rad):
-        return math.nan, math.nan
-    cosine, sine = math.cos(angle_rad), math.sin(angle_rad)
-    return cosine * x - sine * y, sine * x + cosine * y
+        return complex(math.nan, math.nan)
+    return complex(math.cos(angle_rad), math.sin(angle_rad))

@@ -51,7 +51,6 @@ enum { /* value references */
        INSTANCES,
        SOFT,
        SMALL,
-       ROWS,
        VALUES
 };
 
@@ -223,9 +222,6 @@ EXPORT Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean d, fmi3Flo
     return (Status)OK;
 }
 
-EXPORT Status fmi3EnterConfigurationMode(fmi3Instance c) { return (void)c, (Status)OK; }
-EXPORT Status fmi3ExitConfigurationMode(fmi3Instance c) { return (void)c, (Status)OK; }
-
 #define ACCESS(Name, Type)                                                               \
     EXPORT Status fmi3Set##Name(fmi3Instance c, const fmi3ValueReference vr[], size_t n, \
                                 const Type values[], size_t nv) {                        \
@@ -243,7 +239,6 @@ ACCESS(Float64, fmi3Float64)
 ACCESS(Float32, fmi3Float32)
 ACCESS(Int32, fmi3Int32)
 ACCESS(UInt8, fmi3UInt8)
-ACCESS(UInt64, fmi3UInt64)
 ACCESS(Boolean, fmi3Boolean)
 
 EXPORT Status fmi3SetString(fmi3Instance c, const fmi3ValueReference vr[], size_t n,
