@@ -20,7 +20,7 @@ from controller.weights.checks import Checks
 from controller.weights.settings import GateSettings
 from controller.weights.store import AcceptedWeights, History, Store, digest_of
 
-__all__ = ["compiled_controller", "predictive_controller", "read_settings"]
+__all__ = ["compiled_controller", "predictive_controller", "read_checked", "read_settings"]
 
 Settings = TypeVar("Settings", bound=BaseModel)
 
@@ -61,6 +61,19 @@ def compiled_controller(
     return PredictiveController(step, version, track=track.identity)
 
 
+def read_checked(
+    path: Path, artefact: Path, car: CarParameters, gate: GateSettings | None = None
+) -> GpWeights:
+    """Weights that may drive the car from the start, with the controller of ``artefact``; nothing
+    watches them there. InputError names the file and what it fails."""
+    weights = read_weights(path)
+    try:
+        Checks(gate or GateSettings(), artefact, car).check_start(encode_weights(weights))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return weights
+
+
 def predictive_controller(
     artefact: Path,
     car: CarParameters,
@@ -77,17 +90,12 @@ def predictive_controller(
     the start, whatever ``weights`` are. ``gate``: thresholds that ``weights`` must pass; those in
     the store have. Raises InputError naming the file that cannot be used.
     """
-    loaded = None if weights is None else read_weights(weights)
+    loaded = None if weights is None else read_checked(weights, artefact, car, gate)
     driven_on = load_track(track, car.width_m)
     line = read_raceline_for(raceline, driven_on, car)
     mpc = read_settings(settings, MpcSettings)
     step = compiled_controller(artefact, car, driven_on, line, loaded, mpc).native
     version, data = ("", b"") if loaded is None else (loaded.version, encode_weights(loaded))
-    if data:
-        try:
-            Checks(gate or GateSettings(), artefact, car).check_start(data)
-        except InputError as error:
-            raise InputError(f"{weights}: {error}") from None
     first = AcceptedWeights(
         number=0,
         version=version,

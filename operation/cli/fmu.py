@@ -128,12 +128,11 @@ def _controller(
     artefact: Path | None,
     version: Literal[2, 3],
 ) -> "FmuDefinition":
-    from bayesrace.gp.weights import read_weights
     from bayesrace.manifest import read_manifest
     from codegen.build import build
     from codegen.fmu import controller_fmu
     from codegen.settings import BuildSettings
-    from controller.assembly import read_settings
+    from controller.assembly import read_checked, read_settings
     from controller.cycle_settings import FallbackSettings
     from controller.settings import MpcSettings
 
@@ -147,7 +146,7 @@ def _controller(
         spacing_m=table.spacing_m,
         settings=read_settings(settings, MpcSettings).parameters(car, problem),
         fallback=FallbackSettings().model_dump() | {"brake_fade_mps": car.brake_fade_mps},
-        weights=None if weights is None else read_weights(weights),
+        weights=None if weights is None else read_checked(weights, folder, car),
         version=version,
     )
 

@@ -301,13 +301,12 @@ def export(
     car: Car = DEFAULT_CAR,
 ) -> None:
     """Write racing line, weights and settings for a C program (examples/c_host)."""
-    from bayesrace.gp.weights import read_weights
     from bayesrace.manifest import read_manifest
     from bayesrace.vehicles import get_car
     from codegen.build import build as make
     from codegen.host_files import export as write
     from codegen.settings import BuildSettings
-    from controller.assembly import read_settings
+    from controller.assembly import read_checked, read_settings
     from controller.cycle_settings import cycle_values
     from controller.process_settings import ControllerSettings
     from controller.settings import MpcSettings
@@ -321,7 +320,7 @@ def export(
     mpc = read_settings(settings, MpcSettings).parameters(parameters, manifest.problem.name)
     cycle = process.fallback, process.compensation, process.stale_s, process.sensor_tolerance
     values = mpc | cycle_values(parameters, *cycle)
-    learned = None if weights is None else read_weights(weights)
+    learned = None if weights is None else read_checked(weights, folder, parameters)
     write(out, manifest, table.rows, table.spacing_m, values, learned)
     typer.echo(f"{track}, {parameters.name}: {out}")
 
