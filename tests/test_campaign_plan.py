@@ -228,7 +228,7 @@ def test_each_update_learns_from_all_laps_before_it(
         learned.append(([len(one) for one in samples], first.version, read_weights(made).version))
         return made
 
-    monkeypatch.setattr("studies.campaign.execute.updated_weights", recorded)
+    monkeypatch.setattr("operation.preparation.updated_weights", recorded)
     text = """
         controllers = ["bayesrace-updated-twice", "bayesrace-updated", "bayesrace"]
         [grid]

@@ -51,7 +51,7 @@ def test_the_controller_drives_with_its_own_extra_alone(
 def test_a_missing_package_of_campaigns_is_named_with_its_extra(
     cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    for name in ("page", "summary", "figures", "results"):
+    for name in ("page", "summary", "results"):
         monkeypatch.delitem(sys.modules, f"studies.campaign.{name}", raising=False)
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     refused(cli("campaign-report", tmp_path), "pyarrow", "bayesrace[campaign]")

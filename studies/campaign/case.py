@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final, Literal, get_args
 
@@ -15,19 +16,8 @@ from bayesrace.files import read_whole, write_whole
 from bayesrace.vehicles import CarParameters
 from operation.settings import RaceSettings
 
-__all__ = [
-    "CONTROLLERS",
-    "LEARNS_FROM",
-    "PAPER",
-    "Case",
-    "Controller",
-    "Files",
-    "car_identity",
-    "factors",
-    "named_file",
-    "nested",
-    "software_identity",
-]
+__all__ = ["CONTROLLERS", "LEARNS_FROM", "PAPER", "Case", "Controller", "Files", "car_identity"]
+__all__ += ["factors", "software_identity"]
 
 Controller = Literal[
     "worstcase", "bayesrace", "bayesrace-updated", "bayesrace-updated-twice", "bayesrace-limit",
@@ -43,10 +33,10 @@ LEARNS_FROM: Final[Mapping[Controller, tuple[Controller, ...]]] = {
 """Whose laps a controller's weights are learned from beside the training drive. Training begins
 with the weights of the last one named."""
 
-_FIXED: Final = (
-    *("mode", "fmu", "fmu_map", "simulator", "threads", "limit", "line"),
-    *("discretisation.step_s", "pursuit.step_s", "pursuit.seed"),
-)
+_FIXED: Final = {
+    "mode", "fmu", "fmu_map", "simulator", "threads", "limit", "line", "discretisation.step_s",
+    "pursuit.step_s", "pursuit.seed",
+}  # fmt: skip
 """Settings that a campaign does not vary: it drives the built-in car in lockstep, in the plant's
 period, and ``seed`` is the one seed."""
 
@@ -85,36 +75,20 @@ def _fields(form: type[BaseModel], before: str) -> Iterator[tuple[str, FieldInfo
             yield before + name, field
 
 
-def nested(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Values by dotted names as the nested data that settings are made of."""
-    result: dict[str, Any] = {}
-    for name, value in values.items():
-        *path, last = name.split(".")
-        place = result
-        for part in path:
-            place = place.setdefault(part, {})
-        place[last] = value
-    return result
-
-
-def flat(settings: RaceSettings) -> dict[str, Any]:
-    """The value of every factor by its dotted name; the car by its own."""
-    values: dict[str, Any] = {}
-    for name in factors():
-        value: Any = settings
-        for part in name.split("."):
-            value = getattr(value, part)
-        values[name] = value
-    return values | {"car": settings.car.name, "kernels": "+".join(settings.kernels)}
-
-
 def car_identity(car: CarParameters) -> str:
     """Name and digest of all its values; those of :attr:`CarParameters.identity` are fewer."""
     return f"{car.name}-{digest([car.model_dump_json()])}"
 
 
-Files = dict[str, bytes]
-"""Content of the files that a plan names, by ``DIGEST/NAME``."""
+class Files(dict[str, bytes]):
+    """Content of the files that a plan names, by ``DIGEST/NAME``."""
+
+    def add(self, path: Path, what: str) -> str:
+        """Reads a file; its name here. InputError, which calls it ``what``, if it cannot."""
+        data = read_whole(path, what, 1 << 28)
+        name = f"{digest([data])}/{path.name}"
+        self[name] = data
+        return name
 
 
 @dataclass(frozen=True)
@@ -136,26 +110,21 @@ class Case:
     def columns(self) -> dict[str, Any]:
         """What all rows of the case share: its key, every factor, and the whole settings."""
         settings = self.settings
+        values = {name: attrgetter(name)(settings) for name in factors()}
         return {
             "key": self.key,
-            **flat(settings),
+            **values | {"car": settings.car.name, "kernels": "+".join(settings.kernels)},
             "car_identity": car_identity(settings.car),
             "settings": settings.model_dump_json(exclude=_LEFT_OUT),
         }
 
     def task(self) -> str:
         """The case as JSON, with the identity of the software that is to compute it."""
-        return json.dumps(
-            {
-                "settings": self.settings.model_dump(mode="json"),
-                "controllers": self.controllers,
-                "weights": self.weights,
-                "software": software_identity(),
-            }
-        )
+        settings = self.settings.model_dump(mode="json")
+        return json.dumps(vars(self) | {"settings": settings, "software": software_identity()})
 
     @classmethod
-    def of_task(cls, task: str, files: Files) -> "Case":
+    def of_task(cls, task: str, files: dict[str, bytes]) -> "Case":
         """The case, with its files written where this machine's cache is.
 
         Raises RuntimeError if it was made by another version of the software.
@@ -163,16 +132,13 @@ class Case:
         data = json.loads(task)
         if data["software"] != software_identity():
             raise RuntimeError("this worker runs another version of bayesrace or its libraries")
-        settings = data["settings"]
-        for name in ("track", "train_track"):
-            settings[name] = _placed(settings[name], files)
-        weights = _placed(data["weights"], files)
+        placed = {name: _placed(data["settings"][name], files) for name in ("track", "train_track")}
         # Workers share the processors: each trains in one thread.
-        settings["threads"] = 1
-        return cls(RaceSettings.model_validate(settings), tuple(data["controllers"]), weights)
+        settings = RaceSettings.model_validate(data["settings"] | placed | {"threads": 1})
+        return cls(settings, tuple(data["controllers"]), _placed(data["weights"], files))
 
 
-def _placed(name: str, files: Files) -> str:
+def _placed(name: str, files: dict[str, bytes]) -> str:
     """Where this machine has the file of that name; what names no file stays as it is."""
     if name not in files:
         return name
@@ -181,8 +147,3 @@ def _placed(name: str, files: Files) -> str:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, files[name])
     return str(path)
-
-
-def named_file(path: Path, data: bytes) -> str:
-    """The name of a file in :data:`Files`."""
-    return f"{digest([data])}/{path.name}"

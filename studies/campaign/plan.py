@@ -1,23 +1,15 @@
-"""The plan of a campaign: a TOML file that says what varies.
+"""The plan of a campaign: a TOML file that says what varies, as docs/campaigns.md shows it.
 
-    controllers = ["bayesrace", "bayesrace-updated", "bestcase"]
-
-    [grid]                                  # every combination
-    track = ["harbour", "random:1..100"]
-    seed = "0..4"
-
-    [random]                                # drawn for each combination, ``draws`` times
-    true_grip = { low = 0.8, high = 1.2 }
-
-Every setting of :class:`~operation.settings.RaceSettings` may stand in either table, but for a few
-that a campaign fixes. A text that ends in ``A..B`` stands for the whole numbers from A to B.
+Every setting of :class:`~operation.settings.RaceSettings` may stand in [grid], whose values are
+combined, or in [random], whose values are drawn for each combination, but for a few that a campaign
+fixes. A text that ends in ``A..B`` stands for the whole numbers from A to B.
 """
 
 import itertools
 import json
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -26,29 +18,22 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from bayesrace.cache import digest
-from bayesrace.errors import InputError, fault_in_words, faults_in
-from bayesrace.files import parse_toml, read_text, read_whole
+from bayesrace.errors import InputError, faults_in
+from bayesrace.files import parse_toml, read_text
 from bayesrace.gp.weights import decode_weights
 from bayesrace.tracks import builtin_tracks, is_random_track, load_track
 from bayesrace.vehicles import CarParameters, get_car
 from operation.settings import RaceSettings
-from studies.campaign.case import (
-    CONTROLLERS,
-    LEARNS_FROM,
-    PAPER,
-    Case,
-    Controller,
-    Files,
-    factors,
-    named_file,
-    nested,
-)
+from studies.campaign.case import CONTROLLERS, LEARNS_FROM, PAPER, Case, Controller, Files, factors
 
 __all__ = ["Campaign", "read_plan", "spread"]
 
 _MOST_CASES: Final = 1_000_000
 _SPAN: Final = re.compile(r"(.*?)(\d{1,9})\.\.(\d{1,9})")
-_TRAINING: Final = ("train_track", "seed", "collect_s", "points", "kernels", "widen")
+_TRAINING: Final = ("train_track", "seed", "collect_s", "points", "kernels", "widen", "pursuit")
+
+
+_Drawn = Callable[[np.random.Generator], Any]  # a value by random numbers
 
 
 class _Draw(BaseModel):
@@ -93,14 +78,12 @@ class _Plan(BaseModel):
 
 @dataclass(frozen=True)
 class Campaign:
-    """What a plan comes to."""
+    """What a plan comes to: its cases by their keys, and the text of its file."""
 
     cases: dict[str, Case]
-    """By their keys."""
     files: Files
     cars: tuple[CarParameters, ...]
     text: str
-    """Of the plan's file."""
 
 
 def read_plan(path: Path) -> Campaign:
@@ -111,18 +94,11 @@ def read_plan(path: Path) -> Campaign:
     text = read_text(path, "the plan", "give a TOML file as docs/campaigns.md shows")
     content = parse_toml(text, path, "docs/campaigns.md has an example")
     try:
-        plan = _Plan.model_validate(content)
-    except ValidationError as error:
+        return _Reader(_Plan.model_validate(content), path.parent).campaign(text)
+    except ValidationError as error:  # of the plan, or of the settings of a case
         raise InputError(f"{path}: {faults_in(error, 'the plan', _Plan)}") from None
-    try:
-        return _Reader(plan, path.parent).campaign(text)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 40 else f"{text[:39]}…"
 
 
 class _Reader:
@@ -130,51 +106,32 @@ class _Reader:
 
     def __init__(self, plan: _Plan, folder: Path) -> None:
         self._plan, self._folder = plan, folder
-        self._files: Files = {}
+        self._files = Files()
         self._cars: dict[str, CarParameters] = {}
 
     def campaign(self, text: str) -> Campaign:
         plan = self._plan
-        _check_controllers(plan)
         weights = "" if plan.weights is None else self._weights(plan.weights)
-        grid = {
-            name: self._values("grid", name, given)
-            for name, given in _leaves("grid", plan.grid).items()
-        }
-        drawn = {
-            name: self._drawn(name, given) for name, given in _leaves("random", plan.random).items()
-        }
-        if twice := sorted(grid.keys() & drawn.keys()):
-            raise InputError(f"{twice[0]} is in [grid] and in [random]; leave it in one of them")
-        if not drawn and plan.draws > 1:
-            raise InputError(f"draws = {plan.draws}: there is nothing to draw; add [random]")
-        _check_effect(plan, {**grid, **drawn})
-        if not grid and not drawn:
-            raise InputError(
-                "the plan names no races: give tracks or other settings, such as track = 'harbour' "
-                "in [grid] (docs/campaigns.md)"
-            )
+        grid = {n: self._values("grid", n, v) for n, v in _leaves("grid", plan.grid).items()}
+        drawn = {n: self._drawn(n, v) for n, v in _leaves("random", plan.random).items()}
         count = math.prod(map(len, grid.values())) * plan.draws
-        if count > _MOST_CASES:
-            raise InputError(
-                f"the plan has {count} cases, at most {_MOST_CASES} are possible: "
-                "draw some values in [random] in place of all combinations in [grid]"
-            )
+        if faults := _faults(plan, list(grid), list(drawn), count):
+            raise InputError(faults[0])
         # In the order in which they learn from each other.
-        controllers = tuple(one for one in CONTROLLERS if one in plan.controllers)
-        cases = {}
+        controllers, cases = tuple(one for one in CONTROLLERS if one in plan.controllers), {}
         for values in self._points(grid, drawn):
-            case = Case(_settings(values), controllers, weights)
-            _check_runs(case)
+            settings = RaceSettings.model_validate(_nested(values))
+            if "bayesrace-limit" in controllers and not settings.progress_runs:
+                raise InputError(
+                    "controllers: 'bayesrace-limit' has no runs: progress_drives is 0, as by "
+                    "default on linear tyres; set it, or leave the controller out"
+                )
+            case = Case(settings, controllers, weights)
             cases[case.key] = case
         cars = {case.settings.car.name: case.settings.car for case in cases.values()}
         return Campaign(cases, self._files, tuple(cars.values()), text)
 
-    def _points(
-        self,
-        grid: Mapping[str, list[Any]],
-        drawn: Mapping[str, Callable[[np.random.Generator], Any]],
-    ) -> Iterator[dict[str, Any]]:
+    def _points(self, grid: dict[str, list[Any]], drawn: dict[str, _Drawn]) -> Iterator[Any]:
         """A draw depends on its point and its factor alone: what is added to a plan leaves it."""
         for values in itertools.product(*grid.values()):
             point = dict(zip(grid, values, strict=True))
@@ -186,115 +143,85 @@ class _Reader:
                     for name, draw in drawn.items()
                 }
 
-    # Values ------------------------------------------------------------------------------------
-
     def _values(self, table: str, name: str, given: Any) -> list[Any]:
         """The values of a factor, each checked."""
-        values = given if isinstance(given, list) and not _is_one(name, given) else [given]
-        every = [one for value in values for one in spread(value)]
+        single = name == "kernels" and all(isinstance(one, str) for one in given)  # a list itself
+        values = given if isinstance(given, list) and not single else [given]
+        every = [self._checked(table, name, one) for value in values for one in spread(value)]
         if not every:
             raise InputError(f"{table}.{name} = [] has no values; give some or leave it out")
-        return [self._checked(table, name, value) for value in every]
+        return every
 
-    def _drawn(self, name: str, given: Any) -> Callable[[np.random.Generator], Any]:
-        if isinstance(given, dict):
-            try:
-                draw = _Draw.model_validate(given)
-            except ValidationError as error:
-                raise InputError(
-                    f"random.{name} = {_short(given)}: {faults_in(error, 'the values', _Draw)}; "
-                    "write { low = NUMBER, high = NUMBER }, with log = true for even logarithms"
-                ) from None
-            for bound in (draw.low, draw.high):
-                self._checked("random", name, bound)
-            return draw.value
-        values = self._values("random", name, given)
-        return lambda rng: values[int(rng.integers(len(values)))]
+    def _drawn(self, name: str, given: Any) -> _Drawn:
+        if not isinstance(given, dict):
+            values = self._values("random", name, given)
+            return lambda rng: values[int(rng.integers(len(values)))]
+        try:
+            draw = _Draw.model_validate(given)
+        except ValidationError as error:
+            fault = faults_in(error, "the values", _Draw)
+            form = "{ low = NUMBER, high = NUMBER }, with log = true for even logarithms"
+            raise InputError(f"random.{name}: {fault}; write {form}") from None
+        for bound in (draw.low, draw.high):
+            self._checked("random", name, bound)
+        return draw.value
 
     def _checked(self, table: str, name: str, value: Any) -> Any:
         """The value, with a file's content read; InputError naming it if it cannot be used."""
-        place = f"{table}.{name}"
         try:
-            if name == "car":
+            if name == "car" and isinstance(value, str):
                 return self._car(value)
-            if name in ("track", "train_track"):
+            if name in ("track", "train_track") and isinstance(value, str):
                 value = self._track(value)
-            RaceSettings.model_validate(nested({name: value}))
+            RaceSettings.model_validate(_nested({name: value}))
         except ValidationError as error:
-            about = factors()[name].description
-            fault = "; ".join(map(fault_in_words, error.errors()))
-            raise InputError(f"{place} = {_short(value)}: {fault} ({about})") from None
+            raise InputError(f"{table}.{faults_in(error, name, RaceSettings)}") from None
         except InputError as error:
-            raise InputError(f"{place}: {error}") from None
+            raise InputError(f"{table}.{name}: {error}") from None
         return value
 
-    def _car(self, name: Any) -> CarParameters:
-        if not isinstance(name, str):
-            raise InputError(f"{_short(name)} is no car; give a built-in name or a TOML file")
+    def _car(self, name: str) -> CarParameters:
         car = get_car(str(self._folder / name) if name.endswith(".toml") else name)
         if self._cars.setdefault(car.name, car) != car:
             raise InputError(f"two cars have the name '{car.name}'; give one of them another name")
         return car
 
-    def _track(self, name: Any) -> str:
-        if not isinstance(name, str):
-            raise InputError(
-                f"{_short(name)} is no track; give a name, random:SEED, random10:SEED or a CSV file"
-            )
+    def _track(self, name: str) -> str:
         if name in builtin_tracks() or is_random_track(name):
             return name
         path = self._folder / name
         load_track(path if path.is_file() else name, 0.0)
-        return self._file(path, "the track")
+        return self._files.add(path, "the track")
 
     def _weights(self, path: Path) -> str:
-        name = self._file(self._folder / path, "the weights")
+        name = self._files.add(self._folder / path, "the weights")
         try:
             decode_weights(self._files[name])
         except InputError as error:
             raise InputError(f"weights = '{path}': {error}") from None
         return name
 
-    def _file(self, path: Path, what: str) -> str:
-        data = read_whole(path, what)
-        name = named_file(path, data)
-        self._files[name] = data
-        return name
 
-
-def _check_controllers(plan: _Plan) -> None:
-    learning = next((one for one in plan.controllers if one in LEARNS_FROM), None)
-    if learning and plan.weights is not None:
-        raise InputError(
-            f"controllers: '{learning}' learns from a training drive, which there is none of "
-            "with given weights; leave it or the weights out"
-        )
-    for one in plan.controllers:
-        for other in LEARNS_FROM.get(one, ()):
-            if other not in plan.controllers:
-                raise InputError(
-                    f"controllers: '{one}' learns from the laps of '{other}'; add that"
-                )
-
-
-def _check_runs(case: Case) -> None:
-    if "bayesrace-limit" in case.controllers and not case.settings.progress_runs:
-        raise InputError(
-            "controllers: 'bayesrace-limit' has no runs: progress_drives is 0, as by default on "
-            "linear tyres; set it, or leave the controller out"
-        )
-
-
-def _check_effect(plan: _Plan, names: Iterable[str]) -> None:
-    """InputError for settings of the training where nothing is trained: they would do nothing."""
-    if plan.weights is None:
-        return
-    idle = [name for name in names if name in _TRAINING or name.startswith("pursuit.")]
-    if idle:
-        raise InputError(
-            f"{idle[0]} shapes what is learned, and with given weights nothing is: leave it or the "
-            "weights out"
-        )
+def _faults(plan: _Plan, grid: list[str], drawn: list[str], count: int) -> list[str]:
+    """What is wrong with the plan as a whole: names of its settings, and its number of cases."""
+    faults = []
+    for one in (one for one in plan.controllers if one in LEARNS_FROM):
+        missing = [other for other in LEARNS_FROM[one] if other not in plan.controllers]
+        if plan.weights is not None:
+            faults.append(f"controllers: '{one}' trains anew; leave it or the weights out")
+        elif missing:
+            faults.append(f"controllers: '{one}' learns from the laps of '{missing[0]}'; add that")
+    faults += [f"{one} is in [grid] and in [random]; leave it in one" for one in {*grid} & {*drawn}]
+    if not drawn and plan.draws > 1:
+        faults.append(f"draws = {plan.draws}: there is nothing to draw; add [random]")
+    if plan.weights is not None:
+        idle = [name for name in (*grid, *drawn) if name.split(".")[0] in _TRAINING]
+        faults += [f"{one} shapes what is learned; leave it or the weights out" for one in idle]
+    if not grid and not drawn:
+        faults.append("the plan names no races; give tracks in [grid] (docs/campaigns.md)")
+    if count > _MOST_CASES:
+        faults.append(f"{count} cases, at most {_MOST_CASES} are possible; draw some in [random]")
+    return faults
 
 
 def _leaves(table: str, given: Mapping[str, Any], before: str = "") -> dict[str, Any]:
@@ -307,16 +234,21 @@ def _leaves(table: str, given: Mapping[str, Any], before: str = "") -> dict[str,
         elif isinstance(value, dict) and any(one.startswith(f"{name}.") for one in known):
             leaves |= _leaves(table, value, f"{name}.")
         else:
-            raise InputError(
-                f"{table}.{name} = {_short(value)} is no setting that can vary; these can: "
-                f"{', '.join(known)}"
-            )
+            fault = f"{table}.{name} = {value!r:.40} is no setting that can vary"
+            raise InputError(f"{fault}; these can: {', '.join(known)}")
     return leaves
 
 
-def _is_one(name: str, given: list[Any]) -> bool:
-    """Whether the list is one value: kernels are a list themselves."""
-    return name == "kernels" and all(isinstance(one, str) for one in given)
+def _nested(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values by dotted names as the nested data that settings are made of."""
+    result: dict[str, Any] = {}
+    for name, value in values.items():
+        *path, last = name.split(".")
+        place = result
+        for part in path:
+            place = place.setdefault(part, {})
+        place[last] = value
+    return result
 
 
 def spread(value: Any) -> list[Any]:
@@ -327,10 +259,3 @@ def spread(value: Any) -> list[Any]:
     text, first, last = match[1], int(match[2]), int(match[3])
     numbers = range(first, min(last, first + _MOST_CASES) + 1)
     return [f"{text}{number}" if text else number for number in numbers]
-
-
-def _settings(values: Mapping[str, Any]) -> RaceSettings:
-    try:
-        return RaceSettings.model_validate(nested(values))
-    except ValidationError as error:
-        raise InputError(f"a case cannot be driven: {faults_in(error, 'its settings')}") from None

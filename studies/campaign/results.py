@@ -8,6 +8,7 @@ import fcntl
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import NoneType
 from typing import Any, Final, get_args
@@ -22,84 +23,56 @@ from bayesrace.files import clear_partials, replacing
 from studies.campaign.case import factors
 from studies.campaign.execute import FAILED, Row
 
-__all__ = ["LAPS", "Results", "read_results"]
+__all__ = ["Results", "read_results", "writing"]
 
-LAPS: Final = "laps.parquet"
+_LAPS: Final = "laps.parquet"
 _PARTS: Final = "parts"
-_SUFFIX: Final = ".parquet"
 
-
-def _type(field: FieldInfo) -> pa.DataType:
-    form: Any = field.annotation
-    kinds = {one for one in get_args(form) or (form,) if one is not NoneType}
-    numbers = {bool: pa.bool_(), int: pa.int64(), float: pa.float64()}
-    return next((one for kind, one in numbers.items() if kinds == {kind}), pa.string())
+_COLUMNS: Final = {
+    "controller": str, "car_identity": str, "weights": str, "software": str, "cpu": str,
+    "lap": int, "lap_time_s": float, "samples": int, "off_track_samples": int,
+    "off_track_max_m": float, "fallbacks": int, "ended": str, "reason": str,
+    "trajectory_sha256": str, "step_p50_us": float, "step_p99_us": float, "step_max_us": float,
+    "simulated_s": float, "drive_s": float, "case_s": float, "host": str, "settings": str,
+}  # fmt: skip
+"""All but the key and the factors; docs/campaigns.md says what they mean."""
+_TYPES: Final = {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: pa.string()}
 
 
 def _schema() -> pa.Schema:
-    text, number, count = pa.string(), pa.float64(), pa.int64()
-    return pa.schema(
-        [
-            ("key", text),
-            *((name, _type(field)) for name, field in factors().items()),
-            *(
-                (name, text)
-                for name in ("controller", "car_identity", "weights", "software", "cpu")
-            ),
-            ("lap", count),
-            ("lap_time_s", number),
-            ("samples", count),
-            ("off_track_samples", count),
-            ("off_track_max_m", number),
-            ("fallbacks", count),
-            ("ended", text),
-            ("reason", text),
-            ("trajectory_sha256", text),
-            *((name, number) for name in ("step_p50_us", "step_p99_us", "step_max_us")),
-            *((name, number) for name in ("simulated_s", "drive_s", "case_s")),
-            ("host", text),
-            ("settings", text),
-        ]
-    )
+    columns = {"key": str, **{name: _kind(field) for name, field in factors().items()}, **_COLUMNS}
+    return pa.schema([(name, _TYPES[kind]) for name, kind in columns.items()])
 
 
-MEASURED: Final = (
-    "step_p50_us", "step_p99_us", "step_max_us", "drive_s", "case_s", "host",
-)  # fmt: skip
-"""Columns that differ from machine to machine and from time to time; all others do not."""
+def _kind(field: FieldInfo) -> type:
+    """Of a factor's values, which may be None; text for what is no single number."""
+    form: Any = field.annotation
+    kinds = {one for one in get_args(form) or (form,) if one is not NoneType}
+    return next((kind for kind in _TYPES if kinds == {kind}), str)
 
 
+@dataclass(frozen=True)
 class Results:
-    """The folder of one campaign, which this process alone writes."""
+    """The folder of one campaign, which this process alone writes; see :func:`writing`."""
 
-    def __init__(self, folder: Path) -> None:
-        """``folder`` exists; see :func:`writing`."""
-        self._folder = folder
+    folder: Path
 
     def done(self, again: bool) -> set[str]:
         """Keys of the cases that need not be computed; ``again``: failed ones are."""
-        table = read_results(self._folder, ["key", "ended"])
-        keys = set(table["key"].to_pylist())
-        if again:
-            failed = table.filter(pc.equal(table["ended"], FAILED))
-            keys -= set(failed["key"].to_pylist())
-        return keys
+        rows = read_results(self.folder, ["key", "ended"]).to_pylist()
+        failed = {row["key"] for row in rows if row["ended"] == FAILED and again}
+        return {row["key"] for row in rows} - failed
 
     def add(self, rows: Sequence[Row]) -> None:
         """All rows of some cases; they are on the disk when this returns."""
-        if not rows:
-            return
-        folder = self._folder / _PARTS
-        folder.mkdir(exist_ok=True)
-        table = pa.Table.from_pylist(rows, _schema())
-        _write(folder / f"{time.time_ns():020d}{_SUFFIX}", table)
+        (self.folder / _PARTS).mkdir(exist_ok=True)
+        path = self.folder / _PARTS / f"{time.time_ns():020d}.parquet"
+        _write(path, pa.Table.from_pylist(list(rows), _schema()))
 
     def join(self) -> None:
         """Makes one file of all."""
-        parts = _parts(self._folder)
-        if not parts:
-            return
-        _write(self._folder / LAPS, read_results(self._folder))
+        if parts := _parts(self.folder):
+            _write(self.folder / _LAPS, read_results(self.folder))
         for part in parts:
             part.unlink()
 
@@ -115,9 +88,8 @@ def writing(folder: Path) -> Iterator[Results]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            raise InputError(
-                f"another campaign writes into {folder}: wait for its end, or give another folder"
-            ) from None
+            remedy = "wait for its end, or give another folder"
+            raise InputError(f"another campaign writes into {folder}: {remedy}") from None
         clear_partials(folder)
         clear_partials(folder / _PARTS)
         results = Results(folder)
@@ -133,29 +105,27 @@ def read_results(folder: Path, columns: list[str] | None = None) -> pa.Table:
 
     Raises InputError for a file that is damaged.
     """
-    whole = [folder / LAPS] if (folder / LAPS).exists() else []
+    whole = [folder / _LAPS] if (folder / _LAPS).exists() else []
     tables: list[pa.Table] = []
     seen = pa.array([], pa.string())
     for path in reversed([*whole, *_parts(folder)]):
         try:
             table = pq.read_table(path, columns=columns)
         except (pa.ArrowException, OSError) as error:
-            raise InputError(
-                f"{path} is no table of a campaign: {error}; remove it, and its rows are computed "
-                "again"
-            ) from None
+            remedy = "remove it, and its rows are computed again"
+            raise InputError(f"{path} is no table of a campaign: {error}; {remedy}") from None
         table = table.filter(pc.invert(pc.is_in(table["key"], seen)))
         seen = pa.concat_arrays([seen, *table["key"].chunks])
-        tables.append(table)
+        tables.insert(0, table)
     if not tables:
-        schema = _schema()
-        return (schema if columns is None else pa.schema(map(schema.field, columns))).empty_table()
-    return pa.concat_tables(reversed(tables), promote_options="default")
+        empty = _schema().empty_table()
+        return empty if columns is None else empty.select(columns)
+    return pa.concat_tables(tables, promote_options="default")
 
 
 def _parts(folder: Path) -> list[Path]:
     """In the order in which they were written."""
-    return sorted((folder / _PARTS).glob(f"[0-9]*{_SUFFIX}"))
+    return sorted((folder / _PARTS).glob("[0-9]*.parquet"))
 
 
 def _write(path: Path, table: pa.Table) -> None:

@@ -7,42 +7,42 @@ driven, training included, by the defaults and by what was found.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import optuna
+import pandas as pd
 from distributed import Client
+from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution
+from optuna.trial import TrialState
 from pydantic import BaseModel, ConfigDict, Field
 from rich.console import Console
 from rich.text import Text
 
 from bayesrace.errors import InputError
-from bayesrace.files import read_whole
 from bayesrace.vehicles import CarParameters, CarSetting, default_car, write_car
 from operation.preparation import prepare
 from operation.settings import RaceSettings
 from operation.terminal.progress import Stages
 from operation.terminal.terminal import plain_table
-from studies.campaign.case import Case, Controller, Files, named_file
+from studies.campaign.case import Case, Controller, Files
 from studies.campaign.cluster import computed, connected
 from studies.campaign.execute import FAILED, Row
 
-__all__ = ["Judgement", "TuneSettings", "Verdict", "print_verdict", "tune"]
+__all__ = ["TuneSettings", "Verdict", "print_verdict", "tune"]
 
 _SPANS: Final = {
-    "r_duty": (0.1, 10.0),
-    "r_delta_rate": (0.1, 10.0),
-    "s_slack": (0.3, 30.0),
+    "r_duty": (0.1, 10.0), "r_delta_rate": (0.1, 10.0), "s_slack": (0.3, 30.0),
     "margin_m": (0.25, 4.0),
-}
+}  # fmt: skip
 """As multiples of the car's own; the weight of the position stays, for only ratios matter."""
-_FRICTION: Final = (0.8, 1.2, 0.025)
-"""Least and largest multiple, and the step: each value costs a racing line for each track."""
+_FRICTION: Final = FloatDistribution(0.8, 1.2, step=0.025)
+"""As a multiple: each value costs a racing line for each track."""
 _HORIZONS: Final = (12, 16, 20, 25, 30)
 
 _LAPS: Final = 2
-_STUDY: Final = "tune"
+_RUN: Final = ["track", "controller"]
+_NUMBERS: Final = ["lap_time_s", "simulated_s", "samples", "off_track_samples"]
 
 
 class TuneSettings(BaseModel):
@@ -58,89 +58,55 @@ class TuneSettings(BaseModel):
     seed: int = Field(0, ge=0)
 
 
-@dataclass(frozen=True)
-class Driven:
-    """Both laps on one track."""
-
-    time_s: float
-    """Mean of standing and flying lap; with the run's time limit for what was not finished."""
-    off_track: int
-    """Samples, and all of a lap that was not finished."""
-
-
-@dataclass(frozen=True)
-class Judgement:
-    """One held-out track and controller."""
-
-    track: str
-    controller: str
-    default: Driven
-    tuned: Driven
-
-
-@dataclass(frozen=True)
-class Verdict:
+class Verdict(NamedTuple):
     """What the search has come to."""
 
-    found: dict[str, float]
-    """Settings of the best trial, resolved."""
-    gain: float
-    """Lap time won over the defaults on the tuning tracks, a share."""
-    judged: tuple[Judgement, ...]
-
-    @property
-    def held_out_gain(self) -> float:
-        """The same on the held-out tracks, both controllers."""
-        shares = [1 - one.tuned.time_s / one.default.time_s for one in self.judged]
-        return sum(shares) / len(shares)
-
-    @property
-    def off_track(self) -> tuple[int, int]:
-        """Samples off the held-out tracks by the defaults, and by what was found."""
-        return (
-            sum(one.default.off_track for one in self.judged),
-            sum(one.tuned.off_track for one in self.judged),
-        )
-
-    @property
-    def wins(self) -> bool:
-        """Faster on the held-out tracks, and off them no more than the defaults."""
-        before, after = self.off_track
-        return self.held_out_gain > 0 and after <= before
+    found: dict[str, float]  # settings of the best trial, resolved
+    gain: float  # lap time won over the defaults on the tuning tracks, a share
+    judged: pd.DataFrame
+    """A row for each held-out ``track`` and ``controller``: ``time_s`` and samples ``off`` the
+    track by the defaults, ``time_s_tuned`` and ``off_tuned`` by what was found."""
 
 
 def tune(
-    settings: TuneSettings,
-    out: Path,
-    storage: Path,
-    stages: Stages,
-    scheduler: str | None = None,
-    workers: int = 0,
+    settings: TuneSettings, out: Path, file: Path, stages: Stages, where: str | None, workers: int
 ) -> Verdict:
     """Searches, judges, and writes the car with what was found to ``out``.
 
-    ``storage``: SQLite file of the study; a study that is there goes on. Raises InputError for
-    tracks that are in both sets, or where a run of the defaults fails.
+    ``file``: SQLite of the study; a study that is there goes on. ``where``: the scheduler. Raises
+    InputError for tracks that are in both sets, or where a run of the defaults fails.
     """
     if both := sorted({*settings.tracks} & {*settings.held_out}):
         raise InputError(f"{both[0]} is to tune and to judge on; leave it in one of the two")
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     first = RaceSettings(car=settings.car, track=settings.tracks[0])
     prepared = prepare(first, (first.track,), stages)
-    data = read_whole(prepared.weights, "the weights", 1 << 28)
-    weights = named_file(prepared.weights, data)
-    with connected(scheduler, workers) as client:
-        search = _Search(settings, client, {weights: data}, weights)
+    files = Files()
+    weights = files.add(prepared.weights, "the weights")
+    with connected(where, workers) as client:
         with stages.stage("tune") as stage:
-            study = _study(settings, storage)
+            study, default = _study(settings, file), None
             while (known := _finished(study)) < settings.trials:
                 stage.update(known / settings.trials, f"{known} trials")
-                search.batch(study, min(settings.batch, settings.trials - known))
+                drives = client, files, settings.tracks, weights
+                default = _sound(_driven([settings.car], *drives)) if default is None else default
+                count = min(settings.batch, settings.trials - known)
+                trials = [study.ask(_space(settings.car)) for _ in range(count)]
+                cars = [tuned_car(settings.car, one.params) for one in trials]
+                both = _driven(cars, *drives).merge(default, on=_RUN, suffixes=("", "_default"))
+                for number, trial in enumerate(trials):
+                    own = both[both.car == number]
+                    if own.time_s.isna().any():  # such as a friction without a racing line
+                        study.tell(trial, state=TrialState.FAIL)
+                        continue
+                    trial.set_constraint("off track", float((own.off - own.off_default).sum()))
+                    study.tell(trial, float((own.time_s / own.time_s_default).mean()))
         best = study.best_trial  # the defaults are feasible, so there is one
         tuned = tuned_car(settings.car, best.params)
         with stages.stage("judge on held-out tracks"):
-            judged = search.judge(tuned)
+            both = _sound(_driven([settings.car, tuned], client, files, settings.held_out, ""))
     write_car(out, tuned)
+    judged = both[both.car == 0].merge(both[both.car == 1], on=_RUN, suffixes=("", "_tuned"))
     objective = tuned.tuning.objective.model_dump(exclude={"q_position"})
     return Verdict({**objective, "friction": tuned.friction}, 1 - (best.value or 1.0), judged)
 
@@ -148,18 +114,17 @@ def tune(
 def _study(settings: TuneSettings, storage: Path) -> optuna.Study:
     """The study in a file, or a new one, whose first trial is the defaults."""
     url = f"sqlite:///{storage}"
-    study = optuna.create_study(study_name=_STUDY, storage=url, load_if_exists=True)
+    study = optuna.create_study(study_name="tune", storage=url, load_if_exists=True)
     identity = settings.model_dump_json(exclude={"trials"})
     if study.user_attrs.setdefault("settings", identity) != identity:
-        raise InputError(
-            f"{storage} is the study of another car, other tracks or another seed; name a new file"
-        )
+        remedy = "of another car, other tracks or another seed; name a new file"
+        raise InputError(f"{storage} is the study {remedy}")
     if not study.trials:
         study.set_user_attr("settings", identity)
         own = settings.car.tuning.objective.horizon
         study.enqueue_trial({**dict.fromkeys([*_SPANS, "friction"], 1.0), "horizon": own})
-    for trial in study.get_trials(states=(optuna.trial.TrialState.RUNNING,)):
-        study.tell(trial.number, state=optuna.trial.TrialState.FAIL)  # of a killed search
+    for trial in study.get_trials(states=(TrialState.RUNNING,)):  # of a killed search
+        study.tell(trial.number, state=TrialState.FAIL)
     # Proposals after an interruption must not repeat the first ones.
     study.sampler = optuna.samplers.TPESampler(
         seed=settings.seed + _finished(study), multivariate=True
@@ -171,140 +136,83 @@ def _finished(study: optuna.Study) -> int:
     return sum(trial.state.is_finished() for trial in study.get_trials(deepcopy=False))
 
 
+def _space(car: CarParameters) -> dict[str, BaseDistribution]:
+    """What a trial may propose."""
+    spans = {name: FloatDistribution(*span, log=True) for name, span in _SPANS.items()}
+    horizons = CategoricalDistribution(sorted({*_HORIZONS, car.tuning.objective.horizon}))
+    return {**spans, "friction": _FRICTION, "horizon": horizons}
+
+
 def tuned_car(car: CarParameters, params: Mapping[str, Any]) -> CarParameters:
     """The car with what a trial proposes, in multiples of its own values."""
     own = car.tuning.objective
     changed = {name: float(f"{params[name] * getattr(own, name):.4g}") for name in _SPANS}
     objective = own.model_copy(update={**changed, "horizon": int(params["horizon"])})
-    return car.model_copy(
-        update={
-            "friction": float(f"{params['friction'] * car.friction:.4g}"),
-            "tuning": car.tuning.model_copy(update={"objective": objective}),
-        }
-    )
+    tuning = car.tuning.model_copy(update={"objective": objective})
+    friction = float(f"{params['friction'] * car.friction:.4g}")
+    return car.model_copy(update={"friction": friction, "tuning": tuning})
 
 
-class _Search:
-    def __init__(self, settings: TuneSettings, client: Client, files: Files, weights: str) -> None:
-        self._settings, self._client = settings, client
-        self._files, self._weights = files, weights
-        self._default: dict[str, Driven] = {}
+def _driven(
+    cars: Sequence[CarParameters], client: Client, files: Files, tracks: Sequence[str], weights: str
+) -> pd.DataFrame:
+    """A row for each ``car`` by its number, ``track`` and ``controller``.
 
-    def batch(self, study: optuna.Study, count: int) -> None:
-        """Proposes, drives and reports this many trials."""
-        trials = [study.ask() for _ in range(count)]
-        car, tracks = self._settings.car, self._settings.tracks
-        cars = [tuned_car(car, _proposal(trial, car)) for trial in trials]
-        if not self._default:
-            (own,) = self._drive([car], tracks, self._weights)
-            self._default = {track: _sound(laps)["bayesrace"] for track, laps in own.items()}
-        driven = self._drive(cars, tracks, self._weights)
-        for trial, by_track in zip(trials, driven, strict=True):
-            if not all(by_track.values()):  # such as a friction without a racing line
-                study.tell(trial, state=optuna.trial.TrialState.FAIL)
-                continue
-            laps = {track: one["bayesrace"] for track, one in by_track.items()}
-            shares = [one.time_s / self._default[track].time_s for track, one in laps.items()]
-            more = sum(
-                one.off_track - self._default[track].off_track for track, one in laps.items()
-            )
-            trial.set_constraint("off track", float(more))
-            study.tell(trial, sum(shares) / len(shares))
-
-    def judge(self, tuned: CarParameters) -> tuple[Judgement, ...]:
-        """The held-out tracks, driven by the defaults and by the tuned car, each trained anew."""
-        tracks = self._settings.held_out
-        default, found = self._drive([self._settings.car, tuned], tracks, "")
-        return tuple(
-            Judgement(track, controller, own, _sound(found[track])[controller])
-            for track in tracks
-            for controller, own in _sound(default[track]).items()
-        )
-
-    def _drive(
-        self, cars: Sequence[CarParameters], tracks: Sequence[str], weights: str
-    ) -> list[dict[str, dict[str, Driven]]]:
-        """For each car: track → controller → its laps; all at once on the workers.
-
-        A track on which something failed has no controllers.
-        """
-        both: tuple[Controller, ...] = ("bayesrace", "bayesrace-updated")
-        who = both[:1] if weights else both
-        cases = [
-            [Case(RaceSettings(car=car, track=one, laps=_LAPS), who, weights) for one in tracks]
-            for car in cars
-        ]
-        rows: dict[str, list[Row]] = {}
-        every = {case.key: case for some in cases for case in some}
-        for batch in computed(self._client, every.items(), self._files):
-            rows |= dict(batch)
-        return [
-            {case.settings.track: _driven(rows[case.key], who) for case in some} for some in cases
-        ]
-
-
-def _proposal(trial: optuna.Trial, car: CarParameters) -> dict[str, Any]:
-    low, high, step = _FRICTION
-    values: dict[str, Any] = {
-        name: trial.suggest_float(name, *span, log=True) for name, span in _SPANS.items()
+    ``time_s``: mean of standing and flying lap, with the run's time for what was not finished.
+    ``off``: samples off the track, and all of a lap that was not finished. Neither is a number
+    where a run of the case failed.
+    """
+    both: tuple[Controller, ...] = ("bayesrace", "bayesrace-updated")
+    who = both[:1] if weights else both
+    cases = {
+        (number, track): Case(RaceSettings(car=car, track=track, laps=_LAPS), who, weights)
+        for number, car in enumerate(cars)
+        for track in tracks
     }
-    values["friction"] = trial.suggest_float("friction", low, high, step=step)
-    horizons = sorted({*_HORIZONS, car.tuning.objective.horizon})
-    values["horizon"] = trial.suggest_categorical("horizon", horizons)
-    return values
+    rows: dict[str, list[Row]] = {}
+    for batch in computed(client, {one.key: one for one in cases.values()}.items(), files):
+        rows |= dict(batch)
+    laps = pd.DataFrame(
+        [{"car": n, "track": t} | row for (n, t), one in cases.items() for row in rows[one.key]],
+        columns=["car", *_RUN, "ended", *_NUMBERS],
+    ).astype(dict.fromkeys(_NUMBERS, float))
+    failed = laps.ended.eq(FAILED).groupby([laps.car, laps.track]).transform("any")
+    laps["off"] = laps.off_track_samples.where(laps.lap_time_s.notna(), laps.samples)
+    runs = laps[~failed].groupby(["car", *_RUN])
+    late_s = runs.simulated_s.first().where(runs.lap_time_s.count() < _LAPS, 0.0)
+    time_s = (runs.lap_time_s.sum() + late_s) / _LAPS
+    every = pd.MultiIndex.from_product([range(len(cars)), tracks, who], names=["car", *_RUN])
+    return pd.DataFrame({"time_s": time_s, "off": runs.off.sum()}).reindex(every).reset_index()
 
 
-def _sound(laps: dict[str, Driven]) -> dict[str, Driven]:
-    """The same; InputError if there are none."""
-    if not laps:
-        raise InputError(
-            "a run failed that the search compares with: 'bayesrace race' on the same tracks says "
-            "why; leave that track out"
-        )
-    return laps
-
-
-def _driven(rows: Sequence[Row], controllers: Sequence[Controller]) -> dict[str, Driven]:
-    """The laps of each controller; none of any if a run failed."""
-    if any(row["ended"] == FAILED for row in rows):
-        return {}
-    found: dict[str, Driven] = {}
-    for controller in controllers:
-        own = [row for row in rows if row["controller"] == controller]
-        finished = [row["lap_time_s"] for row in own if row["lap_time_s"] is not None]
-        late_s = own[0]["simulated_s"] if len(finished) < _LAPS else 0.0
-        found[controller] = Driven(
-            (sum(finished) + late_s) / _LAPS,
-            sum(
-                row["off_track_samples"] if row["lap_time_s"] is not None else row["samples"]
-                for row in own
-            ),
-        )
-    return found
+def _sound(driven: pd.DataFrame) -> pd.DataFrame:
+    """The same; InputError if a run failed."""
+    if driven.time_s.isna().any():
+        remedy = "'bayesrace race' on the same tracks says why; leave that track out"
+        raise InputError(f"a run failed that the search compares with: {remedy}")
+    return driven
 
 
 def print_verdict(verdict: Verdict, console: Console) -> None:
-    """What was found, a row for each held-out track and controller, and who wins."""
+    """What was found, a row for each held-out track and controller, and who wins: what is faster
+    on these tracks, and off them no more than the defaults."""
     found = ", ".join(f"{name} {value:g}" for name, value in verdict.found.items())
-    console.print(Text(f"best: {found}"))
-    console.print(
-        Text(f"on the tuning tracks {100 * verdict.gain:+.2f} % faster than the defaults")
-    )
+    gain = f"on the tuning tracks {100 * verdict.gain:+.2f} % faster than the defaults"
+    console.print(Text(f"best: {found}\n{gain}"))
     table = plain_table(
         "held-out track", "controller", "default\ns", "tuned\ns", "faster\n%", "default\noff",
         "tuned\noff", left=2,
     )  # fmt: skip
-    for one in verdict.judged:
-        share = 100 * (1 - one.tuned.time_s / one.default.time_s)
+    judged = verdict.judged.assign(gain=1 - verdict.judged.time_s_tuned / verdict.judged.time_s)
+    for one in judged.itertuples():
         table.add_row(
-            one.track, one.controller, f"{one.default.time_s:.3f}", f"{one.tuned.time_s:.3f}",
-            f"{share:+.2f}", str(one.default.off_track), str(one.tuned.off_track),
+            one.track, one.controller, f"{one.time_s:.3f}", f"{one.time_s_tuned:.3f}",
+            f"{100 * one.gain:+.2f}", f"{one.off:.0f}", f"{one.off_tuned:.0f}",
         )  # fmt: skip
     console.print(table)
-    console.print(
-        Text("s: mean of standing and flying lap; off: samples off the track", style="dim")
-    )
-    before, after = verdict.off_track
-    found = f"{100 * verdict.held_out_gain:+.2f} % faster, samples off track {before} → {after}"
-    winner = "the tuned car wins" if verdict.wins else "the defaults win"
+    legend = "s: mean of standing and flying lap; off: samples off the track"
+    console.print(Text(legend, style="dim"))
+    gain, before, after = judged.gain.mean(), judged.off.sum(), judged.off_tuned.sum()
+    winner = "the tuned car wins" if gain > 0 and after <= before else "the defaults win"
+    found = f"{100 * gain:+.2f} % faster, samples off track {before:.0f} → {after:.0f}"
     console.print(Text(f"held-out tracks: {found}: {winner}"))
