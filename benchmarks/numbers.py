@@ -7,8 +7,9 @@
 A page marks a number with its name: ``6.606 s<!--=race.laps.bayesrace.flying_lap_time_s-->``; unit
 and any other words may stand between. Pages round: a number keeps the decimals that the page gives
 it. The first part of the name is the measurement, the rest the path within what its command writes,
-where a list's items go by their ``controller``, ``name`` or place. ``facts`` are counted anew at
-each check.
+where a list's items go by their ``controller``, ``name``, ``what`` or place; of items of one name
+the second is called ``name-2``. A text's numbers count, too: the second one's path ends in ``.1``.
+``facts`` are counted anew at each check.
 
 A number is older than what it depends on if commits since its own have changed that. 'check' fails
 where page and file differ or a name is unknown; what is older it prints.
@@ -22,6 +23,7 @@ import shlex
 import subprocess
 import sys
 import tomllib
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
@@ -40,6 +42,8 @@ _MARKED: Final = re.compile(
     r"(?P<number>[-−+]?\d[\d ]*(?:\.\d+)?(?:e-?\d+)?)"
     r"(?P<words>[^\d<\n]{0,30})<!--=(?P<name>[\w.%-]+)-->"
 )
+
+_IN_TEXT: Final = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e-?\d+)?(?![\w.])")
 
 
 class Measurement(NamedTuple):
@@ -104,17 +108,25 @@ class Measured:
 
 
 def flat(value: Any, path: str = "") -> Iterator[tuple[str, float]]:
-    """The numbers of a JSON value with their paths."""
+    """The numbers of a JSON value with their paths, those in its texts included."""
     if isinstance(value, bool):
         return
     if isinstance(value, int | float):
         yield path, value
         return
+    if isinstance(value, str):
+        for place, found in enumerate(_IN_TEXT.finditer(value)):
+            yield f"{path}.{place}" if place else path, float(found[0])
+        return
     items: list[tuple[str, Any]] = []
     if isinstance(value, dict):
         items = list(value.items())
     elif isinstance(value, list):
-        items = [(_key(one, place), one) for place, one in enumerate(value)]
+        seen = Counter[str]()
+        for place, one in enumerate(value):
+            key = _key(one, place)
+            seen[key] += 1
+            items.append((f"{key}-{seen[key]}" if seen[key] > 1 else key, one))
     for key, one in items:
         yield from flat(one, f"{path}.{key}" if path else key)
 
@@ -122,7 +134,7 @@ def flat(value: Any, path: str = "") -> Iterator[tuple[str, float]]:
 def _key(item: Any, place: int) -> str:
     """How an item of a list is named."""
     if isinstance(item, dict):
-        for name in ("controller", "name"):
+        for name in ("controller", "name", "what"):
             if isinstance(item.get(name), str):
                 number = item.get("number")
                 words = item[name] if number is None else f"{item[name]}-{number}"
