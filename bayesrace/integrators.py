@@ -82,12 +82,11 @@ def _pose_from_velocities(x: Any, velocities: Any, h: float) -> Any:
 
 
 def _symbols(model: "Model") -> tuple[Any, Any, Any, Any]:
-    """x, u, e and h: scalar expressions, or matrices for an ode that is a black box (an FMU)."""
+    """x, u, e and h."""
     import casadi as ca
 
-    kind = ca.SX if model.ode.is_a("SXFunction") else ca.MX
     n, m = len(model.states), len(model.inputs)
-    return kind.sym("x", n), kind.sym("u", m), kind.sym("e", 3), kind.sym("h")
+    return ca.SX.sym("x", n), ca.SX.sym("u", m), ca.SX.sym("e", 3), ca.SX.sym("h")
 
 
 class Discretisation(BaseModel):
@@ -110,7 +109,7 @@ class Discretisation(BaseModel):
     )
 
     def discretise(self, model: "Model") -> "ca.Function":
-        """F: (x, u) -> x_next for the given model, as a CasADi function (SX if its ode is)."""
+        """F: (x, u) -> x_next for the given model, as a CasADi function."""
         import casadi as ca
 
         corrected = self.corrected(model)

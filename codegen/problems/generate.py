@@ -96,11 +96,8 @@ def _model_sparsity(problem: Problem) -> tuple[np.ndarray[Any, Any], np.ndarray[
     lam = ca.MX.sym("lambda", nx)
     expand = ca.Function("f", [w, lam], [f, ca.dot(lam, f)])
     jacobian = _pattern(ca.jacobian(f, w))
-    try:
-        sw, sl = ca.SX.sym("w", nv + problem.outputs), ca.SX.sym("lambda", nx)
-        hessian = _pattern(ca.hessian(expand(sw, sl)[1], sw)[0])
-    except RuntimeError:  # a model that is a black box, such as an FMU
-        hessian = np.ones((nv + problem.outputs,) * 2, dtype=bool)
+    sw, sl = ca.SX.sym("w", nv + problem.outputs), ca.SX.sym("lambda", nx)
+    hessian = _pattern(ca.hessian(expand(sw, sl)[1], sw)[0])
     features = np.array(problem.feature_indices)
     j, h = jacobian[:, :nv].copy(), hessian[:nv, :nv].copy()
     if problem.outputs:
