@@ -65,7 +65,7 @@ class Compiler:
             objects = [folder / f"{i}.o" for i in range(len(sources))]
 
             def compile_one(source: Path, target: Path) -> None:
-                self._run(*flags, *seen, "-c", source, "-o", target)
+                self.run(*flags, *seen, "-c", source, "-o", target)
 
             list(pool.map(compile_one, sources, objects))  # after a failure no other is begun
             line: list[str | Path] = [*flags, "-shared", *objects, *archives, "-lm", "-o", out]
@@ -75,11 +75,14 @@ class Compiler:
                 script = folder / "exports.map"
                 script.write_text(f"{{ global: {exports}; local: *; }};\n")
                 line += [f"-Wl,--version-script={script}", "-Wl,-z,defs"]
-            self._run(*line)
+            self.run(*line)
 
-    def _run(self, *arguments: str | Path) -> None:
+    def run(self, *arguments: str | Path, folder: Path | None = None) -> None:
+        """Runs it in a folder, the current one by default; CompileError with what it printed."""
         line = [*self.command, *(str(one) for one in arguments)]
-        done = subprocess.run(line, capture_output=True, text=True, errors="replace", check=False)
+        done = subprocess.run(
+            line, cwd=folder, capture_output=True, text=True, errors="replace", check=False
+        )
         if done.returncode:
             raise CompileError(f"{shlex.join(line)}\n{_shortened(done.stderr)}")
 

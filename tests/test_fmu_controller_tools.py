@@ -19,8 +19,8 @@ from fmpy.validation import validate_fmu
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights, zero_weights
 from bayesrace.vehicles import CarParameters
-from codegen.fmu import pack, write_sources
-from codegen.fmu.weights import exchange_weights
+from codegen.fmu import exchange_weights, pack
+from codegen.fmu.build import sources_of, write_sources
 from codegen.host_files import WEIGHTS_FILE, path_file
 from tests.conftest import Circuit, fit_weights
 from tests.fmu_lockstep import (  # noqa: F401 - fixtures are used by name
@@ -86,7 +86,7 @@ def test_no_sanitizer_finds_anything_and_c_sees_what_the_master_sees(
     """A drive with bad states strewn in, saved and restored states, resets, missing resources."""
     run = lockstep().run(circuit.start(v_mps=1.0), 120, strewn)
     definition = exported.define(version=3)
-    linked = write_sources(definition, tmp_path)
+    linked = write_sources(sources_of(definition)[1], tmp_path)
     own = [name for name in linked if not (kinematic_artefact / name).exists()]
     flags = (*SANITIZED, "-Wall", "-Wextra", "-Wno-unused-parameter", "-I.")
     objects = artefact_objects(kinematic_artefact, SANITIZED)

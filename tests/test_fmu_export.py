@@ -51,7 +51,7 @@ def test_the_archive_has_what_people_look_for(version: Version, kind: Kind) -> N
         description = etree.fromstring(archive.read("modelDescription.xml"))
     assert {"sources/car.c", "sources/car_model.c", "sources/fmu_config.h"} <= names
     assert "cc -std=gnu11" in page
-    assert "(F_x - F_fy sin(delta)) / mass_kg" in page
+    assert "dynamic bicycle model with Pacejka tyres and DC motor" in page
     experiment = description.find("DefaultExperiment")
     assert experiment is not None
     assert float(experiment.attrib["stepSize"]) == 0.02

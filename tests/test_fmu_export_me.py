@@ -57,11 +57,6 @@ class Instance:
         unknown, known = self.references(DERIVATIVES), self.references(KNOWN)
         return np.array(self.fmu.getDirectionalDerivative(unknown, known, list(seed)))
 
-    def adjoint(self, seed: Floats) -> Floats:
-        unknown, known = self.references(DERIVATIVES), self.references(KNOWN)
-        count = len(KNOWN)  # fmpy assumes as many as unknowns
-        return np.array(self.fmu.getAdjointDerivative(unknown, known, list(seed), count))
-
 
 @pytest.fixture
 def instance() -> Iterator[Instance]:
@@ -99,40 +94,15 @@ def test_derivatives_are_the_dynamic_models(instance: Instance, car: CarParamete
         np.testing.assert_allclose(instance.rates(), expected, rtol=1e-12, atol=1e-10)
 
 
-def test_directional_and_adjoint_derivatives_are_exact(
-    instance: Instance, car: CarParameters
-) -> None:
+def test_directional_derivatives_are_exact(instance: Instance, car: CarParameters) -> None:
     exact = jacobian(car)
     random = np.random.default_rng(1)
     for x, u in points(60, 1):
         instance.put(x, u)
         expected = exact(x, u)
-        seed, weights = random.normal(size=len(KNOWN)), random.normal(size=7)
-        scale = np.abs(expected).max()
-        forward, reverse = instance.directional(seed), instance.adjoint(weights)
+        seed, scale = random.normal(size=len(KNOWN)), np.abs(expected).max()
+        forward = instance.directional(seed)
         np.testing.assert_allclose(forward, expected @ seed, rtol=1e-11, atol=1e-12 * scale)
-        np.testing.assert_allclose(reverse, weights @ expected, rtol=1e-11, atol=1e-12 * scale)
-
-
-def test_directional_derivatives_agree_with_differences(instance: Instance) -> None:
-    random = np.random.default_rng(2)
-    for x, u in points(40, 2):
-        if abs(x[3]) < 0.2:
-            continue  # differences straddle the blend
-        seed = np.zeros(len(KNOWN))
-        seed[:9] = random.normal(size=9)
-        step = 1e-6
-
-        def moved(by: float, x: Floats = x, u: Floats = u, seed: Floats = seed) -> Floats:
-            instance.put(x + by * seed[:7], u + by * seed[7:9])
-            return instance.rates()
-
-        difference = (moved(step) - moved(-step)) / (2 * step)
-        instance.put(x, u)
-        scale = 1 + np.abs(difference).max()
-        np.testing.assert_allclose(
-            instance.directional(seed) / scale, difference / scale, atol=1e-6
-        )
 
 
 def test_a_state_is_an_output_whose_derivative_is_one(instance: Instance) -> None:
@@ -140,7 +110,6 @@ def test_a_state_is_an_output_whose_derivative_is_one(instance: Instance) -> Non
     known = instance.references(("x", "delta", "delta_rate"))
     out = instance.fmu.getDirectionalDerivative(both, known, [2.0, 3.0, 5.0])
     assert list(out) == [2.0, 3.0, 5.0]
-    assert list(instance.fmu.getAdjointDerivative(both, known, [2.0, 3.0, 5.0])) == [2.0, 3.0, 5.0]
 
 
 def test_time_is_a_known_that_nothing_depends_on(instance: Instance) -> None:
@@ -152,8 +121,6 @@ def test_time_is_a_known_that_nothing_depends_on(instance: Instance) -> None:
     derivative = instance.fmu.getDirectionalDerivative
     assert list(derivative(unknown, [time], [3.0])) == [0.0, 0.0, 0.0]
     assert list(derivative(unknown, [time, rate], [3.0, 5.0])) == [0.0, 5.0, 0.0]
-    adjoint = instance.fmu.getAdjointDerivative(unknown, [time, rate], [3.0, 5.0, 7.0], 2)
-    assert list(adjoint) == [0.0, 5.0]
     with pytest.raises(FMICallException):
         derivative([time], [rate], [1.0])
 
@@ -225,21 +192,3 @@ def test_casadi_knows_the_sparsity_from_the_model_structure(
     ode = dynamic(car).ode
     for i in range(2):
         assert imported.sparsity_jac(i, 0) == ode.sparsity_jac(i, 0)
-
-
-def test_casadi_takes_second_derivatives(imported: Any, car: CarParameters) -> None:
-    """By differences of the directional ones: good enough for a Hessian of an OCP."""
-    weights = ca.DM(np.random.default_rng(4).normal(size=7))
-
-    def hessian(function: Any, kind: Any) -> Any:
-        z = kind.sym("z", 9)
-        return ca.Function("H", [z], [ca.hessian(ca.dot(weights, function(z[:7], z[7:])), z)[0]])
-
-    approximate, exact = hessian(imported, ca.MX), hessian(dynamic(car).ode, ca.SX)
-    for x, u in points(20, 5):
-        if abs(x[3]) < 0.2:
-            continue
-        point = np.concatenate([x, u])
-        expected = np.asarray(ca.densify(exact(point)))
-        got = np.asarray(ca.densify(approximate(point)))
-        np.testing.assert_allclose(got, expected, atol=1e-5 * np.abs(expected).max())

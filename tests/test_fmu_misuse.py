@@ -12,7 +12,8 @@ import pytest
 from fmpy.fmi1 import FMICallException
 
 from bayesrace.vehicles import CarParameters
-from codegen.fmu import car_fmu, write_sources
+from codegen.fmu import car_fmu
+from codegen.fmu.build import sources_of, write_sources
 from tests.car_fmu import packed_car, unpacked_car
 from tests.fmu_exports import Kind, Version, commands, driven, slave
 from tests.fmu_master import Slave
@@ -237,7 +238,7 @@ def test_misuse_under_sanitizers(
     version: Version, kind: Kind, car: CarParameters, tmp_path: Path
 ) -> None:
     """tests/native/fmi*_misuse.c: NULL, wrong sizes, wrong phases, damaged bytes, stale states."""
-    sources = write_sources(car_fmu(car, version, kind), tmp_path)
+    sources = write_sources(sources_of(car_fmu(car, version, kind))[1], tmp_path)
     program = PROGRAMS / f"fmi{version}_misuse.c"
     flags = (*SANITIZERS, "-Wall", "-Werror", "-I.")
     gcc(*flags, *sources, program, "-lm", "-o", "misuse", cwd=tmp_path)

@@ -1,62 +1,144 @@
-"""Writes the FMU file: descriptions, sources that rebuild it, binaries, documentation."""
+"""The FMU file: descriptions, sources that rebuild it, binaries, documentation, licences."""
 
+import re
 import shlex
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from html import escape
+from importlib.metadata import distribution
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from bayesrace.errors import InputError
 from bayesrace.files import replacing
-from codegen.fmu.definition import FmuDefinition
-from codegen.fmu.description import build_description, model_description
-from codegen.fmu.licences import Part, licence_files, third_parties
-from codegen.fmu.platforms import (
-    FLAGS,
+from bayesrace.gp.weights import GpWeights
+from codegen.fmu.build import (
     PLATFORMS,
+    Platform,
     arguments,
-    compile_binary,
+    fmi_headers,
     get_platform,
     host_platform,
+    linked_files,
+    sources_of,
+    write_sources,
 )
-from codegen.fmu.sources import all_sources, linked_files, token_of
+from codegen.fmu.definition import FmuDefinition
+from codegen.fmu.description import build_description, model_description
+from codegen.host_files import HEAD, IDENTITY_BYTES, WEIGHTS_FILE, weights_file
 
-__all__ = ["pack", "write_sources"]
+__all__ = ["Part", "exchange_weights", "licence_files", "pack", "third_parties"]
 
-_STYLE: Final = "body{font:15px/1.5 sans-serif;max-width:60em;margin:2em auto}"
+_LARGEST: Final = 1 << 30
 
-
-def _page(definition: FmuDefinition, parts: Sequence[Part]) -> str:
-    """``documentation/index.html``, with the one command that makes the Linux binary."""
-    kind = "Model Exchange" if definition.states else "Co-Simulation"
-    linux = PLATFORMS["x86_64-linux"]
-    binary = f"{definition.identifier}.so"
-    line = arguments(linux, linked_files(definition, ".c", ".a"), binary, definition.flags)
-    return f"""<!DOCTYPE html><html lang="en"><meta charset="utf-8"><style>{_STYLE}</style>
-<title>{escape(definition.name)}</title><h1>{escape(definition.name)}</h1>
-<p>{escape(definition.description)}. FMI {definition.version}.0 for {kind}.</p>
-{definition.documentation}
+_PAGE: Final = """<!DOCTYPE html><html lang="en"><meta charset="utf-8">
+<style>body{{font:15px/1.5 sans-serif;max-width:60em;margin:2em auto}}</style>
+<title>{name}</title><h1>{name}</h1>
+<p>{description}. FMI {version}.0 for {kind}.</p>
+{documentation}
 <h2>Building it again</h2>
 <p>In the folder <code>sources</code>, with any C11 compiler; elsewhere than on Linux without the
 <code>-Wl</code> options:</p>
-<pre>{escape(shlex.join(["cc", *line]))}</pre>
-<p>The result belongs into <code>binaries/{linux.folder(definition.version)}</code>; other platforms
-have other folders there.</p>
+<pre>{line}</pre>
+<p>The result belongs into <code>binaries/{folder}</code>; other platforms have other folders
+there.</p>
 <h2>Licences</h2>
 <p>BayesRace is under the MIT licence. Parts of this FMU are by other authors; all texts are in
 <a href="licenses/license.txt">licenses</a>:</p>
-<ul>{"".join(f"<li>{escape(str(part))}</li>" for part in parts)}</ul></html>
+<ul>{parts}</ul></html>
 """
 
 
-def write_sources(definition: FmuDefinition, folder: Path) -> list[str]:
-    """Fills ``folder`` with all that is compiled; returns what the compiler is given, in order."""
-    for name, content in all_sources(definition).items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_bytes(content)
-    return linked_files(definition, ".c", ".a")
+class Part(NamedTuple):
+    """Something in an FMU that another project owns.
+
+    ``package``: the installed one that it comes from; ``where``: in the FMU; ``text``: the licence
+    with its copyright lines. THIRD_PARTY_NOTICES.md names the same parts.
+    """
+
+    name: str
+    package: str
+    licence: str
+    where: str
+    text: str
+
+    @property
+    def file(self) -> str:
+        """Name of the file with the text."""
+        return f"{self.name.replace(' ', '-')}.txt"
+
+    def __str__(self) -> str:
+        """One line."""
+        version = distribution(self.package).version
+        return f"{self.name} ({self.package} {version}), {self.licence}: {self.where}"
+
+
+def third_parties(definition: FmuDefinition, targets: Sequence[Platform]) -> list[Part]:
+    """The parts of an FMU with binaries for ``targets``."""
+
+    def text(package: str, path: str) -> str:
+        return Path(str(distribution(package).locate_file(f"{package}/{path}"))).read_text("utf-8")
+
+    fmi = fmi_headers(definition.version)[0].read_text("utf-8")
+    casadi = text("casadi", "include/casadi/core/runtime/casadi_low.hpp")
+    where = f"sources/fmi{definition.version}*.h"
+    parts = [
+        Part("FMI headers", "fmpy", "BSD-2-Clause", where, _comment(fmi, "Copyright")),
+        Part(
+            *("CasADi runtime", "casadi", "MIT-0", "parts of sources/*_model.c"),
+            _comment(casadi, "MIT No Attribution"),
+        ),
+    ]
+    if definition.libraries:
+        daqp = text("casadi", "include/licenses/daqp-external/LICENSE")
+        where = "sources/libdaqpstat.a, sources/daqp, the binary"
+        parts.append(Part("DAQP", "casadi", "MIT", where, daqp))
+    zig = [target.name for target in targets if "ziglang" in target.compiler().command]
+    if names := ", ".join(zig):
+        licence = text("ziglang", "LICENSE")
+        parts.append(Part("Zig compiler runtime", "ziglang", "MIT", names, licence))
+    if names := ", ".join(name for name in zig if name.endswith("windows")):
+        mingw, licence = text("ziglang", "lib/libc/mingw/COPYING"), "ZPL-2.1 and public domain"
+        parts.append(Part("MinGW-w64 runtime", "ziglang", licence, names, mingw))
+    return parts
+
+
+def _comment(source: str, beginning: str) -> str:
+    """The comment of a C file from the line with ``beginning`` on."""
+    found = re.search(rf"[^\n]*{beginning}.*?(?=\*/|\n\n\n)", source, re.DOTALL)
+    if found is None:
+        raise InputError(f"a C file lacks its licence ('{beginning}'): install its package again")
+    return re.sub(r"(?m)^[ */]+", "", found[0])
+
+
+def licence_files(parts: Sequence[Part]) -> dict[str, bytes]:
+    """``documentation/licenses``: BayesRace's own in ``license.txt``, which names the others."""
+    own = distribution("bayesrace").read_text("licenses/LICENSE") or "MIT License\n"
+    note = (
+        "Parts of this FMU are by other authors. Beside them, binaries hold start-up code of the\n"
+        "compiler that built them, such as GCC's under the GCC Runtime Library Exception.\n"
+    )
+    names = "".join(f"- {part}; {part.file}\n" for part in parts)
+    texts = {"license.txt": f"{own}\n{note}\n{names}", **{part.file: part.text for part in parts}}
+    return {f"documentation/licenses/{name}": text.encode() for name, text in texts.items()}
+
+
+def _page(definition: FmuDefinition, linked: Sequence[str], parts: Sequence[Part]) -> bytes:
+    """``documentation/index.html``, with the one command that makes the Linux binary."""
+    linux = PLATFORMS["x86_64-linux"]
+    line = arguments(linux, linked, f"{definition.identifier}.so", definition.flags)
+    return _PAGE.format(
+        name=escape(definition.name),
+        description=escape(definition.description),
+        version=definition.version,
+        kind="Model Exchange" if definition.states else "Co-Simulation",
+        documentation=definition.documentation,
+        line=escape(shlex.join(["cc", *line])),
+        folder=linux.folder(definition.version),
+        parts="".join(f"<li>{escape(str(part))}</li>" for part in parts),
+    ).encode()
 
 
 def pack(definition: FmuDefinition, out: Path, platforms: Sequence[str] | None = None) -> Path:
@@ -76,25 +158,26 @@ def pack(definition: FmuDefinition, out: Path, platforms: Sequence[str] | None =
             f"{foreign}: export it there"
         )
     parts = third_parties(definition, targets)
-    sources = all_sources(definition)
+    token, sources = sources_of(definition)
+    linked = linked_files(sources)
     contents = {
-        "modelDescription.xml": model_description(definition, token_of(definition)),
-        "documentation/index.html": _page(definition, parts).encode(),
+        "modelDescription.xml": model_description(definition, token, linked),
+        "documentation/index.html": _page(definition, linked, parts),
         **licence_files(parts),
         **{f"sources/{name}": content for name, content in sources.items()},
         **{f"resources/{name}": content for name, content in definition.resources.items()},
     }
     if definition.version == 3:
-        options = (*FLAGS, *definition.flags)
-        contents["sources/buildDescription.xml"] = build_description(definition, options)
+        contents["sources/buildDescription.xml"] = build_description(definition, linked)
     with tempfile.TemporaryDirectory(prefix="fmu-") as temporary:
         folder = Path(temporary) / "sources"
-        linked = write_sources(definition, folder)
+        write_sources(sources, folder)
         for target in targets:
-            library = Path(temporary) / f"{definition.identifier}{target.suffix}"
-            compile_binary(target, folder, linked, library, definition.flags)
-            place = f"binaries/{target.folder(definition.version)}/{library.name}"
-            contents[place] = library.read_bytes()
+            binary = Path(temporary) / f"{definition.identifier}{target.suffix}"
+            line = arguments(target, linked, str(binary), definition.flags)
+            target.compiler().run(*line, folder=folder)
+            place = f"binaries/{target.folder(definition.version)}/{binary.name}"
+            contents[place] = binary.read_bytes()
     _write(out, contents)
     return out
 
@@ -111,3 +194,28 @@ def _write(out: Path, contents: Mapping[str, bytes]) -> None:
                 archive.writestr(entry, content, zipfile.ZIP_DEFLATED)
     except OSError as error:
         raise InputError(f"cannot write the FMU to {out}: {error.strerror}") from None
+
+
+def exchange_weights(fmu: Path, weights: GpWeights | None, out: Path) -> None:
+    """Writes ``fmu``, a controller's, with other weights to ``out`` (which may be ``fmu``).
+
+    InputError if ``fmu`` is no controller's FMU, or the weights are for another model or have more
+    points than the controller has room for.
+    """
+    name = f"resources/{WEIGHTS_FILE}"
+    try:
+        with zipfile.ZipFile(fmu) as archive:
+            size = sum(info.file_size for info in archive.infolist())
+            if size > _LARGEST:
+                raise InputError(f"{fmu} would unpack to {size >> 20} MB: no FMU of a controller")
+            contents = {info.filename: archive.read(info) for info in archive.infolist()}
+    except (OSError, RuntimeError, EOFError, zlib.error, zipfile.BadZipFile) as error:
+        raise InputError(f"{fmu} cannot be read as an FMU: {error}") from None
+    before = contents.get(name)
+    if before is None:
+        raise InputError(f"{fmu} is not a controller's FMU: it holds no {name}")
+    if len(before) < HEAD.size + IDENTITY_BYTES:
+        raise InputError(f"{fmu}: {name} is cut off; export the FMU again")
+    capacity = HEAD.unpack_from(before)[4]
+    identity = before[HEAD.size :][:IDENTITY_BYTES].rstrip(b"\0").decode("utf-8", "replace")
+    _write(out, contents | {name: weights_file(weights, identity, capacity)})

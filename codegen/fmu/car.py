@@ -6,6 +6,7 @@ step as the period; Model Exchange gives the bare equations of the dynamic model
 
 import re
 import tempfile
+from html import escape
 from math import inf
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -17,9 +18,8 @@ from bayesrace.integrators import PLANT_SCHEME, PLANT_SUBSTEP_HZ, SCHEMES
 from bayesrace.vehicles import models
 from bayesrace.vehicles.models import INPUTS, STATES
 from bayesrace.vehicles.parameters import CarParameters
-from bayesrace.vehicles.parts import LinearTyres, Pacejka, Part
-from codegen.fmu.definition import FmuDefinition, Variable
-from codegen.fmu.sources import NATIVE
+from bayesrace.vehicles.parts import LinearTyres, Pacejka
+from codegen.fmu.definition import NATIVE, FmuDefinition, Variable
 
 __all__ = ["STATE", "car_fmu"]
 
@@ -35,106 +35,53 @@ STATE: Final = {
 """Unit and meaning of each state."""
 
 _PAGE: Final = """
-<p>{title}, by which BayesRace simulates the car '{car}': state x = [x, y, psi, vx, vy, omega,
-delta], input u = [d, delta_rate], SI units. The start state is the start value of the outputs; any
-parameter can be set before initialisation ends.</p>
-<pre>
-der(x)     = vx cos(psi) - vy sin(psi)
-der(y)     = vx sin(psi) + vy cos(psi)
-der(psi)   = omega
-{rates}
-der(delta) = delta_rate
-
-{forces}
-</pre>
-<p>{slow} {kind}</p>
+<p>The {title}, by which BayesRace simulates the car '{car}' (its docs/equations.md): state x = [x,
+y, psi, vx, vy, omega, delta], input u = [d, delta_rate], SI units. The start state is the start
+value of the outputs; any parameter can be set before initialisation ends.</p>
+<p>{kind}</p>
 """
-
-_PACEJKA: Final = """der(vx)    = (F_x - F_fy sin(delta)) / mass_kg + vy omega
-der(vy)    = (F_ry + F_fy cos(delta)) / mass_kg - vx omega
-der(omega) = (F_fy lf_m cos(delta) - F_ry lr_m) / inertia_kgm2"""
-
-_PACEJKA_FORCES: Final = """
-F_fy = front_d sin(front_c atan(front_b alpha_f))    alpha_f = delta - atan((omega lf_m + vy) / vx)
-F_ry = rear_d sin(rear_c atan(rear_b alpha_r))       alpha_r = atan((omega lr_m - vy) / vx)"""
-
-_LINEAR: Final = """der(v)     = F_x / mass_kg    v = sqrt(vx^2 + vy^2)
-der(beta)  = (mu / (v^2 L) (lr_m C_r - lf_m C_f) - 1) omega - mu / (v L) (C_r + C_f) beta
-             + mu / (v L) C_f delta    beta = atan2(vy, vx)
-der(omega) = mu mass_kg / (inertia_kgm2 L) ((lr_m C_r - lf_m C_f) beta + lf_m C_f delta
-             - (lf_m^2 C_f + lr_m^2 C_r) omega / v)"""
-
-_LINEAR_FORCES: Final = """    L = lf_m + lr_m    a = der(v)
-C_f  = front_stiffness (9.81 lr_m - height_m a)    C_r = rear_stiffness (9.81 lf_m + height_m a)"""
 
 _KIND: Final = {
     "cs": "A communication step has any length and is divided into equal Runge-Kutta steps of at "
     "most 1 ms, with the inputs held. Drive command, steering rate and steering angle stay within "
     "the limits; an input that is not finite brakes the car with the steering held. d_applied and "
     "delta_rate_applied say what acted.",
-    "me": "No limit is applied to an input or to the steering angle. Directional and adjoint "
-    "derivatives are exact, with respect to states, inputs and parameters.",
+    "me": "No limit is applied to an input or to the steering angle. Directional derivatives are "
+    "exact, with respect to states, inputs and parameters.",
 }
 
 
-def _tyres(car: CarParameters) -> str:
-    return "linear" if isinstance(car.tyres, LinearTyres) else "Pacejka"
-
-
 def _title(car: CarParameters) -> str:
+    tyres = "linear" if isinstance(car.tyres, LinearTyres) else "Pacejka"
     drive = "an acceleration as drive command" if car.drive.guarded else "DC motor"
-    return f"dynamic bicycle model with {_tyres(car)} tyres and {drive}"
-
-
-def _page(car: CarParameters, kind: str) -> str:
-    linear = isinstance(car.tyres, LinearTyres)
-    force = "mass_kg d" if car.drive.guarded else "(cm1 - cm2 vx) d - cr0 - cr2 vx^2"
-    slow = "Below 0.1 m/s, slip angles and rolling resistance fade smoothly to none at standstill."
-    if linear:
-        slow = "Below switch_mps this passes smoothly into rolling without slip."
-    return _PAGE.format(
-        title=f"The {_title(car)}",
-        car=car.name,
-        rates=_LINEAR if linear else _PACEJKA,
-        forces=f"F_x  = {force}{_LINEAR_FORCES if linear else _PACEJKA_FORCES}",
-        slow=slow,
-        kind=_KIND[kind],
-    )
-
-
-def _meanings(car: CarParameters) -> dict[str, tuple[str, dict[str, Any]]]:
-    """Flat name of each number to the axle it is of, if any, and its field's schema."""
-    found: dict[str, tuple[str, dict[str, Any]]] = {}
-    for part in (car.tyres, car.drive):
-        for name, value in part:
-            form: type[Part] = type(value) if isinstance(value, Part) else type(part)
-            fields = form.model_json_schema()["properties"]
-            if isinstance(value, Pacejka):
-                found |= {f"{name}_{inner}": (name, fields[inner]) for inner in fields}
-            else:
-                found[name] = "", fields[name]
-    return {
-        name: ("", field) for name, field in CarParameters.model_json_schema()["properties"].items()
-    } | found
+    return f"dynamic bicycle model with {tyres} tyres and {drive}"
 
 
 def _parameters(car: CarParameters, kind: str) -> list[Variable]:
     """With bounds, unit and description of the car's own data model; limits for the guard only."""
+    fields: dict[str, tuple[str, dict[str, Any]]] = {}  # axle, if it is of one, and schema
+    for part in (car, car.tyres, car.drive):
+        schema = type(part).model_json_schema()["properties"]
+        for name, value in part:
+            if isinstance(value, Pacejka):
+                inner = Pacejka.model_json_schema()["properties"]
+                fields |= {f"{name}_{one}": (f"{name} tyre: ", inner[one]) for one in inner}
+            else:
+                fields[name] = "", schema[name]
     values = car.equation_numbers | (car.guard_numbers if kind == "cs" else {})
-    meanings = _meanings(car)
-    return [_parameter(name, value, *meanings[name], car) for name, value in values.items()]
+    return [_parameter(name, value, *fields[name], car) for name, value in values.items()]
 
 
 def _parameter(
     name: str, value: float, axle: str, field: dict[str, Any], car: CarParameters
 ) -> Variable:
     text, unit = re.fullmatch(r"(.*) \[([^]]*)\]", field["description"]).groups()  # type: ignore[union-attr]
-    unit = car.drive.unit if unit == "command" else unit
+    unit = {"command": car.drive.unit, "-": "1"}.get(unit, unit)
     return Variable(
         name,
         "parameter",
-        f"{axle} tyre: {text}" if axle else text,
-        unit="1" if unit == "-" else unit.replace(" ", ".").replace("^", ""),
+        f"{axle}{text}",
+        unit=unit.replace(" ", ".").replace("^", ""),
         start=value,
         min=field.get("minimum", field.get("exclusiveMinimum", -inf)),
         max=field.get("maximum", field.get("exclusiveMaximum", inf)),
@@ -211,15 +158,9 @@ def _functions(car: CarParameters, kind: str) -> list[Any]:
     if kind == "cs":
         return [_substep(car)]
     rates = _rates(car)
-    known, weights = ca.SX.sym("known", rates.size1_in(0)), ca.SX.sym("w", rates.size1_out(0))
-    seed, xdot = ca.SX.sym("seed", known.size1()), rates(known)
-    forward = ca.densify(ca.jtimes(xdot, known, seed))
-    reverse = ca.densify(ca.jtimes(xdot, known, weights, True))
-    return [
-        rates,
-        ca.Function("car_forward", [known, seed], [forward]),
-        ca.Function("car_reverse", [known, weights], [reverse]),
-    ]
+    known, seed = (ca.SX.sym(name, rates.size1_in(0)) for name in ("known", "seed"))
+    forward = ca.densify(ca.jtimes(rates(known), known, seed))
+    return [rates, ca.Function("car_forward", [known, seed], [forward])]
 
 
 def _sources(car: CarParameters, kind: str) -> dict[str, bytes]:
@@ -253,5 +194,5 @@ def car_fmu(
         variables=tuple(_variables(car, kind)),
         sources=_sources(car, kind),
         constants=constants if kind == "cs" else {},
-        documentation=_page(car, kind),
+        documentation=_PAGE.format(title=_title(car), car=escape(car.name), kind=_KIND[kind]),
     )

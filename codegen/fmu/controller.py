@@ -20,8 +20,7 @@ from bayesrace.vehicles.parts import Drive
 from codegen.build import HOST
 from codegen.compiler import FLAGS
 from codegen.fmu.car import STATE
-from codegen.fmu.definition import FmuDefinition, Variable
-from codegen.fmu.sources import NATIVE
+from codegen.fmu.definition import NATIVE, FmuDefinition, Variable
 from codegen.host_files import PATH_FILE, WEIGHTS_FILE, path_file, weights_file
 
 __all__ = ["controller_fmu"]
@@ -171,30 +170,28 @@ def _parameters(
 
 
 def _outputs(drive: Drive) -> list[Variable]:
-    def output(name: str, text: str, **others: Any) -> Variable:
-        return Variable(name, "output", text, dependencies=None, **others)
+    def output(name: str, what: str, text: str) -> Variable:
+        how: dict[str, Any] = {"kind" if what in ("integer", "boolean") else "unit": what}
+        return Variable(name, "output", text, dependencies=None, **how)
 
     return [
-        output("d", drive.command, unit=drive.unit),
-        output("delta_rate", "steering rate", unit="rad/s"),
-        output("status", f"of the step: {', '.join(_STATUSES)}", kind="integer"),
-        output("usable", "the step's solution may be driven", kind="boolean"),
-        output(
-            "fallback_level", "0 solution, 1 plan before, 2 braking, 3 standing", kind="integer"
-        ),
-        output("iterations_used", "SQP iterations of the step", kind="integer"),
-        output("stationarity", "residual at the plan; -1: not known", unit="1"),
-        output("defect", "dynamics residual at the plan; -1: not known", unit="1"),
-        output("slack_max_m", "largest violation of the track in the plan", unit="m"),
-        output(
-            "tube_m", "half the width that uncertainty takes of the track; -1: not known", unit="m"
-        ),
-        output("pace", "of the reference, as a share of the line's speed", unit="1"),
-        output(
-            "widening", "of the model's band by the errors observed; 1: it covers them", unit="1"
-        ),
-        output("s_ref_m", "arc length of the car on the racing line", unit="m"),
-        output("lateral_m", "distance from the racing line, positive to the left", unit="m"),
+        output(*row)
+        for row in (
+            ("d", drive.unit, drive.command),
+            ("delta_rate", "rad/s", "steering rate"),
+            ("status", "integer", f"of the step: {', '.join(_STATUSES)}"),
+            ("usable", "boolean", "the step's solution may be driven"),
+            ("fallback_level", "integer", "0 solution, 1 plan before, 2 braking, 3 standing"),
+            ("iterations_used", "integer", "SQP iterations of the step"),
+            ("stationarity", "1", "residual at the plan; -1: not known"),
+            ("defect", "1", "dynamics residual at the plan; -1: not known"),
+            ("slack_max_m", "m", "largest violation of the track in the plan"),
+            ("tube_m", "m", "half the width that uncertainty takes of the track; -1: not known"),
+            ("pace", "1", "of the reference, as a share of the line's speed"),
+            ("widening", "1", "of the model's band by the errors observed; 1: it covers them"),
+            ("s_ref_m", "m", "arc length of the car on the racing line"),
+            ("lateral_m", "m", "distance from the racing line, positive to the left"),
+        )
     ]
 
 
@@ -203,16 +200,14 @@ def _documentation(manifest: Manifest, weights: GpWeights | None) -> str:
     return f"""<p>Nonlinear model predictive controller, {manifest.horizon} stages of
 {manifest.step_s:g} s, model {escape(manifest.discretisation)}, {correction}. On x86-64 the binary
 uses AVX2 or AVX-512 where the processor has them.</p>
-<p>Every doStep in which a control step is due makes one for the inputs set before it. Its outputs
+<p>Every doStep in which a control step is due makes one for the inputs set before it; its outputs
 are meant for the plant's step over the same time. So step the controller first, hand its outputs to
-the plant, and step that. If your tool steps all FMUs side by side, set <code>delay</code> to the
-communication step.</p>
-<p>A tunable parameter outside its bounds is refused with the status Discard and keeps its value.
-Parameters that do not fit together, such as <code>d_min</code> above <code>d_max</code>, are
-noticed by the next control step: doStep returns Warning with a message, and all tunable parameters
-have the values of the step before again. The simulation may go on after both.</p>
-<p>If a step gives no usable solution, the outputs are those of the plan before it, then of braking
-along it; see <code>fallback_level</code>. Outputs are always finite.</p>
+the plant, and step that; or, if your tool steps all FMUs side by side, set <code>delay</code> to
+the communication step. Without a usable solution, the outputs are those of the plan before it, then
+of braking along it (<code>fallback_level</code>). They are always finite.</p>
+<p>A tunable parameter outside its bounds is refused with the status Discard. Parameters that do not
+fit together, such as <code>d_min</code> above <code>d_max</code>, make the next control step return
+Warning, and all have the values of the step before again. The simulation may go on after both.</p>
 <p>Racing line and weights are in <code>resources/{PATH_FILE}</code> and
 <code>resources/{WEIGHTS_FILE}</code> (format: sources/br_files.h), loaded and checked at
 instantiation: exchange them without compiling.</p>"""

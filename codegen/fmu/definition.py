@@ -3,9 +3,13 @@
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, field
 from math import inf
+from pathlib import Path
 from typing import Final, Literal
 
-__all__ = ["TIME", "FmuDefinition", "Variable"]
+__all__ = ["NATIVE", "FmuDefinition", "Variable"]
+
+NATIVE: Final = Path(__file__).parent / "native"
+"""The hand-written C."""
 
 
 @dataclass(frozen=True)
@@ -49,16 +53,15 @@ TIME: Final = Variable("time", "independent", "simulation time", unit="s")
 
 @dataclass(frozen=True, kw_only=True)
 class FmuDefinition:
-    """An FMU of one FMI version, ready for :func:`codegen.fmu.pack`."""
+    """An FMU of FMI 2.0 or 3.0, ready for :func:`codegen.fmu.pack`.
+
+    ``name``: shown to people; ``identifier``: of the binaries, in C; ``description``: one line.
+    """
 
     name: str
-    """Model name shown to people."""
     identifier: str
-    """C identifier: file name of the binaries."""
     description: str
-    """One line."""
     version: Literal[2, 3]
-    """FMI 2.0 or 3.0."""
     variables: tuple[Variable, ...]
     """In the order of their value references. Of Model Exchange: the states first, at the end their
     derivatives in the same order."""
@@ -70,9 +73,9 @@ class FmuDefinition:
     constants: Mapping[str, float] = field(default_factory=dict)
     """Further macros of ``fmu_config.h``."""
     resources: Mapping[str, bytes] = field(default_factory=dict)
-    """Files of the ``resources/`` folder: relative path to content."""
+    """Files of the ``resources/`` folder."""
     documentation: str = ""
-    """Body of the documentation page, HTML."""
+    """Of the documentation page, HTML."""
     default_step_s: float = 0.02
     serialises: bool = True
     """A saved state can become bytes for another instance: model memory holds no pointers."""

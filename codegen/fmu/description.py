@@ -1,7 +1,7 @@
 """The XML of an FMU: model description (FMI 2.0 and 3.0) and build description (FMI 3.0)."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from math import isfinite
 from typing import Any, Final
@@ -10,8 +10,8 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 import pint
 
 from bayesrace.errors import InputError
-from codegen.fmu.definition import FmuDefinition, Variable
-from codegen.fmu.sources import linked_files
+from codegen.fmu.build import FLAGS
+from codegen.fmu.definition import FmuDefinition
 
 __all__ = ["build_description", "model_description"]
 
@@ -46,51 +46,55 @@ def _text(root: Element) -> bytes:
     return text + b"\n"
 
 
-def _add_files(parent: Element, tag: str, names: Sequence[str]) -> None:
-    for name in names:
-        SubElement(parent, tag, name=name)
+def _add(parent: Element, tag: str, many: Sequence[Mapping[str, str]]) -> None:
+    for attributes in many:
+        SubElement(parent, tag, dict(attributes))
 
 
-def model_description(definition: FmuDefinition, token: str) -> bytes:
-    """``modelDescription.xml``."""
+def _named(names: Sequence[str], end: str) -> list[dict[str, str]]:
+    return [{"name": name} for name in names if name.endswith(end)]
+
+
+def model_description(definition: FmuDefinition, token: str, linked: Sequence[str]) -> bytes:
+    """``modelDescription.xml``; ``linked``: what the compiler is given."""
     two = definition.version == 2
-    head = {
-        "fmiVersion": f"{definition.version}.0",
-        "modelName": definition.name,
-        "guid" if two else "instantiationToken": token,
-        "description": definition.description,
-        "author": "BayesRace contributors",
-        "license": "MIT; parts of other authors: see documentation/licenses",
-        "generationTool": "BayesRace",
-        "variableNamingConvention": "flat",
-    }
-    root = Element("fmiModelDescription", head)
+    root = Element(
+        "fmiModelDescription",
+        {
+            "fmiVersion": f"{definition.version}.0",
+            "modelName": definition.name,
+            "guid" if two else "instantiationToken": token,
+            "description": definition.description,
+            "author": "BayesRace contributors",
+            "license": "MIT; parts of other authors: see documentation/licenses",
+            "generationTool": "BayesRace",
+            "variableNamingConvention": "flat",
+        },
+    )
     state = "FMUstate" if two else "FMUState"
-    interface = {
+    abilities = {
         "modelIdentifier": definition.identifier,
         "canBeInstantiatedOnlyOncePerProcess": "false",
         f"canGetAndSet{state}": "true",
         f"canSerialize{state}": _number(definition.serialises, "boolean"),
     }
     if definition.states:
-        abilities = ("providesDirectionalDerivatives", "providesAdjointDerivatives")
-        SubElement(root, "ModelExchange", interface | dict.fromkeys(abilities, "true"))
+        SubElement(root, "ModelExchange", abilities, providesDirectionalDerivatives="true")
     else:
-        interface["canHandleVariableCommunicationStepSize"] = "true"
-        parent = SubElement(root, "CoSimulation", interface)
+        abilities["canHandleVariableCommunicationStepSize"] = "true"
+        parent = SubElement(root, "CoSimulation", abilities)
         if two:
             parent.set("canNotUseMemoryManagementFunctions", "true")
-            _add_files(SubElement(parent, "SourceFiles"), "File", linked_files(definition, ".c"))
+            _add(SubElement(parent, "SourceFiles"), "File", _named(linked, ".c"))
     units = SubElement(root, "UnitDefinitions")
     for unit in sorted({v.unit for v in definition.all_variables if v.unit is not None}):
         SubElement(SubElement(units, "Unit", name=unit), "BaseUnit", _base_units(unit))
-    categories = SubElement(root, "LogCategories")
-    for status, what in _MESSAGES.items():
-        SubElement(categories, "Category", name=f"logStatus{status}", description=what)
+    messages = [{"name": f"logStatus{name}", "description": t} for name, t in _MESSAGES.items()]
+    _add(SubElement(root, "LogCategories"), "Category", messages)
     step = repr(definition.default_step_s)
     SubElement(root, "DefaultExperiment", startTime="0", stopTime="10", stepSize=step)
-    _variables(root, definition)
-    _structure(root, definition)
+    _variables(SubElement(root, "ModelVariables"), definition)
+    _structure(SubElement(root, "ModelStructure"), definition)
     return _text(root)
 
 
@@ -100,40 +104,32 @@ def _number(value: float, kind: str) -> str:
     return str(int(value)) if kind == "integer" else repr(float(value))
 
 
-def _named(variable: Variable, reference: int) -> dict[str, str]:
-    attributes = {
-        "name": variable.name,
-        "valueReference": str(reference),
-        "description": variable.description,
-        "causality": variable.causality,
-        "variability": variable.variability,
-    }
-    if variable.causality not in ("input", "independent"):  # FMI gives these no 'initial'
-        attributes["initial"] = "calculated" if variable.start is None else "exact"
-    return attributes
-
-
-def _typed(variable: Variable) -> dict[str, str]:
-    numbers = {name: getattr(variable, name) for name in ("min", "max", "nominal", "start")}
-    given = {n: v for n, v in numbers.items() if v is not None and isfinite(v)}
-    unit = {} if variable.unit is None else {"unit": variable.unit}
-    return unit | {name: _number(value, variable.kind) for name, value in given.items()}
-
-
-def _variables(root: Element, definition: FmuDefinition) -> None:
-    parent = SubElement(root, "ModelVariables")
+def _variables(parent: Element, definition: FmuDefinition) -> None:
     for reference, variable in enumerate(definition.all_variables):
         kind = _TYPES[definition.version][variable.kind]
-        named, typed = _named(variable, reference), _typed(variable)
+        named = {
+            "name": variable.name,
+            "valueReference": str(reference),
+            "description": variable.description,
+            "causality": variable.causality,
+            "variability": variable.variability,
+        }
+        if variable.causality not in ("input", "independent"):  # FMI gives these no 'initial'
+            named["initial"] = "calculated" if variable.start is None else "exact"
+        typed = {} if variable.unit is None else {"unit": variable.unit}
+        for name in ("min", "max", "nominal", "start"):
+            value = getattr(variable, name)
+            if value is not None and isfinite(value):
+                typed[name] = _number(value, variable.kind)
         if definition.version == 2:
             SubElement(SubElement(parent, "ScalarVariable", named), kind, typed)
-            continue
-        element = SubElement(parent, kind, named | typed)
-        if variable.derivative_of is not None:
-            element.set("derivative", str(definition.states.index(variable.derivative_of)))
+        else:
+            if variable.derivative_of is not None:
+                typed["derivative"] = str(definition.states.index(variable.derivative_of))
+            SubElement(parent, kind, named | typed)
 
 
-def _structure(root: Element, definition: FmuDefinition) -> None:
+def _structure(structure: Element, definition: FmuDefinition) -> None:
     """Unknowns and what they depend on: by index, from 1, in FMI 2.0, else by reference."""
     two = definition.version == 2
     place = {v.name: str(i) for i, v in enumerate(definition.variables, start=int(two))}
@@ -141,29 +137,30 @@ def _structure(root: Element, definition: FmuDefinition) -> None:
     derivatives = [v for v in definition.variables if v.derivative_of is not None]
     # before the run, calculated outputs are constants, derivatives may depend on all that is set
     given = tuple(v.name for v in definition.variables if v.start is not None)
-    initial = [(v, ()) for v in outputs if v.start is None] + [(v, given) for v in derivatives]
-    structure = SubElement(root, "ModelStructure")
     for tag, unknowns in (
         ("Output", [(v, v.dependencies) for v in outputs]),
         ("ContinuousStateDerivative", [(v, v.dependencies) for v in derivatives]),
-        ("InitialUnknown", initial),
+        (
+            "InitialUnknown",
+            [(v, ()) for v in outputs if v.start is None] + [(v, given) for v in derivatives],
+        ),
     ):
-        if not unknowns:
-            continue
-        parent = SubElement(structure, f"{tag}s") if two else structure
-        for variable, known in unknowns:
-            at = {"index" if two else "valueReference": place[variable.name]}
-            element = SubElement(parent, "Unknown" if two else tag, at)
-            if known is not None:
-                element.set("dependencies", " ".join(place[name] for name in known))
+        rows = [
+            {"index" if two else "valueReference": place[v.name]}
+            | ({} if known is None else {"dependencies": " ".join(place[name] for name in known)})
+            for v, known in unknowns
+        ]
+        if rows:
+            parent = SubElement(structure, f"{tag}s") if two else structure
+            _add(parent, "Unknown" if two else tag, rows)
 
 
-def build_description(definition: FmuDefinition, options: Sequence[str]) -> bytes:
-    """``sources/buildDescription.xml`` of FMI 3.0; ``options``: of the compiler."""
+def build_description(definition: FmuDefinition, linked: Sequence[str]) -> bytes:
+    """``sources/buildDescription.xml`` of FMI 3.0."""
     root = Element("fmiBuildDescription", fmiVersion="3.0")
     parent = SubElement(root, "BuildConfiguration", modelIdentifier=definition.identifier)
-    files = SubElement(parent, "SourceFileSet", language="C11", compilerOptions=" ".join(options))
-    _add_files(files, "SourceFile", linked_files(definition, ".c"))
-    _add_files(parent, "Library", linked_files(definition, ".a"))
-    SubElement(parent, "Library", name="m", external="true")
+    options = " ".join((*FLAGS, *definition.flags))
+    files = SubElement(parent, "SourceFileSet", language="C11", compilerOptions=options)
+    _add(files, "SourceFile", _named(linked, ".c"))
+    _add(parent, "Library", [*_named(linked, ".a"), {"name": "m", "external": "true"}])
     return _text(root)

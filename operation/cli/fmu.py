@@ -159,7 +159,7 @@ def other_weights(
 ) -> None:
     """Copy a controller's FMU with other weights, without compiling."""
     from bayesrace.gp.weights import read_weights
-    from codegen.fmu.weights import exchange_weights
+    from codegen.fmu import exchange_weights
 
     loaded = read_weights(weights)
     exchange_weights(controller, loaded, out)

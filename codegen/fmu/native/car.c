@@ -6,7 +6,7 @@
 #include <math.h>
 #include <string.h>
 
-#include "car_model.h" /* generated: car_substep, or car_rates, car_forward, car_reverse */
+#include "car_model.h" /* generated: car_substep, or car_rates and car_forward */
 #include "fmu.h"
 
 #define NX 7
@@ -93,10 +93,9 @@ FMI(Status) fmu_model_step(fmu_instance *car, double h) {
     x[6] = clipped(v[FMU_V_delta] + h * u[1], -angle, angle); /* without rounding of steps */
     for (int i = 0; i < NX; i++)
         if (!isfinite(x[i]))
-            return fmu_note(car, FMI(Error),
-                            "the state after the step from %.9g s is not finite; the step is "
-                            "undone",
-                            v[FMU_V_time]);
+            return FMU_ERROR(
+                car, "the state after the step from %.9g s is not finite; the step is undone",
+                v[FMU_V_time]);
     memcpy(&v[FMU_V_x], x, sizeof x);
     v[FMU_V_d_applied] = u[0];
     v[FMU_V_delta_rate_applied] = u[1];
@@ -117,12 +116,6 @@ void fmu_model_derivatives(const fmu_instance *car, double *dx) {
 void fmu_model_directional(const fmu_instance *car, const double *in, double *out) {
     memcpy(out, in, FMU_VALUES * sizeof *out); /* a state depends on itself alone */
     EVALUATE(car_forward, &out[KNOWN], car->value, in);
-}
-
-void fmu_model_adjoint(const fmu_instance *car, const double *in, double *out) {
-    memset(out, 0, FMU_VALUES * sizeof *out);
-    EVALUATE(car_reverse, out, car->value, &in[KNOWN]);
-    for (int i = 0; i < NX; i++) out[i] += in[i];
 }
 
 #endif

@@ -171,7 +171,7 @@ FMI(Status) fmu_model_step(fmu_instance *instance, double h) {
     const br_measured state = measured(instance);
     br_decision decision;
     if (br_cycle_answer(c->cycle, &state, &around, v[FMU_V_time], 0, 0, &decision))
-        return fmu_note(instance, FMI(Error), "controller: the control cycle refuses the state");
+        return FMU_ERROR(instance, "controller: the control cycle refuses the state");
     set_outputs(instance, &decision);
     return status;
 }

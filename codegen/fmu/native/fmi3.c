@@ -80,6 +80,9 @@ ABSENT(fmi3SetShiftDecimal, NAMED, const fmi3Float64 shift[])
 ABSENT(fmi3SetShiftFraction, NAMED, const fmi3UInt64 counter[], const fmi3UInt64 resolution[])
 ABSENT(fmi3GetOutputDerivatives, NAMED, const fmi3Int32 order[], fmi3Float64 value[],
        size_t n_values)
+ABSENT(fmi3GetAdjointDerivative, const fmi3ValueReference unknown[], size_t n,
+       const fmi3ValueReference known[], size_t n_known, const fmi3Float64 seed[], size_t n_seed,
+       fmi3Float64 out[], size_t n_out)
 ABSENT(fmi3GetEventIndicators, fmi3Float64 value[], size_t n)
 NEVER(fmi3GetNumberOfVariableDependencies, fmi3Instance c, fmi3ValueReference vr, size_t *n)
 NEVER(fmi3GetVariableDependencies, fmi3Instance c, fmi3ValueReference dependent,
@@ -138,26 +141,21 @@ fmi3Status fmi3CompletedIntegratorStep(fmi3Instance c, fmi3Boolean no_rollback, 
 
 fmi3Status fmi3SetTime(fmi3Instance c, fmi3Float64 time) {
     REQUIRE(FMU_EVENT | FMU_CONTINUOUS);
-    if (!isfinite(time)) {
-        fmu_refuse(instance, "fmi3SetTime: %g is no time", time);
-        return fmi3Error;
-    }
+    if (!isfinite(time)) return FMU_ERROR(instance, "fmi3SetTime: %g is no time", time);
     instance->value[FMU_V_time] = time;
     return fmi3OK;
 }
 
 /* A function of an array x [n] with one number for each state k. */
-#define OF_STATES(function, type, phases, status, assignment)                             \
-    fmi3Status function(fmi3Instance c, type x[], size_t n) {                             \
-        REQUIRE(phases);                                                                  \
-        if (!x || n != FMU_STATES) {                                                      \
-            fmu_refuse(instance, "%d continuous states, but an array of %lu", FMU_STATES, \
-                       (unsigned long)n);                                                 \
-            return fmi3Error;                                                             \
-        }                                                                                 \
-        const fmi3Status result = status;                                                 \
-        for (size_t k = 0; k < n; k++) assignment;                                        \
-        return result;                                                                    \
+#define OF_STATES(function, type, phases, status, assignment)                                   \
+    fmi3Status function(fmi3Instance c, type x[], size_t n) {                                   \
+        REQUIRE(phases);                                                                        \
+        if (!x || n != FMU_STATES)                                                              \
+            return FMU_ERROR(instance, "%d continuous states, but an array of %lu", FMU_STATES, \
+                             (unsigned long)n);                                                 \
+        const fmi3Status result = status;                                                       \
+        for (size_t k = 0; k < n; k++) assignment;                                              \
+        return result;                                                                          \
     }
 
 /* clang-format off */
@@ -194,39 +192,22 @@ static bool differentiable(const fmu_instance *instance, const fmi3ValueReferenc
     return true;
 }
 
-/* out[to] = the Jacobian, or for an adjoint its transpose, times the seed at `from`. */
-static fmi3Status partial_derivatives(fmu_instance *c, const fmi3ValueReference *from,
-                                      size_t n_from, const fmi3ValueReference *to, size_t n_to,
-                                      const double *seed, bool sizes_fit, double *out,
-                                      bool adjoint) {
+fmi3Status fmi3GetDirectionalDerivative(fmi3Instance c, const fmi3ValueReference unknown[],
+                                        size_t n_unknown, const fmi3ValueReference known[],
+                                        size_t n_known, const fmi3Float64 seed[], size_t n_seed,
+                                        fmi3Float64 out[], size_t n_out) {
     double in[FMU_VALUES] = {0}, all[FMU_VALUES] = {0};
     REQUIRE(FMU_STATES ? INITIALISED : 0);
-    if (!seed || !out || !sizes_fit || (n_from && !from) || (n_to && !to)) {
-        fmu_refuse(instance, "partial derivatives: a pointer is NULL or a size does not fit");
+    if (!seed || !out || n_seed != n_known || n_out != n_unknown || (n_known && !known) ||
+        (n_unknown && !unknown))
+        return FMU_ERROR(instance, "partial derivatives: a pointer is NULL or a size does not fit");
+    if (!differentiable(instance, known, n_known, false) ||
+        !differentiable(instance, unknown, n_unknown, true))
         return fmi3Error;
-    }
-    if (!differentiable(instance, from, n_from, adjoint) ||
-        !differentiable(instance, to, n_to, !adjoint))
-        return fmi3Error;
-    for (size_t i = 0; i < n_from; i++) in[from[i]] += seed[i];
+    for (size_t i = 0; i < n_known; i++) in[known[i]] += seed[i];
 #if FMU_STATES
-    (adjoint ? fmu_model_adjoint : fmu_model_directional)(instance, in, all);
+    fmu_model_directional(instance, in, all);
 #endif
-    for (size_t i = 0; i < n_to; i++) out[i] = all[to[i]];
+    for (size_t i = 0; i < n_unknown; i++) out[i] = all[unknown[i]];
     return fmi3OK;
-}
-
-#define PARTIAL                                                                                    \
-    fmi3Instance c, const fmi3ValueReference unknown[], size_t n_unknown,                          \
-        const fmi3ValueReference known[], size_t n_known, const fmi3Float64 seed[], size_t n_seed, \
-        fmi3Float64 out[], size_t n_out
-
-fmi3Status fmi3GetDirectionalDerivative(PARTIAL) {
-    return partial_derivatives(c, known, n_known, unknown, n_unknown, seed,
-                               n_seed == n_known && n_out == n_unknown, out, false);
-}
-
-fmi3Status fmi3GetAdjointDerivative(PARTIAL) {
-    return partial_derivatives(c, unknown, n_unknown, known, n_known, seed,
-                               n_seed == n_unknown && n_out == n_known, out, true);
 }

@@ -3,8 +3,7 @@
  * A model (car.c, controller.c) is a few functions over one array of values. The layer, which owns
  * the instance, does everything else that FMI demands: phases, arguments, messages, saved states.
  * It is compiled for one version, FMU_FMI; FMI(Name) is fmi2Name or fmi3Name: functions that are
- * alike in both are written once, in fmu_instance.c, fmu_values.c and fmu_state.c; fmi2.c or fmi3.c
- * has the others.
+ * alike in both are written once, in fmu.c; fmi2.c or fmi3.c has the others.
  *
  * A refused call has changed nothing and has sent one message, with the status that it returns:
  * Discard for a value outside the bounds of its variable, after which the simulation may go on;
@@ -67,13 +66,13 @@ typedef struct {
     void *environment;    /* the importer's */
 } fmu_instance;
 
-/* Sends an error message (printf format) to the importer's log. Returns false. */
-__attribute__((format(printf, 2, 3))) bool fmu_refuse(const fmu_instance *instance,
-                                                      const char *format, ...);
-
-/* Sends a message with the status that the call is about to return. Returns the status. */
+/* Sends a message (printf format) with the status that the call is about to return, to the
+ * importer's log. Returns the status. */
 __attribute__((format(printf, 3, 4))) FMI(Status)
     fmu_note(const fmu_instance *instance, FMI(Status) status, const char *format, ...);
+
+#define FMU_ERROR(instance, ...) fmu_note(instance, FMI(Error), __VA_ARGS__)
+#define fmu_refuse(...) (FMU_ERROR(__VA_ARGS__) == FMI(OK)) /* false, after the message */
 
 /* ---- the model; what is bool is false after fmu_refuse, else true ---- */
 
@@ -94,10 +93,9 @@ FMI(Status) fmu_model_step(fmu_instance *instance, double h);
 /* Model Exchange: derivatives [FMU_STATES] of the states at the instance's values. */
 void fmu_model_derivatives(const fmu_instance *instance, double *dx);
 
-/* Model Exchange, with the Jacobian J of all values by all values: out = J in, or out = J' in, both
- * [FMU_VALUES]. Only the rows of states (one for itself) and of their derivatives count. */
+/* Model Exchange: out = J in, both [FMU_VALUES], with the Jacobian J of all values by all values.
+ * Only the rows of states (one for itself) and of their derivatives count. */
 void fmu_model_directional(const fmu_instance *instance, const double *in, double *out);
-void fmu_model_adjoint(const fmu_instance *instance, const double *in, double *out);
 
 /* ---- the layer ---- */
 
@@ -137,8 +135,6 @@ char *fmu_folder(char *location);
 /* NULL after a message if the token is another FMU's, or the model refuses. */
 fmu_instance *fmu_new(const char *name, const char *token, const char *resources,
                       void (*logger)(void), void *environment);
-
-const char *fmu_phase_name(const fmu_instance *instance);
 
 /* Whether the instance, which may be NULL, is in one of the phases; else a message. */
 bool fmu_in_phase(const fmu_instance *instance, unsigned phases, const char *function);

@@ -1,0 +1,164 @@
+"""The C of an FMU, and its binaries: the host's by its own compiler, others cross-compiled.
+
+The C is the model's, the FMI layer of its version (``native``), FMI's headers, and the generated
+``fmu_config.h``.
+"""
+
+import hashlib
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from math import isfinite
+from pathlib import Path
+from typing import Final
+from uuid import UUID
+
+import fmpy
+
+from bayesrace.errors import InputError
+from bayesrace.interpreter import RUN_MODULE
+from codegen.compiler import Compiler, find_compiler
+from codegen.fmu.definition import NATIVE, FmuDefinition, Variable
+
+__all__ = [
+    "FLAGS", "PLATFORMS", "Platform", "arguments", "fmi_headers", "get_platform", "host_platform",
+    "linked_files", "sources_of", "write_sources",
+]  # fmt: skip
+
+FLAGS: Final = ("-std=gnu11", "-O2", "-ffp-contract=off", "-fvisibility=hidden")
+"""Portable, and the same arithmetic on every platform: no fused multiply-add."""
+
+
+@dataclass(frozen=True)
+class Platform:
+    """An operating system and processor that FMI has a folder for.
+
+    ``name``: FMI 3.0's folder, and on the command line; ``fmi2``: FMI 2.0's folder; ``suffix``: of
+    binaries; ``zig``: ziglang's target, None if only the host's own compiler can build for it.
+    """
+
+    name: str
+    fmi2: str
+    suffix: str
+    zig: str | None
+
+    def folder(self, version: int) -> str:
+        """Below ``binaries/``."""
+        return self.fmi2 if version == 2 else self.name
+
+    def compiler(self) -> Compiler:
+        """What builds for it here; InputError if there is nothing."""
+        if self == host_platform():
+            return find_compiler()
+        if self.zig is None:
+            raise InputError(f"binaries for {self.name} can only be built on {self.name}")
+        if find_spec("ziglang") is None:
+            raise InputError(
+                f"a binary for {self.name} is cross-compiled with ziglang, which is missing: "
+                "'pip install ziglang', or leave this platform out"
+            )
+        # stripped: what it strips names temporary files, which differ from build to build
+        return Compiler((*RUN_MODULE, "ziglang", "cc", "-target", self.zig, "-s", "-g0"), "")
+
+
+_KNOWN: Final = (  # the old glibc is for the binary to load on old systems too
+    Platform("x86_64-linux", "linux64", ".so", "x86_64-linux-gnu.2.17"),
+    Platform("aarch64-linux", "aarch64-linux", ".so", "aarch64-linux-gnu.2.17"),
+    Platform("x86_64-windows", "win64", ".dll", "x86_64-windows-gnu"),
+    Platform("x86_64-darwin", "darwin64", ".dylib", None),
+    Platform("aarch64-darwin", "darwin64", ".dylib", None),
+)
+PLATFORMS: Final = {known.name: known for known in _KNOWN}
+
+
+def host_platform() -> Platform:
+    """The platform this runs on; InputError if FMI has no folder for it."""
+    machine = platform.machine().lower()
+    machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(machine, machine)
+    return get_platform(f"{machine}-{platform.system().lower()}")
+
+
+def get_platform(name: str) -> Platform:
+    """By FMI 3.0 name, or linux64 or win64; InputError naming the known ones."""
+    name = {"linux64": "x86_64-linux", "win64": "x86_64-windows"}.get(name, name)
+    if name not in PLATFORMS:
+        raise InputError(f"unknown platform '{name}'; known: {', '.join(PLATFORMS)}")
+    return PLATFORMS[name]
+
+
+def fmi_headers(version: int) -> list[Path]:
+    """FMI's own headers, from the installed fmpy."""
+    return sorted((Path(fmpy.__file__).parent / "c-code").glob(f"fmi{version}*.h"))
+
+
+def sources_of(definition: FmuDefinition) -> tuple[str, dict[str, bytes]]:
+    """Instantiation token, and the files of ``sources/`` that a compiler reads: name to content.
+
+    The token stands for everything that is compiled or read at run time.
+    """
+    layer = [NATIVE / name for name in ("fmu.c", "fmu.h", f"fmi{definition.version}.c")]
+    files = {path.name: path.read_bytes() for path in (*layer, *fmi_headers(definition.version))}
+    files = {**definition.sources, **files}
+    files["exports.map"] = b"{ global: fmi2*; fmi3*; local: *; };\n"
+    hashed = {**files, **definition.resources, "": _config_header(definition, "")}
+    digest = hashlib.sha256()
+    for name, content in sorted(hashed.items()):
+        digest.update(f"{name} {len(content)} ".encode() + content)
+    token = f"{{{UUID(bytes=digest.digest()[:16])}}}"
+    return token, files | {"fmu_config.h": _config_header(definition, token)}
+
+
+def linked_files(sources: Mapping[str, bytes]) -> list[str]:
+    """What the compiler is given, in order: C files, then libraries."""
+    return [name for end in (".c", ".a") for name in sorted(sources) if name.endswith(end)]
+
+
+def write_sources(sources: Mapping[str, bytes], folder: Path) -> list[str]:
+    """Fills ``folder`` with all that is compiled; returns what the compiler is given."""
+    for name, content in sources.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content)
+    return linked_files(sources)
+
+
+def _row(v: Variable) -> str:
+    """The variable as the arguments of a macro; see ``fmu_variable`` in ``native/fmu.h``."""
+    role = "FIXED" if v.start is not None else "CALCULATED"
+    if v.causality == "input" or v.tunable:
+        role = "INPUT" if v.causality == "input" else "TUNABLE"
+    low = repr(float(v.min)) if isfinite(v.min) else "-INFINITY"
+    high = repr(float(v.max)) if isfinite(v.max) else "INFINITY"
+    start, nominal, opened = float(v.start or 0.0), float(v.nominal or 1.0), int(v.exclusive)
+    return f"V({v.name}, {v.kind.upper()}, {role}, {start!r}, {low}, {high}, {opened}, {nominal!r})"
+
+
+def _config_header(definition: FmuDefinition, token: str) -> bytes:
+    """``fmu_config.h``: version, token, constants, and the variables as rows of a macro."""
+    macros = {
+        "FMU_FMI": definition.version,
+        "FMU_IDENTIFIER": f'"{definition.identifier}"',
+        "FMU_TOKEN": f'"{token}"',
+        "FMU_STATES": len(definition.states),
+        "FMU_SERIALISES": int(definition.serialises),
+        **definition.constants,
+    }
+    lines = [
+        "/* generated */\n#ifndef FMU_CONFIG_H\n#define FMU_CONFIG_H",
+        *(f"#define {name} {value}" for name, value in macros.items()),
+        "#define FMU_VARIABLES(V) \\",
+        *(f"    {_row(variable)} \\" for variable in definition.all_variables),
+        "\n#define FMU_PLACE(name, ...) FMU_V_##name,",
+        "enum { FMU_VARIABLES(FMU_PLACE) FMU_VALUES };\n#endif\n",
+    ]
+    return "\n".join(lines).encode()
+
+
+def arguments(target: Platform, linked: Sequence[str], out: str, flags: Sequence[str]) -> list[str]:
+    """What follows the compiler's name, in a folder that holds ``linked`` (libraries last)."""
+    line = [*FLAGS, *flags, "-shared", *(["-fPIC"] if target.suffix != ".dll" else [])]
+    line += ["-I.", *linked, "-lm", "-o", out]
+    if target.suffix == ".so":
+        # only FMI's own functions, also where libraries bring others; and nothing left undefined
+        line += ["-Wl,--version-script=exports.map", "-Wl,-z,defs"]
+    return line
