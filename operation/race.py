@@ -8,7 +8,6 @@ import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
-from importlib import import_module
 from pathlib import Path
 from typing import Final
 
@@ -45,10 +44,6 @@ __all__ = ["FILES", "RaceError", "race"]
 
 _MODELS: Final[tuple[PredictionModel, ...]] = ("e_kinematic", "dynamic")
 """Of BayesRace and of BestCase."""
-
-
-_REPORT_MODULES: Final = "operation.report", "operation.analysis.race"
-"""What the report needs, the last first; each takes as long to import as a controller to start."""
 
 
 class RaceError(RuntimeError):
@@ -190,7 +185,6 @@ class _Drives:
         self._race, self._track = race, track
         self._system, self._recorder = system, recorder
         self.reader = RecordingReader(race.out)
-        self._needed = list(_REPORT_MODULES)
 
     def controller(
         self, artefact: Path, name: str, weights: Path | None = None
@@ -209,14 +203,7 @@ class _Drives:
         ]  # fmt: skip
         if weights is not None:
             options += ["--weights", str(weights)]
-        return self._system.controller(options, f"controller-{name}.log", self._read)
-
-    def _read(self) -> None:
-        """Reads the log as far as it goes, and imports a part of what the report needs."""
-        if not self.reader.runs():
-            return
-        if self._needed:
-            import_module(self._needed.pop())
+        return self._system.controller(options, f"controller-{name}.log", self.reader.runs)
 
     def drive(self, controller: str) -> RunPlan:
         """One run; InputError if it broke off."""

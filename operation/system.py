@@ -64,7 +64,7 @@ class System:
         self,
         options: Sequence[str],
         log: str = "controller.log",
-        meanwhile: Callable[[], None] = lambda: None,
+        meanwhile: Callable[[], object] = lambda: None,
     ) -> Iterator[None]:
         """A controller process for the block; it and the plant are ready for a run.
 

@@ -1,13 +1,10 @@
 """The report: one file with the numbers of the result, from whatever a race has left."""
 
-import io
-import logging
 import os
 import re
 import shutil
 import signal
 import subprocess
-import sys
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -19,7 +16,6 @@ from operation.analysis.published import compare_gp, compare_laps
 from operation.analysis.race import analyse, read_race
 from operation.analysis.results import RaceResult
 from operation.report import render, write_report
-from operation.report.fork import forked
 from operation.report.maps import LapMaps
 from operation.terminal.race_table import COLUMNS
 from tests.command_line import Cli, refused
@@ -151,39 +147,6 @@ def test_where_drawing_fails_the_report_before_stays(
     with pytest.raises(ArithmeticError):
         write_report(path)
     assert {file.name: file.stat().st_mtime_ns for file in path.iterdir()} == before
-
-
-def test_a_copy_of_the_process_ignores_interrupts_and_leaves_streams_alone(
-    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    here = os.getpid()
-
-    class Locked(io.StringIO):
-        """In a copy of the process, as a stream whose lock another thread held at the fork."""
-
-        def write(self, text: str) -> int:
-            self.flush()
-            return super().write(text)
-
-        def flush(self) -> None:
-            if os.getpid() != here:
-                os.kill(os.getpid(), signal.SIGKILL)
-
-    def work() -> str:
-        if os.getpid() == here:
-            return "by this process"
-        os.kill(os.getpid(), signal.SIGINT)
-        sys.stdout.write("drawing")
-        logging.getLogger("bayesrace.report").warning("drawn")
-        return "by a copy"
-
-    monkeypatch.setattr(sys, "stdout", Locked())
-    monkeypatch.setattr(sys, "stderr", Locked())
-    handler = logging.StreamHandler(sys.stderr)
-    monkeypatch.setattr(logging.getLogger("bayesrace.report"), "handlers", [handler])
-    with forked(work) as result:
-        assert result() == "by a copy"
-    assert capfd.readouterr() == ("", "")
 
 
 def test_the_papers_numbers_stand_only_beside_laps_on_its_track(

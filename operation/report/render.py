@@ -4,10 +4,9 @@ import platform
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
-from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from matplotlib.figure import Figure
@@ -21,7 +20,6 @@ from operation.analysis.race import DrivenRun, RaceAnalysis, read_race, write_re
 from operation.analysis.results import RaceResult
 from operation.report.canvas import inline_svg, png
 from operation.report.coverage import coverage_figures
-from operation.report.fork import forked
 from operation.report.gp import gp_figures
 from operation.report.maps import LapMaps
 from operation.report.style import figure_style, look
@@ -57,15 +55,14 @@ def write_report(run_dir: Path, analysis: RaceAnalysis | None = None) -> Path:
     """
     run_dir = Path(run_dir)
     analysis = analysis or read_race(run_dir)
-    # Laps on the track are half of the drawing: one process does that, another one the rest.
-    with forked(partial(_maps, analysis)) as wait_for_maps:
-        with figure_style():
-            figures = _svg(_panels(analysis, analysis.result))
-        maps = wait_for_maps()
-    page = _page(run_dir, analysis, figures | maps.figures)
+    with figure_style():
+        figures = _svg(_panels(analysis, analysis.result))
+        maps, picture = _maps(analysis)
+        figures |= _svg(maps)
+    page = _page(run_dir, analysis, figures)
     raise_if_interrupted()
     write_result(run_dir / RESULT, analysis.result)
-    write_whole(run_dir / PICTURE, maps.picture)
+    write_whole(run_dir / PICTURE, picture)
     write_whole(run_dir / REPORT, page)
     return run_dir / REPORT
 
@@ -161,26 +158,16 @@ def _uncertain(analysis: RaceAnalysis) -> list[tuple[str, int, int]]:
     ]
 
 
-class _Maps(NamedTuple):
-    figures: dict[str, list[str]]
-    """Name to panels as SVG: laps on the track, and the training drive."""
-    picture: bytes
-    """Of the laps, as PNG."""
-
-
-def _maps(analysis: RaceAnalysis) -> _Maps:
+def _maps(analysis: RaceAnalysis) -> tuple[dict[str, list[Figure]], bytes]:
+    """Laps on the track and the training drive, as panels, and the picture of the laps as PNG."""
     driven = _driven(analysis)
-    with figure_style():
-        maps = LapMaps(driven, analysis.track, analysis.line)
-        picture = png(maps.picture())
-        figures = {"laps": maps.figures()}
-        if (found := analysis.recording.training) is not None and analysis.training is not None:
-            training = LapMaps([analysis.training], found.track, found.line)
-            figures["training"] = [
-                *training.figures(),
-                *coverage_figures(analysis.training, driven),
-            ]
-        return _Maps(_svg(figures), picture)
+    maps = LapMaps(driven, analysis.track, analysis.line)
+    picture = png(maps.picture())
+    figures = {"laps": maps.figures()}
+    if (found := analysis.recording.training) is not None and analysis.training is not None:
+        training = LapMaps([analysis.training], found.track, found.line)
+        figures["training"] = [*training.figures(), *coverage_figures(analysis.training, driven)]
+    return figures, picture
 
 
 def _panels(analysis: RaceAnalysis, result: RaceResult) -> dict[str, list[Figure]]:
