@@ -29,18 +29,24 @@ def opened(folder: Path, settings: LearnSettings = SETTINGS) -> Iterator[Journal
 
 
 def test_a_job_resumes_with_the_record_and_the_samples(tmp_path: Path) -> None:
-    """``laps.json`` shows the record, also where a killed job has left an older one."""
+    """A sample that was being learned from is learned from again; those kept stay apart."""
     samples = drive(dynamic(CAR), 60, seed=1)
+    kept = samples.select(slice(20))
     with opened(tmp_path / "job") as journal:
         assert not journal.resumed
         journal.add_driven(samples, lap(1, 5.0))
-        journal.add_update(UpdateRecord(after_lap=1, version="a", verdict="refused"), None)
+        journal.take_samples()
+        journal.add_update(UpdateRecord(after_lap=1, version="a", verdict="refused"), None, kept)
+        journal.add_update(UpdateRecord(after_lap=1, verdict="failed"), None)
+        journal.add_driven(samples)
+        journal.take_samples()
         record = journal.record
-    (tmp_path / "job/laps.json").unlink()
+    (tmp_path / "job/.laps.1.part.json").touch()
     with opened(tmp_path / "job") as again:
         assert again.resumed
         assert again.record == record
-        assert [one.digest() for one in again.take_samples()][1] == samples.digest()
+        assert [one.digest() for one in again.take_samples()] == [kept.digest(), samples.digest()]
+    assert {path.name for path in (tmp_path / "job").iterdir()} == {"laps.json", "samples.npz"}
     content = json.loads((tmp_path / "job/laps.json").read_text())
     assert content["laps"][0]["time_s"] == 5.0
 
@@ -89,21 +95,23 @@ def test_two_jobs_in_one_folder_are_refused(tmp_path: Path) -> None:
     """Each would overwrite what the other has written; the lock ends with its owner."""
     folder = tmp_path / "job"
     with opened(folder) as journal:
-        with pytest.raises(InputError, match=f"runs in {folder}; end it first, or choose"):
+        with pytest.raises(
+            InputError, match=f"another process writes to {folder}: wait for its end"
+        ):
             Journal(folder, SETTINGS)
         journal.add_driven(None, lap(1, 5.0))
     with opened(folder) as again:
         assert len(again.record.laps) == 1
 
 
-@pytest.mark.parametrize("size", [10, 9000])
-def test_a_damaged_database_is_reported_at_once_with_the_remedy(tmp_path: Path, size: int) -> None:
+@pytest.mark.parametrize("name", ["laps.json", "samples.npz"])
+def test_a_damaged_file_is_reported_at_once_with_the_remedy(tmp_path: Path, name: str) -> None:
     """Not by each training to come."""
     with opened(tmp_path) as journal:
         journal.add_driven(drive(dynamic(CAR), 200, seed=1))
-    path = tmp_path / "learn.db"
-    path.write_bytes(path.read_bytes()[:size])
-    with pytest.raises(InputError, match=r"learn.db cannot be read .*choose another folder"):
+    path = tmp_path / name
+    path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(InputError, match=f"{name}.* restore it, or choose another folder"):
         Journal(tmp_path, SETTINGS)
 
 

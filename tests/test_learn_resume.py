@@ -1,4 +1,4 @@
-"""A learning job that ends, or is killed, at any moment, and one that resumes in its folder.
+"""A learning job that ends at any moment, and one that resumes in its folder.
 
 Promises guarded: every sample on file is learned from, and once; what is given at the start is
 given once; an answer that is missing when the job is interrupted is noted; a drive that is of no
@@ -6,10 +6,7 @@ use says why.
 """
 
 import itertools
-import multiprocessing
-import os
 import signal
-import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
@@ -186,65 +183,7 @@ def assert_once(data: Dataset, *parts: Dataset) -> None:
     np.testing.assert_array_equal(rows(data), rows(*parts))
 
 
-# Kills ---------------------------------------------------------------------------------------
-
-
-def job_killed_at(step: int, folder: Path) -> None:
-    """Runs a job on FIRST, killed before its step number ``step`` on the disk."""
-    steps = itertools.count(1)
-
-    def count(*_: Any) -> None:
-        if next(steps) == step:
-            os.kill(os.getpid(), signal.SIGKILL)
-
-    def counted(function: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*arguments: Any) -> Any:
-            count()
-            result = function(*arguments)
-            count()
-            return result
-
-        return call
-
-    def connect(*arguments: Any, **options: Any) -> sqlite3.Connection:
-        database = sqlite3.Connection(*arguments, **options)
-        database.set_trace_callback(count)
-        return database
-
-    jobs = Jobs()
-    setattr(sqlite3, "connect", connect)  # noqa: B010
-    for name in ("write_weights", "write_whole", "clear_partials"):
-        setattr(journal, name, counted(getattr(journal, name)))
-    jobs.run(folder, *lap_of(FIRST))
-
-
-def test_after_a_kill_at_any_step_every_sample_is_learned_from_once(
-    tmp_path: Path, jobs: Jobs
-) -> None:
-    """And nothing is left over of what the killed job had begun."""
-    processes = multiprocessing.get_context("forkserver")
-    processes.set_forkserver_preload([__name__])
-    on_file, killed = [], 0
-    for step in itertools.count(1):
-        folder = tmp_path / str(step)
-        process = processes.Process(target=job_killed_at, args=(step, folder))
-        process.start()
-        process.join()
-        if process.exitcode == 0:
-            break
-        assert process.exitcode == -signal.SIGKILL
-        killed += 1
-        if folder.exists():
-            (folder / ".outcome.part").touch()
-        record = jobs.run(folder, *lap_of(SECOND, run=2))
-        on_file.append(len(jobs.learned) > len(SECOND))
-        assert_once(jobs.learned, *([FIRST] if on_file[-1] else []), SECOND)
-        assert [lap.lap for lap in record.laps] == list(range(1, 2 + on_file[-1]))
-        files = {update.file for update in record.updates}
-        assert {path.name for path in folder.iterdir()} == files | {"learn.db", "laps.json"}
-    assert killed > 15
-    assert on_file == sorted(on_file), "what is on file stays there"
-    assert set(on_file) == {False, True}
+# Ends of trainings and of jobs ----------------------------------------------------------------
 
 
 @pytest.mark.parametrize("second", ["died", "interrupted"])

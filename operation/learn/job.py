@@ -78,10 +78,9 @@ def learn(
             say(f"resuming in {folder} after lap {len(journal.record.laps)}{why}")
         elif given is not None:
             known = samples is not None and given.dataset_digest == samples.digest()
-            stages = {} if known else {"kept": recalled(given, car)}
-            stages |= {} if samples is None else {"new": samples}
-            journal.add_update(UpdateRecord(after_lap=0), given, **stages)
-        elif samples is not None:
+            kept = None if known else recalled(given, car)
+            journal.add_update(UpdateRecord(after_lap=0), given, kept)
+        if samples is not None and not journal.resumed:
             journal.add_driven(samples)
         with open_session(endpoints, "learning") as session:
             Learner(session, journal, say, track, beside).run()
@@ -203,17 +202,15 @@ class Learner:
     def _finish_training(self) -> None:
         if (outcome := self._trainer.poll()) is None:
             return
-        kept, failed = outcome.kept, outcome.weights is None
+        failed = outcome.weights is None
         update = UpdateRecord(
             after_lap=self._after_lap,
             samples=outcome.samples,
-            kept=0 if kept is None else len(kept),
             training_s=round(outcome.training_s, 3),
             verdict="failed" if failed else "pending",
             answer=outcome.error,
         )
-        stages = {} if kept is None else {"kept": kept, "learning": kept.select(slice(0))}
-        self._journal.add_update(update, outcome.weights, **stages)
+        self._journal.add_update(update, outcome.weights, outcome.kept)
         self._journal.drop_weights(self._publisher.in_use)
         draw(self._journal.record, self._beside, self._journal.folder / "laps.png")
         if failed:

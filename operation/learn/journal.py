@@ -1,22 +1,21 @@
-"""The folder of a learning job: ``learn.db``, and the files made beside it.
+"""The folder of a learning job: ``laps.json``, ``samples.npz``, and the files made beside them.
 
-``learn.db`` (SQLite, one table of named contents) holds all that a job needs to resume: its
-:class:`~.records.Record`, and its samples in three stages: ``new`` (driven since the last training
-began), ``learning`` (taken by a training) and ``kept`` (by the last training that ended). Each
-change is one transaction that is on the disk when it ends: after a kill or a power failure at any
-moment every sample is in one stage.
+``laps.json`` is the job's :class:`~.records.Record`. ``samples.npz`` holds its samples, first those
+that the last training kept, then those that no training has learned from to its end. Each file is
+replaced as a whole, so a job that is killed at any moment leaves files that the next one can read.
 """
 
-import sqlite3
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from pydantic import ValidationError
 
 from bayesrace.errors import InputError, faults_in
-from bayesrace.files import clear_partials, write_whole
+from bayesrace.files import claimed, clear_partials, read_text, replacing, write_whole
 from bayesrace.gp.weights import OUTPUTS, GpWeights, write_weights
+from learning.arrays import dataset_from_npz, write_npz
 from learning.dataset import Dataset, concatenate
 from learning.pool import MOST_NEW
 from learning.subset import evenly
@@ -27,14 +26,10 @@ __all__ = ["MOST_WEIGHTS", "Journal", "resumable_settings"]
 MOST_WEIGHTS: Final = 20
 """Weights files kept, the newest; besides, those that are in use or were last accepted."""
 
-_DATABASE: Final = "learn.db"
-_SCHEMA: Final = """
-    PRAGMA synchronous = FULL;
-    PRAGMA locking_mode = EXCLUSIVE;
-    BEGIN EXCLUSIVE;
-    CREATE TABLE IF NOT EXISTS content (name TEXT PRIMARY KEY, data BLOB);
-    COMMIT;
-"""
+_RECORD: Final = "laps.json"
+_SAMPLES: Final = "samples.npz"
+_BEGUN: Final = _SAMPLES, "weights-0000.bin", ".*.part*"
+"""What a job that was killed before its first record may have left."""
 
 
 class Journal:
@@ -43,32 +38,52 @@ class Journal:
     def __init__(self, folder: Path, settings: LearnSettings) -> None:
         """Makes the folder, or resumes the job in it.
 
-        InputError if it holds a job of another car or discretisation, or something else, if the
-        database is damaged, or if another job runs in the folder.
+        InputError if it holds a job of another car or discretisation, or something else, if its
+        files are damaged, or if another job runs in the folder.
         """
-        path = folder / _DATABASE
-        if folder.is_dir() and not path.exists() and any(folder.iterdir()):
+        before = _read_record(folder)
+        there = folder.iterdir() if folder.is_dir() and before is None else ()
+        if not all(any(path.match(one) for one in _BEGUN) for path in there):
             raise InputError(f"{folder} holds something else; choose another folder")
-        folder.mkdir(parents=True, exist_ok=True)
-        self._database, self.record, stages = _open(path)
-        before, self.record.settings = self.record.settings, settings
-        self.folder, self.settings, self.resumed = folder, settings, before is not None
-        for what in ("car", "name", "discretisation"):
-            if before is not None and getattr(before, what) != getattr(settings, what):
-                self.close()
-                raise InputError(
-                    f"{folder} holds what was learned with another {what}; choose another folder, "
-                    "or the same settings"
-                )
-        names = ("kept", "learning", "new")
-        self._samples = {name: self._dataset(stages.get(name, b"")) for name in names}
+        self._lock = ExitStack()
+        self._lock.enter_context(claimed(folder))
         clear_partials(folder)
-        if self.resumed:
-            self.save()
+        self.folder, self.settings, self.resumed = folder, settings, before is not None
+        self.record = before or Record()
+        self._kept = self._learning = self._new = Dataset(
+            settings.car, settings.discretisation.step_s, *(np.empty((0, n)) for n in (7, 2, 7))
+        )
+        try:
+            self._resume(before)
+        except InputError:
+            self.close()
+            raise
+
+    def _resume(self, before: Record | None) -> None:
+        settings, path = self.settings, self.folder / _SAMPLES
+        was, self.record.settings = self.record.settings, settings
+        if before is None:
+            path.unlink(missing_ok=True)
+            return
+        for what in ("car", "name", "discretisation"):
+            if was is not None and getattr(was, what) != getattr(settings, what):
+                raise InputError(
+                    f"{self.folder} holds what was learned with another {what}; choose another "
+                    "folder, or the same settings"
+                )
+        if path.exists():
+            try:
+                samples = dataset_from_npz(path, settings.car, settings.discretisation.step_s)
+            except InputError as error:
+                raise InputError(f"{error}; restore it, or choose another folder") from None
+            ended = (one.kept for one in reversed(before.updates) if one.verdict != "failed")
+            kept = next(ended, 0)
+            self._kept, self._new = samples.select(slice(kept)), samples.select(slice(kept, None))
+        self.save()
 
     def close(self) -> None:
         """Releases the folder; nothing may be written after this."""
-        self._database.close()
+        self._lock.close()
 
     @property
     def last_accepted(self) -> UpdateRecord | None:
@@ -93,22 +108,23 @@ class Journal:
         if lap is not None:
             self.record.laps.append(lap)
             lap.lap = len(self.record.laps)
+        if samples is not None:
+            self._new = _joined(self._new, samples)
+            self._save_samples()
         if samples is not None or lap is not None:
-            self.save(new=_joined(self._samples["new"], samples or self._dataset()))
+            self.save()
 
     def take_samples(self) -> list[Dataset]:
-        """For a training: the samples kept, and all others, which are in stage ``learning`` now."""
-        learning = _joined(self._samples["learning"], self._samples["new"])
-        if len(learning):
-            self.save(learning=learning, new=self._dataset())
-        return [self._samples["kept"], learning]
+        """For a training: the samples kept, and all others."""
+        self._learning, self._new = _joined(self._learning, self._new), self._new.select(slice(0))
+        return [self._kept, self._learning]
 
     def add_update(
-        self, update: UpdateRecord, weights: GpWeights | None, **samples: Dataset
+        self, update: UpdateRecord, weights: GpWeights | None, kept: Dataset | None = None
     ) -> None:
         """Adds an update with its weights in a file; new weights supersede those still pending.
 
-        ``samples``: stages that change with it.
+        ``kept``: what its training kept of the samples that it was given.
         """
         if weights is not None:
             for one in self.record.updates:
@@ -118,7 +134,11 @@ class Journal:
             update.file = f"weights-{len(self.record.updates):04d}.bin"
             write_weights(self.folder / update.file, weights)
         self.record.updates.append(update)
-        self.save(**samples)
+        if kept is not None:
+            update.kept = len(kept)
+            self._kept, self._learning = kept, self._learning.select(slice(0))
+            self._save_samples()
+        self.save()
 
     def remark(self, text: str) -> bool:
         """Notes why a drive gave nothing to learn from; False if that is noted already."""
@@ -140,52 +160,43 @@ class Journal:
             if path.name not in names:
                 path.unlink()
 
-    def save(self, **samples: Dataset) -> None:
-        """Writes the record and these samples as one transaction, then ``laps.json``."""
-        self._samples |= samples
-        record = self.record.model_dump_json(indent=1) + "\n"
-        content: dict[str, str | bytes] = {"record": record}
-        for stage, data in samples.items():
-            content[stage] = np.hstack((data.x, data.u, data.x_next)).astype("<f8").tobytes()
+    def save(self) -> None:
+        """Writes the record."""
         try:
-            with self._database as database:
-                database.executemany("REPLACE INTO content VALUES (?, ?)", content.items())
-        except sqlite3.Error as error:
-            path = self.folder / _DATABASE
-            raise InputError(f"cannot write {path}: {error}; the job can be resumed") from None
-        write_whole(self.folder / "laps.json", record)
+            write_whole(self.folder / _RECORD, self.record.model_dump_json(indent=1) + "\n")
+        except OSError as error:
+            raise self._unwritable(error) from None
 
-    def _dataset(self, data: bytes = b"") -> Dataset:
-        x, u, x_next = np.split(np.frombuffer(data, "<f8").reshape(-1, 16), [7, 9], axis=1)
-        return Dataset(self.settings.car, self.settings.discretisation.step_s, x, u, x_next)
+    def _save_samples(self) -> None:
+        try:
+            with replacing(self.folder / _SAMPLES) as path:
+                write_npz(path, concatenate([self._kept, self._learning, self._new]))
+        except OSError as error:
+            raise self._unwritable(error) from None
+
+    def _unwritable(self, error: OSError) -> InputError:
+        why = f"cannot write in {self.folder}: {error.strerror or error}"
+        return InputError(f"{why}; the job can be resumed")
 
 
 def resumable_settings(folder: Path) -> LearnSettings | None:
     """Settings of the job that a new one in this folder resumes; None if there is none.
 
-    InputError if the database is damaged, or if another job runs in the folder.
+    InputError if the record is damaged.
     """
-    if not (folder / _DATABASE).is_file():
+    record = _read_record(folder)
+    return None if record is None else record.settings
+
+
+def _read_record(folder: Path) -> Record | None:
+    path = folder / _RECORD
+    if not path.exists():
         return None
-    database, record, _ = _open(folder / _DATABASE)
-    database.close()
-    return record.settings
-
-
-def _open(path: Path) -> tuple[sqlite3.Connection, Record, dict[str, bytes]]:
-    """The database, locked until it is closed, and the record and the samples in it."""
-    database = sqlite3.connect(path, timeout=0)
+    remedy = "restore it, or choose another folder"
     try:
-        database.executescript(_SCHEMA)
-        content: dict[str, Any] = dict(database.execute("SELECT name, data FROM content"))
-        return database, Record.model_validate_json(content.pop("record", "{}")), content
-    except (sqlite3.Error, ValidationError) as error:
-        database.close()
-        fault = faults_in(error) if isinstance(error, ValidationError) else error
-        why = f"{path} cannot be read ({fault}); restore it"
-        if getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_BUSY:
-            why = f"another learning job runs in {path.parent}; end it first"
-        raise InputError(f"{why}, or choose another folder") from None
+        return Record.model_validate_json(read_text(path, "record", remedy))
+    except ValidationError as error:
+        raise InputError(f"{path} cannot be read ({faults_in(error)}); {remedy}") from None
 
 
 def _joined(first: Dataset, second: Dataset) -> Dataset:
