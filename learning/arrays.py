@@ -37,8 +37,8 @@ __all__ = ["MAX_BYTES", "car_of_npz", "dataset_from_npz", "write_npz"]
 MAX_BYTES: Final = 1 << 30
 """Upper limit of the unpacked size; larger files are refused before they are read."""
 
-_SAMPLES: Final = {"x", "u", "x_next"}
-_DRIVE: Final = {"states", "inputs"}
+_SAMPLES: Final = "x", "u", "x_next"
+_DRIVE: Final = "states", "inputs"
 _ABOUT: Final = {"car", "step_s"}
 _SCHEMA: Final = (
     "need 'car', 'step_s', and either 'x' (n, 7), 'u' (n, 2), 'x_next' (n, 7) or "
@@ -68,26 +68,22 @@ def dataset_from_npz(
 
 
 def car_of_npz(path: str | os.PathLike[str]) -> CarParameters | None:
-    """The car that a file describes; None if it describes none. InputError if it is no such file.
+    """The car that a file describes, its samples unchecked; None if it describes none.
 
-    The samples are not checked.
+    InputError if it is no such file.
     """
     arrays = _read(path, only="car")
     try:
-        return _car(arrays["car"]) if "car" in arrays else None
+        return _car(arrays) if arrays else None
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
 
 def write_npz(path: str | os.PathLike[str], dataset: Dataset) -> None:
     """The samples as :func:`dataset_from_npz` reads them."""
+    car, step_s = np.array(car_text(dataset.car)), np.array(dataset.step_s)
     np.savez_compressed(
-        path,
-        car=np.array(car_text(dataset.car)),
-        step_s=np.array(dataset.step_s),
-        x=dataset.x,
-        u=dataset.u,
-        x_next=dataset.x_next,
+        path, car=car, step_s=step_s, x=dataset.x, u=dataset.u, x_next=dataset.x_next
     )
 
 
@@ -110,33 +106,26 @@ def _dataset(
     arrays: Mapping[str, AnyArray], car: CarParameters | None, step_s: float | None
 ) -> Dataset:
     names = set(arrays)
-    published = names >= _DRIVE and not names & _ABOUT and _is_published(arrays)
-    if not published and names not in (_ABOUT | _SAMPLES, _ABOUT | _DRIVE):
-        raise InputError(f"arrays {', '.join(sorted(names)) or 'none'}; {_SCHEMA}")
-    for name in sorted(names & (_SAMPLES | _DRIVE | {"step_s"})):
+    for name in sorted(names & {*_SAMPLES, *_DRIVE, "step_s"}):
         if arrays[name].dtype.kind not in "fiu":
             raise InputError(f"'{name}' holds no numbers")
-    if published:
-        if "dstates" not in names:
-            raise InputError(
-                "no 'dstates', so these are predictions of a model (the published KIN-*.npz) and "
-                "not a drive: give the drive (DYN-*.npz)"
-            )
-        if car is None or step_s is None:
-            raise InputError("the published form does not name its car and step; give both")
-        return _published(arrays["states"], arrays["inputs"], car, step_s)
-    car, own_step_s = _car(arrays["car"]), arrays["step_s"]
+    if names >= {*_DRIVE} and not names & _ABOUT and _is_published(arrays):
+        return _published(arrays, car, step_s)
+    if names not in ({*_ABOUT, *_SAMPLES}, {*_ABOUT, *_DRIVE}):
+        raise InputError(f"arrays {', '.join(sorted(names)) or 'none'}; {_SCHEMA}")
+    own_step_s = arrays["step_s"]
     if own_step_s.shape != () or not 0 < own_step_s <= 1:
         raise InputError("'step_s' must be one number of seconds, above 0 and at most 1")
+    own = _car(arrays), float(own_step_s)
     if "states" in names:
-        return dataset_from_arrays(car, float(own_step_s), arrays["states"], arrays["inputs"])
-    return Dataset(car, float(own_step_s), arrays["x"], arrays["u"], arrays["x_next"])
+        return dataset_from_arrays(*own, *(arrays[name] for name in _DRIVE))
+    return Dataset(*own, *(arrays[name] for name in _SAMPLES))
 
 
-def _car(description: AnyArray) -> CarParameters:
-    if description.shape != () or description.dtype.kind != "U":
+def _car(arrays: Mapping[str, AnyArray]) -> CarParameters:
+    if arrays["car"].shape != () or arrays["car"].dtype.kind != "U":
         raise InputError("'car' must be one text")
-    return described_car(str(description))
+    return described_car(str(arrays["car"]))
 
 
 def _is_published(arrays: Mapping[str, AnyArray]) -> bool:
@@ -144,8 +133,18 @@ def _is_published(arrays: Mapping[str, AnyArray]) -> bool:
     return len(states) == 2 and states[0] in (6, 7) and inputs == (2, states[1] - 1)
 
 
-def _published(states: AnyArray, inputs: AnyArray, car: CarParameters, step_s: float) -> Dataset:
+def _published(
+    arrays: Mapping[str, AnyArray], car: CarParameters | None, step_s: float | None
+) -> Dataset:
     """All samples of a published drive; zero columns that pad its end are left out."""
+    if "dstates" not in arrays:
+        raise InputError(
+            "no 'dstates', so these are predictions of a model (the published KIN-*.npz) and "
+            "not a drive: give the drive (DYN-*.npz)"
+        )
+    if car is None or step_s is None:
+        raise InputError("the published form does not name its car and step; give both")
+    states, inputs = arrays["states"], arrays["inputs"]
     used = np.flatnonzero(states.any(axis=0))
     if len(used) < 2:
         raise InputError("fewer than two states that are not zero")

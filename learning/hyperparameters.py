@@ -36,16 +36,12 @@ __all__ = ["BOUNDS", "Fit", "maximise", "refine", "starts"]
 BOUNDS: Final = np.log([(1e-2, 25.0)] + [(1e-1, 1e2)] * len(FEATURES) + [(1e-6, 1.0)])
 """Lower and upper bound of theta, (8, 2)."""
 
-_ARD: Final = np.eye(len(BOUNDS))
-_ISOTROPIC: Final = np.zeros((len(BOUNDS), 3))
-_ISOTROPIC[0, 0] = _ISOTROPIC[-1, 2] = 1.0
-_ISOTROPIC[1:-1, 1] = 1.0
-"""theta as a function of what is searched: all of it, or one length scale for all features."""
+_ISOTROPIC: Final = np.eye(3)[[0] + [1] * len(FEATURES) + [2]]
+"""theta (8,) as a function of what is searched where all features share one length scale, (3,)."""
 
 _FIRST: Final = np.log([10.0] + [3.0] * len(FEATURES) + [1e-3])
 _WORST: Final = 1e25
 """Objective where the covariance is singular; an optimiser then shortens its step."""
-
 
 _CURVATURE: Final = 0.05, 50.0
 """Smallest and largest eigenvalue of an inverse Hessian that is believed."""
@@ -93,7 +89,7 @@ def maximise(
     ``isotropic``: all features share one length scale, at the start the first one's.
     """
     cost = _cost(kind, pairs, y)
-    spread = _ISOTROPIC if isotropic else _ARD
+    spread = _ISOTROPIC if isotropic else np.eye(len(BOUNDS))
     searched = spread.argmax(axis=0)
 
     def objective(point: Floats) -> tuple[float, Floats]:

@@ -10,10 +10,7 @@ K = L L', r = L^-1 k, and the columns of Q an orthonormal basis of those of L^-1
 
     r~ = r - Q Q' r,    mean = r~' L^-1 y,    variance = s^2 + noise - r~' r~,
 
-so that one factorisation does for all folds. With Q R = [L^-1]_B, the samples of the fold are
-predicted with
-
-    y_B - mean_B = R^-1 Q' L^-1 y,    covariance_B = R^-1 R^-1'.
+so that one factorisation does for all folds.
 """
 
 from dataclasses import dataclass
@@ -25,7 +22,6 @@ from scipy.linalg import cholesky, lapack, solve_triangular
 from bayesrace.arrays import Floats, Rows
 from bayesrace.errors import InputError
 from bayesrace.gp.expression import kernel_matrix
-from learning.scores import PredictionErrors
 
 __all__ = ["Covariance", "Posterior"]
 
@@ -78,11 +74,6 @@ class Posterior:
         solved: Floats = solve_triangular(self._factor, right, lower=True, check_finite=False)
         return solved
 
-    @property
-    def _inverse(self) -> Floats:
-        """L^-1."""
-        return np.tril(lapack.dtrtri(self._factor, lower=1)[0])
-
     def _sigma(self, root: Floats) -> Floats:
         """Standard deviations, noise included, for the columns of L^-1 k."""
         noise, prior = self._covariance.noise, self._covariance.signal + self._covariance.noise
@@ -104,7 +95,7 @@ class Posterior:
 
         ``folds`` (n,) numbers those of the training samples, ``own`` (m,) those of the points.
         """
-        inverse = self._inverse
+        inverse = np.tril(lapack.dtrtri(self._factor, lower=1)[0])
         mean, sigma = np.empty(len(z)), np.empty(len(z))
         for fold in np.unique(own):
             part = own == fold
@@ -113,15 +104,3 @@ class Posterior:
             root -= basis @ (basis.T @ root)
             mean[part], sigma[part] = self._white @ root, self._sigma(root)
         return mean, sigma
-
-    def held_out(self, folds: Rows) -> PredictionErrors:
-        """Errors at the training samples, each predicted without its fold of ``folds`` (n,)."""
-        inverse, noise = self._inverse, self._covariance.noise
-        error, sigma = np.empty(len(folds)), np.empty(len(folds))
-        for fold in np.unique(folds):
-            rows = folds == fold
-            basis, root = np.linalg.qr(inverse[:, rows])
-            root = np.linalg.inv(root)
-            error[rows] = root @ (basis.T @ self._white)
-            sigma[rows] = np.sqrt(np.maximum(np.einsum("ij,ij->i", root, root), noise))
-        return PredictionErrors(error, sigma)

@@ -1,4 +1,4 @@
-"""The one-step error of the discretised nominal model: what the GP learns."""
+"""The one-step error of the discretised nominal model: what the GP learns, and knows."""
 
 import re
 from typing import Final
@@ -8,13 +8,14 @@ from pydantic import ValidationError
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import OUTPUTS
+from bayesrace.gp.expression import evaluate_mean
+from bayesrace.gp.weights import OUTPUTS, GpWeights
 from bayesrace.integrators import Discretisation
 from bayesrace.vehicles.models import STATES, e_kinematic
 from bayesrace.vehicles.parameters import CarParameters
 from learning.dataset import Dataset
 
-__all__ = ["NOMINAL", "discretisation_of", "identity", "residual"]
+__all__ = ["NOMINAL", "discretisation_of", "identity", "recalled", "residual"]
 
 NOMINAL = e_kinematic
 """The model that is corrected."""
@@ -64,3 +65,23 @@ def residual(dataset: Dataset, discretisation: Discretisation) -> Floats:
     step = discretisation.discretise(NOMINAL(dataset.car))
     predicted = np.asarray(step(dataset.x.T, dataset.u.T), dtype=np.float64).T
     return dataset.x_next[:, _ROWS] - predicted[:, _ROWS]
+
+
+def recalled(weights: GpWeights, car: CarParameters) -> Dataset:
+    """What weights know at their own training inputs, as samples of ``car``, which is theirs.
+
+    For where the drives that they were learned from are not at hand. Each sample is a step of the
+    nominal model from the origin, plus the mean: learned from again they give nearly the same
+    means. InputError if the model is not known here.
+    """
+    discretisation = discretisation_of(weights.discretisation, car)
+    every = np.vstack([output.inputs for output in weights.outputs])
+    _, first = np.unique(every, axis=0, return_index=True)
+    z = every[np.sort(first)]
+    x, u = np.hstack((np.zeros((len(z), 3)), z[:, :4])), z[:, 4:]
+    x_next = np.zeros_like(x)
+    if len(z):
+        step = discretisation.discretise(NOMINAL(car))
+        x_next[:] = np.asarray(step(x.T, u.T), dtype=np.float64).T
+        x_next[:, 3:6] += evaluate_mean(weights, z)
+    return Dataset(car, discretisation.step_s, x, u, x_next)

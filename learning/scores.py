@@ -36,11 +36,6 @@ class PredictionErrors:
         return float(np.sqrt(np.mean(self.error**2)))
 
     @property
-    def coverage(self) -> float:
-        """Share of errors within the 95 % interval."""
-        return float(np.mean(np.abs(self.error) <= NORMAL_95 * self.sigma))
-
-    @property
     def log_density(self) -> float:
         """Mean log predictive density per sample."""
         score = (self.error / self.sigma) ** 2 + np.log(2 * np.pi * self.sigma**2)
@@ -69,21 +64,17 @@ class PredictionErrors:
                 sigma[inside] *= math.sqrt(others.variance_scale)
         return replace(self, sigma=sigma)
 
-    def r2(self, truth: Floats) -> float:
-        """Share of the variance of ``truth`` (n,) that is predicted; 0 where it has none."""
-        spread = float(np.sum((truth - truth.mean()) ** 2))
-        return 1.0 - float(np.sum(self.error**2)) / spread if spread > 0 else 0.0
-
     def metrics(self, truth: Floats, offset: float = 0.0, scale: float = 1.0) -> dict[str, float]:
         """All scores, and the RMSE that predicting zero would have (``uncorrected_rmse``).
 
         ``truth`` (n,), errors and sigmas may be in scaled units: ``offset + scale * truth`` is the
-        measured quantity, and the scores are in its unit.
+        measured quantity, and the scores are in its unit. R^2 is 0 where ``truth`` is constant.
         """
+        spread = float(np.sum((truth - truth.mean()) ** 2))
         return {
             "rmse": self.rmse * scale,
             "uncorrected_rmse": float(np.sqrt(np.mean((offset + scale * truth) ** 2))),
-            "r2": self.r2(truth),
-            "coverage": self.coverage,
+            "r2": 1.0 - float(np.sum(self.error**2)) / spread if spread > 0 else 0.0,
+            "coverage": float(np.mean(np.abs(self.error) <= NORMAL_95 * self.sigma)),
             "log_density": self.log_density - math.log(scale),
         }

@@ -1,13 +1,25 @@
 """What training may be given; kept apart from it, which takes a second to import."""
 
 from collections.abc import Callable
-from typing import Final
+from typing import Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from learning.kernels import DEFAULT_KERNELS, Kernel
+__all__ = [
+    "DEFAULT_KERNELS",
+    "MIN_SAMPLES",
+    "TOLERANCE",
+    "WIDEN",
+    "Kernel",
+    "Progress",
+    "TrainingSettings",
+]
 
-__all__ = ["MIN_SAMPLES", "TOLERANCE", "WIDEN", "Progress", "TrainingSettings"]
+Kernel = Literal["rbf", "matern05", "matern15", "matern25"]
+"""As in :data:`bayesrace.gp.weights.KERNELS`."""
+
+DEFAULT_KERNELS: Final[tuple[Kernel, ...]] = ("rbf", "matern25")
+"""Candidates of which held-out errors choose one for each output."""
 
 Progress = Callable[[float, str], None]
 """Called from the training's own thread with the share done (0 to 1) and what was done."""

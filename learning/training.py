@@ -7,7 +7,7 @@
    weights, are followed on a third of them, where an evaluation costs a tenth; the best is refined
    on all.
 3. Per output: the kernel of largest log density held out by spans of the drive
-   (:mod:`learning.folds`, :mod:`learning.assessment`).
+   (:mod:`learning.folds`).
 4. Factorise all samples, or the most informative ones that fit (:mod:`learning.subset`).
 5. Scale all variances so that the 95 % interval holds 95 % of the errors held out by stretches of
    the track, if it held less. The mean does not change. A likelihood that finds the data
@@ -22,11 +22,11 @@ for other driving; hyperparameters, kernel and choice of samples depend on all s
 
 import hashlib
 import os
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Final
 
 import numpy as np
@@ -37,7 +37,6 @@ from bayesrace.arrays import Floats, Rows
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import FEATURES, OUTPUTS, GpOutput, GpWeights, encode_weights
 from bayesrace.integrators import Discretisation
-from learning.assessment import ChoiceScore, KernelScore, choice_scores, choose_kernel
 from learning.dataset import Dataset, left_out
 from learning.folds import spans, stretches
 from learning.hyperparameters import Fit, maximise, refine, starts
@@ -46,7 +45,7 @@ from learning.posterior import Posterior
 from learning.residual import identity, residual
 from learning.settings import MIN_SAMPLES, Progress, TrainingSettings
 from learning.subset import evenly, most_informative
-from learning.target import Target
+from learning.target import ChoiceScore, KernelScore, Target
 
 __all__ = ["MAX_SAMPLES", "Training", "fit", "train"]
 
@@ -102,16 +101,19 @@ def fit(
     model.
     """
     settings, report = settings or TrainingSettings(), progress or (lambda share, text: None)
-    model = identity(dataset, discretisation)
+    model, errors = identity(dataset, discretisation), residual(dataset, discretisation)
     if initial is not None and initial.discretisation != model:
         raise InputError(
             f"GP training: cannot start from weights for {initial.discretisation}, this is {model}"
         )
-    _check(dataset, discretisation)
+    _check(dataset, errors)
     samples = dataset.with_mirror_images() if dataset.car.mirrored_samples else dataset
-    targets = _targets(samples, discretisation, stretches(dataset, settings.folds))
+    images = len(samples) // len(dataset)
+    folds = np.repeat(stretches(dataset, settings.folds), images)
+    columns = zip(OUTPUTS, residual(samples, discretisation).T, strict=True)
+    targets = [Target.of(name, samples.features, column, folds) for name, column in columns]
     rows = evenly(len(samples), settings.hyper_points)
-    if dataset.car.mirrored_samples and len(samples) >= 2 * len(rows):
+    if images == 2 and len(samples) >= 2 * len(rows):
         rows = rows - rows % 2 + np.arange(len(rows)) % 2  # a sample and an image in turn
     parts = spans(len(rows), settings.folds)
     subsets = [target.select(rows, parts) for target in targets]
@@ -121,17 +123,22 @@ def fit(
     metrics: dict[str, dict[str, float]] = {}
     # One BLAS thread per fit: the matrices are small, and the fits run side by side.
     with threadpool_limits(1, "blas"):
-        fits = _optimise(subsets, settings, initial, report)
-        for i, target in enumerate(targets):
-            chosen, scores = choose_kernel(subsets[i], fits[i])
-            output, measured, costs = _finish(
-                target, chosen, samples.features, settings, compare, first=initial is None
-            )
-            outputs.append(output)
+        every = _optimise(subsets, settings, initial, report)
+        for target, subset, fits in zip(targets, subsets, every, strict=True):
+            chosen, scores = subset.choose_kernel(fits)
             kernels += scores
-            choices += costs
+            kept = most_informative(
+                chosen.kind, target.z, chosen.covariance.lengths,
+                chosen.covariance.noise / chosen.covariance.signal, settings.capacity,
+            )  # fmt: skip
+            widen = 1.0 if initial is not None else settings.widen
+            output, measured = _learned(target, chosen, kept, samples.features[kept], widen)
+            outputs.append(output)
             metrics |= measured
-            report(0.9 + 0.1 * (i + 1) / len(targets), f"{target.name}: {chosen.kind} chosen")
+            if compare and len(kept) < len(target.y):
+                choices += target.compare(chosen.covariance, kept, settings.seed)
+            done = len(outputs) / len(targets)
+            report(0.9 + 0.1 * done, f"{target.name}: {chosen.kind} chosen")
     checked = evenly(len(dataset), _CHECKED)
     weights = GpWeights(
         version="unnamed",
@@ -141,13 +148,21 @@ def fit(
         dataset_digest=dataset.digest(),
         metrics=metrics,
         sample_features=dataset.features[checked],
-        sample_residuals=residual(dataset, discretisation)[checked],
+        sample_residuals=errors[checked],
     )
-    return Training(_named(weights), tuple(kernels), tuple(choices))
+    # Named by content: the same samples and settings always give the same version.
+    digest = hashlib.sha256(encode_weights(weights)).hexdigest()
+    weights = replace(
+        weights,
+        version=f"{weights.car}-{digest[:10]}",
+        created_utc_ns=time.time_ns(),
+        program=f"bayesrace {__version__}",
+    )
+    return Training(weights, tuple(kernels), tuple(choices))
 
 
-def _check(dataset: Dataset, discretisation: Discretisation) -> None:
-    """InputError for samples that nothing can be learned from."""
+def _check(dataset: Dataset, errors: Floats) -> None:
+    """InputError for samples that nothing can be learned from; ``errors``: their residuals."""
     count = len(dataset)
     if not MIN_SAMPLES <= count <= MAX_SAMPLES:
         few = count < MIN_SAMPLES
@@ -157,29 +172,11 @@ def _check(dataset: Dataset, discretisation: Discretisation) -> None:
             f"GP training: {count} samples, {needed} (left out: {left_out(dataset.dropped)}); "
             f"{remedy}"
         )
-    z, y = dataset.features, residual(dataset, discretisation)
     names = (*FEATURES, *(f"the residual of {output}" for output in OUTPUTS))
-    for name, column in zip(names, (*z.T, *y.T), strict=True):
+    for name, column in zip(names, (*dataset.features.T, *errors.T), strict=True):
         if column.std() <= _CONSTANT * max(1.0, float(np.abs(column).max())):
             fault = f"{name} is {column[0]:g} in every sample"
             raise InputError(f"GP training: {fault}: nothing to learn; vary the driving")
-
-
-def _targets(samples: Dataset, discretisation: Discretisation, parts: Rows) -> list[Target]:
-    """One target per output; ``parts``: the fold of each sample, and of its mirror image."""
-    folds = np.repeat(parts, len(samples) // len(parts))
-    columns = zip(OUTPUTS, residual(samples, discretisation).T, strict=True)
-    return [Target.of(name, samples.features, column, folds) for name, column in columns]
-
-
-def _starts(
-    target: Target, settings: TrainingSettings, initial: GpOutput | None
-) -> dict[str, list[Floats]]:
-    """Where the optimisations for one output start, by kernel."""
-    guesses = starts(settings.restarts if initial is None else 0, settings.seed)
-    every: dict[str, list[Floats]] = dict.fromkeys(settings.kernels, guesses)
-    # The kernel that suits more data may be another one: those not in use start anew, once.
-    return every if initial is None else every | {initial.kernel: [target.theta_of(initial)]}
 
 
 def _optimise(
@@ -188,79 +185,61 @@ def _optimise(
     initial: GpWeights | None,
     report: Progress,
 ) -> list[list[Fit]]:
-    """The fits of each output, one for each kernel."""
-    known = (
-        initial.outputs if initial is not None and all(initial.counts) else [None] * len(targets)
-    )
-    z = targets[0].z
+    """The best fit of each output with each kernel; several are sought at once."""
+    z, limits = targets[0].z, (settings.iterations, settings.tolerance)
     some = evenly(len(z), max(MIN_SAMPLES, len(z) // _THINNED))
-    pairs, few = PairDistances(z), PairDistances(z[some])
-    limits = settings.iterations, settings.tolerance
-    rough = [
-        (target.name, partial(maximise, kind, few, target.y[some], start, *limits))
-        for target, output in zip(targets, known, strict=True)
-        for kind, guesses in _starts(target, settings, output).items()
-        for start in guesses
-    ]
-    best: dict[tuple[str, str], Fit] = {}
-    found = _side_by_side(rough, settings, lambda share, text: report(0.4 * share, text))
-    for (name, _), fit in zip(rough, found, strict=True):
-        best[name, fit.kind] = max(
-            best.get((name, fit.kind), fit), fit, key=lambda one: one.log_likelihood
-        )
-    y = {target.name: target.y for target in targets}
-    fine = [
-        (name, partial(refine, pairs, y[name], fit, *limits)) for (name, _), fit in best.items()
-    ]
-    found = _side_by_side(fine, settings, lambda share, text: report(0.4 + 0.5 * share, text))
-    return [
-        [fit for (name, _), fit in zip(fine, found, strict=True) if name == target.name]
-        for target in targets
-    ]
+    pairs, few, ended = PairDistances(z), PairDistances(z[some]), threading.Event()
 
+    def best(target: Target, kind: str, guesses: Sequence[Floats]) -> Fit:
+        rough: list[Fit] = []
+        for guess in guesses:
+            if ended.is_set():
+                raise InterruptedError
+            rough.append(maximise(kind, few, target.y[some], guess, *limits))
+        found = max(rough, key=lambda fit: fit.log_likelihood)
+        return refine(pairs, target.y, found, *limits)
 
-def _side_by_side(
-    tasks: Sequence[tuple[str, Callable[[], Fit]]], settings: TrainingSettings, report: Progress
-) -> list[Fit]:
-    """What the optimisations find, each with the name of its output; several run at once."""
+    usual = starts(settings.restarts if initial is None else 0, settings.seed)
+    tasks = []
+    for i, target in enumerate(targets):
+        guesses: dict[str, list[Floats]] = dict.fromkeys(settings.kernels, usual)
+        if initial is not None and all(initial.counts):
+            # The kernel that suits more data may be another one: others start anew, once.
+            known = initial.outputs[i]
+            guesses |= {known.kernel: [target.theta_of(known)]}
+        tasks += [(target, *one) for one in guesses.items()]
     pool = ThreadPoolExecutor(settings.threads or os.cpu_count() or 1)
     try:
-        futures = {pool.submit(task): name for name, task in tasks}
+        futures = {pool.submit(best, *task): task[0] for task in tasks}
         for done, future in enumerate(as_completed(futures), start=1):
-            report(done / len(tasks), f"{futures[future]}: {future.result().kind}")
+            text = f"{futures[future].name}: {future.result().kind}"
+            report(0.9 * done / len(tasks), text)
     finally:
-        # After an interruption or a failure no other optimisation begins.
+        ended.set()  # after an interruption or a failure no other optimisation begins
         pool.shutdown(cancel_futures=True)
-    return [future.result() for future in futures]
+    return [[one.result() for one, own in futures.items() if own is target] for target in targets]
 
 
-def _finish(
-    target: Target,
-    fit: Fit,
-    inputs: Floats,
-    settings: TrainingSettings,
-    compare: bool,
-    first: bool,
-) -> tuple[GpOutput, dict[str, dict[str, float]], list[ChoiceScore]]:
-    """Factorises with the chosen hyperparameters, calibrates the variance, scores the result."""
+def _learned(
+    target: Target, fit: Fit, rows: Rows, inputs: Floats, widen: float
+) -> tuple[GpOutput, dict[str, dict[str, float]]]:
+    """Factorises the samples ``rows`` with the chosen hyperparameters, calibrates the variance,
+    scores the result. ``inputs``: the features of these samples in SI units."""
     covariance = fit.covariance
-    noise_ratio = covariance.noise / covariance.signal
-    rows = most_informative(fit.kind, target.z, covariance.lengths, noise_ratio, settings.capacity)
-    alpha = Posterior(covariance, target.z[rows], target.y[rows]).alpha
     errors = target.errors_from(rows, covariance)
-    scale = errors.variance_scale * (settings.widen**2 if first else 1.0)
+    scale = errors.variance_scale * widen**2
     output = GpOutput(
         kernel=fit.kind,
         length_scales=covariance.lengths * target.z_scale,
         signal_variance=covariance.signal * scale,
         noise_variance=covariance.noise * scale,
-        inputs=inputs[rows],
-        alpha=alpha / scale,
+        inputs=inputs,
+        alpha=Posterior(covariance, target.z[rows], target.y[rows]).alpha / scale,
         y_mean=target.y_mean,
         y_scale=target.y_scale,
     )
-    metrics = {
-        target.name: target.metrics(target.calibrated(errors)),
+    return output, {
+        target.name: target.metrics(errors),
         f"training {target.name}": {
             "log_likelihood": fit.log_likelihood,
             "variance_scale": scale,
@@ -268,17 +247,3 @@ def _finish(
             "points": float(len(rows)),
         },
     }
-    choose = compare and len(rows) < len(target.y)
-    choices = choice_scores(target, covariance, rows, settings.seed) if choose else []
-    return output, metrics, choices
-
-
-def _named(weights: GpWeights) -> GpWeights:
-    """Named by content: the same samples and settings always give the same version."""
-    digest = hashlib.sha256(encode_weights(weights)).hexdigest()
-    return replace(
-        weights,
-        version=f"{weights.car}-{digest[:10]}",
-        created_utc_ns=time.time_ns(),
-        program=f"bayesrace {__version__}",
-    )

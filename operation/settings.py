@@ -11,8 +11,7 @@ from bayesrace.vehicles import CarParameters, CarSetting, default_car
 from codegen.settings import ProblemName
 from controller.pure_pursuit import PurePursuitSettings
 from controller.settings import MpcSettings
-from learning.kernels import DEFAULT_KERNELS, Kernel
-from learning.settings import WIDEN
+from learning.settings import DEFAULT_KERNELS, WIDEN, Kernel
 from plant.sensors import SensorNoise
 from plant.simulator import PLANT
 from plant.vehicle import SimulatorName

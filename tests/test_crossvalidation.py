@@ -77,7 +77,7 @@ def test_an_interval_is_not_judged_by_the_errors_that_it_was_fitted_to() -> None
     folds = np.arange(1000) // 100
     raw = PredictionErrors(error, np.ones(1000))
     whole = replace(raw, sigma=raw.sigma * np.sqrt(raw.variance_scale))
-    assert whole.coverage == pytest.approx(0.95, abs=0.001)
+    assert whole.metrics(error)["coverage"] == pytest.approx(0.95, abs=0.001)
     scaled = raw.calibrated(folds)
     assert np.mean(np.abs(scaled.error[900:]) < 1.96 * scaled.sigma[900:]) < 0.15
     assert scaled.sigma[900:] == pytest.approx(
@@ -91,7 +91,7 @@ def test_calibration_widens_and_never_narrows() -> None:
     wide = PredictionErrors(error, np.full(200, 5.0))
     assert wide.calibrated(folds).sigma == pytest.approx(wide.sigma)
     narrow = PredictionErrors(error, np.full(200, 0.1))
-    assert 0.9 < narrow.calibrated(folds).coverage < 1
+    assert 0.9 < narrow.calibrated(folds).metrics(error)["coverage"] < 1
     alone = narrow.calibrated(np.zeros(200, dtype=np.int64))
     assert alone.sigma == pytest.approx(0.1), "no other fold to learn the scale from"
 

@@ -12,7 +12,7 @@ from bayesrace.errors import InputError
 from bayesrace.gp.weights import read_weights, zero_weights
 from bayesrace.integrators import PERFECT, PREDICTION
 from bayesrace.vehicles.models import dynamic
-from learning.pool import MOST_NEW
+from learning.subset import MOST_NEW
 from operation.learn.journal import MOST_WEIGHTS, Journal
 from operation.learn.records import LearnSettings, UpdateRecord
 from tests.driven import CAR, drive

@@ -1,7 +1,5 @@
-"""Parts of the learning job, each alone: trainer, publisher, figure and table."""
+"""Parts of the learning job, each alone: publisher, figure and table."""
 
-import os
-import signal
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -15,17 +13,13 @@ from bayesrace.errors import InputError
 from bayesrace.gp.weights import decode_weights, zero_weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.messages import Event, Reply, Scalar
-from bayesrace.vehicles.models import dynamic
-from learning.settings import TrainingSettings
-from learning.worker import NICE, Outcome, Task, Trainer
 from operation.learn import publishing
 from operation.learn.journal import Journal
 from operation.learn.publishing import Publisher
 from operation.learn.records import LapRecord, LearnSettings, Record, UpdateRecord
 from operation.learn.report import draw, print_laps, references
-from tests.driven import CAR, QUICK, blank, drive
+from tests.driven import CAR, blank
 from tests.learning_rig import controller_status, lap
-from tests.programs import until
 
 SETTINGS = LearnSettings(car=CAR)
 NAME = PREDICTION.identity("e_kinematic", CAR)
@@ -206,56 +200,6 @@ def test_a_controller_without_the_last_accepted_weights_gets_them(rig: Publisher
     rig.answers["a"] = no("older than those in use")
     rig.start_controller("theirs")
     assert rig.verdict("a") == "refused"
-
-
-# Training ------------------------------------------------------------------------------------
-
-
-def outcome_of(trainer: Trainer) -> Outcome:
-    found: list[Outcome] = []
-
-    def poll() -> bool:
-        found.extend(filter(None, [trainer.poll()]))
-        return bool(found)
-
-    until(poll, "an outcome")
-    assert not trainer.busy
-    return found[0]
-
-
-@pytest.mark.check
-def test_training_is_a_niced_process_that_may_die(tmp_path: Path) -> None:
-    log = tmp_path / "worker.log"
-    log.write_text("of the job before")
-    trainer = Trainer(tmp_path)
-    assert log.read_text() == ""
-
-    def start(initial: Path | None = None, training: TrainingSettings = QUICK) -> int:
-        task = Task(PREDICTION, [drive(dynamic(CAR), 120, seed=1)], initial, training, 60)
-        trainer.start(task)
-        return trainer.prepare().pid
-
-    try:
-        pid = start()
-        first = outcome_of(trainer)
-        assert first.kept is not None
-        assert (first.error, first.samples, len(first.kept)) == ("", 120, 60)
-        assert os.getpriority(os.PRIO_PROCESS, pid) == NICE
-        assert start(initial=tmp_path / "gone.bin") == pid
-        assert "gone.bin" in outcome_of(trainer).error
-        os.kill(pid, signal.SIGSTOP)  # else it might be done before it is killed
-        start()
-        os.kill(pid, signal.SIGKILL)
-        died = outcome_of(trainer)
-        assert (died.error, died.kept) == ("the training was killed by signal 9", None)
-        start()
-        again = outcome_of(trainer)
-        assert first.weights is not None
-        assert again.weights is not None
-        assert again.weights.version == first.weights.version, "the same samples and weights"
-    finally:
-        trainer.stop()
-    assert [path.name for path in tmp_path.iterdir()] == ["worker.log"]
 
 
 # Figure and table ----------------------------------------------------------------------------

@@ -10,6 +10,7 @@ import signal
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -27,8 +28,8 @@ from bayesrace.transport import Endpoints, Inbox, Item, Kind
 from bayesrace.vehicles.models import dynamic
 from learning.arrays import write_npz
 from learning.dataset import Dataset, concatenate
-from learning.pool import recalled
-from learning.worker import Outcome, Task
+from learning.residual import recalled
+from learning.trainer import Outcome
 from operation.learn import collector, job, journal, publishing
 from operation.learn.publishing import Publisher
 from operation.learn.records import LearnSettings, Record
@@ -73,7 +74,7 @@ class FakeTrainer:
 
     def stop(self) -> None: ...
 
-    def start(self, task: Task) -> None:
+    def start(self, task: partial[Outcome]) -> None:
         self.busy = True
         self._jobs.tasks.append(task)
         if self._jobs.how == "interrupted":
@@ -85,7 +86,7 @@ class FakeTrainer:
         self.busy = False
         if self._jobs.how == "died":
             return Outcome("killed")
-        samples = concatenate(self._jobs.tasks[-1].samples)
+        samples = concatenate(self._jobs.tasks[-1].args[1])
         weights = zero_weights(CAR.name, NAME, f"v{len(self._jobs.tasks)}")
         return Outcome("", weights, len(samples), samples)
 
@@ -95,7 +96,7 @@ class Jobs:
 
     def __init__(self, set_attribute: Callable[[Any, str, Any], None] = setattr) -> None:
         self.said: list[str] = []
-        self.tasks: list[Task] = []
+        self.tasks: list[partial[Outcome]] = []
         self.how: How = "well"
         self._arrive: list[Item] = []
         jobs = self
@@ -118,7 +119,7 @@ class Jobs:
         for module, name, value in (
             (collector, "_PATIENCE_S", 0.0),
             (job, "_TICK_S", 0.001),
-            (job, "Trainer", lambda _: FakeTrainer(jobs)),
+            (job, "Trainer", lambda: FakeTrainer(jobs)),
             (job, "Inbox", Fed),
             (job, "draw", lambda *_: None),
             (job, "open_session", no_network),
@@ -152,7 +153,7 @@ class Jobs:
     @property
     def learned(self) -> Dataset:
         """Samples of the last training."""
-        return concatenate(self.tasks[-1].samples)
+        return concatenate(self.tasks[-1].args[1])
 
 
 @pytest.fixture
@@ -311,7 +312,7 @@ def test_pending_weights_are_sent_by_the_next_job_and_accepted_ones_by_the_one_a
         assert [one.verdict for one in record.updates] == ["accepted"]
     assert sent == ["v1", "v1"]
     jobs.run(tmp_path, *lap_of(SECOND, run=2))
-    assert jobs.tasks[-1].initial == tmp_path / "weights-0000.bin"
+    assert jobs.tasks[-1].keywords["initial"] == tmp_path / "weights-0000.bin"
 
 
 # Drives of no use ------------------------------------------------------------------------------

@@ -1,7 +1,6 @@
 """Learning: samples, residual, likelihood, training, validation."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +13,8 @@ from bayesrace.gp.expression import evaluate_mean
 from bayesrace.gp.weights import FEATURES, KERNELS, OUTPUTS, zero_weights
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.vehicles.models import dynamic, e_kinematic
-from learning.arrays import dataset_from_npz
 from learning.dataset import Dataset, concatenate, filter_dataset, tolerances
-from learning.hyperparameters import BOUNDS, maximise, starts
+from learning.hyperparameters import starts
 from learning.likelihood import MarginalLikelihood, PairDistances
 from learning.logs import dataset_from_log, dataset_from_messages, fallback_cycles
 from learning.posterior import Covariance, Posterior
@@ -161,20 +159,6 @@ def test_a_missing_log_is_an_input_error(tmp_path: Path) -> None:
         dataset_from_log(tmp_path / "none.mcap", CAR, STEP_S)
 
 
-@pytest.mark.parametrize("rows", [6, 7])
-def test_published_arrays_hold_the_angle_at_the_end_of_the_step(tmp_path: Path, rows: int) -> None:
-    random = np.random.default_rng(0)
-    states = random.normal(size=(rows, 8))
-    inputs = np.vstack((np.full(7, 0.5), random.uniform(-0.3, 0.3, 7)))
-    states[:, 6:], inputs[:, 6:] = 0, 0
-    np.savez(tmp_path / "drive.npz", states=states, dstates=states, inputs=inputs)
-    data = dataset_from_npz(tmp_path / "drive.npz", CAR, STEP_S)
-    assert len(data) == 5  # two padding columns are gone
-    assert data.x[0, 6] == 0
-    assert np.allclose(data.x_next[:, 6], inputs[1, :5])
-    assert np.allclose(data.x[:, 6] + STEP_S * data.u[:, 1], data.x_next[:, 6])
-
-
 # --- likelihood, cross-validation, choice of samples -------------------------------------------
 
 
@@ -198,47 +182,22 @@ def test_singular_covariance_is_minus_infinity_not_an_error() -> None:
     assert not gradient.any()
 
 
-def test_optimum_has_no_slope_within_the_bounds() -> None:
-    z, y = gp_problem(80)
-    fit = maximise("rbf", PairDistances(z), y, starts(0, 0)[0], 200)
-    _, gradient = MarginalLikelihood("rbf", PairDistances(z), y)(fit.theta)
-    free = (fit.theta > BOUNDS[:, 0] + 1e-9) & (fit.theta < BOUNDS[:, 1] - 1e-9)
-    assert np.abs(gradient[free]).max() / len(y) < 1e-3
-    assert np.exp(fit.theta[-1]) == pytest.approx(0.01, rel=0.9)
-
-
 def test_block_errors_equal_training_without_the_block() -> None:
     z, y = gp_problem(30)
     theta = np.log([2.0] + [1.5] * 6 + [0.02])
     posterior = Posterior(Covariance.of("rbf", theta), z, y)
     folds = np.repeat([0, 1, 2], 10)
-    checked = posterior.held_out(folds)
+    mean_without, sigma_without = posterior.predict_without(folds, z, folds)
     without = scikit_gp("rbf", theta, z[10:], y[10:])
     mean, sigma = without.predict(z[:10], return_std=True)
-    assert checked.error[:10] == pytest.approx(y[:10] - mean, abs=1e-9)
-    assert checked.sigma[:10] == pytest.approx(sigma, abs=1e-9)
+    assert mean_without[:10] == pytest.approx(mean, abs=1e-9)
+    assert sigma_without[:10] == pytest.approx(sigma, abs=1e-9)
     new, _ = gp_problem(15, seed=5)
     own = np.arange(15) % 3
     elsewhere = posterior.predict_without(folds, new, own)
     mean, sigma = without.predict(new[own == 0], return_std=True)
     assert elsewhere[0][own == 0] == pytest.approx(mean, abs=1e-9)
     assert elsewhere[1][own == 0] == pytest.approx(sigma, abs=1e-9)
-
-
-def test_informative_samples_beat_the_same_number_of_first_ones() -> None:
-    z, _ = gp_problem(120)
-    lengths = np.full(6, 2.0)
-    chosen = most_informative("rbf", z, lengths, 0.01, 30)
-    assert len(set(chosen.tolist())) == 30
-    assert list(chosen) == sorted(chosen)
-    theta = np.log([1.0] + [2.0] * 6 + [0.01])
-
-    def uncertainty(rows: Any) -> float:
-        gp = scikit_gp("rbf", theta, z[rows], np.zeros(len(rows)))
-        return float(gp.predict(z, return_std=True)[1].mean())
-
-    assert uncertainty(chosen) < uncertainty(np.arange(30))
-    assert len(most_informative("rbf", z, lengths, 0.01, 500)) == 120
 
 
 def test_a_choice_that_needs_too_much_memory_is_refused() -> None:
@@ -248,7 +207,7 @@ def test_a_choice_that_needs_too_much_memory_is_refused() -> None:
 
 def test_greedy_choice_takes_the_largest_posterior_variance() -> None:
     z, _ = gp_problem(25)
-    chosen = set(most_informative("matern25", z, np.ones(6), 0.1, 6).tolist())
+    chosen = most_informative("matern25", z, np.ones(6), 0.1, 6).tolist()
     base, picked = Matern(np.ones(6), nu=2.5), [0]
     while len(picked) < 6:
         own = base(z[picked]) + 0.1 * np.eye(len(picked))
@@ -256,7 +215,8 @@ def test_greedy_choice_takes_the_largest_posterior_variance() -> None:
         variance = 1 - np.einsum("ij,jk,ik->i", cross, np.linalg.inv(own), cross)
         variance[picked] = -1
         picked.append(int(np.argmax(variance)))
-    assert chosen == set(picked)
+    assert chosen == sorted(picked)
+    assert len(most_informative("rbf", z, np.ones(6), 0.1, 500)) == len(z)
 
 
 def test_even_choice_covers_the_whole() -> None:
@@ -370,14 +330,6 @@ def test_update_with_new_driving_improves(driven: Dataset) -> None:
     assert all(new[name]["rmse"] < old[name]["rmse"] for name in OUTPUTS)
     assert after.kernels == before.kernels
     assert after.version != before.version
-
-
-def test_capacity_is_kept(driven: Dataset) -> None:
-    settings = QUICK.model_copy(update={"capacity": 40})
-    weights = train(driven, PREDICTION, settings)
-    assert weights.counts == (40, 40, 40)
-    metrics = validate(weights, driven, PREDICTION).metrics
-    assert all(metrics[name]["r2"] > 0.9 for name in OUTPUTS)
 
 
 def test_zero_weights_validate_as_uncorrected(driven: Dataset) -> None:

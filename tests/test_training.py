@@ -20,10 +20,9 @@ from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from learning.dataset import Dataset
 from learning.hyperparameters import BOUNDS, Fit, maximise, refine, starts
-from learning.likelihood import MarginalLikelihood, PairDistances
-from learning.posterior import Covariance, Posterior
+from learning.likelihood import PairDistances
+from learning.posterior import Covariance
 from learning.residual import discretisation_of, identity, residual
-from learning.settings import TrainingSettings
 from learning.target import Target
 from learning.training import MAX_SAMPLES, Training, fit, train
 from learning.validation import predictive_sigma
@@ -80,17 +79,6 @@ def test_a_fit_to_a_third_of_the_samples_is_refined_to_the_optimum(
     assert np.all((BOUNDS[:, 0] <= found.theta) & (found.theta <= BOUNDS[:, 1]))
 
 
-def test_shared_distances_and_reused_memory_change_nothing() -> None:
-    random = np.random.default_rng(0)
-    pairs, theta = PairDistances(random.normal(size=(30, 6))), starts(1, 0)[1]
-    first, second = (MarginalLikelihood("rbf", pairs, y) for y in random.normal(size=(2, 30)))
-    value, gradient = first(theta)
-    second(theta)
-    again, gradient_again = first(theta)
-    assert value == again
-    assert np.array_equal(gradient, gradient_again)
-
-
 # Choice of kernel and samples --------------------------------------------------------------------
 
 
@@ -124,12 +112,7 @@ def test_prediction_by_stretches_leaves_the_stretch_out(driven: Dataset) -> None
     rows = np.arange(len(driven))
     y = residual(driven, PREDICTION)[:, 1]
     target = Target.of("vy", driven.features, y, 4 * rows // len(driven))
-    covariance = Covariance("matern25", 2.0, np.full(6, 1.5), 0.02)
-    found = target.errors_from(rows, covariance)
-    closed = Posterior(covariance, target.z, target.y).held_out(target.folds)
-    assert found.error == pytest.approx(closed.error, abs=1e-8)
-    assert found.sigma == pytest.approx(closed.sigma, abs=1e-8)
-    without = target.errors_from(rows[:30], covariance)
+    without = target.errors_from(rows[:30], Covariance("matern25", 2.0, np.full(6, 1.5), 0.02))
     # The first stretch, rows 0 to 39, holds all that is known: there is nothing but the prior.
     assert without.error[5] == pytest.approx(target.y[5])
     assert without.sigma[5] == pytest.approx(np.sqrt(2.02))
@@ -143,7 +126,7 @@ def test_training_that_is_interrupted_begins_nothing_more(
 
     def counted(*arguments: Any) -> Fit:
         begun.append(arguments[0])
-        if len(begun) > 1:
+        if len(begun) > 12:
             interruption.wait(60)
         return maximise(*arguments)
 
@@ -152,10 +135,10 @@ def test_training_that_is_interrupted_begins_nothing_more(
         raise KeyboardInterrupt
 
     monkeypatch.setattr("learning.training.maximise", counted)
-    settings = QUICK.model_copy(update={"restarts": 100, "threads": 1})
+    settings = QUICK.model_copy(update={"restarts": 10, "threads": 1})
     with pytest.raises(KeyboardInterrupt):
         fit(driven, PREDICTION, settings, progress=interrupted)
-    assert 1 <= len(begun) < 303
+    assert 11 <= len(begun) < 33
 
 
 # What the weights carry --------------------------------------------------------------------------
@@ -254,13 +237,6 @@ def test_too_few_and_too_many_samples_are_refused_with_the_number(driven: Datase
     many = driven.select(np.zeros(MAX_SAMPLES + 1, dtype=np.int64))
     with pytest.raises(InputError, match="fewer logs"):
         train(many, PREDICTION, QUICK)
-
-
-def test_settings_out_of_range_are_refused() -> None:
-    with pytest.raises(ValueError, match="kernels"):
-        TrainingSettings(kernels=())
-    with pytest.raises(ValueError, match="tolerance"):
-        TrainingSettings(tolerance=0)
 
 
 @pytest.mark.parametrize(

@@ -63,12 +63,15 @@ def test_samples_and_unbroken_drives_are_read(tmp_path: Path, driven: Dataset) -
 def test_the_published_form_is_a_drive_and_needs_car_and_step(
     tmp_path: Path, driven: Dataset
 ) -> None:
+    """Its angles are those at the ends of the steps; zero columns that pad it are left out."""
     path, steering = tmp_path / "p.npz", np.vstack((driven.u[:, 0], driven.x_next[:, 6]))
-    states = np.vstack((driven.x, driven.x_next[-1:])).T
-    np.savez(path, states=states[:6], inputs=steering, time=np.arange(3), dstates=states)
-    found = dataset_from_npz(path, CAR, STEP_S)
-    assert np.array_equal(found.x, driven.x)
-    assert found.u == pytest.approx(driven.u)
+    states = np.pad(np.vstack((driven.x, driven.x_next[-1:])).T, ((0, 0), (0, 2)))
+    steering = np.pad(steering, ((0, 0), (0, 2)))
+    for rows in (6, 7):
+        np.savez(path, states=states[:rows], inputs=steering, time=np.arange(3), dstates=states)
+        found = dataset_from_npz(path, CAR, STEP_S)
+        assert np.array_equal(found.x, driven.x)
+        assert found.u == pytest.approx(driven.u)
     with pytest.raises(InputError, match="does not name its car"):
         dataset_from_npz(path)
     np.savez(path, states=states, inputs=steering, time=np.arange(3))

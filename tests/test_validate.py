@@ -17,9 +17,9 @@ from bayesrace.gp.weights import OUTPUTS, GpWeights, read_weights, write_weights
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from learning.arrays import write_npz
-from learning.assessment import ChoiceScore, KernelScore
 from learning.dataset import Dataset, concatenate
 from learning.residual import identity
+from learning.target import ChoiceScore, KernelScore
 from learning.training import train
 from learning.validation import mismatch, unbroken, validate
 from operation.analysis.validation import ValidationResult, validate_weights

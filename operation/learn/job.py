@@ -9,6 +9,7 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,11 +20,10 @@ from bayesrace.manifest import read_manifest
 from bayesrace.messages import TOPICS, TRUTH, Actuation, Event, State, Status, Telemetry
 from bayesrace.tracks import Track, load_track
 from bayesrace.transport import NEWEST, Endpoints, Inbox, Item, Kind, open_session
-from learning.pool import recalled
-from learning.residual import discretisation_of
+from learning.residual import discretisation_of, recalled
 from learning.settings import TrainingSettings
 from learning.sources import read_samples
-from learning.worker import Task, Trainer
+from learning.trainer import Trainer, perform
 from operation.learn.collector import Collector, Stretch
 from operation.learn.journal import Journal, resumable_settings
 from operation.learn.publishing import Publisher
@@ -104,7 +104,7 @@ class Learner:
         self._journal, self._say, self._beside = journal, say, beside
         self._collector = Collector(settings.car, settings.discretisation.step_s, track)
         self._publisher = Publisher(session, journal, say)
-        self._trainer = Trainer(journal.folder)
+        self._trainer = Trainer()
         self._inbox = Inbox(session, settings.name)
         for topic in TOPICS:
             if topic is not TRUTH:
@@ -197,7 +197,9 @@ class Learner:
         how = TrainingSettings(capacity=settings.points, seed=settings.seed, threads=threads)
         if len(samples[-1]):
             model, initial = settings.discretisation, journal.initial
-            self._trainer.start(Task(model, samples, initial, how, settings.keep))
+            self._trainer.start(
+                partial(perform, model, samples, initial=initial, settings=how, keep=settings.keep)
+            )
 
     def _finish_training(self) -> None:
         if (outcome := self._trainer.poll()) is None:

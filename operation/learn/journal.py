@@ -17,8 +17,7 @@ from bayesrace.files import claimed, clear_partials, read_text, replacing, write
 from bayesrace.gp.weights import OUTPUTS, GpWeights, write_weights
 from learning.arrays import dataset_from_npz, write_npz
 from learning.dataset import Dataset, concatenate
-from learning.pool import MOST_NEW
-from learning.subset import evenly
+from learning.subset import MOST_NEW, evenly
 from operation.learn.records import LapRecord, LearnSettings, Record, UpdateRecord
 
 __all__ = ["MOST_WEIGHTS", "Journal", "resumable_settings"]

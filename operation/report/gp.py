@@ -13,8 +13,8 @@ from matplotlib.patches import Patch
 from bayesrace.arrays import Flags, Floats
 from bayesrace.gp.weights import OUTPUTS, UNITS
 from bayesrace.tracks import Track
-from learning.assessment import KernelScore
 from learning.dataset import Dataset
+from learning.target import KernelScore
 from learning.validation import Validation, unbroken
 from operation.report.canvas import panel
 from operation.report.maps import draw_edges, show_all

@@ -6,8 +6,8 @@ from rich.console import Console
 from rich.text import Text
 
 from bayesrace.gp.weights import OUTPUTS, UNITS
-from learning.assessment import ChoiceScore, KernelScore
 from learning.dataset import left_out
+from learning.target import ChoiceScore, KernelScore
 from operation.analysis.validation import Drift, HorizonResult, Spread, ValidationResult
 from operation.terminal.notation import SMOOTHNESS
 from operation.terminal.race_table import GP_COLUMNS, gp_cells

@@ -1,7 +1,11 @@
-"""What is kept from lap to lap stays bounded and useful; weights can be had back as samples."""
+"""Learning lap by lap: what is kept stays bounded and useful; weights can be had back as samples;
+training in a process of its own."""
 
 import dataclasses
+import os
+import signal
 import tracemalloc
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +16,13 @@ from bayesrace.gp.weights import GpWeights, write_weights, zero_weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.vehicles.models import dynamic
 from learning.dataset import Dataset, concatenate
-from learning.pool import MOST_NEW, bounded, recalled
-from learning.residual import residual
+from learning.residual import recalled, residual
 from learning.settings import TrainingSettings
+from learning.subset import MOST_NEW, bounded
+from learning.trainer import NICE, Outcome, Trainer, perform
 from learning.training import train
-from learning.worker import Task, perform
 from tests.driven import CAR, QUICK, drive
+from tests.programs import until
 
 SMALL = TrainingSettings(**{**QUICK.model_dump(), "capacity": 60})
 
@@ -98,7 +103,7 @@ def test_a_task_learns_from_old_and_new(
 ) -> None:
     write_weights(tmp_path / "first.bin", learned)
     samples = [driven.select(slice(0, 150)), driven.select(slice(150, None))]
-    outcome = perform(Task(PREDICTION, samples, tmp_path / "first.bin", SMALL, keep=150))
+    outcome = perform(PREDICTION, samples, tmp_path / "first.bin", SMALL, keep=150)
     assert (outcome.error, outcome.samples) == ("", 300)
     assert outcome.weights is not None
     assert outcome.weights.counts == (60, 60, 60)
@@ -107,8 +112,69 @@ def test_a_task_learns_from_old_and_new(
 
 
 def test_what_cannot_be_learned_from_is_kept_all_the_same(driven: Dataset) -> None:
-    outcome = perform(Task(PREDICTION, [driven.select(slice(0, 5))], None, SMALL, keep=150))
+    outcome = perform(PREDICTION, [driven.select(slice(0, 5))], None, SMALL, keep=150)
     assert "5 samples" in outcome.error
     assert outcome.weights is None
     assert outcome.kept is not None
     assert len(outcome.kept) == 5
+
+
+# The process ---------------------------------------------------------------------------------
+
+
+def outcome_of(trainer: Trainer) -> Outcome:
+    found: list[Outcome] = []
+
+    def poll() -> bool:
+        found.extend(filter(None, [trainer.poll()]))
+        return bool(found)
+
+    until(poll, "an outcome")
+    assert not trainer.busy
+    return found[0]
+
+
+@pytest.mark.check
+def test_training_is_a_niced_process_that_may_die_or_hang(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trainer, samples = Trainer(), [drive(dynamic(CAR), 120, seed=1)]
+    task = partial(perform, PREDICTION, samples, settings=QUICK, keep=60)
+
+    def start(initial: Path | None = None) -> int:
+        trainer.start(partial(task, initial=initial))
+        return process_of(trainer)
+
+    try:
+        pid = start()
+        first = outcome_of(trainer)
+        assert first.kept is not None
+        assert (first.error, first.samples, len(first.kept)) == ("", 120, 60)
+        assert os.getpriority(os.PRIO_PROCESS, pid) == NICE
+        assert start(initial=tmp_path / "gone.bin") == pid
+        assert "gone.bin" in outcome_of(trainer).error
+        trainer.start(partial(divmod, 1, 0))
+        assert outcome_of(trainer).error.startswith("the training failed: ZeroDivisionError: ")
+        os.kill(pid, signal.SIGSTOP)  # else it might be done before it is killed
+        start()
+        os.kill(pid, signal.SIGKILL)
+        died = outcome_of(trainer)
+        assert (died.error, died.kept) == ("the training was killed by signal 9", None)
+        os.kill(start(), signal.SIGSTOP)
+        monkeypatch.setattr("learning.trainer._LONGEST_S", 0.5)
+        assert "no result after 0 s and was killed" in outcome_of(trainer).error
+        monkeypatch.undo()
+        start()
+        again = outcome_of(trainer)
+        assert first.weights is not None
+        assert again.weights is not None
+        assert again.weights.version == first.weights.version, "the same samples and weights"
+        pid = process_of(trainer)
+    finally:
+        trainer.stop()
+    assert not Path(f"/proc/{pid}").exists()
+
+
+def process_of(trainer: Trainer) -> int:
+    trainer.prepare()
+    return trainer._process.pid or 0
