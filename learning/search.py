@@ -1,6 +1,6 @@
 """Bayesian optimisation: the minimum of a costly function over the unit cube in few evaluations.
 
-A Gaussian process (scikit-learn, Matern 5/2 with one length scale) learns the function from its
+A Gaussian process of scikit-learn (Matern 5/2 with one length scale) learns the function from its
 values so far; the next point has the largest expected improvement on the best of them (Jones,
 Schonlau and Welch 1998). Its logarithm is maximised, as the improvement itself is zero to the last
 bit over most of the cube (Ament et al. 2023).
@@ -14,9 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.linalg import cho_solve
-from scipy.optimize import minimize as bounded_minimum
-from scipy.spatial.distance import cdist
+from scipy.optimize import minimize
 from scipy.special import erfcx
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
@@ -26,7 +24,7 @@ from threadpoolctl import threadpool_limits
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 
-__all__ = ["Search", "SearchSettings", "Surrogate", "search"]
+__all__ = ["Search", "SearchSettings", "log_improvement", "search"]
 
 _REFIT: Final = 5
 """Evaluations from one choice of the hyperparameters to the next."""
@@ -34,6 +32,8 @@ _CANDIDATES: Final = 1000
 _STARTS: Final = 3
 _NEAR: Final = 0.1, 0.02
 """Standard deviations of the candidates around the best point."""
+_STEP: Final = 1e-5
+"""Of the differences that are taken for derivatives."""
 
 
 class SearchSettings(BaseModel):
@@ -85,17 +85,15 @@ def search(
     InputError if no random point has a value.
     """
     rng = np.random.default_rng(settings.seed)
-    x, y = np.empty((0, dimension)), np.empty(0)
+    x, y, kernel = np.empty((0, dimension)), np.empty(0), None
     features = np.eye(dimension) if features is None else features
-    kernel = None
     while len(y) < settings.evaluations and not _spent(y, settings):
-        if len(y) < settings.initial:
-            point = rng.random(dimension)
-        else:
+        point = rng.random(dimension)
+        if len(y) >= settings.initial:
             with threadpool_limits(1, "blas"):
                 refit = kernel is None or len(y) % _REFIT == 0
-                surrogate = Surrogate(x, _finite(y), features, kernel, refit)
-                kernel, point = surrogate.kernel, _most_promising(surrogate, x, y, rng)
+                surrogate = _surrogate(x @ features, _finite(y), kernel, refit)
+                kernel, point = surrogate.kernel_, _most_promising(surrogate, features, x, y, rng)
         x, y = np.vstack([x, point]), np.append(y, function(point))
         if progress is not None:
             progress(len(y) / settings.evaluations, f"{len(y)}: {y.min():.4g}")
@@ -121,74 +119,54 @@ def _finite(y: Floats) -> Floats:
     return np.where(valid, y, y[valid].max())
 
 
-class Surrogate:
-    """A Gaussian process through (x, y), and the logarithm of its expected improvement."""
+def _surrogate(x: Floats, y: Floats, kernel: Any, refit: bool) -> GaussianProcessRegressor:
+    """A Gaussian process through (x, y), with y standardised.
 
-    def __init__(
-        self, x: Floats, y: Floats, features: Floats, kernel: Any = None, refit: bool = True
-    ) -> None:
-        """``features``: see :func:`search`. ``kernel``: of an earlier surrogate, to start from; it
-        stays as it is unless ``refit``."""
-        scaled = (y - y.mean()) / (y.std() or 1.0)
-        if kernel is None:
-            smooth = Matern(1.0, (0.05, 50.0), nu=2.5)
-            kernel = ConstantKernel(1.0, (1e-2, 1e2)) * smooth + WhiteKernel(1e-4, (1e-6, 1e-2))
-        process = GaussianProcessRegressor(
-            kernel, alpha=0.0, optimizer="fmin_l_bfgs_b" if refit else None
-        )
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ConvergenceWarning)  # a parameter on its bound
-            process.fit(x @ features, scaled)
-        self.kernel = process.kernel_
-        self._process, self._features = process, features
-        self._variance = float(self.kernel.k1.k1.constant_value)
-        self._scale = float(self.kernel.k1.k2.length_scale)
-        self._best = float(scaled.min())
-
-    def log_improvement(self, x: Floats) -> Floats:
-        """ln of the expected improvement at ``x`` (m, dimension), over the deviation of y; (m,)."""
-        at = cdist(x @ self._features, self._process.X_train_)
-        sigma, z, _q, h, _inverse = self._improvement(at)
-        return np.asarray(np.log(sigma * h) - z**2 / 2 - math.log(2 * math.pi) / 2)
-
-    def gradient(self, x: Floats) -> Floats:
-        """Of :meth:`log_improvement` at one point ``x`` (dimension,)."""
-        apart = x @ self._features - self._process.X_train_
-        distance = np.linalg.norm(apart, axis=1)
-        sigma, _z, q, h, inverse = self._improvement(distance[None])
-        r = math.sqrt(5) / self._scale * distance
-        slope = -5 / 3 * self._variance * np.exp(-r) * (1 + r) / self._scale**2
-        weights = (inverse[0] / sigma[0] + q[0] * self._process.alpha_) * slope
-        return np.asarray(-self._features @ (weights @ apart) / (sigma[0] * h[0]))
-
-    def _improvement(self, distance: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-        """For distances (m, n) from the data: sigma and z of the prediction, q = Phi(z) / phi(z)
-        and h = 1 + z q, each (m,), and K^-1 k, (m, n); the improvement is sigma phi(z) h."""
-        r = math.sqrt(5) / self._scale * distance
-        k = self._variance * np.exp(-r) * (1 + r + r**2 / 3)
-        inverse = cho_solve((self._process.L_, True), k.T, check_finite=False).T
-        sigma = np.sqrt(np.maximum(self._variance - np.sum(k * inverse, axis=1), 1e-12))
-        z = (self._best - k @ self._process.alpha_) / sigma
-        q = math.sqrt(math.pi / 2) * erfcx(-z / math.sqrt(2))
-        return sigma, z, q, np.maximum(1 + z * q, 1e-300), inverse
+    ``kernel``: of an earlier one, to start from; it stays as it is unless ``refit``.
+    """
+    if kernel is None:
+        smooth = Matern(1.0, (0.05, 50.0), nu=2.5)
+        kernel = ConstantKernel(1.0, (1e-2, 1e2)) * smooth + WhiteKernel(1e-4, (1e-6, 1e-2))
+    how = "fmin_l_bfgs_b" if refit else None
+    process = GaussianProcessRegressor(kernel, alpha=0.0, optimizer=how)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)  # a parameter on its bound
+        return process.fit(x, (y - y.mean()) / (y.std() or 1.0))
 
 
-def _most_promising(surrogate: Surrogate, x: Floats, y: Floats, rng: np.random.Generator) -> Floats:
+def log_improvement(surrogate: GaussianProcessRegressor, x: Floats) -> Floats:
+    """ln of the expected improvement of the noise-free function at ``x`` (m, n), shape (m,)."""
+    mean, sigma = surrogate.predict(x, return_std=True)
+    sigma = np.sqrt(np.maximum(sigma**2 - surrogate.kernel_.k2.noise_level, 1e-12))
+    z = (surrogate.y_train_.min() - mean) / sigma
+    # sigma (phi(z) + z Phi(z)), by Phi / phi, which does not vanish far below the best.
+    h = 1 + z * math.sqrt(math.pi / 2) * erfcx(-z / math.sqrt(2))
+    density = -(z**2) / 2 - math.log(2 * math.pi) / 2
+    return np.asarray(np.log(sigma * np.maximum(h, 1e-300)) + density)
+
+
+def _most_promising(
+    surrogate: GaussianProcessRegressor,
+    features: Floats,
+    x: Floats,
+    y: Floats,
+    rng: np.random.Generator,
+) -> Floats:
     """Where the expected improvement is largest, from the best of many random candidates."""
     dimension, best = x.shape[1], x[int(np.argmin(y))]
     spread = [best + rng.normal(0.0, sd, (_CANDIDATES, dimension)) for sd in _NEAR]
     some = rng.random((_CANDIDATES, dimension))
     mixed = np.where(rng.random(some.shape) < 0.25, some, best)
     candidates = np.clip(np.vstack([rng.random(some.shape), mixed, *spread]), 0.0, 1.0)
-    values = surrogate.log_improvement(candidates)
-    found = []
-    for start in candidates[np.argsort(-values)[:_STARTS]]:
+    differences = np.vstack([np.zeros(dimension), _STEP * np.eye(dimension)])
 
-        def downhill(point: Floats) -> tuple[float, Floats]:
-            return -float(surrogate.log_improvement(point[None])[0]), -surrogate.gradient(point)
+    def downhill(point: Floats) -> tuple[float, Floats]:
+        values = -log_improvement(surrogate, (point + differences) @ features)
+        return float(values[0]), (values[1:] - values[0]) / _STEP
 
-        result = bounded_minimum(
-            downhill, start, jac=True, bounds=[(0.0, 1.0)] * dimension, method="L-BFGS-B"
-        )
-        found.append((float(result.fun), result.x))
-    return np.asarray(min(found, key=lambda one: one[0])[1])
+    values = log_improvement(surrogate, candidates @ features)
+    found = [
+        minimize(downhill, start, jac=True, bounds=[(0.0, 1.0)] * dimension, method="L-BFGS-B")
+        for start in candidates[np.argsort(-values)[:_STARTS]]
+    ]
+    return np.asarray(min(found, key=lambda one: float(one.fun)).x)
