@@ -8,7 +8,8 @@ before and after a span pass the same corner: errors held out by time are about 
 lap, far below those on another track.
 
 *Stretches* are all passages of a place. Errors held out by stretch estimate those on a track that
-was not driven (docs/decisions/2026-11-23-held-out-metrics.md has how well, and why kernels are not chosen by it). No track is
+was not driven (docs/decisions/2026-11-23-held-out-metrics.md has how well, and why kernels are not
+chosen by it). No track is
 needed: in driving order, the first sample of new ground becomes a *leader*, and all samples near
 it, driven in the same direction, are at its place (the leader algorithm: Hartigan, "Clustering
 algorithms", 1975, chapter 3). Leaders follow one another along the path.
