@@ -17,8 +17,11 @@ from bayesrace.files import read_text
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.log import LogReader
 from bayesrace.messages import (
-    HEARTBEAT,
-    TOPICS,
+    ACTUATION,
+    EVENT,
+    STATE,
+    TELEMETRY,
+    TRUTH,
     Actuation,
     CarSample,
     Event,
@@ -48,6 +51,9 @@ _log = logging.getLogger("bayesrace.report")
 RUN_EVENT: Final = "run"
 """Kind of the event that announces a run of a race before it starts."""
 
+
+_RUNS: Final = STATE, TRUTH, ACTUATION, TELEMETRY, EVENT
+"""What a run is made of: the messages of a :class:`RunRecord`."""
 
 _REMARKS: Final = ("weights_rolled_back", "weights_slowed")
 
@@ -315,7 +321,7 @@ class _RunsOfLog:
 
     def read(self) -> None:
         """Takes in what has been added to the log."""
-        for entry in self.reader.newer([topic for topic in TOPICS if topic is not HEARTBEAT]):
+        for entry in self.reader.newer(_RUNS):
             if self.started_ns is None:
                 self.started_ns = entry.wall_ns
             message = entry.message
