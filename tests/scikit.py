@@ -29,7 +29,7 @@ def scikit_gp(
     ``bounds`` (8, 2): the hyperparameters are optimised within, from ``theta``.
     """
     signal, *lengths, noise = np.exp(theta)
-    within: Any = ["fixed"] * 3
+    within: Any = [(1e-12, 1e12)] * 3
     if bounds is not None:
         within = [np.exp(bounds[0]), np.exp(bounds[1:-1]), np.exp(bounds[-1])]
     kernel = correlation(kind, lengths, length_scale_bounds=within[1])

@@ -53,8 +53,8 @@ def test_a_missing_package_of_campaigns_is_named_with_its_extra(
 ) -> None:
     for name in ("page", "summary", "results"):
         monkeypatch.delitem(sys.modules, f"studies.campaign.{name}", raising=False)
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    refused(cli("campaign-report", tmp_path), "pyarrow", "bayesrace[campaign]")
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    refused(cli("campaign-report", tmp_path), "pandas", "bayesrace[campaign]")
 
 
 def test_a_missing_package_of_certificates_is_named_with_its_extra(

@@ -27,7 +27,7 @@ _RACE_PACKAGES: Final = (
 )  # fmt: skip
 _SLIPX_PACKAGES: Final = ("slipx",)
 _CERTIFICATE_PACKAGES: Final = ("cryptography",)
-_CAMPAIGN_PACKAGES: Final = ("bokeh", "dask", "distributed", "optuna", "pyarrow")
+_CAMPAIGN_PACKAGES: Final = ("bokeh", "dask", "distributed", "optuna", "pandas", "pyarrow")
 """Modules that the extras of pyproject.toml install."""
 
 
