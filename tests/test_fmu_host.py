@@ -245,12 +245,14 @@ def test_a_worker_ended_from_outside_is_replaced(hosts: dict[int, FmuHost]) -> N
 
 
 def test_nothing_is_left_after_closing(libraries: dict[int, Path], tmp_path: Path) -> None:
+    environment = dict(os.environ)
     host = faulty_host(faulty_fmu(libraries[2], tmp_path / "f.fmu"))
     host.start({})
     process, folder = process_of(host), folder_of(process_of(host))
     assert folder.is_dir()
     host.close()
     assert not folder.exists()
+    assert dict(os.environ) == environment
     assert process.exitcode == 0
 
 

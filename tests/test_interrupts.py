@@ -46,7 +46,7 @@ def test_an_interrupt_anywhere_is_one_interrupt(tmp_path: Path, how: str) -> Non
     done = subprocess.run(
         [sys.executable, "-m", "struck"],
         cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        env={**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"},
         capture_output=True,
         text=True,
         check=False,

@@ -12,8 +12,8 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
@@ -39,6 +39,22 @@ _SHOWN: Final = 1 << 16
 _KEPT: Final = 4096
 """Bytes in which the last message is looked for."""
 _TROUBLE: Final = re.compile(r"^\[FMU (?!info)\w+\] (.+)", re.MULTILINE)
+
+
+@contextmanager
+def _safe_path() -> Iterator[None]:
+    """A Python that starts meanwhile does not import from the current folder.
+
+    Else a file there that is named as a module of ours or of the standard library replaces it.
+    """
+    before = os.environ.get("PYTHONSAFEPATH")
+    os.environ["PYTHONSAFEPATH"] = before or "1"
+    try:
+        yield
+    finally:
+        del os.environ["PYTHONSAFEPATH"]
+        if before is not None:
+            os.environ["PYTHONSAFEPATH"] = before
 
 
 class _Output(threading.Thread):
@@ -155,8 +171,6 @@ class FmuHost:
 
     def _launch(self) -> None:
         spawn, self._used = get_context("spawn"), False
-        # Else Python imports what the current folder has by the names of its own modules.
-        os.environ.setdefault("PYTHONSAFEPATH", "1")
         try:
             with ExitStack() as ours, ExitStack() as theirs:
                 folder = ours.enter_context(temporary_folder())
@@ -172,7 +186,8 @@ class FmuHost:
                 arguments = (worker, writing, self._cpus, str(folder), str(binary), *names)
                 self._output = _Output(reading)
                 process = spawn.Process(target=serve, args=arguments, daemon=True)
-                process.start()
+                with _safe_path():
+                    process.start()
                 self._process, self._held = process, ours.pop_all()
         except (OSError, RuntimeError) as error:  # no memory, processes, descriptors or disk left
             why = getattr(error, "strerror", None) or error
