@@ -6,6 +6,7 @@ import gc
 import math
 import multiprocessing.util
 import os
+import re
 import tempfile
 import zipfile
 from collections.abc import Iterator
@@ -280,6 +281,9 @@ def test_what_is_no_fmu_for_this_plant_is_refused(
     data[len(data) // 2] ^= 0xFF
     damaged, slipping, empty = (tmp_path / f"{n}.fmu" for n in ("damaged", "slipping", "empty"))
     damaged.write_bytes(data)
+    encrypted = tmp_path / "encrypted.fmu"
+    headers = re.compile(rb"(PK\x01\x02.{4}).", re.DOTALL)  # flags are the ninth byte
+    encrypted.write_bytes(headers.sub(lambda m: m[1] + b"\x01", good.read_bytes()))
     slipping.write_bytes(good.read_bytes())
     with zipfile.ZipFile(slipping, "a") as archive:
         archive.writestr("../../evil.txt", "!")
@@ -296,6 +300,7 @@ def test_what_is_no_fmu_for_this_plant_is_refused(
         (tmp_path / "none.fmu", "no FMU at"),
         (text, "no FMU, or a damaged one"),
         (damaged, "no FMU, or a damaged one"),
+        (encrypted, "is encrypted"),
         (slipping, "leads out of its folder"),
         (empty, "without a modelDescription"),
         (foreign, "is for win64, not for this computer"),
@@ -309,5 +314,8 @@ def test_what_is_no_fmu_for_this_plant_is_refused(
         with pytest.raises(InputError, match=why) as caught, open_fmu(get_car("orca"), path):
             pass
         assert "\n" not in str(caught.value)
+    monkeypatch.setattr("plant.fmu.inspection._MOST_BYTES", 1000)
+    with pytest.raises(InputError, match="claims to unpack to"):
+        faulty_host(good)
     assert not (tmp_path.parent / "evil.txt").exists()
     assert not list((tmp_path / "temporary").iterdir())

@@ -35,7 +35,10 @@ from tests.fmu_variables import OWN, description, given, own_fmu, taken, variabl
         ("[outputs]\nx = 3", "give the name of a variable"),
         ("[outputs]\nx = { variable = 'a', unit = 'cm', scale = 2.0 }", "unit and scale"),
         ("[outputs]\nx = { variable = 'a', scale = 0 }", "loses the value"),
-        ("[outputs]\nx = { variable = 'a', sign = 2 }", "sign is 1 or -1"),
+        (
+            "[outputs]\nx = { variable = 'a', sign = 2 }",
+            "has to be 1 or -1",
+        ),
         ("[inputs]\ngas = { form = 'd' }", "inputs.gas.from"),
         ("[inputs]\ngas = inf", "finite number"),
         ("[parameters]\nm = [1]", "parameters.m"),

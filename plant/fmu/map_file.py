@@ -25,14 +25,8 @@ def _plain(value: Any) -> Any:
     raise ValueError("give a finite number, true, false or a text")
 
 
-def _of_one(sign: float) -> float:
-    if sign in (1.0, -1.0):
-        return sign
-    raise ValueError("sign is 1 or -1; a factor is `scale`")
-
-
 Value = Annotated[bool | int | float | str, pydantic.PlainValidator(_plain)]
-Sign = Annotated[float, pydantic.AfterValidator(_of_one)]
+Sign = Literal[1, -1]
 
 
 class _Section(pydantic.BaseModel):
@@ -55,7 +49,7 @@ class _Affine(_Section):
     """The key of the text that will do alone."""
 
     unit: str | None = Field(None, description="the FMU variable's unit; default: as it declares")
-    sign: Sign = Field(1.0, description="-1: positive the other way round")
+    sign: Sign = Field(1, description="-1: positive the other way round; a factor is `scale`")
     scale: float | None = Field(None, description="factor in place of the unit's")
     offset: float | str = Field(
         0.0, description="added after scaling, in the unit of the result, or with one: '90 deg'"
@@ -145,7 +139,7 @@ class _Heading(_Rule):
     quaternion: _Quaternion | None = Field(None, description="rotation body → world")
     cos: Pick | None = None
     sin: Pick | None = None
-    sign: Sign = 1.0
+    sign: Sign = 1
     offset: float | str = 0.0
 
 
