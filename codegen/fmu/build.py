@@ -35,13 +35,13 @@ class Platform:
     """An operating system and processor that FMI has a folder for.
 
     ``name``: FMI 3.0's folder, and on the command line; ``fmi2``: FMI 2.0's folder; ``suffix``: of
-    binaries; ``zig``: ziglang's target, None if only the host's own compiler can build for it.
+    binaries; ``zig``: ziglang's target.
     """
 
     name: str
     fmi2: str
     suffix: str
-    zig: str | None
+    zig: str
 
     def folder(self, version: int) -> str:
         """Below ``binaries/``."""
@@ -51,8 +51,6 @@ class Platform:
         """What builds for it here; InputError if there is nothing."""
         if self == host_platform():
             return find_compiler()
-        if self.zig is None:
-            raise InputError(f"binaries for {self.name} can only be built on {self.name}")
         if find_spec("ziglang") is None:
             raise InputError(
                 f"a binary for {self.name} is cross-compiled with ziglang, which is missing: "
@@ -66,8 +64,6 @@ _KNOWN: Final = (  # the old glibc is for the binary to load on old systems too
     Platform("x86_64-linux", "linux64", ".so", "x86_64-linux-gnu.2.17"),
     Platform("aarch64-linux", "aarch64-linux", ".so", "aarch64-linux-gnu.2.17"),
     Platform("x86_64-windows", "win64", ".dll", "x86_64-windows-gnu"),
-    Platform("x86_64-darwin", "darwin64", ".dylib", None),
-    Platform("aarch64-darwin", "darwin64", ".dylib", None),
 )
 PLATFORMS: Final = {known.name: known for known in _KNOWN}
 

@@ -44,35 +44,31 @@ class FmuTable:
             yield Text(f"and {hidden} local variable(s)", style="dim")
 
     def _table(self) -> Table:
-        rows = [
-            (title, _cells(variable))
+        sections = {
+            title: [_cells(one) for one in self._fmu.modelVariables if one.causality in causalities]
             for title, causalities in _SECTIONS.items()
-            for variable in self._fmu.modelVariables
-            if variable.causality in causalities and (self._all or title != "locals")
-        ]
-        titles = [title for title, _ in rows]
+            if self._all or title != "locals"
+        }
+        rows = [cells for section in sections.values() for cells in section]
         # Room goes to the names: what no variable has gets no column.
-        shown = [i for i in range(len(_COLUMNS)) if any(cells[i].plain for _, cells in rows)]
+        shown = [i for i in range(len(_COLUMNS)) if any(cells[i].plain for cells in rows)]
         table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, show_edge=False)
         table.add_column("", style="bold")
         for i in shown:
             right = _COLUMNS[i] == "start"
             table.add_column(_COLUMNS[i], justify="right" if right else "left", overflow="fold")
-        for k, (title, cells) in enumerate(rows):
-            begins = titles[k - 1 : k] != [title]
-            ends = titles[k + 1 : k + 2] not in ([], [title])
-            table.add_row(title if begins else "", *(cells[i] for i in shown), end_section=ends)
+        for title, section in sections.items():
+            for k, cells in enumerate(section):
+                table.add_row("" if k else title, *(cells[i] for i in shown))
+            table.add_section()
         return table
 
 
 def _head(fmu: Any, platforms: str) -> Iterator[Text]:
     simulation, step_s = fmu.coSimulation, next(filter(None, steps_s(fmu)), None)
-    kinds = {
-        "Co-Simulation": simulation,
-        "Model Exchange": fmu.modelExchange,
-        "Scheduled Execution": fmu.scheduledExecution,
-    }
-    interfaces = " and ".join(name for name, one in kinds.items() if one) or "no interface"
+    names = {"coSimulation": "Co-Simulation", "modelExchange": "Model Exchange"}
+    names |= {"scheduledExecution": "Scheduled Execution"}
+    interfaces = " and ".join(text for name, text in names.items() if getattr(fmu, name))
     version = f" · FMI {printable(fmu.fmiVersion)} {interfaces}"
     yield Text.assemble((printable(fmu.modelName), "bold"), version)
     if fmu.description:
