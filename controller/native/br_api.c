@@ -31,7 +31,7 @@ br_mpc_error br_mpc_set_parameters(br_mpc *mpc, const br_mpc_parameters *paramet
     if (!valid(parameters)) return BR_ERROR_PARAMETERS;
     mpc->parameters = *parameters;
     mpc->has_parameters = 1;
-    mpc->qp.factorised = mpc->qp.evaluated = mpc->caution.known = 0;
+    br_invalidate(mpc, BR_TUBE);
     br_innovation_undo(&mpc->innovation);
     br_evaluate_penalties(mpc);
     return BR_OK;
@@ -40,7 +40,7 @@ br_mpc_error br_mpc_set_parameters(br_mpc *mpc, const br_mpc_parameters *paramet
 br_mpc_error br_mpc_set_path(br_mpc *mpc, const double *table, int n, double spacing_m) {
     if (!mpc || !table) return BR_ERROR_NULL;
 #if BR_HAS_PATH
-    mpc->followed = 0; /* what has been prepared is of the path before */
+    br_invalidate(mpc, BR_FOLLOWED); /* what has been prepared is of the path before */
     return br_path_load(&mpc->path, table, n, spacing_m);
 #else
     (void)n, (void)spacing_m;
@@ -57,10 +57,10 @@ br_mpc_error br_mpc_set_clock(br_mpc *mpc, br_mpc_clock clock, void *context) {
 void br_mpc_reset(br_mpc *mpc) {
     if (!mpc) return;
     mpc->warm = 0;
-    mpc->linearised = 0;
+    br_invalidate(mpc, BR_LINEARISATION);
     mpc->ahead = mpc->prepared = mpc->prepared_iterations = 0;
     mpc->path.known = 0;
-    mpc->caution.known = mpc->caution.active = 0;
+    mpc->caution.active = 0;
     mpc->caution.pace = mpc->caution.widening = 1;
     mpc->innovation.newest.duration = 0;
     br_innovation_reset(&mpc->innovation);

@@ -117,11 +117,11 @@ static void standard_deviations(br_mpc *mpc, double sigma[BR_N][BR_NE]) {
 void br_caution_update(br_mpc *mpc) {
     const br_gp *gp = &mpc->gp[mpc->gp_in_use];
     br_caution *caution = &mpc->caution;
-    if (caution->known) return;
-    caution->known = 1;
+    if (mpc->valid[BR_TUBE]) return;
+    mpc->valid[BR_TUBE] = 1;
     const int was = caution->active;
     caution->active = mpc->parameters.caution_sigmas > 0 && gp->uncertain;
-    if (was || caution->active) mpc->qp.evaluated = 0;
+    if (was || caution->active) br_invalidate(mpc, BR_TERMS);
     mpc->timer.caution = 0;
     if (!caution->active) return;
     const double begin = br_timer_now(&mpc->timer);

@@ -12,7 +12,7 @@ static void note(const br_mpc *mpc, br_incumbent *incumbent, br_mpc_status statu
 
 static void put_back(br_mpc *mpc, const br_incumbent *incumbent) {
     mpc->plan = incumbent->plan;
-    mpc->linearised = mpc->qp.factorised = mpc->qp.evaluated = mpc->followed = 0;
+    br_invalidate(mpc, BR_LINEARISATION);
     mpc->info.stationarity = incumbent->info.stationarity;
     mpc->info.defect = incumbent->info.defect;
     mpc->info.bound = incumbent->info.bound;

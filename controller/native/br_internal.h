@@ -125,10 +125,8 @@ typedef struct {
 } br_beside;
 
 typedef struct {
-    int factorised; /* g, h, and y, scale, m of the rows before BR_ROW_LATE fit the linearisation */
     int regularised;  /* the exact Hessian was not positive definite */
     double curvature; /* share of the second-order part that is in h */
-    int evaluated;    /* terms belong to the plan, the reference and the parameters */
     br_stage_terms terms[BR_N];
     br_stage_curvature second[BR_N];
     double penalty[BR_NR];                       /* of the soft rows */
@@ -209,7 +207,6 @@ typedef struct {
 
 /* What the residual's uncertainty does to the plan: see br_caution.c. */
 typedef struct {
-    int known;                            /* it belongs to the plan that the step starts with */
     int active;                           /* there is an uncertainty to be cautious about */
     double deviation[BR_N][BR_NE][BR_NX]; /* of the states at the ends of the stages */
     double tube[BR_N];                    /* by how much the rows are uncertain, */
@@ -228,6 +225,17 @@ typedef struct {
     double iteration, trial; /* longest seen, of the line search's trials too; 0: none yet */
     double caution;          /* what the last br_caution_update took */
 } br_timer;
+
+/* What is computed from the plan, the weights and a call's arguments, and kept while these stay.
+ * The order is such that none is needed for one after it: see br_invalidate. */
+typedef enum {
+    BR_TERMS,    /* qp.terms: of the plan, the reference, u_before, the parameters and the tube */
+    BR_FOLLOWED, /* reference and first_row: where the plan is on the line, if it follows that */
+    BR_FACTORS,  /* qp: g, h, and y, scale, m of the rows before BR_ROW_LATE */
+    BR_TUBE,     /* caution: of the plan that the step starts with */
+    BR_LINEARISATION, /* stage[]: of the plan and the weights in use */
+    BR_RESULTS
+} br_result;
 
 /* The spare one of the weight buffers, and whose it is. */
 enum {
@@ -250,15 +258,14 @@ struct br_mpc {
     double x0[BR_NX];
     br_mpc_reference reference[BR_N];
     int own_reference; /* of the caller's planner */
-    int follows;   /* the reference is where the plan is on the line, not points to track, ... */
-    int followed;  /* ... and belongs to the plan at hand, ... */
-    int first_row; /* ... of which the first stage is at this row of the path */
+    int follows;   /* the reference is where the plan is on the line, not points to track; ... */
+    int first_row; /* ... the plan's first stage is at this row of the path */
     double turn;   /* the side that the car turns round to, 1 left, -1 right; 0: it does not */
     double turn_u[BR_N][BR_NU]; /* inputs that the reference of a turn has been made with */
     /* the plan, primal and dual */
-    int warm;          /* a plan from the step before is there */
-    int linearised;    /* stage[] belongs to the plan and the weights in use, ... */
-    int curved;        /* ... and so do its Hessians */
+    int warm;               /* a plan from the step before is there */
+    char valid[BR_RESULTS]; /* by br_result */
+    int curved;             /* the Hessians in stage[] belong to the linearisation */
     unsigned attempts; /* steps without a usable plan since the last warm start that gave one */
     int unfinished;    /* iterations that BR_TIME_LIMIT has left without a usable plan */
     double elapsed;    /* since the call before */
@@ -292,6 +299,11 @@ struct br_mpc {
     br_gp gp[3]; /* in use, proven, spare; last: what of it no weights are loaded into is never
                     touched */
 };
+
+/* The result and all before it have to be computed again: what they are made from has changed. */
+static inline void br_invalidate(br_mpc *mpc, br_result result) {
+    memset(mpc->valid, 0, result + 1);
+}
 
 /* br_gp.c */
 /* Mean and gradient of several stages, at most BR_N. Their weights for br_gp_curvature go into

@@ -238,10 +238,10 @@ void br_path_follow(br_mpc *mpc) {
     if (!mpc->follows) return;
     const int car = (int)(wrap_length(path->s, path->length) / path->spacing) % path->n;
     int i = nearest_from(path, car, mpc->plan.x[1]);
-    if (mpc->followed && i == mpc->first_row) return;
-    mpc->followed = 1;
+    if (mpc->valid[BR_FOLLOWED] && i == mpc->first_row) return;
+    br_invalidate(mpc, BR_FACTORS);
+    mpc->valid[BR_FOLLOWED] = 1;
     mpc->first_row = i;
-    mpc->qp.factorised = mpc->qp.evaluated = 0;
     for (int k = 0; k < BR_N; ++k) {
         const double *x = mpc->plan.x[k + 1];
         double s, lateral, row[BR_PATH_COLUMNS], tangent[2];

@@ -27,15 +27,14 @@ int br_shifts_due(double *lag) {
 void br_align(br_mpc *mpc, int shifts) {
     if (shifts < mpc->ahead) br_undo_preparation(mpc); /* the step comes sooner than expected */
     for (; mpc->ahead < shifts; mpc->ahead += 1) br_sqp_shift(mpc);
-    if (!mpc->linearised) br_sqp_linearise(mpc);
+    if (!mpc->valid[BR_LINEARISATION]) br_sqp_linearise(mpc);
 }
 
 void br_undo_preparation(br_mpc *mpc) {
     if (mpc->ahead) {
         mpc->plan = mpc->kept;
         memcpy(mpc->qp.sense, mpc->kept_sense, sizeof mpc->kept_sense);
-        mpc->linearised = mpc->qp.factorised = mpc->qp.evaluated = mpc->followed = 0;
-        mpc->caution.known = 0;
+        br_invalidate(mpc, BR_LINEARISATION);
     }
     mpc->ahead = mpc->looked = 0;
     br_innovation_undo(&mpc->innovation);
@@ -44,7 +43,7 @@ void br_undo_preparation(br_mpc *mpc) {
 /* Of other weights or code; the preparation's new last stage was predicted with those before. */
 void br_forget_linearisation(br_mpc *mpc) {
     br_undo_preparation(mpc);
-    mpc->linearised = mpc->qp.factorised = mpc->caution.known = 0;
+    br_invalidate(mpc, BR_LINEARISATION);
 }
 
 /* Time for an iteration, and what follows it: restoring the best plan, shift and factorisation,
@@ -70,7 +69,7 @@ static void foresee(br_mpc *mpc, double elapsed, int shifts) {
         br_path_plan(&mpc->path, mpc->caution.pace, mpc->reference);
     }
 #endif
-    mpc->followed = mpc->qp.evaluated = 0;
+    br_invalidate(mpc, BR_FOLLOWED);
     br_evaluate_bounds(mpc);
     br_path_follow(mpc);
 }
@@ -106,7 +105,7 @@ static void look_elsewhere(br_mpc *mpc) {
     timer->deadline -= iteration_and_rest(timer);
     if (!br_timer_allows(timer, br_timer_now(timer), BR_SECOND_START_ITERATIONS * timer->iteration))
         return;
-    if (!mpc->linearised) br_sqp_linearise(mpc);
+    if (!mpc->valid[BR_LINEARISATION]) br_sqp_linearise(mpc);
     memset(&mpc->info, 0, sizeof mpc->info);
     br_residuals(mpc);
     const br_mpc_status status = br_judge(mpc);
@@ -124,7 +123,7 @@ static void solve_ahead(br_mpc *mpc, double elapsed, int shifts) {
     if (!(timer->iteration > 0)) return; /* no step has shown yet how long one takes */
     const double needed = iteration_and_rest(timer) + (shifts ? timer->caution : 0);
     if (!br_timer_allows(timer, br_timer_now(timer), needed)) return;
-    if (!mpc->linearised) br_sqp_linearise(mpc);
+    if (!mpc->valid[BR_LINEARISATION]) br_sqp_linearise(mpc);
     double x0[BR_NX], u_before[BR_NU];
     const double s = mpc->path.s, age = mpc->path.age;
     const int known = mpc->path.known;
@@ -132,8 +131,8 @@ static void solve_ahead(br_mpc *mpc, double elapsed, int shifts) {
     memcpy(u_before, mpc->u_before, sizeof u_before);
     foresee(mpc, elapsed, shifts);
     if (improve(mpc, shifts)) look_elsewhere(mpc);
-    mpc->caution.known = mpc->qp.evaluated = 0;
-    if (!mpc->linearised) br_sqp_linearise(mpc);
+    br_invalidate(mpc, BR_TUBE);
+    if (!mpc->valid[BR_LINEARISATION]) br_sqp_linearise(mpc);
     memcpy(mpc->x0, x0, sizeof x0);
     memcpy(mpc->u_before, u_before, sizeof u_before);
     mpc->path.s = s;
@@ -159,13 +158,13 @@ br_mpc_error br_prepare(br_mpc *mpc, double elapsed_s, double budget_s) {
     if (ahead && known) solve_ahead(mpc, elapsed_s, shifts);
     br_path_follow(mpc);
     br_caution_update(mpc);
-    if (!mpc->qp.factorised) br_qp_factorise(mpc);
-    mpc->prepared = mpc->qp.factorised;
+    if (!mpc->valid[BR_FACTORS]) br_qp_factorise(mpc);
+    mpc->prepared = mpc->valid[BR_FACTORS];
     return BR_OK;
 }
 
 br_mpc_error br_rehearse(br_mpc *mpc) {
-    if (!mpc->prepared || !mpc->qp.factorised) return BR_OK;
+    if (!mpc->prepared || !mpc->valid[BR_FACTORS]) return BR_OK;
     br_sqp_linearise(mpc);
     br_path_follow(mpc);
     br_qp_factorise(mpc);

@@ -13,11 +13,10 @@ static const double *input_before(const br_mpc *mpc, int k) {
     return k ? mpc->plan.u[k - 1] : mpc->u_before;
 }
 
-/* Of all stages at the plan, unless they are known: code that changes the plan, the reference,
- * the input before or the parameters clears qp.evaluated. */
+/* Of all stages at the plan, unless they are known. */
 void br_evaluate_terms(br_mpc *mpc) {
-    if (mpc->qp.evaluated) return;
-    mpc->qp.evaluated = 1;
+    if (mpc->valid[BR_TERMS]) return;
+    mpc->valid[BR_TERMS] = 1;
     const double *theta = br_theta(&mpc->parameters);
     casadi_int iw[br_terms_SZ_IW + 1];
     casadi_real w[br_terms_SZ_W + 1];

@@ -175,7 +175,7 @@ static void transform(br_qp *qp) {
 void br_qp_factorise(br_mpc *mpc) {
     static const double curvature[] = {1.0, 0.5, 0.25, 0.0};
     br_qp *qp = &mpc->qp;
-    qp->factorised = 0;
+    mpc->valid[BR_FACTORS] = 0;
     br_sqp_curve(mpc);
     br_evaluate_curvature(mpc);
     br_condense_states(mpc);
@@ -185,7 +185,7 @@ void br_qp_factorise(br_mpc *mpc) {
         qp->curvature = curvature[attempt];
         qp->regularised = attempt > 0;
         transform(qp);
-        qp->factorised = 1;
+        mpc->valid[BR_FACTORS] = 1;
         return;
     }
 }
@@ -193,8 +193,9 @@ void br_qp_factorise(br_mpc *mpc) {
 br_mpc_status br_qp_condense(br_mpc *mpc) {
     br_qp *qp = &mpc->qp;
     br_evaluate_terms(mpc);
-    if (!qp->factorised || (BR_CURVATURE_LATE && !mpc->follows)) br_qp_factorise(mpc);
-    if (!qp->factorised) return BR_NOT_FINITE; /* a convex cost alone is positive definite */
+    if (!mpc->valid[BR_FACTORS] || (BR_CURVATURE_LATE && !mpc->follows)) br_qp_factorise(mpc);
+    if (!mpc->valid[BR_FACTORS])
+        return BR_NOT_FINITE; /* a convex cost alone is positive definite */
     br_condense_gradient(mpc, qp->curvature);
     mpc->info.regularised += qp->regularised;
     return BR_CONVERGED;

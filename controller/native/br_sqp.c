@@ -12,8 +12,9 @@
 
 /* So many stages from one on; their kernels go into the slots from the given one on. */
 static void linearise(br_mpc *mpc, int first, int stages, int slot) {
-    mpc->qp.factorised = mpc->qp.evaluated = mpc->curved = mpc->followed = 0;
-    mpc->linearised = 1;
+    br_invalidate(mpc, BR_FACTORS); /* the tube stays that of the plan the step started with */
+    mpc->curved = 0;
+    mpc->valid[BR_LINEARISATION] = 1;
     br_stages_linearise(&mpc->gp[mpc->gp_in_use], stages, &mpc->plan.x[first], &mpc->plan.u[first],
                         mpc->kernels, BR_N, slot, &mpc->stage[first]);
 }
@@ -55,7 +56,7 @@ void br_sqp_roll_out(br_mpc *mpc, const double u[BR_NU]) {
 /* By one stage. */
 void br_sqp_shift(br_mpc *mpc) {
     const int last = BR_N - 1, free_slot = mpc->stage[0].slot;
-    mpc->caution.known = 0;
+    br_invalidate(mpc, BR_TUBE);
     memmove(mpc->plan.x, mpc->plan.x + 1, BR_N * sizeof mpc->plan.x[0]);
     memmove(mpc->plan.u, mpc->plan.u + 1, last * sizeof mpc->plan.u[0]);
     memmove(mpc->plan.costate, mpc->plan.costate + 1, BR_N * sizeof mpc->plan.costate[0]);
@@ -64,7 +65,7 @@ void br_sqp_shift(br_mpc *mpc) {
     br_qp_shift_rows(mpc->qp.sense, sizeof mpc->qp.sense[0]);
     for (int c = 0; c < BR_NU; ++c)
         if (!BR_INPUT_HELD[c]) mpc->plan.u[last][c] = 0;
-    if (mpc->linearised)
+    if (mpc->valid[BR_LINEARISATION])
         linearise(mpc, last, 1, free_slot);
     else
         br_sqp_linearise(mpc);

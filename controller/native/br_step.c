@@ -18,12 +18,12 @@ static void begin_plan(br_mpc *mpc) {
         br_align(mpc, mpc->info.shifts);
     } else {
         br_sqp_cold_start(mpc);
-        mpc->caution.known = 0;
+        br_invalidate(mpc, BR_TUBE);
         mpc->lag = mpc->unfinished = 0;
         mpc->info.shifts = -1;
     }
     br_path_follow(mpc);
-    mpc->info.prepared = mpc->prepared && mpc->qp.factorised;
+    mpc->info.prepared = mpc->prepared && mpc->valid[BR_FACTORS];
     mpc->ahead = mpc->prepared = 0;
     br_caution_update(mpc);
 }
@@ -113,10 +113,10 @@ static br_mpc_status start_without_soft_rows(br_mpc *mpc, int most) {
     br_sqp_roll_out(mpc, u);
     br_path_follow(mpc);
     memset(mpc->qp.penalty, 0, sizeof mpc->qp.penalty);
-    mpc->qp.evaluated = mpc->qp.factorised = 0;
+    br_invalidate(mpc, BR_FACTORS);
     const br_mpc_status status = iterate(mpc, 0, most);
     br_evaluate_penalties(mpc);
-    mpc->qp.evaluated = mpc->qp.factorised = 0;
+    br_invalidate(mpc, BR_FACTORS);
     return br_usable(status) ? iterate(mpc, 1, most) : status;
 }
 
@@ -173,7 +173,7 @@ static void solve(br_mpc *mpc, double u[BR_NU], br_mpc_status *status, br_mpc_in
     memcpy(mpc->answer_u, mpc->plan.u, sizeof mpc->answer_u);
     memcpy(mpc->answer_reference, mpc->reference, sizeof mpc->answer_reference);
     mpc->info.status = *status;
-    mpc->caution.known = 0; /* the next step starts with another plan */
+    br_invalidate(mpc, BR_TUBE); /* the next step starts with another plan */
     br_innovation_advance(&mpc->innovation);
     br_caution_pace(mpc, mpc->elapsed);
     if (info) *info = mpc->info;
@@ -205,7 +205,7 @@ static br_mpc_error begin(br_mpc *mpc, const request *r, int *plausible) {
     memcpy(mpc->x0, r->x, sizeof mpc->x0);
     memcpy(mpc->u_before, r->u_before, sizeof mpc->u_before);
     br_evaluate_bounds(mpc);
-    mpc->qp.evaluated = 0;
+    br_invalidate(mpc, BR_TERMS);
     mpc->info.prepared_iterations = mpc->prepared_iterations;
     mpc->prepared_iterations = 0;
     return BR_OK;
@@ -231,7 +231,7 @@ static void plan_reference(br_mpc *mpc) {
     const int before = mpc->follows;
     mpc->follows = follows;
     if (follows && before && fabs(mpc->x0[BR_INDEX_VX]) >= BR_TURN_SLOW_MPS) return;
-    mpc->followed = 0;
+    br_invalidate(mpc, BR_FOLLOWED);
 #endif
     br_path_plan(&mpc->path, mpc->caution.pace, mpc->reference);
     br_turnaround(mpc);
