@@ -1,11 +1,10 @@
-"""Bayesian optimisation of the racing line under the published objective, and the direct method.
+"""Bayesian optimisation of the racing line under the published objective.
 
     python -m benchmarks.line_search TRACKS [--trials 3] [--evaluations 110]
 
 TRACKS: folder with ethz.csv and ethzmobil.csv, the paper's tracks. The objective is that of Jain
 and Morari (2020) as tests/published_line.py states it. Prints the best lap after so many
-evaluations, mean and best of the trials, and the lap of the minimum-time line's own method, which
-uses derivatives, under the same objective. PUBLISHED in that module has the published laps.
+evaluations, mean and best of the trials. PUBLISHED in that module has the published laps.
 """
 
 from pathlib import Path
@@ -15,7 +14,7 @@ import numpy as np
 from bayesrace.raceline.nodes import roughness
 from benchmarks.harness import Row, arguments, report
 from learning.search import SearchSettings, search
-from tests.published_line import PUBLISHED, direct, objective
+from tests.published_line import PUBLISHED, objective
 
 _COUNTS = (20, 30, 40, 50, 110)
 
@@ -35,8 +34,6 @@ def main() -> None:
                 after = {"evaluations": k, "mean [s]": float(np.mean(trials, axis=0)[k - 1])}
                 best = {"best [s]": float(np.min(trials, axis=0)[k - 1])}
                 rows.append({"track": name, "way": way, **after, **best})
-        lap_s = direct(Path(given.tracks), name)
-        rows.append({"track": name, "way": "minimum-time line", "best [s]": lap_s})
     report(given, f"{given.trials} trials", rows)
 
 

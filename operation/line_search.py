@@ -1,7 +1,7 @@
 """Racing lines by Bayesian optimisation: for the ideal lap, or for the lap that is driven."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal
@@ -14,7 +14,7 @@ from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from bayesrace.gp.weights import read_weights
 from bayesrace.raceline import RaceLine, RaceLineSettings
-from bayesrace.raceline.identity import line_identity
+from bayesrace.raceline.line import line_identity
 from bayesrace.raceline.nodes import NodeLines, roughness
 from bayesrace.tracks import Track
 from bayesrace.vehicles import CarParameters
@@ -112,13 +112,13 @@ def search_lines(
         return math.inf if line is None else lap(line)
 
     found: dict[str, list[Search]] = {"bayesian": [], "random": []}
-    for trial in range(trials):
-        own = settings.search.model_copy(update={"seed": settings.search.seed + trial})
-        every = own.model_copy(update={"initial": own.evaluations, "patience": None})
-        for method, how in (("bayesian", own), ("random", every))[: 1 + compare]:
-            with stages.stage(f"{method} search, seed {own.seed}") as stage:
+    at_random = {"initial": settings.search.evaluations, "patience": None}
+    for seed in range(settings.search.seed, settings.search.seed + trials):
+        for method, how in (("bayesian", {}), ("random", at_random))[: 1 + compare]:
+            own = settings.search.model_copy(update={**how, "seed": seed})
+            with stages.stage(f"{method} search, seed {seed}") as stage:
                 found[method].append(
-                    search(cost, settings.nodes, how, features, progress=stage.update)
+                    search(cost, settings.nodes, own, features, progress=stage.update)
                 )
     best = min(found["bayesian"], key=lambda one: float(one.y.min()))
     line = lines.line(best.point)
@@ -137,13 +137,11 @@ def write_curve(path: Path, comparison: Comparison, direct_s: float) -> None:
     ``direct_s``: the same lap along the minimum-time line. Raises InputError for other suffixes.
     """
     check_curve(path)
-    columns = {
-        f"{name}_{k}": one.best
-        for name, searches in (("bayesian", comparison.bayesian), ("random", comparison.random))
-        for k, one in enumerate(searches)
-    }
-    table = _padded(list(columns.values()))
-    rows = [",".join(["evaluation", *columns])]
+    curves = {f"bayesian_{k}": one.best for k, one in enumerate(comparison.bayesian)}
+    curves |= {f"random_{k}": one.best for k, one in enumerate(comparison.random)}
+    longest = max(map(len, curves.values()))  # a search that stopped early keeps its best value
+    table = np.stack([np.pad(one, (0, longest - len(one)), "edge") for one in curves.values()])
+    rows = [",".join(["evaluation", *curves])]
     rows += [",".join([str(k + 1), *map(repr, row)]) for k, row in enumerate(table.T.tolist())]
     write_whole(path.with_suffix(".csv"), "\n".join(rows) + "\n")
     if path.suffix == ".csv":
@@ -165,9 +163,3 @@ def check_curve(path: Path) -> None:
     """InputError, before the work, for a file that :func:`write_curve` does not write."""
     if path.suffix not in _CURVES:
         raise InputError(f"cannot write a curve to {path}: name a file in {', '.join(_CURVES)}")
-
-
-def _padded(curves: Sequence[Floats]) -> Floats:
-    """As rows of one length: a search that stopped early keeps its best value."""
-    longest = max(len(curve) for curve in curves)
-    return np.stack([np.pad(curve, (0, longest - len(curve)), "edge") for curve in curves])

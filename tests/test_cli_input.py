@@ -12,7 +12,7 @@ import pytest
 from bayesrace.gp.weights import write_weights, zero_weights
 from bayesrace.integrators import Discretisation
 from bayesrace.raceline import RaceLineSettings, write_raceline
-from bayesrace.raceline.identity import line_identity
+from bayesrace.raceline.line import line_identity
 from bayesrace.tracks import write_track
 from bayesrace.transport import Director, free_endpoint
 from bayesrace.vehicles import get_car, write_car

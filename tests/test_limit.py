@@ -87,13 +87,6 @@ def test_the_plant_can_drive_it_and_stays_on_the_track(name: str, car: str) -> N
     assert off.max() < 0.01 * parameters.width_m
 
 
-def test_the_mesh_is_checked() -> None:
-    lap = limit_on("paddock")
-    assert lap.mesh_change < 1e-3
-    assert lap.intervals + 1 == len(lap.t_s) == len(lap.x) == len(lap.u)
-    assert lap.t_s[-1] == pytest.approx(lap.lap_s)
-
-
 def test_a_standing_lap_begins_at_the_start_pose_and_ends_on_the_start_line() -> None:
     track, lap = track_called("paddock"), limit_on("paddock", standing=True)
     np.testing.assert_allclose(lap.x[0], [*track.start_pose(), 0.1, 0, 0, 0], atol=1e-6)
@@ -101,8 +94,11 @@ def test_a_standing_lap_begins_at_the_start_pose_and_ends_on_the_start_line() ->
     assert lap.lap_s > limit_on("paddock").lap_s + 0.3
 
 
-def test_a_flying_lap_closes() -> None:
+def test_a_flying_lap_closes_and_its_mesh_is_checked() -> None:
     lap = limit_on("paddock")
+    assert lap.mesh_change < 1e-3
+    assert lap.intervals + 1 == len(lap.t_s) == len(lap.x) == len(lap.u)
+    assert lap.t_s[-1] == pytest.approx(lap.lap_s)
     gained = lap.x[-1] - lap.x[0]
     assert abs(gained[2]) == pytest.approx(2 * np.pi)
     np.testing.assert_allclose(np.delete(gained, 2), 0, atol=1e-9)
@@ -127,17 +123,13 @@ def test_the_outline_stays_on_the_track() -> None:
     assert lap.lap_s > limit_on("paddock").lap_s
 
 
-def test_a_margin_is_kept_and_costs_time() -> None:
-    lap = limit_on("paddock", margin_m=0.03)
-    off = track_called("paddock").project_path(lap.x[:, :2]).off_track_m
+def test_a_margin_and_a_largest_lateral_speed_are_kept_and_cost_time() -> None:
+    flying, near = limit_on("paddock"), limit_on("paddock", margin_m=0.03)
+    gripping = limit_on("paddock", lateral_speed_mps=0.3)
+    off = track_called("paddock").project_path(near.x[:, :2]).off_track_m
     assert off.max() == pytest.approx(-0.03, abs=2e-4)
-    assert lap.lap_s > limit_on("paddock").lap_s
-
-
-def test_a_largest_lateral_speed_is_kept_and_costs_time() -> None:
-    lap = limit_on("paddock", lateral_speed_mps=0.3)
-    assert np.abs(lap.x[:, 4]).max() == pytest.approx(0.3, abs=1e-4)
-    assert lap.lap_s > limit_on("paddock").lap_s
+    assert np.abs(gripping.x[:, 4]).max() == pytest.approx(0.3, abs=1e-4)
+    assert min(near.lap_s, gripping.lap_s) > flying.lap_s
 
 
 @pytest.mark.parametrize(

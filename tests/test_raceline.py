@@ -21,9 +21,8 @@ from bayesrace.raceline import (
     read_raceline_for,
     write_raceline,
 )
-from bayesrace.raceline.guess import speed_profile
-from bayesrace.raceline.identity import line_identity
-from bayesrace.raceline.ocp import car_limits
+from bayesrace.raceline.friction import car_limits, speed_profile
+from bayesrace.raceline.line import line_identity
 from bayesrace.tracks import StartLine, Track, load_track
 from bayesrace.vehicles import described_car, get_car
 from bayesrace.vehicles.parts import GRAVITY_MPS2
@@ -163,13 +162,6 @@ def test_limits_are_those_of_the_reference() -> None:
     np.testing.assert_allclose(limits.straight_values(v, 1.0), [4.40, 3.04, 1.67, 0.28], atol=0.02)
     brake = limits.straight_values(v, -0.1)
     assert ((brake > -2.0) & (brake < -1.55)).all()
-
-
-@pytest.mark.check
-def test_less_friction_and_more_margin_cost_time() -> None:
-    base = line_on("paddock").lap_time_s
-    assert line_on("paddock", friction=0.7).lap_time_s > base + 0.05
-    assert line_on("paddock", margin_m=0.06).lap_time_s > base + 0.02
 
 
 def test_guess_closes_the_lap_within_the_limits() -> None:

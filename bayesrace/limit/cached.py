@@ -2,22 +2,16 @@
 
 from contextlib import suppress
 from pathlib import Path
-from typing import Final
 
 from bayesrace.cache import cache_folder, kept
 from bayesrace.errors import InputError
 from bayesrace.limit import compute_limit
-from bayesrace.limit.lap import LimitLap, read_limit, write_limit
-from bayesrace.limit.settings import LimitSettings
+from bayesrace.limit.lap import LimitLap, LimitSettings, read_limit, write_limit
 from bayesrace.raceline.cached import optimised_identity
 from bayesrace.tracks import Track
 from bayesrace.vehicles.parameters import CarParameters
 
 __all__ = ["known_limit", "limit"]
-
-_SOURCES: Final = (
-    "bayesrace/vehicles", "bayesrace/tracks", "bayesrace/raceline", "bayesrace/limit",
-)  # fmt: skip
 
 
 def limit(track: Track, car: CarParameters, settings: LimitSettings | None = None) -> LimitLap:
@@ -39,5 +33,4 @@ def known_limit(track: Track, car: CarParameters, settings: LimitSettings) -> Li
 
 def _file(track: Track, car: CarParameters, settings: LimitSettings) -> Path:
     """Named after car, track, settings and code."""
-    identity = optimised_identity(track, car, settings, _SOURCES)
-    return cache_folder() / f"limit-{identity}.csv"
+    return cache_folder() / f"limit-{optimised_identity(track, car, settings)}.csv"

@@ -5,9 +5,10 @@ from typing import Final
 import numpy as np
 
 from bayesrace.arrays import Floats
-from bayesrace.limit.gates import Gates
-from bayesrace.limit.ocp import Lap
+from bayesrace.limit.lap import LimitSettings
+from bayesrace.limit.ocp import Lap, usual_interval
 from bayesrace.raceline import RaceLine
+from bayesrace.raceline.gates import Gates
 from bayesrace.tracks.projection import CentrelineSearch
 from bayesrace.tracks.spline import PlaneSpline
 from bayesrace.vehicles.parameters import CarParameters
@@ -31,10 +32,9 @@ class Guess:
     """A racing line as a function of the place on the smoothed centreline."""
 
     def __init__(
-        self, line: RaceLine, curve: PlaneSpline, car: CarParameters, start_mps: float | None
+        self, line: RaceLine, curve: PlaneSpline, car: CarParameters, settings: LimitSettings
     ) -> None:
-        """``start_mps``: speed with which a standing lap begins at place 0; None: a flying one."""
-        self._curve, self._car, self._start_mps = curve, car, start_mps
+        self._curve, self._car, self._settings = curve, car, settings
         spacing = line.length_m / len(line.s_m)
         reach = curve.period / 10
         self._place = CentrelineSearch(curve, spacing).follow(line.xy_m, None, reach)
@@ -51,17 +51,18 @@ class Guess:
     def speed(self, places: Floats) -> Floats:
         """Speeds (N,) [m/s]."""
         v = self._at(self._v, places)
-        if self._start_mps is None:
+        if not self._settings.standing:
             return v
         launch = _LAUNCH * self._car.friction * GRAVITY_MPS2
-        return np.minimum(v, np.sqrt(self._start_mps**2 + 2 * launch * places))
+        return np.minimum(v, np.sqrt(self._settings.start_speed_mps**2 + 2 * launch * places))
 
-    def mesh(self, interval_m: float, interval_s: float, refined: int) -> Floats:
+    def mesh(self, refined: int) -> Floats:
         """Ascending places (M + 1,) from 0 to the period.
 
-        Neighbours are at most so far apart, in way and in time at the guess's speeds, over
-        ``refined``.
+        Neighbours are at most as far apart as is usual, in way and in time at the guess's speeds,
+        over ``refined``.
         """
+        interval_m, interval_s = usual_interval(self._car)
         count = max(24, round(self._curve.period / interval_m)) * _OVERSAMPLING
         s = np.arange(count + 1) * (self._curve.period / count)
         middle = (s[1:] + s[:-1]) / 2
@@ -75,7 +76,7 @@ class Guess:
         """Of a car that rolls without slip, at this share of the speeds."""
         car, places = self._car, gates.place_m
         n, xi = self._at(self._n, places), self._at(self._xi, places)
-        if self._start_mps is not None:
+        if self._settings.standing:
             n, xi = (one * np.minimum(places / (_EASE * car.wheelbase_m), 1.0) for one in (n, xi))
         v, kappa = share * self.speed(places), self._at(self._kappa, places)
         beta = np.arcsin(np.clip(car.lr_m * kappa, -0.5, 0.5))
@@ -87,4 +88,4 @@ class Guess:
             n, gates.heading_rad + xi - beta, v * np.cos(beta), v * np.sin(beta), v * kappa,
             np.clip(delta, -car.delta_max_rad, car.delta_max_rad), rolling, rolling,
         ])  # fmt: skip
-        return Lap(states, 2 * way / np.maximum(v[1:] + v[:-1], _SLOWEST * float(v.max())))
+        return Lap(gates, states, 2 * way / np.maximum(v[1:] + v[:-1], _SLOWEST * float(v.max())))

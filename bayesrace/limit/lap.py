@@ -1,33 +1,49 @@
 """A limit as data, and its file form: a CSV of states and inputs over time.
 
-Columns :data:`COLUMNS`; lines with # are comments, and those of the form ``# key: value`` say what
-the limit is and how well it is known.
+Comments say what the limit is and how well it is known.
 """
 
 import math
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
-from bayesrace.files import read_text, write_whole
-from bayesrace.tracks.files import read_table
+from bayesrace.tracks.tables import read_about, read_table, write_table
 
-__all__ = ["COLUMNS", "LimitLap", "read_limit", "write_limit"]
+__all__ = ["LimitLap", "LimitSettings", "read_limit", "write_limit"]
 
-COLUMNS: Final = (
+_COLUMNS: Final = (
     "t_s", "x_m", "y_m", "psi_rad", "vx_mps", "vy_mps", "omega_radps", "delta_rad", "d",
     "ddelta_radps",
 )  # fmt: skip
-_KEY: Final = re.compile(r"#\s*(\w+):\s*(\S+)\s*")
 _KEYS: Final = {
     "car": str, "track": str, "lap_s": float, "intervals": int, "mesh_change": float,
     "solve_s": float,
 }  # fmt: skip
+
+
+class LimitSettings(BaseModel):
+    """Settings of :func:`bayesrace.limit.compute_limit`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    standing: bool = Field(False, description="from the start pose; otherwise a flying lap")
+    start_speed_mps: float = Field(
+        0.1, ge=0, le=5, description="speed at the start of a standing lap"
+    )
+    margin_m: float = Field(0.0, ge=0, description="least distance from the track's edge")
+    body: bool = Field(
+        False, description="the car's outline keeps the margin; otherwise its centre of gravity"
+    )
+    lateral_speed_mps: float | None = Field(
+        None, gt=0, description="largest |vy|, for a lap without slides; None: any"
+    )
+    max_iterations: int = Field(300, ge=1, description="iteration limit of the optimiser")
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,21 +71,16 @@ class LimitLap:
 
 def write_limit(path: Path | str, lap: LimitLap) -> None:
     """Writes the whole file or nothing."""
-    rows = np.column_stack([lap.t_s, lap.x, lap.u]).tolist()
-    lines = [f"# {'; '.join(COLUMNS)}", *(f"# {key}: {getattr(lap, key)}" for key in _KEYS)]
-    lines += ["; ".join(repr(value) for value in row) for row in rows]
-    write_whole(Path(path), "\n".join(lines) + "\n")
+    about = {key: getattr(lap, key) for key in _KEYS}
+    write_table(path, _COLUMNS, np.column_stack([lap.t_s, lap.x, lap.u]), about)
 
 
 def read_limit(path: Path | str) -> LimitLap:
     """The limit in a file that :func:`write_limit` has written; InputError naming what is wrong."""
-    path = Path(path)
-    table, _ = read_table(path, COLUMNS)
-    text = read_text(path, "the limit")
-    found = (_KEY.fullmatch(row) for row in text.splitlines() if row.startswith("#"))
-    values = {match[1]: match[2] for match in found if match}
+    table, _ = read_table(Path(path), _COLUMNS)
+    said = read_about(Path(path))
     try:
-        about = {key: kind(values[key]) for key, kind in _KEYS.items()}
+        about = {key: kind(said[key]) for key, kind in _KEYS.items()}
         if not (0 < about["lap_s"] < math.inf):
             raise ValueError
     except (KeyError, ValueError):

@@ -7,7 +7,8 @@ the independent variable of the dynamics: Hermite-Simpson's scheme, inputs linea
     z_m = (z + z') / 2 + h / 8 (f - f')        z' - z = h / 6 (f + 4 f_m + f')
 
 The track's edges are bounds of n. Minimised is the sum of all h, and a little of the inputs'
-changes, against chatter, which is no part of the lap time that is reported.
+changes, against chatter, which is no part of the lap time that is reported. Nothing divides by the
+distance of gates: where they nearly meet, on the inside of a hairpin, a car passes them at once.
 """
 
 from collections.abc import Callable, Iterator
@@ -18,14 +19,19 @@ import casadi as ca
 import numpy as np
 
 from bayesrace.arrays import Floats
-from bayesrace.limit.gates import Gates
+from bayesrace.limit.lap import LimitSettings
 from bayesrace.limit.outline import Outline
-from bayesrace.limit.programme import Indices, Piece, Solution, minimise
+from bayesrace.limit.programme import Indices, Piece, minimise
+from bayesrace.raceline.gates import Gates
+from bayesrace.raceline.nlp import Solution
 from bayesrace.vehicles.models import Model, command_limits
 from bayesrace.vehicles.parameters import CarParameters
-from bayesrace.vehicles.parts import LinearTyres
+from bayesrace.vehicles.parts import GRAVITY_MPS2, LinearTyres
 
-__all__ = ["Lap", "optimise"]
+__all__ = ["Lap", "optimise", "usual_interval"]
+
+_INTERVAL: Final = 2.0
+"""Length of an interval of the first mesh, over one of the racing line's."""
 
 _CHATTER: Final = 1e-3
 """Cost of an input's change over its whole range within an interval, over the interval's time."""
@@ -37,10 +43,17 @@ _ASIDE_RAD: Final = 1.5
 """Largest angle between car and gate's driving direction."""
 
 
+def usual_interval(car: CarParameters) -> tuple[float, float]:
+    """Length [m] and duration [s] of the first mesh's intervals."""
+    length_m, usable = _INTERVAL * car.tuning.raceline.step_m, car.friction * GRAVITY_MPS2
+    return length_m, length_m / (2 * float(np.sqrt(usable * car.wheelbase_m)))
+
+
 @dataclass(frozen=True, eq=False)
 class Lap:
     """A lap through M + 1 gates."""
 
+    gates: Gates
     states: Floats
     """(M + 1, 8): offset, heading, vx, vy, yaw rate, steering angle, drive command, steering rate;
     in SI units."""
@@ -48,27 +61,46 @@ class Lap:
     """(M,) from gate to gate."""
 
     @property
+    def times_s(self) -> Floats:
+        """When each gate is passed, (M + 1,), from 0 on."""
+        return np.concatenate([[0.0], np.cumsum(self.durations_s)])
+
+    @property
     def time_s(self) -> float:
         """Of the lap."""
         return float(self.durations_s.sum())
+
+    @property
+    def xy_m(self) -> Floats:
+        """Positions (M + 1, 2)."""
+        return self.gates.points(self.states[:, 0])
+
+    def through(self, gates: Gates) -> "Lap":
+        """The same lap through other gates, between its own interpolated linearly."""
+        own, place = self.gates, gates.place_m
+        aside = self.states.copy()
+        aside[:, 1] -= own.heading_rad
+        states = np.column_stack([np.interp(place, own.place_m, column) for column in aside.T])
+        states[:, 1] += gates.heading_rad
+        return Lap(gates, states, np.diff(np.interp(place, own.place_m, self.times_s)))
 
 
 class _Layout:
     """Where the variables of gates and intervals are in the programme's x, and their sizes."""
 
-    def __init__(self, gates: Gates, car: CarParameters, interval_s: float) -> None:
+    def __init__(self, gates: Gates, car: CarParameters) -> None:
         tuned, drive = car.tuning.scale, max(-car.d_min, car.d_max)
         self.scale = np.array([
             car.width_m, 1.0, tuned.speed_mps, tuned.speed_mps, tuned.yaw_rate_radps,
             car.delta_max_rad, drive, car.delta_rate_max_radps,
         ])  # fmt: skip
-        self.interval_s = interval_s
-        intervals = gates.intervals
+        _, self.interval_s = usual_interval(car)
+        self.gates, intervals = gates, gates.intervals
         count = intervals if gates.closed else intervals + 1
         self.gate: Indices = np.arange(8 * count).reshape(count, 8)
         self.duration: Indices = 8 * count + np.arange(intervals)
-        self.begin = np.arange(intervals)
-        self.end = (self.begin + 1) % count
+        self.ends = np.arange(1, intervals + 1) % count
+        """Of the intervals, which begin at the gates 0 to M - 1."""
         turn = gates.heading_rad[-1] - gates.heading_rad[0]
         self.turn_rad = float(turn) if gates.closed else 0.0
         """Heading gained from the last gate's variables to those of the first, which it is."""
@@ -80,17 +112,15 @@ class _Layout:
 
     def lap(self, x: Floats) -> Lap:
         """The values of x in SI units."""
-        states = x[self.gate][np.append(self.begin, self.end[-1])] * self.scale
+        states = x[self.gate][np.append(0, self.ends)] * self.scale
         states[-1, 1] += self.turn_rad
-        return Lap(states, x[self.duration] * self.interval_s)
+        return Lap(self.gates, states, x[self.duration] * self.interval_s)
 
 
-def _interval(model: Model, gates: Gates, layout: _Layout) -> Piece:
+def _interval(model: Model, layout: _Layout) -> Piece:
     """Dynamics from each gate to the next, and the cost."""
-    a, b, h = ca.SX.sym("a", 8), ca.SX.sym("b", 8), ca.SX.sym("h")
-    p = ca.SX.sym("p", 9)
-    one, other = a * layout.scale, b * layout.scale
-    time = h * layout.interval_s
+    a, b, h, p = (ca.SX.sym(*of) for of in (("a", 8), ("b", 8), ("h", 1), ("p", 9)))
+    one, other, time = a * layout.scale, b * layout.scale, h * layout.interval_s
 
     def at(y: Any, gate: Any, turn: Any) -> Any:
         """State of the model at a gate x, y, normal."""
@@ -101,38 +131,26 @@ def _interval(model: Model, gates: Gates, layout: _Layout) -> Piece:
     middle = (za + zb) / 2 + time / 8 * (fa - fb)
     fm = model.ode(middle, (one[6:] + other[6:]) / 2)
     defect = zb - za - time / 6 * (fa + 4 * fm + fb)
-    size = np.concatenate([layout.scale[[0, 0]], layout.scale[1:6]])
-    at_gates = np.column_stack([gates.xy_m, gates.normal])
-    turn = np.zeros(gates.intervals)
+    at_gates = np.column_stack([layout.gates.xy_m, layout.gates.normal])
+    turn = np.zeros(layout.gates.intervals)
     turn[-1] = layout.turn_rad
+    begins = np.arange(layout.gates.intervals)
     return Piece(
         w=ca.vertcat(a, b, h),
         p=p,
         cost=h * (1 + _CHATTER * ca.sumsqr(b[6:] - a[6:])),
-        g=defect / size,
-        g_min=np.zeros(7),
-        g_max=np.zeros(7),
-        index=np.column_stack(
-            [layout.gate[layout.begin], layout.gate[layout.end], layout.duration]
-        ),
+        g=defect / layout.scale[[0, 0, 1, 2, 3, 4, 5]],
+        g_min=0.0,
+        g_max=0.0,
+        index=np.column_stack([layout.gate[begins], layout.gate[layout.ends], layout.duration]),
         numbers=np.column_stack([at_gates[:-1], at_gates[1:], turn]),
     )
 
 
 def _at_gates(layout: _Layout, within: Callable[[Any], list[Any]]) -> Piece:
     """Expressions of a gate's values in SI units that may not be above 0."""
-    y = ca.SX.sym("y", 8)
-    g = ca.vertcat(*within(y * layout.scale))
-    return Piece(
-        w=y,
-        p=ca.SX.sym("p", 0),
-        cost=ca.SX(0),
-        g=g,
-        g_min=np.full(g.numel(), -np.inf),
-        g_max=np.zeros(g.numel()),
-        index=layout.gate,
-        numbers=np.zeros((len(layout.gate), 0)),
-    )
+    y, nothing = ca.SX.sym("y", 8), np.zeros((len(layout.gate), 0))
+    return Piece(y, ca.vertcat(*within(y * layout.scale)), -np.inf, 0.0, layout.gate, nothing)
 
 
 def _car_within(car: CarParameters, layout: _Layout) -> Iterator[Piece]:
@@ -143,59 +161,49 @@ def _car_within(car: CarParameters, layout: _Layout) -> Iterator[Piece]:
             lambda y: command_limits(car, ca.sqrt(y[2] ** 2 + y[3] ** 2), y[6]),
         )
     if isinstance(car.tyres, LinearTyres):
-        most = float(np.tan(_SLIDING_RAD))
-        speed = layout.scale[2]
+        most, speed = float(np.tan(_SLIDING_RAD)), layout.scale[2]
         yield _at_gates(
             layout,
             lambda y: [(y[3] - most * y[2]) / speed, (-y[3] - most * y[2]) / speed],
         )
 
 
-def _bounds(
-    car: CarParameters,
-    gates: Gates,
-    layout: _Layout,
-    start_mps: float | None,
-    lateral_mps: float | None,
-) -> tuple[Floats, Floats]:
+def _bounds(car: CarParameters, layout: _Layout, settings: LimitSettings) -> tuple[Floats, Floats]:
     """Of x."""
-    count, top = len(gates.place_m), car.tuning.raceline.speed_bound_mps
-    aside = top if lateral_mps is None else lateral_mps
-    spin = 20 * layout.scale[4]
-    low = np.tile([0, 0, 0, -aside, -spin, -car.delta_max_rad, car.d_min, 0.0], (count, 1))
-    high = np.tile([0, 0, top, aside, spin, car.delta_max_rad, car.d_max, 0.0], (count, 1))
-    low[:, 7], high[:, 7] = -car.delta_rate_max_radps, car.delta_rate_max_radps
+    gates, top = layout.gates, car.tuning.raceline.speed_bound_mps
+    aside, spin = settings.lateral_speed_mps or top, 20 * layout.scale[4]
+    steer, rate = car.delta_max_rad, car.delta_rate_max_radps
+    count = (len(gates.place_m), 1)
+    low = np.tile([0, 0, 0, -aside, -spin, -steer, car.d_min, -rate], count)
+    high = np.tile([0, 0, top, aside, spin, steer, car.d_max, rate], count)
     low[:, 0], high[:, 0] = gates.n_min_m, gates.n_max_m
     low[:, 1], high[:, 1] = gates.heading_rad - _ASIDE_RAD, gates.heading_rad + _ASIDE_RAD
-    if start_mps is not None:
-        low[0, 1:6] = high[0, 1:6] = [gates.heading_rad[0], start_mps, 0.0, 0.0, 0.0]
-    shortest, longest = np.full(gates.intervals, 0.0), np.full(gates.intervals, np.inf)
-    return layout.packed(low, shortest), layout.packed(high, longest)
+    if settings.standing:
+        start = [gates.heading_rad[0], settings.start_speed_mps, 0.0, 0.0, 0.0]
+        low[0, 1:6] = high[0, 1:6] = start
+    intervals = np.ones(gates.intervals)
+    return layout.packed(low, 0 * intervals), layout.packed(high, np.inf * intervals)
 
 
 def optimise(
     model: Model,
-    gates: Gates,
     guess: Lap,
-    *,
-    interval_s: float,
-    start_mps: float | None,
-    lateral_mps: float | None,
+    settings: LimitSettings,
     outline: Outline | None,
     options: dict[str, Any],
 ) -> tuple[Lap, Solution]:
-    """The fastest lap, and how the optimisation ended.
+    """The fastest lap through the guess's gates, and how the optimisation ended.
 
-    ``interval_s``: usual duration of an interval; ``start_mps``: speed at the first gate of a lap
-    from the start pose, None for a flying one; ``lateral_mps``: largest |vy|, None for any;
     ``outline``: to keep within the track, its edges as they are beside the guess; ``options``: of
     IPOPT.
     """
-    layout = _Layout(gates, model.car, interval_s)
-    pieces = [_interval(model, gates, layout), *_car_within(model.car, layout)]
+    layout = _Layout(guess.gates, model.car)
+    pieces = [_interval(model, layout), *_car_within(model.car, layout)]
     if outline is not None:
-        pieces.append(outline.piece(gates, guess.states, layout.gate, layout.scale))
-    bounds = _bounds(model.car, gates, layout, start_mps, lateral_mps)
-    start = layout.packed(guess.states, guess.durations_s)
-    solution = minimise(pieces, *bounds, np.clip(start, *bounds), options)
+        pieces.append(
+            outline.piece(guess.gates, guess.xy_m, guess.states[:, 1], layout.gate, layout.scale)
+        )
+    bounds = _bounds(model.car, layout, settings)
+    start = np.clip(layout.packed(guess.states, guess.durations_s), *bounds)
+    solution = minimise(pieces, bounds, start, {"max_iter": settings.max_iterations, **options})
     return layout.lap(solution.x), solution

@@ -13,8 +13,8 @@ import casadi as ca
 import numpy as np
 
 from bayesrace.arrays import Floats
-from bayesrace.limit.gates import Gates
 from bayesrace.limit.programme import Indices, Piece
+from bayesrace.raceline.gates import Gates
 from bayesrace.tracks import Track
 from bayesrace.vehicles.parameters import CarParameters
 
@@ -50,13 +50,15 @@ class Outline:
         feet = [self._track.project_path(one) for one in self._placed(xy, psi)]
         return self._margin_m + max(float(one.off_track_m.max()) for one in feet)
 
-    def piece(self, gates: Gates, states: Floats, variables: Indices, scale: Floats) -> Piece:
-        """Constraints on points that are near an edge in these states (M + 1, 8) at the gates.
+    def piece(
+        self, gates: Gates, xy: Floats, psi: Floats, variables: Indices, scale: Floats
+    ) -> Piece:
+        """Constraints on points that are near an edge where the car is at the gates, (M + 1,).
 
         ``variables``: indices (N, 8) of the gates' in the programme; ``scale``: their sizes (8,).
         """
         count = len(variables)  # without the last gate where it is the first again
-        xy, psi = gates.points(states[:, 0])[:count], states[:count, 1]
+        xy, psi = xy[:count], psi[:count]
         rows, numbers, low, high = [], [], [], []
         for point, placed in zip(self._points, self._placed(xy, psi), strict=True):
             on = self._track.project_path(placed)
@@ -74,7 +76,6 @@ class Outline:
         return Piece(
             w=w,
             p=p,
-            cost=ca.SX(0),
             g=_offset(w * scale[:2], p) / scale[0],
             g_min=np.concatenate(low)[:, None] / scale[0],
             g_max=np.concatenate(high)[:, None] / scale[0],

@@ -5,26 +5,21 @@ from typing import Any, Final
 
 import numpy as np
 
-from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
-from bayesrace.limit.gates import Gates, flying_gates, standing_gates
 from bayesrace.limit.guess import Guess
-from bayesrace.limit.lap import LimitLap
+from bayesrace.limit.lap import LimitLap, LimitSettings
 from bayesrace.limit.ocp import Lap, optimise
 from bayesrace.limit.outline import Outline
-from bayesrace.limit.settings import LimitSettings
-from bayesrace.raceline import RaceLine
 from bayesrace.raceline.cached import racing_line
-from bayesrace.raceline.frame import smooth_centreline
+from bayesrace.raceline.gates import Gates, flying_gates, smooth_centreline, standing_gates
 from bayesrace.tracks import Track
-from bayesrace.vehicles.models import Model, dynamic
+from bayesrace.vehicles.models import dynamic
 from bayesrace.vehicles.parameters import CarParameters
-from bayesrace.vehicles.parts import GRAVITY_MPS2
 
 __all__ = ["solve"]
 
-_INTERVAL: Final = 2.0
-"""Length of an interval of the first mesh, over one of the racing line's."""
+_FOLD: Final = 0.98
+"""Largest offset of a gate over the centreline's radius; at 1 neighbouring gates meet."""
 
 _SPEEDS: Final = (1.0, 0.7, 0.5)
 """Shares of the racing line's speeds to begin with: where the car turns about in a hairpin there
@@ -36,7 +31,7 @@ _SAME: Final = 1e-4
 _UNCHANGED: Final = 1e-3
 """Share by which the lap may change with the mesh."""
 
-_FINEST: Final = 8
+_FINER: Final = 2, 4, 8
 """Times as fine as the first."""
 
 _ROUNDS: Final = 10
@@ -52,89 +47,61 @@ class _NoLapError(InputError):
 
 
 class _Limit:
-    """The optimisation of one lap, on any mesh."""
+    """The optimisation of one lap, on any mesh: the dynamic model on a track."""
 
-    def __init__(self, track: Track, model: Model, settings: LimitSettings, line: RaceLine) -> None:
-        car = model.car
-        self._track, self._model, self._settings = track, model, settings
-        self._tuning = car.tuning.raceline
-        self._start_mps = settings.start_speed_mps if settings.standing else None
-        self._curve = smooth_centreline(track, self._tuning)
-        self._guess = Guess(line, self._curve, car, self._start_mps)
-        # The outline reaches at least half the car's width beyond the centre of gravity.
-        self._margin_m = settings.margin_m + (car.width_m / 2 if settings.body else 0.0)
+    def __init__(self, track: Track, car: CarParameters, settings: LimitSettings) -> None:
+        self._track, self._car, self._settings = track, car, settings
+        self._curve = smooth_centreline(track, car.tuning.raceline)
+        self._guess = Guess(racing_line(track, car), self._curve, car, settings)
         self._outline = Outline(track, car, settings.margin_m) if settings.body else None
-        self._interval_m = _INTERVAL * self._tuning.step_m
-        usable = car.friction * GRAVITY_MPS2
-        self._interval_s = self._interval_m / (2 * float(np.sqrt(usable * car.wheelbase_m)))
 
     def gates(self, refined: int) -> Gates:
         """The mesh with ``refined`` times as many intervals as the first."""
-        places = self._guess.mesh(self._interval_m, self._interval_s, refined)
-        make = standing_gates if self._settings.standing else flying_gates
-        return make(self._track, self._curve, places, self._tuning, self._margin_m)
+        tuning = self._car.tuning.raceline
+        # The outline reaches at least half the car's width beyond the centre of gravity.
+        margin_m = self._settings.margin_m + (self._car.width_m / 2 if self._settings.body else 0.0)
+        places = self._guess.mesh(refined)
+        gates = flying_gates(self._track, self._curve, places, tuning, margin_m, _FOLD)
+        if self._settings.standing:
+            return standing_gates(self._track, gates, tuning, margin_m)
+        return gates
 
-    def first(self, gates: Gates) -> Lap:
+    def first(self) -> Lap:
         """The best of laps from the racing line at several speeds, until two are the same."""
-        laps: list[Lap] = []
+        gates, laps, reason = self.gates(1), list[Lap](), ""
         for share in _SPEEDS:
             try:
-                lap = self._fastest(gates, self._guess.lap(gates, share), {})
+                lap = self.fastest(self._guess.lap(gates, share), {})
             except _NoLapError as error:
-                if share == _SPEEDS[-1] and not laps:
-                    raise InputError(str(error)) from None
+                reason = str(error)
                 continue
             laps.append(lap)
             if any(abs(one.time_s / lap.time_s - 1) < _SAME for one in laps[:-1]):
                 break
+        if not laps:
+            raise InputError(reason)
         return min(laps, key=lambda lap: lap.time_s)
 
-    def refined(self, coarse: Gates, lap: Lap, gates: Gates) -> Lap:
-        """The fastest lap from that on another mesh."""
-        passed = np.concatenate([[0.0], np.cumsum(lap.durations_s)])
-        aside = lap.states.copy()
-        aside[:, 1] -= coarse.heading_rad
-        states = _between(gates.place_m, coarse.place_m, aside)
-        states[:, 1] += gates.heading_rad
-        durations = np.diff(np.interp(gates.place_m, coarse.place_m, passed))
-        return self._fastest(gates, Lap(states, durations), _WARM)
-
-    def _fastest(self, gates: Gates, guess: Lap, options: dict[str, Any]) -> Lap:
+    def fastest(self, lap: Lap, options: dict[str, Any]) -> Lap:
         """The fastest lap; with an outline, repeated until this keeps the margin."""
-        lap, most_m = guess, _TOUCHING * self._model.car.width_m
+        failed = f"no limit for track '{self._track.name}':"
         for _ in range(_ROUNDS):
-            lap = self._optimised(gates, lap, options)
-            at = gates.points(lap.states[:, 0]), lap.states[:, 1]
-            if self._outline is None or self._outline.beyond_m(*at) <= most_m:
+            lap, solution = optimise(
+                dynamic(self._car), lap, self._settings, self._outline, options
+            )
+            if not solution.converged:
+                remedy = "try a smaller --margin, or without --body"
+                raise _NoLapError(f"{failed} {solution.how}; {remedy}")
+            if self._outline is None:
+                return lap
+            beyond_m = self._outline.beyond_m(lap.xy_m, lap.states[:, 1])
+            if beyond_m <= _TOUCHING * self._car.width_m:
                 return lap
             options = _WARM
         raise _NoLapError(
-            f"no limit for track '{self._track.name}': the outline still passes the margin after "
-            f"{_ROUNDS} rounds; try another --margin"
+            f"{failed} the outline still passes the margin after {_ROUNDS} rounds; try another "
+            "--margin"
         )
-
-    def _optimised(self, gates: Gates, guess: Lap, options: dict[str, Any]) -> Lap:
-        lap, solution = optimise(
-            self._model,
-            gates,
-            guess,
-            interval_s=self._interval_s,
-            start_mps=self._start_mps,
-            lateral_mps=self._settings.lateral_speed_mps,
-            outline=self._outline,
-            options={"max_iter": self._settings.max_iterations, **options},
-        )
-        if not solution.converged:
-            raise _NoLapError(
-                f"no limit for track '{self._track.name}': IPOPT ended with {solution.status} "
-                f"after {solution.iterations} iterations; try a smaller --margin, or without --body"
-            )
-        return lap
-
-
-def _between(place: Floats, places: Floats, values: Floats) -> Floats:
-    """Columns of values (n, m) at ``places`` (n,), interpolated linearly: (len(place), m)."""
-    return np.column_stack([np.interp(place, places, column) for column in values.T])
 
 
 def solve(track: Track, car: CarParameters, settings: LimitSettings) -> LimitLap:
@@ -143,15 +110,10 @@ def solve(track: Track, car: CarParameters, settings: LimitSettings) -> LimitLap
     Raises InputError if the margin leaves no room, or no lap is found.
     """
     begin = time.monotonic()
-    limit = _Limit(track, dynamic(car), settings, racing_line(track, car))
-    refined = 1
-    gates = limit.gates(refined)
-    lap = limit.first(gates)
-    while refined < _FINEST:
-        refined *= 2
-        finer = limit.gates(refined)
-        before_s, lap = lap.time_s, limit.refined(gates, lap, finer)
-        gates = finer
+    limit = _Limit(track, car, settings)
+    lap = limit.first()
+    for refined in _FINER:
+        before_s, lap = lap.time_s, limit.fastest(lap.through(limit.gates(refined)), _WARM)
         change = abs(lap.time_s / before_s - 1)
         if change < _UNCHANGED:
             break
@@ -160,15 +122,14 @@ def solve(track: Track, car: CarParameters, settings: LimitSettings) -> LimitLap
             f"no limit for track '{track.name}': with half the intervals the lap changes by "
             f"{100 * change:.2g} %; choose a smaller step_m in the car's [tuning.raceline]"
         )
-    positions = gates.points(lap.states[:, 0])
     return LimitLap(
         car=car.identity,
         track=track.identity,
         lap_s=lap.time_s,
-        intervals=gates.intervals,
+        intervals=lap.gates.intervals,
         mesh_change=change,
         solve_s=time.monotonic() - begin,
-        t_s=np.concatenate([[0.0], np.cumsum(lap.durations_s)]),
-        x=np.column_stack([positions, lap.states[:, 1:6]]),
+        t_s=lap.times_s,
+        x=np.column_stack([lap.xy_m, lap.states[:, 1:6]]),
         u=lap.states[:, 6:],
     )

@@ -1,11 +1,23 @@
 """Racing lines: minimum-time optimisation, the line as data, its file form.
 
+Order: the line (line.py), gates across the track (gates.py), the friction circle (friction.py), the
+nonlinear programme over both (ocp.py, solved as nlp.py has it), lines through a few nodes, for
+optimisers without derivatives (nodes.py), and the cache (cached.py).
+
 CasADi is imported on the first call of :func:`compute_raceline`, not with this package.
 """
 
-from bayesrace.raceline.identity import check_line, read_raceline_for, same_track
-from bayesrace.raceline.line import LineIdentity, RaceLine, read_raceline, write_raceline
-from bayesrace.raceline.settings import RaceLineError, RaceLineSettings
+from bayesrace.raceline.line import (
+    LineIdentity,
+    RaceLine,
+    RaceLineError,
+    RaceLineSettings,
+    check_line,
+    read_raceline,
+    read_raceline_for,
+    same_track,
+    write_raceline,
+)
 from bayesrace.tracks import Track
 from bayesrace.vehicles.parameters import CarParameters
 

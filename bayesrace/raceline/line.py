@@ -1,30 +1,63 @@
-"""A racing line as data, and its file form. No optimiser is needed to read or use one.
+"""A racing line as data, its file form, and what it was made for, checked where it is driven.
 
 Columns ``s_m; x_m; y_m; psi_rad; kappa_radpm; vx_mps; ax_mps2``, as the TUM and F1TENTH communities
-have them; lines with # are comments. Those of the form ``# key: value`` say what the line was made
-for (:class:`LineIdentity`). Every number that is written reads back as the same double.
+have them; comments say what the line was made for (:class:`LineIdentity`). No optimiser is needed
+to read or use a line.
 """
 
+import logging
 import math
-import re
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.arrays import Floats
+from bayesrace.cache import digest
 from bayesrace.errors import InputError
-from bayesrace.files import read_text, write_whole
-from bayesrace.tracks.files import read_table
+from bayesrace.tracks import Track
+from bayesrace.tracks.tables import read_about, read_table, write_table
+from bayesrace.vehicles.parameters import CarParameters
 
-__all__ = ["RACELINE_COLUMNS", "LineIdentity", "RaceLine", "read_raceline", "write_raceline"]
+__all__ = [
+    "LineIdentity",
+    "RaceLine",
+    "RaceLineError",
+    "RaceLineSettings",
+    "check_line",
+    "line_identity",
+    "read_raceline",
+    "read_raceline_for",
+    "same_track",
+    "write_raceline",
+]
 
-RACELINE_COLUMNS: Final = ("s_m", "x_m", "y_m", "psi_rad", "kappa_radpm", "vx_mps", "ax_mps2")
+_log = logging.getLogger("bayesrace.raceline")
+
+_COLUMNS: Final = ("s_m", "x_m", "y_m", "psi_rad", "kappa_radpm", "vx_mps", "ax_mps2")
 _MIN_POINTS: Final = 8
 _HEADINGS_DIFFER: Final = 0.3
 """Mean distance on the unit circle within which two headings are the same."""
-_KEY: Final = re.compile(r"#\s*(\w+):\s*(\S+)\s*")
+
+
+class RaceLineError(RuntimeError):
+    """The optimiser found no racing line; the message says how it ended and what may help."""
+
+
+class RaceLineSettings(BaseModel):
+    """Settings of :func:`bayesrace.raceline.compute_raceline`; the car's tuning has its steps."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    friction: float | None = Field(
+        default=None, gt=0, le=5, description="horizontal acceleration over g; None: the car's"
+    )
+    margin_m: float | None = Field(
+        default=None, ge=0, description="centre of gravity to track edge; None: half a car's width"
+    )
+    max_iterations: int = Field(default=500, ge=1, description="iteration limit of the optimiser")
 
 
 @dataclass(frozen=True)
@@ -81,16 +114,12 @@ def write_raceline(path: Path | str, line: RaceLine) -> None:
 
     The repetition carries the length; psi of the last row continues that of the row before.
     """
-    table = np.column_stack([getattr(line, name) for name in RACELINE_COLUMNS])
+    table = np.column_stack([getattr(line, name) for name in _COLUMNS])
     closing = table[:1].copy()
     closing[0, 0] = line.s_m[0] + line.length_m
     closing[0, 3] += 2 * np.pi * np.round((line.psi_rad[-1] - line.psi_rad[0]) / (2 * np.pi))
-    rows = np.concatenate([table, closing]).tolist()
-    lines = [f"# {'; '.join(RACELINE_COLUMNS)}"]
-    if line.made_for is not None:
-        lines += [f"# {f.name}: {getattr(line.made_for, f.name)}" for f in fields(LineIdentity)]
-    lines += ["; ".join(repr(value) for value in row) for row in rows]
-    write_whole(Path(path), "\n".join(lines) + "\n")
+    about = {} if line.made_for is None else asdict(line.made_for)
+    write_table(path, _COLUMNS, np.concatenate([table, closing]), about)
 
 
 def read_raceline(path: Path | str, track_name: str | None = None) -> RaceLine:
@@ -99,7 +128,7 @@ def read_raceline(path: Path | str, track_name: str | None = None) -> RaceLine:
     ``track_name``: default: the file's name. Raises InputError naming file, row and remedy.
     """
     path = Path(path)
-    table, rows = read_table(path, RACELINE_COLUMNS)
+    table, rows = read_table(path, _COLUMNS)
     if len(table) < _MIN_POINTS:
         raise InputError(
             f"{path}: too few points ({len(table)}); a racing line needs at least {_MIN_POINTS}"
@@ -147,12 +176,66 @@ def _continuous(psi: Floats, xy: Floats) -> Floats:
 
 def _made_for(path: Path) -> LineIdentity | None:
     """None unless the comments say all of it."""
-    text = read_text(path, "the racing line")
-    found = (_KEY.fullmatch(row) for row in text.splitlines() if row.startswith("#"))
-    values = {match[1]: match[2] for match in found if match}
+    about = read_about(path)
     try:
-        width_m, friction = float(values["width_m"]), float(values["friction"])
-        made = LineIdentity(values["car"], width_m, friction, values["track"], values["settings"])
+        width_m, friction = float(about["width_m"]), float(about["friction"])
+        made = LineIdentity(about["car"], width_m, friction, about["track"], about["settings"])
     except (KeyError, ValueError):
         return None
     return made if math.isfinite(width_m) and math.isfinite(friction) else None
+
+
+def line_identity(track: Track, car: CarParameters, settings: RaceLineSettings) -> LineIdentity:
+    """Of the line that these give."""
+    return LineIdentity(
+        car=car.identity,
+        width_m=car.width_m,
+        friction=car.friction if settings.friction is None else settings.friction,
+        track=track.identity,
+        settings=digest([settings.model_dump_json(), car.tuning.raceline.model_dump_json()]),
+    )
+
+
+def check_line(line: RaceLine, track: Track, car: CarParameters, where: str) -> None:
+    """InputError, beginning with ``where``, if the line was made for another car, grip or track.
+
+    Names do not count, only what they stand for. A line that does not say what it was made for is
+    accepted, with a warning in the log; how it was computed (``settings``) is not compared.
+    """
+    made = line.made_for
+    if made is None:
+        _log.warning(
+            "%s does not say for which car, grip and track it was made: it is driven as it is",
+            where,
+        )
+        return
+    remedy = "run 'bayesrace raceline' for this one, or name the one that the line is for"
+    if _shape(made.car) != car.digest():
+        fault = f"the car '{made.car}', this is '{car.identity}'"
+    elif made.width_m != car.width_m:
+        fault = f"a car {made.width_m:g} m wide, '{car.name}' is {car.width_m:g} m"
+    elif made.friction != car.friction:
+        fault = f"a friction of {made.friction:g}, the car '{car.name}' has {car.friction:g}"
+        remedy = f"run 'bayesrace raceline' for it, or set [limits] friction = {made.friction:g}"
+    elif not same_track(made.track, track.identity):
+        fault = f"the track '{made.track}', this is '{track.identity}'"
+    else:
+        return
+    raise InputError(f"{where} was made for {fault}: {remedy}")
+
+
+def same_track(one: str, other: str) -> bool:
+    """Whether two :attr:`bayesrace.tracks.Track.identity` are of one shape, whatever the names."""
+    return _shape(one) == _shape(other)
+
+
+def _shape(identity: str) -> str:
+    """The digest of a name with a digest."""
+    return identity.rpartition("-")[2]
+
+
+def read_raceline_for(path: Path, track: Track, car: CarParameters) -> RaceLine:
+    """The racing line in a file, to be driven by ``car`` on ``track``; see :func:`check_line`."""
+    line = read_raceline(path, track.name)
+    check_line(line, track, car, str(path))
+    return line

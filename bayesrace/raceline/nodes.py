@@ -10,10 +10,8 @@ import numpy as np
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
-from bayesrace.raceline.guess import speed_profile
-from bayesrace.raceline.line import RaceLine
-from bayesrace.raceline.ocp import car_limits, top_speed
-from bayesrace.raceline.settings import RaceLineSettings
+from bayesrace.raceline.friction import car_limits
+from bayesrace.raceline.line import RaceLine, RaceLineSettings
 from bayesrace.tracks import Track
 from bayesrace.tracks.spline import PlaneSpline, fit_arc_length
 from bayesrace.vehicles.parameters import CarParameters
@@ -92,15 +90,7 @@ def timed_line(
     psi = np.unwrap(np.arctan2(first[:, 1], first[:, 0]))
     chord = np.linalg.norm(np.roll(xy, -1, axis=0) - xy, axis=1)
     step = chord * (1 + (kappa * chord) ** 2 / 24)
-    v = speed_profile(
-        kappa,
-        step,
-        limits.grip_mps2,
-        lambda v: limits.straight_values(v, car.d_max),
-        lambda v: limits.straight_values(v, car.d_min),
-        car.tuning.raceline.speed_min_mps,
-        top_speed(limits),
-    )
+    v = limits.fastest(kappa, step, car.tuning.raceline.speed_min_mps, limits.top_speed())
     a = (np.roll(v, -1) ** 2 - v**2) / (2 * step)
     s = np.concatenate([[0.0], np.cumsum(step[:-1])])
     return RaceLine(name, s, xy[:, 0], xy[:, 1], psi, kappa, v, a, float(step.sum()))

@@ -1,15 +1,15 @@
 """Minimum-time lap as a nonlinear programme (CasADi, IPOPT).
 
-Per station k of the frame: lateral offset n, path direction xi against the frame, squared speed
-E = v^2, path curvature kappa, acceleration a along the path. Between two stations the path is a
+Per gate k: lateral offset n, path direction xi against the gate's, squared speed
+E = v^2, path curvature kappa, acceleration a along the path. Between two gates the path is a
 clothoid (kappa linear in its length l) and E has slope 2 a with a linear in l, so that
 
     psi' - psi = l (kappa' + kappa) / 2              E' - E = l (a' + a)
     chord direction = (psi + psi') / 2 - l (kappa' - kappa) / 12
     l = chord (1 + (psi' - psi)^2 / 24)              time = 2 l / (v + v')
 
-(' marks the next station; the chord formulas are exact to fourth order in l). No curvature of the
-frame enters: the path is as smooth as the car can drive even where the centreline isn't.
+(' marks the next gate; the chord formulas are exact to fourth order in l). No curvature of the
+centreline enters: the path is as smooth as the car can drive even where the centreline isn't.
 
 Limits, with ay = kappa E: friction circle a^2 + ay^2 <= (mu g)^2; drive, straight(v, d_min) <= a
 <= straight(v, d_max); steering angle and its rate; track edges less the margin. All of it can be
@@ -24,20 +24,17 @@ import casadi as ca
 import numpy as np
 
 from bayesrace.arrays import Floats
-from bayesrace.interrupts import deferred_interrupt
-from bayesrace.raceline.frame import Frame, build_frame
-from bayesrace.raceline.guess import speed_profile
-from bayesrace.raceline.identity import line_identity
-from bayesrace.raceline.line import RaceLine
-from bayesrace.raceline.sample import Clothoids, sample_line
-from bayesrace.raceline.settings import RaceLineError, RaceLineSettings
-from bayesrace.tracks import Track
-from bayesrace.vehicles.models import longitudinal_force, top_command
+from bayesrace.raceline.friction import CarLimits, car_limits
+from bayesrace.raceline.gates import Gates, even_places, flying_gates, smooth_centreline
+from bayesrace.raceline.line import RaceLine, RaceLineError, RaceLineSettings, line_identity
+from bayesrace.raceline.nlp import solve_nlp
+from bayesrace.tracks import StartLine, Track
 from bayesrace.vehicles.parameters import CarParameters
-from bayesrace.vehicles.parts import GRAVITY_MPS2
 
-__all__ = ["CarLimits", "car_limits", "optimise", "solve", "top_speed"]
+__all__ = ["solve"]
 
+_FOLD: Final = 0.85
+"""Largest n * kappa: beyond 1 neighbouring gates cross."""
 _XI_MAX_RAD: Final = 1.2
 _ROUNDS: Final = 3
 _FIRST_ITERATIONS: Final = 100
@@ -45,63 +42,24 @@ _FIRST_ITERATIONS: Final = 100
 second try begins with ..."""
 _SLOWER: Final = 0.4
 """... so much of its squared speeds and accelerations."""
-
-
-@dataclass(frozen=True)
-class CarLimits:
-    """What the car can do, from what one can measure; works on numbers and CasADi expressions."""
-
-    car: CarParameters
-    grip_mps2: float
-    """Radius of the friction circle."""
-    straight: ca.Function
-    """(v, d) to the acceleration without cornering [m/s^2]; d as the drive can."""
-
-    def steering(self, kappa: Any) -> Any:
-        """Steering angle that a path of this curvature needs [rad].
-
-        Kinematic bicycle: sin(beta) = lr kappa and tan(beta) = lr / L tan(delta).
-        """
-        slope = self.car.wheelbase_m * kappa / ca.sqrt(1 - (self.car.lr_m * kappa) ** 2)
-        return ca.atan(slope)
-
-    @property
-    def kappa_max_radpm(self) -> float:
-        """Curvature at full lock."""
-        slope = self.car.lr_m / self.car.wheelbase_m * np.tan(self.car.delta_max_rad)
-        return float(np.sin(np.arctan(slope)) / self.car.lr_m)
-
-    def straight_values(self, v: Floats, d: float) -> Floats:
-        """``straight`` at many speeds."""
-        return np.asarray(self.straight(v.reshape(1, -1), d)).ravel()
-
-
-def car_limits(car: CarParameters, settings: RaceLineSettings) -> CarLimits:
-    """The limits of a car, friction from the settings or else the car's."""
-    v, d = ca.SX.sym("v"), ca.SX.sym("d")
-    acting = ca.fmin(d, top_command(car, v, car.d_max))
-    straight = longitudinal_force(car, v, acting) / car.mass_kg
-    friction = car.friction if settings.friction is None else settings.friction
-    return CarLimits(
-        car=car,
-        grip_mps2=friction * GRAVITY_MPS2,
-        straight=ca.Function("straight", [v, d], [straight]),
-    )
+_GAUSS_X, _GAUSS_W = np.polynomial.legendre.leggauss(6)
 
 
 def solve(track: Track, car: CarParameters, settings: RaceLineSettings) -> RaceLine:
     """Racing line of ``car`` on ``track``; raises InputError or RaceLineError.
 
-    The margin holds at the stations; should the path between them come nearer to the real edge
-    than allowed, it is optimised again with that much more.
+    The margin holds at the gates; should the path between them come nearer to the real edge than
+    allowed, it is optimised again with that much more.
     """
     margin = car.width_m / 2 if settings.margin_m is None else settings.margin_m
     limits, tuning = car_limits(car, settings), car.tuning.raceline
+    curve = smooth_centreline(track, tuning)
+    places = even_places(curve, track, tuning)
     extra, shares = 0.0, [1.0, _SLOWER]
     for _ in range(_ROUNDS):
-        frame = build_frame(track, tuning, margin + extra)
-        path = optimise(track.name, frame, limits, settings, shares)
-        line = sample_line(track, path, tuning.spacing_m)
+        gates = flying_gates(track, curve, places, tuning, margin + extra, _FOLD)
+        path = _optimised(track.name, gates, limits, settings, shares)
+        line = _sampled(track, path, tuning.spacing_m)
         excess = float(np.max(track.project_path(line.xy_m).off_track_m)) + margin
         if excess <= tuning.tolerance_m:
             return replace(line, made_for=line_identity(track, car, settings))
@@ -112,181 +70,189 @@ def solve(track: Track, car: CarParameters, settings: RaceLineSettings) -> RaceL
     )
 
 
-@dataclass(frozen=True)
-class _Problem:
-    """The nonlinear programme: minimise f(x) with g_min <= g(x) <= 0 and bounds on x."""
-
-    x: Any
-    f: Any
-    g: Any
-    g_min: Floats
-    length: Any
-    """Arc lengths between stations, (N, 1)."""
-
-
 def _following(x: Any) -> Any:
-    """The values at the next station, around the lap."""
+    """The values at the next gate, around the lap."""
     return ca.vertcat(x[1:], x[0])
 
 
-def _problem(frame: Frame, limits: CarLimits) -> _Problem:
-    """Objective and constraints over x = [n, xi, E, kappa, a], each (N, 1).
+def _optimised(
+    name: str, gates: Gates, limits: CarLimits, settings: RaceLineSettings, shares: list[float]
+) -> "_Clothoids":
+    """The fastest path over x = [n, xi, E, kappa, a], each (M, 1).
 
-    From the last station of a path that is not closed nothing leads to the first one.
+    ``shares`` of the guess's squared speeds and accelerations are tried in turn; one that fails is
+    dropped, but for the last.
     """
-    count = len(frame.kappa_radpm)
-    intervals = count if frame.start_mps is None else count - 1
-    step = frame.length_m / intervals
-    n, xi, energy, kappa, a = (ca.SX.sym(x, count) for x in ("n", "xi", "E", "kappa", "a"))
-
-    x, y = (frame.xy_m[:, i] + n * frame.normal[:, i] for i in range(2))
-    dx, dy = _following(x) - x, _following(y) - y
-    turn = _following(xi) - xi + frame.turn_rad
-    length = ca.sqrt(dx**2 + dy**2) * (1 + turn**2 / 24)
-    chord = frame.heading_rad + xi + turn / 2 - length * (_following(kappa) - kappa) / 12
-    equal = [
-        turn - length * (_following(kappa) + kappa) / 2,
-        (ca.cos(chord) * dy - ca.sin(chord) * dx) / step,
-        _following(energy) - energy - length * (_following(a) + a),
+    count, tuning = gates.intervals, limits.car.tuning.raceline
+    xy, normal, heading = gates.xy_m[:-1], gates.normal[:-1], gates.heading_rad[:-1]
+    turn = np.diff(np.append(heading, heading[0]))
+    turn[-1] = np.remainder(turn[-1] + np.pi, 2 * np.pi) - np.pi
+    step = gates.place_m[-1] / count
+    n, xi, energy, kappa, a = symbols = [
+        ca.SX.sym(x, count) for x in ("n", "xi", "E", "kappa", "a")
     ]
+
+    x, y = (xy[:, i] + n * normal[:, i] for i in range(2))
+    dx, dy = _following(x) - x, _following(y) - y
+    turned = _following(xi) - xi + turn
+    length = ca.sqrt(dx**2 + dy**2) * (1 + turned**2 / 24)
+    chord = heading + xi + turned / 2 - length * (_following(kappa) - kappa) / 12
     v = ca.sqrt(energy)
     time = 2 * length / (_following(v) + v)
-    within = _car_within(limits, energy, kappa, a)
-    steered = _steered_within(limits, time, kappa)
-    tuning = limits.car.tuning.raceline
+    equal = ca.vertcat(
+        turned - length * (_following(kappa) + kappa) / 2,
+        (ca.cos(chord) * dy - ca.sin(chord) * dx) / step,
+        _following(energy) - energy - length * (_following(a) + a),
+    )
     rough = tuning.rate_weight * (_following(a) - a) ** 2
     rough += tuning.curvature_weight * (_following(kappa) - kappa) ** 2
-    equal, steered = ([part[:intervals] for part in parts] for parts in (equal, steered))
-    limited = ca.vertcat(*within, *steered)
-    return _Problem(
-        x=ca.vertcat(n, xi, energy, kappa, a),
-        f=ca.sum1(time[:intervals]) + ca.sum1(rough[:intervals]) / step,
-        g=ca.vertcat(*equal, limited),
-        g_min=np.append(np.zeros(len(equal) * intervals), np.full(limited.numel(), -np.inf)),
-        length=length,
+    limited = ca.vertcat(*_within(limits, energy, kappa, a, time))
+    every = ca.vertcat(*symbols)
+    nlp = {"x": every, "f": ca.sum1(time) + ca.sum1(rough) / step, "g": ca.vertcat(equal, limited)}
+    least = np.append(np.zeros(equal.numel()), np.full(limited.numel(), -np.inf))
+
+    v_max, most = limits.top_speed(), settings.max_iterations
+    bounds, guess = _bounds(gates, limits, v_max), _guess(gates, limits, v_max)
+    while True:
+        start = guess * np.repeat([1.0, 1.0, shares[0], 1.0, shares[0]], count)
+        options = {"tol": 1e-6, "max_iter": min(_FIRST_ITERATIONS, most) if shares[1:] else most}
+        found = solve_nlp(nlp, start, bounds, (least, 0.0), options)
+        if found.converged or len(shares) == 1:
+            break
+        shares.pop(0)
+    if not found.converged:
+        raise RaceLineError(
+            f"no racing line for track '{name}': {found.how}; try a smaller margin_m, another "
+            "step_m in the car's [tuning.raceline], or more max_iterations"
+        )
+    offset, direction, squared, curvature, along = found.x.reshape(5, -1)
+    return _Clothoids(
+        xy_m=xy + offset[:, None] * normal,
+        psi_rad=heading + direction,
+        kappa_radpm=curvature,
+        energy=squared,
+        ax_mps2=along,
+        step_m=np.asarray(ca.Function("length", [every], [length])(found.x)).ravel(),
+        turn_rad=float(turn.sum()),
     )
 
 
-def _car_within(limits: CarLimits, energy: Any, kappa: Any, a: Any) -> list[Any]:
-    """What the car can do at a station, as expressions (N, 1) that must be <= 0.
-
-    The steering angle's limit is the bound on kappa.
-    """
+def _within(limits: CarLimits, energy: Any, kappa: Any, a: Any, time: Any) -> list[Any]:
+    """What the car can do, as expressions (M, 1) that must be <= 0: friction and drive at the
+    gates, steering rate between them. The steering angle's limit is the bound on kappa."""
     car = limits.car
-    v, ay = ca.sqrt(energy), kappa * energy
+    v, ay, steering = ca.sqrt(energy), kappa * energy, limits.steering(kappa)
+    steered, most = _following(steering) - steering, car.delta_rate_max_radps * time
     return [
         (ay / limits.grip_mps2) ** 2 + (a / limits.grip_mps2) ** 2 - 1,
         a - limits.straight(v.T, car.d_max).T,
         limits.straight(v.T, car.d_min).T - a,
+        steered - most,
+        -steered - most,
     ]
 
 
-def _steered_within(limits: CarLimits, time: Any, kappa: Any) -> list[Any]:
-    """The limit of the steering rate between stations, as expressions (N, 1) that must be <= 0."""
-    steering = limits.steering(kappa)
-    steered = _following(steering) - steering
-    most = limits.car.delta_rate_max_radps * time
-    return [steered - most, -steered - most]
-
-
-def _bounds(frame: Frame, limits: CarLimits, v_max: float) -> tuple[Floats, Floats]:
+def _bounds(gates: Gates, limits: CarLimits, v_max: float) -> tuple[Floats, Floats]:
     """Lower and upper bounds of x."""
-    one = np.ones(len(frame.kappa_radpm))
-    kappa, tuning = limits.kappa_max_radpm, limits.car.tuning.raceline
-    v_min, a_any = tuning.speed_min_mps, tuning.acceleration_bound_mps2
-    slowest, fastest = v_min**2 * one, (1.05 * v_max) ** 2 * one
-    if frame.start_mps is not None:
-        slowest[0] = fastest[0] = frame.start_mps**2
-    low = [frame.n_min_m, -_XI_MAX_RAD * one, slowest, -kappa * one, -a_any * one]
-    high = [frame.n_max_m, _XI_MAX_RAD * one, fastest, kappa * one, a_any * one]
+    one, tuning = np.ones(gates.intervals), limits.car.tuning.raceline
+    kappa, v_min, a_any = (
+        limits.kappa_max_radpm,
+        tuning.speed_min_mps,
+        tuning.acceleration_bound_mps2,
+    )
+    low = [gates.n_min_m[:-1], -_XI_MAX_RAD * one, v_min**2 * one, -kappa * one, -a_any * one]
+    high = [
+        gates.n_max_m[:-1],
+        _XI_MAX_RAD * one,
+        (1.05 * v_max) ** 2 * one,
+        kappa * one,
+        a_any * one,
+    ]
     return np.concatenate(low), np.concatenate(high)
 
 
-def _guess(frame: Frame, limits: CarLimits, v_max: float) -> Floats:
-    """x on the frame's own line with the speeds that the car could drive there."""
-    car = limits.car
-    count = len(frame.kappa_radpm)
-    step = frame.length_m / count
-    kappa_max = 0.9 * limits.kappa_max_radpm
-    kappa = np.clip(frame.kappa_radpm, -kappa_max, kappa_max)
-    v = speed_profile(
-        kappa,
-        np.full(count, step),
-        limits.grip_mps2,
-        lambda v: limits.straight_values(v, car.d_max),
-        lambda v: limits.straight_values(v, car.d_min),
-        2 * car.tuning.raceline.speed_min_mps,
-        v_max,
-        frame.start_mps,
-    )
-    n = np.clip(0.0, frame.n_min_m, frame.n_max_m)
+def _guess(gates: Gates, limits: CarLimits, v_max: float) -> Floats:
+    """x on the centreline with the speeds that the car could drive there."""
+    count = gates.intervals
+    step, kappa_max = gates.place_m[-1] / count, 0.9 * limits.kappa_max_radpm
+    kappa = np.clip(gates.kappa_radpm[:-1], -kappa_max, kappa_max)
+    v_min = 2 * limits.car.tuning.raceline.speed_min_mps
+    v = limits.fastest(kappa, np.full(count, step), v_min, v_max)
+    n = np.clip(0.0, gates.n_min_m[:-1], gates.n_max_m[:-1])
     a = (np.roll(v, -1) ** 2 - v**2) / (2 * step)
-    if frame.start_mps is not None:
-        a[-1] = 0.0
     return np.concatenate([n, np.zeros(count), v**2, kappa, a])
 
 
-def optimise(
-    name: str, frame: Frame, limits: CarLimits, settings: RaceLineSettings, shares: list[float]
-) -> Clothoids:
-    """The fastest path. ``shares`` of the guess's squared speeds and accelerations are tried in
-    turn; one that fails is dropped, but for the last."""
-    problem = _problem(frame, limits)
-    v_max = top_speed(limits)
-    bounds, guess = _bounds(frame, limits, v_max), _guess(frame, limits, v_max)
-    while True:
-        start = guess * np.repeat([1.0, 1.0, shares[0], 1.0, shares[0]], len(guess) // 5)
-        most = settings.max_iterations
-        iterations = min(_FIRST_ITERATIONS, most) if len(shares) > 1 else most
-        result, stats = _solved(problem, bounds, start, iterations)
-        if stats["success"] or len(shares) == 1:
-            break
-        shares.pop(0)
-    if not stats["success"]:
-        raise RaceLineError(
-            f"no racing line for track '{name}': IPOPT ended with {stats['return_status']} after "
-            f"{stats['iter_count']} iterations; try a smaller margin_m, another step_m in "
-            "the car's [tuning.raceline], or more max_iterations"
+@dataclass(frozen=True, eq=False)
+class _Clothoids:
+    """Closed chain of n clothoids with piecewise linear acceleration; arrays (n,)."""
+
+    xy_m: Floats
+    psi_rad: Floats
+    kappa_radpm: Floats
+    energy: Floats
+    """Squared speed [m^2/s^2]."""
+    ax_mps2: Floats
+    step_m: Floats
+    """Arc length from each gate to the next."""
+    turn_rad: float
+    """Direction gained over the lap, +-2 pi."""
+
+    @property
+    def length_m(self) -> float:
+        """Arc length of the whole path."""
+        return float(self.step_m.sum())
+
+    def at(self, s: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+        """xy (m, 2), psi, kappa, v, ax at arc lengths (m,) from gate 0, up to two laps on."""
+        lap, rest = np.divmod(s, self.length_m)
+        knots = np.concatenate([[0.0], np.cumsum(self.step_m[:-1])])
+        k = np.searchsorted(knots, rest, side="right") - 1
+        after = (k + 1) % len(knots)
+        length, t = self.step_m[k], rest - knots[k]
+        bend = (self.kappa_radpm[after] - self.kappa_radpm[k]) / length
+        gain = (self.ax_mps2[after] - self.ax_mps2[k]) / length
+
+        def psi(way: Floats) -> Floats:
+            start = (slice(None),) + (None,) * (way.ndim - 1)
+            turned = way * (self.kappa_radpm[k][start] + way * bend[start] / 2)
+            return np.asarray(self.psi_rad[k][start] + turned)
+
+        inner = psi(t[:, None] * (_GAUSS_X + 1) / 2)
+        weight = t[:, None] * _GAUSS_W / 2
+        offset = np.column_stack(
+            [np.sum(np.cos(inner) * weight, axis=1), np.sum(np.sin(inner) * weight, axis=1)]
         )
-    n, xi, energy, kappa, a = np.asarray(result["x"]).reshape(5, -1)
-    lengths = ca.Function("length", [problem.x], [problem.length])(result["x"])
-    return Clothoids(
-        xy_m=frame.xy_m + n[:, None] * frame.normal,
-        psi_rad=frame.heading_rad + xi,
-        kappa_radpm=kappa,
-        energy=energy,
-        ax_mps2=a,
-        step_m=np.asarray(lengths).ravel(),
-        turn_rad=float(frame.turn_rad.sum()),
-    )
+        energy = self.energy[k] + t * (2 * self.ax_mps2[k] + t * gain)
+        return (
+            self.xy_m[k] + offset,
+            psi(t) + lap * self.turn_rad,
+            self.kappa_radpm[k] + bend * t,
+            np.sqrt(energy),
+            self.ax_mps2[k] + gain * t,
+        )
 
 
-def _solved(
-    problem: _Problem, bounds: tuple[Floats, Floats], start: Floats, iterations: int
-) -> tuple[Any, dict[str, Any]]:
-    """IPOPT's result and statistics, whether it has converged or not."""
-    options: dict[str, Any] = {
-        "print_time": False,
-        "error_on_fail": False,
-        "ipopt": {
-            "print_level": 0,
-            "sb": "yes",
-            "tol": 1e-6,
-            "acceptable_iter": 0,
-            "max_iter": iterations,
-        },
-    }
-    nlp = {"x": problem.x, "f": problem.f, "g": problem.g}
-    solver = ca.nlpsol("raceline", "ipopt", nlp, options)
-    with deferred_interrupt():
-        result = solver(x0=start, lbx=bounds[0], ubx=bounds[1], lbg=problem.g_min, ubg=0.0)
-    return result, solver.stats()
+def _sampled(track: Track, path: _Clothoids, spacing_m: float) -> RaceLine:
+    """Evenly spaced points along the path, the first on the track's start line."""
+    count = max(24, round(path.length_m / spacing_m))
+    s = np.arange(count, dtype=np.float64) * (path.length_m / count)
+    xy, psi, kappa, v, a = path.at(s + _start(track, path))
+    psi = psi - 2 * np.pi * np.round(psi[0] / (2 * np.pi))
+    return RaceLine(track.name, s, xy[:, 0], xy[:, 1], psi, kappa, v, a, path.length_m)
 
 
-def top_speed(limits: CarLimits) -> float:
-    """Speed at which full drive only balances the resistances [m/s]."""
-    highest_mps = limits.car.tuning.raceline.speed_bound_mps
-    v = np.linspace(0.0, highest_mps, 3001)
-    spent = limits.straight_values(v, limits.car.d_max) <= 0
-    spent[0] = False  # a standing car has no resistance but may have no drive either
-    return float(v[int(np.argmax(spent))]) if spent.any() else highest_mps
+def _start(track: Track, path: _Clothoids) -> float:
+    """Arc length, in [0, length), from gate 0 to the start line.
+
+    The gates are normals of a smoothed centreline, so gate 0 and the start line differ slightly.
+    """
+    line = StartLine(track)
+    s = 0.0
+    for _ in range(20):
+        xy, *_ = path.at(np.array([s % path.length_m]))
+        change = line.signed_distance(float(xy[0, 0]), float(xy[0, 1]))
+        s -= change
+        if abs(change) < 1e-12:
+            break
+    return s % path.length_m

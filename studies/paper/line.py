@@ -9,8 +9,8 @@ import numpy as np
 from bayesrace.raceline import RaceLine, RaceLineSettings
 from bayesrace.raceline.nodes import timed_line
 from bayesrace.tracks import Track
-from bayesrace.tracks.files import read_table
 from bayesrace.tracks.spline import fit_arc_length
+from bayesrace.tracks.tables import read_table
 from bayesrace.vehicles import CarParameters
 from operation.analysis.published import LAPS_OFF, LAPS_ON
 from operation.report.style import look
