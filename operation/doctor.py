@@ -10,6 +10,7 @@ from bayesrace.configuration import Configuration
 from bayesrace.errors import InputError
 from bayesrace.messages import Role
 from bayesrace.transport import Credentials, Endpoints, open_session
+from bayesrace.transport.credentials import NEWEST_LIST
 from bayesrace.transport.probe import Finding, probe_all
 from operation.analysis.network_status import SOURCES
 from operation.lifecycle import find
@@ -104,8 +105,11 @@ def _cars(endpoints: Endpoints, own: Credentials | None) -> Iterator[Check]:
     except InputError as error:
         yield Check(False, str(error))
         return
+    remedy = "start it, or correct its endpoints"
+    if own is not None:
+        remedy += f"; if it runs, {NEWEST_LIST}"
     for car, present in sorted(cars.items()):
         missing = [source for source in SOURCES if source not in present]
         text = f"car '{car}': {' and '.join(sorted(present))}"
-        absent = f"; no {' and no '.join(missing)}: start it, or correct its endpoints"
+        absent = f"; no {' and no '.join(missing)}: {remedy}"
         yield Check(not missing, text + (absent if missing else ""))

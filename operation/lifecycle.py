@@ -23,6 +23,7 @@ from bayesrace.messages import (
     is_car_name,
 )
 from bayesrace.transport import Endpoints, Inbox, Kind, ask_all, decisive, open_session
+from bayesrace.transport.credentials import NEWEST_LIST
 from operation.analysis.network_status import SOURCES, NetworkStatus, ProcessStatus
 
 __all__ = ["Action", "Found", "ask_statuses", "command", "find", "follow", "pick", "route"]
@@ -105,7 +106,9 @@ def _not_found(session: Any, endpoints: Endpoints, timeout_s: float, name: str) 
     others = sorted(_tokens(session, ALIVE.format(car="*", source="*"), timeout_s)) if name else []
     if others:
         return InputError(f"no car '{name}' at {where}; cars found: {', '.join(others)}")
-    return InputError(f"no car at {where}, though another process listens there; {remedy}")
+    if endpoints.credentials is not None:
+        remedy += f"; if both run, {NEWEST_LIST}"
+    return InputError(f"linked to {where}, but no car is visible there; {remedy}")
 
 
 def ask_statuses(session: Any, found: Found, timeout_s: float) -> NetworkStatus:

@@ -1,8 +1,8 @@
 """Access control of secured links, generated from the table of messages.
 
 Every node checks what comes from the other end of a link, and what goes there, by the name in the
-other end's certificate. What the table does not allow to that name's role and car is dropped;
-nobody who is not a member may do anything but ask whether he is one (:data:`ACCESS`).
+other end's certificate. What the table does not allow to that name's role and car is dropped; a
+name that is not in the list of members may do nothing.
 """
 
 from collections import defaultdict
@@ -21,15 +21,11 @@ from bayesrace.messages import (
 )
 from bayesrace.transport.credentials import Members
 
-__all__ = ["ACCESS", "access_control"]
-
-ACCESS: Final = "bayesrace-access/{node}"
-"""Where each secured node says what it lets a name do; see :mod:`bayesrace.transport.links`."""
+__all__ = ["access_control"]
 
 _Right = tuple[str, str, str]
 """Direction as seen by the node that checks ("ingress": from the other end), kind, key."""
 
-_ASKING: Final = ("query", "reply", "declare_queryable")
 _EVERY_KIND: Final = (
     "put", "delete", "declare_subscriber", "query", "reply", "declare_queryable",
     "liveliness_token", "liveliness_query", "declare_liveliness_subscriber",
@@ -42,15 +38,15 @@ def access_control(members: Members) -> dict[str, Any]:
     names: dict[tuple[Role, str], list[str]] = defaultdict(list)
     for name, member in members.members.items():
         names[member.role, member.car].append(name)
-    rules = [_rule("access", flow, _ASKING, [ACCESS.format(node="*")]) for flow in _FLOWS]
-    subjects: list[dict[str, Any]] = [{"id": "anyone"}]
-    policies = [_policy("anyone", rules)]
+    rules: list[dict[str, Any]] = []
+    subjects: list[dict[str, Any]] = []
+    policies: list[dict[str, Any]] = []
     for number, ((role, car), bearers) in enumerate(sorted(names.items())):
         subject = f"{role}-{number}"
         granted = _rules(subject, role, car)
         rules += granted
         subjects.append({"id": subject, "cert_common_names": sorted(bearers)})
-        policies.append(_policy(subject, granted))
+        policies.append({"rules": [rule["id"] for rule in granted], "subjects": [subject]})
     return {
         "enabled": True, "default_permission": "deny", "rules": rules, "subjects": subjects,
         "policies": policies,
@@ -61,25 +57,17 @@ _FLOWS: Final = ("ingress", "egress")
 
 
 def _rules(subject: str, role: Role, car: str) -> list[dict[str, Any]]:
-    """One rule for each direction and kind of message."""
+    """One rule for each direction and kind of message that such a process may exchange."""
     keys: dict[tuple[str, str], set[str]] = defaultdict(set)
     for flow, kind, key in _rights(role):
         keys[flow, kind].add(key.format(car=car, source="*"))
     return [
-        _rule(f"{subject}-{kind}", flow, [kind], sorted(some))
+        {
+            "id": f"{subject}-{kind}-{flow}", "permission": "allow", "flows": [flow],
+            "messages": [kind], "key_exprs": sorted(some),
+        }
         for (flow, kind), some in sorted(keys.items())
-    ]
-
-
-def _rule(name: str, flow: str, kinds: Any, keys: list[str]) -> dict[str, Any]:
-    return {
-        "id": f"{name}-{flow}", "permission": "allow", "flows": [flow], "messages": list(kinds),
-        "key_exprs": keys,
-    }  # fmt: skip
-
-
-def _policy(subject: str, rules: list[dict[str, Any]]) -> dict[str, Any]:
-    return {"rules": [rule["id"] for rule in rules], "subjects": [subject]}
+    ]  # fmt: skip
 
 
 def _rights(role: Role) -> Iterator[_Right]:

@@ -21,14 +21,19 @@ if TYPE_CHECKING:
     import ssl
 
 __all__ = [
-    "AUTHORITY", "CERTIFICATE", "COVERS", "EVERY_CAR", "KEY", "MEMBERS", "Credentials", "Member",
-    "Members", "read_members",
+    "AUTHORITY", "CERTIFICATE", "COVERS", "EVERY_CAR", "KEY", "MEMBERS", "NEWEST_LIST",
+    "Credentials", "Member", "Members", "read_members",
 ]  # fmt: skip
 
 AUTHORITY: Final = "ca.pem"
 CERTIFICATE: Final = "certificate.pem"
 KEY: Final = "key.pem"
 MEMBERS: Final = "members.json"
+
+NEWEST_LIST: Final = (
+    f"give every process the newest {MEMBERS} of 'bayesrace certs', and start it again"
+)
+"""Remedy where a link stands and nothing comes over it: one end has an old list of members."""
 
 EVERY_CAR: Final = "*"
 

@@ -1,4 +1,4 @@
-"""Which links of a session stand, and which nodes are at their other ends."""
+"""Which links of a session stand."""
 
 import socket
 import time
@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from bayesrace.transport.endpoints import Endpoints, address_of
 
-__all__ = ["nodes_at", "unlinked", "wait_linked"]
+__all__ = ["unlinked", "wait_linked"]
 
 _LOOK_S: Final = 0.02
 
@@ -19,18 +19,6 @@ def unlinked(session: Any, endpoints: Endpoints, among: Sequence[str] | None = N
         return [] if len(_nodes(session)) >= len(wanted) else wanted
     ends = {_end(link) for link in session.info.links()}
     return [one for one in wanted if not _is_among(one, ends)]
-
-
-def nodes_at(session: Any, endpoints: Endpoints) -> set[str]:
-    """Who is linked at the endpoints to connect to; those who have connected to us are not."""
-    if endpoints.low_latency:
-        return set() if endpoints.listen else {str(node) for node in _nodes(session)}
-    links = session.info.links()
-    return {
-        str(link.zid)
-        for link in links
-        if any(_is_among(x, {_end(link)}) for x in endpoints.connect)
-    }
 
 
 def wait_linked(session: Any, endpoints: Endpoints, among: Sequence[str], timeout_s: float) -> bool:

@@ -25,8 +25,7 @@ from bayesrace.realtime import short_slices
 from bayesrace.transport.access import access_control
 from bayesrace.transport.credentials import AUTHORITY, CERTIFICATE, KEY, Credentials
 from bayesrace.transport.endpoints import Endpoints, check_descriptors, leaves
-from bayesrace.transport.links import nodes_at, wait_linked
-from bayesrace.transport.membership import refusals, serve_access
+from bayesrace.transport.links import wait_linked
 from bayesrace.transport.probe import Finding, probe_all
 from bayesrace.transport.requests import in_transport_thread
 from bayesrace.transport.watch import LinkWatch, report
@@ -130,15 +129,15 @@ def open_session(
     """A Zenoh session of a process in that role, closed at the end of the block.
 
     Raises InputError if an endpoint is malformed, open to others without protection, or cannot be
-    listened on; if the certificate is not for the role; if a link is refused, here or at its other
-    end. An absent peer is no error: the session connects as soon as it appears, and the log says
-    that it waits. See :class:`.Inbox` for waiting with a limit.
+    listened on; if the certificate is not for the role; if a handshake is refused, here or at the
+    other end. An absent peer is no error: the session connects as soon as it appears, and the log
+    says that it waits. See :class:`.Inbox` for waiting with a limit.
 
     ``peers_follow``: the caller starts the peers itself, just before or after this call. Opening
     the session then does not wait for them, and the log does not say that they are absent.
 
-    Where the process's certificate expires (``grace_s`` later) or turns out to be revoked, the main
-    thread gets a SIGINT, and the end of the block raises InputError with the reason.
+    Where the process's certificate expires, the main thread gets a SIGINT ``grace_s`` later, and
+    the end of the block raises InputError with the reason.
     """
     os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)
     absent = _checked(endpoints, role, peers_follow)
@@ -151,9 +150,12 @@ def open_session(
     try:
         with ExitStack() as stack:
             session = stack.enter_context(_opened(endpoints, role, peers_follow))
-            known = _join(session, endpoints, absent, stack)
+            if endpoints.credentials is not None:
+                missing = {finding.endpoint for finding in absent}
+                there = [one for one in endpoints.connect if one not in missing]
+                wait_linked(session, endpoints, there, _LINK_S)
             if endpoints.credentials is not None or (endpoints.connect and not peers_follow):
-                watch = LinkWatch(session, endpoints, known, not peers_follow, grace_s)
+                watch = LinkWatch(session, endpoints, not peers_follow, grace_s)
                 stack.callback(watch.close)
             yield session
     except (InputError, KeyboardInterrupt) as error:
@@ -162,26 +164,6 @@ def open_session(
         raise InputError(watch.fault) from error
     if watch is not None and watch.fault:
         raise InputError(watch.fault)
-
-
-def _join(session: Any, endpoints: Endpoints, absent: list[Finding], stack: ExitStack) -> set[str]:
-    """Waits for the links of a secured session that can be; returns the nodes at their ends.
-
-    InputError if one refuses this process's certificate.
-    """
-    credentials = endpoints.credentials
-    if credentials is None:
-        return set()
-    access = serve_access(session, credentials)
-    stack.callback(access.undeclare)  # a process with a queryable hangs at its exit
-    missing = {finding.endpoint for finding in absent}
-    wait_linked(
-        session, endpoints, [one for one in endpoints.connect if one not in missing], _LINK_S
-    )
-    nodes = nodes_at(session, endpoints)
-    if refused := refusals(session, credentials, nodes):
-        raise InputError("; ".join(refusal.text for refusal in refused))
-    return nodes
 
 
 def try_links(endpoints: Endpoints, role: Role) -> None:

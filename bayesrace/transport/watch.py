@@ -15,8 +15,7 @@ from typing import Any, Final
 import zenoh
 
 from bayesrace.transport.endpoints import Endpoints
-from bayesrace.transport.links import nodes_at, unlinked
-from bayesrace.transport.membership import refusals
+from bayesrace.transport.links import unlinked
 from bayesrace.transport.probe import Finding, expired, probe_all
 
 __all__ = ["LinkWatch", "report"]
@@ -52,17 +51,15 @@ def _only_ours(_number: int, _frame: FrameType | None) -> None:
 class LinkWatch:
     """Watches the links of a session, in a thread."""
 
-    def __init__(
-        self, session: Any, endpoints: Endpoints, known: set[str], explains: bool, grace_s: float
-    ) -> None:
-        """``known``: nodes that are known to accept this process. ``explains``: logs why there is
-        no link. ``grace_s``: from the expiry of the certificate to the end of the process."""
+    def __init__(self, session: Any, endpoints: Endpoints, explains: bool, grace_s: float) -> None:
+        """``explains``: logs why there is no link. ``grace_s``: from the expiry of the certificate
+        to the end of the process."""
         self._session, self._endpoints, self._credentials = (
             session,
             endpoints,
             endpoints.credentials,
         )
-        self._known, self._explains, self._grace_s = known, explains, grace_s
+        self._explains, self._grace_s = explains, grace_s
         self.fault = ""
         """Why the process has to end, with the remedy; it gets a SIGINT in its main thread."""
         self._ends_process = threading.current_thread() is threading.main_thread()
@@ -135,21 +132,7 @@ class LinkWatch:
             if first and lasting:
                 return "; ".join(lasting)
         report(found)
-        return self._refused()
-
-    def _refused(self) -> str:
-        """Logs what ends that are new refuse; returns that the certificate is revoked."""
-        if self._credentials is None:
-            return ""
-        nodes = nodes_at(self._session, self._endpoints)
-        new, self._known = nodes - self._known, nodes
-        if new:  # with certificates that have not been seen
-            report(probe_all(self._endpoints.connect, self._credentials))
-        refused = refusals(self._session, self._credentials, new)
-        for refusal in refused:
-            if not refusal.revoked:
-                _log.error("%s", refusal.text)
-        return "; ".join(refusal.text for refusal in refused if refusal.revoked)
+        return ""
 
     def _end(self, fault: str) -> None:
         if self._over.is_set():

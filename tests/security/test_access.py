@@ -182,6 +182,7 @@ def _opened(members: Members, flow: str) -> dict[str, Any]:
         "key_exprs": ["**"],
     }  # fmt: skip
     content["rules"].append(rule)
+    content["subjects"].append({"id": "anyone"})
     content["policies"].append({"rules": ["open"], "subjects": ["anyone"]})
     return content
 

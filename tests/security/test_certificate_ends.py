@@ -7,7 +7,6 @@ import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -15,12 +14,11 @@ from bayesrace.configuration import read_configuration
 from bayesrace.errors import InputError
 from bayesrace.messages import Role
 from bayesrace.transport import Endpoints, free_endpoint, open_session
-from operation.certificates import add, init, revoke
+from operation.certificates import add, init
 from tests.network.cars import Course, Program
 from tests.network.journey import STANDING_MPS
 from tests.programs import PATIENCE_S, ROOT, until
 from tests.security.authority import CAR, Bundles, bundles, written
-from tests.security.intruder import bare_session
 from tests.security.rig import course, secured
 
 __all__ = ["bundles", "course"]
@@ -116,23 +114,6 @@ def test_commands_end(tmp_path: Path, course: Course) -> None:
             check_ended(program, names[role])
 
 
-def test_a_revoked_certificate_ends_its_process(tmp_path: Path) -> None:
-    """Once the other end has the newest list, and has been started again with it."""
-    certificates, where = certified(tmp_path), free_endpoint("tls")
-    ends = Endpoints(connect=(where,), credentials=certificates.credentials("controller"))
-
-    def drive() -> None:
-        with open_session(ends, "controller") as session:
-            with open_session(certificates.endpoints("plant", listen=(where,)), "plant"):
-                until(session.info.links, "the link")
-            revoke(tmp_path, "controller")
-            with open_session(certificates.endpoints("plant", listen=(where,)), "plant"):
-                time.sleep(PATIENCE_S)  # the controller's session interrupts it
-
-    with pytest.raises(InputError, match="'controller', which is revoked"):
-        drive()
-
-
 def test_a_process_is_interrupted_once(bundles: Bundles) -> None:
     """Whatever its further sessions find out while it ends because of the first one."""
     own, now_s, ended = bundles.credentials("director"), time.time(), []
@@ -181,25 +162,3 @@ def test_a_process_that_ignores_interrupts_ends_as_well(bundles: Bundles) -> Non
     )  # fmt: skip
     assert done.stdout == "goes on\n"
     assert "InputError: certificate 'director' has expired" in done.stderr
-
-
-def test_another_member_cannot_end_a_process(tmp_path: Path, bundles: Bundles) -> None:
-    """By saying in place of the plant that the certificate is revoked."""
-    where, here = free_endpoint("tls"), free_endpoint("tls")
-    asked: list[str] = []
-
-    def lie(query: Any) -> None:
-        asked.append(str(query.key_expr))
-        query.reply(query.key_expr, '{"node": "plant", "member": null, "revoked": true}')
-
-    controller = bundles.endpoints("controller", listen=(here,), connect=(where,))
-    with (
-        open_session(controller, "controller") as session,
-        bare_session(here, bundles.path("viewer")) as viewer,
-    ):
-        liar = viewer.declare_queryable("bayesrace-access/*", lie)
-        with open_session(bundles.endpoints("plant", listen=(where,)), "plant"):
-            until(lambda: asked, "the question")
-            time.sleep(1.0)  # it would be interrupted
-            assert len(session.info.links()) == 2
-        liar.undeclare()
