@@ -18,7 +18,7 @@ from bayesrace.arrays import Floats
 from bayesrace.gp.weights import OUTPUTS
 from bayesrace.integrators import PREDICTION
 from benchmarks.harness import Row, arguments, report
-from learning.hyperparameters import BOUNDS, starts
+from learning.likelihood import BOUNDS, starts
 from learning.residual import residual
 from learning.settings import TrainingSettings
 from learning.target import Target

@@ -1,20 +1,54 @@
-"""One dataset from any number of logs and array files, all of the same car and discretisation."""
+"""One dataset from any number of logs and array files, all of the same car and discretisation.
 
+A file of arrays (``.npz``, made by ``numpy.savez``; reading executes nothing) holds ``car`` (a
+built-in name, or all values as JSON), ``step_s`` [s], and either single samples, ``x`` (n, 7),
+``u`` (n, 2), ``x_next`` (n, 7), or one unbroken drive, ``states`` (n + 1, 7), ``inputs`` (n, 2), as
+:class:`learning.dataset.Dataset` describes them. Any other array is refused: it may be a misspelt
+one.
+
+The published form, the drives of the paper's code, is read as well: ``states`` (6 or 7, n + 1),
+their rates ``dstates``, ``inputs`` (2, n) with duty cycle and **steering angle**, any other arrays,
+but no ``car``. Without ``dstates`` the published states are one-step predictions of a model, each
+from a state of another file, and are refused. The published plant holds inputs[1, k] during the
+whole step k, while our cars turn the steering at a constant rate, from delta_k to delta_k + step *
+delta_rate. Both agree on the angle at the end of a step, so
+
+    delta_k = inputs[1, k - 1]  (0 at the start),    delta_rate_k = (inputs[1, k] - delta_k) / step
+
+which the published seventh state and one-step predictions use, too. The residual of such a drive
+contains the difference between a held and a turning steering angle: fine for comparing with the
+paper, wrong for driving our cars. Nor does that drive keep to the limits of the car.
+"""
+
+import zipfile
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Final, TypeVar
 
+import numpy as np
+
+from bayesrace.arrays import AnyArray
 from bayesrace.errors import InputError
 from bayesrace.integrators import PREDICTION, Discretisation
-from bayesrace.vehicles import CarParameters, builtin_cars
-from learning.arrays import car_of_npz, dataset_from_npz
-from learning.dataset import Dataset, concatenate, filter_dataset
+from bayesrace.vehicles import CarParameters, builtin_cars, car_text, described_car
+from learning.dataset import Dataset, concatenate, dataset_from_arrays, filter_dataset
 from learning.logs import LogFacts, dataset_from_log, log_facts
 
-__all__ = ["Samples", "read_samples"]
+__all__ = ["MAX_BYTES", "Samples", "dataset_from_npz", "read_samples", "write_npz"]
 
 T = TypeVar("T")
+
+MAX_BYTES: Final = 1 << 30
+"""Upper limit of an array file's unpacked size; larger ones are refused before they are read."""
+
+_ABOUT: Final = ("car", "step_s")
+_SAMPLES: Final = ("x", "u", "x_next")
+_DRIVE: Final = ("states", "inputs")
+_SCHEMA: Final = (
+    "need 'car', 'step_s', and either 'x' (n, 7), 'u' (n, 2), 'x_next' (n, 7) or "
+    "'states' (n + 1, 7), 'inputs' (n, 2)"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,12 +82,9 @@ def read_samples(
         raise InputError("no samples given; name at least one log, or --data FILE.npz")
     logs = {path: log_facts(path) for path in paths if path.suffix.lower() != ".npz"}
     drivers = {path: _driver(path, facts, name) for path, facts in logs.items()}
-    cars = {
-        path: logs[path].car or builtin_cars().get(drivers[path])
-        if path in logs
-        else car_of_npz(path)
-        for path in paths
-    }
+    files = {path: _read(path) for path in paths if path not in logs}
+    cars = {path: facts.car or builtin_cars().get(drivers[path]) for path, facts in logs.items()}
+    cars |= {path: file.car for path, file in files.items()}
     driven = _common("cars", cars | {Path("--car"): car}, lambda one: f"'{one.identity}'")
     if driven is None:
         raise InputError("no file names its car; name it with --car")
@@ -69,7 +100,7 @@ def read_samples(
                 path, driven, used.step_s, runs, drivers[path], true, limits=limits
             )
         else:
-            samples = filter_dataset(dataset_from_npz(path, driven, used.step_s), limits=limits)
+            samples = filter_dataset(files[path].dataset(driven, used.step_s), limits=limits)
         digest = samples.digest()
         if digest in seen and len(samples):
             raise InputError(f"{path} holds the same samples as {seen[digest]}; give them once")
@@ -100,3 +131,111 @@ def _common(what: str, named: Mapping[Path, T | None], text: Callable[[T], str])
 
 def _described(one: Discretisation) -> str:
     return f"{one.scheme}x{one.substeps}, {one.pose} pose, {one.step_s!r} s"
+
+
+# Arrays ------------------------------------------------------------------------------------------
+
+
+def dataset_from_npz(
+    path: Path, car: CarParameters | None = None, step_s: float | None = None
+) -> Dataset:
+    """All samples of a file, unfiltered.
+
+    ``car`` and ``step_s``: the expected ones, if given; the published form, which names neither,
+    needs both. InputError for any other content than the arrays above, pickled ones included.
+    """
+    return _read(path).dataset(car, step_s)
+
+
+def write_npz(path: Path, dataset: Dataset) -> None:
+    """The samples as :func:`dataset_from_npz` reads them."""
+    car, step_s = np.array(car_text(dataset.car)), np.array(dataset.step_s)
+    np.savez_compressed(
+        path, car=car, step_s=step_s, x=dataset.x, u=dataset.u, x_next=dataset.x_next
+    )
+
+
+def _read(path: Path) -> "_File":
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(member.file_size for member in archive.infolist()) > MAX_BYTES:
+                raise InputError(f"{path}: more than {MAX_BYTES >> 20} MB; split it")
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: np.asarray(file[name]) for name in file.files}
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
+    except InputError:
+        raise
+    except Exception as error:  # damage raises anything of zipfile, zlib, lzma or numpy
+        raise InputError(f"{path}: not arrays as numpy.savez writes them ({error})") from error
+    car = arrays.get("car")
+    if car is not None and (car.shape != () or car.dtype.kind != "U"):
+        raise InputError(f"{path}: 'car' must be one text")
+    try:
+        return _File(path, arrays, None if car is None else described_car(str(car)))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+@dataclass(frozen=True)
+class _File:
+    """Arrays by name, and the car that they describe, if any."""
+
+    path: Path
+    arrays: Mapping[str, AnyArray]
+    car: CarParameters | None
+
+    def dataset(self, car: CarParameters | None, step_s: float | None) -> Dataset:
+        """The samples; InputError unless they are of this car and step."""
+        try:
+            dataset = self._published(car, step_s) if self._is_published() else self._own()
+            if car is not None and dataset.car != car:
+                raise InputError(f"samples of the car '{dataset.car.name}', not of '{car.name}'")
+            if step_s is not None and abs(dataset.step_s - step_s) > 1e-9:
+                raise InputError(f"samples {dataset.step_s:g} s apart, not {step_s:g} s")
+        except InputError as error:
+            raise InputError(f"{self.path}: {error}") from error
+        # A step in single precision becomes the number that is meant: samples can be mixed.
+        return dataset if step_s is None else replace(dataset, step_s=step_s)
+
+    def _numbers(self, *names: str) -> list[AnyArray]:
+        for name in names:
+            if self.arrays[name].dtype.kind not in "fiu":
+                raise InputError(f"'{name}' holds no numbers")
+        return [self.arrays[name] for name in names]
+
+    def _own(self) -> Dataset:
+        names = set(self.arrays)
+        if self.car is None or names not in ({*_ABOUT, *_SAMPLES}, {*_ABOUT, *_DRIVE}):
+            raise InputError(f"arrays {', '.join(sorted(names)) or 'none'}; {_SCHEMA}")
+        (step_s,) = self._numbers("step_s")
+        if step_s.shape != () or not 0 < step_s <= 1:
+            raise InputError("'step_s' must be one number of seconds, above 0 and at most 1")
+        if "states" in names:
+            return dataset_from_arrays(self.car, float(step_s), *self._numbers(*_DRIVE))
+        return Dataset(self.car, float(step_s), *self._numbers(*_SAMPLES))
+
+    def _is_published(self) -> bool:
+        if not self.arrays.keys() >= {*_DRIVE} or self.arrays.keys() & {*_ABOUT}:
+            return False
+        states, inputs = self.arrays["states"].shape, self.arrays["inputs"].shape
+        return len(states) == 2 and states[0] in (6, 7) and inputs == (2, states[1] - 1)
+
+    def _published(self, car: CarParameters | None, step_s: float | None) -> Dataset:
+        """All samples of a published drive; zero columns that pad its end are left out."""
+        if "dstates" not in self.arrays:
+            raise InputError(
+                "no 'dstates', so these are predictions of a model (the published KIN-*.npz) and "
+                "not a drive: give the drive (DYN-*.npz)"
+            )
+        if car is None or step_s is None:
+            raise InputError("the published form does not name its car and step; give both")
+        states, inputs = self._numbers(*_DRIVE)
+        used = np.flatnonzero(states.any(axis=0))
+        if len(used) < 2:
+            raise InputError("fewer than two states that are not zero")
+        end = int(used[-1]) + 1
+        delta = np.concatenate(([0.0], inputs[1, : end - 1]))
+        x = np.vstack((states[:6, :end], delta)).T
+        u = np.column_stack((inputs[0, : end - 1], np.diff(delta) / step_s))
+        return dataset_from_arrays(car, step_s, x, u)

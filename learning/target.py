@@ -1,7 +1,15 @@
 """One output to learn: its samples in standardised units, and how well some predict the others.
 
 Every score is held out: a GP predicts a sample without its part of the drive (kernels) or its
-stretch of the track (choices of samples); see :mod:`learning.folds`.
+stretch of the track (choices of samples); see :mod:`learning.subset`.
+
+A prediction of one output is a mean and a standard deviation sigma, with the learned noise in it.
+With error = truth - mean, over n samples
+
+    RMSE                     sqrt(mean(error^2))
+    R^2                      1 - sum(error^2) / sum((truth - mean(truth))^2)
+    coverage                 share of |error| <= 1.96 sigma, the 95 % interval
+    log predictive density   mean of log N(error; 0, sigma^2)
 """
 
 import math
@@ -14,17 +22,74 @@ import numpy as np
 from bayesrace.arrays import Floats, Rows
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpOutput
-from learning.hyperparameters import Fit
+from learning.likelihood import Fit
 from learning.posterior import Covariance, Posterior
-from learning.scores import PredictionErrors
 from learning.subset import evenly
 
-__all__ = ["ChoiceScore", "KernelScore", "Target"]
+__all__ = ["NORMAL_95", "KernelScore", "PredictionErrors", "Target"]
+
+NORMAL_95: Final = 1.959963984540054
+"""Half the width of the 95 % interval, in standard deviations."""
 
 _TESTS: Final = 2000
 """Samples that a GP is judged by at most, evenly spread over all."""
-_DRAWS: Final = 5
-"""Random choices that the baseline is the mean of."""
+
+
+@dataclass(frozen=True, eq=False)
+class PredictionErrors:
+    """Errors and predictive standard deviations of one output, each (n,), in the same unit."""
+
+    error: Floats
+    sigma: Floats
+
+    @property
+    def rmse(self) -> float:
+        """Root mean square error."""
+        return float(np.sqrt(np.mean(self.error**2)))
+
+    @property
+    def log_density(self) -> float:
+        """Mean log predictive density per sample."""
+        score = (self.error / self.sigma) ** 2 + np.log(2 * np.pi * self.sigma**2)
+        return float(-0.5 * score.mean())
+
+    @property
+    def variance_scale(self) -> float:
+        """Factor on all variances that makes the 95 % interval hold 95 % of the errors; at least 1.
+
+        An interval that holds more is kept: 20 errors say little about the one outside.
+        """
+        ratio = np.quantile(np.abs(self.error) / self.sigma, 0.95) / NORMAL_95
+        return max(1.0, float(ratio**2))
+
+    def calibrated(self, folds: Rows) -> "PredictionErrors":
+        """The same errors, each fold's variances scaled as those of all other ``folds`` (n,) need.
+
+        An interval fitted to the very errors that it is judged by would hold 95 % of them however
+        poor the GP is.
+        """
+        sigma = self.sigma.copy()
+        for fold in np.unique(folds):
+            inside = folds == fold
+            if not inside.all():
+                others = PredictionErrors(self.error[~inside], self.sigma[~inside])
+                sigma[inside] *= math.sqrt(others.variance_scale)
+        return replace(self, sigma=sigma)
+
+    def metrics(self, truth: Floats, offset: float = 0.0, scale: float = 1.0) -> dict[str, float]:
+        """All scores, and the RMSE that predicting zero would have (``uncorrected_rmse``).
+
+        ``truth`` (n,), errors and sigmas may be in scaled units: ``offset + scale * truth`` is the
+        measured quantity, and the scores are in its unit. R^2 is 0 where ``truth`` is constant.
+        """
+        spread = float(np.sum((truth - truth.mean()) ** 2))
+        return {
+            "rmse": self.rmse * scale,
+            "uncorrected_rmse": float(np.sqrt(np.mean((offset + scale * truth) ** 2))),
+            "r2": 1.0 - float(np.sum(self.error**2)) / spread if spread > 0 else 0.0,
+            "coverage": float(np.mean(np.abs(self.error) <= NORMAL_95 * self.sigma)),
+            "log_density": self.log_density - math.log(scale),
+        }
 
 
 @dataclass(frozen=True)
@@ -36,21 +101,6 @@ class KernelScore:
     rmse: float
     log_density: float
     chosen: bool
-
-
-@dataclass(frozen=True)
-class ChoiceScore:
-    """How well some of the samples predict one output (SI units).
-
-    ``choice``: "all" (a limited number, evenly spread), "greedy" (those in the weights) or
-    "random" (mean of several draws of the same number).
-    """
-
-    output: str
-    choice: str
-    points: int
-    rmse: float
-    log_density: float
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -129,21 +179,6 @@ class Target:
             KernelScore(self.name, fit.kind, *self._si(errors), fit is chosen)
             for fit, errors in held
         ]
-
-    def compare(self, covariance: Covariance, chosen: Rows, seed: int) -> list[ChoiceScore]:
-        """Predictions from all samples, from the ``chosen`` rows, and from as many at random.
-
-        Variances are calibrated as those of weights are.
-        """
-        generators = [np.random.default_rng(seed + draw) for draw in range(_DRAWS)]
-        draws = [one.choice(len(self.y), len(chosen), replace=False) for one in generators]
-        scores = []
-        for name, choices in (("all", [self.tests]), ("greedy", [chosen]), ("random", draws)):
-            held = [self.calibrated(self.errors_from(rows, covariance)) for rows in choices]
-            rmse, density = np.array([self._si(errors) for errors in held]).T
-            mean = math.sqrt(np.mean(rmse**2)), float(density.mean())
-            scores.append(ChoiceScore(self.name, name, len(choices[0]), *mean))
-        return scores
 
     def _si(self, errors: PredictionErrors) -> tuple[float, float]:
         """RMSE and log density in SI units."""

@@ -3,11 +3,11 @@
 1. Add each sample's mirror image, if the car's file says so, and standardise features and targets
    (:mod:`learning.target`). A sample and its image are in the same stretch.
 2. Per output and candidate kernel: hyperparameters by marginal likelihood
-   (:mod:`learning.hyperparameters`) on at most ``hyper_points`` samples. Seeded starts, or given
+   (:mod:`learning.likelihood`) on at most ``hyper_points`` samples. Seeded starts, or given
    weights, are followed on a third of them, where an evaluation costs a tenth; the best is refined
    on all.
 3. Per output: the kernel of largest log density held out by spans of the drive
-   (:mod:`learning.folds`).
+   (:mod:`learning.subset`).
 4. Factorise all samples, or the most informative ones that fit (:mod:`learning.subset`).
 5. Scale all variances so that the 95 % interval holds 95 % of the errors held out by stretches of
    the track, if it held less. The mean does not change. A likelihood that finds the data
@@ -38,14 +38,12 @@ from bayesrace.errors import InputError
 from bayesrace.gp.weights import FEATURES, OUTPUTS, GpOutput, GpWeights, encode_weights
 from bayesrace.integrators import Discretisation
 from learning.dataset import Dataset, left_out
-from learning.folds import spans, stretches
-from learning.hyperparameters import Fit, maximise, refine, starts
-from learning.likelihood import PairDistances
+from learning.likelihood import Fit, PairDistances, maximise, refine, starts
 from learning.posterior import Posterior
 from learning.residual import identity, residual
 from learning.settings import MIN_SAMPLES, Progress, TrainingSettings
-from learning.subset import evenly, most_informative
-from learning.target import ChoiceScore, KernelScore, Target
+from learning.subset import evenly, most_informative, spans, stretches
+from learning.target import KernelScore, Target
 
 __all__ = ["MAX_SAMPLES", "Training", "fit", "train"]
 
@@ -69,8 +67,6 @@ class Training:
     weights: GpWeights
     kernels: tuple[KernelScore, ...]
     """Every candidate of every output, on the samples that hyperparameters are found with."""
-    choices: tuple[ChoiceScore, ...]
-    """The cost of choosing samples; empty if all fit, or without ``compare``."""
 
 
 def train(
@@ -90,13 +86,11 @@ def fit(
     settings: TrainingSettings | None = None,
     initial: GpWeights | None = None,
     progress: Progress | None = None,
-    compare: bool = False,
 ) -> Training:
     """Weights that correct the discretised nominal model of the dataset's car.
 
     ``initial``: earlier weights of the same car and discretisation, for the model update: their
     hyperparameters are the only start of their kernels, and other candidate kernels start once.
-    ``compare``: also measure what it costs to learn from chosen samples instead of all.
     InputError for too few or too many samples, a column that never changes, or weights of another
     model.
     """
@@ -119,7 +113,6 @@ def fit(
     subsets = [target.select(rows, parts) for target in targets]
     outputs: list[GpOutput] = []
     kernels: list[KernelScore] = []
-    choices: list[ChoiceScore] = []
     metrics: dict[str, dict[str, float]] = {}
     # One BLAS thread per fit: the matrices are small, and the fits run side by side.
     with threadpool_limits(1, "blas"):
@@ -135,8 +128,6 @@ def fit(
             output, measured = _learned(target, chosen, kept, samples.features[kept], widen)
             outputs.append(output)
             metrics |= measured
-            if compare and len(kept) < len(target.y):
-                choices += target.compare(chosen.covariance, kept, settings.seed)
             done = len(outputs) / len(targets)
             report(0.9 + 0.1 * done, f"{target.name}: {chosen.kind} chosen")
     checked = evenly(len(dataset), _CHECKED)
@@ -158,7 +149,7 @@ def fit(
         created_utc_ns=time.time_ns(),
         program=f"bayesrace {__version__}",
     )
-    return Training(weights, tuple(kernels), tuple(choices))
+    return Training(weights, tuple(kernels))
 
 
 def _check(dataset: Dataset, errors: Floats) -> None:

@@ -15,15 +15,14 @@ import numpy as np
 
 from bayesrace.arrays import Flags, Floats, Rows
 from bayesrace.errors import InputError
-from bayesrace.gp.corrected import corrected_function
-from bayesrace.gp.expression import evaluate_mean
+from bayesrace.gp.expression import corrected_function, evaluate_mean
 from bayesrace.gp.weights import OUTPUTS, GpWeights
 from bayesrace.integrators import Discretisation
 from learning.dataset import Dataset
 from learning.posterior import Covariance, Posterior
 from learning.residual import NOMINAL, identity, residual
-from learning.scores import NORMAL_95, PredictionErrors
 from learning.subset import evenly
+from learning.target import NORMAL_95, PredictionErrors
 
 __all__ = ["HORIZON", "Validation", "mismatch", "predictive_sigma", "unbroken", "validate"]
 

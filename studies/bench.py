@@ -23,7 +23,7 @@ from pydantic import BaseModel, Field
 from rich.console import Console
 
 from bayesrace.arrays import Floats
-from bayesrace.gp.corrected import corrected_function
+from bayesrace.gp.expression import corrected_function
 from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.messages import State

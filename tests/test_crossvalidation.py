@@ -9,8 +9,8 @@ from bayesrace.gp.weights import OUTPUTS
 from bayesrace.integrators import PREDICTION
 from bayesrace.vehicles.models import dynamic
 from learning.dataset import Dataset, concatenate
-from learning.folds import stretches
-from learning.scores import PredictionErrors
+from learning.subset import stretches
+from learning.target import PredictionErrors
 from learning.training import train
 from learning.validation import validate
 from tests.driven import CAR, QUICK, STEP_S, drive

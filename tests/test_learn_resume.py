@@ -26,9 +26,9 @@ from bayesrace.integrators import PERFECT, PREDICTION
 from bayesrace.messages import HEARTBEAT, STATE, Message, Reply, Role, State, Status, encode
 from bayesrace.transport import Endpoints, Inbox, Item, Kind
 from bayesrace.vehicles.models import dynamic
-from learning.arrays import write_npz
 from learning.dataset import Dataset, concatenate
 from learning.residual import recalled
+from learning.sources import write_npz
 from learning.trainer import Outcome
 from operation.learn import collector, job, journal, publishing
 from operation.learn.publishing import Publisher

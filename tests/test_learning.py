@@ -14,8 +14,7 @@ from bayesrace.gp.weights import FEATURES, KERNELS, OUTPUTS, zero_weights
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from learning.dataset import Dataset, concatenate, filter_dataset, tolerances
-from learning.hyperparameters import starts
-from learning.likelihood import MarginalLikelihood, PairDistances
+from learning.likelihood import MarginalLikelihood, PairDistances, starts
 from learning.logs import dataset_from_log, dataset_from_messages, fallback_cycles
 from learning.posterior import Covariance, Posterior
 from learning.residual import identity, residual

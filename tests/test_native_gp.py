@@ -10,7 +10,7 @@ import pytest
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
-from bayesrace.gp.corrected import corrected_function
+from bayesrace.gp.expression import corrected_function
 from bayesrace.gp.weights import KERNELS, GpWeights, zero_weights
 from bayesrace.integrators import PERFECT, PREDICTION
 from bayesrace.vehicles import CarParameters

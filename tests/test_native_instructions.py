@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bayesrace.errors import InputError
-from bayesrace.gp.corrected import corrected_function
+from bayesrace.gp.expression import corrected_function
 from bayesrace.gp.weights import KERNELS
 from bayesrace.integrators import PREDICTION
 from bayesrace.native_interface import INSTRUCTIONS

@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from bayesrace.arrays import Floats
-from bayesrace.gp.corrected import corrected_function
+from bayesrace.gp.expression import corrected_function
 from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import PERFECT, PREDICTION
 from bayesrace.vehicles import CarParameters, default_car

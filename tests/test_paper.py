@@ -15,8 +15,7 @@ from bayesrace.integrators import PREDICTION
 from bayesrace.vehicles import CarParameters, builtin_cars, files, get_car
 from bayesrace.vehicles.models import dynamic
 from bayesrace.vehicles.tuning import PursuitTuning
-from learning.hyperparameters import maximise, starts
-from learning.likelihood import PairDistances
+from learning.likelihood import PairDistances, maximise, starts
 from learning.residual import residual
 from operation.settings import RaceSettings
 from operation.terminal.progress import Stage, stages_on

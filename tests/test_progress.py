@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bayesrace.arrays import Floats
-from bayesrace.gp.corrected import corrected_function
+from bayesrace.gp.expression import corrected_function
 from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import PREDICTION
 from bayesrace.vehicles import CarParameters

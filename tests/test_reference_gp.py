@@ -14,8 +14,8 @@ from rich.console import Console
 
 from bayesrace.integrators import PREDICTION
 from bayesrace.vehicles import get_car
-from learning.arrays import dataset_from_npz
 from learning.dataset import Dataset, concatenate, filter_dataset
+from learning.sources import dataset_from_npz
 from learning.training import train
 from learning.validation import Validation, validate
 from operation.terminal.learning_table import print_beyond_limits

@@ -19,8 +19,7 @@ from bayesrace.gp.weights import KERNELS, OUTPUTS, decode_weights, encode_weight
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from learning.dataset import Dataset
-from learning.hyperparameters import BOUNDS, Fit, maximise, refine, starts
-from learning.likelihood import PairDistances
+from learning.likelihood import BOUNDS, Fit, PairDistances, maximise, refine, starts
 from learning.posterior import Covariance
 from learning.residual import discretisation_of, identity, residual
 from learning.target import Target
@@ -39,7 +38,7 @@ def driven() -> Dataset:
 def chosen(driven: Dataset) -> Training:
     """Every kernel, a third of the samples."""
     settings = QUICK.model_copy(update={"kernels": KERNELS, "capacity": 50})
-    return fit(driven, PREDICTION, settings, compare=True)
+    return fit(driven, PREDICTION, settings)
 
 
 # Optimum ---------------------------------------------------------------------------------------
@@ -93,21 +92,6 @@ def test_every_kernel_is_scored_and_the_best_density_is_chosen(chosen: Training)
         assert winner.rmse < rough.rmse  # smooth dynamics
 
 
-def test_the_cost_of_choosing_is_reported(chosen: Training, driven: Dataset) -> None:
-    assert chosen.weights.counts == (50, 50, 50)
-    for output in OUTPUTS:
-        everything, greedy, random = (s for s in chosen.choices if s.output == output)
-        assert (everything.choice, greedy.choice, random.choice) == ("all", "greedy", "random")
-        assert (everything.points, greedy.points, random.points) == (2 * len(driven), 50, 50)
-        assert everything.log_density > greedy.log_density
-        carried = chosen.weights.metrics[output]
-        assert carried["rmse"] == pytest.approx(greedy.rmse)
-
-
-def test_nothing_is_chosen_where_all_fit(driven: Dataset) -> None:
-    assert fit(driven, PREDICTION, QUICK, compare=True).choices == ()
-
-
 def test_prediction_by_stretches_leaves_the_stretch_out(driven: Dataset) -> None:
     rows = np.arange(len(driven))
     y = residual(driven, PREDICTION)[:, 1]
@@ -148,6 +132,7 @@ def test_weights_carry_what_they_were_made_from_and_how_good_they_are(
     chosen: Training, driven: Dataset
 ) -> None:
     weights = decode_weights(encode_weights(chosen.weights))
+    assert weights.counts == (50, 50, 50)
     assert weights.program == f"bayesrace {__version__}"
     assert weights.created_utc_ns > 1_700_000_000 * 10**9
     assert weights.dataset_digest == driven.digest()

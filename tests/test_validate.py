@@ -12,19 +12,19 @@ import pytest
 from rich.console import Console
 
 from bayesrace.errors import InputError
-from bayesrace.gp.corrected import corrected_function
+from bayesrace.gp.expression import corrected_function
 from bayesrace.gp.weights import OUTPUTS, GpWeights, read_weights, write_weights, zero_weights
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.vehicles.models import dynamic, e_kinematic
-from learning.arrays import write_npz
 from learning.dataset import Dataset, concatenate
 from learning.residual import identity
-from learning.target import ChoiceScore, KernelScore
+from learning.sources import write_npz
+from learning.target import KernelScore
 from learning.training import train
 from learning.validation import mismatch, unbroken, validate
 from operation.analysis.validation import ValidationResult, validate_weights
 from operation.cli import main
-from operation.terminal.learning_table import print_choices, print_kernels, print_validation
+from operation.terminal.learning_table import print_kernels, print_validation
 from tests.driven import CAR, QUICK, STEP_S, drive, write_log
 
 Program = Callable[..., int]
@@ -244,7 +244,7 @@ def test_train_chooses_the_kernel_and_prints_why(
     assert program("train", "driven.mcap", *arguments, "--out", "new.bin") == 0
     said = capfd.readouterr().out
     assert "…" not in said.replace("residual …", "")
-    for word in ("matern05", "matern15", "matern25", "rbf", "greedy", "random", "250 samples"):
+    for word in ("matern05", "matern15", "matern25", "rbf", "250 samples"):
         assert word in said
     weights = read_weights(files / "new.bin")
     assert weights.counts == (60, 60, 60)
@@ -305,15 +305,8 @@ def test_tables_of_training_fit_a_terminal() -> None:
         for output in OUTPUTS
         for kernel in ("matern05", "matern15", "matern25", "rbf")
     ]
-    choices = [
-        ChoiceScore(output, choice, 1024, 0.000123456, -12.345)
-        for output in OUTPUTS
-        for choice in ("all", "greedy", "random")
-    ]
     text = io.StringIO()
     console = Console(file=text, width=80)
     print_kernels(kernels, console)
-    print_choices(choices, console)
     assert "…" not in text.getvalue()
     assert text.getvalue().count("✓") == 3
-    print_choices([], console)

@@ -10,7 +10,9 @@ Learning", eq. 2.25 and section 4.2)
     matern15  k(r) = (1 + a) exp(-a),            a = sqrt(3) r
     matern25  k(r) = (1 + a + a^2 / 3) exp(-a),  a = sqrt(5) r
 
-with scale = y_scale * signal_variance and offset = y_mean of :class:`.weights.GpOutput`.
+with scale = y_scale * signal_variance and offset = y_mean of :class:`.weights.GpOutput`. The
+corrected model f_corr is the nominal one with this mean added to vx, vy, omega (paper, eq. 7);
+:meth:`bayesrace.integrators.Discretisation.corrected` derives the pose.
 """
 
 import math
@@ -24,8 +26,17 @@ from scipy.spatial.distance import cdist
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import FEATURES, KERNELS, OUTPUTS, GpOutput, GpWeights
+from bayesrace.integrators import Discretisation
+from bayesrace.vehicles.models import Model
 
-__all__ = ["evaluate_mean", "kernel", "kernel_matrix", "kernel_slope", "mean_function"]
+__all__ = [
+    "corrected_function",
+    "evaluate_mean",
+    "kernel",
+    "kernel_matrix",
+    "kernel_slope",
+    "mean_function",
+]
 
 # Added to r^2 under the root: keeps derivatives finite where z meets a training input (there the
 # gradient is 0). The smooth kernels change by O(1e-20), matern05 by 1e-12 (it is linear in r).
@@ -100,3 +111,27 @@ def evaluate_mean(weights: GpWeights, z: ArrayLike) -> Floats:
     if len(points) == 0:
         return np.zeros((0, len(OUTPUTS)))
     return np.asarray(mean_function(weights)(points.T), dtype=np.float64).T
+
+
+def corrected_function(
+    model: Model,
+    discretisation: Discretisation,
+    weights: GpWeights | None,
+    check_identity: bool = True,
+) -> ca.Function:
+    """``(x, u) -> x_next`` of the discretised model plus the posterior mean, as MX function.
+
+    ``weights`` None: no correction. InputError if they were learned for another discretised model,
+    unless ``check_identity`` is False.
+    """
+    identity = discretisation.identity(model.name, model.car)
+    if weights is not None and check_identity and weights.discretisation != identity:
+        raise InputError(
+            f"weights '{weights.version}' were learned for {weights.discretisation}, not {identity}"
+        )
+    if weights is None or not any(output.count or output.y_mean for output in weights.outputs):
+        return discretisation.discretise(model)
+    x, u = ca.MX.sym("x", 7), ca.MX.sym("u", 2)
+    mean = mean_function(weights)(ca.vertcat(x[3:7], u))
+    x_next = discretisation.corrected(model)(x, u, mean)
+    return ca.Function("f_corr", [x, u], [x_next], ["x", "u"], ["x_next"])

@@ -181,8 +181,7 @@ def train(
 ) -> None:
     """Train the three GPs on the residual in run logs or plain arrays.
 
-    Of more samples than --points, those with the largest predictive variance are chosen one by one;
-    the output compares their error with that of a random choice.
+    Of more samples than --points, those with the largest predictive variance are chosen one by one.
     """
 
     from bayesrace.gp.weights import write_weights
@@ -193,11 +192,7 @@ def train(
     from learning.settings import TrainingSettings
     from learning.sources import read_samples
     from learning.training import fit
-    from operation.terminal.learning_table import (
-        print_beyond_limits,
-        print_choices,
-        print_kernels,
-    )
+    from operation.terminal.learning_table import print_beyond_limits, print_kernels
     from operation.terminal.progress import stages_on
     from operation.terminal.terminal import Terminal
 
@@ -218,13 +213,10 @@ def train(
         seed=seed,
     )
     with stages_on(console) as stages, stages.stage("train the residual") as stage:
-        training = fit(
-            samples.dataset, samples.discretisation, settings, progress=stage.update, compare=True
-        )
+        training = fit(samples.dataset, samples.discretisation, settings, progress=stage.update)
     weights = training.weights
     write_weights(out, weights)
     print_kernels(training.kernels, console)
-    print_choices(training.choices, console)
     if plot is not None:
         from operation.report.canvas import write_png
         from operation.report.gp import kernel_figure

@@ -15,8 +15,8 @@ from pydantic import ValidationError
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import claimed, clear_partials, read_text, replacing, write_whole
 from bayesrace.gp.weights import OUTPUTS, GpWeights, write_weights
-from learning.arrays import dataset_from_npz, write_npz
 from learning.dataset import Dataset, concatenate
+from learning.sources import dataset_from_npz, write_npz
 from learning.subset import MOST_NEW, evenly
 from operation.learn.records import LapRecord, LearnSettings, Record, UpdateRecord
 

@@ -7,13 +7,13 @@ from rich.text import Text
 
 from bayesrace.gp.weights import OUTPUTS, UNITS
 from learning.dataset import left_out
-from learning.target import ChoiceScore, KernelScore
+from learning.target import KernelScore
 from operation.analysis.validation import Drift, HorizonResult, Spread, ValidationResult
 from operation.terminal.notation import SMOOTHNESS
 from operation.terminal.race_table import GP_COLUMNS, gp_cells
 from operation.terminal.terminal import plain_table
 
-__all__ = ["print_beyond_limits", "print_choices", "print_kernels", "print_validation"]
+__all__ = ["print_beyond_limits", "print_kernels", "print_validation"]
 
 
 def print_kernels(scores: Sequence[KernelScore], console: Console) -> None:
@@ -37,21 +37,6 @@ def _kernel_cell(score: KernelScore | None) -> Text:
         return Text("–")
     text = f"{score.rmse:.3g} · {score.log_density:.2f}{' ✓' if score.chosen else '  '}"
     return Text(text, style="bold green" if score.chosen else "")
-
-
-def print_choices(scores: Sequence[ChoiceScore], console: Console) -> None:
-    """Held-out errors of chosen samples beside all; prints nothing if all of them fit."""
-    if not scores:
-        return
-    table = plain_table("output", "samples", "points", "RMSE", "log density", left=2)
-    for score in scores:
-        table.add_row(
-            f"{score.output} {UNITS[score.output]}" if score.choice == "all" else "",
-            score.choice, str(score.points), f"{score.rmse:.3g}", f"{score.log_density:.2f}",
-        )  # fmt: skip
-    title = "What choosing samples costs, held out by stretches of the track"
-    console.print(Text(title, style="bold"))
-    console.print(table)
 
 
 def print_beyond_limits(dropped: Mapping[str, int], kept: int, console: Console) -> None:

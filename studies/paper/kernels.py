@@ -15,8 +15,7 @@ from bayesrace.arrays import Floats, Rows
 from bayesrace.gp.weights import OUTPUTS, UNITS
 from bayesrace.integrators import PREDICTION
 from learning.dataset import Dataset
-from learning.hyperparameters import maximise, starts
-from learning.likelihood import PairDistances
+from learning.likelihood import PairDistances, maximise, starts
 from learning.posterior import Posterior
 from learning.residual import residual
 from learning.target import Target

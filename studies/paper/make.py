@@ -11,7 +11,7 @@ from bayesrace.errors import InputError
 from bayesrace.files import read_text, write_whole
 from bayesrace.integrators import PREDICTION
 from bayesrace.raceline import RaceLineSettings, write_raceline
-from learning.arrays import dataset_from_npz
+from learning.sources import dataset_from_npz
 from operation.analysis.published import SOURCE
 from operation.preparation import training_settings
 from operation.report.canvas import inline_svg, write_pdf
