@@ -1,9 +1,8 @@
 """Datasets from run logs and from logged messages."""
 
-import itertools
 import json
 import os
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -11,22 +10,21 @@ from typing import Any, Final
 import numpy as np
 from pydantic import ValidationError
 
+from bayesrace.arrays import Flags
+from bayesrace.columns import Columns, LogColumns
 from bayesrace.errors import InputError, faults_in
 from bayesrace.integrators import Discretisation
 from bayesrace.log import LogReader, topic_of
-from bayesrace.messages import STATE, TELEMETRY, TRUTH, CarSample, Telemetry, car_key
+from bayesrace.messages import STATE, TELEMETRY, TRUTH
 from bayesrace.vehicles import CarParameters, described_car
 from learning.dataset import Dataset, filter_dataset, tolerances
 
-__all__ = [
-    "LogFacts",
-    "cycles_left_out",
-    "dataset_from_log",
-    "dataset_from_messages",
-    "fallback_cycles",
-    "log_facts",
-]
+__all__ = ["CYCLES", "STATES", "LogFacts", "dataset_from_columns", "dataset_from_log", "log_facts"]
 
+STATES: Final = "seq run time_s x u_applied"
+"""Columns of the states that samples are made of ..."""
+CYCLES: Final = "run state_seq fallback sensor_fault"
+"""... and of the telemetry, which says what is left out of them."""
 
 _DOUBTFUL: Final = 16
 """States up to one that is not believed which may be wrong as well: the controller looks back as
@@ -74,28 +72,9 @@ def log_facts(path: str | os.PathLike[str]) -> LogFacts:
         raise InputError(f"{path}: its settings cannot be read ({error})") from error
 
 
-def fallback_cycles(telemetry: Iterable[Telemetry]) -> set[tuple[int, int]]:
-    """Run and number of the states in whose cycles the fallback acted, or that were not believed;
-    those just before such a state may be as wrong."""
-    cycles = ((one.run, one.state_seq, one.fallback, one.sensor_fault) for one in telemetry)
-    return cycles_left_out(cycles)
-
-
-def cycles_left_out(cycles: Iterable[tuple[int, int, int, object]]) -> set[tuple[int, int]]:
-    """The same by run, number of the state, level of the fallback, and what speaks against the
-    state, if anything."""
-    found: set[tuple[int, int]] = set()
-    for run, seq, level, fault in cycles:
-        if fault:
-            found |= {(run, seq - n) for n in range(_DOUBTFUL)}
-        elif level > 0:
-            found.add((run, seq))
-    return found
-
-
-def dataset_from_messages(
-    states: Iterable[CarSample],
-    fallback: Collection[tuple[int, int]],
+def dataset_from_columns(
+    states: Columns,
+    cycles: Columns,
     car: CarParameters,
     step_s: float,
     runs: Collection[int] | None = None,
@@ -104,46 +83,47 @@ def dataset_from_messages(
 ) -> Dataset:
     """Filtered samples from consecutive states of the same run (all runs, or those named).
 
-    ``states``: the measured ones to learn from, the true ones to judge by. ``fallback``: run and
-    number of the states whose cycles are left out, :func:`fallback_cycles`. The input of sample k
-    is ``u_applied`` of the state after it, which acted, not the requested one. A missing state is
-    counted as "gap". ``limits``: as of :func:`~learning.dataset.filter_dataset`.
+    ``states`` has the columns :data:`STATES`: the measured ones to learn from, the true ones to
+    judge by. ``cycles`` has the columns :data:`CYCLES`. Left out are the states in whose cycles the
+    fallback acted, and those that were not believed, with the states just before, which may be as
+    wrong. The input of sample k is ``u_applied`` of the state after it, which acted, not the
+    requested one. A missing state is counted as "gap". ``limits``: as of
+    :func:`~learning.dataset.filter_dataset`.
     """
-    slack_s = tolerances(car)["time"]
-    wanted = [state for state in states if runs is None or state.run in runs]
+    if runs is not None:
+        states = states[np.isin(states["run"], list(runs))]
+    now, after = states[:-1], states[1:]
+    passed_s = after["time_s"] - now["time_s"]
     # A fault of the plant repeats the last state: no time has passed.
-    pairs = [
-        (now, after)
-        for now, after in itertools.pairwise(wanted)
-        if now.run == after.run and after.time_s != now.time_s
-    ]
-    found = [
-        (now, after)
-        for now, after in pairs
-        if after.seq == now.seq + 1 and abs(after.time_s - now.time_s - step_s) <= slack_s
-    ]
-    if not found:
-        steps = [b.time_s - a.time_s for a, b in pairs if b.seq == a.seq + 1]
-        if not steps:
+    pair = (now["run"] == after["run"]) & (passed_s != 0)
+    following = pair & (after["seq"] == now["seq"] + 1)
+    found = following & (np.abs(passed_s - step_s) <= tolerances(car)["time"])
+    if not found.any():
+        if not following.any():
             raise InputError(
                 "no two states follow one another; was the car driven, or does the network or the "
                 "machine lose messages? Give them less to do"
             )
         raise InputError(
-            f"states are {float(np.median(steps)):.3g} s apart, the model's step is {step_s:g} s; "
-            f"drive with --rate {1 / step_s:g}, or learn for the controller that drove: --artefact"
+            f"states are {float(np.median(passed_s[following])):.3g} s apart, the model's step is "
+            f"{step_s:g} s; drive with --rate {1 / step_s:g}, or learn for the controller that "
+            "drove: --artefact"
         )
-    gaps = {"gap": len(pairs) - len(found)} if len(pairs) > len(found) else {}
+    gaps = int(pair.sum() - found.sum())
+    now, after = now[found], after[found]
     samples = Dataset(
-        car,
-        step_s,
-        x=np.array([now.x for now, _ in found]),
-        u=np.array([after.u_applied for _, after in found]),
-        x_next=np.array([after.x for _, after in found]),
-        dropped=gaps,
+        car, step_s, now["x"], after["u_applied"], after["x"], dropped={"gap": gaps} if gaps else {}
     )
-    driven = [(now.run, now.seq) not in fallback for now, _ in found]
-    return filter_dataset(samples.select(driven, "fallback"), limits=limits)
+    return filter_dataset(samples.select(~_left_out(now, cycles), "fallback"), limits=limits)
+
+
+def _left_out(states: Columns, cycles: Columns) -> Flags:
+    """Which of the states are not driven by a solution, or not to be believed."""
+    fallback, doubted = cycles[cycles["fallback"] > 0], cycles[cycles["sensor_fault"] != ""]
+    keys = {(run, seq) for run, seq in fallback[["run", "state_seq"]].tolist()}
+    for run, seq in doubted[["run", "state_seq"]].tolist():
+        keys |= {(run, seq - n) for n in range(_DOUBTFUL)}
+    return np.array([key in keys for key in states[["run", "seq"]].tolist()], dtype=bool)
 
 
 def dataset_from_log(
@@ -156,23 +136,14 @@ def dataset_from_log(
     *,
     limits: bool = True,
 ) -> Dataset:
-    """Filtered samples of ``car`` from a run's MCAP log; see :func:`dataset_from_messages`.
+    """Filtered samples of ``car`` from a run's MCAP log; see :func:`dataset_from_columns`.
 
     ``name``: the car's name in the network, if it differs from its own. ``truth``: the true states
     in place of the measured ones. InputError if it is no log or holds no driving of this car.
     """
-    topics = TRUTH if truth else STATE, TELEMETRY
-    keys = {car_key(topic.key, name or car.name) for topic in topics}
-    states: list[CarSample] = []
-    fallback: set[tuple[int, int]] = set()
-    for entry in LogReader(Path(path)).messages(topics):
-        if entry.key not in keys:
-            continue
-        if isinstance(entry.message, CarSample):
-            states.append(entry.message)
-        else:
-            fallback |= fallback_cycles([entry.message])
+    topic = TRUTH if truth else STATE
+    log = LogColumns(Path(path), {topic: STATES, TELEMETRY: CYCLES}, name or car.name).read()
     try:
-        return dataset_from_messages(states, fallback, car, step_s, runs, limits=limits)
+        return dataset_from_columns(log[topic], log[TELEMETRY], car, step_s, runs, limits=limits)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error

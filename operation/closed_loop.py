@@ -19,11 +19,13 @@ from msgspec import structs
 from numpy.typing import NDArray
 
 from bayesrace.arrays import Floats
+from bayesrace.columns import Columns, columns_of
 from bayesrace.gp.weights import GpWeights
 from bayesrace.log import LogWriter
 from bayesrace.messages import (
     ACTUATION,
     EVENT,
+    SENSOR_FAULTS,
     STATE,
     TELEMETRY,
     TRUTH,
@@ -46,7 +48,7 @@ from controller.driver import Decision
 from controller.interface import Controller, Environment
 from controller.process_settings import ControllerSettings
 from learning.dataset import Dataset
-from learning.logs import cycles_left_out, dataset_from_messages
+from learning.logs import CYCLES, STATES, dataset_from_columns
 from operation.analysis.laps import LapTimes, Trajectory, time_laps
 from operation.drive import RunPlan, announcement, run_request
 from plant.lockstep import CarRun, End, drive_lockstep, truth_behind
@@ -88,10 +90,10 @@ class Driven(Trajectory):
     """Steps that looked for another plan beside the one that went on from before."""
     end: End
 
-    @property
-    def moments(self) -> Sequence[State]:  # type: ignore[override]
+    @cached_property
+    def moments(self) -> Columns:
         """What was measured, with times, inputs and laps that are true; :attr:`x` is as well."""
-        return self.states
+        return columns_of(State, self.states, f"{STATES} lap")
 
     @cached_property
     def x(self) -> Floats:
@@ -130,11 +132,12 @@ class Driven(Trajectory):
         Cycles driven by the fallback, and states that are not believed, are left out. InputError if
         the run ended before its second state.
         """
-        cycles = zip(self.states, self.levels, self.faults, strict=False)
-        fallback = cycles_left_out(
-            (state.run, state.seq, level, fault) for state, level, fault in cycles
-        )
-        return dataset_from_messages(self.states, fallback, self.car, self.step_s)
+        answered = self.moments[: len(self.levels)]
+        cycles = np.empty(len(answered), [(name, object) for name in CYCLES.split()])
+        cycles["run"], cycles["state_seq"] = answered["run"], answered["seq"]
+        cycles["fallback"] = self.levels[: len(answered)]
+        cycles["sensor_fault"] = [SENSOR_FAULTS[one] for one in self.faults[: len(answered)]]
+        return dataset_from_columns(self.moments, cycles, self.car, self.step_s)
 
     def __str__(self) -> str:
         laps = " ".join(f"{t:.3f}" for t in self.laps_s) or "did not finish"

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Final, Literal
 
 from bayesrace.cache import cache_folder, digest, kept, software
+from bayesrace.columns import LogColumns
 from bayesrace.cpu import cpu_identity
 from bayesrace.errors import InputError
 from bayesrace.files import read_whole, replacing
 from bayesrace.gp.weights import GpWeights, encode_weights, read_weights, write_weights
 from bayesrace.integrators import Discretisation
-from bayesrace.log import LogReader
 from bayesrace.messages import STATE, TELEMETRY
 from bayesrace.raceline import RaceLine, RaceLineError, RaceLineSettings, read_raceline_for
 from bayesrace.raceline.cached import raceline_file, racing_line
@@ -27,7 +27,7 @@ from codegen.compiled import compiled
 from codegen.compiler import find_compiler
 from codegen.settings import BuildSettings
 from learning.dataset import Dataset, concatenate
-from learning.logs import dataset_from_messages, fallback_cycles
+from learning.logs import CYCLES, STATES, dataset_from_columns
 from learning.settings import Progress, TrainingSettings
 from operation.collect import collect
 from operation.settings import PreparationSettings
@@ -239,12 +239,11 @@ def training_drive(
             )  # fmt: skip
 
     def read(log: Path) -> Dataset:
-        reader = LogReader(log)
-        states = reader.select(STATE)
-        if reader.truncated or reader.refused:
+        columns = LogColumns(log, {STATE: STATES, TELEMETRY: CYCLES}).read()
+        if columns.reader.truncated or columns.reader.refused:
             raise InputError(f"{log} is damaged")
-        fallback = fallback_cycles(reader.select(TELEMETRY))
-        return dataset_from_messages(states, fallback, car, settings.discretisation.step_s)
+        step_s = settings.discretisation.step_s
+        return dataset_from_columns(columns[STATE], columns[TELEMETRY], car, step_s)
 
     return Training(prepared, path, kept(path, make, read))
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
+from bayesrace.columns import LogColumns
 from bayesrace.errors import InputError
 from bayesrace.files import claimed, write_whole
 from bayesrace.gp.weights import read_weights
@@ -21,8 +22,8 @@ from bayesrace.transport import RefusedError
 from bayesrace.vehicles import write_car
 from codegen.compiler import find_compiler
 from learning.dataset import Dataset
-from learning.logs import dataset_from_messages, fallback_cycles
-from operation.analysis.recording import Recording, RecordingReader
+from learning.logs import dataset_from_columns
+from operation.analysis.recording import RUN_COLUMNS, Recording, read_recording, runs_of
 from operation.drive import RunPlan
 from operation.limits import limits_beside
 from operation.preparation import (
@@ -184,15 +185,12 @@ class _Drives:
     ) -> None:
         self._race, self._track = race, track
         self._system, self._recorder = system, recorder
-        self.reader = RecordingReader(race.out)
+        self.log = LogColumns(race.out / FILES.log, RUN_COLUMNS)
 
     def controller(
         self, artefact: Path, name: str, weights: Path | None = None
     ) -> AbstractContextManager[None]:
-        """A controller process for the block; ready for its first run, with these weights.
-
-        What has been driven is read while it starts: no control step is measured then.
-        """
+        """A controller process for the block; ready for its first run, with these weights."""
         race, track = self._race, self._track
         settings_file = race.out / FILES.mpc
         write_whole(settings_file, race.settings.mpc.model_dump_json(indent=1) + "\n")
@@ -203,7 +201,7 @@ class _Drives:
         ]  # fmt: skip
         if weights is not None:
             options += ["--weights", str(weights)]
-        return self._system.controller(options, f"controller-{name}.log", self.reader.runs)
+        return self._system.controller(options, f"controller-{name}.log")
 
     def drive(self, controller: str) -> RunPlan:
         """One run; InputError if it broke off."""
@@ -225,13 +223,12 @@ class _Drives:
         """What can be learned from a run, from the log; InputError names both."""
         self._recorder.drain(at_most_s=20.0)
         named = f"{self._race.out / FILES.log}, run {plan.run} ({plan.controller})"
-        record = self.reader.runs().get(plan.run)
+        record = runs_of(self.log.read()).get(plan.run)
         if record is None:
             raise InputError(f"{named}: the log does not hold it")
         step_s = self._race.settings.discretisation.step_s
-        fallback = fallback_cycles(record.telemetry)
         try:
-            return dataset_from_messages(record.states, fallback, self._race.car, step_s)
+            return dataset_from_columns(record.states, record.telemetry, self._race.car, step_s)
         except InputError as error:
             raise InputError(f"{named}: {error}") from error
 
@@ -290,7 +287,7 @@ def _compare(this: _Race) -> Recording:
         for best in perfect:
             with drives.controller(best, "bestcase"), stages.stage("drive BestCase"):
                 drives.drive("bestcase")
-    return drives.reader.recording()
+    return read_recording(out, drives.log)
 
 
 def _prepared(this: _Race) -> Prepared:

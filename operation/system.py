@@ -10,7 +10,7 @@ can join, and no certificates are needed.
 
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -60,22 +60,15 @@ class System:
         self._events: Publisher[Event] = Publisher(recording, EVENT, car, "race")
 
     @contextmanager
-    def controller(
-        self,
-        options: Sequence[str],
-        log: str = "controller.log",
-        meanwhile: Callable[[], object] = lambda: None,
-    ) -> Iterator[None]:
+    def controller(self, options: Sequence[str], log: str = "controller.log") -> Iterator[None]:
         """A controller process for the block; it and the plant are ready for a run.
 
-        ``options`` are those of ``bayesrace controller`` beside the configuration; ``meanwhile`` is
-        called while they start.
+        ``options`` are those of ``bayesrace controller`` beside the configuration.
         InputError, with the last message of a process that has ended, if they do not get ready.
         """
         line = ["controller", *options, *self._options]
         with child(line, self._folder / log) as process:
             self.children["controller"] = process
-            meanwhile()
             with self.explained():
                 self._wait_for_both()
                 yield

@@ -1,21 +1,24 @@
 """Driven samples that need no track: smooth random inputs, as arrays, messages and log files."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
 
 from bayesrace.arrays import Floats
+from bayesrace.columns import columns_of
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.log import LogWriter
 from bayesrace.messages import Message, State, Telemetry, Truth, encode
 from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import Model
 from learning.dataset import Dataset, dataset_from_arrays
+from learning.logs import CYCLES, STATES, dataset_from_columns
 from learning.settings import TrainingSettings
 
-__all__ = ["CAR", "QUICK", "STEP_S", "blank", "drive", "logged", "state", "telemetry", "write_log"]
+__all__ = ["CAR", "QUICK", "STEP_S", "blank", "dataset_of", "drive", "logged", "state"]
+__all__ += ["telemetry", "write_log"]
 
 M = TypeVar("M", bound=Message)
 
@@ -62,6 +65,14 @@ def logged(data: Dataset, run: int) -> list[State]:
     x = np.vstack((data.x, data.x_next[-1:]))
     u = np.vstack((np.zeros(2), data.u))
     return [state(run, k, x[k], u[k]) for k in range(len(x))]
+
+
+def dataset_of(
+    states: Sequence[State], cycles: Sequence[Telemetry] = (), runs: Collection[int] | None = None
+) -> Dataset:
+    """What is learned from the states that a controller answered in these cycles."""
+    columns = columns_of(State, states, STATES), columns_of(Telemetry, cycles, CYCLES)
+    return dataset_from_columns(*columns, CAR, STEP_S, runs)
 
 
 def write_log(

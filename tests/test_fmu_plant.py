@@ -17,15 +17,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bayesrace.columns import LogColumns
 from bayesrace.errors import InputError
-from bayesrace.log import LogReader
-from bayesrace.messages import STATE, TELEMETRY, State, Truth
+from bayesrace.log import LogReader, LogWriter
+from bayesrace.messages import STATE, TELEMETRY, TRUTH, Truth, car_key, encode
 from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
 from bayesrace.vehicles import get_car
-from learning.logs import dataset_from_messages
-from operation.analysis.recording import PlannedRun, RunRecord
+from learning.logs import dataset_from_log
+from operation.analysis.recording import RUN_COLUMNS, runs_of
 from tests import programs
 from tests.car_fmu import Version, packed_car
+from tests.driven import state
 from tests.faulty_fmu import Mode, faulty_fmu, faulty_library
 from tests.programs import until
 from tests.pursuit_rig import PATIENCE_S, PLANT, Rig, Spectator, request, running_rig, start
@@ -235,40 +237,17 @@ def test_the_command_refuses_an_unusable_fmu_in_a_line_a_fault(
         assert why in done.stderr
 
 
-def test_a_repeated_last_state_is_no_gap_and_no_sample() -> None:
-    def state(seq: int, time_s: float, *, final: bool = False) -> State:
-        x = (0.02 * seq, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
-        return State(
-            seq=seq,
-            source_time_ns=seq,
-            epoch=1,
-            run=1,
-            time_s=time_s,
-            x=x,
-            u_applied=(0.1, 0.0),
-            lap=0,
-            lockstep=True,
-            actuation_delays=(),
-            final=final,
-        )
-
-    states = [state(0, 0.0), state(1, 0.02), state(2, 0.04), state(3, 0.04, final=True)]
-    record = RunRecord(PlannedRun(1, "a controller", ""))
-    for message in states:
-        record.add(message)
-        record.add(
-            Truth(
-                seq=message.seq,
-                source_time_ns=message.seq,
-                epoch=1,
-                run=1,
-                time_s=message.time_s,
-                x=message.x,
-                u_applied=(0.1, 0.0),
-                lap=0,
-            )
-        )
-    assert [one.seq for one in record.states] == [one.seq for one in record.truth] == [0, 1, 2]
+def test_a_repeated_last_state_is_no_gap_and_no_sample(tmp_path: Path) -> None:
+    log = LogWriter(tmp_path / "log.mcap")
+    for seq, time_s in enumerate((0.0, 0.02, 0.04, 0.04)):
+        x = np.array([0.02 * seq, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+        one = state(1, seq, x, np.array([0.1, 0.0]), time_s=time_s, final=seq == 3)
+        sample = Truth(**{name: getattr(one, name) for name in Truth.__struct_fields__})
+        for topic, message in ((STATE, one), (TRUTH, sample)):
+            log.write(car_key(topic.key, "orca"), encode(message), seq)
+    log.close()
+    record = runs_of(LogColumns(tmp_path / "log.mcap", RUN_COLUMNS).read())[1]
+    assert record.states["seq"].tolist() == record.truth["seq"].tolist() == [0, 1, 2]
     assert record.gaps == 0
-    data = dataset_from_messages(states, [], get_car("orca"), 0.02)
+    data = dataset_from_log(tmp_path / "log.mcap", get_car("orca"), 0.02)
     assert (len(data), data.dropped.get("gap", 0)) == (2, 0)

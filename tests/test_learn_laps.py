@@ -11,10 +11,9 @@ from bayesrace.messages import Actuation, State
 from bayesrace.tracks import Track
 from bayesrace.vehicles.models import dynamic
 from learning.dataset import Dataset
-from learning.logs import dataset_from_messages
 from operation.learn import collector
 from operation.learn.collector import Collector, Stretch
-from tests.driven import CAR, STEP_S, blank, drive, logged, state, telemetry
+from tests.driven import CAR, STEP_S, blank, dataset_of, drive, logged, state, telemetry
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +49,7 @@ def test_samples_are_those_of_the_log(states: list[State]) -> None:
     lossy = [one for one in states if one.seq not in (30, 31, 120)]
     fallbacks = (10, 60, 61, 199)
     taken, rest = fed(lossy, fallbacks)
-    log = dataset_from_messages(lossy, [(7, k) for k in fallbacks], CAR, STEP_S)
+    log = dataset_of(lossy, [telemetry(7, k, 1) for k in fallbacks])
     got = samples(taken + rest)
     np.testing.assert_array_equal(got.x, log.x)
     np.testing.assert_array_equal(got.u, log.u)

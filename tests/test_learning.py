@@ -15,7 +15,7 @@ from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from learning.dataset import Dataset, concatenate, filter_dataset, tolerances
 from learning.likelihood import MarginalLikelihood, PairDistances, starts
-from learning.logs import dataset_from_log, dataset_from_messages, fallback_cycles
+from learning.logs import dataset_from_log
 from learning.posterior import Covariance, Posterior
 from learning.residual import identity, residual
 from learning.settings import TrainingSettings
@@ -23,7 +23,7 @@ from learning.subset import evenly, most_informative
 from learning.training import train
 from learning.validation import predictive_sigma, validate
 from tests.conftest import discrete
-from tests.driven import CAR, QUICK, STEP_S, drive, logged, telemetry
+from tests.driven import CAR, QUICK, STEP_S, dataset_of, drive, logged, telemetry
 from tests.programs import ROOT
 from tests.scikit import scikit_gp
 
@@ -101,7 +101,7 @@ def test_states_are_consecutive_within_the_tolerance_of_time(driven: Dataset, sh
     late_s = share * tolerances(CAR)["time"]
     states = logged(driven, 0)
     states[-1] = replace(states[-1], time_s=states[-1].time_s + late_s)
-    data = dataset_from_messages(states, (), CAR, STEP_S)
+    data = dataset_of(states)
     assert dict(data.dropped) == ({} if share < 1 else {"gap": 1})
 
 
@@ -133,7 +133,7 @@ def test_datasets_are_checked(driven: Dataset) -> None:
 
 def test_messages_become_the_samples_that_were_driven(driven: Dataset) -> None:
     states = logged(driven, 0)
-    data = dataset_from_messages(states, fallback_cycles([telemetry(0, 5, 0)]), CAR, STEP_S)
+    data = dataset_of(states, [telemetry(0, 5, 0)])
     assert np.array_equal(data.x, driven.x)
     assert np.array_equal(data.u, driven.u)
     assert np.array_equal(data.x_next, driven.x_next)
@@ -143,14 +143,14 @@ def test_messages_become_the_samples_that_were_driven(driven: Dataset) -> None:
 def test_gaps_fallback_and_other_runs_are_left_out(driven: Dataset) -> None:
     first, second = logged(driven, 0), logged(driven, 1)
     messages = first[:10] + first[11:] + second
-    seen = fallback_cycles([telemetry(0, 3, 1), telemetry(0, 4, 2), telemetry(1, 3, 0)])
-    everything = dataset_from_messages(messages, seen, CAR, STEP_S)
+    seen = [telemetry(0, 3, 1), telemetry(0, 4, 2), telemetry(1, 3, 0)]
+    everything = dataset_of(messages, seen)
     assert dict(everything.dropped) == {"gap": 1, "fallback": 2}
     assert len(everything) == 2 * len(driven) - 2 - 2
-    one = dataset_from_messages(messages, seen, CAR, STEP_S, runs=(1,))
+    one = dataset_of(messages, seen, runs=(1,))
     assert len(one) == len(driven)
     with pytest.raises(InputError, match="driven"):
-        dataset_from_messages([], [], CAR, STEP_S)
+        dataset_of([])
 
 
 def test_a_missing_log_is_an_input_error(tmp_path: Path) -> None:

@@ -5,17 +5,21 @@ and one off the track.
 """
 
 from contextlib import closing
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
+from bayesrace.columns import columns_of
 from bayesrace.log import LogWriter
+from bayesrace.messages import Telemetry
 from controller.driver import Level
+from learning.logs import CYCLES
 from operation.analysis.laps import LapTimes
 from operation.analysis.verdict import Cycles, judge, judge_log
 from operation.closed_loop import ClosedLoop
+from tests.driven import telemetry
 from tests.racing import racing
 
 COUNT = 450
@@ -27,13 +31,12 @@ CUT = LapTimes((), (), 155)
 
 def verdict(
     laps: LapTimes = LAP, off_m: float = -0.1, level: Level = Level.SOLUTION, every: int = 1,
-    asked: int = 1, fault: str = "",
+    asked: int = 1, fault: str = "", count: int = COUNT,
 ) -> Any:  # fmt: skip
-    samples: Any = [SimpleNamespace(seq=k, time_s=k * STEP_S) for k in range(COUNT)]
-    cycles = Cycles()
-    for k in range(0, COUNT - 1, every):
-        message: Any = SimpleNamespace(state_seq=k, fallback=int(level), sensor_fault=fault)
-        cycles.add(message)
+    samples = np.array([(k, k * STEP_S) for k in range(count)], [("seq", int), ("time_s", float)])
+    answered = range(0, COUNT - 1, every)
+    messages = [replace(telemetry(0, k, int(level)), sensor_fault=fault) for k in answered]
+    cycles = Cycles(columns_of(Telemetry, messages, CYCLES))
     off_track_m = np.full(COUNT, -0.1)
     off_track_m[200] = off_m
     return judge(samples, off_track_m, laps, cycles, asked)
@@ -49,7 +52,7 @@ def verdict(
         (verdict(level=Level.STOP, laps=NONE), "for 0.00 of 8.98 s (cycles: 449 stop)"),
         (verdict(laps=NONE, fault="frozen"), "449 solution; sensor faults: 449 frozen)"),
         (verdict(every=50), "solutions drove the car for 0.90 of 8.98 s (cycles: 9 solution)"),
-        (judge([], np.zeros(0), NONE, Cycles(), 1), "there is no state of the run"),
+        (verdict(count=0), "there is no state of the run"),
     ],
 )
 def test_a_run_fails_with_the_reason(case: Any, words: str) -> None:

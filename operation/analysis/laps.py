@@ -1,7 +1,6 @@
 """Where a car was in truth, and its lap times."""
 
 import hashlib
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesrace.arrays import Floats
-from bayesrace.messages import CarSample
+from bayesrace.columns import Columns
 from bayesrace.tracks import StartLine, Track
 
 __all__ = ["LapTimes", "Trajectory", "time_laps", "trajectory_digest"]
@@ -24,24 +23,28 @@ leaves out a piece of it: what comes after is no lap. (At 4 m/s a sample is .08 
 class Trajectory:
     """A run as arrays: what is judged is where the car was in truth, never what was measured."""
 
-    moments: Sequence[CarSample]
-    """In order, one a sampling period."""
+    @property
+    def moments(self) -> Columns:
+        """In order, one a sampling period: ``x``, ``u_applied``, ``time_s`` and ``lap``."""
+        raise NotImplementedError
 
-    @cached_property
+    @property
     def x(self) -> Floats:
         """True states, shape (n, 7)."""
-        return np.array([one.x for one in self.moments], dtype=np.float64).reshape(-1, 7)
+        x: Floats = self.moments["x"]
+        return x
 
-    @cached_property
+    @property
     def u(self) -> Floats:
         """Inputs that acted from each state to the next, shape (max(n - 1, 0), 2)."""
-        acted = [one.u_applied for one in self.moments[1:]]
-        return np.array(acted, dtype=np.float64).reshape(-1, 2)
+        acted: Floats = self.moments["u_applied"][1:]
+        return acted
 
-    @cached_property
+    @property
     def time_s(self) -> Floats:
         """Plant time of the states, shape (n,)."""
-        return np.array([one.time_s for one in self.moments], dtype=np.float64)
+        time_s: Floats = self.moments["time_s"]
+        return time_s
 
     @cached_property
     def slip_rad(self) -> Floats:
@@ -60,10 +63,11 @@ class Trajectory:
         across = (speed[1:] + speed[:-1]) / 2 * turned / np.diff(self.time_s)
         return np.append(across, across[-1:]) if len(across) else np.zeros(len(self.x))
 
-    @cached_property
+    @property
     def lap(self) -> NDArray[np.int64]:
         """Start-line crossings up to each state, shape (n,)."""
-        return np.array([one.lap for one in self.moments], dtype=np.int64)
+        lap: NDArray[np.int64] = self.moments["lap"]
+        return lap
 
 
 @dataclass(frozen=True)

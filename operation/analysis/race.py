@@ -23,7 +23,7 @@ from bayesrace.tracks.projection import CentrelineSearch
 from bayesrace.tracks.spline import PlaneSpline
 from bayesrace.vehicles import CarParameters
 from learning.dataset import Dataset
-from learning.logs import dataset_from_messages, fallback_cycles
+from learning.logs import dataset_from_columns
 from learning.validation import Validation, validate
 from operation.analysis.between import positions_between
 from operation.analysis.laps import time_laps, trajectory_digest
@@ -175,7 +175,7 @@ class DrivenRun:
             lateral_max_mps2=self._largest(self.record.lateral_mps2),
             slip_max_rad=self._largest(self.record.slip_rad),
             speed_max_mps=self._largest(self.record.x[:, 3]),
-            solve_us=_percentiles(self.record.solve_us),
+            solve_us=_percentiles(self.record.telemetry["solve_us"]),
             cycles=cycles.counts,
             sensor_faults=cycles.sensor_faults,
             passed=verdict.passed,
@@ -240,7 +240,7 @@ class RaceAnalysis:
         car = self.recording.car
         step_s = self.recording.discretisation.step_s
         try:
-            return dataset_from_messages(run.truth, fallback_cycles(run.telemetry), car, step_s)
+            return dataset_from_columns(run.truth, run.telemetry, car, step_s)
         except InputError:  # cut off before its second state
             return None
 
@@ -312,9 +312,9 @@ def _summary(recording: Recording) -> SettingsSummary:
 
 def _real_time_factor(runs: Sequence[RunRecord]) -> float | None:
     driven = [run.states for run in runs if run.lockstep and len(run.states) > 1]
-    simulated_s = sum(states[-1].time_s - states[0].time_s for states in driven)
-    wall_ns = sum(states[-1].source_time_ns - states[0].source_time_ns for states in driven)
-    return simulated_s / (wall_ns * 1e-9) if wall_ns > 0 else None
+    simulated_s = sum(np.ptp(states["time_s"]) for states in driven)
+    wall_ns = sum(np.ptp(states["source_time_ns"]) for states in driven)
+    return float(simulated_s / (wall_ns * 1e-9)) if wall_ns > 0 else None
 
 
 def read_race(run_dir: Path) -> RaceAnalysis:

@@ -2,47 +2,35 @@
 
 import json
 import logging
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from pydantic import ValidationError
 
-from bayesrace.arrays import Floats
+from bayesrace.columns import Columns, LogColumns
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_text
 from bayesrace.integrators import PREDICTION, Discretisation
-from bayesrace.log import LogReader
-from bayesrace.messages import (
-    ACTUATION,
-    EVENT,
-    STATE,
-    TELEMETRY,
-    TRUTH,
-    Actuation,
-    CarSample,
-    Event,
-    State,
-    Telemetry,
-    Truth,
-)
+from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY, TRUTH, Topic
 from bayesrace.raceline import RaceLine, read_raceline
 from bayesrace.tracks import Track, read_track
 from bayesrace.transport import Numbering
 from bayesrace.vehicles import DEFAULT_CAR, CarParameters, described_car
+from learning.logs import CYCLES, STATES
 from operation.analysis.laps import Trajectory
 
 __all__ = [
+    "RUN_COLUMNS",
     "RUN_EVENT",
     "PlannedRun",
     "Recording",
-    "RecordingReader",
     "RunRecord",
     "TrainingRecord",
     "read_recording",
+    "runs_of",
 ]
 
 _log = logging.getLogger("bayesrace.report")
@@ -52,10 +40,17 @@ RUN_EVENT: Final = "run"
 """Kind of the event that announces a run of a race before it starts."""
 
 
-_RUNS: Final = STATE, TRUTH, ACTUATION, TELEMETRY, EVENT
-"""What a run is made of: the messages of a :class:`RunRecord`."""
+RUN_COLUMNS: Final[Mapping[Topic[Any], str]] = {
+    STATE: f"{STATES} source_time_ns lap lockstep",
+    TRUTH: f"{STATES} lap",
+    ACTUATION: "seq run weights_version",
+    TELEMETRY: f"seq {CYCLES} solve_us tube_m pace widening",
+    EVENT: "run source kind text data",
+}
+"""What is read of a run, in the order of the fields of a :class:`RunRecord`."""
 
 _REMARKS: Final = ("weights_rolled_back", "weights_slowed")
+_WORDS: Final = ("weights_version", "refused")
 
 
 @dataclass(frozen=True)
@@ -69,106 +64,103 @@ class PlannedRun:
     """Why the controller has refused its weights, so that it was not driven; else empty."""
 
     @classmethod
-    def from_event(cls, event: Event) -> "PlannedRun | None":
-        """None if it is another event."""
-        if event.source != "race" or event.kind != RUN_EVENT:
-            return None
-        run, controller = event.data.get("run"), event.data.get("controller")
+    def of_event(cls, data: Mapping[str, Any]) -> "PlannedRun | None":
+        """The plan in the data of an event; None if it names no run."""
+        run, controller = data.get("run"), data.get("controller")
         if type(run) is not int or type(controller) is not str:
             return None
-        words = (str(event.data.get(name, "")) for name in ("weights_version", "refused"))
-        return cls(run, controller, *words)
+        return cls(run, controller, *(str(data.get(one, "")) for one in _WORDS))
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class RunRecord(Trajectory):
-    """All messages of one run, in the order in which they arrived."""
+    """The messages of one run as columns, in the order in which they arrived."""
 
     plan: PlannedRun
-    states: list[State] = field(default_factory=list)
-    truth: list[Truth] = field(default_factory=list)
-    actuations: list[Actuation] = field(default_factory=list)
-    telemetry: list[Telemetry] = field(default_factory=list)
-    events: list[Event] = field(default_factory=list)
-
-    def add(self, message: Any) -> None:
-        """Appends a message, unless it repeats the last sample, as after a fault of the plant."""
-        lists: dict[type, list[Any]] = {
-            State: self.states, Truth: self.truth, Actuation: self.actuations,
-            Telemetry: self.telemetry, Event: self.events,
-        }  # fmt: skip
-        found = lists[type(message)]
-        if not (isinstance(message, CarSample) and found and found[-1].time_s == message.time_s):
-            found.append(message)
-
-    def copy(self) -> "RunRecord":
-        """A record that stays as it is while messages are added to this one."""
-        copies: dict[str, Any] = {
-            one.name: list(getattr(self, one.name)) for one in fields(self)[1:]
-        }
-        return replace(self, **copies)
+    states: Columns
+    truth: Columns
+    actuations: Columns
+    telemetry: Columns
+    events: Columns
 
     @property
-    def moments(self) -> Sequence[CarSample]:  # type: ignore[override]
+    def moments(self) -> Columns:
         """The truth, sample by sample."""
         return self.truth
-
-    @cached_property
-    def solve_us(self) -> Floats:
-        """Execution times of the controller's steps [us]."""
-        return np.array([message.solve_us for message in self.telemetry], dtype=np.float64)
 
     @property
     def lockstep(self) -> bool:
         """Whether the plant waited for the controller."""
-        return bool(self.states) and self.states[0].lockstep
+        return bool(self.states["lockstep"][:1].any())
 
     @property
     def weights_version(self) -> str:
         """Of the weights that drove, by the actuations; several are joined in order."""
-        versions = dict.fromkeys(message.weights_version for message in self.actuations)
+        versions = dict.fromkeys(self.actuations["weights_version"])
         return " → ".join(versions) if versions else self.plan.weights_version
 
     @property
     def gaps(self) -> int:
         """Number of messages missing in the numbering, of states missing at the beginning, and of
         states without their truth."""
-        streams: tuple[Sequence[Any], ...] = (self.states, self.actuations, self.telemetry)
-        missing = sum(_missing(message.seq for message in stream) for stream in streams)
-        missing += len({one.seq for one in self.states} - {one.seq for one in self.truth})
-        if len(self.states) > 1 and self.states[0].time_s > 0:
-            step_s = self.states[1].time_s - self.states[0].time_s
-            missing += round(self.states[0].time_s / step_s) if step_s > 0 else 1
+        states = self.states
+        missing = sum(_missing(one["seq"]) for one in (states, self.actuations, self.telemetry))
+        missing += len(np.setdiff1d(states["seq"], self.truth["seq"]))
+        if len(states) > 1 and states["time_s"][0] > 0:
+            step_s = states["time_s"][1] - states["time_s"][0]
+            missing += round(states["time_s"][0] / step_s) if step_s > 0 else 1
         return missing
 
     @property
     def remarks(self) -> list[str]:
         """What the controller has reported of its weights in mid-run, in order."""
-        own = (event for event in self.events if event.source == "controller")
-        return [event.text for event in own if event.kind in _REMARKS]
+        own = self.events[self.events["source"] == "controller"]
+        return list(own["text"][np.isin(own["kind"], _REMARKS)])
 
     @property
     def ended(self) -> str:
         """Why the run ended: the text of the plant's event, or where the log ends without one."""
-        for event in reversed(self.events):
-            if event.source == "plant" and event.kind == "run_ended":
-                return event.text
+        ends = (self.events["source"] == "plant") & (self.events["kind"] == "run_ended")
+        if ends.any():
+            return str(self.events["text"][ends][-1])
         if self.plan.refused:
             return f"the controller has refused its weights: {self.plan.refused}"
-        if not self.states:
+        if not len(self.states):
             return "the run never started"
         return (
-            f"the log ends {self.states[-1].time_s:.2f} s into the run, before the plant reported "
-            "its end: the plant or the race was killed"
+            f"the log ends {self.states['time_s'][-1]:.2f} s into the run, before the plant "
+            "reported its end: the plant or the race was killed"
         )
 
 
-def _missing(numbers: Iterable[int]) -> int:
+def _missing(numbers: Columns) -> int:
     """Messages lost by the rule of the processes: forged numbers and restarts are no losses."""
     numbering = Numbering()
-    for seq in numbers:
+    for seq in numbers.tolist():
         numbering.note(seq)
     return numbering.lost
+
+
+def runs_of(log: LogColumns) -> dict[int, RunRecord]:
+    """What has been read of each run in a log, by its number."""
+    events = log[EVENT]
+    announced = (events["source"] == "race") & (events["kind"] == RUN_EVENT)
+    plans = [plan for data in events["data"][announced] if (plan := PlannedRun.of_event(data))]
+    found = {plan.run: plan for plan in plans}
+    for run in np.unique(np.concatenate([log[topic]["run"] for topic in RUN_COLUMNS])).tolist():
+        found.setdefault(run, PlannedRun(run, "", ""))
+    return {
+        run: RunRecord(plan, *(_of_run(log[topic], run) for topic in RUN_COLUMNS))
+        for run, plan in sorted(found.items())
+    }
+
+
+def _of_run(rows: Columns, run: int) -> Columns:
+    """Its rows, but for samples that repeat the one before, as after a fault of the plant."""
+    own: Columns = rows[rows["run"] == run]
+    if "time_s" in (own.dtype.names or ()) and len(own):
+        own = own[np.append(True, np.diff(own["time_s"]) != 0)]
+    return own
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,40 +227,22 @@ class Recording:
         return next((run for run in reversed(self.runs) if run.plan.controller == controller), None)
 
 
-class RecordingReader:
-    """Reads the log of a race, each message once, also while the race is driven."""
+def read_recording(run_dir: Path, log: LogColumns | None = None) -> Recording:
+    """Reads a run directory, also one whose race was cut short; InputError if it is none.
 
-    def __init__(self, run_dir: Path) -> None:
-        self._directory = Path(run_dir)
-
-    @cached_property
-    def _log(self) -> "_RunsOfLog":
-        return _RunsOfLog(self._directory / "run.mcap")
-
-    def runs(self) -> dict[int, RunRecord]:
-        """What has been recorded up to now of each run, by its number, without what later calls
-        find; InputError if there is no log."""
-        self._log.read()
-        return self._log.runs()
-
-    def recording(self) -> Recording:
-        """The run directory as it is now; InputError if it is none of a race."""
-        settings = _read_settings(self._directory / "settings.json")
-        track, line = _driven_on(self._directory, settings, "track", "race")
-        self._log.read()
-        planned, reader = self._log.planned(), self._log.reader
-        training, whole = _read_training(self._directory, settings)
-        return Recording(
-            directory=self._directory, settings=settings, track=track, line=line,
-            runs=_with_truth(planned), truth=_has_truth(planned), training=training,
-            truncated=reader.truncated or not whole, refused=reader.refused,
-            started_ns=self._log.started_ns,
-        )  # fmt: skip
-
-
-def read_recording(run_dir: Path) -> Recording:
-    """Reads a run directory, also one whose race was cut short; InputError if it is none."""
-    return RecordingReader(run_dir).recording()
+    ``log``: its ``run.mcap`` with :data:`RUN_COLUMNS`, of which only the rest is read then.
+    """
+    settings = _read_settings(run_dir / "settings.json")
+    track, line = _driven_on(run_dir, settings, "track", "race")
+    log = (log or LogColumns(run_dir / "run.mcap", RUN_COLUMNS)).read()
+    firsts = [log[topic]["wall_ns"][:1] for topic in RUN_COLUMNS]
+    runs, truth = _planned(log)
+    training, whole = _read_training(run_dir, settings)
+    return Recording(
+        directory=run_dir, settings=settings, track=track, line=line, runs=runs, truth=truth,
+        training=training, truncated=log.reader.truncated or not whole,
+        refused=log.reader.refused, started_ns=min(map(int, np.concatenate(firsts)), default=None),
+    )  # fmt: skip
 
 
 def _driven_on(
@@ -285,68 +259,31 @@ def _read_training(run_dir: Path, settings: dict[str, Any]) -> tuple[TrainingRec
 
     The race does not need it: where it cannot be read, it is left out.
     """
-    log = run_dir / "collect.mcap"
-    if not log.is_file():
+    path = run_dir / "collect.mcap"
+    if not path.is_file():
         return None, True
     try:
-        runs = _RunsOfLog(log)
-        runs.read()
+        log = LogColumns(path, RUN_COLUMNS).read()
         track, line = _driven_on(run_dir, settings, "train_track", "train")
     except InputError as error:
         _log.warning("the training drive is left out: %s", error)
         return None, False
-    planned = _with_truth(runs.planned())
-    if not planned:
+    runs, _ = _planned(log)
+    if not runs:
         return None, False
-    whole = not (runs.reader.truncated or runs.reader.refused)
-    return TrainingRecord(planned[-1], track, line), whole
+    return TrainingRecord(runs[-1], track, line), not (log.reader.truncated or log.reader.refused)
 
 
-class _RunsOfLog:
-    """The runs of a log that may still be written."""
+def _planned(log: LogColumns) -> tuple[list[RunRecord], bool]:
+    """The runs that were announced, in order, and whether the log holds their truth.
 
-    def __init__(self, path: Path) -> None:
-        self.reader = LogReader(path)
-        self.started_ns: int | None = None
-        """Calendar time of the first message [ns since 1970]."""
-        self._runs: dict[int, RunRecord] = {}
-
-    def runs(self) -> dict[int, RunRecord]:
-        """Copies of all runs, by their number."""
-        return {run: record.copy() for run, record in self._runs.items()}
-
-    def planned(self) -> list[RunRecord]:
-        """Copies of the runs that were announced, in order."""
-        return [record for _, record in sorted(self.runs().items()) if record.plan.controller]
-
-    def read(self) -> None:
-        """Takes in what has been added to the log."""
-        for entry in self.reader.newer(_RUNS):
-            if self.started_ns is None:
-                self.started_ns = entry.wall_ns
-            message = entry.message
-            plan = PlannedRun.from_event(message) if isinstance(message, Event) else None
-            run = message.run if plan is None else plan.run
-            record = self._runs.setdefault(run, RunRecord(PlannedRun(run, "", "")))
-            if plan is None:
-                record.add(message)
-            else:  # a state can overtake it, since it comes from another process
-                record.plan = plan
-
-
-def _has_truth(runs: Sequence[RunRecord]) -> bool:
-    return any(record.truth for record in runs)
-
-
-def _with_truth(runs: Sequence[RunRecord]) -> list[RunRecord]:
-    """The runs; measurements take the place of the truth where none has one."""
-    if _has_truth(runs):
-        return list(runs)
-    names = Truth.__struct_fields__
-    return [
-        replace(run, truth=[Truth(**{n: getattr(one, n) for n in names}) for one in run.states])
-        for run in runs
-    ]
+    Measurements take the place of the truth where no run has one.
+    """
+    runs = [run for run in runs_of(log).values() if run.plan.controller]
+    if any(len(run.truth) for run in runs):
+        return runs, True
+    columns = RUN_COLUMNS[TRUTH].split()
+    return [replace(run, truth=run.states[columns]) for run in runs], False
 
 
 def _read_settings(path: Path) -> dict[str, Any]:

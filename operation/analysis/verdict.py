@@ -1,17 +1,17 @@
 """The verdict on a run: whether it did what was asked, by the truth and by what drove the car."""
 
 from collections import Counter
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from bayesrace.arrays import Floats
-from bayesrace.log import LogReader
-from bayesrace.messages import STATE, TELEMETRY, TRUTH, CarSample, Telemetry, Truth
+from bayesrace.arrays import Floats, Rows
+from bayesrace.columns import Columns, LogColumns
+from bayesrace.messages import STATE, TELEMETRY, TRUTH, Topic
 from bayesrace.tracks import Track
 from controller.driver import Level
+from learning.logs import CYCLES, STATES
 from operation.analysis.laps import LapTimes, time_laps
 
 __all__ = ["Cycles", "Verdict", "judge", "judge_log"]
@@ -34,16 +34,12 @@ class Cycles:
     """The controller's cycles in one run: the state that each answered, what spoke against that
     state, and at which level the input was found."""
 
-    def __init__(self, telemetry: Sequence[Telemetry] = ()) -> None:
-        self._levels: dict[int, int] = {}
-        self._faults: dict[int, str] = {}
-        for message in telemetry:
-            self.add(message)
-
-    def add(self, message: Telemetry) -> None:
-        """Takes in one cycle; of several for one state the newest counts."""
-        self._levels[message.state_seq] = message.fallback
-        self._faults[message.state_seq] = message.sensor_fault
+    def __init__(self, telemetry: Columns) -> None:
+        """``telemetry``: its columns :data:`learning.logs.CYCLES`; of several cycles for one state
+        the newest counts."""
+        seqs = telemetry["state_seq"].tolist()
+        self._levels = dict(zip(seqs, telemetry["fallback"].tolist(), strict=True))
+        self._faults = dict(zip(seqs, telemetry["sensor_fault"], strict=True))
 
     @property
     def counts(self) -> dict[str, int]:
@@ -62,19 +58,16 @@ class Cycles:
         text = f"cycles: {', '.join(levels) or 'none'}".replace("_", " ")
         return text + (f"; sensor faults: {', '.join(faults)}" if faults else "")
 
-    def driven_s(self, seqs: Sequence[int], time_s: Floats) -> float:
+    def driven_s(self, seqs: Rows, time_s: Floats) -> float:
         """Time for which solutions have driven, of a run with these states."""
-        answered = [k for k, seq in enumerate(seqs) if seq in self._levels]
-        if not answered:
-            return 0.0
-        begins = time_s[answered]
-        held = np.minimum(np.diff(np.append(begins, time_s[-1])), _HELD_S)
-        solved = [self._levels[seqs[k]] == Level.SOLUTION for k in answered]
-        return float(held[solved].sum())
+        levels = np.array([self._levels.get(seq, -1) for seq in seqs.tolist()])
+        answered = levels >= 0
+        held = np.minimum(np.diff(np.append(time_s[answered], time_s[-1])), _HELD_S)
+        return float(held[levels[answered] == Level.SOLUTION].sum())
 
 
 def judge(
-    samples: Sequence[CarSample], off_track_m: Floats, laps: LapTimes, cycles: Cycles, asked: int
+    samples: Columns, off_track_m: Floats, laps: LapTimes, cycles: Cycles, asked: int
 ) -> Verdict:
     """Judges a run of which ``asked`` laps were wanted; 0: none.
 
@@ -82,19 +75,19 @@ def judge(
     outside of the track the counted ones are.
     """
     faults: list[str] = []
-    if not samples:
+    if not len(samples):
         return Verdict(False, "failed: there is no state of the run")
     if len(laps.times_s) < asked:
         fault = f"{len(laps.times_s)} of {asked} laps driven"
         if laps.cut_at is not None:
-            cut_s = samples[laps.cut_at].time_s
+            cut_s = samples["time_s"][laps.cut_at]
             fault += f": at {cut_s:.2f} s the car left out a piece of the track"
         faults.append(fault)
     if (off := int((off_track_m > 0).sum())) > 0:
         faults.append(f"{off} samples off the track, up to {off_track_m.max():.3f} m")
-    time_s = np.array([one.time_s for one in samples])
+    time_s = samples["time_s"]
     lasted_s = float(time_s[-1] - time_s[0])
-    driven_s = cycles.driven_s([one.seq for one in samples], time_s)
+    driven_s = cycles.driven_s(samples["seq"], time_s)
     if driven_s < _DRIVEN * lasted_s:
         faults.append(f"solutions drove the car for {driven_s:.2f} of {lasted_s:.2f} s")
     if faults:
@@ -106,21 +99,12 @@ def judge(
 
 
 def judge_log(log: Path, run: int, track: Track, asked: int) -> Verdict:
-    """Judges a run in a log; only what the verdict needs is kept in memory."""
-    samples: dict[bool, list[CarSample]] = {True: [], False: []}
-    cycles = Cycles()
-    for entry in LogReader(log).messages((STATE, TRUTH, TELEMETRY)):
-        message = entry.message
-        if message.run != run:
-            continue
-        if isinstance(message, Telemetry):
-            cycles.add(message)
-        else:
-            samples[isinstance(message, Truth)].append(message)
-    known = samples[True] or samples[False]
-    xy = np.array([one.x[:2] for one in known]).reshape(-1, 2)
-    time_s = np.array([one.time_s for one in known])
-    projected = track.project_path(xy)
-    laps = time_laps(track, time_s, xy, projected.s_m)
+    """Judges a run in a log."""
+    wanted: dict[Topic[Any], str] = {STATE: STATES, TRUTH: STATES, TELEMETRY: CYCLES}
+    columns = LogColumns(log, wanted).read()
+    states, truth, telemetry = (columns[one][columns[one]["run"] == run] for one in wanted)
+    known = truth if len(truth) else states
+    projected = track.project_path(known["x"][:, :2])
+    laps = time_laps(track, known["time_s"], known["x"][:, :2], projected.s_m)
     counted = laps.after[-1] if laps.after else len(known)
-    return judge(known, projected.off_track_m[:counted], laps, cycles, asked)
+    return judge(known, projected.off_track_m[:counted], laps, Cycles(telemetry), asked)

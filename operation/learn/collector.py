@@ -7,12 +7,13 @@ from typing import Final
 
 import numpy as np
 
+from bayesrace.columns import columns_of
 from bayesrace.errors import InputError
 from bayesrace.messages import Actuation, State, Telemetry
 from bayesrace.tracks import StartLine, Track
 from bayesrace.vehicles.parameters import CarParameters
 from learning.dataset import Dataset
-from learning.logs import dataset_from_messages
+from learning.logs import CYCLES, STATES, dataset_from_columns
 from operation.learn.records import LapRecord
 
 __all__ = ["MOST_STATES", "Collector", "Stretch"]
@@ -58,7 +59,7 @@ class Stretch:
 class Collector:
     """Makes stretches with their samples and laps of messages, given in the order of arrival.
 
-    Samples are those of :func:`learning.logs.dataset_from_messages`: the same pairs, gaps, fallback
+    Samples are those of :func:`learning.logs.dataset_from_columns`: the same pairs, gaps, fallback
     cycles and filters as from a log of the same drive. A lap ends where the plant has counted it.
     A stretch is given out when the telemetry of its last cycle, or of a later one, has arrived.
     """
@@ -70,8 +71,8 @@ class Collector:
         self._open = Stretch()
         self._ended: deque[Stretch] = deque()
         self._run, self._laps = (-1, -1), 0
-        self._fallbacks: deque[tuple[int, int]] = deque(maxlen=2 * MOST_STATES)
-        """Run and number of the states that the fallback has answered."""
+        self._cycles: deque[Telemetry] = deque(maxlen=2 * MOST_STATES)
+        """Those in which the fallback drove, or the state was not believed."""
         self._waited_s, self._looked_s = 0.0, time.monotonic()
 
     def state(self, state: State) -> None:
@@ -96,8 +97,8 @@ class Collector:
         for one in (*self._ended, self._open):
             if one.states and one.states[0].run == message.run:
                 one.reported = max(one.reported, message.state_seq)
-        if message.fallback > 0:
-            self._fallbacks.append((message.run, message.state_seq))
+        if message.fallback > 0 or message.sensor_fault:
+            self._cycles.append(message)
 
     def actuation(self, message: Actuation) -> None:
         """Adds the actuation of a cycle, which names the weights that drive."""
@@ -153,10 +154,13 @@ class Collector:
     def _evaluate(self, stretch: Stretch) -> None:
         states, lap = stretch.states, stretch.lap
         run, first, last = states[0].run, states[0].seq, states[-1].seq
-        fallbacks = {key for key in self._fallbacks if key[0] == run and first <= key[1] < last}
+        cycles = [one for one in self._cycles if one.run == run and one.state_seq >= first]
         samples, why_not = None, ""
         try:
-            samples = dataset_from_messages(states, fallbacks, self._car, self._step_s)
+            samples = dataset_from_columns(
+                columns_of(State, states, STATES), columns_of(Telemetry, cycles, CYCLES),
+                self._car, self._step_s,
+            )  # fmt: skip
             if not len(samples):
                 reason = max(samples.dropped, key=lambda one: samples.dropped[one])
                 why_not = _REMEDIES.get(reason, f"the samples are left out: {reason}")
@@ -166,6 +170,7 @@ class Collector:
         # A short stretch that is no lap, such as the end of a run, may well be of no use.
         stretch.why_not = why_not if lap is not None or len(states) >= 50 else ""
         if lap is not None:
+            fallbacks = {one.state_seq for one in cycles if one.fallback and one.state_seq < last}
             lap.versions, lap.fallbacks = list(stretch.versions), len(fallbacks)
             if samples is not None:
                 lap.samples, lap.left_out = len(samples), samples.dropped

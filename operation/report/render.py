@@ -186,7 +186,7 @@ def _panels(analysis: RaceAnalysis, result: RaceResult) -> dict[str, list[Figure
     if data is not None and analysis.validations:
         progress = track.project_path(data.x[:, :2]).progress_m
         figures["gp"] = gp_figures(analysis.validations, progress, track.length_m)
-    if any(len(run.record.solve_us) for run in driven):
+    if any(len(run.record.telemetry) for run in driven):
         figures["solve"] = [solve_figure(driven)]
     return figures
 

@@ -15,7 +15,7 @@ __all__ = ["solve_figure"]
 
 def solve_figure(runs: Sequence[DrivenRun]) -> Figure:
     """Histogram of the step's execution time, one row a controller, logarithmic bins."""
-    timed = [run for run in runs if len(run.record.solve_us)]
+    timed = [run for run in runs if len(run.record.telemetry)]
     tall = 0.85 * len(timed) + 0.5
     figure = Figure(figsize=(PANEL_WIDTH, tall))
     # fixed, as in a panel; 0.33 inch between two rows are for the title of the lower one
@@ -23,7 +23,7 @@ def solve_figure(runs: Sequence[DrivenRun]) -> Figure:
         0.1 / PANEL_WIDTH, 0.5 / tall, 1 - 0.25 / PANEL_WIDTH, 1 - 0.33 / tall, hspace=0.33 / 0.52
     )
     grid = figure.subplots(len(timed), 1, sharex=True, squeeze=False)[:, 0]
-    times = [np.maximum(run.record.solve_us, 1e-3) for run in timed]
+    times = [np.maximum(run.record.telemetry["solve_us"], 1e-3) for run in timed]
     bins = np.geomspace(0.98 * min(map(np.min, times)), 1.02 * max(map(np.max, times)), 90)
     for axes, run, values in zip(grid, timed, times, strict=True):
         name, colour, _ = look(run.controller, run.number)

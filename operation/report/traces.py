@@ -1,6 +1,5 @@
 """Panels over the arc length of the centreline: time lost, speed, inputs, deviation."""
 
-import math
 from collections.abc import Callable, Sequence
 from typing import Final
 
@@ -9,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bayesrace.arrays import Floats
-from bayesrace.messages import Telemetry
+from bayesrace.columns import Columns
 from bayesrace.raceline import RaceLine
 from bayesrace.tracks import Track
 from bayesrace.vehicles import CarParameters
@@ -162,31 +161,33 @@ def caution_figures(runs: Sequence[DrivenRun], track: Track) -> list[Figure]:
     laps = [
         lap
         for lap in first_laps(runs, track)
-        if any(any(one.tube_m) or one.pace < 1 for one in lap.run.record.telemetry)
+        if any(map(any, lap.run.record.telemetry["tube_m"]))
+        or (lap.run.record.telemetry["pace"] < 1).any()
     ]
-    rows: list[tuple[str, str, Callable[[Telemetry], float]]] = [
-        ("uncertainty at the end of the plan", "either side [m]", lambda one: _last(one.tube_m)),
-        ("speed of the reference", "share of the line's", lambda one: one.pace),
-        ("band of the model", "widened by", lambda one: one.widening),
+    rows: list[tuple[str, str, Callable[[Columns], Floats]]] = [
+        ("uncertainty at the end of the plan", "either side [m]", _last_of_tube),
+        ("speed of the reference", "share of the line's", lambda rows: rows["pace"]),
+        ("band of the model", "widened by", lambda rows: rows["widening"]),
     ]
     figures = []
-    for title, label, value in rows if laps else ():
+    for title, label, values in rows if laps else ():
         figure, axes = _panel(track, title, label)
         for lap in laps:
-            _plot(axes, lap, _of_states(lap.run, value)[lap.rows])
+            _plot(axes, lap, _of_states(lap.run, values)[lap.rows])
         axes.set_ylim(0, None)
         figures.append(figure)
     return figures
 
 
-def _last(tube_m: tuple[float, ...]) -> float:
-    return tube_m[-1] if tube_m else math.nan
+def _last_of_tube(telemetry: Columns) -> Floats:
+    return np.array([tube_m[-1] if tube_m else np.nan for tube_m in telemetry["tube_m"]])
 
 
-def _of_states(run: DrivenRun, value: Callable[[Telemetry], float]) -> Floats:
+def _of_states(run: DrivenRun, values: Callable[[Columns], Floats]) -> Floats:
     """A value of each state's cycle; NaN where there was none."""
-    known = {one.state_seq: value(one) for one in run.record.telemetry}
-    return np.array([known.get(truth.seq, np.nan) for truth in run.record.truth])
+    cycles = run.record.telemetry
+    known = dict(zip(cycles["state_seq"].tolist(), values(cycles), strict=True))
+    return np.array([known.get(seq, np.nan) for seq in run.record.truth["seq"].tolist()])
 
 
 def deviation_figures(runs: Sequence[DrivenRun], track: Track) -> list[Figure]:

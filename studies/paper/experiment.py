@@ -5,24 +5,25 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from bayesrace.cache import cache_folder, digest, kept, software
+from bayesrace.columns import LogColumns
 from bayesrace.cpu import cpu_identity
 from bayesrace.errors import InputError
 from bayesrace.files import read_text
 from bayesrace.gp.weights import GpWeights, read_weights
-from bayesrace.log import LogReader, LogWriter
-from bayesrace.messages import EVENT, STATE, TELEMETRY, TRUTH
+from bayesrace.log import LogWriter
+from bayesrace.messages import TELEMETRY
 from bayesrace.raceline import RaceLine
 from controller.assembly import compiled_controller
 from controller.process_settings import ControllerSettings
 from learning.dataset import Dataset
-from learning.logs import dataset_from_messages, fallback_cycles
+from learning.logs import dataset_from_columns
 from operation.analysis.race import DrivenRun
-from operation.analysis.recording import PlannedRun, RunRecord
+from operation.analysis.recording import RUN_COLUMNS, runs_of
 from operation.closed_loop import ClosedLoop, built_in_car
 from operation.preparation import PredictionModel, prepare, updated_weights
 from operation.settings import RaceSettings
@@ -30,6 +31,8 @@ from operation.terminal.progress import Stages
 from studies.campaign.case import software_identity
 
 __all__ = ["Experiment", "stored"]
+
+_COLUMNS: Final = {**RUN_COLUMNS, TELEMETRY: f"{RUN_COLUMNS[TELEMETRY]} plan_x plan_u"}
 
 
 class Experiment:
@@ -64,17 +67,15 @@ class Experiment:
         artefact = self._artefacts[controller == "bestcase"]
         mpc = self.settings.mpc.model_copy(update={"constraints": constraints})
         law = compiled_controller(artefact, self.car, self.track, line, weights, mpc)
-        record = RunRecord(PlannedRun(1, controller, law.weights_version))
         with TemporaryDirectory() as folder:
             path = Path(folder) / "lap.mcap"
             log = LogWriter(path)
             # As published, every state is believed.
             process = ControllerSettings(car=self.car, sensor_tolerance=0)
             loop = ClosedLoop(self.car, self.track, line, law, self._vehicle, log, process)
-            loop.drive(1)
+            loop.drive(1, name=controller)
             log.close()
-            for entry in LogReader(path).messages((STATE, TRUTH, TELEMETRY, EVENT)):
-                record.add(entry.message)
+            record = runs_of(LogColumns(path, _COLUMNS).read())[1]
         run = DrivenRun(record, self.track, line)
         width_m = float(np.max(self.track.width_left_m + self.track.width_right_m))
         lost = np.flatnonzero(run.on_track.off_track_m > width_m)
@@ -85,8 +86,7 @@ class Experiment:
     def samples(self, run: DrivenRun) -> Dataset:
         """What can be learned from a lap."""
         record, step_s = run.record, self.settings.discretisation.step_s
-        fallback = fallback_cycles(record.telemetry)
-        return dataset_from_messages(record.states, fallback, self.car, step_s)
+        return dataset_from_columns(record.states, record.telemetry, self.car, step_s)
 
     def updated(self, lap: DrivenRun) -> GpWeights:
         """Learned from training drive and lap, beginning with the weights before."""

@@ -90,15 +90,16 @@ def _mismatch(laps: Laps, one: Experiment) -> Section:
 def _horizons(run: DrivenRun, one: Experiment) -> tuple[Floats, Floats, Floats]:
     """Time of each plan of the lap (m,), its positions, and those that the car reaches by its
     inputs, (m, N + 1, 2)."""
-    shown = {truth.seq: truth.time_s for truth in run.record.truth[run.shown()]}
-    plans = [plan for plan in run.record.telemetry if plan.plan_x and plan.state_seq in shown]
-    x = np.array([plan.plan_x for plan in plans]).reshape(len(plans), -1, 7)
-    u = np.array([plan.plan_u for plan in plans]).reshape(len(plans), -1, 2)
+    truth, plans = run.record.truth[run.shown()], run.record.telemetry
+    shown = dict(zip(truth["seq"].tolist(), truth["time_s"].tolist(), strict=True))
+    plans = plans[plans["plan_x"].astype(bool) & np.isin(plans["state_seq"], truth["seq"])]
+    x = np.array(plans["plan_x"].tolist()).reshape(len(plans), -1, 7)
+    u = np.array(plans["plan_u"].tolist()).reshape(len(plans), -1, 2)
     step, state, driven = PLANT.discretise(dynamic(one.car)), x[:, 0].T, [x[:, 0, :2]]
     for k in range(u.shape[1]):
         state = np.asarray(step(state, u[:, k].T))
         driven.append(state[:2].T)
-    time_s = np.array([shown[plan.state_seq] for plan in plans])
+    time_s = np.array([shown[seq] for seq in plans["state_seq"].tolist()])
     return time_s, x[..., :2], np.stack(driven, axis=1)
 
 
