@@ -11,7 +11,7 @@ from bayesrace.errors import InputError
 from bayesrace.messages import Role
 from bayesrace.transport import Credentials, Endpoints, open_session
 from bayesrace.transport.credentials import NEWEST_LIST
-from bayesrace.transport.probe import Finding, probe_all
+from bayesrace.transport.probe import probe_all
 from operation.analysis.network_status import SOURCES
 from operation.lifecycle import find
 
@@ -54,11 +54,11 @@ def examine(configuration: Configuration) -> Iterator[Check]:
     except InputError as error:
         yield Check(False, str(error))
         return
-    found = probe_all(endpoints.connect, own)
-    yield from _reached(endpoints, found)
-    absent = {finding.endpoint for finding in found}
-    there = tuple(one for one in endpoints.connect if one not in absent)
-    if there and not any(finding.lasting for finding in found):
+    faults = probe_all(endpoints.connect, own)
+    for endpoint in endpoints.connect:
+        yield Check(endpoint not in faults, faults.get(endpoint, f"{endpoint} answers"))
+    there = tuple(one for one in endpoints.connect if one not in faults)
+    if there:
         yield from _cars(endpoints.model_copy(update={"connect": there}), own)
 
 
@@ -87,13 +87,6 @@ def _everyone(configuration: Configuration, own: Credentials | None) -> Endpoint
         limits=configuration.limits,
         zenoh=configuration.zenoh,
     )
-
-
-def _reached(endpoints: Endpoints, found: list[Finding]) -> Iterator[Check]:
-    faults = {finding.endpoint: finding.text for finding in found}
-    for endpoint in endpoints.connect:
-        text = faults.get(endpoint, f"{endpoint} answers")
-        yield Check(endpoint not in faults, text)
 
 
 def _cars(endpoints: Endpoints, own: Credentials | None) -> Iterator[Check]:

@@ -102,7 +102,8 @@ def _not_found(session: Any, endpoints: Endpoints, timeout_s: float, name: str) 
         "start 'bayesrace plant' and 'bayesrace controller', or give their endpoints (--endpoint)"
     )
     if not _connected(session):
-        return InputError(f"no connection to {where} within {timeout_s:g} s; {remedy}")
+        doctor = "'bayesrace doctor' says what is wrong"
+        return InputError(f"no connection to {where} within {timeout_s:g} s; {remedy}; {doctor}")
     others = sorted(_tokens(session, ALIVE.format(car="*", source="*"), timeout_s)) if name else []
     if others:
         return InputError(f"no car '{name}' at {where}; cars found: {', '.join(others)}")

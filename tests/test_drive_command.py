@@ -108,8 +108,8 @@ class Waiting:
 
     def drive(self, log: Path, *options: str) -> subprocess.Popen[str]:
         """A drive of many laps, of which the first is in progress."""
-        # Else 'drive' says, besides, that nobody listens yet.
-        until(lambda: not probe_all(self.where[1::2], None, greets=False), "both to listen")
+        # Otherwise 'drive' says, besides, that there is no link yet.
+        until(lambda: not probe_all(self.where[1::2], None), "both to listen")
         drive = start("drive", *self.track, *LONG, *options, *self.where, "--log", log)
         self.ended.append(drive)
         until(lambda: log.exists() and log.stat().st_size > 20_000, "a run in progress")

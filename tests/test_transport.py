@@ -48,8 +48,8 @@ from bayesrace.transport import (
     open_session,
     private_endpoints,
 )
-from bayesrace.transport.links import unlinked, wait_linked
-from tests.programs import PATIENCE_S
+from bayesrace.transport.session import unlinked
+from tests.programs import until
 
 pytestmark = pytest.mark.wall_clock
 
@@ -409,8 +409,7 @@ def test_each_unix_socket_is_a_link_of_its_own() -> None:
         open_session(Endpoints(listen=(ends[0],))),
         open_session(wanted := Endpoints(connect=tuple(ends)), peers_follow=True) as session,
     ):
-        assert wait_linked(session, wanted, ends[:1], PATIENCE_S)
-        assert unlinked(session, wanted) == ends[1:]
+        until(lambda: unlinked(session, wanted) == ends[1:], "the link")
 
 
 def test_events_of_all_sources_arrive(pair: tuple[Any, Any]) -> None:

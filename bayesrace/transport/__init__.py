@@ -2,10 +2,10 @@
 
 ``endpoints`` says where a process listens and connects, ``credentials`` holds its certificate,
 ``access`` makes Zenoh's access control of the table of messages, and ``session`` opens a session
-with all of that. ``probe`` says why an endpoint cannot be linked, and ``watch`` says it while a
-session is open. ``publisher`` sends messages, ``inbox`` is the one subscriber, with ``requests``
-for what it serves; ``client`` sends requests, ``director`` starts and follows runs; ``numbering``
-counts losses.
+with all of that; ``expiry`` ends a process whose certificate expires. ``probe`` says why an
+endpoint cannot be linked, for ``bayesrace doctor``. ``publisher`` sends messages, ``inbox`` is the
+one subscriber, with ``requests`` for what it serves; ``client`` sends requests, ``director`` starts
+and follows runs; ``numbering`` counts losses.
 """
 
 from bayesrace.transport.client import (

@@ -62,7 +62,7 @@ class Director:
                 if left_s <= 0:
                     raise InputError(
                         f"no {' and no '.join(sorted(missing))} for car '{self._car}' within "
-                        f"{timeout_s:g} s; start it, or check the endpoints"
+                        f"{timeout_s:g} s; start it, or check the endpoints with 'bayesrace doctor'"
                     )
                 _raise_on_signal(self.inbox.get(left_s))
         # A process that answers a request knows all that was declared before it.

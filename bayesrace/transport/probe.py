@@ -5,10 +5,9 @@ connection, and a handshake with this process's certificate.
 """
 
 import socket
-import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from bayesrace.transport.credentials import AUTHORITY, CERTIFICATE, KEY, Credentials
 from bayesrace.transport.endpoints import Address, address_of
@@ -16,7 +15,7 @@ from bayesrace.transport.endpoints import Address, address_of
 if TYPE_CHECKING:
     import ssl
 
-__all__ = ["Finding", "expired", "probe", "probe_all"]
+__all__ = ["probe", "probe_all"]
 
 _CONNECT_S: Final = 1.0
 _REFUSAL_S: Final = 0.2
@@ -28,56 +27,35 @@ _OTHER_NAME: Final = (62, 64)
 """OpenSSL's numbers of what is wrong with a certificate."""
 
 
-_ends: Final[dict[str, float]] = {}
-"""When the certificate at an endpoint expires, as last seen by this process."""
+def probe_all(endpoints: Sequence[str], credentials: Credentials | None) -> dict[str, str]:
+    """What is wrong with each endpoint, and the remedy; those that are fine are left out.
 
-
-class Finding(NamedTuple):
-    """What is wrong with an endpoint."""
-
-    endpoint: str
-    text: str
-    """What, and the remedy."""
-    lasting: bool = True
-    """It does not change by waiting."""
-
-
-def expired(endpoints: Sequence[str]) -> list[str]:
-    """Those whose certificate must have expired, or been renewed, since it was last seen."""
-    return [one for one in endpoints if time.time() >= _ends.get(one, float("inf"))]
-
-
-def probe_all(
-    endpoints: Sequence[str], credentials: Credentials | None, *, greets: bool = True
-) -> list[Finding]:
-    """What is wrong with each of the endpoints; all are tried at once, within some 1.5 s.
-
-    Unless it ``greets``, only whether somebody listens.
+    All are tried at once, within some 1.5 s.
     """
     if not endpoints:
-        return []
+        return {}
     with ThreadPoolExecutor(len(endpoints)) as pool:
-        found = pool.map(lambda one: probe(one, credentials, greets=greets), endpoints)
-        return [finding for finding in found if finding is not None]
+        found = pool.map(lambda one: probe(one, credentials), endpoints)
+        return {one: text for one, text in zip(endpoints, found, strict=True) if text}
 
 
-def probe(endpoint: str, credentials: Credentials | None, *, greets: bool = True) -> Finding | None:
-    """What is wrong with an endpoint; None if nothing is found."""
+def probe(endpoint: str, credentials: Credentials | None) -> str:
+    """What is wrong with an endpoint, and the remedy; empty if nothing is found."""
     address = address_of(endpoint)
     if address.protocol not in ("tcp", "tls", "ws", "unixsock-stream"):
-        return None
+        return ""
     try:
         connection = _connected(endpoint, address)
     except OSError as error:
-        return Finding(endpoint, _unreached(endpoint, address, error), lasting=False)
+        return _unreached(endpoint, address, error)
     with connection:
-        if not greets or address.protocol in ("ws", "unixsock-stream"):
-            return None
+        if address.protocol in ("ws", "unixsock-stream"):
+            return ""
         if credentials is None:
             text = _asks_for_certificates(connection)
-            return Finding(endpoint, f"{endpoint} {text}") if text else None
-        text = _refused(connection, endpoint, address, credentials)
-        return Finding(endpoint, f"{endpoint} {text}") if text else None
+        else:
+            text = _refused(connection, address, credentials)
+    return f"{endpoint} {text}" if text else ""
 
 
 def _connected(endpoint: str, address: Address) -> socket.socket:
@@ -95,7 +73,9 @@ def _connected(endpoint: str, address: Address) -> socket.socket:
 
 def _unreached(endpoint: str, address: Address, error: OSError) -> str:
     if isinstance(error, ConnectionRefusedError | FileNotFoundError):
-        return f"nobody listens at {endpoint}: start what should, or correct the endpoint"
+        return (
+            f"nobody listens at {endpoint}: start the process that should, or correct the endpoint"
+        )
     if isinstance(error, socket.gaierror):
         return f"{endpoint}: the name '{address.host}' is not known: correct it, or give an address"
     if isinstance(error, TimeoutError):
@@ -120,9 +100,7 @@ def _asks_for_certificates(connection: socket.socket) -> str:
     )
 
 
-def _refused(
-    connection: socket.socket, endpoint: str, address: Address, credentials: Credentials
-) -> str:
+def _refused(connection: socket.socket, address: Address, credentials: Credentials) -> str:
     """Why the handshake fails at one of its ends; empty if it does not."""
     import ssl  # as above
 
@@ -136,8 +114,6 @@ def _refused(
         return f"cannot be tried, since {why}: copy the folder again, as 'bayesrace certs' wrote it"
     try:
         with context.wrap_socket(connection, server_hostname=address.host) as link:
-            theirs = link.getpeercert() or {}
-            _ends[endpoint] = ssl.cert_time_to_seconds(str(theirs["notAfter"]))
             # The other end judges our certificate when the handshake is over for this one.
             link.settimeout(_REFUSAL_S)
             link.recv(1)

@@ -12,8 +12,9 @@ import os
 import re
 import socket
 import struct
+import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,13 +25,11 @@ from bayesrace.messages import Role
 from bayesrace.realtime import short_slices
 from bayesrace.transport.access import access_control
 from bayesrace.transport.credentials import AUTHORITY, CERTIFICATE, KEY, Credentials
-from bayesrace.transport.endpoints import Endpoints, check_descriptors, leaves
-from bayesrace.transport.links import wait_linked
-from bayesrace.transport.probe import Finding, probe_all
+from bayesrace.transport.endpoints import Endpoints, address_of, check_descriptors, leaves
+from bayesrace.transport.expiry import ending_on_expiry
 from bayesrace.transport.requests import in_transport_thread
-from bayesrace.transport.watch import LinkWatch, report
 
-__all__ = ["open_session", "try_links", "zenoh_config"]
+__all__ = ["open_session", "try_links", "unlinked", "zenoh_config"]
 
 _log = logging.getLogger("bayesrace.links")
 
@@ -41,8 +40,10 @@ forwards between regions only, which suffices: processes of one region exchange 
 # One receiving worker hands over between threads less often than the default of two.
 _RUNTIME: Final = "(rx: (worker_threads: 1))"
 _RETRY: Final = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
-_LINK_S: Final = 0.7
-"""How long a secured session waits for the links that its handshakes have shown to be possible."""
+_LINK_S: Final = 0.5
+"""How long a session waits for its links before the log says that there are none yet."""
+_LOOK_S: Final = 0.02
+"""Time between two looks at the links of a session."""
 
 # Zenoh's own tools name no region: they form one more, and clients another.
 _FILTERS: Final[list[dict[str, list[str]]]] = [
@@ -129,9 +130,9 @@ def open_session(
     """A Zenoh session of a process in that role, closed at the end of the block.
 
     Raises InputError if an endpoint is malformed, open to others without protection, or cannot be
-    listened on; if the certificate is not for the role; if a handshake is refused, here or at the
-    other end. An absent peer is no error: the session connects as soon as it appears, and the log
-    says that it waits. See :class:`.Inbox` for waiting with a limit.
+    listened on, or if the certificate is not for the role. An absent peer is no error: the session
+    connects as soon as it appears, and the log says that it waits. See :class:`.Inbox` for waiting
+    with a limit.
 
     ``peers_follow``: the caller starts the peers itself, just before or after this call. Opening
     the session then does not wait for them, and the log does not say that they are absent.
@@ -140,56 +141,49 @@ def open_session(
     the end of the block raises InputError with the reason.
     """
     os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)
-    absent = _checked(endpoints, role, peers_follow)
+    try_links(endpoints, role)
     if endpoints.exposed:
         _log.warning(
             "INSECURE: links by %s are open to everyone in that network, who could drive the car; "
             "see docs/security.md", ", ".join(endpoints.exposed),
         )  # fmt: skip
-    watch: LinkWatch | None = None
-    try:
-        with ExitStack() as stack:
-            session = stack.enter_context(_opened(endpoints, role, peers_follow))
-            if endpoints.credentials is not None:
-                missing = {finding.endpoint for finding in absent}
-                there = [one for one in endpoints.connect if one not in missing]
-                wait_linked(session, endpoints, there, _LINK_S)
-            if endpoints.credentials is not None or (endpoints.connect and not peers_follow):
-                watch = LinkWatch(session, endpoints, not peers_follow, grace_s)
-                stack.callback(watch.close)
-            yield session
-    except (InputError, KeyboardInterrupt) as error:
-        if watch is None or not watch.fault:
-            raise
-        raise InputError(watch.fault) from error
-    if watch is not None and watch.fault:
-        raise InputError(watch.fault)
+    own = endpoints.credentials
+    ending = nullcontext() if own is None else ending_on_expiry(own, grace_s)
+    with _opened(endpoints, role, peers_follow) as session, ending:
+        if not peers_follow and (missing := unlinked(session, endpoints, _LINK_S)):
+            _log.warning(
+                "no link to %s yet; this goes on trying, and 'bayesrace doctor' says why there is "
+                "none", ", ".join(missing),
+            )  # fmt: skip
+        yield session
 
 
 def try_links(endpoints: Endpoints, role: Role) -> None:
-    """What :func:`open_session` says and raises, for commands with seconds of work before it."""
-    if endpoints.credentials is None:
-        _checked(endpoints, role)
-    else:
-        with open_session(endpoints, role):
-            pass
+    """InputError for what no session can be opened with: certificate, endpoints, limits.
 
-
-def _checked(endpoints: Endpoints, role: Role, peers_follow: bool = False) -> list[Finding]:
-    """Where nobody is now, which is logged; InputError for what waiting cannot help."""
+    For commands with seconds of work before they open one.
+    """
     check_descriptors()
     endpoints.check()
-    credentials = endpoints.credentials
-    if credentials is not None:
-        credentials.check(role)
-    elif peers_follow:
-        return []
-    found = probe_all(endpoints.connect, credentials, greets=credentials is not None)
-    if lasting := [finding.text for finding in found if finding.lasting]:
-        raise InputError("; ".join(lasting))
-    if not peers_follow:
-        report(found)
-    return found
+    if endpoints.credentials is not None:
+        endpoints.credentials.check(role)
+
+
+def unlinked(session: Any, endpoints: Endpoints, timeout_s: float = 0.0) -> list[str]:
+    """Endpoints to connect to that have no link; waits for their links for that time at most."""
+    deadline = time.monotonic() + timeout_s
+    while (missing := _unlinked(session, endpoints)) and time.monotonic() < deadline:
+        time.sleep(_LOOK_S)
+    return missing
+
+
+def _unlinked(session: Any, endpoints: Endpoints) -> list[str]:
+    wanted = list(endpoints.connect)
+    if endpoints.low_latency:  # Zenoh 1.10.2 panics where it is asked for the ends of such links
+        nodes = [*session.info.peers_zid(), *session.info.routers_zid()]
+        return [] if len(nodes) >= len(wanted) else wanted
+    ends = {_without_settings(str(link.dst)) for link in session.info.links()}
+    return [one for one in wanted if not _is_among(one, ends)]
 
 
 @contextmanager
@@ -230,3 +224,22 @@ def _close_without_waiting() -> None:
             continue
         finally:
             one.detach()
+
+
+def _without_settings(endpoint: str) -> str:
+    return endpoint.partition("?")[0].partition("#")[0]
+
+
+def _is_among(endpoint: str, ends: set[str]) -> bool:
+    address = address_of(endpoint)
+    if address.protocol == "unixsock-stream":
+        return _without_settings(endpoint) in ends
+    if address.protocol not in ("tcp", "tls"):
+        return any(end.startswith(address.protocol) for end in ends)
+    try:
+        found = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)
+    except OSError:
+        return False
+    hosts = {str(one[4][0]) for one in found}
+    named = {f"[{host}]" if ":" in host else host for host in hosts}
+    return any(f"{address.protocol}/{host}:{address.port}" in ends for host in named)

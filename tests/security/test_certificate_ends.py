@@ -45,7 +45,6 @@ def check_ended(program: Program, name: str) -> None:
     assert f"bayesrace: certificate '{name}' has expired" in last
     assert f"bayesrace certs add {name} --renew" in last
     assert "Traceback" not in program.said()
-    assert "nobody listens" not in last
 
 
 def test_a_controller_ends_and_its_car_brakes(tmp_path: Path, course: Course) -> None:
@@ -71,9 +70,6 @@ def test_a_plant_ends_when_its_car_stands(tmp_path: Path, course: Course) -> Non
         assert "this process ends in" in rig.plant.said()
         assert re.search("run 1 ended .* for 10 s", rig.plant.said())
         assert rig.controller.process.poll() is None
-        # A controller that is late to look, on a loaded machine, finds that the plant has ended.
-        seen = "has a certificate that has expired: renew it there|nobody listens"
-        assert re.search(seen, rig.controller.said())
         journey = rig.journey()
     assert max(state.x[3] for state in journey.states) > 0.5
     # The recording's own link closes, too, and does not always open again: it may end there.
