@@ -212,8 +212,8 @@ def test_a_case_whose_workers_die_is_a_failed_row_and_reported(tmp_path: Path) -
     from distributed.scheduler import KilledWorker
 
     from operation.settings import RaceSettings
+    from studies.campaign.campaign import CampaignError, rows_of
     from studies.campaign.case import Case
-    from studies.campaign.cluster import CampaignError, rows_of
     from studies.campaign.page import render_campaign
     from studies.campaign.results import writing
 

@@ -19,15 +19,14 @@ from learning.likelihood import PairDistances, maximise, starts
 from learning.residual import residual
 from operation.settings import RaceSettings
 from operation.terminal.progress import Stage, stages_on
-from studies.paper import kernels, make
+from studies.paper import make
+from studies.paper import residual as learning
 from studies.paper.experiment import Experiment
 from studies.paper.finding import Finding, at_most
-from studies.paper.kernels import kernel_section, smoothness
-from studies.paper.line import line_section, published_line
+from studies.paper.loop import line_section, published_line, tenth_section
 from studies.paper.make import DRIVES, PaperSettings
 from studies.paper.models import model_section
-from studies.paper.residual import gains
-from studies.paper.tenth import tenth_section
+from studies.paper.residual import gains, kernel_section, smoothness
 from tests.command_line import Cli, refused
 from tests.conftest import Circuit
 from tests.driven import CAR, drive
@@ -99,11 +98,11 @@ def test_what_was_computed_before_an_interruption_is_not_computed_again(
         computed.append((kind, isotropic))
         return [0.1 * len(computed)] * 6
 
-    monkeypatch.setattr(kernels, "_errors", errors)
+    monkeypatch.setattr(learning, "_errors", errors)
     with pytest.raises(KeyboardInterrupt):
         smoothness("our", training, test, 30, 2, QUIET)
     before, computed[:] = [*computed], []
-    monkeypatch.setattr(kernels, "_errors", lambda *_: [1.0] * 6)
+    monkeypatch.setattr(learning, "_errors", lambda *_: [1.0] * 6)
     found = smoothness("our", training, test, 30, 2, QUIET)
     assert len(before) == 3
     assert found.rmse.shape == (2, 4, 2, 3)

@@ -79,7 +79,7 @@ def campaign_worker(
     workers: Workers = 0,
 ) -> None:
     """Compute for a campaign elsewhere until its Dask scheduler ends."""
-    from studies.campaign.cluster import run_worker
+    from studies.campaign.campaign import run_worker
 
     run_worker(scheduler, workers)
 

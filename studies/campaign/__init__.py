@@ -2,8 +2,7 @@
 
 In the order of use: ``plan`` reads the TOML file and makes its ``case``s, each with a key that
 changes with everything that shapes its result. ``execute`` drives one case, on a worker.
-``cluster`` starts workers or finds them, and ``campaign`` hands them the cases that ``results``
-does not hold yet. ``results`` keeps one row a lap in Parquet. ``summary`` makes one table of all
-rows and summaries of it, which ``page`` shows. ``tune`` searches for better settings by the same
-workers.
+``campaign`` starts workers or finds them, and hands them the cases that ``results`` does not hold
+yet. ``results`` keeps one row a lap in Parquet. ``summary`` makes one table of all rows and
+summaries of it, which ``page`` shows. ``tune`` searches for better settings by the same workers.
 """

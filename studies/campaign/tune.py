@@ -25,8 +25,8 @@ from operation.preparation import prepare
 from operation.settings import RaceSettings
 from operation.terminal.progress import Stages
 from operation.terminal.terminal import plain_table
+from studies.campaign.campaign import computed, connected
 from studies.campaign.case import Case, Controller, Files
-from studies.campaign.cluster import computed, connected
 from studies.campaign.execute import FAILED, Row
 
 __all__ = ["TuneSettings", "Verdict", "print_verdict", "tune"]

@@ -1,9 +1,8 @@
 """``bayesrace paper``: every figure and number of the paper, made from scratch, on one page.
 
 In the order of use: ``make`` reads what is asked for and makes the sections, of which ``models``,
-``residual``, ``loop``, ``line``, ``kernels`` and ``tenth`` have one module each; it writes the
-page. ``orca.json`` and ``f1tenth.json`` are the settings by which all of it is made.
-``experiment`` prepares a car and drives its laps. ``finding`` puts a published result beside ours
-and derives from a criterion whether they agree. What takes long is kept in the cache, so that a run
-that was interrupted goes on where it was.
+``residual`` and ``loop`` have their modules; it writes the page. ``orca.json`` and ``f1tenth.json``
+are the settings by which all of it is made. ``experiment`` prepares a car and drives its laps.
+``finding`` puts a published result beside ours and derives from a criterion whether they agree.
+What takes long is kept in the cache, so that a run that was interrupted goes on where it was.
 """

@@ -96,7 +96,7 @@ class Experiment:
 
 def stored(name: str, parts: Iterable[str], make: Callable[[], Any]) -> Any:
     """What ``make`` returned for these parts, this software and this machine, as JSON."""
-    own = software(("studies/paper/kernels.py", "studies/bench.py"), ())
+    own = software(("studies/paper/residual.py", "studies/bench.py"), ())
     key = digest((*parts, *own, software_identity(), cpu_identity()))
 
     def read(path: Path) -> Any:

@@ -22,12 +22,9 @@ from operation.terminal.progress import Stages
 from studies.bench import BenchResult, BenchSettings, run_bench
 from studies.paper.experiment import Experiment, stored
 from studies.paper.finding import Finding, Section
-from studies.paper.kernels import kernel_section, smoothness
-from studies.paper.line import line_section, published_line
-from studies.paper.loop import loop_sections
+from studies.paper.loop import line_section, loop_sections, published_line, tenth_section
 from studies.paper.models import model_section
-from studies.paper.residual import Learned, learned, learning_sections
-from studies.paper.tenth import tenth_section
+from studies.paper.residual import Learned, kernel_section, learned, learning_sections, smoothness
 
 __all__ = ["DRIVES", "PaperSettings", "make_paper"]
 
