@@ -41,7 +41,7 @@ from bayesrace.raceline import RaceLine
 from bayesrace.tracks import PathProjection, Track
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
-from codegen.compiled import compiled
+from codegen.compiler import compiled
 from controller.assembly import compiled_controller
 from controller.cycle import Cycle
 from controller.driver import Decision

@@ -23,8 +23,7 @@ from bayesrace.raceline.cached import raceline_file, racing_line
 from bayesrace.tracks import Track, load_track, write_track
 from bayesrace.vehicles import CarParameters
 from codegen.build import build
-from codegen.compiled import compiled
-from codegen.compiler import find_compiler
+from codegen.compiler import compiled, find_compiler
 from codegen.settings import BuildSettings
 from learning.dataset import Dataset, concatenate
 from learning.logs import CYCLES, STATES, dataset_from_columns

@@ -13,8 +13,7 @@ from bayesrace.errors import InputError
 from bayesrace.integrators import Discretisation
 from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import dynamic
-from codegen.compiled import compiled
-from codegen.compiler import Compiler
+from codegen.compiler import Compiler, compiled
 from plant.laps import LineCounter
 from plant.simulator import Simulator
 
@@ -193,7 +192,7 @@ def test_without_a_compiler_the_equations_are_interpreted(
         raise InputError("no C compiler found")
 
     monkeypatch.setenv("BAYESRACE_CACHE", str(tmp_path))
-    monkeypatch.setattr("codegen.compiled.find_compiler", none)
+    monkeypatch.setattr("codegen.compiler.find_compiler", none)
     simulator = Simulator(dynamic(CAR), compiled=compiled)
     assert "no C compiler found" in caplog.text
     SIMULATOR.reset(START)

@@ -73,7 +73,7 @@ def plant(
     """Simulate the car: waits for runs, as of 'bayesrace drive', until Ctrl-C."""
     die_with_parent(parent_pid)
     from bayesrace.vehicles import get_car
-    from codegen.compiled import compiled
+    from codegen.compiler import compiled
     from plant.process import PlantSettings, main
 
     settings = PlantSettings(

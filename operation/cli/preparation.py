@@ -106,7 +106,7 @@ def collect(
     from bayesrace.tracks import load_track
     from bayesrace.vehicles import get_car
     from codegen.build import build
-    from codegen.compiled import compiled
+    from codegen.compiler import compiled
     from codegen.settings import BuildSettings
     from controller.pure_pursuit import PurePursuitSettings
     from operation.collect import collect as drive
