@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from bayesrace.errors import InputError
 from bayesrace.vehicles import CarParameters, get_car
-from bayesrace.vehicles.models import STATES, dynamic
+from bayesrace.vehicles.models import STATES
 from codegen.fmu import Variable, car_fmu, pack
 from plant.simulator import PlantGuard
 from tests.car_fmu import packed_car, unpacked_car
@@ -254,16 +254,3 @@ def test_a_definition_that_cannot_work_is_refused(car: CarParameters, tmp_path: 
     strange = replace(definition, variables=(Variable("a", "local", "", unit="furlong"),))
     with pytest.raises(InputError, match="furlong"):
         pack(strange, tmp_path / "x.fmu")
-
-
-def test_symbolic_parameters_give_the_same_equations(car: CarParameters) -> None:
-    from bayesrace.vehicles.models import dynamic_with_parameters
-
-    random = np.random.default_rng(0)
-    p = list(car.equation_numbers.values())
-    numeric, parametric = dynamic(car).ode, dynamic_with_parameters(car)
-    for x in random.uniform(-2, 2, (100, 7)):
-        u = random.uniform(-1, 1, 2)
-        np.testing.assert_allclose(
-            np.asarray(parametric(x, u, p)), np.asarray(numeric(x, u)), rtol=1e-12, atol=1e-10
-        )

@@ -164,31 +164,3 @@ def test_a_solver_of_variable_step_drives_like_the_plant(
     assert result["time"][-1] == pytest.approx(1.0)
     last = [result[name][-1] for name in STATES]
     np.testing.assert_allclose(last, simulator.x, rtol=0, atol=1e-6)
-
-
-@pytest.fixture(scope="module")
-def imported() -> Any:
-    """The FMU as CasADi's function (x, u) -> xdot."""
-    builder = ca.DaeBuilder("car", str(unpacked_car(3, "me")))
-    return builder.create("f", ["x", "u"], ["ode"])
-
-
-def test_casadi_imports_values_and_jacobians(imported: Any, car: CarParameters) -> None:
-    x, u = ca.MX.sym("x", 7), ca.MX.sym("u", 2)
-    function = ca.Function(
-        "f", [x, u], [imported(x, u), ca.jacobian(imported(x, u), ca.vertcat(x, u))]
-    )
-    exact, ode = jacobian(car), dynamic(car).ode
-    for a, b in points(60, 3):
-        value, slope = (np.asarray(ca.densify(out)) for out in function(a, b))
-        np.testing.assert_allclose(value, np.asarray(ode(a, b)), rtol=1e-12, atol=1e-10)
-        expected = exact(a, b)[:, :9]
-        np.testing.assert_allclose(slope, expected, atol=1e-12 * np.abs(expected).max())
-
-
-def test_casadi_knows_the_sparsity_from_the_model_structure(
-    imported: Any, car: CarParameters
-) -> None:
-    ode = dynamic(car).ode
-    for i in range(2):
-        assert imported.sparsity_jac(i, 0) == ode.sparsity_jac(i, 0)

@@ -1,7 +1,5 @@
 """The FMI layers: saved states to the last bit, and a message instead of a crash for misuse."""
 
-import ctypes
-import shutil
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +12,6 @@ from fmpy.fmi1 import FMICallException
 from bayesrace.vehicles import CarParameters
 from codegen.fmu import car_fmu
 from codegen.fmu.build import sources_of, write_sources
-from tests.car_fmu import packed_car, unpacked_car
 from tests.fmu_exports import Kind, Version, commands, driven, slave
 from tests.fmu_master import Slave
 from tests.native_programs import PROGRAMS, SANITIZERS, gcc
@@ -169,66 +166,6 @@ def test_unknown_and_mistyped_variables_are_refused(version: Version) -> None:
     refused(one, lambda: put([one.references["d"], 12345], [0.3, 1.0]), "unknown")
     assert one.get("d") == before  # all or none
     refused(one, lambda: put([one.references["time"]], [1.0]), "'time' cannot be set")
-    one.close()
-
-
-def test_numbers_of_values_that_do_not_fit_are_refused() -> None:
-    one = stepping()
-    values, reference = (ctypes.c_double * 2)(), (ctypes.c_uint32 * 1)()
-    call = one.fmu.fmi3GetFloat64
-    refused(one, lambda: call(one.fmu.component, reference, 1, values, 2), "1 scalar")
-    refused(one, lambda: call(one.fmu.component, None, 1, values, 1), "NULL")
-    one.close()
-
-
-@VERSIONS
-def test_the_token_of_another_fmu_gives_no_instance(version: Version, tmp_path: Path) -> None:
-    other = slave(version)
-    other.description.guid = "{0}"
-    unknown = "{00000000-0000-0000-0000-000000000000}"
-    arguments = _with_token(other, version, unknown, tmp_path / "foreign")
-    with pytest.raises(Exception, match="instantiate"):
-        Slave.__init__(*arguments)
-    other.fmu.freeInstance()
-
-
-def _with_token(one: Slave, version: Version, token: str, folder: Path) -> tuple[Slave, Path, Path]:
-    """Arguments of an instance whose description has another token."""
-    shutil.copytree(unpacked_car(version), folder)
-    path = folder / "modelDescription.xml"
-    text = path.read_text()
-    start = text.index("{")
-    path.write_text(text[:start] + token + text[text.index("}") + 1 :])
-    return one, packed_car(version), folder
-
-
-def test_instances_do_not_know_each_other() -> None:
-    inputs = commands(100), commands(100, 1)
-    alone = []
-    for rows in inputs:
-        one = stepping()
-        alone.append(driven(one, rows))
-        one.close()
-    pair = stepping(), stepping()
-    for k in range(100):
-        for one, rows, expected in zip(pair, inputs, alone, strict=True):
-            np.testing.assert_array_equal(driven(one, rows[k : k + 1])[0], expected[k])
-    for one in pair:
-        one.close()
-
-
-@VERSIONS
-def test_reset_is_as_new(version: Version) -> None:
-    inputs = commands(50)
-    one = slave(version)
-    one.initialise()
-    expected = driven(one, inputs)
-    one.reset()
-    one.initialise({"mass_kg": 0.1, "x": 3.0})
-    driven(one, inputs)
-    one.reset()
-    one.initialise()
-    np.testing.assert_array_equal(driven(one, inputs), expected)
     one.close()
 
 

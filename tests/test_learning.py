@@ -1,7 +1,5 @@
 """Learning: samples, residual, likelihood, training, validation."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from msgspec.structs import replace
@@ -15,11 +13,10 @@ from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from learning.dataset import Dataset, concatenate, filter_dataset, tolerances
 from learning.likelihood import MarginalLikelihood, PairDistances, starts
-from learning.logs import dataset_from_log
 from learning.posterior import Covariance, Posterior
 from learning.residual import identity, residual
 from learning.settings import TrainingSettings
-from learning.subset import evenly, most_informative
+from learning.subset import most_informative
 from learning.training import train
 from learning.validation import predictive_sigma, validate
 from tests.conftest import discrete
@@ -153,11 +150,6 @@ def test_gaps_fallback_and_other_runs_are_left_out(driven: Dataset) -> None:
         dataset_of([])
 
 
-def test_a_missing_log_is_an_input_error(tmp_path: Path) -> None:
-    with pytest.raises(InputError):
-        dataset_from_log(tmp_path / "none.mcap", CAR, STEP_S)
-
-
 # --- likelihood, cross-validation, choice of samples -------------------------------------------
 
 
@@ -218,13 +210,6 @@ def test_greedy_choice_takes_the_largest_posterior_variance() -> None:
     assert len(most_informative("rbf", z, np.ones(6), 0.1, 500)) == len(z)
 
 
-def test_even_choice_covers_the_whole() -> None:
-    assert list(evenly(4, 10)) == [0, 1, 2, 3]
-    chosen = evenly(1000, 10)
-    assert len(set(chosen.tolist())) == 10
-    assert chosen[0] < 100 < 900 <= chosen[-1]
-
-
 # --- training and validation -------------------------------------------------------------------
 
 
@@ -239,15 +224,6 @@ def test_training_corrects_the_model(driven: Dataset) -> None:
     assert seen == sorted(seen)
     assert seen[-1] == pytest.approx(1.0)
     assert weights.dataset_digest == driven.digest()
-
-
-def test_training_is_reproducible_and_named_by_content(driven: Dataset) -> None:
-    first, again = (train(driven, PREDICTION, QUICK) for _ in range(2))
-    assert first.version == again.version
-    for a, b in zip(first.outputs, again.outputs, strict=True):
-        assert np.array_equal(a.alpha, b.alpha)
-    other = train(driven.select(slice(100)), PREDICTION, QUICK)
-    assert other.version != first.version
 
 
 def test_the_car_drives_a_mirror_image_as_it_drives(driven: Dataset) -> None:
@@ -292,13 +268,6 @@ def test_the_posterior_equals_scikit_learn(kind: str, monkeypatch: pytest.Monkey
     ours = Posterior(Covariance.of(kind, theta), z, y).predict(new)
     assert ours[0] == pytest.approx(mean, abs=1e-10)
     assert ours[1] == pytest.approx(sigma, abs=1e-10)
-
-
-def test_without_samples_the_posterior_is_the_prior() -> None:
-    covariance = Covariance("rbf", 2.0, np.ones(6), 0.25)
-    mean, sigma = Posterior(covariance, np.zeros((0, 6)), np.zeros(0)).predict(np.ones((3, 6)))
-    assert not mean.any()
-    assert list(sigma) == [1.5, 1.5, 1.5]
 
 
 def test_coverage_is_nominal_where_the_gp_is_right() -> None:

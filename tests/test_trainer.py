@@ -37,8 +37,11 @@ def learned(driven: Dataset) -> GpWeights:
     return train(driven, PREDICTION, SMALL)
 
 
-def test_what_fits_is_kept_as_it_is(driven: Dataset) -> None:
+def test_as_many_are_kept_as_wanted(driven: Dataset) -> None:
     assert bounded(driven, len(driven)) is driven
+    assert len(bounded(driven, 100)) == 100
+    many = driven.select(np.arange(MOST_NEW + 5000) % len(driven))
+    assert len(bounded(many, 50)) == 50
 
 
 def test_the_newest_and_the_most_informative_are_kept(driven: Dataset, learned: GpWeights) -> None:
@@ -58,10 +61,6 @@ def test_the_newest_and_the_most_informative_are_kept(driven: Dataset, learned: 
     assert (spread[0] > 0.8 * spread[1]).all(), "the wealth of the drive is lost"
 
 
-def test_without_weights_they_are_evenly_spread(driven: Dataset) -> None:
-    assert len(bounded(driven, 100)) == 100
-
-
 def test_laps_without_end_need_no_more_memory(learned: GpWeights) -> None:
     """The bound that is stated: samples times a quarter of what is kept, in doubles, and little."""
     wanted, kept = 200, drive(dynamic(CAR), 100, seed=2)
@@ -73,11 +72,6 @@ def test_laps_without_end_need_no_more_memory(learned: GpWeights) -> None:
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 8 * (wanted + 300) * wanted / 4 + 2e6
-
-
-def test_of_too_many_at_once_evenly_spread_ones_are_looked_at(driven: Dataset) -> None:
-    many = driven.select(np.arange(MOST_NEW + 5000) % len(driven))
-    assert len(bounded(many, 50)) == 50
 
 
 def test_recalled_samples_teach_what_the_weights_know(driven: Dataset, learned: GpWeights) -> None:
