@@ -30,18 +30,23 @@ def faults_in(
     whole: str = "the content",
     form: Any = None,
     tags: Collection[str] = (),
+    names: Mapping[str, str] | None = None,
 ) -> str:
     """What is wrong with data that do not fit a pydantic model: field, value and remedy, one line.
 
     ``whole``: the name of what has no field of its own, such as text that is no JSON. ``form``: the
     model, whose fields are named and explained. ``tags``: of unions, which are no part of a place.
+    ``names``: of places that the user knows by others, such as options.
     """
-    return "; ".join(_fault(one, whole, form, tags) for one in error.errors())
+    return "; ".join(_fault(one, whole, form, tags, names or {}) for one in error.errors())
 
 
-def _fault(one: Any, whole: str, form: Any, tags: Collection[str]) -> str:
+def _fault(one: Any, whole: str, form: Any, tags: Collection[str], names: Mapping[str, str]) -> str:
     loc = [part for part in one["loc"] if part not in ("[key]", *tags)]
     place, fields = ".".join(map(str, loc)) or whole, _fields(form, loc[:-1])
+    for known, name in names.items():
+        if f"{place}.".startswith(f"{known}."):
+            place = f"{name}{place[len(known) :].replace('.', ' ')}"
     meaning = getattr(fields.get(loc[-1]) if loc else None, "description", None)
     about = f" ({meaning})" if meaning else ""
     if one["type"] == "value_error":  # our own words

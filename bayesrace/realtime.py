@@ -35,11 +35,11 @@ class RealtimeSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    cpu: int | None = Field(None, ge=0, description="CPU that the control thread is bound to")
+    cpu: int | None = Field(None, ge=0, description="CPU to bind the control thread to")
     fifo: int | None = Field(
         None, ge=1, le=99, description="SCHED_FIFO priority of the control thread"
     )
-    lock_memory: bool = Field(False, description="keep all memory of the process from being paged")
+    lock_memory: bool = Field(False, description="lock the memory of the process against paging")
 
 
 def prepare_thread(settings: RealtimeSettings) -> list[str]:

@@ -19,12 +19,16 @@ class BuildSettings(BaseModel):
 
     car: CarSetting = Field(default_factory=default_car)
     model: Literal["e_kinematic", "dynamic"] = Field(
-        "e_kinematic", description="model the OCP predicts with; dynamic is BestCase"
+        "e_kinematic", description="prediction model: e_kinematic, or dynamic, which is BestCase"
     )
-    problem: ProblemName = Field("tracking", description="control problem: tracking or progress")
+    problem: ProblemName = Field(
+        "tracking",
+        description="control problem: tracking (the line, at its speed) or progress (as fast as "
+        "possible)",
+    )
     discretisation: Discretisation = Field(PREDICTION, description="scheme, step, sub-steps")
     horizon: int | None = Field(
-        None, ge=2, le=100, description="stages N; the car's, from its tuning, without"
+        None, ge=2, le=100, description="stages of the horizon; None: the car's, from its tuning"
     )
     free_stages: int | None = Field(
         None,
@@ -40,7 +44,7 @@ class BuildSettings(BaseModel):
         description="of the stages after them, so many change alike; 1: no blocks; the car's "
         "without",
     )
-    gp_capacity: int = Field(1024, ge=8, le=16384, description="training points per output")
+    gp_capacity: int = Field(1024, ge=8, le=16384, description="most points per output")
 
     @property
     def stages(self) -> int:

@@ -1,7 +1,10 @@
 """How a controller process is started."""
 
+from typing import Annotated
+
 from pydantic import BaseModel, ConfigDict, Field
 
+from bayesrace.option import Option
 from bayesrace.realtime import RealtimeSettings
 from bayesrace.transport import CONTROLLER_ENDPOINT, PLANT_ENDPOINT, Endpoints
 from bayesrace.vehicles import CarSetting, default_car
@@ -17,11 +20,11 @@ class ControllerSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     car: CarSetting = Field(default_factory=default_car)
-    name: str = Field(default="", description="name in message keys; the car's own if empty")
+    name: str = Field("", description="name of the car in the network; empty: the car's own")
     endpoints: Endpoints = Endpoints(listen=(CONTROLLER_ENDPOINT,), connect=(PLANT_ENDPOINT,))
-    rate_hz: float = Field(50.0, ge=1, le=500, description="of the loop in real time")
-    budget: float = Field(
-        0.8, gt=0, le=1, description="fraction of the period that a cycle may take, step included"
+    rate_hz: float = Field(50.0, ge=1, le=500, description="rate in real time [Hz]")
+    budget: Annotated[float, Option(metavar="SHARE")] = Field(
+        0.8, ge=0.05, le=1, description="share of the period that a cycle may take, step included"
     )
     compensation: CompensationSettings = CompensationSettings()
     fallback: FallbackSettings = FallbackSettings()
@@ -32,10 +35,10 @@ class ControllerSettings(BaseModel):
         default=1.0,
         ge=0,
         le=1e3,
-        description="multiple of the contradictions in measured states that noise of motion "
-        "capture causes; beyond, a state is not believed; 0: every state is",
+        description="contradictions in measured states beyond which they are not believed, as a "
+        "multiple of those by noise of motion capture; 0: every state is",
     )
-    hold: bool = Field(False, description="wait for 'go' before driving")
+    hold: bool = Field(False, description="do not drive before 'bayesrace go'")
     gate: GateSettings = GateSettings()
     realtime: RealtimeSettings = RealtimeSettings()
     parent_pid: int | None = Field(None, description="end when this process, the parent, ends")

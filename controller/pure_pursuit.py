@@ -42,7 +42,8 @@ class PurePursuitSettings(BaseModel):
 
     style: DrivingStyle = Field(
         default="limit",
-        description="limit: sliding; calm: slower than the line; weave: in waves about the line",
+        description="style of the training drive: limit (it slides), calm, or weave (in waves "
+        "about the line)",
     )
     speed_scale: float | None = Field(
         default=None,

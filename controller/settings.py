@@ -1,11 +1,12 @@
 """Run-time settings of the OCP (paper, equation 8) and of the SQP that solves it."""
 
 from statistics import NormalDist
-from typing import Any
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from bayesrace.native_interface import SOLVER
+from bayesrace.option import Option
 from bayesrace.vehicles import CarParameters
 
 __all__ = ["MpcSettings"]
@@ -26,11 +27,11 @@ class MpcSettings(BaseModel):
     q_contour: float | None = _objective("progress: squared distance to the line [1/m^2]")
     gain: float | None = _objective("progress: reward of it [1/s]")
     s_slack: float | None = _objective("S: squared track violation [1/m^2]")
-    constraints: bool = Field(True, description="track constraints (8d) on or off")
+    constraints: bool = Field(True, description="apply the track constraints (8d)")
     margin_m: float | None = Field(
         None, ge=0, description="distance kept from the track edges [m]; the car's without"
     )
-    caution: float = Field(
+    caution: Annotated[float, Option(metavar="P")] = Field(
         0.95,
         ge=0,
         lt=1,

@@ -41,8 +41,8 @@ class TrainingSettings(BaseModel):
     kernels: tuple[Kernel, ...] = Field(
         DEFAULT_KERNELS, min_length=1, description="candidates; held-out log density decides"
     )
-    restarts: int = Field(2, ge=0, le=100, description="further seeded starts per kernel")
-    seed: int = Field(0, ge=0)
+    restarts: int = Field(2, ge=0, le=100, description="further starts of the optimiser per kernel")
+    seed: int = Field(0, ge=0, le=2**32 - 1, description="seed of the optimiser's starts")
     capacity: int = Field(1024, ge=1, description="training points per output at most")
     hyper_points: int = Field(
         400, ge=MIN_SAMPLES, description="samples that hyperparameters are found with at most"

@@ -16,7 +16,7 @@ from controller.python_controller import PythonController
 from operation.closed_loop import ClosedLoop, Driven, built_in_car
 from operation.training_line import room_beside, training_line
 from plant.fmu.faults import FmuFault
-from plant.sensors import SensorNoise
+from plant.settings import SensorNoise
 from plant.vehicle import Vehicle
 
 __all__ = ["collect"]

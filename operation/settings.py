@@ -1,22 +1,24 @@
 """Settings of a race, as one resolved object that goes into the run directory."""
 
 from pathlib import Path
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from bayesrace.integrators import PREDICTION, Discretisation
+from bayesrace.option import Option
 from bayesrace.raceline import RaceLineSettings
 from bayesrace.vehicles import CarParameters, CarSetting, default_car
 from codegen.settings import ProblemName
 from controller.pure_pursuit import PurePursuitSettings
 from controller.settings import MpcSettings
 from learning.settings import DEFAULT_KERNELS, WIDEN, Kernel
-from plant.sensors import SensorNoise
-from plant.simulator import PLANT
-from plant.vehicle import SimulatorName
+from plant.settings import SensorNoise, SimulatorName
 
-__all__ = ["PreparationSettings", "RaceSettings"]
+__all__ = ["PreparationSettings", "RaceSettings", "TimeMode"]
+
+TimeMode = Literal["lockstep", "realtime"]
+"""How time passes in a run."""
 
 
 class PreparationSettings(BaseModel):
@@ -27,15 +29,20 @@ class PreparationSettings(BaseModel):
     car: CarSetting = Field(default_factory=default_car)
     train_track: str = Field(
         "",
-        description="training track: name, random:SEED, random10:SEED or CSV file; "
+        description="track of the training drive: name, random:SEED, random10:SEED or CSV file; "
         "empty: the car's",
     )
     fmu: Path | None = Field(
-        None, description="FMU that simulates the car; the built-in car without"
+        None, description="Co-Simulation FMU (2.0, 3.0) that simulates the car"
     )
-    fmu_map: Path | None = Field(None, description="how the FMU's variables are ours (TOML)")
+    fmu_map: Annotated[Path | None, Option("--map")] = Field(
+        None,
+        description="meaning of the FMU's variables (TOML), as 'bayesrace fmu inspect' begins it; "
+        "None: they have our names",
+    )
     simulator: SimulatorName = Field(
-        "equations", description="what simulates the car without an FMU"
+        "equations",
+        description="what simulates the car without an FMU: equations, or slipx, for --car slipx",
     )
     true_grip: float = Field(
         1.0,
@@ -44,15 +51,20 @@ class PreparationSettings(BaseModel):
         description="tyre forces of the simulated car, as a multiple of those in its file, "
         "which all controllers but BestCase assume",
     )
-    delay_s: float = Field(
-        0.0, ge=0, le=1, description="delay put on states and on actuations each [s]"
+    delay_s: Annotated[float, Option(unit="ms", per_unit=1000)] = Field(
+        0.0, ge=0, le=1, description="delay put on states and on actuations each"
     )
-    noise: SensorNoise = SensorNoise()
+    noise: Annotated[SensorNoise, Option(metavar="NAME=STD")] = Field(
+        SensorNoise(), description="standard deviation of a sensor; empty: exact"
+    )
     seed: int = Field(
-        0, ge=0, description="of the training drive, the GP's starts and the sensors' noise"
+        0,
+        ge=0,
+        le=2**32 - 1,
+        description="seed of the training drive, the GP's starts and the sensors' noise",
     )
     start_speed_mps: float = Field(0.1, ge=0, le=5, description="speed at the start line")
-    collect_s: float | None = Field(
+    collect_s: Annotated[float | None, Option("--train-time")] = Field(
         None,
         ge=1,
         le=3600,
@@ -69,10 +81,12 @@ class PreparationSettings(BaseModel):
         0, ge=0, description="of the training, which they do not change; 0: one per core"
     )
     problem: ProblemName = Field(
-        "tracking", description="control problem: tracking the line, or progress along it"
+        "tracking",
+        description="control problem: tracking (the line, at its speed) or progress (as fast as "
+        "possible)",
     )
     horizon: int | None = Field(
-        None, ge=2, le=100, description="stages of the OCP; None: the car's, from its tuning"
+        None, ge=2, le=100, description="stages of the horizon; None: the car's, from its tuning"
     )
     discretisation: Discretisation = PREDICTION
     raceline: RaceLineSettings = RaceLineSettings()
@@ -128,21 +142,22 @@ class RaceSettings(PreparationSettings):
     track: str = Field(
         "", description="race track: name, random:SEED, random10:SEED or CSV file; empty: the car's"
     )
-    line: Path | None = Field(
-        None, description="racing line to drive on the race track (CSV); computed without"
+    line: Annotated[Path | None, Option("--raceline")] = Field(
+        None,
+        description="racing line to drive, as 'bayesrace raceline' writes it; None: computed",
     )
-    laps: int = Field(
-        2, ge=1, le=100, description="laps a controller drives: one from standstill, then flying"
-    )
+    laps: int = Field(2, ge=1, le=100, description="laps of a controller, the first from rest")
     progress_drives: int | None = Field(
         None,
         ge=0,
         le=20,
         description="runs of bayesrace-limit, which maximises progress, each after the first with "
-        "weights learned from all before; None: 3, but none on linear tyres, which have no limit, "
-        "and with slipx, where they can leave the track",
+        "weights learned from all before; None: 3; 0 on linear tyres, which have no limit, and "
+        "with slipx, where they can leave the track",
     )
-    mode: Literal["lockstep", "realtime"] = Field("lockstep", description="time mode of the runs")
+    mode: TimeMode = Field(
+        "lockstep", description="time mode: lockstep (as fast as possible) or realtime (the clock)"
+    )
     time_limit: float = Field(
         3.0, gt=1, description="a run ends at this multiple of the racing line's time"
     )
@@ -172,6 +187,8 @@ class RaceSettings(PreparationSettings):
         """One seed and one sampling time hold for all parts; the plant's time is not to choose."""
         if self.fmu is None and self.fmu_map is not None:
             raise ValueError(f"map {self.fmu_map} without an FMU to apply it to: add --fmu")
+        from plant.simulator import PLANT  # with CasADi, which the help does not need
+
         steps = {self.discretisation.step_s, self.pursuit.step_s, PLANT.step_s}
         if len(steps) > 1:
             raise ValueError(f"all parts must share the plant's period of {PLANT.step_s} s")

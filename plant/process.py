@@ -6,10 +6,7 @@ import secrets
 import time
 from collections.abc import Mapping
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
-
-from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.clock import die_with_parent, suspension
 from bayesrace.errors import InputError
@@ -27,12 +24,10 @@ from bayesrace.messages import (
     Scalar,
     Status,
 )
-from bayesrace.realtime import RealtimeSettings, prepare_thread
+from bayesrace.realtime import prepare_thread
 from bayesrace.transport import (
     HEARTBEAT_S,
     NEWEST,
-    PLANT_ENDPOINT,
-    Endpoints,
     Heartbeat,
     Inbox,
     Item,
@@ -44,13 +39,13 @@ from bayesrace.transport import (
     decode_request,
     open_session,
 )
-from bayesrace.vehicles import CarSetting, default_car
 from plant.fmu.faults import FmuFault
 from plant.lockstep import End
+from plant.process_settings import PlantSettings
 from plant.run import Run, RunCounters
-from plant.sensors import SensorNoise, Sensors
+from plant.sensors import Sensors
 from plant.simulator import Compile
-from plant.vehicle import SimulatorName, Vehicle, open_vehicle
+from plant.vehicle import Vehicle, open_vehicle
 
 __all__ = ["PlantProcess", "PlantSettings", "main"]
 
@@ -65,45 +60,6 @@ _RELINKED_S = 2.0
 
 _STATUS_S = 1.0
 """How long a controller may take to answer before a run begins, and after it has ended."""
-
-
-class PlantSettings(BaseModel):
-    """How a plant process is started; what a run is like comes with its request."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    car: CarSetting = Field(default_factory=default_car)
-    name: str = Field(default="", description="name in message keys; the car's own if empty")
-    endpoints: Endpoints = Endpoints(listen=(PLANT_ENDPOINT,))
-    rate_hz: float = Field(
-        default=50.0, gt=0, description="how often the state is sampled; the period in lockstep"
-    )
-    delay_s: float = Field(
-        default=0.0,
-        ge=0,
-        le=1,
-        description="delay put on states and on actuations each",
-    )
-    noise: SensorNoise = SensorNoise()
-    seed: int = Field(0, ge=0, description="of the sensors' noise, which is the same in each run")
-    fmu: Path | None = Field(
-        None,
-        description="Co-Simulation FMU that simulates the car, instead of the built-in equations",
-    )
-    fmu_map: Path | None = Field(
-        None, description="TOML file that names the FMU's variables; none: they have our names"
-    )
-    simulator: SimulatorName = Field(
-        "equations", description="what simulates the car without an FMU"
-    )
-    realtime: RealtimeSettings = RealtimeSettings()
-    controller_wait_s: float = Field(
-        default=2.0,
-        ge=0,
-        le=60,
-        description="how long a lockstep run waits for a controller to appear",
-    )
-    parent_pid: int | None = Field(None, description="end when this process, the parent, ends")
 
 
 class PlantProcess:

@@ -3,18 +3,16 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Protocol
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.vehicles.models import dynamic
 from bayesrace.vehicles.parameters import CarParameters
+from plant.settings import SimulatorName
 from plant.simulator import Command, Compile, PlantGuard, Simulator, plant_discretisation
 
-__all__ = ["SimulatorName", "Vehicle", "open_vehicle"]
-
-SimulatorName = Literal["equations", "slipx"]
-"""What simulates the car where no FMU does."""
+__all__ = ["Vehicle", "open_vehicle"]
 
 
 class Vehicle(Protocol):

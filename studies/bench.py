@@ -19,7 +19,7 @@ from functools import partial
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, Field
+from pydantic import BaseModel
 from rich.console import Console
 
 from bayesrace.arrays import Floats
@@ -27,7 +27,7 @@ from bayesrace.gp.expression import corrected_function
 from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.messages import State
-from bayesrace.tracks import DEFAULT_RACE_TRACK, Track
+from bayesrace.tracks import Track
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import e_kinematic
 from codegen.ocp import OcpNlp
@@ -42,21 +42,17 @@ from controller.settings import MpcSettings
 from operation.closed_loop import built_in_car
 from operation.drive import RunPlan, run_request
 from operation.preparation import prepare, progress_artefact
-from operation.settings import PreparationSettings
 from operation.terminal.progress import Stages
 from operation.terminal.terminal import plain_table
 from plant.lockstep import CarRun, drive_lockstep
 from plant.simulator import PLANT
 from plant.vehicle import Vehicle
+from studies.bench_settings import PUBLISHED, BenchSettings
 
 __all__ = ["BenchResult", "BenchSettings", "run_bench"]
 
-Case = tuple[ProblemName, float]
-"""Problem and caution."""
 Part = Literal["whole step", "preparation", "feedback"]
 
-_PUBLISHED: Final[Case] = ("tracking", 0.0)
-"""What IPOPT solves: it knows no uncertainty."""
 _PUBLISHED_STEP: Final = Discretisation(scheme="euler", step_s=PREDICTION.step_s)
 """The published controller predicts with forward Euler; the mean changes the velocities alone."""
 
@@ -80,34 +76,6 @@ _STRICT: Final = {
 
 class BenchError(RuntimeError):
     """There is nothing to compare with."""
-
-
-class BenchSettings(PreparationSettings):
-    """What is measured."""
-
-    tracks: tuple[str, ...] = Field(
-        (), description="driven on; none: the car's race track, and two beside the 1:43 one"
-    )
-    published: bool = Field(False, description="tracking without caution alone, as published")
-    problems: int = Field(900, ge=10, description="control steps of a case, all tracks")
-    peers: int = Field(25, ge=1, description="of these, solved by IPOPT")
-
-    @property
-    def driven_on(self) -> tuple[str, ...]:
-        """The tracks, in order; random ones are 1:43 circuits."""
-        race = self.car.race_track
-        more = ("random:11", "random:15") if race == DEFAULT_RACE_TRACK else ()
-        return self.tracks or (race, *more)
-
-    @property
-    def cases(self) -> tuple[Case, ...]:
-        """What is driven; not progress on linear tyres, which have no limit."""
-        caution = MpcSettings().caution
-        progress: tuple[Case, ...] = ("progress", caution), ("progress", 0.0)
-        both: tuple[Case, ...] = ("tracking", caution), _PUBLISHED
-        if self.published:
-            return (_PUBLISHED,)
-        return both if self.car.tyres.model == "linear" else both + progress
 
 
 class Times(BaseModel):
@@ -170,7 +138,7 @@ class BenchResult(BaseModel):
     @property
     def published(self) -> Row:
         """Our whole step on the problems that IPOPT solves."""
-        return next(row for row in self.rows if (row.problem, row.caution) == _PUBLISHED)
+        return next(row for row in self.rows if (row.problem, row.caution) == PUBLISHED)
 
     def print(self, console: Console) -> None:
         """A table for a person."""
@@ -248,7 +216,7 @@ def run_bench(settings: BenchSettings, stages: Stages) -> BenchResult:
                 ("whole step", whole), ("preparation", fast), ("feedback", fast)
             )  # fmt: skip
             rows += [_row(problem, caution, part, steps) for part, steps in parts]
-        if (problem, caution) == _PUBLISHED:
+        if (problem, caution) == PUBLISHED:
             published = [solution for one in whole for solution in one.solutions]
             step_us = rows[-3].us
     return BenchResult(

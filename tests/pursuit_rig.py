@@ -37,7 +37,8 @@ PATIENCE_S = 60.0
 
 PLANT = """
 import json, sys
-from plant.process import PlantSettings, main
+from plant.process import main
+from plant.process_settings import PlantSettings
 sys.exit(main(PlantSettings.model_validate_json(sys.argv[1])))
 """
 

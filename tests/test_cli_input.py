@@ -34,6 +34,8 @@ def test_an_unknown_command_or_option_is_refused(cli: Cli) -> None:
     refused(cli("race", "--mode", "slow"), "lockstep", "realtime")
     refused(cli("race", "--laps", "0"), "--laps")
     refused(cli("race", "--laps", "101"), "--laps")
+    refused(cli("race", "--caution", "1"), "--caution = 1.0: has to be less than 1 (probability")
+    refused(cli("race", "--caution", "0.3"), "--caution: is a probability from 0.5 on")
     refused(cli("raceline", "paddock", "--friction", "-1"), "friction")
 
 

@@ -26,7 +26,7 @@ from operation.closed_loop import ClosedLoop
 from operation.collect import collect
 from operation.drive import RunPlan, execute
 from plant.fmu.faults import FmuFault
-from plant.sensors import SensorNoise
+from plant.settings import SensorNoise
 from plant.simulator import Command, Simulator
 from tests.conftest import Circuit
 from tests.network.cars import gentle_course, start_controller, start_plant

@@ -7,6 +7,7 @@ import stat
 import textwrap
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.main import get_command
@@ -22,8 +23,8 @@ from bayesrace.transport import (
     open_session,
     private_endpoints,
 )
+from bayesrace.vehicles import get_car
 from operation.cli.app import app
-from operation.cli.help import TaskGroup
 from operation.settings import RaceSettings
 from operation.system import CONFIGURATION, started_system
 from tests.command_line import Cli, refused
@@ -158,10 +159,9 @@ def test_a_router_in_the_file_is_what_all_connect_to() -> None:
 def test_every_command_reads_the_file(cli: Cli, tmp_path: Path) -> None:
     """Those of groups, too."""
     spoilt = config(tmp_path, "[limits]\nlease = 1\n")
-    group = get_command(app)
-    assert isinstance(group, TaskGroup)
+    group: Any = get_command(app)
     for name in group.list_commands(None):
-        command = group.get_command(None, name)
+        command = group.resolve_command(None, [name])[1]
         for one in getattr(command, "commands", {name: command}).values():
             assert any("--config" in option.opts for option in one.params), one.name
     refused(cli("fmu", "inspect", "no.fmu", "--config", spoilt), "limits.lease")
@@ -281,9 +281,10 @@ def test_a_race_repeats_the_settings_of_another(
     StopError.__module__ = "operation.race"
     monkeypatch.setattr("operation.race.race", record)
     first = ("--laps", "5", "--seed", "3", "--style", "calm", "--no-constraints", "--delay", "20")
-    line = ("--raceline", "line.csv")
+    line = ("--raceline", "line.csv", "--car", "f1tenth")
     cli("race", *first, *line, "--track", "paddock", "--noise", "speed_mps=0.5")
     assert seen[0].line == Path("line.csv")
+    assert (seen[0].delay_s, seen[0].mpc.constraints, seen[0].noise.speed_mps) == (0.02, False, 0.5)
     path = tmp_path / "settings.json"
     path.write_text(seen[0].model_dump_json())
     cli("race", "--settings", path)
@@ -291,5 +292,7 @@ def test_a_race_repeats_the_settings_of_another(
     cli("race", "--settings", path, "--seed", "4", "--style", "weave")
     pursuit = seen[0].pursuit.model_copy(update={"style": "weave", "seed": 4})
     assert seen[2] == seen[0].model_copy(update={"seed": 4, "pursuit": pursuit})
+    cli("race", "--settings", path, "--tyres", "pacejka")
+    assert seen[3] == seen[0].model_copy(update={"car": get_car("f1tenth").on_tyres("pacejka")})
     path.write_text(json.dumps({"laps": 0}))
     refused(cli("race", "--settings", path), str(path), "laps")

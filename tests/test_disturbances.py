@@ -16,7 +16,8 @@ from controller.process_settings import ControllerSettings
 from controller.settings import MpcSettings
 from operation.closed_loop import ClosedLoop, Driven
 from plant.lockstep import CarRun
-from plant.sensors import SensorNoise, Sensors
+from plant.sensors import Sensors
+from plant.settings import SensorNoise
 from plant.simulator import Simulator
 from tests.command_line import Cli, refused
 from tests.conftest import Circuit

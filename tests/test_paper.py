@@ -24,9 +24,9 @@ from studies.paper import residual as learning
 from studies.paper.experiment import Experiment
 from studies.paper.finding import Finding, at_most
 from studies.paper.loop import line_section, published_line, tenth_section
-from studies.paper.make import DRIVES, PaperSettings
 from studies.paper.models import model_section
 from studies.paper.residual import gains, kernel_section, smoothness
+from studies.paper.settings import DRIVES, PaperSettings
 from tests.command_line import Cli, refused
 from tests.conftest import Circuit
 from tests.driven import CAR, drive
@@ -162,7 +162,7 @@ def test_the_small_car_laps_as_the_paper_says(seed: int) -> None:
     """Appendix B, on its own track: with correction, and not without."""
     tracks = reference_file("tracks/f110_map2.csv").parent
     with stages_on(Console(quiet=True)) as stages:
-        one = Experiment(PaperSettings(tracks, seed=seed).tenth, stages, ("e_kinematic",))
+        one = Experiment(PaperSettings(tracks=tracks, seed=seed).tenth, stages, ("e_kinematic",))
         verdicts = [found.verdict for found in tenth_section(one).findings]
     assert verdicts == ["agrees", "agrees", "differs"]
 
@@ -199,7 +199,7 @@ def test_a_published_line_is_closed_and_at_speed_from_its_start(
 def test_on_the_papers_line_our_laps_take_as_long_as_the_published_ones() -> None:
     file = reference_file("tracks/ethz_published_raceline.csv")
     with stages_on(Console(quiet=True)) as stages:
-        one = Experiment(PaperSettings(file.parent).orca, stages)
+        one = Experiment(PaperSettings(tracks=file.parent).orca, stages)
     weights = {"bayesrace": one.weights, "bestcase": None}
     pairs = product(weights, (True, False))
     laps = {(name, on): one.drive(name, weights[name], on) for name, on in pairs}

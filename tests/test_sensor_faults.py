@@ -18,7 +18,7 @@ from bayesrace.vehicles import get_car
 from controller.assembly import compiled_controller
 from controller.driver import Level
 from operation.closed_loop import ClosedLoop, Driven, built_in_car
-from plant.sensors import SensorNoise
+from plant.settings import SensorNoise
 from tests.racing import Racing, racing
 
 STEP_S = 0.02

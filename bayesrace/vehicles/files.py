@@ -17,6 +17,7 @@ from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 from bayesrace.defaults import DEFAULT_CAR
 from bayesrace.errors import InputError, fault_in_words
 from bayesrace.files import parse_toml, read_text, write_whole
+from bayesrace.option import Option
 from bayesrace.vehicles.parameters import CarParameters
 from bayesrace.vehicles.parts import AccelerationDrive, DcMotor, LinearTyres, PacejkaTyres, Part
 from bayesrace.vehicles.tuning import Tuning
@@ -121,7 +122,8 @@ def _setting(value: Any) -> Any:
 CarSetting = Annotated[
     CarParameters,
     BeforeValidator(_setting),
-    Field(description="the car, with all its values"),
+    Field(description="car: built-in name or TOML file"),
+    Option(default=DEFAULT_CAR),
 ]
 """Field of settings that accepts a name or a file and holds the whole car, as JSON does, too."""
 

@@ -1,4 +1,7 @@
-"""The Typer application: subcommands grouped by task, and errors as one line."""
+"""The Typer application: commands by task, each imported when it is called, and errors as a line.
+
+All modules, the options of all commands and Rich's boxes take longer than many a command.
+"""
 
 import atexit
 import gc
@@ -6,56 +9,104 @@ import io
 import logging
 import shutil
 import sys
+from copy import copy
+from importlib import import_module
 from tempfile import gettempdir
-from typing import Annotated, ClassVar, Final
+from typing import Any, Final
 
 import typer
+from typer.core import TyperCommand, TyperGroup
+from typer.main import get_command
 
 from bayesrace.errors import InputError, faults_in
 from bayesrace.interrupts import remembering_interrupts
-from operation.cli.help import TaskGroup
+from operation.cli.configured import configured
 
 __all__ = ["app", "main"]
 
 _INTERRUPTED: Final = 130
 _OUR_OWN: Final = ("bayesrace", "codegen", "operation", "plant", "studies")
 
-_FMU_PACKAGES: Final = ("fmpy", "pint")
-_RACE_PACKAGES: Final = (
-    "PIL", "casadi", "contourpy", "hdrh", "jinja2", "lz4", "matplotlib", "mcap", "rich", "scipy",
-    "sklearn", "threadpoolctl", "yaml", "zstandard",
-)  # fmt: skip
-_SLIPX_PACKAGES: Final = ("slipx",)
-_CERTIFICATE_PACKAGES: Final = ("cryptography",)
-_CAMPAIGN_PACKAGES: Final = ("bokeh", "dask", "distributed", "optuna", "pandas", "pyarrow")
+_EXTRAS: Final = {
+    "fmu": ("fmpy", "pint"),
+    "race": (
+        "PIL", "casadi", "contourpy", "hdrh", "jinja2", "lz4", "matplotlib", "mcap", "rich",
+        "scipy", "sklearn", "threadpoolctl", "yaml", "zstandard",
+    ),
+    "campaign": ("bokeh", "dask", "distributed", "optuna", "pandas", "pyarrow"),
+    "slipx": ("slipx",),
+    "certificates": ("cryptography",),
+}  # fmt: skip
 """Modules that the extras of pyproject.toml install."""
 
+_TASKS: Final = {
+    "Race": "race.race race.report",
+    "Prepare": "preparation.tracks preparation.cars raceline.raceline preparation.collect "
+    "learning.train learning.validate preparation.build",
+    "Drive": "processes.plant processes.controller race.drive processes.status processes.stop "
+    "processes.go processes.router processes.doctor configuration.config configuration.certs",
+    "Learn while driving": "learning.learn learning.publish learning.rollback",
+    "Measure": "limit.limit race.bench race.latency race.paper",
+    "Many laps": "campaign.campaign campaign.campaign_report campaign.campaign_worker "
+    "campaign.tune",
+    "Export to other tools": "preparation.export fmu.fmu",
+}
+"""Sections of the help: commands, or groups of them, in the modules of this package."""
 
-class _Commands(TaskGroup):
-    tasks: ClassVar[dict[str, tuple[str, ...]]] = {
-        "Race": ("evaluation.race", "evaluation.report"),
-        "Prepare": (
-            "tracks.tracks", "preparation.cars", "raceline.raceline", "preparation.collect",
-            "preparation.train", "learning.validate", "preparation.build",
-        ),
-        "Drive": (
-            "parts.plant", "parts.controller", "evaluation.drive", "operation.status",
-            "operation.stop", "operation.go", "operation.router", "operation.doctor",
-            "configuration.config", "certificates.certs",
-        ),
-        "Learn while driving": ("learning.learn", "learning.publish", "learning.rollback"),
-        "Measure": ("limit.limit", "evaluation.bench", "latency.latency", "paper.paper"),
-        "Many laps": (
-            "campaign.campaign", "campaign.campaign_report", "campaign.campaign_worker",
-            "campaign.tune",
-        ),
-        "Export to other tools": ("preparation.export", "fmu.fmu"),
-    }  # fmt: skip
-    networked = frozenset({
-        "parts.plant", "parts.controller", "evaluation.drive", "operation.status", "operation.stop",
-        "operation.go", "operation.router", "operation.doctor", "learning.learn",
-        "learning.publish", "learning.rollback", "latency.latency",
-    })  # fmt: skip
+
+def _name(place: str) -> str:
+    return place.partition(".")[2].replace("_", "-")
+
+
+_PLACES: Final = {_name(place): place for places in _TASKS.values() for place in places.split()}
+
+
+def _declared(name: str) -> Any:
+    """The function of a command, or the Typer application of a group."""
+    module, _, attribute = _PLACES[name].partition(".")
+    return getattr(import_module(f"operation.cli.{module}"), attribute)
+
+
+def _whole(name: str) -> Any:
+    """A command, or a group of them, with all options."""
+    found = _declared(name)
+    if isinstance(found, typer.Typer):
+        made = copy(found)
+        made.registered_commands = [copy(one) for one in found.registered_commands]
+        for one in made.registered_commands:
+            one.callback = one.callback and configured(one.callback)
+    else:
+        made = typer.Typer(add_completion=False, rich_markup_mode=None)
+        made.command(name)(configured(found))
+    return get_command(made)
+
+
+class _Commands(TyperGroup):
+    def list_commands(self, ctx: Any) -> list[str]:
+        return list(_PLACES)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Name and help of a command, which is what lists show; None for an unknown name."""
+        if cmd_name not in _PLACES:
+            return None
+        found = _declared(cmd_name)
+        text = found.info.help if isinstance(found, typer.Typer) else found.__doc__
+        return TyperCommand(cmd_name, help=text)
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The command that is called, with its options."""
+        if args[0] in _PLACES:
+            return args[0], _whole(args[0]), args[1:]
+        self.commands = {name: self.get_command(ctx, name) for name in _PLACES}  # one may be meant
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """A section for each task."""
+        for task, places in _TASKS.items():
+            names = [_name(place) for place in places.split()]
+            texts = [self.get_command(ctx, name).help.split("\n\n")[0].split() for name in names]
+            with formatter.section(task):
+                formatter.write_dl(list(zip(names, map(" ".join, texts), strict=True)))
 
 
 app = typer.Typer(
@@ -78,12 +129,9 @@ def _version(wanted: bool) -> None:
 
 @app.callback()
 def _options(
-    version: Annotated[
-        bool,
-        typer.Option(
-            "--version", callback=_version, is_eager=True, help="Print the version and exit."
-        ),
-    ] = False,
+    version: bool = typer.Option(
+        False, "--version", callback=_version, is_eager=True, help="Print the version and exit."
+    ),
 ) -> None:
     from operation.terminal.printable import PrintableFormatter
 
@@ -143,11 +191,7 @@ def _in_words(error: Exception) -> str | None:
 
 def _missing(package: str) -> str | None:
     """What to install for a package; None if no extra brings it."""
-    extras = {
-        "fmu": _FMU_PACKAGES, "race": _RACE_PACKAGES, "campaign": _CAMPAIGN_PACKAGES,
-        "slipx": _SLIPX_PACKAGES, "certificates": _CERTIFICATE_PACKAGES,
-    }  # fmt: skip
-    extra = next((name for name, packages in extras.items() if package in packages), None)
+    extra = next((name for name, packages in _EXTRAS.items() if package in packages), None)
     if extra is None:
         return None
     return f"this command needs {package}, which is not installed: pip install 'bayesrace[{extra}]'"

@@ -1,20 +1,22 @@
-"""``config``: the configuration file, shown, checked and begun."""
+"""``config``, ``certs``: where the processes of a system are, and how they know each other."""
 
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final, get_args
 
 import typer
 
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from bayesrace.messages import Role
-from operation.cli.configured import current
-from operation.cli.options import writable
+from operation.cli import options
 
 if TYPE_CHECKING:
     from bayesrace.configuration import Configuration
 
-__all__ = ["config"]
+__all__ = ["certs", "config"]
+
+_CHECKED: Final[tuple[Role, ...]] = ("plant", "controller", "director", "router")
 
 config = typer.Typer(
     name="config",
@@ -23,32 +25,47 @@ config = typer.Typer(
     rich_markup_mode=None,
     help="The configuration, bayesrace.toml: where processes are, how they are secured.",
 )
+certs = typer.Typer(
+    name="certs",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    help="Certificates: who may drive, learn, command or look on.",
+)
+
+Folder = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="DIR",
+        show_default="[tls] folder as configured; certs",
+        help="Folder of the certificates and of the authority that signs them.",
+    ),
+]
+Name = Annotated[str, typer.Argument(metavar="NAME", help="Name in the certificate.")]
 
 
 @config.command()
-def show() -> None:
+def show(configuration: "Configuration") -> None:
     """Print the configuration that commands use here: the file, and the defaults of all else."""
     from bayesrace.configuration import as_toml
 
-    typer.echo(as_toml(current()), nl=False)
+    typer.echo(as_toml(configuration), nl=False)
 
 
 @config.command()
 def check(
-    file: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="FILE", show_default="the one that commands use here", help="Configuration."
-        ),
-    ] = None,
+    configuration: "Configuration",
+    file: Path | None = options.argument(
+        "FILE", "Configuration.", None, "the one that commands use here"
+    ),
 ) -> None:
     """Check a configuration: each value, and the certificates that it names.
 
     'bayesrace doctor' tries the links, too.
     """
-    from bayesrace.configuration import configured, read_configuration
+    from bayesrace.configuration import read_configuration
 
-    found = configured() if file is None else read_configuration(file)
+    found = configuration if file is None else read_configuration(file)
     found.network.check()
     typer.echo(f"{file or 'configuration'}: {_certificates(found)}")
 
@@ -57,40 +74,33 @@ def _certificates(found: "Configuration") -> str:
     """What there is of certificates, each of which is read; InputError if one cannot be used."""
     from bayesrace.transport.session import zenoh_config
 
-    names: tuple[Role, ...] = ("plant", "controller", "director", "router")
-    if found.tls.folder is None:
-        for role in names:
-            (ends := found.endpoints(role)).check()
-            zenoh_config(ends, role)
-        reach = "open to everyone in the network" if found.network.insecure else "for loopback only"
-        return f"fine; no certificates, so links are {reach}"
-    there = found.tls.certificates()
-    if not there:
+    folder, there = found.tls.folder, found.tls.certificates()
+    if folder is not None and not there:
         raise InputError(
-            f"no certificates in {found.tls.folder}: make them with 'bayesrace certs', or correct "
+            f"no certificates in {folder}: make them with 'bayesrace certs', or correct "
             "[tls] folder"
         )
     roles = {one.name: "revoked" if one.member is None else one.member.role for one in there}
-    for role in names:
-        if role in roles.values():
+    for role in _CHECKED:
+        if folder is None or role in roles.values():
             (ends := found.endpoints(role)).check()
             zenoh_config(ends, role)
+    if folder is None:
+        reach = "open to everyone in the network" if found.network.insecure else "for loopback only"
+        return f"fine; no certificates, so links are {reach}"
     return "fine; certificates " + ", ".join(f"'{name}' ({role})" for name, role in roles.items())
 
 
 @config.command()
 def example(
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            "-o",
-            metavar="FILE",
-            callback=writable,
-            show_default="printed",
-            help="File to write; never over another one.",
-        ),
-    ] = None,
+    out: Path | None = options.value(
+        "File to write; never over another one.",
+        None,
+        "--out",
+        "-o",
+        shown="printed",
+        callback=options.writable,
+    ),
 ) -> None:
     """Write a configuration to start from: every setting with its default and its meaning."""
     from bayesrace.configuration import Configuration, as_toml
@@ -102,3 +112,71 @@ def example(
         raise InputError(f"{out} exists: name another file, or remove it")
     else:
         write_whole(out, text)
+
+
+def _folder(given: Path | None, configuration: "Configuration") -> Path:
+    return given or configuration.tls.folder or Path("certs")
+
+
+@certs.command()
+def init(configuration: "Configuration", folder: Folder = None) -> None:
+    """Make the authority of a system, once; its folder 'authority' belongs on no car."""
+    from operation.certificates import init as make
+
+    where = _folder(folder, configuration)
+    make(where)
+    typer.echo(f"{where}: next, 'bayesrace certs add NAME --role ROLE'")
+
+
+@certs.command()
+def add(
+    configuration: "Configuration",
+    name: Name,
+    role: Role | None = options.value(f"One of {', '.join(get_args(Role))}."),
+    car: str | None = options.value("The one car that it is for, by its name.", shown="every car"),
+    host: list[str] = options.value(
+        "Name or address by which others connect to its process; repeatable.",
+        (),
+        shown="loopback only",
+    ),
+    days: int = options.value("Days until it expires.", 365, min=1, max=3650),
+    renew: bool = options.flag("--renew", "Replace the one of this name; what is not given stays."),
+    folder: Folder = None,
+) -> None:
+    """Make a certificate: a folder to copy to the machine of its process.
+
+    The list of members in all the folders changes: copy that, too, to where they are, and restart
+    the processes there.
+    """
+    from operation.certificates import add as make
+
+    made = make(_folder(folder, configuration), name, role, car, host, days, renew)
+    typer.echo(f"{made}: copy it to its machine, and members.json in it to the others")
+
+
+@certs.command("list")
+def members(configuration: "Configuration", folder: Folder = None) -> None:
+    """List the certificates, and when they expire."""
+    from operation.certificates import read_register
+
+    for name, one in sorted(read_register(_folder(folder, configuration)).items()):
+        state = "revoked" if one.revoked else f"until {one.ends:%Y-%m-%d}"
+        if not one.revoked and one.ends < datetime.now(UTC):
+            state = f"expired {one.ends:%Y-%m-%d}"
+        hosts = ", ".join(one.hosts) or "loopback"
+        typer.echo(f"{name:<20} {one.role:<10} car {one.car:<12} {state:<18} {hosts}")
+
+
+@certs.command()
+def revoke(configuration: "Configuration", name: Name, folder: Folder = None) -> None:
+    """Take a certificate off the list of members, for ever.
+
+    It counts no more where the new list is and the process has been restarted.
+    """
+    from operation.certificates import revoke as take_off
+
+    take_off(_folder(folder, configuration), name)
+    typer.echo(
+        f"'{name}' is revoked: copy members.json to each machine, and restart the processes there; "
+        "until then they accept it"
+    )

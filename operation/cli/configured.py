@@ -1,26 +1,30 @@
-"""``--config`` of every command, and what the file and the options say together."""
+"""What every command has beside its own options: those of its settings, and ``--config``."""
 
 import functools
 import inspect
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from contextvars import ContextVar
+from inspect import Parameter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any, get_args, get_origin
 
 import typer
+from typer.models import OptionInfo
 
 from bayesrace.defaults import CONFIGURATION_VARIABLE
+from operation.cli.fields import SettingsOptions, inner_type, keyword, metavar
 
-if TYPE_CHECKING:
-    from bayesrace.configuration import Configuration
-    from bayesrace.messages import Role
-    from bayesrace.realtime import RealtimeSettings
-    from bayesrace.transport.endpoints import Endpoints
+__all__ = ["configured"]
 
-__all__ = ["configurable", "connect_to", "current", "networked", "realtime"]
-
+Insecure = Annotated[
+    bool,
+    typer.Option(
+        "--insecure",
+        help="Allow endpoints beyond loopback without certificates, where anyone could drive the "
+        "car.",
+    ),
+]
 ConfigFile = Annotated[
     Path | None,
     typer.Option(
@@ -30,66 +34,52 @@ ConfigFile = Annotated[
         help="Configuration, as 'bayesrace config example' writes it.",
     ),
 ]
-Insecure = Annotated[
-    bool,
-    typer.Option(
-        "--insecure",
-        help="Allow endpoints beyond loopback without certificates, where anyone could drive the "
-        "car.",
-    ),
-]
-
-_current: ContextVar["Configuration | None"] = ContextVar("configuration", default=None)
 
 
-def current() -> "Configuration":
-    """The configuration of the command that runs."""
-    from bayesrace.configuration import configured
+def configured(command: Callable[..., None]) -> Callable[..., None]:
+    """The command as Typer calls it, which is once the configuration has been read.
 
-    return _current.get() or configured()
+    It may take ``configuration``, or ``network``, the same with ``--insecure``; and ``settings``,
+    if :func:`operation.cli.fields.options_of` marks it. The processes that it starts read the same
+    configuration.
+    """
+    settings = SettingsOptions.of(command)
+    own = dict(inspect.signature(command).parameters)
+    taken = [name for name in ("configuration", "network") if own.pop(name, None)]
+    places = {name: [_with_metavar(one)] for name, one in own.items()}
+    if settings is not None:
+        places["settings"] = settings.parameters
+    if "network" in taken:
+        places["insecure"] = [keyword("insecure", Insecure, False)]
+    places["config"] = [keyword("config", ConfigFile, None)]
+    parameters = [one for place in places.values() for one in place]
 
-
-def configurable(command: Callable[..., None]) -> Callable[..., None]:
-    """The command with ``--config``: read before it runs, and by the processes that it starts."""
-
-    def run(config: Path | None, **options: Any) -> None:
-        from bayesrace.configuration import configured
-
-        with _named(config), _used(configured()):
-            command(**options)
-
-    return _extended(command, run, {"config": (ConfigFile, None)})
-
-
-def networked(command: Callable[..., None]) -> Callable[..., None]:
-    """The same of a command that opens links, with ``--insecure``."""
-
-    def run(config: Path | None, insecure: bool, **options: Any) -> None:
-        from bayesrace.configuration import configured
+    @functools.wraps(command)
+    def run(config: Path | None, insecure: bool = False, **options: Any) -> None:
+        from bayesrace.configuration import configured as configuration_of_process
 
         with _named(config):
-            found = configured()
-            network = found.network.model_copy(
-                update={"insecure": insecure or found.network.insecure}
-            )
-            with _used(found.model_copy(update={"network": network})):
-                command(**options)
+            found = configuration_of_process()
+            if insecure:
+                network = found.network.model_copy(update={"insecure": True})
+                found = found.model_copy(update={"network": network})
+            if settings is not None:
+                options["settings"] = settings.given(options)
+            command(**options, **dict.fromkeys(taken, found))
 
-    return _extended(command, run, {"insecure": (Insecure, False), "config": (ConfigFile, None)})
-
-
-def connect_to(given: list[str] | None, role: "Role") -> "Endpoints":
-    """What a command connects to: the endpoints given, or those of the configuration."""
-    return current().endpoints(role, connect=given or None)
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {one.name: one.annotation for one in parameters}
+    return run
 
 
-def realtime(
-    cpu: int | None = None, fifo: int | None = None, lock_memory: bool = False
-) -> "RealtimeSettings":
-    """What is given, else as configured."""
-    given = {"cpu": cpu, "fifo": fifo, "lock_memory": lock_memory or None}
-    update = {name: value for name, value in given.items() if value is not None}
-    return current().realtime.model_copy(update=update)
+def _with_metavar(parameter: Parameter) -> Parameter:
+    """Of a command's own option, which may lack one."""
+    kind, option = parameter.annotation, parameter.default
+    if get_origin(kind) is Annotated:
+        kind, option = get_args(kind)
+    if isinstance(option, OptionInfo) and option.metavar is None:
+        option.metavar = metavar(inner_type(kind), parameter.name)
+    return parameter.replace(kind=Parameter.KEYWORD_ONLY)
 
 
 @contextmanager
@@ -105,30 +95,3 @@ def _named(config: Path | None) -> Iterator[None]:
             del os.environ[CONFIGURATION_VARIABLE]
         elif before is not None:
             os.environ[CONFIGURATION_VARIABLE] = before
-
-
-@contextmanager
-def _used(configuration: "Configuration") -> Iterator[None]:
-    token = _current.set(configuration)
-    try:
-        yield
-    finally:
-        _current.reset(token)
-
-
-def _extended(
-    command: Callable[..., None], run: Callable[..., None], added: dict[str, tuple[Any, Any]]
-) -> Callable[..., None]:
-    """``run`` with the command's options and more, as Typer reads them off a signature."""
-    signature = inspect.signature(command)
-    extra = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
-        for name, (kind, default) in added.items()
-    ]
-    functools.update_wrapper(run, command)
-    run.__signature__ = signature.replace(  # type: ignore[attr-defined]
-        parameters=[*signature.parameters.values(), *extra]
-    )
-    kinds = {name: kind for name, (kind, _) in added.items()}
-    run.__annotations__ = {**command.__annotations__, **kinds}
-    return run

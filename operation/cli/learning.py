@@ -1,37 +1,34 @@
-"""``validate``, ``publish``, ``rollback``, ``learn``: validation and update of weights."""
+"""``train``, ``validate``, ``learn``, ``publish``, ``rollback``: from logs to weights in use."""
 
-from datetime import UTC, datetime
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from bayesrace.defaults import DEFAULT_CAR
 from bayesrace.files import write_whole
-from operation.cli.configured import connect_to
-from operation.cli.options import (
-    AllSamples,
-    Car,
-    CarName,
-    Endpoint,
-    Seed,
-    writable,
-)
+from operation.cli import options
+from operation.cli.fields import Given, options_of
 from operation.terminal.notation import UNCERTAIN
 
 if TYPE_CHECKING:
-    from bayesrace.transport import Endpoints
+    from bayesrace.configuration import Configuration
+    from bayesrace.messages import Reply
+    from learning.settings import TrainingSettings
+    from operation.learn.records import LearnSettings
 
-__all__ = ["learn", "publish", "rollback", "validate"]
+__all__ = ["learn", "publish", "rollback", "train", "validate"]
 
+Artefact = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="DIR", show_default="the default one", help="Built controller to learn for."
+    ),
+]
 Name = Annotated[
     str,
     typer.Option(
-        "--name",
-        "--car",
-        metavar="NAME",
-        show_default="the only one that is found",
-        help="Name of the car.",
+        "--name", "--car", show_default="the only one that is found", help="Name of the car."
     ),
 ]
 Timeout = Annotated[
@@ -44,58 +41,85 @@ Timeout = Annotated[
         help="Time limit [s], once for finding the controller and once for its answer.",
     ),
 ]
-WeightsFile = Annotated[
-    Path,
-    typer.Argument(metavar="WEIGHTS", help="Weights file, as 'bayesrace train' writes it."),
-]
-_FINDING_S, _ANSWER_S = 5.0, 20.0
+
+
+@options_of("learning.settings.TrainingSettings", "restarts seed")
+def train(
+    settings: "Given[TrainingSettings]",
+    logs: list[Path] = options.argument("LOG", "Run logs (MCAP).", ()),
+    data: list[Path] = options.value("Samples in plain arrays (.npz); repeatable.", ()),
+    kernel: Literal["rbf", "matern05", "matern15", "matern25", "auto"] = options.value(
+        "rbf, matern05, matern15, matern25; auto: the best per output.", "auto"
+    ),
+    out: options.OutFile = Path("weights.bin"),
+    points: int = options.value("Points per output.", 400, min=20, max=20000),
+    plot: Path | None = options.new_file("Draw the error against the kernel's smoothness (PNG)."),
+    artefact: Artefact = None,
+    car: str = options.value("Car that drove.", "", shown="named by the files"),
+    name: options.CarName = "",
+    all_samples: options.AllSamples = False,
+) -> None:
+    """Train the three GPs on the residual in run logs or plain arrays.
+
+    Of more samples than --points, those with the largest predictive variance are chosen one by one.
+    """
+    from bayesrace.gp.weights import KERNELS, write_weights
+    from bayesrace.manifest import read_manifest
+    from bayesrace.vehicles import get_car
+    from learning.dataset import left_out
+    from learning.residual import discretisation_of
+    from learning.sources import read_samples
+    from learning.training import fit
+    from operation.terminal import learning_table
+    from operation.terminal.terminal import Terminal
+
+    wanted, parameters = None, get_car(car) if car else None
+    if artefact is not None:
+        manifest = read_manifest(artefact)
+        parameters = parameters or get_car(manifest.car)
+        wanted = discretisation_of(manifest.discretisation, parameters)
+        manifest.check_points(points)
+    samples = read_samples([*logs, *data], parameters, name, wanted, limits=not all_samples)
+    kernels = tuple(KERNELS) if kernel == "auto" else (kernel,)
+    with options.stages_shown() as stages, stages.stage("train the residual") as stage:
+        training = fit(
+            samples.dataset, samples.discretisation, settings(kernels=kernels, capacity=points),
+            progress=stage.update,
+        )  # fmt: skip
+    weights, console = training.weights, Terminal()
+    write_weights(out, weights)
+    learning_table.print_kernels(training.kernels, console)
+    if plot is not None:
+        from operation.report.canvas import write_png
+        from operation.report.gp import kernel_figure
+        from operation.report.style import figure_style
+
+        with figure_style():
+            write_png(kernel_figure(training.kernels), plot)
+    typer.echo(
+        f"{weights.version}: {len(samples.dataset)} samples "
+        f"(left out: {left_out(samples.dataset.dropped)}), "
+        f"kernels {', '.join(weights.kernels)}: {out}"
+    )
+    learning_table.print_beyond_limits(samples.dataset.dropped, len(samples.dataset), console)
 
 
 def validate(
-    weights: WeightsFile,
-    on: Annotated[
-        list[Path],
-        typer.Option("--on", metavar="FILE", help="Run log (MCAP) or arrays (.npz); repeatable."),
-    ],
-    json_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--json", metavar="FILE", callback=writable, help="Write the numbers to this file."
-        ),
-    ] = None,
-    plot: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", callback=writable, help="Draw the error with its 95 % band (PNG)."
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out", "-o", metavar="DIR", help="Folder for numbers, error.png and track.png."
-        ),
-    ] = None,
-    track: Annotated[
-        str | None,
-        typer.Option(
-            metavar="TRACK",
-            help="Track for track.png: name, random:SEED, random10:SEED or CSV file.",
-        ),
-    ] = None,
-    threshold: Annotated[
-        float,
-        typer.Option(metavar="SIGMA", min=0, help="Mark samples whose largest sigma is above."),
-    ] = UNCERTAIN,
-    run: Annotated[
-        list[int] | None,
-        typer.Option(metavar="N", help="Only this run of the log; repeatable."),
-    ] = None,
-    car: Annotated[
-        str,
-        typer.Option(metavar="CAR", help="TOML file of the weights' car if it is not built in."),
-    ] = "",
-    name: CarName = "",
-    all_samples: AllSamples = False,
+    weights: Path = options.argument("WEIGHTS", "Weights file, as 'bayesrace train' writes it."),
+    on: list[Path] = options.value("Run log (MCAP) or arrays (.npz); repeatable.", ...),
+    json_file: Path | None = options.new_file("Write the numbers to this file.", "--json"),
+    plot: Path | None = options.new_file("Draw the error with its 95 % band (PNG)."),
+    out: Path | None = options.out_folder("Folder for numbers, error.png and track.png."),
+    track: str | None = options.value(
+        "Track for track.png: name, random:SEED, random10:SEED or CSV file."
+    ),
+    threshold: float = options.value(
+        "Mark samples whose largest sigma is above.", UNCERTAIN, min=0, metavar="SIGMA"
+    ),
+    run: list[int] = options.value("Only this run of the log; repeatable.", ()),
+    car: str = options.value("TOML file of the weights' car if it is not built in.", ""),
+    name: options.CarName = "",
+    all_samples: options.AllSamples = False,
 ) -> None:
     """Validate weights on a drive: error, coverage, and drift over one step and the horizon.
 
@@ -112,9 +136,14 @@ def validate(
 
     parameters = get_car(car) if car else None
     course = None if track is None else load_track(track)
-    runs = tuple(run) if run else None
     judged = validate_weights(
-        read_weights(weights), on, name, runs, threshold, parameters, limits=not all_samples
+        read_weights(weights),
+        on,
+        name,
+        tuple(run) or None,
+        threshold,
+        parameters,
+        limits=not all_samples,
     )
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
@@ -139,9 +168,10 @@ def validate(
 
 
 def publish(
-    weights: WeightsFile,
+    network: "Configuration",
+    weights: Path = options.argument("WEIGHTS", "Weights file, as 'bayesrace train' writes it."),
     name: Name = "",
-    endpoint: Endpoint = None,
+    endpoint: options.Endpoint = None,
     timeout: Timeout = None,
 ) -> None:
     """Send new weights to a running controller, and wait for its answer.
@@ -150,106 +180,75 @@ def publish(
     can succeed), 2 if it cannot be reached.
     """
     from bayesrace.gp.weights import encode_weights, read_weights
-    from bayesrace.transport import open_session, send_weights
+    from bayesrace.transport import send_weights
 
     data = encode_weights(read_weights(weights))
-    endpoints = connect_to(endpoint, "learning")
-    name = endpoints.car_named(name)
-    with open_session(endpoints, "learning") as session:
-        # Imports that take as long as all before: whether there is a link is said first.
-        from operation.learn.publishing import NotTakenOverError, in_words
 
-        car = _controller(session, endpoints, name, timeout or _FINDING_S)
-        reply = send_weights(session, car, data, timeout or _ANSWER_S)
-    if not reply.accepted:
-        raise NotTakenOverError(f"{car}: {in_words(reply)}")
-    typer.echo(f"{car}: {reply.data.get('version', '')} {in_words(reply)}")
+    def send(session: Any, car: str, timeout_s: float) -> "Reply":
+        return send_weights(session, car, data, timeout_s)
+
+    typer.echo(_accepted(network, name, endpoint, timeout, send)[0])
 
 
 def rollback(
+    network: "Configuration",
     name: Name = "",
-    endpoint: Endpoint = None,
-    reason: Annotated[
-        str, typer.Option(metavar="TEXT", help="Reason, for the controller's event.")
-    ] = "",
+    endpoint: options.Endpoint = None,
+    reason: str = options.value("Reason, for the controller's event.", "", metavar="TEXT"),
     timeout: Timeout = None,
 ) -> None:
     """Let a controller return to the weights before those in use.
 
     Exit code 0 once it drives with them, 1 if there are none, 2 if it cannot be reached.
     """
-    from bayesrace.transport import open_session, send_rollback
+    from bayesrace.transport import send_rollback
 
-    endpoints = connect_to(endpoint, "learning")
+    def send(session: Any, car: str, timeout_s: float) -> "Reply":
+        return send_rollback(session, car, reason or "bayesrace rollback", timeout_s)
+
+    text, reply = _accepted(network, name, endpoint, timeout, send)
+    before = reply.data.get("from_version")
+    typer.echo(text + (f", instead of {before}" if before else ""))
+
+
+def _accepted(
+    network: "Configuration",
+    name: str,
+    endpoint: list[str] | None,
+    timeout: float | None,
+    send: "Callable[[Any, str, float], Reply]",
+) -> "tuple[str, Reply]":
+    """What the controller answers to what is sent, in words; NotTakenOverError if it refuses."""
+    from bayesrace.transport import open_session
+
+    endpoints = network.endpoints("learning", connect=endpoint or None)
     name = endpoints.car_named(name)
     with open_session(endpoints, "learning") as session:
+        # Imports that take as long as all before: whether there is a link is said first.
         from operation.learn.publishing import NotTakenOverError, in_words
+        from operation.lifecycle import find, pick
 
-        car = _controller(session, endpoints, name, timeout or _FINDING_S)
-        reply = send_rollback(session, car, reason or "bayesrace rollback", timeout or _ANSWER_S)
+        found = find(session, endpoints, timeout or 5.0, name, ("controller",))
+        car = pick(found, name, False)[0]
+        reply = send(session, car, timeout or 20.0)
     if not reply.accepted:
         raise NotTakenOverError(f"{car}: {in_words(reply)}")
-    before = reply.data.get("from_version")
-    instead = f", instead of {before}" if before else ""
-    typer.echo(f"{car}: {reply.data.get('version', '')} {in_words(reply)}{instead}")
+    return f"{car}: {reply.data.get('version', '')} {in_words(reply)}", reply
 
 
+@options_of("operation.learn.records.LearnSettings", "laps points keep track compare seed car name")
 def learn(
-    watch: Annotated[
-        bool, typer.Option("--watch", help="Learn after each lap until Ctrl-C, not after one lap.")
-    ] = False,
-    laps: Annotated[
-        int | None, typer.Option(metavar="N", min=1, help="End after so many laps.")
-    ] = None,
-    data: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="FILE", help="First samples: log (MCAP) or arrays (.npz); repeatable."
-        ),
-    ] = None,
-    weights: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="First weights, which are sent to the controller."),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            "-o",
-            metavar="DIR",
-            show_default="runs/learn-DATE-TIME",
-            help="Folder for results, or of a job to resume (--data and --weights do not count "
-            "then).",
-        ),
-    ] = None,
-    points: Annotated[
-        int, typer.Option(metavar="N", min=20, max=20000, help="Points per output.")
-    ] = 400,
-    keep: Annotated[
-        int,
-        typer.Option(metavar="N", min=100, max=20000, help="Samples kept from lap to lap."),
-    ] = 1200,
-    track: Annotated[
-        str | None,
-        typer.Option(
-            metavar="TRACK",
-            help="Track that is driven: for exact lap times and excursions.",
-        ),
-    ] = None,
-    compare: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Run directory of a race, to draw its lap times, too."),
-    ] = None,
-    artefact: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR", show_default="the default one", help="Built controller to learn for."
-        ),
-    ] = None,
-    endpoint: Endpoint = None,
-    seed: Seed = 0,
-    car: Car = DEFAULT_CAR,
-    name: CarName = "",
+    network: "Configuration",
+    settings: "Given[LearnSettings]",
+    watch: bool = options.flag("--watch", "Learn after each lap until Ctrl-C, not after one lap."),
+    data: list[Path] = options.value("First samples: log (MCAP) or arrays (.npz); repeatable.", ()),
+    weights: Path | None = options.value("First weights, which are sent to the controller."),
+    out: Path | None = options.out_folder(
+        "Folder for results, or of a job to resume (--data and --weights do not count then).",
+        "runs/learn-DATE-TIME",
+    ),
+    artefact: Artefact = None,
+    endpoint: options.Endpoint = None,
 ) -> None:
     """Learn from the laps of a driving car, and send the weights to its controller.
 
@@ -258,38 +257,17 @@ def learn(
     restart; with the same --out, this command resumes. Start a run with 'bayesrace drive'.
     """
     from bayesrace.transport import try_links
-    from bayesrace.vehicles import get_car
 
-    parameters, endpoints = get_car(car), connect_to(endpoint, "learning")
-    endpoints.check_car(name or parameters.name)
+    chosen = settings({} if watch else {"laps": 1})
+    endpoints = network.endpoints("learning", connect=endpoint or None)
+    endpoints.check_car(chosen.name)
     try_links(endpoints, "learning")  # before imports that take seconds
     from operation.learn.job import learn as follow
-    from operation.learn.records import LearnSettings
     from operation.learn.report import print_laps
 
-    stamp = datetime.now(UTC).astimezone().strftime("%Y%m%d-%H%M%S")
-    folder = out or Path("runs") / f"learn-{stamp}"
-    settings = LearnSettings(
-        car=parameters,
-        name=name or parameters.name,
-        points=points,
-        keep=keep,
-        laps=laps or (None if watch else 1),
-        track=track,
-        compare=compare,
-        seed=seed,
-    )
+    folder = options.run_folder(out, "learn-")
     record = follow(
-        settings, endpoints, folder, typer.echo,
-        data=data or (), weights=weights, artefact=artefact,
-    )  # fmt: skip
+        chosen, endpoints, folder, typer.echo, data=data, weights=weights, artefact=artefact
+    )
     print_laps(record)
-    typer.echo(str(folder))
-
-
-def _controller(session: object, endpoints: "Endpoints", name: str, timeout_s: float) -> str:
-    """The car of the controller to send to; InputError if none or several are found."""
-    from operation.lifecycle import find, pick
-
-    found = find(session, endpoints, timeout_s, name, ("controller",))
-    return pick(found, name, False)[0]
+    typer.echo(f"{folder}")

@@ -1,49 +1,27 @@
-"""Options that several subcommands share."""
+"""Options that are no fields of settings: how they are declared, and those that several commands
+have. :func:`operation.cli.configured.configured` adds metavars by type where there are none."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from bayesrace.errors import InputError, faults_in
+from bayesrace.errors import InputError
 
 if TYPE_CHECKING:
-    from pydantic import BaseModel
-
     from bayesrace.vehicles import CarParameters
     from controller.path_table import PathTable
-    from plant.sensors import SensorNoise
+    from operation.terminal.progress import Stages
 
 __all__ = [
-    "AllSamples",
-    "Car",
-    "Caution",
-    "CarName",
-    "Delay",
-    "Endpoint",
-    "FmuFile",
-    "FmuMap",
-    "GivenLine",
-    "LowLatency",
-    "Noise",
-    "OutFile",
-    "ParentPid",
-    "RaceLineFile",
-    "ControlProblem",
-    "DriveTime",
-    "ProblemChoice",
-    "Seed",
-    "SettingsFile",
-    "Simulator",
-    "Style",
-    "TrackName",
-    "Tyres",
-    "path_on",
-    "sensor_noise",
-    "settings_of",
-    "writable",
-]
+    "AllSamples", "Car", "CarName", "Endpoint", "GivenLine", "LowLatency", "MpcFile", "OutFile",
+    "ParentPid", "RaceLineFile", "TrackName", "Tyres", "Weights", "argument", "flag", "new_file",
+    "out_folder", "path_on", "run_folder", "stages_shown", "value", "writable",
+]  # fmt: skip
 
 
 class TyreModel(StrEnum):
@@ -53,108 +31,38 @@ class TyreModel(StrEnum):
     linear = "linear"
 
 
-Car = Annotated[str, typer.Option(metavar="CAR", help="Car: built-in name or TOML file.")]
-CarName = Annotated[
-    str,
-    typer.Option(
-        "--name",
-        metavar="NAME",
-        show_default="the car's own",
-        help="Name of the car in the network.",
-    ),
-]
-Tyres = Annotated[
-    TyreModel | None,
-    typer.Option(
-        metavar="TYRES",
-        show_default="the car's",
-        help="pacejka: of the same stiffness as the car's linear tyres, saturating.",
-    ),
-]
-AllSamples = Annotated[
-    bool,
-    typer.Option(
-        "--all-samples",
-        help="Keep samples beyond the car's limits, as the paper's published drives have them.",
-    ),
-]
+def value(text: str, default: Any = None, *names: str, shown: str = "", **more: Any) -> Any:
+    """An option with a value; ``shown``: its default in words."""
+    return typer.Option(default, *names, help=text, show_default=shown or True, **more)
 
 
-DriveTime = Annotated[
-    float | None,
-    typer.Option(
-        metavar="S",
-        min=1,
-        max=3600,
-        show_default="the car's, and a lap at least",
-        help="Length of the training drive [s].",
-    ),
-]
+def argument(metavar: str, text: str, default: Any = ..., shown: str = "") -> Any:
+    """A word of the command that is no option."""
+    return typer.Argument(default, metavar=metavar, help=text, show_default=shown or True)
 
 
-class ProblemChoice(StrEnum):
-    """Control problem."""
-
-    tracking = "tracking"
-    progress = "progress"
+def flag(name: str, text: str) -> Any:
+    """An option without a value."""
+    return typer.Option(False, name, help=text)
 
 
-ControlProblem = Annotated[
-    ProblemChoice,
-    typer.Option(
-        metavar="PROBLEM", help="tracking: follow the line in its speed; progress: be fast."
-    ),
-]
+def new_file(text: str, *names: str, default: Path | None = None) -> Any:
+    """A file to write, refused before the work if it cannot be."""
+    return value(text, default, *names, metavar="FILE", callback=writable)
 
-Caution = Annotated[
-    float | None,
-    typer.Option(
-        metavar="P",
-        min=0,
-        max=0.9999999,
-        show_default="0.95",
-        help="Probability with which the plan stays on the track in spite of the model's "
-        "uncertainty, from 0.5 on; 0: none, as in the paper.",
-    ),
-]
 
-Seed = Annotated[
-    int,
-    typer.Option(
-        min=0, max=2**32 - 1, metavar="N", help="Seed of the training drive and of the training."
-    ),
-]
-TrackName = Annotated[
-    str,
-    typer.Option(
-        metavar="TRACK",
-        show_default="the car's",
-        help="Built-in name, random:SEED, random10:SEED or CSV file.",
-    ),
-]
-RaceLineFile = Annotated[
-    Path,
-    typer.Option(
-        "--raceline", metavar="FILE", help="Racing line, as 'bayesrace raceline' writes it."
-    ),
-]
-GivenLine = Annotated[
-    Path | None,
-    typer.Option(
-        "--raceline",
-        metavar="FILE",
-        show_default="computed",
-        help="Racing line to drive, as 'bayesrace raceline' writes it.",
-    ),
-]
-Endpoint = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="ENDPOINT",
-        help="Zenoh endpoint of a plant, a controller or a router; repeatable.",
-        show_default="as configured; tcp/127.0.0.1:7447 and :7448",
-    ),
-]
+def out_folder(text: str, shown: str = "") -> Any:
+    """A folder to write into."""
+    return value(text, None, "--out", "-o", metavar="DIR", shown=shown)
+
+
+def writable(path: Path | None) -> Path | None:
+    """Callback of options that name a file to write: InputError before the work, not after it."""
+    if path is not None and not path.parent.is_dir():
+        raise InputError(f"cannot write {path}: no folder {path.parent}; make it first")
+    if path is not None and path.is_dir():
+        raise InputError(f"cannot write {path}: it is a folder; name a file in it")
+    return path
 
 
 def path_on(track: str, raceline: Path | None, car: "CarParameters") -> "PathTable":
@@ -171,117 +79,68 @@ def path_on(track: str, raceline: Path | None, car: "CarParameters") -> "PathTab
     return make_path_table(course, line, car.tuning.path.spacing_m)
 
 
-def writable(path: Path | None) -> Path | None:
-    """Callback of options that name a file to write: InputError before the work, not after it."""
-    if path is not None and not path.parent.is_dir():
-        raise InputError(f"cannot write {path}: no folder {path.parent}; make it first")
-    if path is not None and path.is_dir():
-        raise InputError(f"cannot write {path}: it is a folder; name a file in it")
-    return path
+def run_folder(given: Path | None, prefix: str = "") -> Path:
+    """The folder given, or one named after the time."""
+    stamp = datetime.now(UTC).astimezone().strftime("%Y%m%d-%H%M%S")
+    return given or Path("runs") / f"{prefix}{stamp}"
 
 
-SettingsFile = Annotated[
-    Path | None,
+@contextmanager
+def stages_shown() -> Iterator["Stages"]:
+    """The stages of the work, shown on the terminal."""
+    from operation.terminal.progress import stages_on
+    from operation.terminal.terminal import Terminal
+
+    with stages_on(Terminal()) as stages:
+        yield stages
+
+
+Car = Annotated[str, typer.Option(help="Car: built-in name or TOML file.")]
+CarName = Annotated[
+    str, typer.Option(show_default="the car's own", help="Name of the car in the network.")
+]
+Tyres = Annotated[
+    TyreModel | None,
     typer.Option(
-        "--settings",
-        metavar="FILE",
-        help="Settings of an earlier run (its settings.json); options that are given override it.",
+        metavar="TYRES",
+        show_default="the car's",
+        help="pacejka: of the same stiffness as the car's linear tyres, saturating.",
     ),
 ]
-S = TypeVar("S", bound="BaseModel")
-
-
-def settings_of(
-    kind: type[S], options: typer.Context, file: Path | None, values: dict[str, dict[str, Any]]
-) -> S:
-    """Settings of the file, overridden by options on the command line; of all options without one.
-
-    ``values``: option, by the name of its parameter, to the fields that it sets.
-    """
-    from pydantic import ValidationError
-
-    from bayesrace.files import read_text
-
-    content: dict[str, Any] = {}
-    if file is not None:
-        text = read_text(file, "settings", "give the settings.json of a run")
-        try:
-            content = kind.model_validate_json(text).model_dump()
-        except ValidationError as error:
-            raise InputError(f"{file}: {faults_in(error, 'the file', kind)}") from None
-    for option, fields in values.items():
-        source = options.get_parameter_source(option)
-        if file is None or (source is not None and source.name == "COMMANDLINE"):
-            _update(content, fields)
-    return kind.model_validate(content)
-
-
-def _update(content: dict[str, Any], fields: dict[str, Any]) -> None:
-    for name, value in fields.items():
-        if isinstance(value, dict):
-            _update(content.setdefault(name, {}), value)
-        else:
-            content[name] = value
-
-
-OutFile = Annotated[
-    Path,
-    typer.Option("--out", "-o", metavar="FILE", callback=writable, help="File to write."),
+TrackName = Annotated[
+    str,
+    typer.Option(
+        show_default="the car's", help="Built-in name, random:SEED, random10:SEED or CSV file."
+    ),
 ]
-Noise = Annotated[
+RaceLineFile = Annotated[Path, typer.Option(help="Racing line, as 'bayesrace raceline' writes it.")]
+GivenLine = Annotated[
+    Path | None,
+    typer.Option(
+        show_default="computed", help="Racing line to drive, as 'bayesrace raceline' writes it."
+    ),
+]
+Weights = Annotated[
+    Path | None, typer.Option(help="GP weights; without them, the uncorrected model.")
+]
+MpcFile = Annotated[
+    Path | None, typer.Option("--settings", help="OCP settings (JSON): controller/settings.py.")
+]
+AllSamples = Annotated[
+    bool,
+    typer.Option(
+        "--all-samples",
+        help="Keep samples beyond the car's limits, as the paper's published drives have them.",
+    ),
+]
+Endpoint = Annotated[
     list[str] | None,
     typer.Option(
-        metavar="NAME=STD",
-        show_default="exact",
-        help="Standard deviation of a sensor: position_m, heading_rad, speed_mps, yaw_rate_radps, "
-        "steering_rad; repeatable.",
+        show_default="as configured; tcp/127.0.0.1:7447 and :7448",
+        help="Zenoh endpoint of a plant, a controller or a router; repeatable.",
     ),
 ]
-Delay = Annotated[
-    float,
-    typer.Option(
-        metavar="MS", min=0, max=1000, help="Delay of states and of actuations each [ms]."
-    ),
-]
-
-
-def sensor_noise(given: list[str] | None) -> "SensorNoise":
-    """The noise of the options ``NAME=STD``; InputError naming one that cannot be."""
-    from pydantic import ValidationError
-
-    from plant.sensors import SensorNoise
-
-    pairs = dict(one.partition("=")[::2] for one in given or ())
-    try:
-        return SensorNoise.model_validate(pairs)
-    except ValidationError as error:
-        faults = faults_in(error, "the noise", SensorNoise)
-        raise InputError(f"--noise: {faults}; give NAME=STD") from None
-
-
-FmuFile = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE", help="Co-Simulation FMU (2.0, 3.0) that simulates the car."),
-]
-FmuMap = Annotated[
-    Path | None,
-    typer.Option(
-        "--map",
-        metavar="FILE",
-        help="Meaning of the FMU's variables (TOML); 'bayesrace fmu inspect' writes one to edit.",
-    ),
-]
-Simulator = Annotated[
-    Literal["equations", "slipx"],
-    typer.Option(metavar="NAME", help="equations, or slipx, whose reference car is --car slipx."),
-]
-Style = Annotated[
-    Literal["limit", "calm", "weave"],
-    typer.Option(
-        metavar="STYLE",
-        help="Of the training drive: limit (it slides), calm, weave (in waves about the line).",
-    ),
-]
+OutFile = Annotated[Path, typer.Option("--out", "-o", callback=writable, help="File to write.")]
 LowLatency = Annotated[
     bool,
     typer.Option(

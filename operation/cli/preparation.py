@@ -1,73 +1,138 @@
-"""``cars`` to ``export``: preparation of a drive, each command with files in and out."""
+"""``tracks``, ``cars``, ``collect``, ``build``, ``export``: preparation of a drive, by files."""
 
+import math
 import shutil
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
 from bayesrace.defaults import DEFAULT_CAR
 from bayesrace.errors import InputError
-from operation.cli.options import (
-    AllSamples,
-    Car,
-    CarName,
-    ControlProblem,
-    DriveTime,
-    FmuFile,
-    FmuMap,
-    GivenLine,
-    OutFile,
-    ProblemChoice,
-    RaceLineFile,
-    Seed,
-    Simulator,
-    Style,
-    TrackName,
-    Tyres,
-    path_on,
-    writable,
-)
+from operation.cli import options
+from operation.cli.fields import Given, options_of
 
-__all__ = ["build", "cars", "collect", "export", "train"]
+if TYPE_CHECKING:
+    from bayesrace.tracks import Track
+    from bayesrace.tracks.maps import RosMap
+    from codegen.settings import BuildSettings
+    from operation.settings import PreparationSettings
+
+__all__ = ["build", "cars", "collect", "export", "tracks"]
 
 
-class PredictionModel(StrEnum):
-    """Prediction model of the OCP."""
+def tracks(
+    name: str | None = options.argument(
+        "TRACK",
+        "Built-in name, random:SEED, random10:SEED, CSV file or ROS map (YAML).",
+        None,
+        "all built in",
+    ),
+    out: Path | None = options.new_file("Write the track as CSV.", "--out", "-o"),
+    picture: Path | None = options.new_file("Draw the track (SVG, PNG)."),
+    reverse: bool = options.flag("--reverse", "Drive it the other way."),
+    start: str | None = options.value(
+        "Start line at the node nearest to this point [m].",
+        metavar="X,Y",
+        shown="as it is; of a map: 0,0",
+    ),
+    smooth: bool = options.flag(
+        "--smooth", "Take the noise off the points of a measured CSV file."
+    ),
+    recentre: bool = options.flag("--recentre", "Make the first point of a CSV file the origin."),
+    car: str = options.value("Car whose scale to check.", "", shown="of any"),
+) -> None:
+    """List the built-in tracks, check a track, turn a ROS map into one, write or draw it."""
+    from rich.table import Table
 
-    e_kinematic = "e_kinematic"
-    dynamic = "dynamic"
+    from bayesrace.tracks import builtin_tracks, write_track
+    from bayesrace.vehicles import get_car
+    from operation.terminal.terminal import Terminal
+
+    if name is None and (out or picture or start or reverse or smooth or recentre):
+        those = "--out, --picture, --start, --reverse, --smooth and --recentre"
+        raise InputError(f"{those} need the name of the track")
+    if picture is not None:
+        from operation.report.track_picture import check_picture, write_picture
+
+        check_picture(picture)
+    place = _point(start)
+    car_width_m = get_car(car).width_m if car else None
+    table = Table("track", "length m", "width m", "tightest radius m", "points")
+    for one in [name] if name else builtin_tracks():
+        track, grid, remark = _loaded(one, car_width_m, smooth, recentre)
+        if place is not None or reverse:
+            track = track.driven_from(place, reverse)
+        table.add_row(*_cells(track))
+        if out is not None:
+            write_track(out, track)
+        if picture is not None:
+            write_picture(picture, track, grid)
+    Terminal().print(table)
+    if remark:
+        typer.echo(remark)
 
 
-class KernelChoice(StrEnum):
-    """Kernels by name, and the choice among them."""
+def _loaded(
+    name: str, car_width_m: float | None, smooth: bool, recentre: bool
+) -> "tuple[Track, RosMap | None, str]":
+    """The track, the map that it was found in, and what was done to its points."""
+    import numpy as np
 
-    rbf = "rbf"
-    matern05 = "matern05"
-    matern15 = "matern15"
-    matern25 = "matern25"
-    auto = "auto"
+    from bayesrace.tracks import load_track, read_recentred, read_smoothed
+
+    is_map = Path(name).suffix in (".yaml", ".yml")
+    if smooth and recentre:
+        raise InputError("--recentre and --smooth are a step each: smooth the file of the first")
+    if (smooth or recentre) and (is_map or not Path(name).is_file()):
+        option = "--smooth" if smooth else "--recentre"
+        raise InputError(f"{option} is for a CSV file of measured points, not for '{name}'")
+    if is_map:
+        from bayesrace.tracks.maps import read_map, track_of_map
+
+        grid = read_map(name)
+        return track_of_map(grid, car_width_m), grid, ""
+    if smooth:
+        track, away_m = read_smoothed(name, car_width_m)
+        rms_mm, largest_mm = 1e3 * np.sqrt(np.mean(away_m**2)), 1e3 * away_m.max()
+        away = f"{rms_mm:.1f} mm (RMS) and at most {largest_mm:.1f} mm away"
+        return track, None, f"{len(away_m)} points are {away} from the smooth centreline"
+    if recentre:
+        track, origin = read_recentred(name, car_width_m)
+        x, y = origin.tolist()
+        return track, None, f"the origin is at x = {x}, y = {y} of the file"
+    return load_track(name, car_width_m), None, ""
+
+
+def _cells(track: "Track") -> tuple[str, ...]:
+    """A track's row of the table."""
+    import numpy as np
+
+    width = track.width_left_m + track.width_right_m
+    bend = np.abs(track.curvature(np.arange(0, track.length_m, 0.01))).max()
+    return (
+        track.name, f"{track.length_m:.2f}", f"{width.min():.2f}–{width.max():.2f}",
+        f"{1 / bend:.2f}", str(len(track.s_m)),
+    )  # fmt: skip
+
+
+def _point(text: str | None) -> tuple[float, float] | None:
+    """The two numbers of an option."""
+    if text is None:
+        return None
+    try:
+        x, y = (float(part) for part in text.split(","))
+    except ValueError:
+        x = y = math.nan
+    if not (math.isfinite(x) and math.isfinite(y)):
+        raise InputError(f"--start {text}: give x and y in metres, as 1.5,-2")
+    return x, y
 
 
 def cars(
-    car: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="CAR", show_default="all built in", help="Built-in name or TOML file."
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            "-o",
-            metavar="FILE",
-            callback=writable,
-            help="Write the car as TOML, tuning included.",
-        ),
-    ] = None,
-    tyres: Tyres = None,
+    car: str | None = options.argument("CAR", "Built-in name or TOML file.", None, "all built in"),
+    out: Path | None = options.new_file("Write the car as TOML, tuning included.", "--out", "-o"),
+    tyres: options.Tyres = None,
 ) -> None:
     """List the built-in cars, check a car's file, or write a car to a file with all its values."""
     from rich.table import Table
@@ -89,41 +154,38 @@ def cars(
     Terminal().print(table)
 
 
+@options_of(
+    "operation.settings.PreparationSettings",
+    "collect_s=--duration pursuit.style seed fmu fmu_map simulator car",
+)
 def collect(
-    track: TrackName,
-    raceline: RaceLineFile,
-    out: OutFile = Path("collect.mcap"),
-    duration: DriveTime = None,
-    style: Style = "limit",
-    seed: Seed = 0,
-    fmu: FmuFile = None,
-    fmu_map: FmuMap = None,
-    simulator: Simulator = "equations",
-    car: Car = DEFAULT_CAR,
+    track: options.TrackName,
+    raceline: options.RaceLineFile,
+    settings: "Given[PreparationSettings]",
+    out: options.OutFile = Path("collect.mcap"),
 ) -> None:
     """Drive a track by pure pursuit and log the drive as training data."""
     from bayesrace.raceline import read_raceline_for
     from bayesrace.tracks import load_track
-    from bayesrace.vehicles import get_car
     from codegen.build import build
     from codegen.compiler import compiled
     from codegen.settings import BuildSettings
-    from controller.pure_pursuit import PurePursuitSettings
     from operation.collect import collect as drive
     from operation.training_line import drive_length_s
     from plant.vehicle import open_vehicle
 
-    settings = PurePursuitSettings(style=style, seed=seed)
-    parameters = get_car(car)
-    course = load_track(track, parameters.width_m)
-    line = read_raceline_for(raceline, course, parameters)
-    vehicles = open_vehicle(parameters, fmu, fmu_map, compiled=compiled, simulator=simulator)
+    chosen = settings()
+    car = chosen.car
+    course = load_track(track, car.width_m)
+    line = read_raceline_for(raceline, course, car)
+    pursuit = chosen.pursuit.model_copy(update={"seed": chosen.seed})
+    vehicles = open_vehicle(
+        car, chosen.fmu, chosen.fmu_map, compiled=compiled, simulator=chosen.simulator
+    )
     with vehicles as vehicle:
-        duration_s = duration or drive_length_s(parameters, line)
-        artefact, _ = build(BuildSettings(car=parameters))
-        driven = drive(
-            course, line, parameters, artefact, out, duration_s, settings, vehicle=vehicle
-        )
+        duration_s = chosen.collect_s or drive_length_s(car, line)
+        artefact, _ = build(BuildSettings(car=car))
+        driven = drive(course, line, car, artefact, out, duration_s, pursuit, vehicle=vehicle)
     off_track_m = course.project_path(driven.x[:, :2]).off_track_m
     typer.echo(
         f"{len(driven.u)} samples, {int((off_track_m > 0).sum())} of them off the track, "
@@ -131,166 +193,42 @@ def collect(
     )
 
 
-def train(
-    logs: Annotated[
-        list[Path] | None, typer.Argument(metavar="LOG", help="Run logs (MCAP).")
-    ] = None,
-    data: Annotated[
-        list[Path] | None,
-        typer.Option(metavar="FILE", help="Samples in plain arrays (.npz); repeatable."),
-    ] = None,
-    kernel: Annotated[
-        KernelChoice,
-        typer.Option(
-            metavar="KERNEL", help="rbf, matern05, matern15, matern25; auto: the best per output."
-        ),
-    ] = KernelChoice.auto,
-    out: OutFile = Path("weights.bin"),
-    points: Annotated[
-        int, typer.Option(metavar="N", min=20, max=20000, help="Points per output.")
-    ] = 400,
-    restarts: Annotated[
-        int,
-        typer.Option(
-            metavar="N", min=0, max=100, help="Further starts of the optimiser per kernel."
-        ),
-    ] = 2,
-    plot: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            callback=writable,
-            help="Draw the error against the kernel's smoothness (PNG).",
-        ),
-    ] = None,
-    artefact: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR",
-            show_default="the default one",
-            help="Built controller to learn for.",
-        ),
-    ] = None,
-    seed: Seed = 0,
-    car: Annotated[
-        str,
-        typer.Option(metavar="CAR", show_default="named by the files", help="Car that drove."),
-    ] = "",
-    name: CarName = "",
-    all_samples: AllSamples = False,
-) -> None:
-    """Train the three GPs on the residual in run logs or plain arrays.
-
-    Of more samples than --points, those with the largest predictive variance are chosen one by one.
-    """
-
-    from bayesrace.gp.weights import write_weights
-    from bayesrace.manifest import read_manifest
-    from bayesrace.vehicles import get_car
-    from learning.dataset import left_out
-    from learning.residual import discretisation_of
-    from learning.settings import TrainingSettings
-    from learning.sources import read_samples
-    from learning.training import fit
-    from operation.terminal.learning_table import print_beyond_limits, print_kernels
-    from operation.terminal.progress import stages_on
-    from operation.terminal.terminal import Terminal
-
-    wanted, parameters = None, get_car(car) if car else None
-    if artefact is not None:
-        manifest = read_manifest(artefact)
-        parameters = parameters or get_car(manifest.car)
-        wanted = discretisation_of(manifest.discretisation, parameters)
-        manifest.check_points(points)
-    files = [*(logs or []), *(data or [])]
-    samples = read_samples(files, parameters, name, wanted, limits=not all_samples)
-    console = Terminal()
-    every = tuple(one.value for one in KernelChoice if one is not KernelChoice.auto)
-    settings = TrainingSettings(
-        kernels=every if kernel is KernelChoice.auto else (kernel.value,),
-        capacity=points,
-        restarts=restarts,
-        seed=seed,
-    )
-    with stages_on(console) as stages, stages.stage("train the residual") as stage:
-        training = fit(samples.dataset, samples.discretisation, settings, progress=stage.update)
-    weights = training.weights
-    write_weights(out, weights)
-    print_kernels(training.kernels, console)
-    if plot is not None:
-        from operation.report.canvas import write_png
-        from operation.report.gp import kernel_figure
-        from operation.report.style import figure_style
-
-        with figure_style():
-            write_png(kernel_figure(training.kernels), plot)
-    console.print(
-        f"{weights.version}: {len(samples.dataset)} samples "
-        f"(left out: {left_out(samples.dataset.dropped)}), "
-        f"kernels {', '.join(weights.kernels)}: {out}",
-        highlight=False,
-        soft_wrap=True,
-    )
-    print_beyond_limits(samples.dataset.dropped, len(samples.dataset), console)
-
-
+@options_of("codegen.settings.BuildSettings", "model problem horizon gp_capacity car")
 def build(
-    model: Annotated[
-        PredictionModel,
-        typer.Option(metavar="MODEL", help="Prediction model: e_kinematic or dynamic."),
-    ] = PredictionModel.e_kinematic,
-    problem: ControlProblem = ProblemChoice.tracking,
-    horizon: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N", min=2, max=100, show_default="the car's", help="Stages of the horizon."
-        ),
-    ] = None,
-    gp_capacity: Annotated[
-        int, typer.Option(metavar="N", min=8, max=16384, help="Most points per output.")
-    ] = 1024,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", metavar="DIR", help="Copy the artefact here.")
-    ] = None,
-    car: Car = DEFAULT_CAR,
+    settings: "Given[BuildSettings]",
+    out: Path | None = options.out_folder("Copy the artefact here."),
 ) -> None:
     """Generate and compile a controller, or take it from the cache; prints its folder."""
-    from bayesrace.integrators import PERFECT, PREDICTION
-    from bayesrace.vehicles import get_car
+    from bayesrace.integrators import PERFECT
     from codegen.build import build as make
-    from codegen.settings import BuildSettings
 
-    settings = BuildSettings(
-        car=get_car(car),
-        model=model.value,
-        problem=problem.value,
-        discretisation=PERFECT if model is PredictionModel.dynamic else PREDICTION,
-        horizon=horizon,
-        gp_capacity=gp_capacity,
-    )
-    folder, _ = make(settings)
+    chosen = settings()
+    if chosen.model == "dynamic":
+        chosen = settings(discretisation=PERFECT)
+    folder, _ = make(chosen)
     if out is not None:
         shutil.copytree(folder, out, dirs_exist_ok=True, copy_function=_replace)
         folder = out
-    typer.echo(str(folder))
+    typer.echo(f"{folder}")
+
+
+def _replace(source: str, target: str) -> None:
+    """Copies beside the target and renames: a running controller keeps the library it loaded."""
+    beside = f"{target}.new"
+    shutil.copy2(source, beside)
+    Path(beside).replace(target)
 
 
 def export(
-    out: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write into.")],
-    track: TrackName = "",
-    raceline: GivenLine = None,
-    weights: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="GP weights; without them, the uncorrected model."),
-    ] = None,
-    settings: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="OCP settings (JSON).")
-    ] = None,
-    artefact: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", show_default="built", help="Folder of 'bayesrace build'."),
-    ] = None,
-    car: Car = DEFAULT_CAR,
+    out: Path = options.argument("DIR", "Folder to write into."),
+    track: options.TrackName = "",
+    raceline: options.GivenLine = None,
+    weights: options.Weights = None,
+    mpc: options.MpcFile = None,
+    artefact: Path | None = options.value(
+        "Folder of 'bayesrace build'.", metavar="DIR", shown="built"
+    ),
+    car: options.Car = DEFAULT_CAR,
 ) -> None:
     """Write racing line, weights and settings for a C program (examples/c_host)."""
     from bayesrace.manifest import read_manifest
@@ -305,20 +243,13 @@ def export(
 
     parameters, process = get_car(car), ControllerSettings()
     track = track or parameters.race_track
-    table = path_on(track, raceline, parameters)
+    table = options.path_on(track, raceline, parameters)
     folder = artefact or make(BuildSettings(car=parameters))[0]
     manifest = read_manifest(folder)
     manifest.check_car(parameters, folder)
-    mpc = read_settings(settings, MpcSettings).parameters(parameters, manifest.problem.name)
+    values = read_settings(mpc, MpcSettings).parameters(parameters, manifest.problem.name)
     cycle = process.fallback, process.compensation, process.stale_s, process.sensor_tolerance
-    values = mpc | cycle_values(parameters, *cycle)
+    values |= cycle_values(parameters, *cycle)
     learned = None if weights is None else read_checked(weights, folder, parameters)
     write(out, manifest, table.rows, table.spacing_m, values, learned)
     typer.echo(f"{track}, {parameters.name}: {out}")
-
-
-def _replace(source: str, target: str) -> None:
-    """Copies beside the target and renames: a running controller keeps the library it loaded."""
-    beside = f"{target}.new"
-    shutil.copy2(source, beside)
-    Path(beside).replace(target)

@@ -2,11 +2,12 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.integrators import PREDICTION, Discretisation
+from bayesrace.option import Option
 from bayesrace.vehicles import CarSetting, default_car
 
 __all__ = ["LapRecord", "LearnSettings", "Record", "UpdateRecord", "Verdict"]
@@ -26,15 +27,19 @@ class LearnSettings(BaseModel):
     car: CarSetting = Field(default_factory=default_car)
     name: str = Field(
         default_factory=lambda known: known["car"].name if "car" in known else "",
-        description="name of the car in the network [its own]",
+        description="name of the car in the network; empty: the car's own",
     )
     discretisation: Discretisation = PREDICTION
     points: int = Field(400, ge=20, le=20_000, description="training points per output")
     keep: int = Field(1200, ge=100, le=20_000, description="samples kept from lap to lap")
-    laps: int | None = Field(None, ge=1, description="number of laps to learn from; none: no end")
-    track: str | None = Field(None, description="times laps and measures excursions")
-    compare: Path | None = Field(None, description="race whose lap times are drawn for comparison")
-    seed: int = Field(0, ge=0, description="of the optimiser's starts")
+    laps: int | None = Field(None, ge=1, description="end after so many laps")
+    track: str | None = Field(
+        None, description="track that is driven, for exact lap times and excursions"
+    )
+    compare: Annotated[Path | None, Option(metavar="DIR")] = Field(
+        None, description="run directory of a race whose lap times are drawn, too"
+    )
+    seed: int = Field(0, ge=0, le=2**32 - 1, description="seed of the optimiser's starts")
 
 
 class LapRecord(BaseModel):

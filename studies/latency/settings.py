@@ -1,15 +1,21 @@
 """The settings of one latency measurement, which go into its folder."""
 
 from pathlib import Path
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from bayesrace.option import Option
 from bayesrace.realtime import RealtimeSettings
-from bayesrace.tracks import DEFAULT_RACE_TRACK
 from bayesrace.transport import Endpoints
 from bayesrace.vehicles import CarSetting, default_car
 
 __all__ = ["LatencySettings"]
+
+
+def _own_track(known: dict[str, Any]) -> str:
+    elsewhere = known.get("log") or known.get("attach")
+    return "" if elsewhere or "car" not in known else str(known["car"].race_track)
 
 
 class LatencySettings(BaseModel):
@@ -18,18 +24,31 @@ class LatencySettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     car: CarSetting = Field(default_factory=default_car)
-    name: str = Field("", description="name in message keys; the car's own if empty")
-    rate_hz: float = Field(50.0, ge=1, le=500, description="of plant and controller")
-    duration_s: float = Field(20.0, gt=0, description="counted, after the warm-up")
-    warm_up_s: float = Field(3.0, ge=0, le=60, description="plant time before cycles count")
-    load: int = Field(0, ge=0, le=1024, description="busy processes beside")
-    track: str = Field(DEFAULT_RACE_TRACK, description="empty: not known")
-    realtime: RealtimeSettings = RealtimeSettings()
-    weights: Path | None = Field(None, description="instead of those trained here")
-    artefact: Path | None = Field(None, description="instead of the one built here")
-    raceline: Path | None = Field(None, description="instead of the one computed here")
+    log: Path | None = Field(None, description="log of a run (MCAP), in place of a new run")
     attach: Endpoints | None = Field(None, description="where a running system is")
-    log: Path | None = Field(None, description="log of a recorded run, in place of a new one")
+    name: str = Field("", description="name of the car in the network; empty: the car's own")
+    rate_hz: float = Field(50.0, ge=1, le=500, description="rate of plant and controller [Hz]")
+    duration_s: float = Field(
+        default_factory=lambda known: 1e9 if known.get("log") else 20.0,
+        ge=1,
+        le=1e9,
+        description="time that counts, after the warm-up [s]; empty: 20; all of a log",
+    )
+    warm_up_s: float = Field(3.0, ge=0, le=60, description="plant time before cycles count")
+    load: int = Field(0, ge=0, le=1024, description="busy processes to start as load")
+    track: str = Field(
+        default_factory=_own_track,
+        description="track: name, random:SEED, random10:SEED or CSV file; empty: the car's; not "
+        "known of a log or a running system",
+    )
+    realtime: RealtimeSettings = RealtimeSettings()
+    weights: Path | None = Field(None, description="GP weights; None: trained")
+    artefact: Annotated[Path | None, Option(metavar="DIR")] = Field(
+        None, description="folder of 'bayesrace build'; None: built"
+    )
+    raceline: Path | None = Field(
+        None, description="racing line to drive, as 'bayesrace raceline' writes it; None: computed"
+    )
 
     @property
     def car_name(self) -> str:

@@ -96,7 +96,8 @@ class Experiment:
 
 def stored(name: str, parts: Iterable[str], make: Callable[[], Any]) -> Any:
     """What ``make`` returned for these parts, this software and this machine, as JSON."""
-    own = software(("studies/paper/residual.py", "studies/bench.py"), ())
+    sources = ("studies/paper/residual.py", "studies/bench.py", "studies/bench_settings.py")
+    own = software(sources, ())
     key = digest((*parts, *own, software_identity(), cpu_identity()))
 
     def read(path: Path) -> Any:

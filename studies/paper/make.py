@@ -2,116 +2,39 @@
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final
 
-from bayesrace.errors import InputError
-from bayesrace.files import read_text, write_whole
+from bayesrace.files import write_whole
 from bayesrace.integrators import PREDICTION
-from bayesrace.raceline import RaceLineSettings, write_raceline
+from bayesrace.raceline import write_raceline
 from learning.sources import dataset_from_npz
 from operation.analysis.published import SOURCE
 from operation.preparation import training_settings
 from operation.report.canvas import inline_svg, write_pdf
 from operation.report.render import template
 from operation.report.style import figure_style
-from operation.settings import PreparationSettings, RaceSettings
+from operation.settings import PreparationSettings
 from operation.terminal.progress import Stages
-from studies.bench import BenchResult, BenchSettings, run_bench
+from studies.bench import BenchResult, run_bench
+from studies.bench_settings import BenchSettings
 from studies.paper.experiment import Experiment, stored
 from studies.paper.finding import Finding, Section
 from studies.paper.loop import line_section, loop_sections, published_line, tenth_section
 from studies.paper.models import model_section
 from studies.paper.residual import Learned, kernel_section, learned, learning_sections, smoothness
+from studies.paper.settings import LINE, PaperSettings
 
-__all__ = ["DRIVES", "PaperSettings", "make_paper"]
+__all__ = ["make_paper"]
 
-_TRACKS: Final = "ethzmobil.csv", "ethz.csv"
-"""Training and race track of the paper's 1:43 car."""
-_TENTH_TRACK: Final = "f110_map2.csv"
-"""Track of appendix B, which may be missing."""
-_LINE: Final = "ethz_published_raceline.csv"
-"""The line that the paper's laps follow, which may be missing; closed, it is written beside the
-page as a racing line of ours."""
-DRIVES: Final = "DYN-PP-ETHZMobil.npz", "DYN-GPMPC-ETHZ.npz", "DYN-NMPC-ETHZ.npz"
-"""Published drives: pure pursuit, BayesRace's lap, BestCase's lap."""
 _SAMPLES: Final = 400
 """Of each published drive, as the paper uses them."""
 _PAPER_MS: Final = 260.0, 100.0
 """Published solve time, mean and standard deviation."""
 _PAGE: Final = "paper.html"
 _FIGURES: Final = "figures"
-
-
-class PaperSettings(NamedTuple):
-    """Folders of tracks and published drives, if there are any; InputError for missing files.
-
-    ``raceline``: driven by the 1:43 car in place of the computed one. ``quick``: fewer kernels,
-    points, seeds and problems. ``seed``: of training drives and GPs.
-    """
-
-    tracks: Path | None = None
-    data: Path | None = None
-    raceline: Path | None = None
-    quick: bool = False
-    seed: int = 0
-
-    @property
-    def drives(self) -> tuple[Path, ...]:
-        """Files of the published drives; none without them."""
-        return _files(self.data, DRIVES, "--data")
-
-    @property
-    def orca(self) -> RaceSettings:
-        """Of the 1:43 car."""
-        train, race = map(str, _files(self.tracks, _TRACKS, "--tracks") or ("", ""))
-        return self._of("orca", train_track=train, track=race, line=self.raceline)
-
-    @property
-    def tenth(self) -> RaceSettings:
-        """Of the 1:10 car; the paper's track is trained on, too.
-
-        There the racing line assumes a friction of 1, as published.
-        """
-        race = (self.tracks or Path()) / _TENTH_TRACK
-        if self.tracks is None or not race.is_file():
-            return self._of("f1tenth")
-        line = RaceLineSettings(friction=1.0)
-        return self._of("f1tenth", train_track=str(race), track=str(race), raceline=line)
-
-    @property
-    def line(self) -> Path | None:
-        """File of the published racing line, if there is one."""
-        path = (self.tracks or Path()) / _LINE
-        return path if self.tracks is not None and path.is_file() else None
-
-    def _of(self, car: str, **others: Any) -> RaceSettings:
-        fewer: Any = {"kernels": ("matern25",), "points": 150} if self.quick else {}
-        return RaceSettings.model_validate(
-            _as_published(car) | {"seed": self.seed} | fewer | others
-        )
-
-
-def _as_published(car: str) -> dict[str, Any]:
-    """Frozen settings of a race, the car's tuning included, by which the paper is reproduced.
-
-    They hold every setting: a car's file and the defaults may change, the reproduction does not.
-    As published there are no mirrored samples, no widened bands (``widen`` 1) and no caution.
-    """
-    path = Path(__file__).with_name(f"{car}.json")
-    settings: dict[str, Any] = json.loads(read_text(path, "the frozen settings"))
-    return settings
-
-
-def _files(folder: Path | None, names: Iterable[str], option: str) -> tuple[Path, ...]:
-    """These files of the folder, none without a folder; InputError naming missing ones."""
-    files = () if folder is None else tuple(folder / name for name in names)
-    missing = ", ".join(path.name for path in files if not path.is_file())
-    if missing:
-        raise InputError(f"{option} {folder}: no {missing} there; docs/paper.md lists the files")
-    return files
 
 
 def make_paper(settings: PaperSettings, out: Path, stages: Stages) -> tuple[Path, list[Section]]:
@@ -133,7 +56,7 @@ def make_paper(settings: PaperSettings, out: Path, stages: Stages) -> tuple[Path
     if settings.line is not None:
         with stages.stage("drive the published racing line"):
             line = published_line(settings.line, one.track, one.car)
-            write_raceline(out / _LINE, line)
+            write_raceline(out / LINE, line)
             published = [line_section(one, line, laps)]
     tracks, test = (one.train_track, one.track), one.samples(laps["bestcase", True])
     every = [Learned("our", one.training, test, tracks, (one.weights, after))]

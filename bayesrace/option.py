@@ -1,0 +1,25 @@
+"""How a field of settings is given on the command line, where its name and type do not say it.
+
+Stands beside the field, as ``delay_s: Annotated[float, Option(unit="ms", per_unit=1000)]``;
+:mod:`operation.cli.fields` makes options of fields.
+"""
+
+from dataclasses import dataclass
+
+__all__ = ["Option"]
+
+
+@dataclass(frozen=True)
+class Option:
+    """What of an option does not follow from its field."""
+
+    flag: str = ""
+    """Without: the field's name, without its unit."""
+    metavar: str = ""
+    """Without: the unit, or what kind of value it is."""
+    unit: str = ""
+    """Unit on the command line, if that is not the field's."""
+    per_unit: float = 1
+    """So many of :attr:`unit` are one of the field's."""
+    default: str = ""
+    """As it would be typed, where the field's own default cannot be."""

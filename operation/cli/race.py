@@ -1,0 +1,236 @@
+"""``race``, ``report``, ``drive``, ``bench``, ``latency``, ``paper``: whole runs, and measurements
+that are made of them."""
+
+import gc
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from bayesrace.errors import InputError
+from bayesrace.files import write_whole
+from operation.cli import options
+from operation.cli.fields import Given, options_of
+
+if TYPE_CHECKING:
+    from bayesrace.configuration import Configuration
+    from operation.analysis.race import RaceAnalysis
+    from operation.settings import RaceSettings
+    from studies.bench_settings import BenchSettings
+    from studies.latency.settings import LatencySettings
+    from studies.paper.settings import PaperSettings
+
+__all__ = ["bench", "drive", "latency", "paper", "race", "report"]
+
+
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """No cyclic garbage collection within the block: the messages of a log live until its report is
+    written, and looking for garbage among them takes a quarter of the time of both."""
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
+
+
+@options_of(
+    "operation.settings.RaceSettings",
+    "car track train_track line collect_s pursuit.style laps problem progress_drives mode "
+    "mpc.constraints mpc.caution seed fmu fmu_map simulator delay_s noise limit",
+    file=True,
+)
+def race(
+    settings: "Given[RaceSettings]",
+    tyres: options.Tyres = None,
+    out: Path | None = options.out_folder("Run directory.", "runs/DATE-TIME"),
+) -> None:
+    """Drive the paper's comparison: WorstCase, BayesRace, BayesRace-updated, BestCase; and
+    BayesRace-limit, which maximises progress in place of tracking the line.
+
+    Computes racing lines, drives the training track by pure pursuit, trains the GPs, builds the
+    controllers, and drives them as two processes over Zenoh. Leaves a run directory with the log,
+    result.json and report.html.
+    """
+    from bayesrace.transport import check_descriptors
+    from operation.race import race as drive_all
+
+    check_descriptors()  # before the preparation, which takes a while
+    chosen = settings()
+    if tyres is not None:
+        chosen = settings(car=chosen.car.on_tyres(tyres))
+    folder = options.run_folder(out)
+    with _uncollected(), options.stages_shown() as stages:
+        recording = drive_all(chosen, folder, stages)
+        with stages.stage("result and report"):
+            # They take a second to import, in which nothing would be seen of a race.
+            from operation.analysis.race import RaceAnalysis
+            from operation.report import write_report
+
+            analysis = RaceAnalysis(recording)
+            page = write_report(folder, analysis)
+    _print_result(analysis, page)
+
+
+def report(
+    run: Path = options.argument(
+        "DIR", "Run directory, or its log; also of a race that was interrupted."
+    ),
+) -> None:
+    """Compute result.json, the table and report.html again from a run's log."""
+    from operation.analysis.race import read_race
+    from operation.report import write_report
+
+    if run.suffix == ".mcap" and run.is_file():
+        run = run.parent
+    with _uncollected():
+        analysis = read_race(run)
+        if not analysis.runs:
+            raise InputError(f"{run}: no run in its log; drive again with 'bayesrace race'")
+        page = write_report(run, analysis)
+    _print_result(analysis, page)
+
+
+def _print_result(analysis: "RaceAnalysis", page: Path) -> None:
+    from operation.terminal.race_table import print_table
+    from operation.terminal.terminal import Terminal
+
+    print_table(analysis.result, Terminal())
+    typer.echo(f"{page}")
+
+
+@options_of("operation.settings.RaceSettings", "track mode car")
+def drive(
+    network: "Configuration",
+    settings: "Given[RaceSettings]",
+    laps: int = options.value("Laps to drive, the first from rest.", 2, min=1),
+    endpoint: options.Endpoint = None,
+    max_time: float = options.value("Time limit [s].", 60.0, min=1, max=1e6, metavar="S"),
+    log: Path = options.new_file("Log to write (MCAP).", default=Path("run.mcap")),
+    name: options.CarName = "",
+) -> None:
+    """Start a run on a plant and a controller that are already running, and record it.
+
+    Exit code 0 if all laps were driven on the track, by the controller's solutions; 1 if not; 2 if
+    the run could not be driven to its end.
+    """
+    from bayesrace.messages import EVENT, Event
+    from bayesrace.recorder import Recorder
+    from bayesrace.tracks import load_track
+    from bayesrace.transport import Director, Publisher, open_session
+    from bayesrace.vehicles import car_text
+    from operation.analysis.verdict import judge_log
+    from operation.drive import RunPlan, execute
+
+    chosen = settings()
+    course = load_track(chosen.track, chosen.car.width_m)
+    name = name or chosen.car.name
+    endpoints = network.endpoints("director", connect=endpoint or None)
+    endpoints.check_car(name)
+    about = {"drive": {"car": car_text(chosen.car), "track": course.name}}
+    with (
+        open_session(endpoints, "director") as session,
+        Recorder(session, name, log, about) as recorder,
+    ):
+        director = Director(session, name)
+        director.wait_for(("plant", "controller"), 10.0)
+        publisher: Publisher[Event] = Publisher(session, EVENT, name, "race")
+        number = director.status("plant").run + 1
+        plan = RunPlan(number, "manual", laps, max_time, chosen.mode == "lockstep")
+        end = execute(director, publisher, course, plan, recorder)
+    verdict = judge_log(log, number, course, laps)
+    typer.echo(f"{end.text}; log: {log}\n{verdict.text}")
+    if not verdict.passed:
+        raise typer.Exit(1)
+
+
+@options_of("studies.bench_settings.BenchSettings", "tracks problems peers points seed car")
+def bench(
+    settings: "Given[BenchSettings]",
+    json_file: Path | None = options.new_file("Write the numbers to this file.", "--json"),
+) -> None:
+    """Time the compiled step and the paper's formulation (CasADi, IPOPT) on the same problems."""
+    from operation.terminal.terminal import Terminal
+    from studies.bench import run_bench
+
+    with options.stages_shown() as stages:
+        result = run_bench(settings(), stages)
+    result.print(Terminal())
+    if json_file:
+        write_whole(json_file, result.model_dump_json(indent=1) + "\n")
+
+
+@options_of(
+    "studies.latency.settings.LatencySettings",
+    "rate_hz duration_s load track realtime.fifo realtime.lock_memory weights artefact raceline "
+    "log car name",
+    file=True,
+)
+def latency(
+    network: "Configuration",
+    settings: "Given[LatencySettings]",
+    out: Path | None = options.out_folder("Folder for results.", "runs/latency-DATE-TIME"),
+    json_file: Path | None = options.new_file("Write the numbers to this file as well.", "--json"),
+    attach: bool = options.flag("--attach", "Measure a run started elsewhere, or wait for one."),
+    endpoint: options.Endpoint = None,
+) -> None:
+    """Measure each leg of a control cycle, from the sampled state to the acting input.
+
+    Starts plant and controller as processes and drives the track in real time. A loop that only
+    sleeps runs beside them: its delays are those of the machine, not of the program. Leaves
+    latency.json, a picture and HdrHistogram logs; see docs/latency.md.
+    """
+    beneath = {"realtime": network.realtime.model_dump()}
+    chosen = settings(beneath)
+    if endpoint and not attach:
+        raise InputError("--endpoint is of a running system: add --attach, or leave it out")
+    if (attach or chosen.log) and (chosen.weights or chosen.artefact or chosen.raceline):
+        raise InputError("--weights, --artefact and --raceline are for what is started here")
+    if chosen.log and (attach or chosen.load):
+        raise InputError("--log is of a run that is over: leave out --attach and --load")
+    if attach:
+        from bayesrace.transport import try_links
+
+        running = network.endpoints("director", connect=endpoint or None)
+        try_links(running, "director")  # before imports that take seconds
+        chosen = settings(beneath, attach=running, warm_up_s=0.0)
+
+    from operation.terminal.terminal import Terminal
+    from studies.latency.measure import measure
+    from studies.latency.report import print_report
+
+    folder = options.run_folder(out, "latency-")
+    with options.stages_shown() as stages:
+        result, run = measure(chosen, folder, stages)
+    print_report(result, Terminal())
+    if json_file:
+        write_whole(json_file, result.model_dump_json(indent=1) + "\n")
+    typer.echo(f"{folder}")
+    if run.error is not None:
+        raise run.error
+
+
+@options_of("studies.paper.settings.PaperSettings", "tracks data raceline quick seed")
+def paper(
+    settings: "Given[PaperSettings]",
+    out: Path = options.value(
+        "Folder for page and figures.", Path("runs/paper"), "--out", "-o", metavar="DIR"
+    ),
+) -> None:
+    """Make every figure and number of the paper from scratch, and compare them with it.
+
+    Leaves paper.html, the figures as SVG and PDF, and numbers.json. What is computed is kept: the
+    same command goes on after an interruption.
+    """
+    from operation.terminal.printable import printable
+    from studies.paper.make import make_paper
+
+    with options.stages_shown() as stages:
+        page, sections = make_paper(settings(), out, stages)
+    for finding in (one for section in sections for one in section.findings):
+        typer.echo(printable(f"{finding.verdict}: {finding.what}: {finding.ours}"))
+    typer.echo(f"{page}")
