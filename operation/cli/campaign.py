@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from bayesrace.defaults import DEFAULT_CAR
-from operation.cli.options import Car, OutFile, writable
+from operation.cli import options
 
 __all__ = ["campaign", "campaign_report", "campaign_worker", "tune"]
 
@@ -23,29 +23,16 @@ Scheduler = Annotated[
 ]
 Workers = Annotated[
     int,
-    typer.Option(
-        metavar="N", min=0, max=1024, show_default="one a core", help="Processes on this machine."
-    ),
-]
-Folder = Annotated[
-    Path | None,
-    typer.Option(
-        "--out", "-o", metavar="DIR", show_default="runs/NAME-OF-PLAN", help="Folder of results."
-    ),
+    typer.Option(min=0, max=1024, show_default="one a core", help="Processes on this machine."),
 ]
 
 
 def campaign(
-    plan: Annotated[
-        Path,
-        typer.Argument(metavar="PLAN", help="TOML file that says what varies: docs/campaigns.md."),
-    ],
-    out: Folder = None,
+    plan: Path = options.argument("PLAN", "TOML file that says what varies: docs/campaigns.md."),
+    out: Path | None = options.out_folder("Folder of results.", "runs/NAME-OF-PLAN"),
     scheduler: Scheduler = None,
     workers: Workers = 0,
-    again: Annotated[
-        bool, typer.Option("--again", help="Compute cases that failed once more.")
-    ] = False,
+    again: bool = options.flag("--again", "Compute cases that failed once more."),
 ) -> None:
     """Drive all cases of a plan, on this machine or on many; one row a lap in Parquet.
 
@@ -66,7 +53,7 @@ def campaign(
 
 
 def campaign_report(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a campaign's results.")],
+    folder: Path = options.argument("DIR", "Folder of a campaign's results."),
 ) -> None:
     """Make the report of a campaign again from its Parquet files."""
     from studies.campaign.page import render_campaign
@@ -75,8 +62,7 @@ def campaign_report(
 
 
 def campaign_worker(
-    scheduler: Annotated[str, typer.Argument(metavar="ADDRESS", help="As tcp://HOST:8786.")],
-    workers: Workers = 0,
+    scheduler: str = options.argument("ADDRESS", "As tcp://HOST:8786."), workers: Workers = 0
 ) -> None:
     """Compute for a campaign elsewhere until its Dask scheduler ends."""
     from studies.campaign.campaign import run_worker
@@ -85,37 +71,22 @@ def campaign_worker(
 
 
 def tune(
-    track: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="TRACK",
-            show_default="harbour, random:21..24",
-            help="Track to tune on: a name, random:SEED, random:FIRST..LAST; repeatable.",
-        ),
-    ] = None,
-    held_out: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="TRACK",
-            show_default="random:31..36",
-            help="Track that judges the result; repeatable.",
-        ),
-    ] = None,
-    trials: Annotated[
-        int, typer.Option(metavar="N", min=1, max=100_000, help="Trials, the defaults included.")
-    ] = 60,
-    batch: Annotated[
-        int, typer.Option(metavar="N", min=1, max=1000, help="Trials that are proposed at once.")
-    ] = 4,
-    out: OutFile = Path("tuned.toml"),
-    study: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", callback=writable, show_default="beside --out", help="SQLite of trials."
-        ),
-    ] = None,
-    car: Car = DEFAULT_CAR,
-    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Seed of the search.")] = 0,
+    track: list[str] = options.value(
+        "Track to tune on: a name, random:SEED, random:FIRST..LAST; repeatable.",
+        (),
+        shown="harbour, random:21..24",
+    ),
+    held_out: list[str] = options.value(
+        "Track that judges the result; repeatable.", (), metavar="TRACK", shown="random:31..36"
+    ),
+    trials: int = options.value("Trials, the defaults included.", 60, min=1, max=100_000),
+    batch: int = options.value("Trials that are proposed at once.", 4, min=1, max=1000),
+    out: options.OutFile = Path("tuned.toml"),
+    study: Path | None = options.value(
+        "SQLite of trials.", metavar="FILE", shown="beside --out", callback=options.writable
+    ),
+    car: options.Car = DEFAULT_CAR,
+    seed: int = options.value("Seed of the search.", 0, min=0),
     scheduler: Scheduler = None,
     workers: Workers = 0,
 ) -> None:
@@ -125,7 +96,6 @@ def tune(
     --car; the same command goes on with the study after an interruption.
     """
     from bayesrace.vehicles import get_car
-    from operation.terminal.progress import stages_on
     from operation.terminal.terminal import Terminal
     from studies.campaign.plan import spread
     from studies.campaign.tune import TuneSettings, print_verdict
@@ -139,9 +109,8 @@ def tune(
         batch=batch,
         seed=seed,
     )
-    console = Terminal()
-    with stages_on(console) as stages:
+    with options.stages_shown() as stages:
         storage = study or out.with_suffix(".sqlite")
         verdict = search(settings, out, storage, stages, scheduler, workers)
-    print_verdict(verdict, console)
-    console.print(f"{out}", highlight=False, soft_wrap=True)
+    print_verdict(verdict, Terminal())
+    typer.echo(f"{out}")

@@ -1,35 +1,20 @@
 """``bayesrace fmu``: exports FMUs, exchanges their weights, lists the variables of any FMU."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import typer
 
 from bayesrace.defaults import DEFAULT_CAR
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
-from operation.cli.options import Car, OutFile, path_on, writable
+from operation.cli import options
 
 if TYPE_CHECKING:
     from bayesrace.vehicles import CarParameters
     from codegen.fmu import FmuDefinition
 
 __all__ = ["fmu"]
-
-
-class Version(StrEnum):
-    """Of the FMI standard."""
-
-    two = "2"
-    three = "3"
-
-
-class Kind(StrEnum):
-    """Of an FMU's interface."""
-
-    cs = "cs"
-    me = "me"
 
 
 fmu = typer.Typer(
@@ -43,73 +28,51 @@ fmu = typer.Typer(
 
 @fmu.command()
 def export(
-    out: OutFile,
-    car: Car = DEFAULT_CAR,
-    version: Annotated[
-        Version, typer.Option(metavar="FMI", help="Version of the FMI standard: 2 or 3.")
-    ] = Version.three,
-    kind: Annotated[
-        Kind,
-        typer.Option(
-            metavar="KIND", help="cs: Co-Simulation; me: Model Exchange (the car, FMI 3.0)."
-        ),
-    ] = Kind.cs,
-    platform: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="PLATFORM",
-            show_default="this one",
-            help="x86_64-linux, aarch64-linux or x86_64-windows; repeatable. Others than this one "
-            "need ziglang.",
-        ),
-    ] = None,
-    controller: Annotated[
-        bool, typer.Option("--controller", help="Export the controller instead of the car.")
-    ] = False,
-    track: Annotated[
-        str | None,
-        typer.Option(metavar="TRACK", show_default="the car's", help="Controller: its track."),
-    ] = None,
-    raceline: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", show_default="computed", help="Controller: racing line."),
-    ] = None,
-    weights: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Controller: GP weights; without them, the uncorrected model."
-        ),
-    ] = None,
-    settings: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Controller: OCP settings (JSON).")
-    ] = None,
-    artefact: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR", show_default="built", help="Controller: folder of 'bayesrace build'."
-        ),
-    ] = None,
+    out: options.OutFile,
+    car: options.Car = DEFAULT_CAR,
+    version: Literal["2", "3"] = options.value(
+        "Version of the FMI standard: 2 or 3.", "3", metavar="FMI"
+    ),
+    kind: Literal["cs", "me"] = options.value(
+        "cs: Co-Simulation; me: Model Exchange (the car, FMI 3.0).", "cs"
+    ),
+    platform: list[str] = options.value(
+        "x86_64-linux, aarch64-linux or x86_64-windows; repeatable. Others than this one need "
+        "ziglang.",
+        (),
+        shown="this one",
+    ),
+    controller: bool = options.flag("--controller", "Export the controller instead of the car."),
+    track: str | None = options.value("Controller: its track.", shown="the car's"),
+    raceline: Path | None = options.value("Controller: racing line.", shown="computed"),
+    weights: Path | None = options.value(
+        "Controller: GP weights; without them, the uncorrected model."
+    ),
+    settings: Path | None = options.value("Controller: OCP settings (JSON)."),
+    artefact: Path | None = options.value(
+        "Controller: folder of 'bayesrace build'.", metavar="DIR", shown="built"
+    ),
 ) -> None:
     """Write the car, or the controller of a track, as an FMU, C sources inside."""
     from bayesrace.vehicles import get_car
     from codegen.fmu import car_fmu, pack
 
     parameters = get_car(car)
-    number: Literal[2, 3] = 2 if version is Version.two else 3
+    number: Literal[2, 3] = 2 if version == "2" else 3
     if not controller:
         _only_for_controllers(
             track=track, raceline=raceline, weights=weights, settings=settings, artefact=artefact,
         )  # fmt: skip
-        definition = car_fmu(parameters, number, kind.value)
-    elif kind is Kind.me:
+        definition = car_fmu(parameters, number, kind)
+    elif kind == "me":
         raise InputError("a controller is sampled, not continuous: export it with --kind cs")
     else:
         definition = _controller(
             parameters, track or parameters.race_track, raceline=raceline, weights=weights,
             settings=settings, artefact=artefact, version=number,
         )  # fmt: skip
-    pack(definition, out, platform)
-    typer.echo(f"{definition.name}, FMI {number}.0 {kind.value}: {out}")
+    pack(definition, out, platform or None)
+    typer.echo(f"{definition.name}, FMI {number}.0 {kind}: {out}")
 
 
 def _only_for_controllers(**options: object) -> None:
@@ -136,7 +99,7 @@ def _controller(
     from controller.cycle_settings import FallbackSettings
     from controller.settings import MpcSettings
 
-    table = path_on(track, raceline, car)
+    table = options.path_on(track, raceline, car)
     folder = artefact or build(BuildSettings(car=car))[0]
     problem = read_manifest(folder).problem.name
     return controller_fmu(
@@ -153,9 +116,9 @@ def _controller(
 
 @fmu.command(name="weights")
 def other_weights(
-    controller: Annotated[Path, typer.Argument(metavar="FMU", help="FMU of a controller.")],
-    weights: Annotated[Path, typer.Argument(metavar="WEIGHTS", help="New GP weights.")],
-    out: OutFile,
+    out: options.OutFile,
+    controller: Path = options.argument("FMU", "FMU of a controller."),
+    weights: Path = options.argument("WEIGHTS", "New GP weights."),
 ) -> None:
     """Copy a controller's FMU with other weights, without compiling."""
     from bayesrace.gp.weights import read_weights
@@ -168,14 +131,9 @@ def other_weights(
 
 @fmu.command()
 def inspect(
-    file: Annotated[Path, typer.Argument(metavar="FMU", help="FMU file.")],
-    map_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--map", metavar="FILE", callback=writable, help="Write a map to fill in (TOML)."
-        ),
-    ] = None,
-    every: Annotated[bool, typer.Option("--all", help="Print local variables, too.")] = False,
+    file: Path = options.argument("FMU", "FMU file."),
+    map_file: Path | None = options.new_file("Write a map to fill in (TOML).", "--map"),
+    every: bool = options.flag("--all", "Print local variables, too."),
 ) -> None:
     """Print an FMU's variables; write a map for 'bayesrace plant --fmu' to fill in."""
     from operation.terminal.fmu_table import FmuTable
