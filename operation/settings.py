@@ -3,17 +3,17 @@
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.option import Option
 from bayesrace.raceline import RaceLineSettings
-from bayesrace.vehicles import CarParameters, CarSetting, default_car
+from bayesrace.vehicles import CarParameters
 from codegen.settings import ProblemName
 from controller.pure_pursuit import PurePursuitSettings
 from controller.settings import MpcSettings
 from learning.settings import DEFAULT_KERNELS, WIDEN, Kernel
-from plant.settings import SensorNoise, SimulatorName
+from plant.settings import CarSimulation
 
 __all__ = ["PreparationSettings", "RaceSettings", "TimeMode"]
 
@@ -21,28 +21,13 @@ TimeMode = Literal["lockstep", "realtime"]
 """How time passes in a run."""
 
 
-class PreparationSettings(BaseModel):
+class PreparationSettings(CarSimulation):
     """From what, and with what, everything is made that a drive needs."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    car: CarSetting = Field(default_factory=default_car)
     train_track: str = Field(
         "",
         description="track of the training drive: name, random:SEED, random10:SEED or CSV file; "
         "empty: the car's",
-    )
-    fmu: Path | None = Field(
-        None, description="Co-Simulation FMU (2.0, 3.0) that simulates the car"
-    )
-    fmu_map: Annotated[Path | None, Option("--map")] = Field(
-        None,
-        description="meaning of the FMU's variables (TOML), as 'bayesrace fmu inspect' begins it; "
-        "None: they have our names",
-    )
-    simulator: SimulatorName = Field(
-        "equations",
-        description="what simulates the car without an FMU: equations, or slipx, for --car slipx",
     )
     true_grip: float = Field(
         1.0,
@@ -50,12 +35,6 @@ class PreparationSettings(BaseModel):
         le=3,
         description="tyre forces of the simulated car, as a multiple of those in its file, "
         "which all controllers but BestCase assume",
-    )
-    delay_s: Annotated[float, Option(unit="ms", per_unit=1000)] = Field(
-        0.0, ge=0, le=1, description="delay put on states and on actuations each"
-    )
-    noise: Annotated[SensorNoise, Option(metavar="NAME=STD")] = Field(
-        SensorNoise(), description="standard deviation of a sensor; empty: exact"
     )
     seed: int = Field(
         0,

@@ -1,10 +1,14 @@
 """What is chosen of a simulated car: who simulates it, and how well its sensors measure."""
 
-from typing import Literal
+from pathlib import Path
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["SensorNoise", "SimulatorName"]
+from bayesrace.option import Option
+from bayesrace.vehicles import CarSetting, default_car
+
+__all__ = ["CarSimulation", "SensorNoise", "SimulatorName"]
 
 SimulatorName = Literal["equations", "slipx"]
 """What simulates the car where no FMU does."""
@@ -29,3 +33,29 @@ class SensorNoise(BaseModel):
             position, position, self.heading_rad, speed, speed, self.yaw_rate_radps,
             self.steering_rad,
         )  # fmt: skip
+
+
+class CarSimulation(BaseModel):
+    """The car, what simulates it, and what lies between it and the controller."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    car: CarSetting = Field(default_factory=default_car)
+    fmu: Path | None = Field(
+        None, description="Co-Simulation FMU (2.0, 3.0) that simulates the car"
+    )
+    fmu_map: Annotated[Path | None, Option("--map")] = Field(
+        None,
+        description="map of the FMU's variables (TOML), which 'bayesrace fmu inspect' writes to be "
+        "filled in; None: they have our names",
+    )
+    simulator: SimulatorName = Field(
+        "equations",
+        description="what simulates the car without an FMU: equations, or slipx, for --car slipx",
+    )
+    delay_s: Annotated[float, Option(unit="ms", per_unit=1000)] = Field(
+        0.0, ge=0, le=1, description="delay put on states and on actuations each"
+    )
+    noise: Annotated[SensorNoise, Option(metavar="NAME=STD")] = Field(
+        SensorNoise(), description="standard deviation of a sensor; empty: exact"
+    )

@@ -34,6 +34,9 @@ SettingsFile = Annotated[
         help="Settings of an earlier run (its settings.json); options that are given override it.",
     ),
 ]
+_UNITS: Final = {"s": "s", "m": "m", "hz": "Hz", "mps": "m/s"}
+_UNIT: Final = re.compile(f"(.+?)(?:_({'|'.join(_UNITS)}))?$")
+"""Name of a field, without its unit, and the unit."""
 _marked: Final[dict[Callable[..., None], tuple[str, str, bool]]] = {}
 
 
@@ -81,7 +84,7 @@ class FieldOption:
         *outer, name = self.path = where.split(".")
         for one in outer:
             model = model.model_fields[one].annotation
-        field, (stem, unit) = model.model_fields[name], re.findall("(.+?)(?:_(s|m|hz))?$", name)[0]
+        field, (stem, unit) = model.model_fields[name], _UNIT.findall(name)[0]
         own = next((one for one in field.metadata if isinstance(one, Option)), Option())
         kind, default = inner_type(field.annotation), own.default or field.get_default()
         text, *words = re.split("; (?:None|empty): ", field.description or "")
@@ -97,16 +100,21 @@ class FieldOption:
         elif hasattr(kind, "model_fields"):
             kind = str
         elif own.unit:
-            text, default = f"{text} [{own.unit}]", default * own.per_unit
+            default *= own.per_unit
             self.value = lambda given: given / own.per_unit
-        text = f"{text[0].upper()}{text[1:]}{'; repeatable' if several else ''}."
         bounds = {
             limit: own.per_unit * getattr(one, bound)
-            for limit, bound in (("min", "ge"), ("max", "le"))
+            for limit, bound in (("min", "ge"), ("max", "le"), ("above", "gt"), ("below", "lt"))
             for one in field.metadata
             if hasattr(one, bound)
         }
-        shown = own.metavar or (own.unit or unit).upper() or metavar(kind, flag)
+        unit = own.unit or _UNITS.get(unit, "")
+        text = f"{text[0].upper()}{text[1:]}"
+        text += f" [{unit}]" if unit and f"[{unit}]" not in text else ""
+        # Typer has no bounds that are themselves excluded.
+        text += "".join(f" ({at} {bounds.pop(at):g})" for at in ("above", "below") if at in bounds)
+        text += "; repeatable." if several else "."
+        shown = own.metavar or unit.upper() or metavar(kind, flag)
         option = typer.Option(
             flag, metavar=shown, show_default=words[0] if words else True, help=text, **bounds
         )
