@@ -23,7 +23,7 @@ from learning.validation import Validation, validate
 from operation.closed_loop import drive_compiled
 from operation.preparation import updated_weights
 from operation.settings import PreparationSettings
-from studies.campaign.plan import spread
+from studies.settings import spread
 
 _PROBABILITIES, _METRICS = (0.9, 0.95, 0.99), ("coverage", "log_density", "rmse")
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 from scipy.optimize import minimize
 from scipy.special import erfcx
 from sklearn.exceptions import ConvergenceWarning
@@ -23,8 +22,9 @@ from threadpoolctl import threadpool_limits
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
+from learning.settings import SearchSettings
 
-__all__ = ["Search", "SearchSettings", "log_improvement", "search"]
+__all__ = ["Search", "log_improvement", "search"]
 
 _REFIT: Final = 5
 """Evaluations from one choice of the hyperparameters to the next."""
@@ -34,20 +34,6 @@ _NEAR: Final = 0.1, 0.02
 """Standard deviations of the candidates around the best point."""
 _STEP: Final = 1e-5
 """Of the differences that are taken for derivatives."""
-
-
-class SearchSettings(BaseModel):
-    """How long and from where :func:`search` looks; a search is a function of these alone."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-    evaluations: int = Field(110, ge=1, le=2000, description="most evaluations, random ones too")
-    initial: int = Field(10, ge=1, description="random evaluations before the first surrogate")
-    patience: int | None = Field(
-        None, ge=1, description="evaluations without a gain after which it ends; None: never"
-    )
-    gain: float = Field(1e-3, gt=0, description="decrease that counts, over the best value")
-    seed: int = Field(0, ge=0, description="of the random points and of the candidates")
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,33 +4,34 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
-from pydantic import Field
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from bayesrace.gp.weights import read_weights
 from bayesrace.raceline import RaceLine, RaceLineSettings
+from bayesrace.raceline.cached import racing_line
 from bayesrace.raceline.line import line_identity
 from bayesrace.raceline.nodes import NodeLines, roughness
-from bayesrace.tracks import Track
+from bayesrace.tracks import Track, load_track
 from bayesrace.vehicles import CarParameters
 from controller.assembly import compiled_controller
-from learning.search import Search, SearchSettings, search
+from learning.search import Search, search
 from operation.closed_loop import ClosedLoop, built_in_car
+from operation.preparation import prepare
+from operation.settings import BayesianSettings, PreparationSettings
 from operation.terminal.progress import Stages
 
 __all__ = [
-    "BayesianSettings",
     "Comparison",
     "Lap",
     "check_curve",
+    "compare_lines",
     "driven_lap",
     "ideal_lap",
-    "search_lines",
     "write_curve",
 ]
 
@@ -44,14 +45,6 @@ Lap = Callable[[RaceLine], float]
 """Lap time along a line [s]; infinite where there is none."""
 
 
-class BayesianSettings(RaceLineSettings):
-    """Everything that a line found by :func:`search_lines` depends on, but for weights."""
-
-    nodes: int = Field(21, ge=6, le=60, description="nodes of the line, the search's dimension")
-    objective: Literal["ideal", "driven"] = Field("ideal", description="lap time to minimise")
-    search: SearchSettings = SearchSettings()
-
-
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """The searches of some seeds, and as many random ones."""
@@ -63,6 +56,8 @@ class Comparison:
     bayesian: tuple[Search, ...]
     random: tuple[Search, ...]
     """Empty unless asked for."""
+    direct_s: float
+    """The same lap along the minimum-time line."""
 
 
 def ideal_lap(line: RaceLine) -> float:
@@ -90,20 +85,28 @@ def driven_lap(artefact: Path, weights: Path | None, track: Track, car: CarParam
     return drive
 
 
-def search_lines(
-    track: Track,
+def compare_lines(
+    name: str,
     car: CarParameters,
     settings: BayesianSettings,
-    lap: Lap,
     stages: Stages,
-    trials: int = 1,
+    weights: Path | None = None,
     compare: bool = False,
 ) -> Comparison:
-    """The best line of ``trials`` searches from one seed after the other.
+    """The best line of the track of this name or file, by searches from one seed after the other.
 
-    ``compare``: random search from the same seeds as well. Raises InputError if the margin leaves
-    no room, or no random line keeps it.
+    ``weights``: for the driven lap; trained without. ``compare``: random search from the same
+    seeds as well. Raises InputError if the margin leaves no room, or no random line keeps it.
     """
+    lap: Lap = ideal_lap
+    track = load_track(name, car.width_m)
+    direct = RaceLineSettings(friction=settings.friction, margin_m=settings.margin_m)
+    if settings.objective == "driven":
+        preparation = PreparationSettings(car=car, raceline=direct)
+        car = preparation.driven_car
+        made = prepare(preparation, (name,), stages, weights=weights)
+        lap = driven_lap(made.artefacts[0], made.weights, track, car)
+    direct_s = lap(racing_line(track, car, direct))
     lines = NodeLines(track, car, settings, settings.nodes)
     features = roughness(settings.nodes)
 
@@ -113,7 +116,8 @@ def search_lines(
 
     found: dict[str, list[Search]] = {"bayesian": [], "random": []}
     at_random = {"initial": settings.search.evaluations, "patience": None}
-    for seed in range(settings.search.seed, settings.search.seed + trials):
+    first = settings.search.seed
+    for seed in range(first, first + settings.trials):
         for method, how in (("bayesian", {}), ("random", at_random))[: 1 + compare]:
             own = settings.search.model_copy(update={**how, "seed": seed})
             with stages.stage(f"{method} search, seed {seed}") as stage:
@@ -127,14 +131,15 @@ def search_lines(
             f"no line through {settings.nodes} nodes on track '{track.name}' was driven or keeps "
             "the margin: choose more --nodes, another --seed or a smaller --margin"
         )
-    made = replace(line, made_for=line_identity(track, car, settings))
-    return Comparison(made, float(best.y.min()), tuple(found["bayesian"]), tuple(found["random"]))
+    best_line = replace(line, made_for=line_identity(track, car, settings))
+    searches = tuple(found["bayesian"]), tuple(found["random"])
+    return Comparison(best_line, float(best.y.min()), *searches, direct_s)
 
 
-def write_curve(path: Path, comparison: Comparison, direct_s: float) -> None:
+def write_curve(path: Path, comparison: Comparison) -> None:
     """Best lap against evaluations: a CSV, and a figure (SVG, PNG) where ``path`` names one.
 
-    ``direct_s``: the same lap along the minimum-time line. Raises InputError for other suffixes.
+    Raises InputError for other suffixes.
     """
     check_curve(path)
     curves = {f"bayesian_{k}": one.best for k, one in enumerate(comparison.bayesian)}
@@ -152,7 +157,7 @@ def write_curve(path: Path, comparison: Comparison, direct_s: float) -> None:
 
     count = len(comparison.bayesian)
     with figure_style():
-        figure = curve_figure(table[:count], table[count:], direct_s)
+        figure = curve_figure(table[:count], table[count:], comparison.direct_s)
         if path.suffix == ".png":
             write_png(figure, path)
         else:

@@ -12,10 +12,10 @@ from bayesrace.vehicles import CarParameters
 from codegen.settings import ProblemName
 from controller.pure_pursuit import PurePursuitSettings
 from controller.settings import MpcSettings
-from learning.settings import DEFAULT_KERNELS, WIDEN, Kernel
+from learning.settings import DEFAULT_KERNELS, WIDEN, Kernel, SearchSettings
 from plant.settings import CarSimulation
 
-__all__ = ["PreparationSettings", "RaceSettings", "TimeMode"]
+__all__ = ["BayesianSettings", "PreparationSettings", "RaceSettings", "TimeMode"]
 
 TimeMode = Literal["lockstep", "realtime"]
 """How time passes in a run."""
@@ -178,3 +178,15 @@ class RaceSettings(PreparationSettings):
             without = self.car.tyres.model == "linear" or self.simulator != "equations"
             object.__setattr__(self, "progress_drives", 0 if without else 3)
         return self
+
+
+class BayesianSettings(RaceLineSettings):
+    """Everything that a line found by :func:`operation.line_search.compare_lines` depends on, but
+    for weights."""
+
+    objective: Annotated[Literal["ideal", "driven"], Option(metavar="LAP")] = Field(
+        "ideal", description="lap to minimise, ideal (by the line's own speeds) or driven"
+    )
+    nodes: int = Field(21, ge=6, le=60, description="nodes of the line, the search's dimension")
+    search: SearchSettings = SearchSettings()
+    trials: int = Field(1, ge=1, le=100, description="searches, from one seed after the other")

@@ -47,7 +47,7 @@ from operation.terminal.terminal import plain_table
 from plant.lockstep import CarRun, drive_lockstep
 from plant.simulator import PLANT
 from plant.vehicle import Vehicle
-from studies.bench_settings import PUBLISHED, BenchSettings
+from studies.settings import PUBLISHED, BenchSettings
 
 __all__ = ["BenchResult", "BenchSettings", "run_bench"]
 

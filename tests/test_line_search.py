@@ -15,7 +15,8 @@ from bayesrace.raceline.friction import speed_profile
 from bayesrace.raceline.nodes import NodeLines, roughness
 from bayesrace.tracks import StartLine, load_track
 from bayesrace.vehicles import get_car
-from learning.search import Search, SearchSettings, _surrogate, log_improvement, search
+from learning.search import Search, _surrogate, log_improvement, search
+from learning.settings import SearchSettings
 from operation.line_search import Comparison, check_curve, driven_lap, write_curve
 from tests.command_line import Cli, refused
 from tests.published_line import (
@@ -164,8 +165,8 @@ def test_curve_as_picture(tmp_path: Path) -> None:
     one = Search(np.zeros((3, 2)), np.array([math.inf, 2.0, 3.0]))
     line = NodeLines(PADDOCK, CAR, RaceLineSettings(), 16).line(np.full(16, 0.5))
     assert line is not None
-    compared = Comparison(line, 2.0, (one, Search(one.x[:2], one.y[1:])), ())
-    write_curve(tmp_path / "curve.png", compared, 1.5)
+    compared = Comparison(line, 2.0, (one, Search(one.x[:2], one.y[1:])), (), 1.5)
+    write_curve(tmp_path / "curve.png", compared)
     assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / "curve.csv").read_text().splitlines()[-1] == "3,2.0,2.0"
     with pytest.raises(InputError, match=r"curve.pdf: name a file in .csv, .svg, .png"):

@@ -41,12 +41,12 @@ _EXTRAS: Final = {
 
 _TASKS: Final = {
     "Race": "race.race race.report",
-    "Prepare": "preparation.tracks preparation.cars raceline.raceline preparation.collect "
+    "Prepare": "tracks.tracks tracks.cars tracks.raceline preparation.collect "
     "learning.train learning.validate preparation.build",
     "Drive": "processes.plant processes.controller race.drive processes.status processes.stop "
     "processes.go processes.router processes.doctor configuration.config configuration.certs",
     "Learn while driving": "learning.learn learning.publish learning.rollback",
-    "Measure": "limit.limit race.bench race.latency race.paper",
+    "Measure": "tracks.limit race.bench race.latency race.paper",
     "Many laps": "campaign.campaign campaign.campaign_report campaign.campaign_worker "
     "campaign.tune",
     "Export to other tools": "preparation.export fmu.fmu",

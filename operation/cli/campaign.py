@@ -1,17 +1,17 @@
 """``campaign``, ``campaign-report``, ``campaign-worker``, ``tune``: laps by the thousand."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bayesrace.defaults import DEFAULT_CAR
 from operation.cli import options
+from operation.cli.fields import Given, options_of
+
+if TYPE_CHECKING:
+    from studies.settings import TuneSettings
 
 __all__ = ["campaign", "campaign_report", "campaign_worker", "tune"]
-
-_TUNED_ON = ("harbour", "random:21..24")
-_JUDGED_ON = ("random:31..36",)
 
 Scheduler = Annotated[
     str | None,
@@ -70,23 +70,13 @@ def campaign_worker(
     run_worker(scheduler, workers)
 
 
+@options_of("studies.settings.TuneSettings", "track held_out trials batch car seed")
 def tune(
-    track: list[str] = options.value(
-        "Track to tune on: a name, random:SEED, random:FIRST..LAST; repeatable.",
-        (),
-        shown="harbour, random:21..24",
-    ),
-    held_out: list[str] = options.value(
-        "Track that judges the result; repeatable.", (), metavar="TRACK", shown="random:31..36"
-    ),
-    trials: int = options.value("Trials, the defaults included.", 60, min=1, max=100_000),
-    batch: int = options.value("Trials that are proposed at once.", 4, min=1, max=1000),
+    settings: "Given[TuneSettings]",
     out: options.OutFile = Path("tuned.toml"),
     study: Path | None = options.value(
         "SQLite of trials.", metavar="FILE", shown="beside --out", callback=options.writable
     ),
-    car: options.Car = DEFAULT_CAR,
-    seed: int = options.value("Seed of the search.", 0, min=0),
     scheduler: Scheduler = None,
     workers: Workers = 0,
 ) -> None:
@@ -95,22 +85,12 @@ def tune(
     Held-out tracks judge what is found. Leaves a car's file with it, which every command takes as
     --car; the same command goes on with the study after an interruption.
     """
-    from bayesrace.vehicles import get_car
     from operation.terminal.terminal import Terminal
-    from studies.campaign.plan import spread
-    from studies.campaign.tune import TuneSettings, print_verdict
+    from studies.campaign.tune import print_verdict
     from studies.campaign.tune import tune as search
 
-    settings = TuneSettings(
-        car=get_car(car),
-        tracks=tuple(name for one in track or _TUNED_ON for name in spread(one)),
-        held_out=tuple(name for one in held_out or _JUDGED_ON for name in spread(one)),
-        trials=trials,
-        batch=batch,
-        seed=seed,
-    )
     with options.stages_shown() as stages:
         storage = study or out.with_suffix(".sqlite")
-        verdict = search(settings, out, storage, stages, scheduler, workers)
+        verdict = search(settings(), out, storage, stages, scheduler, workers)
     print_verdict(verdict, Terminal())
     typer.echo(f"{out}")

@@ -164,6 +164,11 @@ class Given(Generic[Settings]):
     ) -> None:
         self._model, self._file, self._typed = model, file, typed
 
+    @property
+    def flags(self) -> list[str]:
+        """What was typed of them."""
+        return [one.flag for one in self._typed]
+
     def __call__(self, beneath: Mapping[str, Any] | None = None, **above: Any) -> Settings:
         """The settings: ``beneath``, overridden by the file, by the options, and by ``above``."""
         from pydantic import ValidationError

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from operation.terminal.progress import Stages
 
 __all__ = [
-    "AllSamples", "Car", "CarName", "Endpoint", "GivenLine", "LowLatency", "MpcFile", "OutFile",
-    "ParentPid", "RaceLineFile", "TrackName", "Tyres", "Weights", "argument", "flag", "new_file",
-    "out_folder", "path_on", "run_folder", "stages_shown", "value", "writable",
+    "AllSamples", "Car", "CarName", "Course", "Endpoint", "GivenLine", "LowLatency", "MpcFile",
+    "OutFile", "ParentPid", "RaceLineFile", "TrackName", "Tyres", "Weights", "argument", "flag",
+    "new_file", "out_folder", "path_on", "run_folder", "stages_shown", "value", "writable",
 ]  # fmt: skip
 
 
@@ -112,6 +112,10 @@ TrackName = Annotated[
     typer.Option(
         show_default="the car's", help="Built-in name, random:SEED, random10:SEED or CSV file."
     ),
+]
+Course = Annotated[
+    str,
+    typer.Argument(metavar="TRACK", help="Built-in name, random:SEED, random10:SEED or CSV file."),
 ]
 RaceLineFile = Annotated[Path, typer.Option(help="Racing line, as 'bayesrace raceline' writes it.")]
 GivenLine = Annotated[

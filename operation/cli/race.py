@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from bayesrace.configuration import Configuration
     from operation.analysis.race import RaceAnalysis
     from operation.settings import RaceSettings
-    from studies.bench_settings import BenchSettings
     from studies.latency.settings import LatencySettings
     from studies.paper.settings import PaperSettings
+    from studies.settings import BenchSettings
 
 __all__ = ["bench", "drive", "latency", "paper", "race", "report"]
 
@@ -148,7 +148,7 @@ def drive(
         raise typer.Exit(1)
 
 
-@options_of("studies.bench_settings.BenchSettings", "tracks problems peers points seed car")
+@options_of("studies.settings.BenchSettings", "tracks problems peers points seed car")
 def bench(
     settings: "Given[BenchSettings]",
     json_file: Path | None = options.new_file("Write the numbers to this file.", "--json"),

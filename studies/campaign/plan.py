@@ -8,7 +8,6 @@ fixes. A text that ends in ``A..B`` stands for the whole numbers from A to B.
 import itertools
 import json
 import math
-import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,11 +24,11 @@ from bayesrace.tracks import builtin_tracks, is_random_track, load_track
 from bayesrace.vehicles import CarParameters, get_car
 from operation.settings import RaceSettings
 from studies.campaign.case import CONTROLLERS, LEARNS_FROM, PAPER, Case, Controller, Files, factors
+from studies.settings import spread
 
-__all__ = ["Campaign", "read_plan", "spread"]
+__all__ = ["Campaign", "read_plan"]
 
 _MOST_CASES: Final = 1_000_000
-_SPAN: Final = re.compile(r"(.*?)(\d{1,9})\.\.(\d{1,9})")
 _TRAINING: Final = ("train_track", "seed", "collect_s", "points", "kernels", "widen", "pursuit")
 
 
@@ -249,13 +248,3 @@ def _nested(values: Mapping[str, Any]) -> dict[str, Any]:
             place = place.setdefault(part, {})
         place[last] = value
     return result
-
-
-def spread(value: Any) -> list[Any]:
-    """``TEXT A..B`` as TEXT with each number, or as numbers alone; all else as it is."""
-    match = _SPAN.fullmatch(value) if isinstance(value, str) else None
-    if match is None:
-        return [value]
-    text, first, last = match[1], int(match[2]), int(match[3])
-    numbers = range(first, min(last, first + _MOST_CASES) + 1)
-    return [f"{text}{number}" if text else number for number in numbers]

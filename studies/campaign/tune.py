@@ -15,12 +15,11 @@ import pandas as pd
 from distributed import Client
 from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution
 from optuna.trial import TrialState
-from pydantic import BaseModel, ConfigDict, Field
 from rich.console import Console
 from rich.text import Text
 
 from bayesrace.errors import InputError
-from bayesrace.vehicles import CarParameters, CarSetting, default_car, write_car
+from bayesrace.vehicles import CarParameters, write_car
 from operation.preparation import prepare
 from operation.settings import RaceSettings
 from operation.terminal.progress import Stages
@@ -28,8 +27,9 @@ from operation.terminal.terminal import plain_table
 from studies.campaign.campaign import computed, connected
 from studies.campaign.case import Case, Controller, Files
 from studies.campaign.execute import FAILED, Row
+from studies.settings import TuneSettings
 
-__all__ = ["TuneSettings", "Verdict", "print_verdict", "tune"]
+__all__ = ["Verdict", "print_verdict", "tune"]
 
 _SPANS: Final = {
     "r_duty": (0.1, 10.0), "r_delta_rate": (0.1, 10.0), "s_slack": (0.3, 30.0),
@@ -43,19 +43,6 @@ _HORIZONS: Final = (12, 16, 20, 25, 30)
 _LAPS: Final = 2
 _RUN: Final = ["track", "controller"]
 _NUMBERS: Final = ["lap_time_s", "simulated_s", "samples", "off_track_samples"]
-
-
-class TuneSettings(BaseModel):
-    """What is searched, and on which tracks."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    car: CarSetting = Field(default_factory=default_car)
-    tracks: tuple[str, ...] = Field(min_length=1, description="the trials drive on")
-    held_out: tuple[str, ...] = Field(min_length=1, description="judge the best trial")
-    trials: int = Field(60, ge=1, le=100_000)
-    batch: int = Field(4, ge=1, le=1000, description="trials that are proposed at once")
-    seed: int = Field(0, ge=0)
 
 
 class Verdict(NamedTuple):
@@ -76,10 +63,10 @@ def tune(
     ``file``: SQLite of the study; a study that is there goes on. ``where``: the scheduler. Raises
     InputError for tracks that are in both sets, or where a run of the defaults fails.
     """
-    if both := sorted({*settings.tracks} & {*settings.held_out}):
+    if both := sorted({*settings.track} & {*settings.held_out}):
         raise InputError(f"{both[0]} is to tune and to judge on; leave it in one of the two")
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    first = RaceSettings(car=settings.car, track=settings.tracks[0])
+    first = RaceSettings(car=settings.car, track=settings.track[0])
     prepared = prepare(first, (first.track,), stages)
     files = Files()
     weights = files.add(prepared.weights, "the weights")
@@ -88,7 +75,7 @@ def tune(
             study, default = _study(settings, file), None
             while (known := _finished(study)) < settings.trials:
                 stage.update(known / settings.trials, f"{known} trials")
-                drives = client, files, settings.tracks, weights
+                drives = client, files, settings.track, weights
                 default = _sound(_driven([settings.car], *drives)) if default is None else default
                 count = min(settings.batch, settings.trials - known)
                 trials = [study.ask(_space(settings.car)) for _ in range(count)]

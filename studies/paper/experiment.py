@@ -96,7 +96,7 @@ class Experiment:
 
 def stored(name: str, parts: Iterable[str], make: Callable[[], Any]) -> Any:
     """What ``make`` returned for these parts, this software and this machine, as JSON."""
-    sources = ("studies/paper/residual.py", "studies/bench.py", "studies/bench_settings.py")
+    sources = ("studies/paper/residual.py", "studies/bench.py", "studies/settings.py")
     own = software(sources, ())
     key = digest((*parts, *own, software_identity(), cpu_identity()))
 

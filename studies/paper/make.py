@@ -19,13 +19,13 @@ from operation.report.style import figure_style
 from operation.settings import PreparationSettings
 from operation.terminal.progress import Stages
 from studies.bench import BenchResult, run_bench
-from studies.bench_settings import BenchSettings
 from studies.paper.experiment import Experiment, stored
 from studies.paper.finding import Finding, Section
 from studies.paper.loop import line_section, loop_sections, published_line, tenth_section
 from studies.paper.models import model_section
 from studies.paper.residual import Learned, kernel_section, learned, learning_sections, smoothness
 from studies.paper.settings import LINE, PaperSettings
+from studies.settings import BenchSettings
 
 __all__ = ["make_paper"]
 
