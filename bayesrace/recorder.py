@@ -17,7 +17,7 @@ import zenoh
 from bayesrace.errors import InputError
 from bayesrace.log import LogWriter, topic_of
 from bayesrace.messages import EVENT, EVERYTHING, HEARTBEAT, Event, car_key, encode
-from bayesrace.transport.numbering import Numbering
+from bayesrace.transport.publisher import Numbering
 
 __all__ = ["FLUSH_PERIOD_S", "Recorder", "RecorderCounters"]
 

@@ -52,13 +52,9 @@ _LOOPBACK: Final = ("localhost", "127.0.0.1", "::1")
 _LISTENERS: Final[tuple[Role, ...]] = ("plant", "controller", "router")
 
 
-class Entry(BaseModel):
+class Entry(Member):
     """A certificate in the register."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    role: Role
-    car: str = EVERY_CAR
     hosts: tuple[str, ...] = Field((), description="where its process listens, beside loopback")
     ends: datetime
     revoked: bool = False
@@ -259,6 +255,5 @@ def _write_private(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
     """The key, at no moment readable by others."""
     content = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
     with replacing(path) as partial:
-        descriptor = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(content)
+        partial.touch(0o600, exist_ok=False)
+        partial.write_bytes(content)

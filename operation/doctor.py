@@ -1,27 +1,64 @@
 """Why the processes of a system do not meet: configuration, certificates, endpoints, access, cars.
 
-Everything is tried as a process of this machine would try it, and each fault has its remedy.
+Everything is tried as a process of this machine would try it, and each fault has its remedy. Zenoh
+does not say why there is no link, so each endpoint is tried here as Zenoh tries it: a connection,
+and a handshake with this machine's certificate.
 """
 
+import socket
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Final, NamedTuple
 
 from bayesrace.configuration import Configuration
 from bayesrace.errors import InputError
 from bayesrace.messages import Role
 from bayesrace.transport import Credentials, Endpoints, open_session
-from bayesrace.transport.credentials import NEWEST_LIST
-from bayesrace.transport.probe import probe_all
+from bayesrace.transport.credentials import CERTIFICATE_EXPIRED, CERTIFICATE_NOT_YET, NEWEST_LIST
+from bayesrace.transport.endpoints import Address, address_of
 from operation.analysis.network_status import SOURCES
 from operation.lifecycle import find
 
-__all__ = ["Check", "examine"]
+__all__ = ["Check", "examine", "probe"]
 
 _CARS_S: Final = 1.0
 _ROLES: Final[tuple[Role, ...]] = (
     "director", "learning", "viewer", "controller", "plant", "router"
 )  # fmt: skip
 """In the order in which a certificate of this machine is tried."""
+
+_CONNECT_S: Final = 1.0
+_REFUSAL_S: Final = 0.2
+"""How long the other end may take to refuse a certificate after the handshake."""
+
+_NO_TLS: Final = (
+    "is not encrypted, or is no process of ours: start the one that listens there with a "
+    "certificate, too"
+)
+_OTHER_AUTHORITY: Final = (
+    "of another authority than this machine's: both have to come from one 'bayesrace certs init'"
+)
+_WE_REFUSE: Final = {
+    CERTIFICATE_EXPIRED: "has a certificate that has expired: renew it there with 'bayesrace certs "
+    "add NAME --renew'",
+    CERTIFICATE_NOT_YET: "has a certificate that is not valid yet: set the clocks of both machines",
+    **dict.fromkeys(
+        (62, 64),
+        "has a certificate for other hosts: connect by a name that is in it, or renew it with "
+        "'bayesrace certs add NAME --renew --host {host}'",
+    ),
+}
+"""OpenSSL's number of what is wrong with the other end's certificate, to what is said of it."""
+_THEY_REFUSE: Final = {
+    **dict.fromkeys(
+        ("UNKNOWN_CA", "BAD_CERTIFICATE", "DECRYPT_ERROR"),
+        f"refuses certificate '{{name}}'; its own is {_OTHER_AUTHORITY}",
+    ),
+    "EXPIRED": "refuses certificate '{name}' as expired: renew it with 'bayesrace certs add {name} "
+    "--renew', or set the clocks of both machines",
+    **dict.fromkeys(("WRONG_VERSION", "EOF"), _NO_TLS),
+}
+"""Part of OpenSSL's reason for the end of a handshake, to what is said of it."""
 
 
 class Check(NamedTuple):
@@ -54,7 +91,9 @@ def examine(configuration: Configuration) -> Iterator[Check]:
     except InputError as error:
         yield Check(False, str(error))
         return
-    faults = probe_all(endpoints.connect, own)
+    with ThreadPoolExecutor(max(len(endpoints.connect), 1)) as pool:
+        found = pool.map(lambda one: probe(one, own), endpoints.connect)
+    faults = {one: text for one, text in zip(endpoints.connect, found, strict=True) if text}
     for endpoint in endpoints.connect:
         yield Check(endpoint not in faults, faults.get(endpoint, f"{endpoint} answers"))
     there = tuple(one for one in endpoints.connect if one not in faults)
@@ -106,3 +145,75 @@ def _cars(endpoints: Endpoints, own: Credentials | None) -> Iterator[Check]:
         text = f"car '{car}': {' and '.join(sorted(present))}"
         absent = f"; no {' and no '.join(missing)}: {remedy}"
         yield Check(not missing, text + (absent if missing else ""))
+
+
+def probe(endpoint: str, credentials: Credentials | None) -> str:
+    """What is wrong with an endpoint, and the remedy; empty if nothing is found within some 1.5 s.
+
+    Others than tcp and tls are not tried.
+    """
+    address = address_of(endpoint)
+    if address.protocol not in ("tcp", "tls"):
+        return ""
+    try:
+        connection = socket.create_connection((address.host, address.port), _CONNECT_S)
+    except ConnectionRefusedError:
+        return (
+            f"nobody listens at {endpoint}: start the process that should, or correct the endpoint"
+        )
+    except socket.gaierror:
+        return f"{endpoint}: the name '{address.host}' is not known: correct it, or give an address"
+    except TimeoutError:
+        return f"{endpoint} does not answer: check address, network and firewall"
+    except OSError as error:
+        return f"{endpoint} cannot be reached: {error.strerror or error}; check address and network"
+    with connection:
+        if credentials is None:
+            text = _asks_for_certificates(connection)
+        else:
+            text = _refused(connection, address, credentials)
+    return f"{endpoint} {text}" if text else ""
+
+
+def _asks_for_certificates(connection: socket.socket) -> str:
+    """Whether TLS is spoken where plain links were asked for."""
+    import ssl  # 1.4 MB, which a process without certificates does not need
+
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    connection.settimeout(_REFUSAL_S)
+    try:
+        context.wrap_socket(connection).close()
+    except OSError:
+        return ""
+    return (
+        "asks for a certificate: name the folder of this process's in [tls] of bayesrace.toml, and "
+        "write tls/ in place of tcp/"
+    )
+
+
+def _refused(connection: socket.socket, address: Address, credentials: Credentials) -> str:
+    """Why the handshake fails at one of its ends; empty if it does not."""
+    import ssl  # as above
+
+    context = credentials.client()
+    try:
+        with context.wrap_socket(connection, server_hostname=address.host) as link:
+            # The other end judges our certificate when the handshake is over for this one.
+            link.settimeout(_REFUSAL_S)
+            link.recv(1)
+    except TimeoutError as error:
+        # It waits for our greeting; or, in the handshake, for something that is no TLS.
+        return "" if "handshake" not in str(error) else _NO_TLS
+    except ssl.SSLCertVerificationError as error:
+        if text := _WE_REFUSE.get(error.verify_code):
+            return text.format(host=address.host)
+        return f"has a certificate {_OTHER_AUTHORITY} ({error.verify_message})"
+    except ssl.SSLError as error:
+        reason = error.reason or str(error)
+        known = next((text for part, text in _THEY_REFUSE.items() if part in reason), "")
+        unknown = f"refuses the link ({reason.replace('_', ' ').lower()})"
+        return known.format(name=credentials.name) or unknown
+    except OSError:  # it closes the connection
+        return _NO_TLS
+    return ""

@@ -14,7 +14,7 @@ import pytest
 from bayesrace.log import LogReader
 from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY
 from bayesrace.transport import free_endpoint
-from bayesrace.transport.probe import probe_all
+from operation.doctor import probe
 from tests.command_line import Cli, course_files, refused
 from tests.conftest import Circuit
 from tests.programs import finish, peanut, run, start, until
@@ -109,7 +109,7 @@ class Waiting:
     def drive(self, log: Path, *options: str) -> subprocess.Popen[str]:
         """A drive of many laps, of which the first is in progress."""
         # Otherwise 'drive' says, besides, that there is no link yet.
-        until(lambda: not probe_all(self.where[1::2], None), "both to listen")
+        until(lambda: not any(probe(one, None) for one in self.where[1::2]), "both to listen")
         drive = start("drive", *self.track, *LONG, *options, *self.where, "--log", log)
         self.ended.append(drive)
         until(lambda: log.exists() and log.stat().st_size > 20_000, "a run in progress")

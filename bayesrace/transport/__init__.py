@@ -2,21 +2,11 @@
 
 ``endpoints`` says where a process listens and connects, ``credentials`` holds its certificate,
 ``access`` makes Zenoh's access control of the table of messages, and ``session`` opens a session
-with all of that; ``expiry`` ends a process whose certificate expires. ``probe`` says why an
-endpoint cannot be linked, for ``bayesrace doctor``. ``publisher`` sends messages, ``inbox`` is the
-one subscriber, with ``requests`` for what it serves; ``client`` sends requests, ``director`` starts
-and follows runs; ``numbering`` counts losses.
+with all of that; ``expiry`` ends a process whose certificate expires. ``publisher`` sends messages
+and counts what is lost of them, ``inbox`` is the one subscriber, ``requests`` sends requests and
+serves them; ``director`` starts and follows runs.
 """
 
-from bayesrace.transport.client import (
-    Answers,
-    ask,
-    ask_all,
-    count_processes,
-    decisive,
-    send_rollback,
-    send_weights,
-)
 from bayesrace.transport.credentials import Credentials, Member, Members
 from bayesrace.transport.director import Director, RefusedError
 from bayesrace.transport.endpoints import (
@@ -30,9 +20,19 @@ from bayesrace.transport.endpoints import (
     private_endpoints,
 )
 from bayesrace.transport.inbox import LOCKSTEP_SPIN_S, NEWEST, POLL_S, Inbox, Item, Kind
-from bayesrace.transport.numbering import Numbering
-from bayesrace.transport.publisher import HEARTBEAT_S, Heartbeat, Publisher
-from bayesrace.transport.requests import Request, declare_service, decode_request
+from bayesrace.transport.publisher import HEARTBEAT_S, Heartbeat, Numbering, Publisher
+from bayesrace.transport.requests import (
+    Answers,
+    Request,
+    ask,
+    ask_all,
+    count_processes,
+    decisive,
+    declare_service,
+    decode_request,
+    send_rollback,
+    send_weights,
+)
 from bayesrace.transport.session import open_session, try_links
 
 __all__ = [

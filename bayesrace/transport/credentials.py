@@ -8,6 +8,7 @@ A folder holds what one process needs, as ``bayesrace certs`` writes it: the aut
 import os
 import stat
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
@@ -21,8 +22,8 @@ if TYPE_CHECKING:
     import ssl
 
 __all__ = [
-    "AUTHORITY", "CERTIFICATE", "COVERS", "EVERY_CAR", "KEY", "MEMBERS", "NEWEST_LIST",
-    "Credentials", "Member", "Members", "read_members",
+    "AUTHORITY", "CERTIFICATE", "CERTIFICATE_EXPIRED", "CERTIFICATE_NOT_YET", "COVERS", "EVERY_CAR",
+    "KEY", "MEMBERS", "NEWEST_LIST", "Credentials", "Member", "Members",
 ]  # fmt: skip
 
 AUTHORITY: Final = "ca.pem"
@@ -42,9 +43,16 @@ COVERS: Final[dict[Role, tuple[Role, ...]]] = {
 }  # fmt: skip
 """Roles that may do all that these may."""
 
+CERTIFICATE_EXPIRED: Final = 10
+CERTIFICATE_NOT_YET: Final = 9
+"""OpenSSL's numbers of what is wrong with a certificate."""
+
 _SOON_S: Final = 14 * 86400
-_OPENSSL_EXPIRED: Final = 10
-_OPENSSL_NOT_YET: Final = 9
+_COPY: Final = "copy the folder again, as 'bayesrace certs' wrote it"
+_UNUSABLE: Final = {
+    CERTIFICATE_EXPIRED: "has expired: renew it with 'bayesrace certs add NAME --renew'",
+    CERTIFICATE_NOT_YET: "is not valid yet: set the clock of this machine",
+}
 
 
 class Member(BaseModel):
@@ -69,15 +77,6 @@ class Members(BaseModel):
     revoked: tuple[str, ...] = Field((), description="names that never count again")
 
 
-def read_members(path: Path) -> Members:
-    """The members in a file; InputError if it cannot be used."""
-    text = read_text(path, "list of members", "copy it from where 'bayesrace certs' wrote it")
-    try:
-        return Members.model_validate_json(text)
-    except ValidationError as error:
-        raise InputError(f"{path}: {faults_in(error)}; copy it again") from None
-
-
 class Credentials(BaseModel):
     """The certificate of one process, checked, with what all members may do."""
 
@@ -99,10 +98,14 @@ class Credentials(BaseModel):
         if not folder.is_dir():
             raise InputError(f"no certificate in {folder}: make one with 'bayesrace certs add'")
         for name in (AUTHORITY, CERTIFICATE, KEY, MEMBERS):
-            read_text(folder / name, "file", "copy the folder again, as 'bayesrace certs' wrote it")
+            read_text(folder / name, "file", _COPY)
         _check_private(folder / KEY)
         name, ends_s = _verified(folder)
-        return cls(folder=folder, name=name, ends_s=ends_s, members=read_members(folder / MEMBERS))
+        return cls(folder=folder, name=name, ends_s=ends_s, members=_members(folder / MEMBERS))
+
+    def client(self) -> "ssl.SSLContext":
+        """For a link to another end, whose certificate is checked."""
+        return _context(self.folder, server=False)
 
     @property
     def member(self) -> Member | None:
@@ -158,6 +161,15 @@ class Credentials(BaseModel):
         )
 
 
+def _members(path: Path) -> Members:
+    """The members in a file; InputError if it cannot be used."""
+    text = read_text(path, "list of members", "copy it from where 'bayesrace certs' wrote it")
+    try:
+        return Members.model_validate_json(text)
+    except ValidationError as error:
+        raise InputError(f"{path}: {faults_in(error)}; copy it again") from None
+
+
 def _check_private(key: Path) -> None:
     """InputError if others can read the key: theirs may be a group, where root owns the file."""
     status = key.stat()
@@ -166,49 +178,42 @@ def _check_private(key: Path) -> None:
         raise InputError(f"others can read the private key {key}: chmod 600 {key}")
 
 
-def _verified(folder: Path) -> tuple[str, float]:
-    """Name and end of the certificate, after a handshake with itself; InputError if that fails."""
+def _context(folder: Path, server: bool) -> "ssl.SSLContext":
+    """What one end of a link with the certificate in that folder has; both ends are checked."""
     import ssl  # 1.4 MB, which a process without certificates does not need
 
-    authority, files = folder / AUTHORITY, (folder / CERTIFICATE, folder / KEY)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if server else ssl.PROTOCOL_TLS_CLIENT)
+    context.verify_mode = ssl.CERT_REQUIRED
+    context.load_verify_locations(folder / AUTHORITY)
+    context.load_cert_chain(folder / CERTIFICATE, folder / KEY)
+    return context
+
+
+def _verified(folder: Path) -> tuple[str, float]:
+    """Name and end of the certificate, after a handshake with itself; InputError if that fails."""
+    import ssl  # as above
+
     try:
-        server = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-        client = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-        client.check_hostname, client.verify_mode = False, ssl.CERT_NONE
-        server.verify_mode = ssl.CERT_REQUIRED
-        server.load_verify_locations(authority)
-        for context in (server, client):
-            context.load_cert_chain(*files)
+        server, client = _context(folder, server=True), _context(folder, server=False)
     except ssl.SSLError as error:
         reason = (error.reason or str(error)).replace("_", " ").lower()
         raise InputError(
-            f"{folder}: certificate, key and authority do not fit ({reason}): copy the folder "
-            "again, as 'bayesrace certs' wrote it"
+            f"{folder}: certificate, key and authority do not fit ({reason}): {_COPY}"
         ) from None
-    here, there, incoming, outgoing = (ssl.MemoryBIO() for _ in range(4))
-    one = server.wrap_bio(here, there, server_side=True)
-    other = client.wrap_bio(incoming, outgoing)
+    # The server judges; a certificate may be for clients alone.
+    client.check_hostname, client.verify_mode = False, ssl.CERT_NONE
+    to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
+    one = server.wrap_bio(to_server, to_client, server_side=True)
+    other = client.wrap_bio(to_client, to_server)
     try:
         for _ in range(4):
             for end in (other, one):
-                try:
+                with suppress(ssl.SSLWantReadError):
                     end.do_handshake()
-                except ssl.SSLWantReadError:
-                    here.write(outgoing.read())
-                    incoming.write(there.read())
     except ssl.SSLCertVerificationError as error:
-        raise InputError(f"certificate in {folder} {_why_not(error)}") from None
+        why = _UNUSABLE.get(error.verify_code)
+        why = why or f"is not of the authority in {AUTHORITY} ({error.verify_message}): {_COPY}"
+        raise InputError(f"certificate in {folder} {why}") from None
     found = one.getpeercert() or {}
     subject = {str(pair[0]): str(pair[1]) for group in found["subject"] for pair in group}
     return subject["commonName"], ssl.cert_time_to_seconds(str(found["notAfter"]))
-
-
-def _why_not(error: "ssl.SSLCertVerificationError") -> str:
-    if error.verify_code == _OPENSSL_EXPIRED:
-        return "has expired: renew it with 'bayesrace certs add NAME --renew'"
-    if error.verify_code == _OPENSSL_NOT_YET:
-        return "is not valid yet: set the clock of this machine"
-    return (
-        f"is not of the authority in {AUTHORITY} ({error.verify_message}): copy the folder again, "
-        "as 'bayesrace certs' wrote it"
-    )

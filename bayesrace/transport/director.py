@@ -19,8 +19,8 @@ from bayesrace.messages import (
     StatusRequest,
     StopRequest,
 )
-from bayesrace.transport.client import ask, count_processes, send_rollback, send_weights
 from bayesrace.transport.inbox import Inbox, Item, Kind
+from bayesrace.transport.requests import ask, count_processes, send_rollback, send_weights
 
 __all__ = ["Director", "RefusedError"]
 

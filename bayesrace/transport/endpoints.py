@@ -8,7 +8,7 @@ import socket
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from tempfile import gettempdir
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, NamedTuple
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue
 
@@ -68,10 +68,8 @@ def check_descriptors() -> None:
         )
 
 
-class Address(BaseModel):
+class Address(NamedTuple):
     """Protocol, host and port of an endpoint."""
-
-    model_config = ConfigDict(frozen=True)
 
     protocol: str
     host: str = ""

@@ -1,7 +1,6 @@
 """Without a link every process names the endpoint, and ``doctor`` says why there is none."""
 
 import json
-import re
 import shutil
 from pathlib import Path
 from typing import Final
@@ -12,8 +11,8 @@ from bayesrace.gp.weights import write_weights, zero_weights
 from bayesrace.raceline.line import write_raceline
 from bayesrace.tracks import write_track
 from bayesrace.transport import Credentials, Endpoints, free_endpoint, open_session
-from bayesrace.transport.probe import probe
 from operation.certificates import add, init
+from operation.doctor import probe
 from tests.command_line import Cli, refused
 from tests.conftest import Circuit
 from tests.programs import finish, start, until
@@ -54,16 +53,6 @@ def test_what_is_wrong_with_an_endpoint_is_found(
     with listening(listened, bundles.path(at_plant) if at_plant else None):
         found = probe(tried, credentials)
     assert all(word in found for word in (tried, *words)) if words else found == ""
-
-
-def test_a_certificate_that_is_gone_meanwhile_is_found(bundles: Bundles, tmp_path: Path) -> None:
-    where = free_endpoint("tls")
-    shutil.copytree(bundles.path("controller"), tmp_path / "own")
-    credentials = Credentials.read(tmp_path / "own")
-    shutil.rmtree(tmp_path / "own")
-    with listening(where, bundles.path("plant")):
-        found = probe(where, credentials)
-    assert re.search("'controller' in .*/own cannot be read .*: copy the folder again", found)
 
 
 def test_another_host_name_is_found(bundles: Bundles) -> None:
