@@ -6,7 +6,10 @@ or scheme are refused by comparing :attr:`Manifest.discretisation`.
 
 import hashlib
 import os
+import re
 import stat
+import zlib
+from functools import cache
 from pathlib import Path
 from typing import Final
 
@@ -14,10 +17,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_whole
-from bayesrace.native_interface import ABI
 from bayesrace.vehicles.parameters import CarParameters
 
 __all__ = [
+    "DECLARATIONS",
     "LIBRARY",
     "MANIFEST",
     "Manifest",
@@ -25,13 +28,20 @@ __all__ = [
     "ProblemInfo",
     "check_library",
     "check_owner",
+    "interface_version",
     "read_manifest",
 ]
 
 _ROOT: Final = 0
 
 LIBRARY: Final = "libmpc.so"
+DECLARATIONS: Final = "libmpc_interface.py"
+"""What the headers of the library declare, as cffi reads it fastest."""
 MANIFEST: Final = "manifest.json"
+_HEADERS: Final = tuple(
+    Path(__file__).resolve().parents[1] / "controller" / "native" / name
+    for name in ("bayesrace_mpc.h", "bayesrace_cycle.h")
+)
 DRIVING_PROBLEMS: Final = ("tracking", "progress")
 """Control problems that drive a car; see ``codegen/problems``."""
 
@@ -82,6 +92,7 @@ class Manifest(BaseModel):
     flags: list[str]
     build_hash: str = Field(description="hash of everything that shaped the artefact")
     library_sha256: str
+    interface_sha256: str
 
     def check_car(self, car: CarParameters, artefact: Path) -> None:
         """InputError if this artefact was built for another car, or solves another problem."""
@@ -105,6 +116,14 @@ class Manifest(BaseModel):
             )
 
 
+@cache
+def interface_version() -> int:
+    """Number of the C interface: a hash of what its headers declare, comments left out."""
+    text = " ".join(path.read_text() for path in _HEADERS)
+    code = re.sub(r"/\*.*?\*/", " ", text, flags=re.DOTALL)
+    return zlib.crc32(" ".join(code.split()).encode()) & 0x7FFFFFFF
+
+
 def read_manifest(artefact: Path) -> Manifest:
     """Manifest of the artefact folder; InputError if it is not one or belongs to another ABI."""
     path = artefact / MANIFEST
@@ -118,32 +137,37 @@ def read_manifest(artefact: Path) -> Manifest:
         raise InputError(
             f"{path} is no manifest ({faults_in(error)}): run 'bayesrace build'"
         ) from None
-    if manifest.abi != ABI:
+    if manifest.abi != interface_version():
         raise InputError(
-            f"{path} was built for interface {manifest.abi}, this program has {ABI}: "
-            "run 'bayesrace build'"
+            f"{path} was built for interface {manifest.abi}, this program has "
+            f"{interface_version()}: run 'bayesrace build'"
         )
     return manifest
 
 
 def check_library(artefact: Path, manifest: Manifest) -> Path:
-    """The library of the artefact, which is code that will be executed.
+    """The library of the artefact, which is code that will be executed, as its declarations are.
 
-    InputError if it is not the one that the manifest describes, or others may have put it there:
-    it has to belong to this user or to root, and not to be writable for every user.
+    InputError if they are not those that the manifest describes, or others may have put them there:
+    they have to belong to this user or to root, and not to be writable for every user.
     """
-    path = artefact / LIBRARY
-    try:
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()
-        for one in (artefact, path):
-            check_owner(one)
-    except OSError as error:
-        raise InputError(
-            f"{path} cannot be read ({error.strerror or error}): run 'bayesrace build'"
-        ) from None
-    if digest != manifest.library_sha256:
-        raise InputError(f"{path} is not the library its manifest describes: run 'bayesrace build'")
-    return path
+    for path, expected in (
+        (artefact / DECLARATIONS, manifest.interface_sha256),
+        (artefact / LIBRARY, manifest.library_sha256),
+    ):
+        try:
+            digest = hashlib.sha256(path.read_bytes()).hexdigest()
+            for one in (artefact, path):
+                check_owner(one)
+        except OSError as error:
+            raise InputError(
+                f"{path} cannot be read ({error.strerror or error}): run 'bayesrace build'"
+            ) from None
+        if digest != expected:
+            raise InputError(
+                f"{path} is not the file its manifest describes: run 'bayesrace build'"
+            )
+    return artefact / LIBRARY
 
 
 def check_owner(path: Path) -> None:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Final
 from bayesrace.cache import cache_folder, digest, kept, locked, note_use, software
 from bayesrace.errors import InputError
 from bayesrace.manifest import (
+    DECLARATIONS,
     LIBRARY,
     MANIFEST,
     Manifest,
@@ -25,9 +26,9 @@ from bayesrace.manifest import (
     ProblemInfo,
     check_library,
     check_owner,
+    interface_version,
     read_manifest,
 )
-from bayesrace.native_interface import ABI, c_interface
 from bayesrace.vehicles import get_car
 from codegen.compiler import FLAGS, Compiler, find_compiler
 from codegen.settings import BuildSettings
@@ -61,7 +62,6 @@ _SHAPED_BY: Final = (
     "codegen",
     "bayesrace/vehicles",
     "bayesrace/integrators.py",
-    "bayesrace/native_interface.py",
 )
 
 
@@ -80,7 +80,7 @@ def build_hash(
             *compiler.command,
             compiler.version,
             *FLAGS,
-            *software(_SHAPED_BY, ("casadi",)),
+            *software(_SHAPED_BY, ("casadi", "cffi")),
         ]
     )
 
@@ -104,7 +104,7 @@ def problem_of(settings: BuildSettings) -> "Problem":
 
 
 def generate(problem: "Problem", settings: BuildSettings, folder: Path) -> None:
-    """Writes br_model.c, br_model.h, br_config.h, br_interface.h and br_problem.h into a folder."""
+    """Writes br_model.c, br_model.h, br_config.h and br_problem.h into a folder."""
     import casadi as ca
 
     from codegen.problems.generate import c_header, functions
@@ -117,7 +117,6 @@ def generate(problem: "Problem", settings: BuildSettings, folder: Path) -> None:
         generator.add(function)
     generator.generate(str(folder) + os.sep)
     (folder / "br_problem.h").write_text(c_header(problem))
-    (folder / "br_interface.h").write_text(c_interface())
     free, block = settings.blocks
     (folder / "br_config.h").write_text(
         "/* generated: dimensions of this controller */\n"
@@ -127,6 +126,7 @@ def generate(problem: "Problem", settings: BuildSettings, folder: Path) -> None:
         f"#define BR_BLOCK {block}\n"
         f"#define BR_TS {settings.discretisation.step_s!r}\n"
         f"#define BR_GP_CAPACITY {settings.gp_capacity}\n"
+        f"#define BR_ABI {interface_version()}\n"
         f'#define BR_MODEL_NAME "{settings.model}"\n'
         f'#define BR_MODEL_IDENTITY "{_model_identity(settings)}"\n'
         "#endif\n"
@@ -158,6 +158,26 @@ def _compile(problem: "Problem", settings: BuildSettings, compiler: Compiler, fo
     shutil.copy(include / "licenses" / "daqp-external" / "LICENSE", folder / "daqp")
     shutil.copy(daqp, folder)
     (folder / LIBRARY).write_bytes(_library(compiler, folder, folder / daqp.name))
+    _write_declarations(compiler, folder)
+
+
+def _write_declarations(compiler: Compiler, folder: Path) -> None:
+    """Writes what the headers declare in cffi's own form, which it reads within a millisecond; to
+    parse C takes it a hundred."""
+    from cffi import FFI
+    from cffi.recompiler import make_py_source
+
+    with tempfile.TemporaryDirectory() as temporary:
+        empty = Path(temporary)
+        for name in ("stddef.h", "stdint.h"):  # cffi knows their types
+            (empty / name).touch()
+        text = empty / "interface.i"
+        includes = ("-nostdinc", f"-I{empty}", f"-I{folder}")
+        header = folder / "bayesrace_cycle.h"
+        compiler.run("-E", "-P", "-DBR_API=", *includes, header, "-o", text)
+        ffi = FFI()
+        ffi.cdef(text.read_text())
+        make_py_source(ffi, Path(DECLARATIONS).stem, str(folder / DECLARATIONS))
 
 
 def _library(compiler: Compiler, folder: Path, daqp: Path) -> bytes:
@@ -230,7 +250,7 @@ def build(
             _compile(problem, settings, compiler, folder)
             manifest = _manifest(problem, settings, compiler, identity, folder)
             (folder / MANIFEST).write_text(manifest.model_dump_json(indent=1) + "\n")
-            for one in (folder, folder / LIBRARY):
+            for one in (folder, folder / LIBRARY, folder / DECLARATIONS):
                 one.chmod(_MODE)
             folder.rename(target)
     note_use(made=True)
@@ -264,7 +284,7 @@ def _manifest(
     """What the compiled controller in the folder is."""
     car = get_car(settings.car)
     return Manifest(
-        abi=ABI,
+        abi=interface_version(),
         problem=ProblemInfo(
             name=problem.name,
             states=[one.name for one in problem.states],
@@ -296,4 +316,5 @@ def _manifest(
         flags=list(FLAGS),
         build_hash=identity,
         library_sha256=hashlib.sha256((folder / LIBRARY).read_bytes()).hexdigest(),
+        interface_sha256=hashlib.sha256((folder / DECLARATIONS).read_bytes()).hexdigest(),
     )

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
-from bayesrace.gp.weights import KERNELS, GpWeights, zero_weights
+from bayesrace.gp.weights import GpWeights, pack_weights, zero_weights
 from bayesrace.manifest import Manifest
 
 __all__ = [
@@ -75,26 +75,12 @@ def weights_file(weights: GpWeights | None, identity: str, capacity: int) -> byt
     """
     if weights is None:
         weights = zero_weights("none", identity)
-    if weights.discretisation != identity:
-        raise InputError(
-            f"weights '{weights.version}' were learned for {weights.discretisation}, this "
-            f"controller predicts with {identity}: train with the same car and discretisation"
-        )
-    if max(weights.counts) > capacity:
-        raise InputError(
-            f"weights '{weights.version}' have {max(weights.counts)} points, the controller was "
-            f"built for {capacity}: train with fewer points or build with a larger capacity"
-        )
+    weights.check_fit(identity, capacity)
     name = identity.encode()
     if len(name) >= IDENTITY_BYTES:
         raise InputError(f"the model's identity '{identity}' is too long for a weights file")
-    parts = [name.ljust(IDENTITY_BYTES, b"\0")]
-    for output in weights.outputs:
-        kernel = KERNELS.index(output.kernel)
-        parts.append(struct.pack("<IIdddd", kernel, output.count, *output.amplitudes))
-        numbers = (output.length_scales, output.inputs, output.alpha)
-        parts += [np.ascontiguousarray(array, dtype="<f8").tobytes() for array in numbers]
-    return _file(b"BRFMGPWT", b"".join(parts), capacity)
+    body = name.ljust(IDENTITY_BYTES, b"\0") + pack_weights(weights)
+    return _file(b"BRFMGPWT", body, capacity)
 
 
 def settings_file(values: Mapping[str, float]) -> str:

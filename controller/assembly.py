@@ -7,12 +7,18 @@ from pydantic import BaseModel, ValidationError
 
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_whole
-from bayesrace.gp.weights import GpWeights, decode_weights, encode_weights, read_weights
+from bayesrace.gp.weights import (
+    GpWeights,
+    decode_weights,
+    encode_weights,
+    pack_weights,
+    read_weights,
+)
 from bayesrace.raceline import RaceLine, read_raceline_for
 from bayesrace.tracks import Track, load_track
 from bayesrace.vehicles import CarParameters
 from controller.mpc import PredictiveController
-from controller.native_step import NativeStep, pack_weights, unpack_weights
+from controller.native_step import NativeStep
 from controller.path_table import PathTable, make_path_table
 from controller.settings import MpcSettings
 from controller.weights.adoption import WeightsPort
@@ -102,14 +108,14 @@ def predictive_controller(
         digest=digest_of(data),
         proven=True,
         data=data,
-        packed=pack_weights(loaded),
+        packed=b"" if loaded is None else pack_weights(loaded),
     )
     folder = None if store is None else Store(store, step.manifest.discretisation)
     history = History(entries=[first]) if folder is None else folder.restore(first)
     if (proven := history.reference) is not first:
         step.set_weights(decode_weights(proven.data))
     if history.in_use is not proven:  # a controller has ended while it watched them
-        step.stage_weights(unpack_weights(history.in_use.packed))
+        step.stage_weights(history.in_use.packed)
         step.adopt_weights()
     port = WeightsPort(artefact.resolve(), step, car, history, folder)
     return PredictiveController(step, history.in_use.version, port, driven_on.identity)

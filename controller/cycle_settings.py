@@ -1,10 +1,9 @@
 """Settings of the control cycle around the step: fallback and delay compensation."""
 
-from typing import Final, Literal
+from typing import Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from bayesrace.native_interface import COMPENSATIONS
 from bayesrace.vehicles.parameters import CarParameters
 
 __all__ = ["CompensationSettings", "FallbackSettings", "cycle_values", "input_limits"]
@@ -30,21 +29,22 @@ class FallbackSettings(BaseModel):
     )
 
 
+_Mode = Literal["off", "measured", "fixed"]
+"""In the order of br_compensation in controller/native/bayesrace_cycle.h."""
+
+
 class CompensationSettings(BaseModel):
     """Over which delay the state is predicted: see controller/native/br_delay.c."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    mode: Literal["measured", "fixed", "off"] = Field(
+    mode: _Mode = Field(
         "measured", description="off: the state is taken as it is, as if everything were at once"
     )
     delay_s: float = Field(0.0, ge=0, le=1, description="delay from decision to acting if fixed")
     longest_s: float = Field(
         0.5, gt=0, le=1, description="no prediction goes farther; a longer delay is not covered"
     )
-
-
-_MODES: Final = tuple(name.lower() for name, _ in COMPENSATIONS)
 
 
 def cycle_values(
@@ -54,7 +54,7 @@ def cycle_values(
     stale_s: float,
     sensor_tolerance: float,
 ) -> dict[str, float]:
-    """The numbers of :data:`bayesrace.native_interface.DRIVING` by name, limits left out."""
+    """The numbers of br_driving (controller/native/bayesrace_cycle.h) by name, limits left out."""
     return {
         **car.brake_numbers,
         "standing_mps": car.tuning.driving.standing_mps,
@@ -62,7 +62,7 @@ def cycle_values(
         "shifted_s": fallback.shifted_s,
         "limit_tolerance": fallback.tolerance,
         "recover_cycles": fallback.recover_cycles,
-        "compensation": _MODES.index(compensation.mode),
+        "compensation": get_args(_Mode).index(compensation.mode),
         "delay_s": compensation.delay_s,
         "longest_s": compensation.longest_s,
         "stale_s": stale_s,

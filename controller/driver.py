@@ -5,13 +5,11 @@ count, stop and go, delay compensation, the step, the fallback. Times are the pl
 say otherwise, so lockstep and free-running mode are the same here.
 """
 
-import ctypes as ct
 import time
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 
 from bayesrace.messages import SENSOR_FAULTS, BrakingPlan, State
-from bayesrace.native_interface import NO_STEP, RECEPTIONS
 from bayesrace.transport import Numbering
 from bayesrace.vehicles.parameters import CarParameters
 from controller.cycle_settings import (
@@ -21,7 +19,6 @@ from controller.cycle_settings import (
     input_limits,
 )
 from controller.interface import Controller, Environment, StepOutput
-from controller.native_library import EnvironmentStructure, Layout, aligned_memory
 
 __all__ = [
     "DOUBTED",
@@ -35,8 +32,9 @@ __all__ = [
     "Phase",
 ]
 
-DOUBTED, UNPREDICTABLE, HALTED, NO_STATE, STEP_FAILED = (number for _, number, _ in NO_STEP)
-"""Statuses of a cycle without a result of a step: see there."""
+DOUBTED, UNPREDICTABLE, HALTED, NO_STATE, STEP_FAILED = range(251, 256)
+"""Statuses of a cycle without a result of a step: br_no_step in
+controller/native/bayesrace_cycle.h."""
 
 
 class Level(IntEnum):
@@ -49,7 +47,7 @@ class Level(IntEnum):
 
 
 class Phase(StrEnum):
-    """Life cycle of a controller: :data:`bayesrace.native_interface.PHASES`, in that order."""
+    """Life cycle of a controller, in the order of br_phase in bayesrace_cycle.h."""
 
     WAITING = "waiting"
     READY = "ready"
@@ -59,7 +57,6 @@ class Phase(StrEnum):
 
 
 _PHASES, _LEVELS = tuple(Phase), tuple(Level)
-_NEW, _STALE, _FOREIGN = range(len(RECEPTIONS))
 
 
 @dataclass(slots=True)
@@ -77,7 +74,7 @@ class Decision:
     step_us: float = 0.0
     """Execution time of the step."""
     fault: int = 0
-    """What speaks against the state: :data:`bayesrace.native_interface.FAULTS`; 0: nothing."""
+    """What speaks against the state: a number of :data:`bayesrace.messages.SENSOR_FAULTS`."""
     stepped: bool = False
     """Whether a step was made; :attr:`Driver.output` has its results."""
 
@@ -103,26 +100,22 @@ class Driver:
         artefact = controller.artefact
         artefact.check_cycle()
         library = self._library = artefact.library
-        self._memory, memory = aligned_memory(library.br_cycle_memory_size())
-        self._cycle = ct.c_void_p()
-        size = library.br_cycle_memory_size()
-        artefact.check(controller.begin_cycle(memory, size, hold, self._cycle), "control cycle")
+        ffi, size = artefact.ffi, library.br_cycle_memory_size()
+        self._memory, made = artefact.memory(size), ffi.new("br_cycle **")
+        artefact.check(controller.begin_cycle(self._memory, size, hold, made), "control cycle")
+        self._cycle = made[0]
         values = cycle_values(
             car, fallback, compensation, stale_s, sensor_tolerance
         ) | input_limits(car)
-        settings = ct.byref(artefact.Driving(**values))
+        settings = ffi.new("br_driving *", values)
         artefact.check(library.br_cycle_set_driving(self._cycle, settings), "cycle settings")
-        clock = ct.cast(library.br_mpc_monotonic, ct.c_void_p)
-        library.br_cycle_set_clock(self._cycle, clock, None)
-        self._counters = artefact.Counters.from_address(library.br_cycle_counters(self._cycle))
-        self._measured, self._decided = artefact.Measured(), artefact.Decision()
-        self._measured_at = ct.addressof(self._measured)
-        self._decided_address = ct.addressof(self._decided)
-        self._braking = artefact.Braking()
-        self._braking_address = ct.addressof(self._braking)
-        self._write_measured = Layout(artefact.Measured, "delays").write
-        self._read_decided = Layout(artefact.Decision, "fault").read
-        self._decide = library.br_cycle_decide
+        clock = ffi.addressof(library, "br_mpc_monotonic")
+        library.br_cycle_set_clock(self._cycle, clock, ffi.NULL)
+        self._counters = library.br_cycle_counters(self._cycle)
+        self._measured = ffi.new("br_measured *")
+        self._measured.averaged = 1
+        self._decided, self._braking = ffi.new("br_decision *"), ffi.new("br_braking *")
+        self._new, self._null = ffi.new, ffi.NULL
         self._refused: State | None = None
         self.last_error = ""
         """Of the last step that was broken; empty if none was."""
@@ -157,19 +150,26 @@ class Driver:
         return list(self._counters.levels)
 
     def count(self, name: str) -> int:
-        """One of the counters of :data:`bayesrace.native_interface.COUNTERS`."""
+        """One of br_counters in controller/native/bayesrace_cycle.h."""
         return int(getattr(self._counters, name))
 
     @property
     def faults(self) -> dict[str, int]:
         """States by what speaks against them: :data:`bayesrace.messages.SENSOR_FAULTS`."""
-        return dict(zip(SENSOR_FAULTS[1:], self._counters.faults[1:], strict=True))
+        return dict(zip(SENSOR_FAULTS[1:], list(self._counters.faults)[1:], strict=True))
 
     @property
     def fault(self) -> str:
         """What speaks against the newest state; empty: nothing."""
         fault: int = self._counters.fault
         return SENSOR_FAULTS[fault]
+
+    @property
+    def fault_text(self) -> str:
+        """The same as a sentence."""
+        return self.controller.artefact.text(
+            self._library.br_cycle_fault_text(self._counters.fault)
+        )
 
     @property
     def output(self) -> StepOutput | None:
@@ -206,18 +206,18 @@ class Driver:
     def observe(self, state: State) -> bool:
         """Takes a state that has arrived; False if it is not to be driven on."""
         measured, delays_s = self._measured, state.actuation_delays[2::3]
-        self._write_measured(
-            measured, 0, state.epoch, state.run, state.seq, state.time_s, *state.x,
-            *state.u_applied, True, state.lockstep, len(delays_s),
-        )  # fmt: skip
-        if delays_s:
-            measured.delays_s[: len(delays_s)] = delays_s
-        reception = self._library.br_cycle_observe(self._cycle, self._measured_at)
-        if reception != _FOREIGN:
+        measured.epoch, measured.run, measured.seq = state.epoch, state.run, state.seq
+        measured.time_s, measured.lockstep = state.time_s, state.lockstep
+        measured.x, measured.u_applied = state.x, state.u_applied
+        measured.delays = len(delays_s)
+        measured.delays_s[0 : len(delays_s)] = delays_s
+        library = self._library
+        reception = library.br_cycle_observe(self._cycle, measured)
+        if reception != library.BR_STATE_FOREIGN:
             if self.newest is not None and state.epoch != self.newest.epoch:
                 self.numbering.restart()
             self.numbering.note(state.seq)
-        if reception != _NEW:
+        if reception != library.BR_STATE_NEW:
             self._refused = state
             return False
         self.newest = state
@@ -235,29 +235,29 @@ class Driver:
         ``budget_s``: how long after its release the cycle should be done; 0: no limit but the
         step's own. ``spent_s``: how long ago the release is. InputError before the first state.
         """
-        decision = self.decision
-        around = None if environment is None else ct.byref(EnvironmentStructure(*environment))
-        error = self._decide(
-            self._cycle, around, decided_at_s, budget_s, spent_s, self._decided_address
+        decision, decided, around = self.decision, self._decided, self._null
+        if environment is not None:
+            around = self._new("br_environment *", environment)
+        error = self._library.br_cycle_decide(
+            self._cycle, around, decided_at_s, budget_s, spent_s, decided
         )
         self.controller.artefact.check(error, "control cycle")
         self.controller.raise_pending()
-        decided = self._read_decided(self._decided)
-        decision.d, decision.delta_rate = decided.u0, decided.u1
+        decision.d, decision.delta_rate = decided.u
         decision.level, decision.status = _LEVELS[decided.level], decided.status
         decision.decided_at_s, decision.delay_s = decided.decided_at_s, decided.delay_s
         decision.fault = decided.fault
         decision.step_us, decision.stepped = decided.step_us, bool(decided.stepped)
         if decision.status == STEP_FAILED:
-            text = self._library.br_mpc_error_text(decided.error).decode()
-            self.last_error = self.controller.last_error or text
+            text = self._library.br_mpc_error_text(decided.error)
+            self.last_error = self.controller.last_error or self.controller.artefact.text(text)
         return decision
 
     def braking(self, seq: int) -> BrakingPlan | None:
         """What the car's guard shall do if nothing more comes; None for a car that is halted or
         whose controller knows no line."""
         plan, newest = self._braking, self.newest
-        if newest is None or self._library.br_cycle_brake(self._cycle, self._braking_address):
+        if newest is None or self._library.br_cycle_brake(self._cycle, plan):
             return None
         return BrakingPlan(
             seq=seq,
@@ -266,8 +266,8 @@ class Driver:
             run=newest.run,
             begins_s=max(plan.begins_s, 0.0),
             step_s=plan.step_s,
-            d=tuple(round(one, 6) for one in plan.duty[: plan.rows]),
-            delta=tuple(round(one, 6) for one in plan.delta_rad[: plan.rows]),
+            d=tuple(round(one, 6) for one in plan.duty[0 : plan.rows]),
+            delta=tuple(round(one, 6) for one in plan.delta_rad[0 : plan.rows]),
         )
 
     def prepare(self, period_s: float, budget_s: float = 0.0) -> None:

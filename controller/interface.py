@@ -1,9 +1,8 @@
 """What the control cycle drives: the compiled controller, or a control law written in Python."""
 
-import ctypes as ct
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
 import numpy as np
 
@@ -24,7 +23,7 @@ _NO_STATES: Final[Floats] = np.zeros((0, 7))
 
 
 class Environment(NamedTuple):
-    """What limits the car besides: :data:`bayesrace.native_interface.ENVIRONMENT`."""
+    """What limits the car besides: br_environment in controller/native/bayesrace_mpc.h."""
 
     speed_limit_mps: float = math.inf
     speed_limit_rate_mps2: float = 0.0
@@ -72,10 +71,10 @@ class Controller(Protocol):
     def artefact(self) -> "Artefact":
         """Whose control cycle it is driven by."""
 
-    def begin_cycle(self, memory: ct.c_void_p, size: int, hold: bool, cycle: ct.c_void_p) -> int:
+    def begin_cycle(self, memory: Any, size: int, hold: bool, cycle: Any) -> int:
         """Makes the br_cycle that drives it in that memory; returns a br_mpc_error."""
 
-    def result(self, cycle: ct.c_void_p) -> StepOutput:
+    def result(self, cycle: Any) -> StepOutput:
         """Of the last step of that cycle; valid until the next."""
 
     def raise_pending(self) -> None:

@@ -1,17 +1,14 @@
 """The predictive controller as the process drives it: native step, weights, telemetry."""
 
-import ctypes as ct
-from typing import Final
+from typing import Any
 
 from bayesrace.gp.weights import decode_weights
 from controller.interface import StepOutput
-from controller.native_library import Artefact, Layout, StepInfo, StepStatus
+from controller.native_library import Artefact, StepStatus
 from controller.native_step import NativeStep
 from controller.weights.adoption import WeightsPort
 
 __all__ = ["PredictiveController"]
-
-_INFO: Final = Layout(StepInfo, "lateral_m")
 
 
 class PredictiveController:
@@ -69,18 +66,18 @@ class PredictiveController:
         self.native.revert_weights()
         self._version = version
 
-    def begin_cycle(self, memory: ct.c_void_p, size: int, hold: bool, cycle: ct.c_void_p) -> int:
+    def begin_cycle(self, memory: Any, size: int, hold: bool, cycle: Any) -> int:
         """With the compiled step, called from C."""
         native = self.native
         drive = native.artefact.library.br_cycle_drive_mpc
-        return int(drive(memory, size, native.handle, hold, ct.byref(cycle)))
+        return int(drive(memory, size, native.handle, hold, cycle))
 
     def raise_pending(self) -> None:
         """Nothing: its step is C."""
 
-    def result(self, cycle: ct.c_void_p) -> StepOutput:
+    def result(self, cycle: Any) -> StepOutput:
         """Of the cycle's last step; the plan, too, if it is not usable."""
-        info = _INFO.read(StepInfo.from_address(self.artefact.library.br_cycle_info(cycle)))
+        info = self.artefact.library.br_cycle_info(cycle)
         output = self._output
         self.native.read_plan()
         self.native.read_tube()

@@ -4,9 +4,8 @@ For comparisons, data collection and tests: it has the same fallback, delay comp
 and stop. Each call costs some microseconds for the way from C into Python.
 """
 
-import ctypes as ct
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -17,28 +16,6 @@ from controller.interface import ControlLaw, Environment, StepOutput
 from controller.native_library import Artefact
 
 __all__ = ["PythonController"]
-
-_DOUBLES: Final = ct.POINTER(ct.c_double)
-_STEP = ct.CFUNCTYPE(
-    ct.c_int, ct.c_void_p, _DOUBLES, _DOUBLES, _DOUBLES, ct.c_double, ct.c_double, ct.c_void_p
-)
-_PREPARE = ct.CFUNCTYPE(None, ct.c_void_p, ct.c_double, ct.c_double)
-_REHEARSE = _RESET = ct.CFUNCTYPE(None, ct.c_void_p)
-_PREDICT = ct.CFUNCTYPE(ct.c_int, ct.c_void_p, _DOUBLES, _DOUBLES, ct.c_double, _DOUBLES)
-
-
-class _Functions(ct.Structure):
-    """br_controller in controller/native/bayesrace_cycle.h."""
-
-    _fields_ = [
-        ("self", ct.c_void_p),
-        ("step", _STEP),
-        ("prepare", _PREPARE),
-        ("rehearse", _REHEARSE),
-        ("predict", _PREDICT),
-        ("reset", _RESET),
-        ("steer", ct.c_void_p),
-    ]
 
 
 class PythonController:
@@ -58,22 +35,25 @@ class PythonController:
         self._pending: BaseException | None = None
         self._was_reset = True
         self._result = StepOutput(u=np.zeros(2))
-        self._functions = _Functions(
-            None,
-            _STEP(self._step),
-            _PREPARE(lambda *_: None),
-            _REHEARSE(lambda _: None),
-            _PREDICT(self._predict),
-            _RESET(self._reset),
-            None,  # braking, its steering is held
-        )
+        ffi = self.artefact.ffi
+        types = dict(ffi.typeof("br_controller").fields)
+        functions: dict[str, Any] = {
+            "step": self._step,
+            "prepare": lambda *_: None,
+            "rehearse": lambda _: None,
+            "predict": self._predict,
+            "reset": self._reset,
+        }  # without "steer": braking, its steering is held
+        self._functions = {
+            name: ffi.callback(types[name].type, function) for name, function in functions.items()
+        }
 
-    def begin_cycle(self, memory: ct.c_void_p, size: int, hold: bool, cycle: ct.c_void_p) -> int:
+    def begin_cycle(self, memory: Any, size: int, hold: bool, cycle: Any) -> int:
         """With this object's functions."""
-        init = self.artefact.library.br_cycle_init
-        return int(init(memory, size, ct.byref(self._functions), hold, ct.byref(cycle)))
+        controller = self.artefact.ffi.new("br_controller *", self._functions)
+        return int(self.artefact.library.br_cycle_init(memory, size, controller, hold, cycle))
 
-    def result(self, cycle: ct.c_void_p) -> StepOutput:
+    def result(self, cycle: Any) -> StepOutput:
         """What the law returned."""
         return self._result
 
@@ -118,14 +98,15 @@ class PythonController:
         environment: Any,
         elapsed_s: float,
         budget_s: float,
-        solution: int,
+        solution: Any,
     ) -> int:
         if not self._was_reset:
             return STEP_FAILED
         try:
-            around = Environment(environment[0], environment[1])
-            output = self.law.step(_array(x, 7), _array(u_before, 2), around, elapsed_s, budget_s)
-            self._fill(self.artefact.Solution.from_address(solution), output)
+            around = Environment(*(getattr(environment, name) for name in Environment._fields))
+            given = self._array(x, 7), self._array(u_before, 2)
+            output = self.law.step(*given, around, elapsed_s, budget_s)
+            self._fill(solution, output)
             if not 0 <= output.status < DOUBTED:
                 raise ValueError(f"status {output.status} is not from 0 to {DOUBTED - 1}")
         except BaseException as error:
@@ -136,23 +117,22 @@ class PythonController:
 
     def _fill(self, solution: Any, output: StepOutput) -> None:
         rows = min(len(output.plan_u), self.artefact.manifest.horizon)
-        solution.u[:] = output.u.tolist()
+        solution.u[0:2] = output.u.tolist()
         solution.rows = rows
-        solution.plan_u[: 2 * rows] = output.plan_u[:rows].ravel().tolist()
+        solution.plan_u[0 : 2 * rows] = output.plan_u[:rows].ravel().tolist()
         solution.plan_step_s = output.plan_step_s
         solution.second_start = output.second_start
         solution.cost, solution.shifted_cost = output.cost, output.cost_shifted
 
     def _predict(self, _: Any, x: Any, u: Any, duration_s: float, x_next: Any) -> int:
         try:
-            after = self.law.predict(_array(x, 7), _array(u, 2), duration_s)
-            np.ctypeslib.as_array(x_next, (7,))[:] = after
+            after = self.law.predict(self._array(x, 7), self._array(u, 2), duration_s)
+            x_next[0:7] = after.tolist()
         except BaseException as error:
             self._caught(error)
             return -1
         return 0
 
-
-def _array(pointer: Any, count: int) -> Floats:
-    """A copy."""
-    return np.array(pointer[:count])
+    def _array(self, pointer: Any, count: int) -> Floats:
+        """A copy."""
+        return np.array(self.artefact.ffi.unpack(pointer, count))

@@ -16,7 +16,6 @@ from bayesrace.messages import (
     Scalar,
     Status,
 )
-from bayesrace.native_interface import FAULTS
 from bayesrace.transport import Heartbeat, Inbox, Item, Kind, Publisher, Request, decode_request
 from controller.driver import Driver, Level
 from controller.interface import Controller
@@ -24,7 +23,6 @@ from controller.interface import Controller
 __all__ = ["Service"]
 
 _REMEDY: Final = "the car stops along the line; look at the sensors, then 'bayesrace go'"
-_FAULT_TEXTS: Final = {name.lower(): text for name, text in FAULTS}
 
 
 class Service:
@@ -80,7 +78,7 @@ class Service:
             return
         self._fault_reported = bool(fault)
         if fault:
-            self.announce("sensor_fault", f"{fault}: {_FAULT_TEXTS[fault]}", {"fault": fault})
+            self.announce("sensor_fault", f"{fault}: {self._driver.fault_text}", {"fault": fault})
         else:
             self.announce("sensor_recovered", "the measured states are believed again", {})
 
@@ -122,7 +120,7 @@ class Service:
     def _words(self) -> str:
         driver, words = self._driver, [self._text]
         if fault := driver.fault:
-            words.append(f"sensor fault '{fault}': {_FAULT_TEXTS[fault]}; {_REMEDY}")
+            words.append(f"sensor fault '{fault}': {driver.fault_text}; {_REMEDY}")
         failed = driver.count("failed")
         if failed:
             words.append(f"{failed} step(s) failed, the last {driver.last_error}")

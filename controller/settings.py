@@ -1,15 +1,18 @@
 """Run-time settings of the OCP (paper, equation 8) and of the SQP that solves it."""
 
 from statistics import NormalDist
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from bayesrace.native_interface import SOLVER
 from bayesrace.option import Option
 from bayesrace.vehicles import CarParameters
 
 __all__ = ["MpcSettings"]
+
+
+_SOLVER: Final = ("tolerance", "defect_max", "early_stop_tol", "iterations", "iterations_cold")
+"""BR_SOLVER_FIELDS in controller/native/bayesrace_mpc.h that have the names of settings."""
 
 
 def _objective(text: str) -> Any:
@@ -81,7 +84,7 @@ class MpcSettings(BaseModel):
         tuning = car.tuning.objective.model_dump(exclude={"horizon"})
         if problem == "progress":
             tuning |= car.tuning.progress.run_time
-        known = {*tuning, *(name for name, *_ in SOLVER)}
+        known = {*tuning, *_SOLVER}
         stated = self.model_dump(include=known, exclude_none=True)
         values = tuning | stated
         if not self.constraints:

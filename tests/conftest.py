@@ -17,7 +17,6 @@ from bayesrace.arrays import Floats
 from bayesrace.gp.expression import kernel_matrix
 from bayesrace.gp.weights import KERNELS, GpOutput, GpWeights
 from bayesrace.integrators import PREDICTION, Discretisation
-from bayesrace.native_interface import SOLVER
 from bayesrace.raceline.line import RaceLine
 from bayesrace.tracks import Track
 from bayesrace.vehicles import CarParameters, get_car
@@ -242,7 +241,9 @@ def native_numbers(settings: MpcSettings, car: CarParameters, weights: GpWeights
     """Parameters and weights in the order of the C structures, as the C programs read them."""
     values = settings.parameters(car)
     problem = tracking(e_kinematic(car), PREDICTION)
-    names = [*(one.name for one in problem.parameters), *(name for name, *_ in SOLVER)]
+    solver = ("tolerance", "defect_max", "early_stop_tol", "caution_sigmas", "iterations",
+              "iterations_cold")  # fmt: skip
+    names = [*(one.name for one in problem.parameters), *solver]
     parts: list[ArrayLike] = [[values[name] for name in names]]
     for output in weights.outputs:
         parts.append([KERNELS.index(output.kernel), output.count, *output.amplitudes])

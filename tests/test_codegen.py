@@ -1,10 +1,9 @@
 """Code generation: the cache's hash sees everything, what cannot be built or loaded is reported."""
 
-import hashlib
 import os
 import shutil
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, cast
@@ -19,7 +18,7 @@ from bayesrace.errors import InputError
 from bayesrace.integrators import PERFECT, PREDICTION, Discretisation
 from bayesrace.interpreter import RUN_MODULE
 from bayesrace.manifest import LIBRARY, MANIFEST, read_manifest
-from bayesrace.native_interface import ABI, INFO, STATUSES
+from bayesrace.messages.types import BRAKING_ROWS, SENSOR_FAULTS
 from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import MODELS
 from codegen.build import build, build_hash, generate
@@ -27,9 +26,19 @@ from codegen.compiler import FLAGS, CompileError, Compiler, find_compiler
 from codegen.problems.problem import Problem
 from codegen.settings import BuildSettings
 from codegen.stage import linearise_function
-from controller.native_library import StepInfo, StepStatus
+from controller.driver import (
+    DOUBTED,
+    HALTED,
+    NO_STATE,
+    STEP_FAILED,
+    UNPREDICTABLE,
+    Level,
+    Phase,
+)
+from controller.native_library import Artefact, StepStatus
 from controller.native_step import NativeStep
 from controller.settings import MpcSettings
+from controller.weights.settings import SAMPLES, WATCHED
 
 SMALL = BuildSettings(
     horizon=3, gp_capacity=8, discretisation=Discretisation(scheme="euler", pose="integrated")
@@ -272,7 +281,7 @@ def test_a_damaged_library_is_refused(artefact: Path, car: CarParameters) -> Non
     data[len(data) // 2] ^= 1
     (artefact / LIBRARY).unlink()  # this process has it loaded: never write into that file
     (artefact / LIBRARY).write_bytes(data)
-    with pytest.raises(InputError, match=r"not the library its manifest describes.*build"):
+    with pytest.raises(InputError, match=r"not the file its manifest describes.*build"):
         load(artefact, car)
     (artefact / LIBRARY).unlink()
     with pytest.raises(InputError, match="cannot be read"):
@@ -324,19 +333,6 @@ def test_what_is_built_may_be_loaded_whatever_the_umask(car: CarParameters) -> N
         os.umask(before)
 
 
-def test_a_library_without_its_functions_is_refused(artefact: Path, car: CarParameters) -> None:
-    source = artefact / "empty.c"
-    source.write_text(f"int br_mpc_abi(void) {{ return {ABI}; }}\n")
-    (artefact / LIBRARY).unlink()
-    line = [*find_compiler().command, "-shared", "-fPIC", str(source), "-o"]
-    subprocess.run([*line, str(artefact / LIBRARY)], check=True)
-    digest = hashlib.sha256((artefact / LIBRARY).read_bytes()).hexdigest()
-    manifest = read_manifest(artefact).model_copy(update={"library_sha256": digest})
-    (artefact / MANIFEST).write_text(manifest.model_dump_json())
-    with pytest.raises(InputError, match=r"lacks a function.*build"):
-        load(artefact, car)
-
-
 def test_a_compiler_command_that_cannot_be_read_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CC", "gcc 'unbalanced")
     with pytest.raises(InputError, match=r"CC=gcc 'unbalanced: No closing quotation"):
@@ -351,13 +347,27 @@ def test_a_manifest_of_another_interface_is_refused(artefact: Path, car: CarPara
         load(artefact, car)
 
 
-def test_the_binding_has_the_names_of_the_interface() -> None:
-    """They are written out for readers and type checkers; C is made from the tables."""
-    assert [(one.name, one.value) for one in StepStatus] == [
-        (name, number) for number, (name, _, _) in enumerate(STATUSES)
-    ]
-    assert list(StepInfo.__annotations__) == [name for name, _, _ in INFO]
-    assert StepStatus.TIME_LIMIT.text == "out of time before the plan was usable"
+def test_the_names_and_numbers_in_python_are_those_of_the_header(kinematic_artefact: Path) -> None:
+    artefact = Artefact(kinematic_artefact)
+    no_steps = {"DOUBTED": DOUBTED, "UNPREDICTABLE": UNPREDICTABLE, "HALTED": HALTED,
+                "NO_STATE": NO_STATE, "STEP_FAILED": STEP_FAILED}  # fmt: skip
+    tables: dict[str, tuple[str, Iterable[str]]] = {
+        "br_mpc_status": ("", StepStatus.__members__),
+        "br_level": ("", Level.__members__),
+        "br_no_step": ("", no_steps),
+        "br_phase": ("PHASE_", Phase.__members__),
+        "br_fault": ("FAULT_", ["NONE", *(name.upper() for name in SENSOR_FAULTS[1:])]),
+        "br_compensation": ("COMPENSATION_", ["OFF", "MEASURED", "FIXED"]),
+    }
+    for name, (prefix, names) in tables.items():
+        elements = artefact.ffi.typeof(name).elements
+        assert list(elements.values()) == [f"BR_{prefix}{one}" for one in names]
+        first = 251 if name == "br_no_step" else 0
+        assert list(elements) == list(range(first, first + len(elements)))
+    assert list(no_steps.values()) == list(range(251, 256))
+    duty = dict(artefact.ffi.typeof("br_braking").fields)["duty"].type
+    numbers = duty.length, artefact.library.BR_SAMPLES, artefact.library.BR_WATCHED
+    assert numbers == (BRAKING_ROWS, SAMPLES, WATCHED)
 
 
 @pytest.mark.parametrize("text", ["", "{", "{}", '{"abi": "one"}'])

@@ -10,7 +10,6 @@ import pytest
 
 from bayesrace.arrays import Floats
 from bayesrace.messages import State
-from bayesrace.native_interface import LEVELS, PHASES
 from bayesrace.vehicles import CarParameters, default_car
 from bayesrace.vehicles.models import dynamic
 from controller.cycle_settings import CompensationSettings, FallbackSettings
@@ -382,8 +381,3 @@ def test_second_starts_and_jumps_of_the_cost_are_counted(kinematic_artefact: Pat
     driver.observe(state(0))
     driver.decide(0.0)
     assert (driver.count("second_starts"), driver.count("cost_jumps")) == (1, 1)
-
-
-def test_names_are_those_of_the_interface() -> None:
-    assert [one.name for one in Level] == [name for name, _ in LEVELS]
-    assert [one.name for one in Phase] == [name for name, _ in PHASES]

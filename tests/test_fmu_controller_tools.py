@@ -221,7 +221,7 @@ def test_weights_are_exchanged_without_compiling(
     same(answers(exported.slave(out), run.x), run)
     exchange_weights(out, None, out)  # in place
     worst = lockstep()
-    worst.native.set_zero_weights()
+    worst.native.load_weights(b"")
     worst.run(circuit.start(v_mps=1.0), 60)
     controller = Slave(out, tmp_path / "worst")
     controller.initialise()

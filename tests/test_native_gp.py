@@ -1,6 +1,5 @@
 """The compiled model: CasADi's numbers and derivatives for every kernel; weights refused."""
 
-import ctypes as ct
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +14,6 @@ from bayesrace.gp.weights import KERNELS, GpWeights, zero_weights
 from bayesrace.integrators import PERFECT, PREDICTION
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic, e_kinematic
-from controller.native_library import Gp
 from controller.native_step import NativeStep
 from controller.settings import MpcSettings
 from tests.conftest import LENGTH_SCALES, fit_weights, smooth_drive
@@ -235,10 +233,13 @@ def test_the_c_interface_refuses_spoiled_weights_and_keeps_the_old(
     """What the file format already refuses, once more at the boundary that C callers use."""
     n = 12
     lengths, inputs, alpha = np.ones(6), np.ones((n, 6)), np.ones(n)
-    outputs = (Gp * 3)()
+    ffi = native.artefact.ffi
+    outputs = ffi.new("br_mpc_gp[3]")
     for gp in outputs:
         gp.n, gp.scale = n, 1.0
-        gp.length_scales, gp.inputs, gp.alpha = (a.ctypes.data for a in (lengths, inputs, alpha))
+        gp.length_scales, gp.inputs, gp.alpha = (
+            ffi.from_buffer("double[]", array) for array in (lengths, inputs, alpha)
+        )
     bad = outputs[2]
     spare = np.array([0.0, -1.0, np.nan])
     if spoil.startswith("alpha"):
@@ -257,8 +258,8 @@ def test_the_c_interface_refuses_spoiled_weights_and_keeps_the_old(
         bad.scale = np.inf
     else:
         field = {"alpha": "alpha", "inputs": "inputs", "lengths": "length_scales"}
-        setattr(bad, field[spoil.split()[1]], None)
+        setattr(bad, field[spoil.split()[1]], ffi.NULL)
     before = answers(native)
     error_weights = 5
-    assert native._library.br_mpc_set_weights(native._mpc, ct.byref(outputs)) == error_weights
+    assert native._library.br_mpc_set_weights(native.handle, outputs) == error_weights
     assert answers(native) == before

@@ -211,17 +211,6 @@ def test_what_is_not_finite_is_refused(
             corrected.predict(x, u, duration_s)
 
 
-def test_the_answer_goes_where_it_is_asked_to(corrected: NativeStep, car: CarParameters) -> None:
-    x, u = drives(car)[3]
-    first = corrected.predict(x, u, 0.03)
-    kept = first.copy()
-    place = x.copy()
-    assert corrected.predict(place, u, 0.03, place) is place
-    assert place.tobytes() == kept.tobytes()
-    corrected.predict(x, -u, 0.05)
-    assert first.tobytes() == kept.tobytes()
-
-
 def test_predicting_leaves_the_controller_as_it_is(
     corrected: NativeStep, nominal: NativeStep, recorded: list[Problem], weights: GpWeights
 ) -> None:

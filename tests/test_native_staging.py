@@ -2,6 +2,7 @@
 
 import platform
 import shutil
+import struct
 import subprocess
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,9 +12,9 @@ import pytest
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import GpWeights
+from bayesrace.gp.weights import GpWeights, pack_weights
 from bayesrace.vehicles import CarParameters
-from controller.native_step import NativeStep, pack_weights, unpack_weights
+from controller.native_step import NativeStep
 from tests.conftest import SETTINGS, Circuit, Problem, fit_weights, mirrored_weights
 from tests.native_programs import OPTIMISED, PROGRAMS, native_program
 
@@ -48,7 +49,7 @@ def drive(native: NativeStep, recorded: list[Problem], takeovers: Mapping[int, b
     inputs = []
     for k, problem in enumerate(recorded[:100]):
         if k in takeovers:
-            native.stage_weights(unpack_weights(takeovers[k]))
+            native.stage_weights(takeovers[k])
             native.adopt_weights()
         native.prepare()
         native.step(problem.x0, problem.d_previous)
@@ -99,7 +100,7 @@ def test_staging_changes_nothing_before_the_adoption(
     x, u = recorded[50].x0, np.array([0.5, 0.1])
     before = native.predict(x, u, 0.02)
     packed = pack_weights(mirrored_weights(weights))
-    native.stage_weights(unpack_weights(packed))
+    native.stage_weights(packed)
     assert native.predict(x, u, 0.02).tobytes() == before.tobytes()
     native.adopt_weights()
     assert native.predict(x, u, 0.02).tobytes() != before.tobytes()
@@ -109,10 +110,11 @@ def test_staging_changes_nothing_before_the_adoption(
 
 def test_unusable_weights_are_not_staged(native: NativeStep, weights: GpWeights) -> None:
     packed = pack_weights(weights)
-    outputs = unpack_weights(packed)
-    outputs[1].scale = float("inf")
+    scale = struct.pack("<d", weights.outputs[0].amplitudes[1])
     with pytest.raises(InputError, match="unusable"):
-        native.stage_weights(outputs)
+        native.stage_weights(packed.replace(scale, struct.pack("<d", np.inf)))
+    with pytest.raises(InputError, match="not the weights of the 3 outputs"):
+        native.stage_weights(packed[:-8])
     with pytest.raises(InputError, match="no weights are staged"):
         native.adopt_weights()
 

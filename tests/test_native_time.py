@@ -1,8 +1,8 @@
 """The compiled step and time: the plan keeps in step with it, and a budget is used and kept."""
 
-import ctypes as ct
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -41,21 +41,21 @@ class Clock:
     """A host's clock on which every reading takes ``tick_s``."""
 
     def __init__(self, step: NativeStep, tick_s: float) -> None:
-        self.now_s = 0.0
+        self.now_s: float = 0.0
         self.tick_s = tick_s
-        prototype = ct.CFUNCTYPE(ct.c_double, ct.c_void_p)
-        self._callback = prototype(self._read)
+        ffi = step.artefact.ffi
+        self._callback = ffi.callback("br_mpc_clock", self._read)
         _CLOCKS.append(self)  # the library calls it as long as the controller is used
-        pointer = ct.cast(self._callback, ct.c_void_p)
-        step._check(step._library.br_mpc_set_clock(step._mpc, pointer, None), "clock")
+        error = step._library.br_mpc_set_clock(step.handle, self._callback, ffi.NULL)
+        step._check(error, "clock")
 
-    def _read(self, _: int | None) -> float:
+    def _read(self, _: Any) -> float:
         self.now_s += self.tick_s
         return self.now_s
 
 
 def residual(step: NativeStep) -> float:
-    return max(step.info.stationarity, 0.1 * step.info.defect)
+    return float(max(step.info.stationarity, 0.1 * step.info.defect))
 
 
 # --- the plan keeps in step --------------------------------------------------------------------
@@ -229,7 +229,8 @@ def test_no_budget_means_the_iteration_limits(
 
 def test_without_a_clock_there_is_no_budget(make: Make, recorded: list[Problem]) -> None:
     step, plain = make(), make()
-    step._check(step._library.br_mpc_set_clock(step._mpc, None, None), "clock")
+    null = step.artefact.ffi.NULL
+    step._check(step._library.br_mpc_set_clock(step.handle, null, null), "clock")
     for p in recorded[:20]:
         assert solve(step, p, budget_s=1.0) is solve(plain, p)
         assert step.u.tobytes() == plain.u.tobytes()
@@ -307,6 +308,8 @@ def test_the_systems_clock_runs(make: Make, recorded: list[Problem]) -> None:
 
 
 def test_every_status_has_the_librarys_text(native: NativeStep) -> None:
-    for status in StepStatus:
-        assert native._library.br_mpc_status_text(status).decode() == status.text
-    assert native._library.br_mpc_status_text(len(StepStatus)) == b"unknown status"
+    known = len(StepStatus)
+    numbers = (*range(known), known)
+    texts = [native.artefact.text(native._library.br_mpc_status_text(i)) for i in numbers]
+    assert len(set(texts)) == known + 1
+    assert (texts[StepStatus.BAD_STATE], texts[-1]) == ("bad state", "unknown status")

@@ -41,6 +41,7 @@ __all__ = [
     "GpWeights",
     "decode_weights",
     "encode_weights",
+    "pack_weights",
     "read_weights",
     "write_weights",
     "zero_weights",
@@ -207,6 +208,21 @@ class GpWeights:
                 f"{features.shape} and {residuals.shape}, expected {shapes[0]} and {shapes[1]}"
             )
 
+    def check_fit(self, discretisation: str, capacity: int) -> None:
+        """InputError unless a controller can use them that predicts by ``discretisation`` and has
+        room for ``capacity`` training points per output."""
+        if self.discretisation != discretisation:
+            raise InputError(
+                f"weights '{self.version}' were learned for {self.discretisation}, this "
+                f"controller predicts with {discretisation}: train with the same car and "
+                "discretisation"
+            )
+        if max(self.counts) > capacity:
+            raise InputError(
+                f"weights '{self.version}' have {max(self.counts)} points, the controller was "
+                f"built for {capacity}: train with fewer points or build with a larger capacity"
+            )
+
     @property
     def kernels(self) -> tuple[str, ...]:
         """Kernel kind per output."""
@@ -319,6 +335,21 @@ def decode_weights(data: bytes) -> GpWeights:
     if encode_weights(weights) != data:  # something is missing, or has another type or shape
         raise InputError("GP weights: the body is not encoded as weights are; train again")
     return weights
+
+
+def pack_weights(weights: GpWeights) -> bytes:
+    """What the compiled step needs of them, as in the weights file of hosts in C.
+
+    For each output the members of br_mpc_gp: kernel and points as u32, offset, scale, signal, noise
+    and the arrays as f64, little-endian.
+    """
+    parts = []
+    for output in weights.outputs:
+        kernel = KERNELS.index(output.kernel)
+        parts.append(struct.pack("<IIdddd", kernel, output.count, *output.amplitudes))
+        numbers = (output.length_scales, output.inputs, output.alpha)
+        parts += [np.ascontiguousarray(array, dtype="<f8").tobytes() for array in numbers]
+    return b"".join(parts)
 
 
 def write_weights(path: str | os.PathLike[str], weights: GpWeights) -> None:

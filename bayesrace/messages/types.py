@@ -13,12 +13,10 @@ from typing import Annotated, Final
 
 from msgspec import Meta, Struct
 
-from bayesrace.native_interface import BRAKING_ROWS, FAULTS
-
 __all__ = [
-    "END_REASONS", "PHASES", "SENSOR_FAULTS", "Actuation", "BrakingPlan", "CarSample", "Command",
-    "Event", "Message", "Reply", "RollbackRequest", "RunRequest", "Scalar", "State", "Status",
-    "StatusRequest", "StopRequest", "Telemetry", "Truth",
+    "BRAKING_ROWS", "END_REASONS", "PHASES", "SENSOR_FAULTS", "Actuation", "BrakingPlan",
+    "CarSample", "Command", "Event", "Message", "Reply", "RollbackRequest", "RunRequest", "Scalar",
+    "State", "Status", "StatusRequest", "StopRequest", "Telemetry", "Truth",
 ]  # fmt: skip
 
 END_REASONS: Final = (
@@ -34,8 +32,14 @@ regular end the run had more than one controller, so its actuations cannot be at
 PHASES: Final = ("idle", "running", "waiting", "ready", "driving", "fallback", "stopped")
 """Phases of a process, see :class:`Status`."""
 
-SENSOR_FAULTS: Final = ("", *(name.lower() for name, _ in FAULTS[1:]))
-"""What can speak against a measured state, in the order of the native interface."""
+SENSOR_FAULTS: Final = (
+    "", "frozen", "time", "position", "heading", "velocity", "yaw_rate", "steering", "elsewhere",
+)  # fmt: skip
+"""What can speak against a measured state, in the order of br_fault in
+controller/native/bayesrace_cycle.h, which says what each means."""
+
+BRAKING_ROWS: Final = 192
+"""BRBRAKING_ROWS there."""
 
 
 def _one_of(words: Sequence[str]) -> Meta:
@@ -230,7 +234,7 @@ class Telemetry(Message, frozen=True, kw_only=True, tag=5):
     """Lateral offset from the racing line, positive to the left."""
     sensor_fault: Annotated[str, _one_of(SENSOR_FAULTS)]
     """What speaks against the measured state, in whose place the model's prediction counts; empty:
-    nothing (:data:`bayesrace.native_interface.FAULTS`)."""
+    nothing (:data:`SENSOR_FAULTS`)."""
 
     def __post_init__(self) -> None:
         if len(self.plan_x) % len(_CAR_STATE) or len(self.plan_u) % len(_INPUT):

@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
 from bayesrace.manifest import Manifest, read_manifest
-from bayesrace.native_interface import NO_STEP, SOLVER, STATUSES
 from bayesrace.vehicles.parameters import CarParameters
 from bayesrace.vehicles.parts import Drive
 from codegen.build import HOST
@@ -35,23 +34,31 @@ _FALLBACK: Final = (
 )
 """Name in the settings, name here, unit, whether it must be above 0, meaning."""
 
-_NAMED: Final = {
-    "DOUBTED": "states contradict each other", "UNPREDICTABLE": "not predictable",
-    "HALTED": "none yet", "STEP_FAILED": "refused",
-}  # fmt: skip
-"""Of :data:`bayesrace.native_interface.NO_STEP`, those of an FMU, and what they mean here."""
+_ABOVE_0: Final[dict[str, Any]] = {"unit": "1", "min": 0.0, "exclusive": True}
+_FROM_0: Final[dict[str, Any]] = {"unit": "1", "min": 0.0}
+_COUNT: Final[dict[str, Any]] = {"kind": "integer", "min": 1, "max": 1000}
 
-_STATUSES: Final = (  # a step without a budget is never out of time, which is the last
-    *(f"{number} {text}" for number, (_, text, _) in enumerate(STATUSES[:-1])),
-    *(f"{number} {_NAMED[name]}" for name, number, _ in NO_STEP if name in _NAMED),
+_SOLVER: Final = (
+    ("tolerance", _ABOVE_0, "KKT residual (scaled) of a converged step"),
+    ("defect_max", _ABOVE_0, "largest dynamics defect of a usable plan"),
+    ("early_stop_tol", _FROM_0,
+     "a step ends at this stationarity and tenth of it as defect, or earlier: see br_step.c"),
+    ("caution_sigmas", _FROM_0,
+     "standard deviations of the residual by which rows are tightened; 0: none"),
+    ("iterations", _COUNT,
+     "SQP iterations a step without budget may use, once the defect is below 0.01"),
+    ("iterations_cold", _COUNT,
+     "the same for the first step after a reset; with a budget the larger limits every step"),
+)  # fmt: skip
+"""BR_SOLVER_FIELDS in controller/native/bayesrace_mpc.h: name, bounds, meaning."""
+
+_STATUSES: Final = (
+    "0 converged, 1 acceptable, 2 dynamics defect too large, 3 QP infeasible, "
+    "4 QP iteration limit, 5 not finite, 6 bad state, 251 states contradict each other, "
+    "252 not predictable, 253 none yet, 255 refused"
 )
-
-_RANGES: Final[dict[str, dict[str, Any]]] = {
-    "> 0": {"unit": "1", "min": 0.0, "exclusive": True},
-    ">= 0": {"unit": "1", "min": 0.0},
-    ">= 1": {"kind": "integer", "min": 1, "max": 1000},
-}
-"""Of the solver's settings, by the rule in :data:`bayesrace.native_interface.SOLVER`."""
+"""br_mpc_status in controller/native/bayesrace_mpc.h and br_no_step in bayesrace_cycle.h. A step
+without a budget is never out of time."""
 
 
 def controller_fmu(
@@ -155,8 +162,8 @@ def _parameters(
         *(tunable(one.name, one.text, _value(settings, one.name), unit=one.unit, max=one.high,
                   min=0.0 if one.positive else one.low, exclusive=one.positive)
           for one in manifest.problem.parameters),
-        *(tunable(name, text, _value(settings, name), **_RANGES[rule])
-          for name, _, text, rule in SOLVER),
+        *(tunable(name, text, _value(settings, name), **bounds)
+          for name, bounds, text in _SOLVER),
         *(tunable(name, f"fallback: {text}", _value(fallback, key), unit=unit, min=0.0,
                   exclusive=positive)
           for key, name, unit, positive, text in _FALLBACK),
@@ -179,7 +186,7 @@ def _outputs(drive: Drive) -> list[Variable]:
         for row in (
             ("d", drive.unit, drive.command),
             ("delta_rate", "rad/s", "steering rate"),
-            ("status", "integer", f"of the step: {', '.join(_STATUSES)}"),
+            ("status", "integer", f"of the step: {_STATUSES}"),
             ("usable", "boolean", "the step's solution may be driven"),
             ("fallback_level", "integer", "0 solution, 1 plan before, 2 braking, 3 standing"),
             ("iterations_used", "integer", "SQP iterations of the step"),

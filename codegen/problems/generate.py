@@ -7,7 +7,6 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from bayesrace.native_interface import SOLVER, c_fields
 from codegen.problems.problem import Parameter, Problem
 
 __all__ = ["c_header", "functions"]
@@ -139,12 +138,13 @@ def _pairs(name: str, matrix: ca.SX) -> list[str]:
     ]
 
 
-def _struct(name: str, parameters: Sequence[Parameter], after: Sequence[str] = ()) -> list[str]:
-    lines = [
-        f"    double {one.name}; /* {one.text}{' ' if one.text else ''}[{one.unit}] */"
-        for one in parameters
-    ]
-    return ["typedef struct {", *lines, *after, f"}} {name};"]
+def _meaning(parameter: Parameter) -> str:
+    return f"{parameter.text} [{parameter.unit}]".lstrip()
+
+
+def _struct(name: str, parameters: Sequence[Parameter]) -> list[str]:
+    lines = [f"    double {one.name}; /* {_meaning(one)} */" for one in parameters]
+    return ["typedef struct {", *lines, f"}} {name};"]
 
 
 def _groups(features: int, most: int = 11) -> str:
@@ -194,8 +194,9 @@ def c_header(problem: Problem) -> str:
         *(f"#define BR_INDEX_{role.upper()} {problem.role(role)}" for role in problem.path),
         *(f"#define BR_{n.upper()} {float(v)!r}" for n, v in problem.constants.items()),
         *_struct("br_mpc_reference", problem.stage_parameters),
-        *_struct("br_mpc_parameters", problem.parameters, c_fields(SOLVER)),
-        f"#define BR_PARAMETERS(X) {' '.join(f'X({one.name})' for one in problem.parameters)}",
+        "#define BR_PARAMETERS(X) \\",
+        *(f"    X({one.name}) /* {_meaning(one)} */ \\" for one in problem.parameters),
+        "",
         "#ifdef BR_TABLES /* for the runtime */",
         _array("BR_FEATURE", problem.feature_indices),
         _array("BR_STATE_SCALE", [float(one.scale) for one in states], "double"),

@@ -16,11 +16,158 @@
 #ifndef BAYESRACE_CYCLE_H
 #define BAYESRACE_CYCLE_H
 
+#include <stdint.h>
+
 #include "bayesrace_mpc.h"
 
 #ifdef __cplusplus
 extern "C" {
 #endif
+
+#define BR_DELAYS 64        /* most measured delays that come with one state */
+#define BR_BRAKING_ROWS 192 /* most rows of a braking plan */
+
+/* Why a cycle has no result of a step: its status. The statuses of steps are smaller numbers. */
+typedef enum {
+    BR_DOUBTED = 251, /* the states contradict each other, for longer than they may be old */
+    BR_UNPREDICTABLE, /* the state cannot be predicted to the moment of acting */
+    BR_HALTED,        /* the car is not to be driven */
+    BR_NO_STATE,      /* the newest state is too old */
+    BR_STEP_FAILED    /* the step is broken: an exception, or a call that it refuses */
+} br_no_step;
+
+/* Levels of the fallback: where the input comes from. */
+typedef enum {
+    BR_SOLUTION = 0, /* the solution */
+    BR_SHIFTED_PLAN, /* the plan before, shifted */
+    BR_BRAKE,        /* braking along the plan's steering, held when the plan is over */
+    BR_STOP          /* standing still */
+} br_level;
+
+/* Why a measured state is not believed: see br_monitor.c and br_cycle_fault_text. */
+typedef enum {
+    BR_FAULT_NONE = 0,
+    BR_FAULT_FROZEN,
+    BR_FAULT_TIME,
+    BR_FAULT_POSITION,
+    BR_FAULT_HEADING,
+    BR_FAULT_VELOCITY,
+    BR_FAULT_YAW_RATE,
+    BR_FAULT_STEERING,
+    BR_FAULT_ELSEWHERE
+} br_fault;
+
+/* Life cycle of a controller. */
+typedef enum {
+    BR_PHASE_WAITING = 0, /* no state has arrived */
+    BR_PHASE_READY,       /* states arrive; it waits for br_cycle_go */
+    BR_PHASE_DRIVING,     /* the input is the solution */
+    BR_PHASE_FALLBACK,    /* the input is the fallback's */
+    BR_PHASE_STOPPED      /* after br_cycle_stop: the car brakes to standstill, and stays */
+} br_phase;
+
+/* What became of a state that has arrived. */
+typedef enum {
+    BR_STATE_NEW = 0, /* it is now the newest one */
+    BR_STATE_STALE,   /* older than one before */
+    BR_STATE_FOREIGN  /* of another plant or run, or far ahead */
+} br_reception;
+
+/* Modes of the delay compensation. */
+typedef enum {
+    BR_COMPENSATION_OFF = 0,  /* the state is taken as it is */
+    BR_COMPENSATION_MEASURED, /* over the delay that the plant measures */
+    BR_COMPENSATION_FIXED     /* over the delay of the settings */
+} br_compensation;
+
+/* A state as a controller receives it. */
+typedef struct {
+    int64_t epoch;              /* random number of the plant's process */
+    int64_t run;                /* number of the run */
+    int64_t seq;                /* number of the state among those of its plant */
+    double time_s;              /* plant time since the start of the run */
+    double x[BR_NX];            /* as measured */
+    double u_applied[BR_NU];    /* acted during the period before */
+    int averaged;               /* 1: that is their mean; 0: what acts now, as far as is known */
+    int lockstep;               /* 1: the plant waits for the answer */
+    int delays;                 /* how many delays follow */
+    double delays_s[BR_DELAYS]; /* from the decision on an input to its acting, since the last
+                                 * state */
+} br_measured;
+
+/* Settings of the control cycle. */
+#define BR_DRIVING_FIELDS(REAL, WHOLE)                                                 \
+    REAL(brake_fade_mps)   /* speed below which braking fades to none at standstill */ \
+    REAL(brake_d)          /* drive command of braking, turned positive */             \
+    REAL(brake_slow)       /* what is added to it, times the squared speed */          \
+    REAL(standing_mps)     /* a car that is not faster stands */                       \
+    REAL(stop_mps2)        /* deceleration of a stop on command */                     \
+    REAL(shifted_s)        /* how long after its first input a plan may be driven */   \
+    REAL(limit_tolerance)  /* excess over a limit that is clipped, not refused */      \
+    WHOLE(recover_cycles)  /* usable solutions in a row that end braking */            \
+    WHOLE(compensation)    /* br_compensation */                                       \
+    REAL(delay_s)          /* the fixed one */                                         \
+    REAL(longest_s)        /* no prediction goes farther */                            \
+    REAL(stale_s)          /* age from which a state is fallen back from */            \
+    REAL(sensor_tolerance) /* multiple of the bounds of br_monitor.c; 0: no monitor */
+
+typedef struct {
+    double u_low[BR_NU];  /* what no input is below */
+    double u_high[BR_NU]; /* what no input is above */
+    BR_DRIVING_FIELDS(BR_REAL_MEMBER, BR_WHOLE_MEMBER)
+} br_driving;
+
+/* What a controller's step hands out. */
+typedef struct {
+    double u[BR_NU];             /* first input of the plan */
+    int rows;                    /* of the plan; 0: none */
+    double plan_u[BR_N * BR_NU]; /* planned inputs */
+    double plan_step_s;          /* time from one row of the plan to the next */
+    int second_start;            /* as in br_mpc_info */
+    double cost;                 /* of the plan; -1: not known */
+    double shifted_cost;         /* of the plan before, shifted; -1: there was none */
+} br_solution;
+
+/* What one cycle decides. */
+typedef struct {
+    double u[BR_NU];     /* to be sent: finite, and within the limits */
+    int status;          /* of the step, 0: usable; or why there was none */
+    int level;           /* br_level */
+    int stepped;         /* 1: a step has been made */
+    int error;           /* br_mpc_error of a step that is broken */
+    int64_t epoch;       /* of the state that this answers */
+    int64_t run;         /* of that state */
+    int64_t seq;         /* of that state */
+    double decided_at_s; /* plant time when the cycle began */
+    double delay_s;      /* prediction from there to the moment of acting */
+    double step_us;      /* execution time of the step; 0 without a clock */
+    double late_s;       /* how much later than its budget it was made; not above 0: in time */
+    int fault;           /* br_fault of that state */
+} br_decision;
+
+/* What the car's guard does if nothing more comes. */
+typedef struct {
+    int rows;                          /* of the plan */
+    double begins_s;                   /* plant time from which the first row acts */
+    double step_s;                     /* time from one row to the next */
+    double duty[BR_BRAKING_ROWS];      /* drive command of each row */
+    double delta_rad[BR_BRAKING_ROWS]; /* steering angle at its end */
+} br_braking;
+
+/* What a control cycle has counted. */
+typedef struct {
+    int64_t levels[BR_STOP + 1]; /* cycles by level of the fallback; commanded ones left out */
+    int64_t failed;              /* steps that were broken */
+    int64_t second_starts;       /* steps that looked for another plan */
+    int64_t cost_jumps;          /* steps whose plan costs much more than to go on as before */
+    int64_t stale;               /* states of the current run that were not newer than one before */
+    int64_t foreign; /* states of another plant or run, or far ahead, that were not driven on */
+    int64_t faults[BR_FAULT_ELSEWHERE + 1]; /* states by what speaks against them */
+    int fault;                              /* br_fault of the newest state */
+    int phase;                              /* br_phase, at this moment */
+    double delay_s;                         /* delay that is compensated, at this moment */
+    double interval_s; /* plant time between two states in a row; 0: not known */
+} br_counters;
 
 /* What a cycle drives: the compiled controller (br_cycle_drive_mpc), or another with these
  * functions. None may block; self comes back as it was given. */
@@ -115,6 +262,9 @@ BR_API int br_cycle_forget(br_cycle *cycle);
 
 /* Counts and state, kept up to date there. */
 BR_API const br_counters *br_cycle_counters(const br_cycle *cycle);
+
+/* What speaks against a state, in words. */
+BR_API const char *br_cycle_fault_text(br_fault fault);
 
 #ifdef __cplusplus
 }

@@ -23,9 +23,8 @@
 
 #include <stddef.h>
 
-#include "br_config.h"    /* generated: BR_N, BR_TS, BR_GP_CAPACITY, BR_MODEL_NAME */
-#include "br_problem.h"   /* generated: sizes, br_mpc_parameters, br_mpc_reference */
-#include "br_interface.h" /* generated: br_mpc_error, br_mpc_status, br_mpc_info, BR_ABI */
+#include "br_config.h"  /* generated: BR_N, BR_TS, BR_GP_CAPACITY, BR_MODEL_NAME, BR_ABI */
+#include "br_problem.h" /* generated: sizes, BR_PARAMETERS, br_mpc_reference */
 
 #ifdef __cplusplus
 extern "C" {
@@ -40,13 +39,120 @@ extern "C" {
 #define BR_PATH_CAPACITY 8192 /* points of the path table */
 #define BR_PREDICT_MAX_S 1.0  /* longest br_mpc_predict */
 
-#if defined(_WIN32)
+#if defined(BR_API) /* as it is given */
+#elif defined(_WIN32)
 #define BR_API __declspec(dllexport)
 #else
 #define BR_API __attribute__((visibility("default")))
 #endif
 
 typedef struct br_mpc br_mpc;
+
+/* What is wrong with a call: see br_mpc_error_text. */
+typedef enum {
+    BR_OK = 0,
+    BR_ERROR_NULL,
+    BR_ERROR_MEMORY,
+    BR_ERROR_PARAMETERS,
+    BR_ERROR_PATH,
+    BR_ERROR_WEIGHTS,
+    BR_ERROR_NOT_READY,
+    BR_ERROR_TIME,
+    BR_ERROR_STATE,
+    BR_ERROR_BUSY,
+    BR_ERROR_NOT_STAGED,
+    BR_ERROR_INSTRUCTIONS
+} br_mpc_error;
+
+/* What becomes of the optimisation problem. The first two are usable. */
+typedef enum {
+    BR_CONVERGED = 0, /* all residuals below tolerance */
+    BR_ACCEPTABLE,    /* dynamics and bounds hold; not stationary to tolerance */
+    BR_DEFECT,        /* the dynamics are violated by more than defect_max */
+    BR_INFEASIBLE,    /* the QP has no solution */
+    BR_QP_LIMIT,      /* the QP solver hit its iteration limit or cycled */
+    BR_NOT_FINITE,    /* a number in the problem or its solution is not finite */
+    BR_BAD_STATE,     /* the measured state is not finite or absurd; nothing was solved */
+    BR_TIME_LIMIT     /* the budget was used up before the plan was usable */
+} br_mpc_status;
+
+/* Instruction sets that a library has code for. */
+typedef enum {
+    BR_BASELINE = 0, /* those that every processor of its kind has */
+    BR_AVX2,         /* x86-64 with AVX2 and fused multiply-add */
+    BR_AVX512        /* x86-64 with AVX-512 */
+} br_instructions;
+
+/* Run-time parameters: of the problem (BR_PARAMETERS, all doubles), then settings of the solver. */
+#define BR_SOLVER_FIELDS(REAL, WHOLE)                                                       \
+    REAL(tolerance)        /* KKT residual (scaled) of a converged step; above 0 */         \
+    REAL(defect_max)       /* largest dynamics defect of a usable plan; above 0 */          \
+    REAL(early_stop_tol)   /* a step ends at this stationarity and a tenth of it as defect, \
+                            * or earlier: see br_step.c */                                  \
+    REAL(caution_sigmas)   /* standard deviations of the residual by which rows are         \
+                            * tightened; 0: none */                                         \
+    WHOLE(iterations)      /* SQP iterations a step without budget may use, once the defect \
+                            * is below 0.01; at least 1 */                                  \
+    WHOLE(iterations_cold) /* the same for the first step after a reset; with a budget the  \
+                            * larger limits every step */
+
+#define BR_REAL_MEMBER(name) double name;
+#define BR_WHOLE_MEMBER(name) int name;
+
+typedef struct {
+    BR_PARAMETERS(BR_REAL_MEMBER)
+    BR_SOLVER_FIELDS(BR_REAL_MEMBER, BR_WHOLE_MEMBER)
+} br_mpc_parameters;
+
+/* What a step reports. */
+typedef struct {
+    int status;              /* br_mpc_status */
+    int iterations;          /* SQP iterations used, those of a second start included */
+    int qp_iterations;       /* active-set iterations, summed */
+    int regularised;         /* iterations whose Hessian had to be made positive definite */
+    int shortened;           /* steps that the line search halved */
+    int second_start;        /* 1: the plan from before was doubtful, and a new one no better;
+                              * 2: the new one is better */
+    int shifts;              /* stages by which the plan was shifted; -1: there was no plan */
+    int prepared;            /* 1: br_mpc_prepare had linearised and factorised already */
+    int prepared_iterations; /* SQP iterations of br_mpc_prepare since the step before */
+    int time_limited;        /* 1: the budget ended the iterations */
+    double stationarity;     /* scaled infinity norms at the returned plan: of the gradient, */
+    double defect;           /* of the dynamics, */
+    double bound;            /* of the hard constraints */
+    double shifted_cost;     /* of the plan before, shifted, under the same reference; 0 after a
+                              * cold start */
+    double cost;             /* objective at the returned plan, slack included */
+    double slack_max_m;      /* largest violation of a soft constraint */
+    double tube_m;           /* half the width that uncertainty takes of a soft constraint, the
+                              * largest */
+    double pace;             /* of the reference, as a share of the line's speed; 1 where all is
+                              * known */
+    double widening;         /* of the residual's standard deviations by the errors observed; 1:
+                              * they cover these */
+    double s_ref_m;          /* projection of the car on the racing line */
+    double lateral_m;        /* distance of the car from the racing line, positive left */
+} br_mpc_info;
+
+/* What a step takes into account beside the car's own state. With INFINITY and 0 nothing is
+ * limited. */
+typedef struct {
+    double speed_limit_mps;       /* the reference moves along the line at most this fast */
+    double speed_limit_rate_mps2; /* by how much the limit falls along the horizon */
+} br_environment;
+
+/* Samples of what the car has done that a controller keeps; and the newest of these, on which
+ * weights are compared while they are watched. */
+enum { BR_SAMPLES = 512, BR_WATCHED = 100 };
+
+/* How the weights in use do beside others: root mean square errors per stage. */
+typedef struct {
+    int samples;           /* of the newest, judged so far */
+    double fresh;          /* samples since the weights in use were adopted */
+    double in_use[BR_NE];  /* error of the weights in use */
+    double proven[BR_NE];  /* of the proven weights */
+    double nominal[BR_NE]; /* of the model without correction */
+} br_mpc_watch;
 
 typedef enum {
     BR_KERNEL_RBF = 0,
@@ -230,10 +336,13 @@ BR_API br_mpc_error br_mpc_evaluate(const br_mpc *mpc, const double v[BR_NV],
                                     const double lambda[BR_NX], double x_next[BR_NX],
                                     double jacobian[BR_NX * BR_NV], double hessian[BR_NV * BR_NV]);
 
+/* Version of the interface: a hash of the declarations in this header and bayesrace_cycle.h.
+ * A library fits to headers whose BR_ABI it has. */
+BR_API int br_mpc_abi(void);
+
 BR_API const char *br_mpc_error_text(br_mpc_error error);
 BR_API const char *br_mpc_status_text(br_mpc_status status);
 BR_API const char *br_mpc_model_name(void);
-BR_API int br_mpc_abi(void);
 
 #ifdef __cplusplus
 }

@@ -22,8 +22,9 @@ br_mpc_error br_mpc_init(void *memory, size_t size, br_mpc **out) {
 
 static int valid(const br_mpc_parameters *p) {
     const double numbers[] = {p->tolerance, p->defect_max, p->early_stop_tol, p->caution_sigmas};
-    return br_all_finite(numbers, sizeof numbers / sizeof numbers[0]) && BR_SOLVER_VALID(p) &&
-           br_valid_parameters(p);
+    return br_all_finite(numbers, sizeof numbers / sizeof numbers[0]) && p->tolerance > 0 &&
+           p->defect_max > 0 && p->early_stop_tol >= 0 && p->caution_sigmas >= 0 &&
+           p->iterations >= 1 && p->iterations_cold >= 1 && br_valid_parameters(p);
 }
 
 br_mpc_error br_mpc_set_parameters(br_mpc *mpc, const br_mpc_parameters *parameters) {
@@ -103,12 +104,34 @@ br_mpc_error br_mpc_get_tube(const br_mpc *mpc, double tube[BR_N]) {
 }
 
 const char *br_mpc_error_text(br_mpc_error error) {
-    static const char *const texts[] = BR_ERROR_TEXTS;
+    static const char *const texts[] = {
+        [BR_OK] = "no error",
+        [BR_ERROR_NULL] = "a required pointer is NULL",
+        [BR_ERROR_MEMORY] = "memory block too small or not aligned to 64 bytes",
+        [BR_ERROR_PARAMETERS] = "a parameter is not finite or out of its range",
+        [BR_ERROR_PATH] = "path table is unusable",
+        [BR_ERROR_WEIGHTS] = "GP weights are unusable",
+        [BR_ERROR_NOT_READY] = "parameters or path have not been set",
+        [BR_ERROR_TIME] = "a time is negative, not finite or too long",
+        [BR_ERROR_STATE] = "a state or input is not finite or absurd",
+        [BR_ERROR_BUSY] = "another thread is staging weights",
+        [BR_ERROR_NOT_STAGED] = "no weights are staged",
+        [BR_ERROR_INSTRUCTIONS] = "this processor lacks these instructions",
+    };
     return (unsigned)error < sizeof texts / sizeof texts[0] ? texts[error] : "unknown error";
 }
 
 const char *br_mpc_status_text(br_mpc_status status) {
-    static const char *const texts[] = BR_STATUS_TEXTS;
+    static const char *const texts[] = {
+        [BR_CONVERGED] = "converged",
+        [BR_ACCEPTABLE] = "acceptable",
+        [BR_DEFECT] = "dynamics defect too large",
+        [BR_INFEASIBLE] = "QP infeasible",
+        [BR_QP_LIMIT] = "QP iteration limit",
+        [BR_NOT_FINITE] = "not finite",
+        [BR_BAD_STATE] = "bad state",
+        [BR_TIME_LIMIT] = "out of time before the plan was usable",
+    };
     return (unsigned)status < sizeof texts / sizeof texts[0] ? texts[status] : "unknown status";
 }
 

@@ -455,6 +455,22 @@ br_mpc_error br_cycle_brake(const br_cycle *cycle, br_braking *braking) {
     return BR_OK;
 }
 
+const char *br_cycle_fault_text(br_fault fault) {
+    static const char *const texts[] = {
+        [BR_FAULT_NONE] = "the state is believed",
+        [BR_FAULT_FROZEN] = "it is equal to the state before, though the car moves",
+        [BR_FAULT_TIME] = "its time does not follow from its number",
+        [BR_FAULT_POSITION] = "the position does not follow from the velocities",
+        [BR_FAULT_HEADING] = "the heading does not follow from the yaw rate",
+        [BR_FAULT_VELOCITY] = "the velocity changes faster than tyres can make it",
+        [BR_FAULT_YAW_RATE] = "the yaw rate changes faster than tyres can make it",
+        [BR_FAULT_STEERING] = "the steering angle does not follow from the steering rate",
+        [BR_FAULT_ELSEWHERE] =
+            "the states agree with each other again, but not with where the car must be",
+    };
+    return (unsigned)fault < sizeof texts / sizeof texts[0] ? texts[fault] : "unknown fault";
+}
+
 /* A car is being driven: a step has been made, and no halt since. */
 void br_cycle_prepare(br_cycle *cycle, double period_s, double budget_s) {
     if (cycle && cycle->stepped)

@@ -9,10 +9,9 @@ import numpy as np
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import OUTPUTS, decode_weights
+from bayesrace.gp.weights import OUTPUTS, decode_weights, pack_weights
 from bayesrace.messages import Scalar
 from bayesrace.vehicles.parameters import CarParameters
-from controller.native_step import pack_weights
 from controller.weights.comparison import compare, slack_of
 from controller.weights.prediction import Correction, Samples, plausible_features
 from controller.weights.settings import GateSettings
@@ -33,7 +32,7 @@ class Verdict(NamedTuple):
     text: str
     data: dict[str, Scalar]
     packed: bytes = b""
-    """Arrays of accepted weights, by :func:`controller.native_step.pack_weights`; else empty."""
+    """Arrays of accepted weights, by :func:`bayesrace.gp.weights.pack_weights`; else empty."""
 
 
 class Checks:

@@ -9,9 +9,8 @@ import numpy as np
 from bayesrace.arrays import Floats
 from bayesrace.gp.weights import OUTPUTS, UNITS
 from bayesrace.messages import Scalar
-from bayesrace.native_interface import WATCHED
 from bayesrace.vehicles.parameters import CarParameters
-from controller.weights.settings import GateSettings
+from controller.weights.settings import WATCHED, GateSettings
 
 __all__ = ["Comparison", "compare", "slack_of"]
 

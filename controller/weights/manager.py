@@ -18,7 +18,6 @@ from bayesrace.messages import ROLLBACK, WEIGHTS, Reply, Scalar
 from bayesrace.transport import Request, declare_service, decode_request
 from bayesrace.vehicles import car_text
 from controller.interface import Controller
-from controller.native_step import unpack_weights
 from controller.weights.adoption import Adoption, Offer, WeightsPort
 from controller.weights.checks import NO_SAMPLES
 from controller.weights.judge import judged
@@ -276,7 +275,7 @@ class WeightUpdateManager:
     def _adopt(self, packed: bytes, version: str, watched: bool, due_s: float) -> Offer:
         """Stages weights and waits until the control thread has adopted them."""
         offer = Offer(version, self.adoption.reverted, watched)
-        self._port.step.stage_weights(unpack_weights(packed))
+        self._port.step.stage_weights(packed)
         self.adoption.offers.append(offer)
         until_s = min(time.monotonic() + _ADOPT_S, due_s)
         while not offer.done:

@@ -1,10 +1,16 @@
 """Thresholds for new weights, with the reason for each; docs/learning.md explains the tests."""
 
+from typing import Final
+
 from pydantic import BaseModel, ConfigDict, Field
 
-from bayesrace.native_interface import SAMPLES, WATCHED
+__all__ = ["SAMPLES", "WATCHED", "GateSettings"]
 
-__all__ = ["GateSettings"]
+SAMPLES: Final = 512
+"""BRSAMPLES in controller/native/bayesrace_mpc.h: what a controller keeps."""
+
+WATCHED: Final = 100
+"""BR_WATCHED there: the newest of these, on which weights are compared while they are watched."""
 
 
 class GateSettings(BaseModel):

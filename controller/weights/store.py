@@ -17,8 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from bayesrace.errors import InputError
 from bayesrace.files import read_text, read_whole, write_whole
-from bayesrace.gp.weights import MAX_BYTES, decode_weights
-from controller.native_step import pack_weights
+from bayesrace.gp.weights import MAX_BYTES, decode_weights, pack_weights
 
 __all__ = ["HISTORY", "AcceptedWeights", "History", "Store", "StoreWriter", "digest_of"]
 

@@ -3,10 +3,9 @@
 from typing import Any, Final, Literal, NamedTuple
 
 from bayesrace.messages import Scalar
-from bayesrace.native_interface import WATCHED
 from bayesrace.vehicles.parameters import CarParameters
 from controller.weights.comparison import compare, slack_of
-from controller.weights.settings import GateSettings
+from controller.weights.settings import WATCHED, GateSettings
 
 __all__ = ["Ruling", "Watch"]
 

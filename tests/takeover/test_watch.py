@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 
 from bayesrace.arrays import Floats
-from bayesrace.gp.weights import GpWeights, zero_weights
-from bayesrace.native_interface import SAMPLES, WATCHED
+from bayesrace.gp.weights import GpWeights, pack_weights, zero_weights
 from bayesrace.vehicles import CarParameters
-from controller.native_step import NativeStep, pack_weights, unpack_weights
+from controller.native_step import NativeStep
 from controller.path_table import make_path_table
 from controller.settings import MpcSettings
-from controller.weights.settings import GateSettings
+from controller.weights.settings import SAMPLES, WATCHED, GateSettings
 from controller.weights.watch import Ruling, Watch
 from tests.conftest import Circuit, fit_weights, smooth_drive
 from tests.takeover.rig import KINDS
@@ -54,7 +53,7 @@ def step(kinematic_artefact: Path, car: CarParameters, circuit: Circuit) -> Nati
 
 def adopt(step: NativeStep, new: GpWeights) -> None:
     packed = pack_weights(new)
-    step.stage_weights(unpack_weights(packed))
+    step.stage_weights(packed)
     step.adopt_weights()
 
 
@@ -180,7 +179,7 @@ def test_going_back_restores_the_proven_weights_to_the_bit(
     other = predicted()
     adopt(step, replace(again, version="next"))
     staged = pack_weights(spoilt(again, "scale 3"))
-    step.stage_weights(unpack_weights(staged))
+    step.stage_weights(staged)
     assert predicted() == other != proven
     step.revert_weights()
     assert predicted() == proven

@@ -2,7 +2,7 @@
 
 import math
 
-from bayesrace.gp.weights import GpWeights, encode_weights, zero_weights
+from bayesrace.gp.weights import GpWeights, encode_weights, pack_weights, zero_weights
 from bayesrace.messages import State
 from bayesrace.raceline.cached import racing_line
 from bayesrace.tracks import load_track
@@ -12,7 +12,7 @@ from codegen.settings import BuildSettings
 from controller.assembly import compiled_controller
 from controller.interface import Environment
 from controller.mpc import PredictiveController
-from controller.native_step import NativeStep, pack_weights, unpack_weights
+from controller.native_step import NativeStep
 from controller.weights.adoption import limits_at, slowed_down
 from controller.weights.checks import Checks
 from controller.weights.settings import GateSettings
@@ -70,7 +70,7 @@ class Course:
             return "refused as absurd", -math.inf
         before = proven or zero_weights(weights.car, weights.discretisation)
         controller, packed = self._controller(before), pack_weights(weights)
-        controller.native.stage_weights(unpack_weights(packed))
+        controller.native.stage_weights(packed)
         controller.native.adopt_weights()
         loop = WatchedLoop(self._car, self._track, self._line, controller)
         loop.watch(controller.native)
