@@ -1,6 +1,7 @@
 """What the control cycle drives: the compiled controller, or a control law written in Python."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
@@ -41,7 +42,6 @@ class StepOutput:
     """Shape (2,): d [-], delta_rate [rad/s]. Looked at only if ``status`` is 0."""
     status: int = 0
     """0: usable. Else the controller's own code (1 to 250): the fallback takes over."""
-    iterations: int = 0
     plan_x: Floats = field(default_factory=lambda: _NO_STATES)
     """Shape (N + 1, 7) or (0, 7): predicted states."""
     plan_u: Floats = field(default_factory=lambda: NO_PLAN)
@@ -49,19 +49,14 @@ class StepOutput:
     along the first ones, as many as the artefact's horizon has."""
     plan_step_s: float = 0.02
     """Time from one row of the plan to the next."""
-    residual_dynamics: float = -1.0
-    residual_bounds: float = -1.0
-    residual_stationarity: float = -1.0
     cost: float = -1.0
     cost_shifted: float = -1.0
     second_start: int = 0
     """As in :class:`bayesrace.messages.Telemetry`; -1 if there is none."""
     tube_m: Floats = field(default_factory=lambda: _NO_TUBE)
     """Shape (N,) or (0,): as in :class:`bayesrace.messages.Telemetry`."""
-    pace: float = 1.0
-    widening: float = 1.0
-    s_ref_m: float = 0.0
-    n_ref_m: float = 0.0
+    numbers: Mapping[str, float] = field(default_factory=dict)
+    """Further fields of :class:`bayesrace.messages.Telemetry`; those left out are not known."""
 
 
 class Controller(Protocol):

@@ -1,14 +1,23 @@
 """The predictive controller as the process drives it: native step, weights, telemetry."""
 
-from typing import Any
+from typing import Any, Final
 
 from bayesrace.gp.weights import decode_weights
+from bayesrace.messages import NOT_REPORTED
 from controller.interface import StepOutput
 from controller.native_library import Artefact, StepStatus
 from controller.native_step import NativeStep
 from controller.weights.adoption import WeightsPort
 
 __all__ = ["PredictiveController"]
+
+_IN_C: Final = {
+    "residual_dynamics": "defect",
+    "residual_bounds": "bound",
+    "residual_stationarity": "stationarity",
+    "n_ref_m": "lateral_m",
+}
+"""Names in br_mpc_info, where they are not those of :class:`bayesrace.messages.Telemetry`."""
 
 
 class PredictiveController:
@@ -28,6 +37,9 @@ class PredictiveController:
         self.port = port
         self.track = track
         self._version = weights_version
+        known = {name for name, _ in step.artefact.ffi.typeof("br_mpc_info").fields}
+        names = ((name, _IN_C.get(name, name)) for name in NOT_REPORTED)
+        self._numbers = [(name, in_c) for name, in_c in names if in_c in known]
         self._output = StepOutput(
             u=step.plan_u[0],
             plan_x=step.plan_x,
@@ -83,15 +95,8 @@ class PredictiveController:
         self.native.read_tube()
         # Acceptable and converged may both be driven; the residuals below distinguish them.
         output.status = 0 if info.status <= StepStatus.ACCEPTABLE else info.status
-        output.iterations = info.iterations
-        output.residual_dynamics = info.defect
-        output.residual_bounds = max(info.bound, 0.0)
-        output.residual_stationarity = info.stationarity
         output.cost = info.cost
         output.cost_shifted = info.shifted_cost if info.shifts >= 0 else -1.0
         output.second_start = info.second_start
-        output.pace = info.pace
-        output.widening = info.widening
-        output.s_ref_m = info.s_ref_m
-        output.n_ref_m = info.lateral_m
+        output.numbers = {name: getattr(info, in_c) for name, in_c in self._numbers}
         return output

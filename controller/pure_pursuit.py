@@ -180,7 +180,7 @@ class PurePursuit:
         highest = min(car.delta_rate_max_radps, (car.delta_max_rad - delta) / settings.step_s)
         output.u[0] = min(max(d, car.d_min), car.d_max)
         output.u[1] = min(max(rate, lowest), highest)
-        output.s_ref_m = float(self._lengths[place.nearest])
+        output.numbers = {"s_ref_m": float(self._lengths[place.nearest])}
         return output
 
     def _place(self, px: float, py: float) -> _Place:

@@ -3,17 +3,19 @@
 import math
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from bayesrace.arrays import Floats
-from bayesrace.messages import SENSOR_FAULTS, State, Telemetry
+from bayesrace.messages import NOT_REPORTED, SENSOR_FAULTS, State, Telemetry
 from controller.driver import Decision
 from controller.interface import NO_PLAN, StepOutput
 
 __all__ = ["Timing", "telemetry_of"]
 
 _SCALE, _LARGEST = 1e6, 1e6
+_LARGEST_MEASURE = 1e12
 _NO_OUTPUT = StepOutput(u=np.zeros(2), plan_u=NO_PLAN)
 
 
@@ -52,6 +54,7 @@ def telemetry_of(
 ) -> Telemetry:
     """The message of one cycle; ``output``: of its step, if one was made."""
     output = output or _NO_OUTPUT
+    numbers = {"cost": output.cost, "cost_shifted": output.cost_shifted, **output.numbers}
     return Telemetry(
         seq=seq,
         source_time_ns=time.monotonic_ns(),
@@ -59,7 +62,6 @@ def telemetry_of(
         state_seq=state.seq,
         status=decision.status,
         fallback=int(decision.level),
-        iterations=output.iterations,
         tick=timing.tick,
         released_ns=timing.released_ns,
         received_ns=timing.received_ns,
@@ -73,17 +75,9 @@ def telemetry_of(
         plan_x=_finite(output.plan_x),
         plan_u=_finite(output.plan_u),
         tube_m=_finite(output.tube_m),
-        pace=output.pace,
-        widening=output.widening,
-        residual_dynamics=_known(output.residual_dynamics),
-        residual_bounds=_known(output.residual_bounds),
-        residual_stationarity=_known(output.residual_stationarity),
-        cost=_known(output.cost),
-        cost_shifted=_known(output.cost_shifted),
-        second_start=output.second_start,
-        s_ref_m=output.s_ref_m if math.isfinite(output.s_ref_m) else 0.0,
-        n_ref_m=output.n_ref_m if math.isfinite(output.n_ref_m) else 0.0,
         sensor_fault=SENSOR_FAULTS[decision.fault],
+        second_start=output.second_start,
+        **{name: _known(numbers.get(name, none), none) for name, none in NOT_REPORTED.items()},
     )
 
 
@@ -100,5 +94,7 @@ def _finite(plan: Floats) -> tuple[float, ...]:
     return tuple((scaled / _SCALE).tolist())
 
 
-def _known(residual: float) -> float:
-    return float(residual) if 0.0 <= residual <= 1e12 else -1.0
+def _known(number: float, none: float) -> Any:
+    """A number that telemetry can have, or what it has in place of one that is not known."""
+    known = 0.0 <= number <= _LARGEST_MEASURE if none < 0 else math.isfinite(number)
+    return number if known else none

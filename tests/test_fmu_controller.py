@@ -187,8 +187,9 @@ def test_it_is_as_cautious_as_in_lockstep(
         rows.append(answers(controller, [x])[0])
     same(np.array(rows), run)
     assert run.driver.output is not None
-    assert controller.get("widening") == pytest.approx([run.driver.output.widening], rel=1e-12)
-    assert run.driver.output.widening > 1
+    widening = run.driver.output.numbers["widening"]
+    assert controller.get("widening") == pytest.approx([widening], rel=1e-12)
+    assert widening > 1
 
 
 def test_a_speed_limit_slows_down_along_the_line_to_standstill(

@@ -181,7 +181,7 @@ class TestCycle:
             driver.decide(one.time_s)
             driver.prepare(STEP_S)
         assert driver.output is not None
-        return driver.output.widening
+        return driver.output.numbers["widening"]
 
     @staticmethod
     def states(circuit: Circuit, numbers: list[int], vx: float = 1.0) -> list[State]:

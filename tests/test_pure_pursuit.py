@@ -112,7 +112,7 @@ def test_a_car_far_from_where_it_was_finds_the_line_again() -> None:
     driver.reset()
     driver.step(np.array(START), np.zeros(2))
     elsewhere = np.array([-2.0, 0.1, -math.pi / 2, 1.0, 0.0, 0.0, 0.0])
-    arc = driver.step(elsewhere, np.zeros(2)).s_ref_m
+    arc = driver.step(elsewhere, np.zeros(2)).numbers["s_ref_m"]
     perimeter = 9.688
     assert arc == pytest.approx(perimeter / 2, abs=0.2)
 

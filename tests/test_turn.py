@@ -30,7 +30,7 @@ def where(rig: Rig) -> float:
     """Arc length of the car's place on the line."""
     output = rig.driver.output
     assert output is not None
-    return output.s_ref_m
+    return output.numbers["s_ref_m"]
 
 
 def test_a_car_drives_off_from_any_pose(native: NativeStep, circuit: Circuit) -> None:

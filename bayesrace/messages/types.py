@@ -14,9 +14,9 @@ from typing import Annotated, Final
 from msgspec import Meta, Struct
 
 __all__ = [
-    "BRAKING_ROWS", "END_REASONS", "PHASES", "SENSOR_FAULTS", "Actuation", "BrakingPlan",
-    "CarSample", "Command", "Event", "Message", "Reply", "RollbackRequest", "RunRequest", "Scalar",
-    "State", "Status", "StatusRequest", "StopRequest", "Telemetry", "Truth",
+    "BRAKING_ROWS", "END_REASONS", "NOT_REPORTED", "PHASES", "SENSOR_FAULTS", "Actuation",
+    "BrakingPlan", "CarSample", "Command", "Event", "Message", "Reply", "RollbackRequest",
+    "RunRequest", "Scalar", "State", "Status", "StatusRequest", "StopRequest", "Telemetry", "Truth",
 ]  # fmt: skip
 
 END_REASONS: Final = (
@@ -239,6 +239,14 @@ class Telemetry(Message, frozen=True, kw_only=True, tag=5):
     def __post_init__(self) -> None:
         if len(self.plan_x) % len(_CAR_STATE) or len(self.plan_u) % len(_INPUT):
             raise ValueError("plan_x, plan_u: not whole rows of 7, 2")
+
+
+NOT_REPORTED: Final[Mapping[str, float]] = {
+    "iterations": 0, "pace": 1.0, "widening": 1.0, "residual_dynamics": -1.0,
+    "residual_bounds": -1.0, "residual_stationarity": -1.0, "cost": -1.0, "cost_shifted": -1.0,
+    "s_ref_m": 0.0, "n_ref_m": 0.0,
+}  # fmt: skip
+"""Numbers of :class:`Telemetry` that a step reports, as they are where there is no such report."""
 
 
 class BrakingPlan(Message, frozen=True, kw_only=True):

@@ -52,6 +52,14 @@ _SOLVER: Final = (
 )  # fmt: skip
 """BR_SOLVER_FIELDS in controller/native/bayesrace_mpc.h: name, bounds, meaning."""
 
+_PLANNED: Final = (
+    ("pace", "1", "of the reference, as a share of the line's speed"),
+    ("widening", "1", "of the model's band by the errors observed; 1: it covers them"),
+    ("s_ref_m", "m", "arc length of the car on the racing line"),
+    ("lateral_m", "m", "distance from the racing line, positive to the left"),
+)
+"""Outputs with the names of br_mpc_info that stay as they are where a step makes no plan."""
+
 _STATUSES: Final = (
     "0 converged, 1 acceptable, 2 dynamics defect too large, 3 QP infeasible, "
     "4 QP iteration limit, 5 not finite, 6 bad state, 251 states contradict each other, "
@@ -110,7 +118,9 @@ def _sources(artefact: Path) -> dict[str, bytes]:
     own = {*artefact.glob("*.[ch]"), *(artefact / HOST).iterdir()} - {artefact / "br_clock.c"}
     files = {path.name: path for path in (NATIVE / "controller.c", *own, *artefact.glob("*.a"))}
     files |= {f"daqp/{path.name}": path for path in (artefact / "daqp").iterdir()}
-    return {name: path.read_bytes() for name, path in sorted(files.items())}
+    planned = " ".join(f"X({name})" for name, *_ in _PLANNED)
+    made = {"controller_outputs.h": f"#define PLANNED(X) {planned}\n".encode()}
+    return made | {name: path.read_bytes() for name, path in sorted(files.items())}
 
 
 def _value(values: Mapping[str, float], name: str) -> float:
@@ -194,10 +204,7 @@ def _outputs(drive: Drive) -> list[Variable]:
             ("defect", "1", "dynamics residual at the plan; -1: not known"),
             ("slack_max_m", "m", "largest violation of the track in the plan"),
             ("tube_m", "m", "half the width that uncertainty takes of the track; -1: not known"),
-            ("pace", "1", "of the reference, as a share of the line's speed"),
-            ("widening", "1", "of the model's band by the errors observed; 1: it covers them"),
-            ("s_ref_m", "m", "arc length of the car on the racing line"),
-            ("lateral_m", "m", "distance from the racing line, positive to the left"),
+            *_PLANNED,
         )
     ]
 

@@ -13,7 +13,7 @@ br_mpc_error br_mpc_init(void *memory, size_t size, br_mpc **out) {
     for (int i = 0; i < 3; ++i) br_gp_clear(&mpc->gp[i]);
     br_qp_init(&mpc->qp);
     br_weights_init(mpc);
-    mpc->caution.pace = mpc->caution.widening = 1;
+    br_caution_reset(&mpc->caution);
     br_innovation_reset(&mpc->innovation);
     mpc->code = br_fastest_code();
     *out = mpc;
@@ -61,8 +61,7 @@ void br_mpc_reset(br_mpc *mpc) {
     br_invalidate(mpc, BR_LINEARISATION);
     mpc->ahead = mpc->prepared = mpc->prepared_iterations = 0;
     mpc->path.known = 0;
-    mpc->caution.active = 0;
-    mpc->caution.pace = mpc->caution.widening = 1;
+    br_caution_reset(&mpc->caution);
     mpc->innovation.newest.duration = 0;
     br_innovation_reset(&mpc->innovation);
     mpc->turn = 0;

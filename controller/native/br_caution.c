@@ -114,6 +114,11 @@ static void standard_deviations(br_mpc *mpc, double sigma[BR_N][BR_NE]) {
         }
 }
 
+void br_caution_reset(br_caution *caution) {
+    caution->active = 0;
+    caution->pace = caution->widening = 1;
+}
+
 void br_caution_update(br_mpc *mpc) {
     const br_gp *gp = &mpc->gp[mpc->gp_in_use];
     br_caution *caution = &mpc->caution;

@@ -329,6 +329,7 @@ BR_PART void br_gp_variances(const br_gp *gp, int stages, double (*z)[BR_NZ],
                              double (*work)[BR_COLUMNS], double (*variance)[BR_NE]);
 
 /* br_caution.c */
+BR_PART void br_caution_reset(br_caution *caution);
 BR_PART void br_caution_update(br_mpc *mpc);
 BR_PART void br_caution_tighten(br_mpc *mpc, int k, br_stage_terms *terms);
 BR_PART void br_caution_pace(br_mpc *mpc, double elapsed);

@@ -11,6 +11,7 @@
 
 #include "bayesrace_cycle.h"
 #include "br_files.h"
+#include "controller_outputs.h" /* generated: PLANNED */
 #include "fmu.h"
 
 #define ALIGNED(size) (((size) + 63) / 64 * 64)
@@ -155,10 +156,9 @@ static void set_outputs(fmu_instance *instance, const br_decision *decision) {
     const bool planned = decision->stepped && status != BR_BAD_STATE;
     v[FMU_V_tube_m] = planned ? known(info->tube_m) : -1;
     if (!planned) return; /* nor projected */
-    v[FMU_V_pace] = info->pace;
-    v[FMU_V_widening] = info->widening;
-    v[FMU_V_s_ref_m] = info->s_ref_m;
-    v[FMU_V_lateral_m] = info->lateral_m;
+#define COPY(name) v[FMU_V_##name] = info->name;
+    PLANNED(COPY)
+#undef COPY
 }
 
 FMI(Status) fmu_model_step(fmu_instance *instance, double h) {
