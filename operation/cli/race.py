@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from bayesrace.configuration import Configuration
     from operation.analysis.race import RaceAnalysis
     from operation.settings import RaceSettings
-    from studies.latency.settings import LatencySettings
+    from studies.latency.results import LatencySettings
     from studies.paper.settings import PaperSettings
     from studies.settings import BenchSettings
 
@@ -165,7 +165,7 @@ def bench(
 
 
 @options_of(
-    "studies.latency.settings.LatencySettings",
+    "studies.latency.results.LatencySettings",
     "rate_hz duration_s load track realtime.fifo realtime.lock_memory weights artefact raceline "
     "log car name",
     file=True,

@@ -10,19 +10,21 @@ from typing import Any, Final
 import numpy as np
 
 from bayesrace.arrays import Floats
+from bayesrace.columns import Columns
 from bayesrace.tracks import Track
 from studies.latency.clocks import ClockMap
-from studies.latency.columns import (
-    MOST_CYCLES,
-    Columns,
-    begins_anew,
-    read_tables,
-    split,
-)
 from studies.latency.legs import ANSWER, LEGS, Cycles
-from studies.latency.results import BareLoop, Clocks, LatencyResult, LegResult, Memory, Traffic
+from studies.latency.results import (
+    BareLoop,
+    Clocks,
+    LatencyResult,
+    LatencySettings,
+    LegResult,
+    Memory,
+    Traffic,
+)
 from studies.latency.series import Series
-from studies.latency.settings import LatencySettings
+from studies.latency.tables import MOST_CYCLES, begins_anew, read_tables, split
 
 __all__ = ["Analysis", "Beside", "analyse"]
 
@@ -68,8 +70,8 @@ def analyse(log: Path, settings: LatencySettings, track: Track | None, beside: B
     # Runs in real time, or those in lockstep if there are no others.
     chosen = [part for part in parts if not part["states"]["lockstep"][0]] or parts
     cycles = [Cycles(part) for part in chosen]
-    begin_ns = cycles[0].states["at"][0]
-    span_s = float(np.ptp(np.concatenate([one.states["at"] for one in cycles]))) * 1e-9
+    begin_ns = int(cycles[0].states["wall_ns"][0])
+    span_s = float(np.ptp(np.concatenate([one.states["wall_ns"] for one in cycles]))) * 1e-9
     series = _series([one.legs() for one in cycles], begin_ns)
     clock = _clocks([one.clock for one in cycles if one.clock is not None])
     legs = {leg: _leg(leg, one, clock) for leg, one in series.items()}
@@ -177,7 +179,7 @@ def _traffic(counts: Counter[str], parts: int) -> dict[str, Traffic]:
 def _drive(truth: Columns, track: Track | None) -> dict[str, Any]:
     """Laps, and samples off the track, all runs together."""
     one_run = (np.diff(truth["epoch"]) == 0) & (np.diff(truth["run"]) == 0)
-    places = np.column_stack([truth["x_m"], truth["y_m"]])
+    places = truth["x"][:, :2]
     batches = [places[k : k + _BATCH] for k in range(0, len(places), _BATCH)]
     return {
         "laps": int(np.diff(truth["lap"])[one_run].sum()) if len(truth) else None,

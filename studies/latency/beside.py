@@ -1,8 +1,12 @@
-"""Processes that run beside what is measured: a bare loop, and busy processes.
+"""Processes that run beside what is measured: a bare loop, bare messages, and busy processes.
 
 The bare loop does nothing but sleep to absolute deadlines, at the same rate and with the same
 scheduling. Its errors come from the machine, not from the program. As for the controller, a release
 is missed when nothing could be done before the next one: here, when the loop wakes after that.
+
+For bare messages, one process sends as many bytes as a state has, another answers at once, and
+neither does anything else: state → actuation less this is what plant and controller add. They are
+sent half a period after the bare loop's releases, so that the two do not wake each other.
 """
 
 import json
@@ -16,46 +20,76 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import zenoh
 from numpy.typing import NDArray
 
 from bayesrace.clock import die_with_parent, sleep_until_ns
 from bayesrace.realtime import RealtimeSettings, prepare_thread
+from bayesrace.transport import Endpoints, open_session, private_endpoints
 from operation.processes import child
 from studies.latency.results import BareLoop
 from studies.latency.series import Series
 
-__all__ = ["bare_loop", "bare_result", "read_bare_loop", "running_beside"]
+__all__ = ["bare_loop", "bare_result", "read_bare_loop", "read_round_trips", "running_beside"]
 
-_FILE: Final = "bare_loop.npy"
+_LOOP: Final = "bare_loop"
+_MESSAGES: Final = "round_trip"
+"""Names of the files: ``.npy`` with the numbers, ``.log`` with the output."""
+
+_BYTES: Final = bytes(120)
+_LOOK_S: Final = 0.01
 
 
 @contextmanager
 def running_beside(
     out: Path, load: int, realtime: RealtimeSettings, rate_hz: float, begin_ns: int, count: int
 ) -> Iterator[None]:
-    """A bare loop of ``count`` periods from ``begin_ns`` on, and ``load`` busy processes; at the
-    block's end the loop's wake-up errors are in the folder ``out``."""
-    line, module = ["--parent-pid", str(os.getpid())], "studies.latency.beside"
-    loop = {"path": str(out / _FILE), "realtime": realtime.model_dump(), "count": count}
-    loop |= {"period_ns": round(1e9 / rate_hz), "begin_ns": begin_ns}
+    """A bare loop and bare messages, both ``count`` periods from ``begin_ns`` on, and ``load`` busy
+    processes for the block; at its end the numbers are in the folder ``out``."""
+    np.save(out / f"{_MESSAGES}.npy", np.zeros(count, dtype=np.int64))
     with ExitStack() as stack:
+        (endpoint,) = stack.enter_context(private_endpoints("answers"))
+
+        def start(log: str, **task: Any) -> Any:
+            task |= {"realtime": realtime.model_dump(), "period_ns": round(1e9 / rate_hz)}
+            line = ["--parent-pid", str(os.getpid()), json.dumps(task)]
+            return stack.enter_context(child(line, out / f"{log}.log", "studies.latency.beside"))
+
         for _ in range(load):
-            stack.enter_context(child(line, out / "load.log", module))
-        log = out / "bare_loop.log"
-        bare = stack.enter_context(child([*line, json.dumps(loop)], log, module))
+            start("load", work="load")
+        path = str(out / f"{_LOOP}.npy")
+        bare = start(_LOOP, work="loop", path=path, count=count, begin_ns=begin_ns)
+        start("answer", work="answer", endpoint=endpoint)
+        path = str(out / f"{_MESSAGES}.npy")
+        start(_MESSAGES, work="send", endpoint=endpoint, path=path, begin_ns=begin_ns)
         yield
         bare.wait(1.0)
 
 
+def _read(path: Path) -> NDArray[np.int64]:
+    """The numbers in a file, which is removed; empty if there is none."""
+    try:
+        found: NDArray[np.int64] = np.load(path)
+        path.unlink()
+    except (OSError, ValueError):
+        return np.empty(0, dtype=np.int64)
+    return found
+
+
 def read_bare_loop(out: Path, rate_hz: float) -> tuple[Series, BareLoop] | None:
     """Wake-up errors by time, and the numbers of the report; None if the loop never woke."""
-    try:
-        late_ns = np.load(out / _FILE)
-        (out / _FILE).unlink()
-    except (OSError, ValueError):
+    late_ns = _read(out / f"{_LOOP}.npy")
+    if not len(late_ns):
         return None
-    refused = (out / "bare_loop.log").read_text(errors="replace").splitlines()
-    return bare_result(late_ns, round(1e9 / rate_hz), refused) if len(late_ns) else None
+    refused = (out / f"{_LOOP}.log").read_text(errors="replace").splitlines()
+    return bare_result(late_ns, round(1e9 / rate_hz), refused)
+
+
+def read_round_trips(out: Path, rate_hz: float) -> Series | None:
+    """Round trips by time; None if no message came back."""
+    taken_ns = _read(out / f"{_MESSAGES}.npy")
+    (back,) = np.nonzero(taken_ns)
+    return Series(back / rate_hz, taken_ns[back].astype(np.float64)) if len(back) else None
 
 
 def bare_result(
@@ -99,18 +133,56 @@ def bare_loop(
     return late_ns[:woken]
 
 
-def _run(path: str, realtime: Any, count: int, period_ns: int, begin_ns: int) -> None:
+def _loop(path: str, period_ns: int, begin_ns: int, count: int) -> None:
     """The bare loop as a process; SIGTERM ends it early, and it keeps what it has measured."""
     signals: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, _frame: signals.append(number))
-    sys.stdout.writelines(f"{one}\n" for one in prepare_thread(RealtimeSettings(**realtime)))
     np.save(path, bare_loop(count, period_ns, begin_ns, lambda: bool(signals)))
+
+
+def _answer(endpoint: str, period_ns: int) -> None:
+    """Sends back what comes, until it is ended."""
+    with open_session(Endpoints(listen=(endpoint,))) as session:
+        there, back = _receiver(session, "there"), _sender(session, "back")
+        while True:
+            back.put(there.recv().payload)
+
+
+def _send(endpoint: str, path: str, period_ns: int, begin_ns: int) -> None:
+    """One message each period; the file has what came back, however this process ends."""
+    taken_ns = np.lib.format.open_memmap(path, mode="r+")
+    begin_ns += period_ns // 2
+    with open_session(Endpoints(connect=(endpoint,)), peers_follow=True) as session:
+        back, there = _receiver(session, "back"), _sender(session, "there")
+        while not there.matching_status.matching:
+            time.sleep(_LOOK_S)
+        first = max(0, -(-(time.monotonic_ns() - begin_ns) // period_ns))
+        for k in range(first, len(taken_ns)):
+            sleep_until_ns(begin_ns + k * period_ns)
+            sent_ns = time.monotonic_ns()
+            there.put(_BYTES)
+            back.recv()
+            taken_ns[k] = time.monotonic_ns() - sent_ns
+
+
+def _receiver(session: Any, key: str) -> Any:
+    return session.declare_subscriber(key, zenoh.handlers.FifoChannel(100))
+
+
+def _sender(session: Any, key: str) -> Any:
+    return session.declare_publisher(key, express=True)
+
+
+def _run(work: str, realtime: Any, **task: Any) -> None:
+    while work == "load":
+        pass
+    # What is refused the bare loop says for all.
+    refused = prepare_thread(RealtimeSettings(**realtime))
+    sys.stdout.writelines(f"{one}\n" for one in refused if work == "loop")
+    works: dict[str, Callable[..., None]] = {"loop": _loop, "answer": _answer, "send": _send}
+    works[work](**task)
 
 
 if __name__ == "__main__":
     die_with_parent(int(sys.argv[2]))
-    if sys.argv[3:]:
-        _run(**json.loads(sys.argv[3]))
-    else:
-        while True:
-            pass
+    _run(**json.loads(sys.argv[3]))

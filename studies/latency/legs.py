@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesrace.arrays import Floats
+from bayesrace.columns import Columns
 from studies.latency.clocks import ClockMap
-from studies.latency.columns import Columns, Tables
-from studies.latency.traffic import heartbeats, traffic
+from studies.latency.tables import Tables, heartbeats, traffic
 
 __all__ = ["ANSWER", "BESIDE", "LEGS", "Cycles"]
 
@@ -60,7 +60,7 @@ class Cycles:
         self.answers, ticks = self._known(tables["answers"]), self._known(tables["ticks"])
         # After the last state the controller predicts and falls back, until it gives up.
         self.ticks = ticks[ticks["n"] < self.states["n"][-1]]
-        self._starts = self.ticks[_first(self.ticks, "state")]
+        self._starts = self.ticks[_first(self.ticks, "state_seq")]
         """The first cycle of each state."""
         self._releases = self.ticks[_first(self.ticks, "tick")]
         """The first cycle of each release; all others are late ones."""
@@ -72,38 +72,43 @@ class Cycles:
     def _exchanges(self) -> tuple[Floats, Floats, Floats, Floats]:
         """The first answer to each state as an exchange of timestamps: sampled at the plant,
         received and sent by the controller's clock, arrived at the plant [ns]."""
-        k = _first(self._arrived, "state")
+        k = _first(self._arrived, "state_seq")
         _, i, j = np.intersect1d(
-            self._starts["state"], self._arrived["state"][k], return_indices=True
+            self._starts["state_seq"], self._arrived["state_seq"][k], return_indices=True
         )
         starts, k = self._starts[i], k[j]
-        return self._sampled(starts), starts["received"], self._sent["sent"][k], self._arrived_at[k]
+        return (
+            self._sampled(starts),
+            starts["received_ns"],
+            self._sent["source_time_ns"][k],
+            self._arrived_at[k],
+        )
 
     def legs(self) -> dict[str, tuple[Floats, Floats]]:
         """Calendar times at the recorder, and values, of each leg that the messages give [ns]."""
         ticks, starts, releases = self.ticks, self._starts, self._releases
-        first = self.answers[_first(self.answers, "state")]
+        first = self.answers[_first(self.answers, "state_seq")]
         acted = self.answers[self.answers["acting_s"] >= 0]
         # Every cycle sends one actuation and one telemetry message, with equal numbers.
         _, i, j = np.intersect1d(self.actuations["seq"], ticks["seq"], return_indices=True)
-        made, released = self.actuations["sent"][i], ticks["released"][j]
+        made, released = self.actuations["source_time_ns"][i], ticks["released_ns"][j]
         legs = {
-            "wake_up": (releases["at"], releases["wake_us"] * 1e3),
-            "decode": (starts["at"], starts["decode_us"] * 1e3),
-            "release_wait": (starts["at"], starts["released"] - starts["received"]),
-            "feedback": (ticks["at"], ticks["solve_us"] * 1e3),
-            "compute": (ticks["at"][j], made - released),
-            "encode": (ticks["at"], ticks["encode_us"] * 1e3),
-            "state_to_actuation": (first["at"], first["arrival_s"] * 1e9),
-            "acting": (acted["at"], acted["acting_s"] * 1e9),
-            "prepare": (releases["at"], releases["prepare_us"] * 1e3),
+            "wake_up": (releases["wall_ns"], releases["wake_us"] * 1e3),
+            "decode": (starts["wall_ns"], starts["decode_us"] * 1e3),
+            "release_wait": (starts["wall_ns"], starts["released_ns"] - starts["received_ns"]),
+            "feedback": (ticks["wall_ns"], ticks["solve_us"] * 1e3),
+            "compute": (ticks["wall_ns"][j], made - released),
+            "encode": (ticks["wall_ns"], ticks["encode_us"] * 1e3),
+            "state_to_actuation": (first["wall_ns"], first["arrival_s"] * 1e9),
+            "acting": (acted["wall_ns"], acted["acting_s"] * 1e9),
+            "prepare": (releases["wall_ns"], releases["prepare_us"] * 1e3),
         }
         if self.clock is not None:
-            readings = starts["received"], ticks["released"], self._sent["sent"]
+            readings = starts["received_ns"], ticks["released_ns"], self._sent["source_time_ns"]
             received, released, sent = map(self.clock.to_plant, readings)
-            legs["state_transport"] = starts["at"], received - self._sampled(starts)
-            legs["state_age"] = ticks["at"], released - self._sampled(ticks)
-            legs["actuation_transport"] = self._arrived["at"], self._arrived_at - sent
+            legs["state_transport"] = starts["wall_ns"], received - self._sampled(starts)
+            legs["state_age"] = ticks["wall_ns"], released - self._sampled(ticks)
+            legs["actuation_transport"] = self._arrived["wall_ns"], self._arrived_at - sent
         return legs
 
     def counts(self) -> Counter[str]:
@@ -111,17 +116,17 @@ class Cycles:
         ticks, answers, releases = self.ticks, self.answers, self._releases
         late = len(ticks) - len(releases)
         streams = self.states, self.actuations, self._tables["ticks"]
-        beats = heartbeats(self._tables, controller=True)
+        beats = heartbeats(self._tables, "controller")
         found = {
             "releases": len(releases),
             "late_states": late,
             "skipped": np.maximum(np.diff(ticks["tick"]) - np.diff(ticks["seq"]), 0).sum(),
             "deadline_misses": ticks["missed"].sum(),
             "fallbacks": np.count_nonzero(ticks["fallback"]),
-            "overruns": np.diff(beats["overruns"]).sum(),
+            "overruns": np.diff(beats["counters.overruns"]).sum(),
             "periods": np.diff(ticks["seq"]).sum() - late,
-            "length_ns": np.diff(releases["released"]).sum(),
-            "repeated_answers": len(answers) - len(_first(answers, "state")),
+            "length_ns": np.diff(releases["released_ns"]).sum(),
+            "repeated_answers": len(answers) - len(_first(answers, "state_seq")),
             "overtaken_answers": np.count_nonzero(answers["acting_s"] < 0),
             # By their numbers; the run itself may have had them.
             "unobserved": sum((np.diff(np.unique(one["seq"])) - 1.0).sum() for one in streams),
@@ -132,12 +137,14 @@ class Cycles:
 
     def _sampled(self, rows: Columns) -> Floats:
         """When the state of each row was, on the plant's clock."""
-        found: Floats = self.states["sampled"][np.searchsorted(self.states["seq"], rows["state"])]
+        found: Floats = self.states["source_time_ns"][
+            np.searchsorted(self.states["seq"], rows["state_seq"])
+        ]
         return found
 
     def _known(self, rows: Columns) -> Columns:
         """The rows whose state is one of those that count."""
-        return rows[np.isin(rows["state"], self.states["seq"])]
+        return rows[np.isin(rows["state_seq"], self.states["seq"])]
 
 
 def _first(table: Columns, key: str = "seq") -> NDArray[np.intp]:
@@ -147,10 +154,10 @@ def _first(table: Columns, key: str = "seq") -> NDArray[np.intp]:
 
 def _paired(one: Columns, other: Columns) -> tuple[Columns, Columns]:
     """The rows of the states of which both tables have equally many, the k-th with the k-th."""
-    one, other = (rows[np.argsort(rows["state"], kind="stable")] for rows in (one, other))
+    one, other = (rows[np.argsort(rows["state_seq"], kind="stable")] for rows in (one, other))
     (keys, counts), (others, more) = (
-        np.unique(rows["state"], return_counts=True) for rows in (one, other)
+        np.unique(rows["state_seq"], return_counts=True) for rows in (one, other)
     )
     common, i, j = np.intersect1d(keys, others, return_indices=True)
     whole = common[counts[i] == more[j]]
-    return one[np.isin(one["state"], whole)], other[np.isin(other["state"], whole)]
+    return one[np.isin(one["state_seq"], whole)], other[np.isin(other["state_seq"], whole)]

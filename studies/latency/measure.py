@@ -23,11 +23,9 @@ from operation.settings import PreparationSettings
 from operation.system import started_system
 from operation.terminal.progress import Stages
 from studies.latency.analysis import Beside, analyse
-from studies.latency.beside import read_bare_loop, running_beside
+from studies.latency.beside import read_bare_loop, read_round_trips, running_beside
 from studies.latency.report import RESULT, write_files
-from studies.latency.results import LatencyResult, Memory
-from studies.latency.round_trip import passing_messages, read_round_trips
-from studies.latency.settings import LatencySettings
+from studies.latency.results import LatencyResult, LatencySettings, Memory
 
 __all__ = ["LatencyError", "Run", "measure"]
 
@@ -156,7 +154,6 @@ def _record(
         count = round(settings.duration_s * rate_hz)
         with (
             running_beside(out, settings.load, settings.realtime, rate_hz, begin_ns, count),
-            passing_messages(out, settings.realtime, rate_hz, begin_ns, count),
             stages.stage(f"record {settings.duration_s:g} s"),
         ):
             run.watch(director, recorder, begin_ns, end_ns)
