@@ -8,7 +8,7 @@ the same file. Options of a command override it.
 import itertools
 import json
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -121,10 +121,10 @@ class TlsSettings(_Section):
 class Configuration(_Section):
     """Everything in the file; what is left out has its default."""
 
-    network: NetworkSettings = Field(NetworkSettings())
-    tls: TlsSettings = Field(TlsSettings())
-    realtime: RealtimeSettings = Field(RealtimeSettings())
-    limits: LinkLimits = Field(LinkLimits())
+    network: NetworkSettings = NetworkSettings()
+    tls: TlsSettings = TlsSettings()
+    realtime: RealtimeSettings = RealtimeSettings()
+    limits: LinkLimits = LinkLimits()
     zenoh: ZenohSettings = Field(
         {}, description='Zenoh\'s own settings, such as "transport/link/tx/queue/size/data" = 4'
     )
@@ -198,38 +198,25 @@ def as_toml(configuration: Configuration, explained: bool = False) -> str:
     mark = "#" if explained else ""
     for name, field in Configuration.model_fields.items():
         section = getattr(configuration, name)
-        is_model = isinstance(section, BaseModel)
+        fields = type(section).model_fields if isinstance(section, BaseModel) else {}
         if explained:
-            words = (type(section).__doc__ or "").splitlines()[0] if is_model else field.description
+            words = field.description or (type(section).__doc__ or "").splitlines()[0]
             lines += [f"# {words}"]
         lines += [f"{mark}[{name}]"]
-        if is_model:
-            lines += _fields(section, explained, mark)
-        else:
-            lines += [f"{mark}{_text(key)} = {_value(value)}" for key, value in section.items()]
+        for key, value in dict(section).items():
+            if explained and key in fields:
+                lines += [f"# {fields[key].description}"]
+            setting = key if key in fields else _value(key)
+            # TOML has no null: what is not set is a comment.
+            lines += [f"#{key} =" if value is None else f"{mark}{setting} = {_value(value)}"]
         lines += [""]
     return "\n".join(lines[:-1]) + "\n"
 
 
-def _fields(section: BaseModel, explained: bool, mark: str) -> Iterator[str]:
-    for name, field in type(section).model_fields.items():
-        value = getattr(section, name)
-        if explained:
-            yield f"# {field.description}"
-        # TOML has no null: what is not set is a comment.
-        yield f"#{name} =" if value is None else f"{mark}{name} = {_value(value)}"
-
-
 def _value(value: Any) -> str:
+    """A value in TOML. Texts are those of JSON, but for what JSON writes as two surrogates."""
     if isinstance(value, dict):
-        if not value:
-            return "{}"
-        return "{ " + ", ".join(f"{_text(k)} = {_value(v)}" for k, v in value.items()) + " }"
+        return "{" + ", ".join(f"{_value(k)} = {_value(v)}" for k, v in value.items()) + "}"
     if isinstance(value, tuple | list):
         return "[" + ", ".join(map(_value, value)) + "]"
-    return _text(str(value) if isinstance(value, Path) else value)
-
-
-def _text(value: Any) -> str:
-    """As JSON, which is TOML but for what it would write as two surrogates."""
-    return json.dumps(value, ensure_ascii=False)
+    return json.dumps(value, ensure_ascii=False, default=str)
