@@ -1,6 +1,6 @@
 """What the tests of the controller's FMU share: the lockstep run that it must drive, exports.
 
-The fixtures ``exported`` and ``lockstep`` are there for modules that import their functions.
+The fixture ``exported`` is there for modules that import its function.
 """
 
 import fcntl
@@ -36,7 +36,6 @@ __all__ = [
     "Lockstep",
     "answers",
     "exported_controllers",
-    "lockstep_runs",
     "same",
     "strewn",
     "versions",
@@ -105,12 +104,35 @@ class Lockstep:
 
 @dataclass(frozen=True)
 class Exported:
-    """FMUs made once, and folders they are extracted to once; ``define``: the controller's."""
+    """FMUs of the controller on a circuit, made once, and folders they are extracted to once."""
 
     folder: Path
     shared: Path
     """With the test processes beside this one: they take seconds to compile."""
-    define: Callable[..., FmuDefinition]
+    artefact: Path
+    car: CarParameters
+    circuit: Circuit
+    weights: GpWeights
+
+    def define(self, **changes: Any) -> FmuDefinition:
+        """The controller's definition."""
+        values: dict[str, Any] = {
+            "artefact": self.artefact,
+            "car": self.car,
+            "rows": self.circuit.table.rows,
+            "spacing_m": self.circuit.table.spacing_m,
+            "settings": RACING.parameters(self.car),
+            "fallback": FALLBACK.model_dump() | {"brake_fade_mps": self.car.brake_fade_mps},
+            "weights": self.weights,
+        }
+        return controller_fmu(**(values | changes))
+
+    def lockstep(self, delay_s: float = 0.0, tolerance: float = 1.0) -> Lockstep:
+        """The same controller in one process with the plant."""
+        native = NativeStep(self.artefact, self.car, RACING)
+        native.set_weights(self.weights)
+        native.set_path(self.circuit.table)
+        return Lockstep(native, self.car, delay_s, tolerance)
 
     def fmu(self, version: Literal[2, 3]) -> Path:
         """The controller's."""
@@ -140,38 +162,10 @@ def exported_controllers(
     circuit: Circuit,
     weights: GpWeights,
 ) -> Exported:
-    """The controller on the circuit."""
-
-    def define(**changes: Any) -> FmuDefinition:
-        values: dict[str, Any] = {
-            "artefact": kinematic_artefact,
-            "car": car,
-            "rows": circuit.table.rows,
-            "spacing_m": circuit.table.spacing_m,
-            "settings": RACING.parameters(car),
-            "fallback": FALLBACK.model_dump() | {"brake_fade_mps": car.brake_fade_mps},
-            "weights": weights,
-        }
-        return controller_fmu(**(values | changes))
-
     base = tmp_path_factory.getbasetemp()
     shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
-    return Exported(tmp_path_factory.mktemp("exported"), shared, define)
-
-
-@pytest.fixture(name="lockstep")
-def lockstep_runs(
-    kinematic_artefact: Path, car: CarParameters, circuit: Circuit, weights: GpWeights
-) -> Callable[..., Lockstep]:
-    """Makes a :class:`Lockstep` on the circuit, of the delay and tolerance that it is given."""
-
-    def make(delay_s: float = 0.0, tolerance: float = 1.0) -> Lockstep:
-        native = NativeStep(kinematic_artefact, car, RACING)
-        native.set_weights(weights)
-        native.set_path(circuit.table)
-        return Lockstep(native, car, delay_s, tolerance)
-
-    return make
+    folder = tmp_path_factory.mktemp("exported")
+    return Exported(folder, shared, kinematic_artefact, car, circuit, weights)
 
 
 def strewn(k: int, x: Floats) -> Floats:

@@ -1,6 +1,5 @@
 """The controller as an FMU in a plain FMI master: the lap of the lockstep run, no bad input."""
 
-from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -11,16 +10,13 @@ from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import STATES
 from controller.driver import DOUBTED, UNPREDICTABLE, Level
 from controller.native_step import StepStatus
-from tests.conftest import Circuit
-from tests.fmu_lockstep import (  # noqa: F401 - fixtures are used by name
+from tests.fmu_lockstep import (  # noqa: F401 - a fixture is used by name
     RACING,
     STEP_S,
     STEPS,
     Exported,
-    Lockstep,
     answers,
     exported_controllers,
-    lockstep_runs,
     same,
     strewn,
     versions,
@@ -34,12 +30,10 @@ def test_fmpy_has_no_finding(exported: Exported, version: Literal[2, 3]) -> None
 
 
 @versions
-def test_a_plain_master_drives_the_lockstep_run(
-    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit, version: Literal[2, 3]
-) -> None:
+def test_a_plain_master_drives_the_lockstep_run(exported: Exported, version: Literal[2, 3]) -> None:
     """The controller gives the same bits; the car differs by rounding."""
-    start = circuit.start(v_mps=0.1)
-    run = lockstep().run(start, STEPS)
+    start = exported.circuit.start(v_mps=0.1)
+    run = exported.lockstep().run(start, STEPS)
     laps = (run.x[-1][2] - run.x[0][2]) / (2 * np.pi)
     assert laps > 3
     controller = exported.slave(exported.fmu(version))
@@ -54,12 +48,10 @@ def test_a_plain_master_drives_the_lockstep_run(
     car.close()
 
 
-def test_a_master_that_steps_side_by_side_is_compensated_for(
-    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit
-) -> None:
+def test_a_master_that_steps_side_by_side_is_compensated_for(exported: Exported) -> None:
     """The car gets each input a step later, and the controller knows."""
-    start = circuit.start(v_mps=0.1)
-    run = lockstep(delay_s=STEP_S).run(start, STEPS)
+    start = exported.circuit.start(v_mps=0.1)
+    run = exported.lockstep(delay_s=STEP_S).run(start, STEPS)
     controller = exported.slave(exported.fmu(3), {"delay": STEP_S})
     same(answers(controller, run.x), run)
     assert max(level for _, level in run.said) == Level.SOLUTION
@@ -72,24 +64,24 @@ def test_a_master_that_steps_side_by_side_is_compensated_for(
 
 @pytest.mark.parametrize("turned_rad", [-1.1, 1.1])
 def test_a_car_that_stands_and_points_away_finds_its_way_as_in_lockstep(
-    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit, turned_rad: float
+    exported: Exported, turned_rad: float
 ) -> None:
-    start = circuit.start(1.0, 0.0)
+    start = exported.circuit.start(1.0, 0.0)
     start[2] += turned_rad
     start[6] = 0.35 * np.sign(turned_rad)
-    run = lockstep().run(start, 150)
+    run = exported.lockstep().run(start, 150)
     assert run.x[-1][3] > 0.5
     same(answers(exported.slave(exported.fmu(2)), run.x), run)
 
 
 @pytest.mark.parametrize("turned_rad", [0.0, 2.0])
 def test_a_car_that_is_held_is_answered_as_in_lockstep(
-    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit, turned_rad: float
+    exported: Exported, turned_rad: float
 ) -> None:
     """By something, whatever is sent; on its line, and about to turn round."""
-    held = circuit.start(0.5, 0.0)
+    held = exported.circuit.start(0.5, 0.0)
     held[2] += turned_rad
-    run = lockstep()
+    run = exported.lockstep()
     for k in range(80):
         d, delta_rate = run.answer(k, held)
         run.plant.u_applied = (float(d), float(delta_rate))
@@ -97,11 +89,13 @@ def test_a_car_that_is_held_is_answered_as_in_lockstep(
 
 
 def test_inputs_on_their_way_and_states_that_nothing_follows_from_are_compensated_for_alike(
-    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit
+    exported: Exported,
 ) -> None:
     """A delay of two and a half periods; a state that is no state cannot be predicted from."""
-    run = lockstep(delay_s=2.5 * STEP_S, tolerance=0.0)
-    for k, x in enumerate(lockstep().run(circuit.start(v_mps=1.0), 120, strewn).x):
+    run = exported.lockstep(delay_s=2.5 * STEP_S, tolerance=0.0)
+    for k, x in enumerate(
+        exported.lockstep().run(exported.circuit.start(v_mps=1.0), 120, strewn).x
+    ):
         d, delta_rate = run.u[k - 3] if k >= 3 else (0.0, 0.0)
         run.plant.u_applied = (float(d), float(delta_rate))
         run.answer(k, x)
@@ -112,9 +106,9 @@ def test_inputs_on_their_way_and_states_that_nothing_follows_from_are_compensate
 
 @versions
 def test_bad_states_are_answered_as_in_lockstep_and_nothing_bad_comes_out(
-    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit, version: Literal[2, 3]
+    exported: Exported, version: Literal[2, 3]
 ) -> None:
-    run = lockstep(tolerance=0.0).run(circuit.start(v_mps=1.0), 320, strewn)
+    run = exported.lockstep(tolerance=0.0).run(exported.circuit.start(v_mps=1.0), 320, strewn)
     statuses, levels = ({said[i] for said in run.said} for i in (0, 1))
     assert statuses >= {0, StepStatus.INFEASIBLE, StepStatus.BAD_STATE}
     assert levels == set(Level)
@@ -142,21 +136,17 @@ def test_bad_states_are_answered_as_in_lockstep_and_nothing_bad_comes_out(
     assert controller.messages == []
 
 
-def test_a_sensor_that_freezes_stops_the_car_on_its_line(
-    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit
-) -> None:
-    run = lockstep().run(circuit.start(v_mps=1.0), 60)
+def test_a_sensor_that_freezes_stops_the_car_on_its_line(exported: Exported) -> None:
+    run = exported.lockstep().run(exported.circuit.start(v_mps=1.0), 60)
     controller = exported.slave(exported.fmu(3))
     said = answers(controller, [*run.x, *[run.x[-1]] * 20])[61:]
     assert (said[3:, 2] == DOUBTED).all()
     assert (said[-10:, 3] >= Level.BRAKE).all()
 
 
-def test_parameters_act_and_limits_can_be_tuned_during_the_run(
-    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit
-) -> None:
-    start = circuit.start(v_mps=0.1)
-    run = lockstep()
+def test_parameters_act_and_limits_can_be_tuned_during_the_run(exported: Exported) -> None:
+    start = exported.circuit.start(v_mps=0.1)
+    run = exported.lockstep()
     other = RACING.model_copy(update={"r_duty": 0.05, "margin_m": 0.03})
     run.native.set_parameters(run.car, other)
     run.run(start, 100)
@@ -171,14 +161,12 @@ def test_parameters_act_and_limits_can_be_tuned_during_the_run(
 
 
 @pytest.mark.parametrize("connected", [False, True])
-def test_it_is_as_cautious_as_in_lockstep(
-    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit, connected: bool
-) -> None:
+def test_it_is_as_cautious_as_in_lockstep(exported: Exported, connected: bool) -> None:
     """Also about errors that its band does not cover, which it learns from its own outputs."""
-    run = lockstep()
+    run = exported.lockstep()
     cautious = RACING.model_copy(update={"caution": 0.95})
     run.native.set_parameters(run.car, cautious)
-    run.run(circuit.start(v_mps=0.1), 150)
+    run.run(exported.circuit.start(v_mps=0.1), 150)
     values = {"caution_sigmas": cautious.caution_sigmas, "d_applied_connected": float(connected)}
     controller = exported.slave(exported.fmu(3), values)
     rows = []
@@ -192,10 +180,8 @@ def test_it_is_as_cautious_as_in_lockstep(
     assert widening > 1
 
 
-def test_a_speed_limit_slows_down_along_the_line_to_standstill(
-    exported: Exported, circuit: Circuit
-) -> None:
-    start = circuit.start(v_mps=1.5)
+def test_a_speed_limit_slows_down_along_the_line_to_standstill(exported: Exported) -> None:
+    start = exported.circuit.start(v_mps=1.5)
     controller = exported.slave(exported.fmu(3))
     car = exported.slave(exported.plant(3), dict(zip(STATES, start, strict=True)))
     drive(car, controller, 50)
@@ -212,9 +198,9 @@ def test_a_speed_limit_slows_down_along_the_line_to_standstill(
 
 @pytest.mark.parametrize("h", [0.001, 0.005])
 def test_a_short_communication_step_holds_the_outputs_for_a_period(
-    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit, h: float
+    exported: Exported, h: float
 ) -> None:
-    run = lockstep().run(circuit.start(v_mps=1.0), 60)
+    run = exported.lockstep().run(exported.circuit.start(v_mps=1.0), 60)
     times = round(STEP_S / h)
     controller = exported.slave(exported.fmu(3))
     rows = answers(controller, [x for x in run.x for _ in range(times)], h)
@@ -225,11 +211,9 @@ def test_a_short_communication_step_holds_the_outputs_for_a_period(
     assert len({tuple(row[:2]) for row in first}) > 1
 
 
-def test_what_acts_may_be_connected(
-    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit
-) -> None:
+def test_what_acts_may_be_connected(exported: Exported) -> None:
     """By default it is what was sent; a car that does something else says so."""
-    run = lockstep().run(circuit.start(v_mps=1.0), 50)
+    run = exported.lockstep().run(exported.circuit.start(v_mps=1.0), 50)
     connected = exported.slave(exported.fmu(3), {"d_applied_connected": 1.0})
     rows = []
     for k, x in enumerate(run.x):

@@ -4,7 +4,6 @@ import ctypes
 import shutil
 import subprocess
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,18 +16,15 @@ from fmpy.fmi2 import FMU2Slave
 from fmpy.validation import validate_fmu
 
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import GpWeights, zero_weights
-from bayesrace.vehicles import CarParameters
+from bayesrace.gp.weights import zero_weights
 from codegen.fmu import exchange_weights, pack
 from codegen.fmu.build import sources_of, write_sources
 from codegen.host_files import WEIGHTS_FILE, path_file
-from tests.conftest import Circuit, fit_weights
-from tests.fmu_lockstep import (  # noqa: F401 - fixtures are used by name
+from tests.conftest import fit_weights
+from tests.fmu_lockstep import (  # noqa: F401 - a fixture is used by name
     Exported,
-    Lockstep,
     answers,
     exported_controllers,
-    lockstep_runs,
     same,
     strewn,
     versions,
@@ -38,10 +34,10 @@ from tests.native_programs import PROGRAMS, SANITIZED, artefact_objects, gcc
 
 
 def test_two_instances_do_not_know_each_other_and_reset_begins_the_same_run_again(
-    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit
+    exported: Exported,
 ) -> None:
-    one_run = lockstep().run(circuit.start(v_mps=0.1), 80)
-    two_run = lockstep().run(circuit.start(2.0, 1.5), 80)
+    one_run = exported.lockstep().run(exported.circuit.start(v_mps=0.1), 80)
+    two_run = exported.lockstep().run(exported.circuit.start(2.0, 1.5), 80)
     one, two = (exported.slave(exported.fmu(3), name=name) for name in ("one", "two"))
     for _ in range(2):
         rows = [
@@ -57,10 +53,8 @@ def test_two_instances_do_not_know_each_other_and_reset_begins_the_same_run_agai
 
 
 @versions
-def test_a_tool_can_roll_back(
-    exported: Exported, lockstep: Callable[..., Lockstep], circuit: Circuit, version: Literal[2, 3]
-) -> None:
-    run = lockstep().run(circuit.start(v_mps=1.0), 60)
+def test_a_tool_can_roll_back(exported: Exported, version: Literal[2, 3]) -> None:
+    run = exported.lockstep().run(exported.circuit.start(v_mps=1.0), 60)
     controller = exported.slave(exported.fmu(version))
     answers(controller, run.x[:30])
     get, put, free = (
@@ -77,19 +71,15 @@ def test_a_tool_can_roll_back(
 
 @pytest.mark.check
 def test_no_sanitizer_finds_anything_and_c_sees_what_the_master_sees(
-    exported: Exported,
-    lockstep: Callable[..., Lockstep],
-    circuit: Circuit,
-    kinematic_artefact: Path,
-    tmp_path: Path,
+    exported: Exported, tmp_path: Path
 ) -> None:
     """A drive with bad states strewn in, saved and restored states, resets, missing resources."""
-    run = lockstep().run(circuit.start(v_mps=1.0), 120, strewn)
+    run = exported.lockstep().run(exported.circuit.start(v_mps=1.0), 120, strewn)
     definition = exported.define(version=3)
     linked = write_sources(sources_of(definition)[1], tmp_path)
-    own = [name for name in linked if not (kinematic_artefact / name).exists()]
+    own = [name for name in linked if not (exported.artefact / name).exists()]
     flags = (*SANITIZED, "-Wall", "-Wextra", "-Wno-unused-parameter", "-I.")
-    objects = artefact_objects(kinematic_artefact, SANITIZED)
+    objects = artefact_objects(exported.artefact, SANITIZED)
     main, archives = PROGRAMS / "fmu_controller.c", ("libdaqpstat.a", "-lm")
     said = gcc(*flags, main, *own, *objects, *archives, "-o", "drive", cwd=tmp_path)
     assert "controller" not in said
@@ -111,13 +101,11 @@ def test_no_sanitizer_finds_anything_and_c_sees_what_the_master_sees(
 
 
 @versions
-def test_wrong_parameters_are_refused_and_named(
-    exported: Exported, circuit: Circuit, version: Literal[2, 3]
-) -> None:
+def test_wrong_parameters_are_refused_and_named(exported: Exported, version: Literal[2, 3]) -> None:
     """Discard and Warning let the simulation go on, and leave no trace in it."""
     fmu = exported.fmu(version)
     controller, other = (exported.slave(fmu, name=name) for name in ("one", "two"))
-    states = [circuit.start()] * 3
+    states = [exported.circuit.start()] * 3
     np.testing.assert_array_equal(answers(controller, states), answers(other, states))
     for name, value in (("q_position", 0.0), ("r_duty", np.nan), ("iterations", 0)):
         with pytest.raises(FMICallException, match=r"\(discard\)"):
@@ -203,41 +191,32 @@ def test_the_resources_are_found_by_uri_and_by_plain_path(
         assert not instance(location), location
 
 
-def test_weights_are_exchanged_without_compiling(
-    exported: Exported,
-    lockstep: Callable[..., Lockstep],
-    circuit: Circuit,
-    car: CarParameters,
-    weights: GpWeights,
-    tmp_path: Path,
-) -> None:
-    other = fit_weights(car, ("matern25", "rbf", "rbf"), count=90, seed=4)
+def test_weights_are_exchanged_without_compiling(exported: Exported, tmp_path: Path) -> None:
+    other = fit_weights(exported.car, ("matern25", "rbf", "rbf"), count=90, seed=4)
     out = tmp_path / "other.fmu"
     exchange_weights(exported.fmu(3), other, out)
     assert validate_fmu(str(out)) == []
-    run = lockstep()
+    run = exported.lockstep()
     run.native.set_weights(other)
-    run.run(circuit.start(v_mps=1.0), 60)
+    run.run(exported.circuit.start(v_mps=1.0), 60)
     same(answers(exported.slave(out), run.x), run)
     exchange_weights(out, None, out)  # in place
-    worst = lockstep()
+    worst = exported.lockstep()
     worst.native.load_weights(b"")
-    worst.run(circuit.start(v_mps=1.0), 60)
+    worst.run(exported.circuit.start(v_mps=1.0), 60)
     controller = Slave(out, tmp_path / "worst")
     controller.initialise()
     same(answers(controller, worst.x), worst)
     with pytest.raises(InputError, match="learned for"):
         exchange_weights(out, zero_weights("orca", "another"), out)
     with pytest.raises(InputError, match="not a controller's FMU"):
-        exchange_weights(exported.plant(3), weights, out)
+        exchange_weights(exported.plant(3), other, out)
     with pytest.raises(InputError, match="cannot be read"):
-        exchange_weights(tmp_path / "none.fmu", weights, out)
+        exchange_weights(tmp_path / "none.fmu", other, out)
 
 
-def test_what_does_not_fit_together_is_not_exported(
-    exported: Exported, circuit: Circuit, car: CarParameters
-) -> None:
-    heavier = car.model_copy(update={"mass_kg": 0.05})
+def test_what_does_not_fit_together_is_not_exported(exported: Exported) -> None:
+    heavier = exported.car.model_copy(update={"mass_kg": 0.05})
     with pytest.raises(InputError, match="built for car"):
         exported.define(car=heavier)
     with pytest.raises(InputError, match="learned for"):
@@ -245,7 +224,7 @@ def test_what_does_not_fit_together_is_not_exported(
     with pytest.raises(InputError, match="lack 'q_position'"):
         exported.define(settings={})
     with pytest.raises(InputError, match="path table"):
-        exported.define(rows=circuit.table.rows[:4])
+        exported.define(rows=exported.circuit.table.rows[:4])
     with pytest.raises(InputError, match="export it there"):
         pack(exported.define(), exported.folder / "no.fmu", ["x86_64-linux", "x86_64-windows"])
-    assert len(path_file(circuit.table.rows, circuit.table.spacing_m)) % 8 == 0
+    assert len(path_file(exported.circuit.table.rows, exported.circuit.table.spacing_m)) % 8 == 0

@@ -2,8 +2,6 @@
 
 import io
 import json
-import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,11 +21,9 @@ from learning.target import KernelScore
 from learning.training import train
 from learning.validation import mismatch, unbroken, validate
 from operation.analysis.validation import ValidationResult, validate_weights
-from operation.cli import main
 from operation.terminal.learning_table import print_kernels, print_validation
+from tests.command_line import Cli, refused
 from tests.driven import CAR, QUICK, STEP_S, drive, write_log
-
-Program = Callable[..., int]
 
 
 @pytest.fixture(scope="module")
@@ -52,20 +48,6 @@ def files(tmp_path: Path, weights: GpWeights, driven: Dataset, fresh: Dataset) -
     write_log(tmp_path / "driven.mcap", driven)
     write_npz(tmp_path / "fresh.npz", fresh)
     return tmp_path
-
-
-@pytest.fixture
-def program(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Program:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "80")
-
-    def call(*arguments: str | Path) -> int:
-        monkeypatch.setattr(sys, "argv", ["bayesrace", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            main()
-        return int(end.value.code or 0)
-
-    return call
 
 
 # Horizon -----------------------------------------------------------------------------------------
@@ -122,11 +104,11 @@ def test_mismatch_of_other_weights_is_refused(fresh: Dataset) -> None:
 
 
 def test_validate_writes_what_it_prints(
-    files: Path, program: Program, capfd: pytest.CaptureFixture[str], fresh: Dataset
+    files: Path, cli: Cli, fresh: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
     arguments = ("--on", "fresh.npz", "--json", "v.json", "--out", "all", "--plot", "band.png")
-    assert program("validate", "weights.bin", *arguments) == 0
-    said = capfd.readouterr().out
+    said = cli("validate", "weights.bin", *arguments).out
     assert "…" not in said
     assert max(map(len, said.splitlines())) <= 80
     content = json.loads((files / "v.json").read_text())
@@ -147,11 +129,8 @@ def test_validate_writes_what_it_prints(
     assert (files / "all/validation.json").read_text() == (files / "v.json").read_text()
 
 
-def test_validate_says_when_the_samples_were_learned_from(
-    files: Path, program: Program, capfd: pytest.CaptureFixture[str]
-) -> None:
-    assert program("validate", "weights.bin", "--on", "driven.mcap") == 0
-    assert "learned from" in capfd.readouterr().out
+def test_validate_says_when_the_samples_were_learned_from(files: Path, cli: Cli) -> None:
+    assert "learned from" in cli("validate", "weights.bin", "--on", "driven.mcap").out
 
 
 def test_weights_are_judged_by_the_discretisation_that_they_were_learned_with(
@@ -175,39 +154,6 @@ def test_a_drive_shorter_than_the_horizon_has_no_horizon(
     text = io.StringIO()
     print_validation(result, Console(file=text, width=80))
     assert "no stretch is long enough" in text.getvalue()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("missing.bin", "--on", "fresh.npz"), "missing.bin"),
-        (("fresh.npz", "--on", "fresh.npz"), "weights file"),
-        (("weights.bin", "--on", "missing.mcap"), "missing.mcap"),
-        (("weights.bin", "--on", "weights.bin"), "MCAP"),
-        (("weights.bin", "--on", "driven.mcap", "--run", "7"), "driven"),
-        (("weights.bin", "--on", "fresh.npz", "--track", "nowhere"), "nowhere"),
-        (("weights.bin", "--on", "fresh.npz", "--json", "no/where.json"), "where.json"),
-        (("weights.bin",), "--on"),
-        (("foreign.bin", "--on", "fresh.npz"), "names no discretised model"),
-        (("weights.bin", "--on", "still.npz"), "standstill"),
-    ],
-)
-def test_validate_refuses_in_one_line(
-    files: Path,
-    program: Program,
-    capfd: pytest.CaptureFixture[str],
-    fresh: Dataset,
-    arguments: tuple[str, ...],
-    words: str,
-) -> None:
-    write_weights(files / "foreign.bin", zero_weights("orca", "another model"))
-    x = fresh.x.copy()
-    x[:, 3] = 0
-    write_npz(files / "still.npz", Dataset(CAR, STEP_S, x, fresh.u, fresh.x_next))
-    assert program("validate", *arguments) == 2
-    error = capfd.readouterr().err.strip()
-    assert len(error.splitlines()) == 1
-    assert words in error
 
 
 @pytest.mark.parametrize(
@@ -238,11 +184,11 @@ def test_weights_that_predict_nothing_finite_are_refused(
 
 
 def test_train_chooses_the_kernel_and_prints_why(
-    files: Path, program: Program, capfd: pytest.CaptureFixture[str]
+    files: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
     arguments = ("--data", "fresh.npz", "--restarts", "0", "--points", "60", "--plot", "k.png")
-    assert program("train", "driven.mcap", *arguments, "--out", "new.bin") == 0
-    said = capfd.readouterr().out
+    said = cli("train", "driven.mcap", *arguments, "--out", "new.bin").out
     assert "…" not in said.replace("residual …", "")
     for word in ("matern05", "matern15", "matern25", "rbf", "250 samples"):
         assert word in said
@@ -250,53 +196,51 @@ def test_train_chooses_the_kernel_and_prints_why(
     assert weights.counts == (60, 60, 60)
     assert weights.version in said
     assert (files / "k.png").read_bytes().startswith(b"\x89PNG")
-    assert program("validate", "new.bin", "--on", "fresh.npz") == 0
+    assert cli("validate", "new.bin", "--on", "fresh.npz").code == 0
 
 
-def test_train_takes_one_kernel(files: Path, program: Program) -> None:
+def test_train_takes_one_kernel(files: Path, cli: Cli) -> None:
     arguments = ("--kernel", "matern15", "--restarts", "0")
-    assert program("train", "--data", "fresh.npz", *arguments) == 0
+    assert cli("train", "--data", "fresh.npz", *arguments).code == 0
     assert set(read_weights(files / "weights.bin").kernels) == {"matern15"}
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ((), "at least one log"),
-        (("driven.mcap", "--kernel", "cubic"), "cubic"),
-        (("driven.mcap", "--points", "30000"), "20000"),
-        (("driven.mcap", "driven.mcap"), "same samples"),
-        (("driven.mcap", "--car", "lorry"), "lorry"),
-        (("driven.mcap", "--artefact", "nowhere"), "bayesrace build"),
-        (("driven.mcap", "--plot", "no/where.png"), "where.png"),
-        (("--data", "short.npz"), "at least 20"),
-        (("--data", "constant.npz"), "d is 0.5 in every sample"),
+        ("validate missing.bin --on fresh.npz", "missing.bin"),
+        ("validate fresh.npz --on fresh.npz", "weights file"),
+        ("validate weights.bin --on missing.mcap", "missing.mcap"),
+        ("validate weights.bin --on weights.bin", "MCAP"),
+        ("validate weights.bin --on driven.mcap --run 7", "driven"),
+        ("validate weights.bin --on fresh.npz --track nowhere", "nowhere"),
+        ("validate weights.bin --on fresh.npz --json no/where.json", "where.json"),
+        ("validate weights.bin", "--on"),
+        ("validate foreign.bin --on fresh.npz", "names no discretised model"),
+        ("validate weights.bin --on still.npz", "standstill"),
+        ("train", "at least one log"),
+        ("train driven.mcap --kernel cubic", "cubic"),
+        ("train driven.mcap --points 30000", "20000"),
+        ("train driven.mcap driven.mcap", "same samples"),
+        ("train driven.mcap --car lorry", "lorry"),
+        ("train driven.mcap --artefact nowhere", "bayesrace build"),
+        ("train driven.mcap --artefact ARTEFACT --points 20000", "room for"),
+        ("train driven.mcap --plot no/where.png", "where.png"),
+        ("train --data short.npz", "at least 20"),
+        ("train --data constant.npz", "d is 0.5 in every sample"),
     ],
 )
-def test_train_refuses_in_one_line(
-    files: Path,
-    program: Program,
-    capfd: pytest.CaptureFixture[str],
-    fresh: Dataset,
-    arguments: tuple[str, ...],
-    words: str,
+def test_bad_input_is_refused_in_one_line(
+    files: Path, cli: Cli, fresh: Dataset, kinematic_artefact: Path, arguments: str, words: str
 ) -> None:
-    write_npz(files / "short.npz", fresh.select(slice(10)))
-    u = fresh.u.copy()
-    u[:, 0] = 0.5
-    write_npz(files / "constant.npz", Dataset(CAR, STEP_S, fresh.x, u, fresh.x_next))
-    assert program("train", *arguments) == 2
-    error = capfd.readouterr().err.strip()
-    assert len(error.splitlines()) == 1
-    assert words in error
-
-
-def test_train_keeps_to_the_controllers_room(
-    files: Path, program: Program, kinematic_artefact: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    arguments = ("--artefact", kinematic_artefact, "--points", "20000")
-    assert program("train", "driven.mcap", *arguments) == 2
-    assert "room for" in capfd.readouterr().err
+    write_weights(files / "foreign.bin", zero_weights("orca", "another model"))
+    still = replace(fresh, x=fresh.x * [1, 1, 1, 0, 1, 1, 1])
+    constant = replace(fresh, u=fresh.u * [0, 1] + [0.5, 0])
+    short = fresh.select(slice(10))
+    for name, data in {"still": still, "short": short, "constant": constant}.items():
+        write_npz(files / f"{name}.npz", data)
+    said = cli(*arguments.replace("ARTEFACT", str(kinematic_artefact)).split())
+    refused(said, words)
 
 
 def test_tables_of_training_fit_a_terminal() -> None:
