@@ -14,8 +14,7 @@ from typing import Final
 
 from bayesrace.cache import note_use
 from bayesrace.errors import InputError
-from bayesrace.limit import LimitSettings, read_limit, write_limit
-from bayesrace.limit.cached import known_limit
+from bayesrace.limit import LimitSettings, known_limit, read_limit, write_limit
 from bayesrace.tracks import load_track
 from operation.processes import Child, child
 from operation.settings import RaceSettings

@@ -12,8 +12,7 @@ from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from bayesrace.gp.weights import read_weights
-from bayesrace.raceline import RaceLine, RaceLineSettings
-from bayesrace.raceline.cached import racing_line
+from bayesrace.raceline import RaceLine, RaceLineSettings, racing_line
 from bayesrace.raceline.line import line_identity
 from bayesrace.raceline.nodes import NodeLines, roughness
 from bayesrace.tracks import Track, load_track

@@ -18,8 +18,14 @@ from bayesrace.files import read_whole, replacing
 from bayesrace.gp.weights import GpWeights, encode_weights, read_weights, write_weights
 from bayesrace.integrators import Discretisation
 from bayesrace.messages import STATE, TELEMETRY
-from bayesrace.raceline import RaceLine, RaceLineError, RaceLineSettings, read_raceline_for
-from bayesrace.raceline.cached import raceline_file, racing_line
+from bayesrace.raceline import (
+    RaceLine,
+    RaceLineError,
+    RaceLineSettings,
+    raceline_file,
+    racing_line,
+    read_raceline_for,
+)
 from bayesrace.tracks import Track, load_track, write_track
 from bayesrace.vehicles import CarParameters
 from codegen.build import build

@@ -12,7 +12,7 @@ from bayesrace.cache import digest, kept
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.integrators import PREDICTION
-from bayesrace.raceline import RaceLine, RaceLineSettings, cached
+from bayesrace.raceline import RaceLine, RaceLineSettings, racing_line
 from bayesrace.tracks import load_track
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
@@ -88,19 +88,19 @@ def test_a_racing_line_is_kept_for_its_track_car_and_settings(
         computed.append(arguments)
         return offset_line(track, 0.01 * len(computed), 5.0, 2.5)
 
-    monkeypatch.setattr(cached, "compute_raceline", compute)
-    first, again = (cached.racing_line(track, car) for _ in range(2))
+    monkeypatch.setattr("bayesrace.raceline.compute_raceline", compute)
+    first, again = (racing_line(track, car) for _ in range(2))
     expected = offset_line(track, 0.01, 5.0, 2.5)
     for line in (first, again):
         assert line.track_name == "paddock"
         for name in ("s_m", "x_m", "y_m", "psi_rad", "kappa_radpm", "vx_mps", "ax_mps2"):
             assert (getattr(line, name) == getattr(expected, name)).all()
-    cached.racing_line(track, car, RaceLineSettings(margin_m=0.01))
-    cached.racing_line(load_track("random:1", car.width_m), car)
-    cached.racing_line(track, car.model_copy(update={"mass_kg": 0.05}))
+    racing_line(track, car, RaceLineSettings(margin_m=0.01))
+    racing_line(load_track("random:1", car.width_m), car)
+    racing_line(track, car.model_copy(update={"mass_kg": 0.05}))
     with monkeypatch.context() as patch:
         patch.setattr("bayesrace.cache.version", lambda _: "9.9")
-        cached.racing_line(track, car)
+        racing_line(track, car)
     assert len(computed) == 5
 
 

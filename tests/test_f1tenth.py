@@ -9,8 +9,7 @@ from fmpy.validation import validate_fmu
 from bayesrace.arrays import Floats
 from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.integrators import PREDICTION
-from bayesrace.raceline import RaceLine, read_raceline_for
-from bayesrace.raceline.cached import racing_line
+from bayesrace.raceline import RaceLine, racing_line, read_raceline_for
 from bayesrace.tracks import load_track
 from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import dynamic

@@ -10,8 +10,14 @@ from scipy.optimize import fsolve
 from bayesrace.arrays import Floats
 from bayesrace.cache import uses
 from bayesrace.errors import InputError
-from bayesrace.limit import LimitLap, LimitSettings, compute_limit, read_limit, write_limit
-from bayesrace.limit.cached import limit
+from bayesrace.limit import (
+    LimitLap,
+    LimitSettings,
+    compute_limit,
+    limit_lap,
+    read_limit,
+    write_limit,
+)
 from bayesrace.tracks import StartLine
 from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import command_limits, dynamic, top_command
@@ -24,7 +30,7 @@ CAR = get_car("orca")
 
 
 def limit_on(name: str, car: CarParameters = CAR, **options: float) -> LimitLap:
-    return limit(track_called(name), car, LimitSettings.model_validate(options))
+    return limit_lap(track_called(name), car, LimitSettings.model_validate(options))
 
 
 def steady_speed(radius: float) -> float:

@@ -10,9 +10,8 @@ from rich.console import Console
 
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
-from bayesrace.raceline import RaceLineSettings, cached
+from bayesrace.raceline import RaceLineSettings
 from bayesrace.tracks import Track
-from operation import preparation
 from operation.preparation import Prepared, prepare
 from operation.settings import PreparationSettings
 from operation.terminal.progress import stages_on
@@ -39,7 +38,7 @@ def preparing(
     def compute(track: Track, *_: object) -> object:
         return offset_line(track, 0.01, 5.0, 2.5)
 
-    monkeypatch.setattr(cached, "compute_raceline", compute)
+    monkeypatch.setattr("bayesrace.raceline.compute_raceline", compute)
     monkeypatch.setattr("learning.training.train", lambda *_: weights)
 
     def run(**changes: object) -> tuple[Prepared, list[str]]:
@@ -72,9 +71,11 @@ def test_a_second_preparation_computes_nothing_and_says_so(
     def never(*_: object) -> None:
         raise AssertionError("computed again")
 
-    for module, name in ((cached, "compute_raceline"), (preparation, "collect")):
-        monkeypatch.setattr(module, name, never)
-    monkeypatch.setattr("learning.training.train", never)
+    for name in (
+        "bayesrace.raceline.compute_raceline", "operation.preparation.collect",
+        "learning.training.train",
+    ):  # fmt: skip
+        monkeypatch.setattr(name, never)
     again, stages = preparing()
     assert stages == STAGES
     assert again.arguments == first.arguments
@@ -115,7 +116,7 @@ def test_a_track_without_the_room_is_trained_on_with_less(
             raise InputError("too narrow")
         return offset_line(track, 0.01, 5.0, 2.5)
 
-    monkeypatch.setattr(cached, "compute_raceline", compute)
+    monkeypatch.setattr("bayesrace.raceline.compute_raceline", compute)
     prepared, _ = preparing()
     assert prepared.training is not None
     asked = [margin for margin in margins if margin is not None]

@@ -1,19 +1,32 @@
 """The limit: the fastest lap that a car can drive on a track, by minimum-time optimal control.
 
-With the true model, tyres and actuators' limits as the plant has them; grid, first guess and IPOPT
-are the racing line's (:mod:`bayesrace.raceline`). Order: the racing line on the gates (guess.py),
-the nonlinear programme (ocp.py, of pieces as programme.py has them; outline.py for the car's
-outline), solved on meshes twice as fine each (solve.py), and the lap as a file (lap.py), kept in
-the cache (cached.py).
+With the true model, tyres and actuators' limits as the plant has them; gates, first guess and IPOPT
+are the racing line's (:mod:`bayesrace.raceline`). Order: the lap as a file (lap.py), the racing
+line on the gates (guess.py), the nonlinear programme (ocp.py; outline.py for the car's outline),
+solved on meshes twice as fine each (solve.py).
 
 CasADi is imported on the first call of :func:`compute_limit`, not with this package.
 """
 
+from contextlib import suppress
+from pathlib import Path
+
+from bayesrace.cache import cache_folder, kept
+from bayesrace.errors import InputError
 from bayesrace.limit.lap import LimitLap, LimitSettings, read_limit, write_limit
+from bayesrace.raceline import optimised_identity
 from bayesrace.tracks import Track
 from bayesrace.vehicles.parameters import CarParameters
 
-__all__ = ["LimitLap", "LimitSettings", "compute_limit", "read_limit", "write_limit"]
+__all__ = [
+    "LimitLap",
+    "LimitSettings",
+    "compute_limit",
+    "known_limit",
+    "limit_lap",
+    "read_limit",
+    "write_limit",
+]
 
 
 def compute_limit(
@@ -26,3 +39,25 @@ def compute_limit(
     from bayesrace.limit.solve import solve
 
     return solve(track, car, settings or LimitSettings())
+
+
+def limit_lap(track: Track, car: CarParameters, settings: LimitSettings | None = None) -> LimitLap:
+    """:func:`compute_limit`, or what it returned for the same track, car and settings before."""
+    settings = settings or LimitSettings()
+    return kept(
+        _file(track, car, settings),
+        lambda path: write_limit(path, compute_limit(track, car, settings)),
+        read_limit,
+    )
+
+
+def known_limit(track: Track, car: CarParameters, settings: LimitSettings) -> LimitLap | None:
+    """The limit if it was computed before."""
+    with suppress(InputError):
+        return read_limit(_file(track, car, settings))
+    return None
+
+
+def _file(track: Track, car: CarParameters, settings: LimitSettings) -> Path:
+    """Named after car, track, settings and code."""
+    return cache_folder() / f"limit-{optimised_identity(track, car, settings)}.csv"

@@ -21,9 +21,8 @@ import numpy as np
 from bayesrace.arrays import Floats
 from bayesrace.limit.lap import LimitSettings
 from bayesrace.limit.outline import Outline
-from bayesrace.limit.programme import Indices, Piece, minimise
 from bayesrace.raceline.gates import Gates
-from bayesrace.raceline.nlp import Solution
+from bayesrace.raceline.nlp import Indices, Piece, Solution, minimise
 from bayesrace.vehicles.models import Model, command_limits
 from bayesrace.vehicles.parameters import CarParameters
 from bayesrace.vehicles.parts import GRAVITY_MPS2, LinearTyres
@@ -41,6 +40,9 @@ _SLIDING_RAD: Final = float(np.pi / 3)
 
 _ASIDE_RAD: Final = 1.5
 """Largest angle between car and gate's driving direction."""
+
+_TOLERANCE: Final = 1e-7
+"""IPOPT's, of a scaled programme."""
 
 
 def usual_interval(car: CarParameters) -> tuple[float, float]:
@@ -205,5 +207,6 @@ def optimise(
         )
     bounds = _bounds(model.car, layout, settings)
     start = np.clip(layout.packed(guess.states, guess.durations_s), *bounds)
-    solution = minimise(pieces, bounds, start, {"max_iter": settings.max_iterations, **options})
+    ipopt = {"tol": _TOLERANCE, "max_iter": settings.max_iterations, **options}
+    solution = minimise(pieces, bounds, start, ipopt)
     return layout.lap(solution.x), solution

@@ -13,8 +13,8 @@ import casadi as ca
 import numpy as np
 
 from bayesrace.arrays import Floats
-from bayesrace.limit.programme import Indices, Piece
 from bayesrace.raceline.gates import Gates
+from bayesrace.raceline.nlp import Indices, Piece
 from bayesrace.tracks import Track
 from bayesrace.vehicles.parameters import CarParameters
 

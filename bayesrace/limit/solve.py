@@ -10,7 +10,7 @@ from bayesrace.limit.guess import Guess
 from bayesrace.limit.lap import LimitLap, LimitSettings
 from bayesrace.limit.ocp import Lap, optimise
 from bayesrace.limit.outline import Outline
-from bayesrace.raceline.cached import racing_line
+from bayesrace.raceline import racing_line
 from bayesrace.raceline.gates import Gates, flying_gates, smooth_centreline, standing_gates
 from bayesrace.tracks import Track
 from bayesrace.vehicles.models import dynamic

@@ -1,12 +1,18 @@
-"""Racing lines: minimum-time optimisation, the line as data, its file form.
+"""Racing lines: minimum-time optimisation, the line as data, its file form, and the cache.
 
 Order: the line (line.py), gates across the track (gates.py), the friction circle (friction.py), the
-nonlinear programme over both (ocp.py, solved as nlp.py has it), lines through a few nodes, for
-optimisers without derivatives (nodes.py), and the cache (cached.py).
+nonlinear programme over both (ocp.py, solved as nlp.py has it), and lines through a few nodes, for
+optimisers without derivatives (nodes.py).
 
 CasADi is imported on the first call of :func:`compute_raceline`, not with this package.
 """
 
+from pathlib import Path
+
+from pydantic import BaseModel
+
+from bayesrace.cache import cache_folder, digest, kept, software
+from bayesrace.cpu import cpu_identity
 from bayesrace.raceline.line import (
     LineIdentity,
     RaceLine,
@@ -28,6 +34,9 @@ __all__ = [
     "RaceLineSettings",
     "check_line",
     "compute_raceline",
+    "optimised_identity",
+    "raceline_file",
+    "racing_line",
     "read_raceline",
     "read_raceline_for",
     "same_track",
@@ -45,3 +54,29 @@ def compute_raceline(
     from bayesrace.raceline.ocp import solve
 
     return solve(track, car, settings or RaceLineSettings())
+
+
+def racing_line(
+    track: Track, car: CarParameters, settings: RaceLineSettings | None = None
+) -> RaceLine:
+    """:func:`compute_raceline`, or what it returned for the same track, car and settings before."""
+    settings = settings or RaceLineSettings()
+    return kept(
+        raceline_file(track, car, settings),
+        lambda path: write_raceline(path, compute_raceline(track, car, settings)),
+        lambda path: read_raceline(path, track.name),
+    )
+
+
+def raceline_file(track: Track, car: CarParameters, settings: RaceLineSettings) -> Path:
+    """Where the line is kept, in a folder named after car, track, settings and code."""
+    identity = optimised_identity(track, car, settings)
+    return cache_folder() / f"line-{identity}" / "race_raceline.csv"
+
+
+def optimised_identity(track: Track, car: CarParameters, settings: BaseModel) -> str:
+    """Digest of all that shapes a racing line or a limit of a car on a track."""
+    sources = [f"bayesrace/{part}" for part in ("vehicles", "tracks", "raceline", "limit")]
+    inputs = [car.model_dump_json(), settings.model_dump_json(), track.identity]
+    # The last bits depend on the processor.
+    return digest([*inputs, cpu_identity(), *software(sources, ("casadi", "numpy"))])

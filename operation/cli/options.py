@@ -67,8 +67,7 @@ def writable(path: Path | None) -> Path | None:
 
 def path_on(track: str, raceline: Path | None, car: "CarParameters") -> "PathTable":
     """What the planner follows: the racing line of the file, or computed where there is none."""
-    from bayesrace.raceline import read_raceline_for
-    from bayesrace.raceline.cached import racing_line
+    from bayesrace.raceline import racing_line, read_raceline_for
     from bayesrace.tracks import load_track
     from controller.path_table import make_path_table
 

@@ -176,8 +176,7 @@ def raceline(
     --friction and --margin are for both methods; the options from --objective to --seed, --curve
     and --weights are for the second.
     """
-    from bayesrace.raceline import RaceLineSettings, write_raceline
-    from bayesrace.raceline.cached import racing_line
+    from bayesrace.raceline import RaceLineSettings, racing_line, write_raceline
     from bayesrace.tracks import load_track
     from bayesrace.vehicles import get_car
 
@@ -228,8 +227,7 @@ def limit(
     again with half the intervals; it may not change by 0.1 %.
     """
     die_with_parent(parent_pid)
-    from bayesrace.limit import write_limit
-    from bayesrace.limit.cached import limit as cached_limit
+    from bayesrace.limit import limit_lap, write_limit
     from bayesrace.tracks import load_track
     from bayesrace.vehicles import get_car
 
@@ -239,7 +237,7 @@ def limit(
         raise InputError("--start-speed is that of a standing lap: add --standing, or leave it out")
     if tyres is not None:
         parameters = parameters.on_tyres(tyres)
-    lap = cached_limit(load_track(track, parameters.width_m), parameters, chosen)
+    lap = limit_lap(load_track(track, parameters.width_m), parameters, chosen)
     typer.echo(
         f"{'standing' if chosen.standing else 'flying'} lap {lap.lap_s:.3f} s, "
         f"{'outline' if chosen.body else 'centre of gravity'} on the track"

@@ -4,7 +4,7 @@ import math
 
 from bayesrace.gp.weights import GpWeights, encode_weights, pack_weights, zero_weights
 from bayesrace.messages import State
-from bayesrace.raceline.cached import racing_line
+from bayesrace.raceline import racing_line
 from bayesrace.tracks import load_track
 from bayesrace.vehicles import CarParameters
 from codegen.build import build
