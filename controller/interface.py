@@ -10,7 +10,7 @@ import numpy as np
 from bayesrace.arrays import Floats
 
 if TYPE_CHECKING:
-    from controller.native_library import Artefact
+    from controller.native_step import Artefact
     from controller.weights.adoption import WeightsPort
 
 __all__ = ["NO_LIMITS", "NO_PLAN", "ControlLaw", "Controller", "Environment", "StepOutput"]

@@ -5,8 +5,7 @@ from typing import Any, Final
 from bayesrace.gp.weights import decode_weights
 from bayesrace.messages import NOT_REPORTED
 from controller.interface import StepOutput
-from controller.native_library import Artefact, StepStatus
-from controller.native_step import NativeStep
+from controller.native_step import Artefact, NativeStep, StepStatus
 from controller.weights.adoption import WeightsPort
 
 __all__ = ["PredictiveController"]

@@ -1,15 +1,372 @@
-"""The compiled control problem of one car: its limits, its path, its weights."""
+"""The compiled controller in Python: its library, any control problem, the step of a car.
 
+Names and sizes come from the headers in controller/native, which cffi reads from the artefact. A
+step costs about 2 us beyond the C call.
+"""
+
+import ctypes
+import runpy
+from collections.abc import Mapping
+from enum import IntEnum
+from mmap import ACCESS_COPY, mmap
 from pathlib import Path
+from struct import Struct
+from typing import Any, Final
 
+import numpy as np
+import numpy.typing as npt
+
+from bayesrace.arrays import Floats
+from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights, pack_weights
+from bayesrace.manifest import DECLARATIONS, check_library, read_manifest
 from bayesrace.vehicles import CarParameters
-from controller.native_library import StepStatus
-from controller.native_problem import NativeProblem, Reference
+from controller.interface import Environment
 from controller.path_table import PATH_COLUMNS, PathTable
 from controller.settings import MpcSettings
 
-__all__ = ["NativeStep", "Reference", "StepStatus"]
+__all__ = ["Artefact", "NativeProblem", "NativeStep", "Reference", "StepStatus"]
+
+
+Reference = Floats
+"""Parameters of the stages 1..N, shape (N, np), in the order of the manifest."""
+
+_GP_HEAD: Final = Struct("<II4d")
+"""Kernel, points, offset, scale, signal and noise: see bayesrace.gp.weights.pack_weights."""
+
+
+class StepStatus(IntEnum):
+    """What became of the optimisation problem: br_mpc_status in controller/native/bayesrace_mpc.h,
+    which says what each means."""
+
+    CONVERGED = 0
+    ACCEPTABLE = 1
+    DEFECT = 2
+    INFEASIBLE = 3
+    QP_LIMIT = 4
+    NOT_FINITE = 5
+    BAD_STATE = 6
+    TIME_LIMIT = 7
+
+    @property
+    def usable(self) -> bool:
+        """Whether the first input may go to the actuators."""
+        return self <= StepStatus.ACCEPTABLE
+
+
+class Artefact:
+    """A built controller: its manifest, its library, and ``ffi`` with the types of its header.
+
+    The functions of ``library`` release the interpreter's lock while they run.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """InputError if it cannot be used here."""
+        self.manifest = read_manifest(folder)
+        self.path = check_library(folder, self.manifest)
+        self.ffi: Any = runpy.run_path(str(folder / DECLARATIONS))["ffi"]
+        try:
+            self.library: Any = self.ffi.dlopen(str(self.path))
+        except OSError as error:
+            raise InputError(
+                f"{self.path} cannot be loaded here ({error}): it was built for another machine, "
+                "or its file system allows no programs (noexec); remove the folder and run "
+                "'bayesrace build', with BAYESRACE_CACHE set to another folder if need be"
+            ) from None
+
+    def memory(self, size: int) -> Any:
+        """A block for an object of the library, zeros.
+
+        Of pages of its own: those that nobody writes, as for weights of more points, take no
+        memory.
+        """
+        return self.ffi.from_buffer(mmap(-1, size, access=ACCESS_COPY))
+
+    def check_cycle(self) -> None:
+        """InputError if it has no control cycle: its problem does not follow a path."""
+        if not hasattr(self.library, "br_cycle_init"):
+            raise InputError(
+                f"problem '{self.manifest.problem.name}' drives no car: run 'bayesrace build'"
+            )
+
+    def check(self, error: int, what: str) -> None:
+        """InputError with the library's words, if there is an error."""
+        if error:
+            text = self.text(self.library.br_mpc_error_text(error))
+            raise InputError(f"native controller, {what}: {text}")
+
+    def text(self, characters: Any) -> str:
+        """A string of the library's."""
+        return str(self.ffi.string(characters).decode())
+
+
+class NativeProblem:
+    """A compiled control problem. Not thread-safe, but for :meth:`stage_weights`.
+
+    With nx states and nu inputs, ``u`` (nu,), ``info`` (br_mpc_info in bayesrace_mpc.h) and the
+    plan arrays are overwritten by each step. Times are in seconds; budgets are measured by the
+    system's monotonic clock.
+    """
+
+    def __init__(self, artefact: Path) -> None:
+        """Without parameters, and with a residual of zero. InputError for no usable artefact."""
+        self.artefact = Artefact(artefact)
+        self.manifest, self._library = self.artefact.manifest, self.artefact.library
+        self._check, ffi = self.artefact.check, self.artefact.ffi
+        self._ffi, size = ffi, self._library.br_mpc_memory_size()
+        self._memory, handle = self.artefact.memory(size), ffi.new("br_mpc **")
+        self._check(self._library.br_mpc_init(self._memory, size, handle), "init")
+        self.handle: Final = handle[0]
+        """The br_mpc, for other functions of the library."""
+        problem, n = self.manifest.problem, self.manifest.horizon
+        self._nx, self._nu = nx, nu = len(problem.states), len(problem.inputs)
+        self._reference_shape = (n, len(problem.stage_parameters))
+        self._parameters = ffi.new("br_mpc_parameters *")
+        self.info, self._status = ffi.new("br_mpc_info *"), ffi.new("br_mpc_status *")
+        self.u, self._u = self._made(nu)
+        self.plan_x, self._plan_x = self._made(n + 1, nx)
+        self.plan_u, self._plan_u = self._made(n, nu)
+        self.tube, self._tube = self._made(n)
+        self._watch = ffi.new("br_mpc_watch *")
+        # Functions of PyDLL hold on to the interpreter's lock, which takes longer to get back than
+        # they run; those of cffi release it.
+        self._quick = ctypes.PyDLL(str(self.artefact.path))
+        self._address, self._watch_address = (
+            ctypes.c_void_p(int(ffi.cast("uintptr_t", one))) for one in (self.handle, self._watch)
+        )
+        clock = ffi.addressof(self._library, "br_mpc_monotonic")
+        self._check(self._library.br_mpc_set_clock(self.handle, clock, ffi.NULL), "clock")
+        self.load_weights(b"")
+
+    def _made(self, *shape: int) -> tuple[Floats, Any]:
+        """Zeros, and the same as an argument for C."""
+        array = np.zeros(shape)
+        return array, self._ffi.from_buffer("double[]", array)
+
+    def _given(self, what: str, values: npt.ArrayLike, *shape: int) -> Any:
+        """The values as an argument for C; InputError if they have another shape."""
+        array = np.ascontiguousarray(values, dtype=np.float64)
+        if array.shape != shape:
+            raise InputError(f"{what} has shape {array.shape}, not {shape}")
+        return self._ffi.from_buffer("double[]", array)
+
+    @property
+    def instructions(self) -> str:
+        """What the step is compiled for, a name of br_instructions; at first the fastest here."""
+        number = self._library.br_mpc_get_instructions(self.handle)
+        return str(self._ffi.string(self._ffi.cast("br_instructions", number))).removeprefix("BR_")
+
+    def set_instructions(self, name: str) -> None:
+        """Others, whose results differ by rounding; InputError if the processor lacks them."""
+        number = getattr(self._library, f"BR_{name}")
+        self._check(self._library.br_mpc_set_instructions(self.handle, number), "instructions")
+
+    def set_values(self, values: Mapping[str, float]) -> None:
+        """Sets run-time parameters and solver settings by name; effective from the next step.
+
+        All of them the first time. InputError for a name that there is not, or a value that the
+        problem does not allow.
+        """
+        known = dir(self._parameters)
+        if unknown := sorted(set(values) - set(known)):
+            raise InputError(
+                f"problem '{self.manifest.problem.name}' has no parameter {', '.join(unknown)}; "
+                f"it has {', '.join(known)}"
+            )
+        for name, value in values.items():
+            setattr(self._parameters, name, value)
+        error = self._library.br_mpc_set_parameters(self.handle, self._parameters)
+        self._check(error, "parameters")
+
+    def _outputs(self, packed: bytes) -> Any:
+        """A br_mpc_gp for each output, with its arrays where they are in ``packed``."""
+        problem, ffi, at = self.manifest.problem, self._ffi, 0
+        nz, data = len(problem.features), ffi.from_buffer(packed)
+        outputs = ffi.new("br_mpc_gp[]", problem.outputs)
+        for one in outputs if packed else ():
+            if at + _GP_HEAD.size > len(packed):
+                break
+            one.kernel, one.n, *amplitudes = _GP_HEAD.unpack_from(packed, at)
+            one.offset, one.scale, one.signal, one.noise = amplitudes
+            at += _GP_HEAD.size
+            one.length_scales = numbers = ffi.cast("double *", data + at)
+            one.inputs, one.alpha = numbers + nz, numbers + nz * (1 + one.n)
+            at += 8 * (nz * (1 + one.n) + one.n)
+        if at != len(packed):
+            raise InputError(
+                f"these are not the weights of the {problem.outputs} outputs that the residual of "
+                f"problem '{problem.name}' has"
+            )
+        return outputs
+
+    def load_weights(self, packed: bytes) -> None:
+        """Uses weights (``bayesrace.gp.weights.pack_weights``) from the next step on; empty: no
+        correction of the model. They are not compared with the manifest."""
+        outputs = self._outputs(packed)
+        self._check(self._library.br_mpc_set_weights(self.handle, outputs), "weights")
+
+    def stage_weights(self, packed: bytes) -> None:
+        """Copies weights beside those in use, for :meth:`adopt_weights`; else as
+        :meth:`load_weights`.
+
+        The one method that another thread may call; the interpreter goes on meanwhile. InputError
+        if they are unusable.
+        """
+        outputs = self._outputs(packed)
+        self._check(self._library.br_mpc_stage_weights(self.handle, outputs), "weights")
+
+    def adopt_weights(self) -> None:
+        """Puts what is staged into use, between two steps; InputError if there is nothing.
+
+        They are on probation: :meth:`watch` compares them with those that were proven before.
+        """
+        self._check(self._quick.br_mpc_adopt_weights(self._address), "weights")
+
+    def prove_weights(self) -> None:
+        """Ends the probation of the weights in use."""
+        self._check(self._quick.br_mpc_prove_weights(self._address), "weights")
+
+    def revert_weights(self) -> None:
+        """Goes back to the proven weights, between two steps."""
+        self._check(self._quick.br_mpc_revert_weights(self._address), "weights")
+
+    def watch(self) -> Any:
+        """How the weights in use do beside the proven ones, a br_mpc_watch; overwritten by the
+        next."""
+        self._quick.br_mpc_get_watch(self._address, self._watch_address)
+        return self._watch
+
+    def samples(self) -> tuple[Floats, Floats]:
+        """The newest samples of what the car has done, by the thread that steps: features (n, nz)
+        and residuals of the model without correction (n, ne), per stage."""
+        problem, count = self.manifest.problem, self._ffi.new("int *")
+        features, z = self._made(self._library.BR_SAMPLES, len(problem.features))
+        residuals, e = self._made(self._library.BR_SAMPLES, problem.outputs)
+        self._check(self._library.br_mpc_get_samples(self.handle, z, e, count), "samples")
+        return features[: count[0]], residuals[: count[0]]
+
+    def reset(self) -> None:
+        """Forgets plan, working set and place on the line."""
+        self._library.br_mpc_reset(self.handle)
+
+    def step(
+        self,
+        x: Floats,
+        u_before: npt.ArrayLike,
+        *,
+        elapsed_s: float | None = None,
+        budget_s: float = 0.0,
+        environment: Environment | None = None,
+    ) -> StepStatus:
+        """One control step from the measured state x (nx,); results in ``u`` and ``info``.
+
+        ``u_before`` (nu,): the input that acts now; a number stands for all components.
+        ``elapsed_s``: since the state of the call before, of whatever status; None: one stage Ts.
+        ``budget_s``: iterate until converged or within this time from now; 0: the iteration limits
+        of the settings alone. InputError if ``elapsed_s`` is negative or not finite, or a limit of
+        the ``environment`` no limit.
+        """
+        around = self._ffi.NULL
+        if environment is not None:
+            around = self._ffi.new("br_environment *", environment)
+        return self._solved("step", x, u_before, around, self._elapsed(elapsed_s), budget_s)
+
+    def solve(
+        self,
+        x: Floats,
+        u_before: npt.ArrayLike,
+        reference: Reference,
+        *,
+        elapsed_s: float | None = None,
+        budget_s: float = 0.0,
+    ) -> StepStatus:
+        """As :meth:`step`, with the stage parameters (N, np) of another planner."""
+        numbers = self._given("reference", reference, *self._reference_shape)
+        stages = self._ffi.cast("br_mpc_reference *", numbers)
+        return self._solved("solve", x, u_before, self._elapsed(elapsed_s), budget_s, stages)
+
+    def _solved(self, what: str, x: Floats, u_before: npt.ArrayLike, *arguments: Any) -> StepStatus:
+        u = np.broadcast_to(np.asarray(u_before, dtype=np.float64), self._nu)
+        given = self._given("x", x, self._nx), self._given("u_before", u, self._nu)
+        results = self._u, self._status, self.info
+        call = getattr(self._library, f"br_mpc_{what}")
+        self._check(call(self.handle, *given, *arguments, *results), what)
+        return StepStatus(self._status[0])
+
+    def _elapsed(self, elapsed_s: float | None) -> float:
+        return self.manifest.step_s if elapsed_s is None else elapsed_s
+
+    def observe(self, x: Floats, u: Floats, duration_s: float, x_next: Floats) -> None:
+        """What the car did between two measured states (nx,), under u (nu,) on average.
+
+        Where such errors are larger than the posterior's standard deviations, caution widens these.
+        InputError for a duration that is not above 0 and at most 1, or numbers
+        that are not finite.
+        """
+        given = self._given("x", x, self._nx), self._given("u", u, self._nu)
+        after = self._given("x_next", x_next, self._nx)
+        error = self._library.br_mpc_observe(self.handle, *given, duration_s, after)
+        self._check(error, "observe")
+
+    def prepare(self, elapsed_s: float | None = None, budget_s: float = 0.0) -> None:
+        """Makes ready what of the next step needs no state; call it after :meth:`step`.
+
+        ``elapsed_s``: expected of the next step; None: one stage Ts. With ``budget_s`` the last
+        problem is iterated on first. Results in ``u``, ``info`` and the plan stay. Leaving it out,
+        or another ``elapsed_s`` in the step, changes nothing but the time that the step takes.
+        """
+        elapsed = self._elapsed(elapsed_s)
+        self._check(self._library.br_mpc_prepare(self.handle, elapsed, budget_s), "prepare")
+
+    def rehearse(self) -> None:
+        """Does the preparation over, to the same bits, so that the step finds its caches warm."""
+        self._check(self._library.br_mpc_rehearse(self.handle), "rehearse")
+
+    def predict(self, x: Floats, u: Floats, duration_s: float) -> Floats:
+        """State (nx,) after x (nx,) with u (nu,) held, by the model and the weights in use.
+
+        ``duration_s``: 0 to 1. InputError if it is not, or if a number is not finite or absurd.
+        """
+        given = self._given("x", x, self._nx), self._given("u", u, self._nu)
+        x_next, result = self._made(self._nx)
+        error = self._library.br_mpc_predict(self.handle, *given, duration_s, result)
+        self._check(error, "predict")
+        return x_next
+
+    def read_plan(self) -> tuple[Floats, Floats]:
+        """The last plan, x (N + 1, nx) and u (N, nu), in buffers that the next call overwrites."""
+        self._library.br_mpc_get_plan(self.handle, self._plan_x, self._plan_u)
+        return self.plan_x, self.plan_u
+
+    def read_tube(self) -> Floats:
+        """How uncertain the stages of the last plan are, (N,): :attr:`StepOutput.tube_m`. In a
+        buffer that the next call overwrites."""
+        self._library.br_mpc_get_tube(self.handle, self._tube)
+        return self.tube
+
+    def read_reference(self) -> Reference:
+        """The stage parameters of the last step, (N, np)."""
+        rows, numbers = self._made(*self._reference_shape)
+        stages = self._ffi.cast("br_mpc_reference *", numbers)
+        self._library.br_mpc_get_reference(self.handle, stages)
+        return rows
+
+    def variance(self, v: Floats) -> Floats:
+        """Posterior variance of the residual's outputs at v = [x; u] (nv,), noise included."""
+        variance, result = self._made(self.manifest.problem.outputs)
+        given = self._given("v", v, self._nx + self._nu)
+        self._check(self._library.br_mpc_variance(self.handle, given, result), "variance")
+        return variance
+
+    def evaluate(self, v: Floats, costate: Floats) -> tuple[Floats, Floats, Floats]:
+        """Corrected model at v = [x; u] (nv,): x_next (nx,), J (nx, nv), H of lambda' x_next."""
+        nx, nv = self._nx, self._nx + self._nu
+        given = self._given("v", v, nv), self._given("costate", costate, nx)
+        made = self._made(nx), self._made(nx, nv), self._made(nv, nv)
+        results = (result for _, result in made)
+        self._check(self._library.br_mpc_evaluate(self.handle, *given, *results), "evaluate")
+        (x_next, _), (jacobian, _), (hessian, _) = made
+        return x_next, jacobian, hessian
 
 
 class NativeStep(NativeProblem):

@@ -13,7 +13,7 @@ from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from controller.driver import DOUBTED, STEP_FAILED
 from controller.interface import ControlLaw, Environment, StepOutput
-from controller.native_library import Artefact
+from controller.native_step import Artefact
 
 __all__ = ["PythonController"]
 

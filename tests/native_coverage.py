@@ -23,7 +23,7 @@ OURS: Final = {
     for folder in ("controller/native", "controller/native/host", "codegen/fmu/native")
     for path in (ROOT / folder).glob("*.[ch]")
 }
-WITHOUT_CODE: Final = {"br_avx2.c", "br_avx512.c", "br_table.c"}
+WITHOUT_CODE: Final = {"br_avx2.c", "br_avx512.c"}
 """They include the code of others, or name it."""
 
 TESTS: Final = (

@@ -9,8 +9,7 @@ from bayesrace.vehicles import CarParameters, default_car
 from codegen.ocp import OcpNlp
 from codegen.problems.problem import Problem
 from codegen.settings import BuildSettings
-from controller.native_library import StepStatus
-from controller.native_problem import NativeProblem
+from controller.native_step import NativeProblem, StepStatus
 from tests.test_problems import (
     HORIZON,
     IPOPT,

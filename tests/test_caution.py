@@ -17,8 +17,7 @@ from bayesrace.vehicles.models import dynamic, e_kinematic
 from bayesrace.vehicles.tuning import CautionTuning
 from codegen.problems.tracking import tracking
 from controller.assembly import compiled_controller
-from controller.native_library import StepStatus
-from controller.native_step import NativeStep
+from controller.native_step import NativeStep, StepStatus
 from controller.settings import MpcSettings
 from learning.validation import predictive_sigma
 from operation.closed_loop import ClosedLoop, built_in_car

@@ -35,8 +35,7 @@ from controller.driver import (
     Level,
     Phase,
 )
-from controller.native_library import Artefact, StepStatus
-from controller.native_step import NativeStep
+from controller.native_step import Artefact, NativeStep, StepStatus
 from controller.settings import MpcSettings
 from controller.weights.settings import SAMPLES, WATCHED
 

@@ -7,7 +7,7 @@ from rich.console import Console
 from bayesrace.gp.weights import read_weights
 from bayesrace.vehicles import default_car
 from controller.assembly import compiled_controller
-from controller.native_library import StepStatus
+from controller.native_step import StepStatus
 from operation.closed_loop import drive_compiled
 from operation.preparation import prepare, updated_weights
 from operation.settings import PreparationSettings

@@ -20,8 +20,7 @@ from codegen.ocp import OcpNlp
 from codegen.problems.problem import NO_BOUND, Input, Parameter, Problem, Row, State, Symbols
 from codegen.settings import BuildSettings
 from codegen.stage import linearised
-from controller.native_library import StepStatus
-from controller.native_problem import NativeProblem
+from controller.native_step import NativeProblem, StepStatus
 
 HORIZON, STEP_S, CAPACITY = 12, 0.15, 24
 VALUES = {

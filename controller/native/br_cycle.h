@@ -88,7 +88,7 @@ void br_monitor_restart(br_monitor *monitor);
 br_fault br_monitor_check(br_monitor *monitor, const br_driving *settings,
                           const br_controller *controller, double interval_s, br_measured *state);
 
-/* --- br_braking_plan.c: what the car's guard does if nothing more comes --- */
+/* --- br_fallback.c, too: what the car's guard does if nothing more comes --- */
 
 typedef struct {
     const br_controller *controller;

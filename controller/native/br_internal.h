@@ -194,7 +194,7 @@ typedef struct {
     br_judged judged[BR_WATCHED]; /* the newest */
 } br_watch;
 
-/* Of each output, by how many standard deviations the residual errs: see br_innovation.c. */
+/* Of each output, by how many standard deviations the residual errs: see br_caution.c. */
 typedef struct {
     double recent[BR_NE], held[BR_NE]; /* mean of the newest; the largest, slowly forgotten */
 } br_misfit;
@@ -335,7 +335,7 @@ BR_PART void br_caution_tighten(br_mpc *mpc, int k, br_stage_terms *terms);
 BR_PART void br_caution_pace(br_mpc *mpc, double elapsed);
 BR_PART void br_caution_report(br_mpc *mpc); /* into mpc->info */
 
-/* br_innovation.c */
+/* br_caution.c: against what the car does */
 BR_PART void br_innovation_reset(br_innovation *innovation);
 /* A step has been made: what was observed before it is due. */
 BR_PART void br_innovation_advance(br_innovation *innovation);
@@ -430,7 +430,7 @@ BR_PART br_mpc_status br_qp_solve(br_mpc *mpc, int warm);
 BR_PART void br_qp_shift_rows(void *rows, size_t size);
 BR_PART void br_qp_forget_working_set(br_qp *qp);
 
-/* br_timer.c */
+/* br_prepare.c: the clock that the host gave */
 BR_PART void br_timer_start(br_timer *timer, double budget);
 BR_PART double br_timer_now(const br_timer *timer);
 BR_PART int br_timer_allows(const br_timer *timer, double now, double duration);
@@ -452,7 +452,7 @@ BR_PART void br_align(br_mpc *mpc, int shifts);
 BR_PART void br_undo_preparation(br_mpc *mpc);
 BR_PART void br_forget_linearisation(br_mpc *mpc);
 
-/* br_step.c, br_prepare.c, br_predict.c, br_braking.c, br_inspect.c: functions of the interface,
+/* br_step.c, br_prepare.c, br_predict.c, br_planner.c: functions of the interface,
  * see br_code.h */
 BR_PART br_mpc_error br_step(br_mpc *mpc, const double x[BR_NX], const double u_before[BR_NU],
                              const br_environment *environment, double elapsed_s, double budget_s,
@@ -479,7 +479,7 @@ BR_PART br_mpc_error br_evaluate(const br_mpc *mpc, const double v[BR_NV],
 BR_PART br_mpc_status br_start_again(br_mpc *mpc, br_mpc_status status, unsigned turn);
 BR_PART int br_iteration_limit(const br_mpc *mpc);
 
-/* br_incumbent.c */
+/* br_sqp.c: the best plan of several iterations */
 BR_PART void br_incumbent_reset(br_mpc *mpc);
 BR_PART void br_incumbent_keep(br_mpc *mpc, br_mpc_status status, int lowest);
 BR_PART br_mpc_status br_incumbent_restore(br_mpc *mpc, br_mpc_status status);

@@ -10,13 +10,9 @@
 
 #pragma GCC diagnostic ignored "-Wunused-function" /* part of it is for other files */
 
-#include "br_braking.c"
 #include "br_caution.c"
 #include "br_condense.c"
 #include "br_gp.c"
-#include "br_incumbent.c"
-#include "br_innovation.c"
-#include "br_inspect.c"
 #include "br_planner.c"
 #include "br_predict.c"
 #include "br_prepare.c"
@@ -26,8 +22,6 @@
 #include "br_sqp.c"
 #include "br_stage.c"
 #include "br_step.c"
-#include "br_table.c"
-#include "br_timer.c"
 #include "br_turnaround.c"
 #include "br_variance.c"
 #include "br_watch.c"

@@ -1,7 +1,31 @@
-/* Keeping the plan in step with time, and the preparation phase between two steps. */
+/* Time within a call, the plan in step with time, and the preparation phase between two steps. */
 #include <math.h>
 
 #include "br_internal.h"
+
+/* --- the clock that the host gave --- */
+
+/* 0 without a clock; its time is measured with and without a budget, so that br_mpc_prepare knows
+ * what an iteration takes. */
+double br_timer_now(const br_timer *timer) {
+    return timer->clock ? timer->clock(timer->context) : 0;
+}
+
+void br_timer_start(br_timer *timer, double budget) {
+    timer->limited = timer->clock && budget > 0;
+    timer->deadline = timer->limited ? br_timer_now(timer) + budget : 0;
+}
+
+/* Whether what takes that long fits; a clock that gives NaN never lets anything begin. */
+int br_timer_allows(const br_timer *timer, double now, double duration) {
+    return !timer->limited || timer->deadline - now >= duration;
+}
+
+void br_timer_note(const br_timer *timer, double begin, double *longest) {
+    *longest = fmax(*longest, br_timer_now(timer) - begin);
+}
+
+/* --- the plan and its preparation --- */
 
 int br_plausible_state(const double x[BR_NX]) {
     for (int i = 0; i < BR_NX; ++i)
