@@ -126,19 +126,6 @@ def test_what_is_no_file_of_arrays_is_refused(tmp_path: Path) -> None:
             dataset_from_npz(path)
 
 
-def test_damage_inside_a_compressed_array_is_refused(tmp_path: Path, driven: Dataset) -> None:
-    path = tmp_path / "x.npz"
-    write_npz(path, driven)
-    with zipfile.ZipFile(path) as archive:
-        begin = archive.getinfo("x.npy").header_offset
-    content = bytearray(path.read_bytes())
-    name_bytes, extra_bytes = content[begin + 26], content[begin + 28]
-    content[begin + 30 + name_bytes + extra_bytes] = 0xFF  # a block of a type that there is not
-    path.write_bytes(content)
-    with pytest.raises(InputError, match=r"x\.npz: not arrays"):
-        dataset_from_npz(path)
-
-
 def test_arrays_too_large_are_refused_unread(tmp_path: Path, driven: Dataset) -> None:
     """A small archive may unpack to more than there is memory."""
     path = save(tmp_path / "x.npz", driven)
@@ -153,8 +140,10 @@ def test_arrays_too_large_are_refused_unread(tmp_path: Path, driven: Dataset) ->
 def test_damaged_files_are_read_or_refused(
     tmp_path_factory: pytest.TempPathFactory, driven: Dataset, data: st.DataObject
 ) -> None:
+    """Also inside compressed arrays."""
     path = tmp_path_factory.mktemp("npz") / "x.npz"
-    content = bytearray(save(path, driven.select(slice(3))).read_bytes())
+    write_npz(path, driven.select(slice(3)))
+    content = bytearray(path.read_bytes())
     for _ in range(data.draw(st.integers(1, 3))):
         content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
     path.write_bytes(content[: data.draw(st.integers(0, len(content)))])
@@ -188,19 +177,13 @@ def test_damaged_settings_in_a_log_are_refused(
 def test_logs_and_arrays_come_together_in_order(
     tmp_path: Path, driven: Dataset, other: Dataset
 ) -> None:
-    paths = [write_log(tmp_path / "a.mcap", driven), save(tmp_path / "b.npz", other)]
+    """A step in single precision is the step that is meant."""
+    paths = [write_log(tmp_path / "a.mcap", driven)]
+    paths.append(save(tmp_path / "b.npz", other, step_s=np.float32(STEP_S)))
     samples = read_samples(paths)
     assert samples.discretisation == PREDICTION
     assert np.array_equal(samples.dataset.x, np.vstack((driven.x, other.x)))
     assert len(read_samples(paths[1:]).dataset) == len(other)
-
-
-def test_a_step_in_single_precision_is_the_step_that_is_meant(
-    tmp_path: Path, driven: Dataset, other: Dataset
-) -> None:
-    paths = [write_log(tmp_path / "a.mcap", driven)]
-    paths.append(save(tmp_path / "b.npz", other, step_s=np.float32(STEP_S)))
-    assert len(read_samples(paths).dataset) == len(driven) + len(other)
 
 
 def test_a_damaged_file_is_reported_as_such(tmp_path: Path) -> None:

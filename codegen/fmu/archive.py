@@ -6,7 +6,6 @@ import tempfile
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
-from html import escape
 from importlib.metadata import distribution
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -26,29 +25,12 @@ from codegen.fmu.build import (
     write_sources,
 )
 from codegen.fmu.definition import FmuDefinition
-from codegen.fmu.description import build_description, model_description
+from codegen.fmu.description import build_description, model_description, rendered
 from codegen.host_files import HEAD, IDENTITY_BYTES, WEIGHTS_FILE, weights_file
 
 __all__ = ["Part", "exchange_weights", "licence_files", "pack", "third_parties"]
 
 _LARGEST: Final = 1 << 30
-
-_PAGE: Final = """<!DOCTYPE html><html lang="en"><meta charset="utf-8">
-<style>body{{font:15px/1.5 sans-serif;max-width:60em;margin:2em auto}}</style>
-<title>{name}</title><h1>{name}</h1>
-<p>{description}. FMI {version}.0 for {kind}.</p>
-{documentation}
-<h2>Building it again</h2>
-<p>In the folder <code>sources</code>, with any C11 compiler; elsewhere than on Linux without the
-<code>-Wl</code> options:</p>
-<pre>{line}</pre>
-<p>The result belongs into <code>binaries/{folder}</code>; other platforms have other folders
-there.</p>
-<h2>Licences</h2>
-<p>BayesRace is under the MIT licence. Parts of this FMU are by other authors; all texts are in
-<a href="licenses/license.txt">licenses</a>:</p>
-<ul>{parts}</ul></html>
-"""
 
 
 class Part(NamedTuple):
@@ -129,16 +111,13 @@ def _page(definition: FmuDefinition, linked: Sequence[str], parts: Sequence[Part
     """``documentation/index.html``, with the one command that makes the Linux binary."""
     linux = PLATFORMS["x86_64-linux"]
     line = arguments(linux, linked, f"{definition.identifier}.so", definition.flags)
-    return _PAGE.format(
-        name=escape(definition.name),
-        description=escape(definition.description),
-        version=definition.version,
-        kind="Model Exchange" if definition.states else "Co-Simulation",
-        documentation=definition.documentation,
-        line=escape(shlex.join(["cc", *line])),
+    return rendered(
+        "index.html",
+        definition,
+        line=shlex.join(["cc", *line]),
         folder=linux.folder(definition.version),
-        parts="".join(f"<li>{escape(str(part))}</li>" for part in parts),
-    ).encode()
+        parts=parts,
+    )
 
 
 def pack(definition: FmuDefinition, out: Path, platforms: Sequence[str] | None = None) -> Path:
