@@ -51,8 +51,7 @@ from learning.dataset import Dataset
 from learning.logs import CYCLES, STATES, dataset_from_columns
 from operation.analysis.laps import LapTimes, Trajectory, time_laps
 from operation.drive import RunPlan, announcement, run_request
-from plant.lockstep import CarRun, End, drive_lockstep, truth_behind
-from plant.sensors import Sensors
+from plant.lockstep import CarRun, End, Sensors, drive_lockstep, truth_behind
 from plant.settings import SensorNoise
 from plant.simulator import Simulator
 from plant.vehicle import Vehicle

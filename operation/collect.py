@@ -15,9 +15,8 @@ from controller.pure_pursuit import PurePursuit, PurePursuitSettings
 from controller.python_controller import PythonController
 from operation.closed_loop import ClosedLoop, Driven, built_in_car
 from operation.training_line import room_beside, training_line
-from plant.fmu.faults import FmuFault
 from plant.settings import SensorNoise
-from plant.vehicle import Vehicle
+from plant.vehicle import FmuFault, Vehicle
 
 __all__ = ["collect"]
 

@@ -37,9 +37,8 @@ from operation.preparation import (
 from operation.settings import RaceSettings
 from operation.system import System, started_system
 from operation.terminal.progress import Stage, Stages
-from plant.fmu.faults import FmuFault
 from plant.simulator import PLANT
-from plant.vehicle import open_vehicle
+from plant.vehicle import FmuFault, open_vehicle
 
 __all__ = ["FILES", "RaceError", "race"]
 

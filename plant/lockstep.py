@@ -11,13 +11,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from bayesrace.messages import RunRequest, State, Truth
-from plant.fmu.faults import FmuFault
-from plant.laps import LineCounter
-from plant.sensors import Sensors
-from plant.vehicle import Vehicle
+import numpy as np
 
-__all__ = ["CarRun", "End", "drive_lockstep", "fault_end", "truth_behind"]
+from bayesrace.messages import RunRequest, State, Truth
+from bayesrace.tracks.startline import CrossingLine
+from plant.settings import SensorNoise
+from plant.vehicle import FmuFault, Vehicle
+
+__all__ = ["CarRun", "End", "LineCounter", "Sensors", "drive_lockstep", "fault_end", "truth_behind"]
 
 _WORLD_M: Final = 1e4
 
@@ -47,6 +48,45 @@ def truth_behind(state: State, x: tuple[float, ...]) -> Truth:
         u_applied=state.u_applied,
         lap=state.lap,
     )
+
+
+class Sensors:
+    """What measures one run: the same seed gives each run the same noise."""
+
+    def __init__(self, noise: SensorNoise | None = None, seed: int = 0) -> None:
+        deviations = (noise or SensorNoise()).deviations
+        self._deviations = np.array(deviations) if any(deviations) else None
+        self._random = np.random.default_rng(seed)
+
+    def measure(self, x: tuple[float, ...]) -> tuple[float, ...]:
+        """What the sensors measure of the true state x (7,)."""
+        if self._deviations is not None:
+            noise = self._deviations * self._random.standard_normal(len(x))
+            x = tuple((np.array(x) + noise).tolist())
+        return x
+
+
+class LineCounter:
+    """Counts crossings of a line: forwards plus one, backwards minus one."""
+
+    def __init__(
+        self, x_m: float, y_m: float, heading_rad: float, left_m: float, right_m: float
+    ) -> None:
+        self._line = CrossingLine(x_m, y_m, heading_rad, left_m, right_m)
+        self.restart(x_m, y_m)
+
+    def restart(self, x_m: float, y_m: float) -> None:
+        """Begin at a position, without a crossing so far."""
+        self._at, self._past = (x_m, y_m), self._line.is_past(x_m, y_m)
+        self.crossings = 0
+
+    def move(self, x_m: float, y_m: float) -> int:
+        """Crossings so far, after the car moved here."""
+        before, was_past = self._at, self._past
+        self._at, self._past = (x_m, y_m), self._line.is_past(x_m, y_m)
+        if self._past != was_past:
+            self.crossings += self._line.crossing(before, self._at).direction
+        return self.crossings
 
 
 class CarRun:

@@ -39,13 +39,10 @@ from bayesrace.transport import (
     decode_request,
     open_session,
 )
-from plant.fmu.faults import FmuFault
-from plant.lockstep import End
+from plant.lockstep import End, Sensors
 from plant.process_settings import PlantSettings
 from plant.run import Run, RunCounters
-from plant.sensors import Sensors
-from plant.simulator import Compile
-from plant.vehicle import Vehicle, open_vehicle
+from plant.vehicle import Compile, FmuFault, Vehicle, open_vehicle
 
 __all__ = ["PlantProcess", "PlantSettings", "main"]
 

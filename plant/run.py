@@ -10,12 +10,9 @@ from typing import Final, NamedTuple
 from bayesrace.clock import SUSPENDED_S, sleep_until_ns
 from bayesrace.messages import ACTUATION, Actuation, BrakingPlan, Decoder, RunRequest, State, Truth
 from bayesrace.transport import LOCKSTEP_SPIN_S, Inbox, Item, Kind, Numbering, Publisher
-from plant.braking import planned_at
-from plant.fmu.faults import FmuFault
-from plant.lockstep import CarRun, End, drive_lockstep, fault_end, truth_behind
-from plant.sensors import Sensors
-from plant.simulator import Command
-from plant.vehicle import Vehicle
+from plant.guard import Command, planned_at
+from plant.lockstep import CarRun, End, Sensors, drive_lockstep, fault_end, truth_behind
+from plant.vehicle import FmuFault, Vehicle
 
 __all__ = ["Run", "RunCounters"]
 

@@ -11,19 +11,17 @@ x ahead, y to the left, angles anticlockwise, SI units.
 """
 
 import math
-from collections.abc import Sequence
 from importlib.metadata import version
 from typing import Any, Final
 
-import numpy as np
 import slipx
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
-from bayesrace.vehicles.models import STATES
 from bayesrace.vehicles.parameters import CarParameters
-from plant.fmu.faults import FmuFault
-from plant.simulator import Command, PlantGuard, checked_start, hold_in_turn, plant_discretisation
+from plant.guard import Command
+from plant.simulator import plant_discretisation
+from plant.vehicle import FmuFault, Vehicle
 
 __all__ = ["SlipxSimulator"]
 
@@ -31,18 +29,13 @@ _TOLERANCE: Final = 0.01
 """Relative difference of mass and geometry within which two cars are one."""
 
 
-class SlipxSimulator:
+class SlipxSimulator(Vehicle):
     """slipx' reference car that advances by one sampling period per call; see ``plant.vehicle``."""
 
     def __init__(self, car: CarParameters, rate_hz: float = 50.0) -> None:
         """``car``: whose limits the guard keeps; InputError if it is not the reference car."""
         discretisation = plant_discretisation(rate_hz)
-        self.car = car
-        self.step_s, self.substeps = discretisation.step_s, discretisation.substeps
-        self.guard = PlantGuard(car)
-        self.u_applied: tuple[float, float] = (0.0, 0.0)
-        self.steps = 0
-        self.x: Floats = np.zeros(len(STATES))
+        super().__init__(car, discretisation.step_s, discretisation.substeps)
         tier = slipx.Tier.L2_DoubleTrack
         self._parameters: Any = slipx.load_reference_car().params_for_tier(tier)
         self._lag_s = 2.0 * self._parameters.steer_damping / self._parameters.steer_bandwidth
@@ -63,17 +56,8 @@ class SlipxSimulator:
                     "file with that value"
                 )
 
-    @property
-    def time_s(self) -> float:
-        """Time since the reset, exact multiples of the period."""
-        return self.steps * self.step_s
-
-    def reset(self, x0: Sequence[float]) -> None:
-        """Put the car into state ``x0`` at time zero, its battery full; wheels roll freely.
-
-        InputError if it cannot be in it.
-        """
-        start = checked_start(x0, self.car)
+    def _place(self, start: Floats) -> None:
+        """The battery is full, and the wheels roll freely."""
         x, y, psi, vx, vy, omega, delta = start.tolist()
         state = self._state = slipx.VehicleState()
         state.pos = slipx.Vec3(x, y, 0.0)
@@ -83,17 +67,6 @@ class SlipxSimulator:
         state.pack_v = self._parameters.pack_v_full
         state.omega_w = [vx / self._parameters.wheel_radius] * 4
         self.x[:] = start
-        self.u_applied = (0.0, 0.0)
-        self.steps = 0
-
-    def step(self, u: Command) -> None:
-        """Hold the command ``u`` = (d, delta_rate) for one period; None brakes."""
-        self.step_switched([(self.substeps, u)])
-
-    def step_switched(self, commands: Sequence[tuple[int, Command]]) -> None:
-        """One period in which the command changes: (substeps, command) in order of time."""
-        self.u_applied = hold_in_turn(self.x, commands, self.substeps, self._hold)
-        self.steps += 1
 
     def _hold(self, u: Command, count: int) -> tuple[float, float]:
         """For so many substeps; what acted."""

@@ -21,7 +21,7 @@ from controller.driver import NO_STATE, Level
 from operation.closed_loop import ClosedLoop
 from operation.drive import RunPlan, run_request
 from operation.system import started_system
-from plant.braking import planned_at
+from plant.guard import planned_at
 from tests.racing import Racing, prepared, racing
 from tests.reference import reference_file
 

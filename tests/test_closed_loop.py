@@ -25,9 +25,10 @@ from learning.logs import dataset_from_log
 from operation.closed_loop import ClosedLoop
 from operation.collect import collect
 from operation.drive import RunPlan, execute
-from plant.fmu.faults import FmuFault
+from plant.guard import Command
 from plant.settings import SensorNoise
-from plant.simulator import Command, Simulator
+from plant.simulator import Simulator
+from plant.vehicle import FmuFault
 from tests.conftest import Circuit
 from tests.network.cars import gentle_course, start_controller, start_plant
 from tests.programs import PATIENCE_S

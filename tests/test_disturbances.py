@@ -15,8 +15,7 @@ from controller.cycle_settings import CompensationSettings
 from controller.process_settings import ControllerSettings
 from controller.settings import MpcSettings
 from operation.closed_loop import ClosedLoop, Driven
-from plant.lockstep import CarRun
-from plant.sensors import Sensors
+from plant.lockstep import CarRun, Sensors
 from plant.settings import SensorNoise
 from plant.simulator import Simulator
 from tests.command_line import Cli, refused

@@ -19,7 +19,7 @@ from bayesrace.errors import InputError
 from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import STATES
 from codegen.fmu import Variable, car_fmu, pack
-from plant.simulator import PlantGuard
+from plant.guard import PlantGuard
 from tests.car_fmu import packed_car, unpacked_car
 from tests.cars import with_numbers
 from tests.fmu_exports import Kind, Version, built_in, commands, driven, slave

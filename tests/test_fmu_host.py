@@ -18,9 +18,9 @@ import pytest
 
 from bayesrace.errors import InputError
 from bayesrace.vehicles import get_car
-from plant.fmu.faults import FmuFault
 from plant.fmu.host import FmuHost
 from plant.fmu.simulator import open_fmu
+from plant.vehicle import FmuFault
 from tests.faulty_fmu import (
     PATIENCE_S,
     STATES,

@@ -11,11 +11,11 @@ import pytest
 
 from bayesrace.errors import InputError
 from bayesrace.vehicles import get_car
-from plant.fmu.faults import FmuFault
 from plant.fmu.host import FmuHost
 from plant.fmu.inspection import inspect
 from plant.fmu.simulator import FmuSimulator, communication_step
 from plant.fmu.wiring import Link, Wiring
+from plant.vehicle import FmuFault
 from tests.faulty_fmu import (
     STATES,
     Mode,

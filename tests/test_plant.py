@@ -14,7 +14,7 @@ from bayesrace.integrators import Discretisation
 from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import dynamic
 from codegen.compiler import Compiler, compiled
-from plant.laps import LineCounter
+from plant.lockstep import LineCounter
 from plant.simulator import Simulator
 
 CAR = get_car("orca")

@@ -13,8 +13,8 @@ import pytest
 from bayesrace.messages import Actuation, BrakingPlan, Decoder, RunRequest, State, Truth
 from bayesrace.transport import Inbox, Item, Kind, Numbering, Publisher
 from bayesrace.vehicles import get_car
+from plant.guard import GuardCounters
 from plant.run import Run, RunCounters
-from plant.simulator import GuardCounters
 from plant.vehicle import Vehicle, open_vehicle
 from tests.car_fmu import packed_car
 

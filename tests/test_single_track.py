@@ -18,7 +18,8 @@ from bayesrace.errors import InputError
 from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import dynamic, e_kinematic, top_command
 from bayesrace.vehicles.parts import LinearTyres
-from plant.simulator import PlantGuard, Simulator
+from plant.guard import PlantGuard
+from plant.simulator import Simulator
 from tests.cars import with_numbers
 
 CAR = get_car("f1tenth")

@@ -13,9 +13,8 @@ from bayesrace.errors import InputError
 from bayesrace.vehicles import get_car
 from operation.analysis.results import read_result
 from operation.settings import RaceSettings
-from plant.fmu.faults import FmuFault
 from plant.slipx_car import SlipxSimulator
-from plant.vehicle import open_vehicle
+from plant.vehicle import FmuFault, open_vehicle
 from tests.command_line import Cli, refused
 from tests.programs import Race
 

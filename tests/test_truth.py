@@ -22,7 +22,7 @@ from operation.analysis.race import analyse, read_race
 from operation.analysis.results import RaceResult
 from operation.analysis.validation import validate_weights
 from operation.closed_loop import ClosedLoop, Driven
-from plant.sensors import Sensors
+from plant.lockstep import Sensors
 from tests.conftest import Circuit
 from tests.driven import CAR, STEP_S, drive, write_log
 from tests.synthetic_race import LAP_S, Drive, circle, write_race

@@ -24,10 +24,10 @@ from msgspec import Meta, MsgspecError, msgpack
 
 from bayesrace.errors import InputError
 from bayesrace.temporary import temporary_folder
-from plant.fmu.faults import FmuFault
 from plant.fmu.inspection import extract, library
 from plant.fmu.wiring import Value
 from plant.fmu.worker import LONGEST, serve
+from plant.vehicle import FmuFault
 
 __all__ = ["FmuHost"]
 

@@ -1,12 +1,10 @@
 """An FMU as the car: the same guard in front of it, and the same interface, as the equations."""
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, Final
-
-import numpy as np
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
@@ -17,7 +15,9 @@ from plant.fmu.inspection import inspect, steps_s
 from plant.fmu.map import wire
 from plant.fmu.map_file import FmuMap, read_map
 from plant.fmu.wiring import Wiring
-from plant.simulator import Command, PlantGuard, checked_start, hold_in_turn, plant_discretisation
+from plant.guard import Command
+from plant.simulator import plant_discretisation
+from plant.vehicle import Vehicle
 
 __all__ = ["FmuSimulator", "communication_step", "open_fmu"]
 
@@ -55,8 +55,8 @@ def _divides(step_s: float, period_s: float) -> bool:
     return abs(whole * step_s - period_s) <= 1e-9 * period_s
 
 
-class FmuSimulator:
-    """A :class:`plant.vehicle.Vehicle` that an FMU computes.
+class FmuSimulator(Vehicle):
+    """A car that an FMU computes.
 
     A command that holds for a while is one step of an FMU that takes steps of any size, and as
     many communication steps as fit of any other.
@@ -67,41 +67,14 @@ class FmuSimulator:
         any_size: bool,
     ) -> None:  # fmt: skip
         """``part_s``: communication step; ``any_size``: other steps are as good."""
-        self.car = car
-        self.step_s = period_s
-        self.guard = PlantGuard(car)
-        self.u_applied: tuple[float, float] = (0.0, 0.0)
-        self.steps = 0
-        self.x: Floats = np.zeros(len(STATES))
-        self.substeps = round(period_s / part_s)
+        super().__init__(car, period_s, round(period_s / part_s))
         self._host, self._wiring = host, wiring
         self._part_s, self._any_size = part_s, any_size
 
-    @property
-    def time_s(self) -> float:
-        """Time since the reset, exact multiples of the period."""
-        return self.steps * self.step_s
-
-    def reset(self, x0: Sequence[float]) -> None:
-        """A new instance of the FMU in state ``x0`` at time zero.
-
-        Raises InputError if it cannot be in it, FmuFault if it fails.
-        """
-        start = checked_start(x0, self.car)
+    def _place(self, start: Floats) -> None:
+        """A new instance of the FMU."""
         outputs = self._host.start(self._wiring.start_values(start))
         self._take(self._wiring.begin(outputs, start))
-        self.u_applied = (0.0, 0.0)
-        self.steps = 0
-
-    def step(self, u: Command) -> None:
-        """Hold the command ``u`` = (d, delta_rate) for one period; None brakes."""
-        self.u_applied = self._hold(u, self.substeps)
-        self.steps += 1
-
-    def step_switched(self, commands: Sequence[tuple[int, Command]]) -> None:
-        """One period in which the command changes: (substeps, command) in order of time."""
-        self.u_applied = hold_in_turn(self.x, commands, self.substeps, self._hold)
-        self.steps += 1
 
     def _hold(self, u: Command, count: int) -> tuple[float, float]:
         """Holds a command for ``count`` communication steps; what acted."""
