@@ -225,7 +225,7 @@ def test_names_from_files_are_text_not_markup(tmp_path: Path) -> None:
 
 def test_time_lost_along_the_track_is_known(tmp_path: Path) -> None:
     """A car that is 1 % slower everywhere loses evenly."""
-    from operation.report.laps import first_laps, reference_of
+    from operation.report.traces import first_laps, reference_of
 
     drives = [
         Drive("bayesrace", circle(TWO_LAPS / 1.01, 1.0)),

@@ -16,7 +16,6 @@ from bayesrace.raceline import RaceLine
 from bayesrace.tracks import Track
 from operation.analysis.race import DrivenRun
 from operation.report.canvas import PANEL_WIDTH
-from operation.report.laps import Lap, first_laps, reference_of
 from operation.report.style import (
     INK,
     MUTED,
@@ -26,6 +25,7 @@ from operation.report.style import (
     look,
     speed_map,
 )
+from operation.report.traces import Lap, first_laps, reference_of
 
 __all__ = ["LapMaps", "draw_edges", "show_all"]
 

@@ -19,11 +19,10 @@ from operation.analysis.published import LIMIT, SOURCE, compare_gp, compare_laps
 from operation.analysis.race import DrivenRun, RaceAnalysis, read_race, write_result
 from operation.analysis.results import RaceResult
 from operation.report.canvas import inline_svg, png
-from operation.report.coverage import coverage_figures
 from operation.report.gp import gp_figures
 from operation.report.maps import LapMaps
+from operation.report.runs import coverage_figures, solve_figure
 from operation.report.style import figure_style, look
-from operation.report.timing import solve_figure
 from operation.report.traces import (
     caution_figures,
     cornering_figures,

@@ -1,11 +1,12 @@
-"""Panels over the arc length of the centreline: time lost, speed, inputs, deviation."""
+"""Laps over the arc length of the centreline: time lost, speed, inputs, deviation."""
 
 from collections.abc import Callable, Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from scipy.interpolate import CubicSpline
 
 from bayesrace.arrays import Floats
 from bayesrace.columns import Columns
@@ -15,24 +16,108 @@ from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.parts import GRAVITY_MPS2
 from operation.analysis.race import DrivenRun
 from operation.report.canvas import panel
-from operation.report.laps import Lap, first_laps, flying_laps, reference_of
 from operation.report.style import INK, MUTED, look
 
 __all__ = [
+    "Lap",
     "caution_figures",
     "cornering_figures",
     "deviation_figures",
+    "first_laps",
     "input_figures",
+    "reference_of",
     "speed_figures",
     "time_figures",
 ]
 
-
+_SLOW_MPS: Final = 0.05
+_POINTS, _SMOOTH = 600, 0.015
 _LEAP_M: Final = 1.0
 _NEAR_MS: Final = 300.0
 """A lap that ends farther from the reference leaves the picture, so that the others remain
 legible."""
 _DASHES: Final = (0, (4, 2))
+
+
+class Lap:
+    """One lap of a run over the arc length of the centreline, [0, length]."""
+
+    def __init__(self, run: DrivenRun, track: Track, number: int) -> None:
+        self.run, self.length_m, self.number = run, track.length_m, number
+        self.rows = run.shown(number)
+        self.s_m: Floats = run.on_track.progress_m[self.rows] - number * track.length_m
+
+    def time_at(self, s: Floats) -> Floats:
+        """Time since the start line at arc lengths (n,) [s]; the lap must be a finished one."""
+        time_s = self.run.record.time_s[self.rows]
+        progress = CubicSpline(time_s, self.s_m)  # smooth at standstill, as its inverse is not
+        time = np.interp(s, np.maximum.accumulate(self.s_m), time_s)
+        for _ in range(2):  # Newton's steps from the linear interpolation, which errs by 1 ms
+            step = (s - progress(time)) / np.maximum(progress(time, 1), _SLOW_MPS)
+            time = np.clip(time + step, time_s[0], time_s[-1])
+        return np.asarray(time - time[0])
+
+    def behind(self, other: "Lap") -> tuple[Floats, Floats]:
+        """Arc lengths (n,) from the start line on, and the time behind another finished lap [s].
+
+        Smoothed over :data:`_SMOOTH` of the lap: feet on a bent centreline jump by millimetres.
+        """
+        s: Floats = np.linspace(0.0, self.length_m, _POINTS)
+        window = np.ones(round(_SMOOTH * _POINTS)) / round(_SMOOTH * _POINTS)
+        padded = np.pad(self.time_at(s) - other.time_at(s), len(window) // 2, mode="edge")
+        return s, np.convolve(padded, window, "valid")[:_POINTS]
+
+    def plot(self, axes: Axes, values: Floats) -> None:
+        """Values (n,) of all samples of the run; a leap to another piece of the track is left
+        open."""
+        leaps = np.flatnonzero(np.abs(np.diff(self.s_m)) > _LEAP_M) + 1
+        s, y = (
+            np.insert(np.asarray(one, dtype=float), leaps, np.nan)
+            for one in (self.s_m, values[self.rows])
+        )
+        axes.plot(s, y, color=look(self.run.controller, self.run.number).colour, linewidth=1.1)
+
+
+def first_laps(runs: Sequence[DrivenRun], track: Track) -> list[Lap]:
+    """The first lap of each run, or its part that was driven."""
+    return [Lap(run, track, 0) for run in runs if len(run.record.truth) > 1]
+
+
+def _flying_laps(runs: Sequence[DrivenRun], track: Track) -> list[Lap]:
+    """The best lap after the first of each run that has one."""
+    return [
+        Lap(run, track, 1 + int(np.argmin(run.laps.times_s[1:])))
+        for run in runs
+        if len(run.laps.times_s) > 1
+    ]
+
+
+def _both(runs: Sequence[DrivenRun], track: Track) -> dict[str, list[Lap]]:
+    """The first and, where there are any, the best flying laps by their title."""
+    laps = {
+        "first lap, from standstill": first_laps(runs, track),
+        "best flying lap": _flying_laps(runs, track),
+    }
+    return {title: some for title, some in laps.items() if some}
+
+
+def reference_of(laps: Sequence[Lap]) -> Lap | None:
+    """Of finished laps the one to compare with: BestCase's, or the fastest; None without any."""
+    best = [lap for lap in laps if lap.run.controller == "bestcase"]
+    return min(best or laps, key=lambda lap: lap.run.laps.times_s[lap.number], default=None)
+
+
+class _Trace(NamedTuple):
+    """What a panel shows of each lap."""
+
+    title: str
+    label: str
+    values: Callable[[DrivenRun], Floats]
+    """One for each sample of a run."""
+    limits: tuple[float, ...] = ()
+    """Drawn as dotted lines."""
+    floor: float | None = None
+    """Where the axis begins, if not where the values do."""
 
 
 def _panel(track: Track, title: str, label: str, height: float = 2.0) -> tuple[Figure, Axes]:
@@ -42,20 +127,19 @@ def _panel(track: Track, title: str, label: str, height: float = 2.0) -> tuple[F
     return figure, axes
 
 
-def _plot(axes: Axes, lap: Lap, values: Floats) -> None:
-    """Values (n,) of the lap's samples; a leap to another piece of the track is left open."""
-    leaps = np.flatnonzero(np.abs(np.diff(lap.s_m)) > _LEAP_M) + 1
-    s, y = (np.insert(np.asarray(one, dtype=float), leaps, np.nan) for one in (lap.s_m, values))
-    axes.plot(s, y, color=look(lap.run.controller, lap.run.number).colour, linewidth=1.1)
-
-
-def _both(runs: Sequence[DrivenRun], track: Track) -> dict[str, list[Lap]]:
-    """The first and, where there are any, the best flying laps by their title."""
-    laps = {
-        "first lap, from standstill": first_laps(runs, track),
-        "best flying lap": flying_laps(runs, track),
-    }
-    return {title: some for title, some in laps.items() if some}
+def _figures(track: Track, laps: Sequence[Lap], traces: Sequence[_Trace]) -> list[Figure]:
+    """A panel for each trace, with all laps."""
+    figures = []
+    for trace in traces:
+        figure, axes = _panel(track, trace.title, trace.label)
+        for limit in trace.limits:
+            axes.axhline(limit, color=INK, linewidth=0.6, linestyle=(0, (1, 2)))
+        for lap in laps:
+            lap.plot(axes, trace.values(lap.run))
+        if trace.floor is not None:
+            axes.set_ylim(trace.floor, None)
+        figures.append(figure)
+    return figures
 
 
 def time_figures(runs: Sequence[DrivenRun], track: Track) -> list[Figure]:
@@ -72,9 +156,8 @@ def time_figures(runs: Sequence[DrivenRun], track: Track) -> list[Figure]:
         for lap in finished:
             s, behind_s = lap.behind(reference)
             behind_ms = 1e3 * behind_s
-            axes.plot(
-                s, behind_ms, color=look(lap.run.controller, lap.run.number).colour, linewidth=1.3
-            )
+            colour = look(lap.run.controller, lap.run.number).colour
+            axes.plot(s, behind_ms, color=colour, linewidth=1.3)
             if abs(behind_ms[-1]) < _NEAR_MS:
                 near_ms.extend(behind_ms)
         room = 0.05 * (max(near_ms) - min(near_ms))
@@ -94,100 +177,10 @@ def speed_figures(runs: Sequence[DrivenRun], track: Track, line: RaceLine) -> li
             on_line.s_m[order], line.vx_mps[order], color=MUTED, linewidth=0.9, linestyle=_DASHES
         )
         for lap in laps:
-            _plot(axes, lap, lap.run.record.x[lap.rows, 3])
+            lap.plot(axes, lap.run.record.x[:, 3])
         axes.set_ylim(0, None)
         figures.append(figure)
     return figures
-
-
-def input_figures(runs: Sequence[DrivenRun], track: Track, car: CarParameters) -> list[Figure]:
-    """Drive command and steering on the first lap, with the car's limits."""
-    command, unit = car.drive.command, {"1": "–", "m/s2": "m/s²"}[car.drive.unit]
-    rows: list[tuple[str, str, tuple[float, float], Callable[[DrivenRun], Floats]]] = [
-        (command, f"d [{unit}]", (car.d_min, car.d_max), lambda run: _held(run.record.u[:, 0])),
-        (
-            "steering angle", "δ [rad]", (-car.delta_max_rad, car.delta_max_rad),
-            lambda run: run.record.x[:, 6],
-        ),
-        (
-            "steering rate", "dδ/dt [rad/s]",
-            (-car.delta_rate_max_radps, car.delta_rate_max_radps),
-            lambda run: _held(run.record.u[:, 1]),
-        ),
-    ]  # fmt: skip
-    figures = []
-    for title, label, limits, values in rows:
-        figure, axes = _panel(track, title, label)
-        for limit in limits:
-            axes.axhline(limit, color=INK, linewidth=0.6, linestyle=(0, (1, 2)))
-        for lap in first_laps(runs, track):
-            _plot(axes, lap, values(lap.run)[lap.rows])
-        figures.append(figure)
-    return figures
-
-
-def cornering_figures(
-    runs: Sequence[DrivenRun], track: Track, friction: float | None
-) -> list[Figure]:
-    """Lateral acceleration, with what the friction would allow, and slip on the flying lap."""
-    laps = flying_laps(runs, track) or first_laps(runs, track)
-    rows: list[tuple[str, str, Callable[[DrivenRun], Floats], float | None]] = [
-        (
-            "acceleration across the way", "to the left [g]",
-            lambda run: run.record.lateral_mps2 / GRAVITY_MPS2, friction,
-        ),
-        ("slip of the body", "β [°]", lambda run: np.degrees(run.record.slip_rad), None),
-    ]  # fmt: skip
-    figures = []
-    for title, label, values, limit in rows:
-        figure, axes = _panel(track, title, label)
-        for side in () if limit is None else (-limit, limit):
-            axes.axhline(side, color=INK, linewidth=0.6, linestyle=(0, (1, 2)))
-        for lap in laps:
-            _plot(axes, lap, values(lap.run)[lap.rows])
-        figures.append(figure)
-    return figures
-
-
-def _held(u: Floats) -> Floats:
-    """One value a state: the last state's input is not known, it keeps the one before."""
-    return np.append(u, u[-1:]) if len(u) else np.zeros(1)
-
-
-def caution_figures(runs: Sequence[DrivenRun], track: Track) -> list[Figure]:
-    """What the uncertainty of the model does on the first lap: how far off the plan's last stage
-    may be, the speed that the reference is left with, and by how much the errors that were seen
-    have widened the model's band. Nothing if there was no caution."""
-    laps = [
-        lap
-        for lap in first_laps(runs, track)
-        if any(map(any, lap.run.record.telemetry["tube_m"]))
-        or (lap.run.record.telemetry["pace"] < 1).any()
-    ]
-    rows: list[tuple[str, str, Callable[[Columns], Floats]]] = [
-        ("uncertainty at the end of the plan", "either side [m]", _last_of_tube),
-        ("speed of the reference", "share of the line's", lambda rows: rows["pace"]),
-        ("band of the model", "widened by", lambda rows: rows["widening"]),
-    ]
-    figures = []
-    for title, label, values in rows if laps else ():
-        figure, axes = _panel(track, title, label)
-        for lap in laps:
-            _plot(axes, lap, _of_states(lap.run, values)[lap.rows])
-        axes.set_ylim(0, None)
-        figures.append(figure)
-    return figures
-
-
-def _last_of_tube(telemetry: Columns) -> Floats:
-    return np.array([tube_m[-1] if tube_m else np.nan for tube_m in telemetry["tube_m"]])
-
-
-def _of_states(run: DrivenRun, values: Callable[[Columns], Floats]) -> Floats:
-    """A value of each state's cycle; NaN where there was none."""
-    cycles = run.record.telemetry
-    known = dict(zip(cycles["state_seq"].tolist(), values(cycles), strict=True))
-    return np.array([known.get(seq, np.nan) for seq in run.record.truth["seq"].tolist()])
 
 
 def deviation_figures(runs: Sequence[DrivenRun], track: Track) -> list[Figure]:
@@ -198,9 +191,70 @@ def deviation_figures(runs: Sequence[DrivenRun], track: Track) -> list[Figure]:
         figure, axes = _panel(track, title, "to the left [m]")
         axes.axhline(0, color=MUTED, linewidth=0.8, linestyle=_DASHES)
         for lap in laps:
-            _plot(axes, lap, lap.run.offset_m[lap.rows])
+            lap.plot(axes, lap.run.offset_m)
         largest = max(float(np.abs(lap.run.offset_m[lap.rows]).max()) for lap in laps)
         limit = min(1.08 * largest, 1.5 * reach)
         axes.set_ylim(-limit, limit)
         figures.append(figure)
     return figures
+
+
+def input_figures(runs: Sequence[DrivenRun], track: Track, car: CarParameters) -> list[Figure]:
+    """Drive command and steering on the first lap, with the car's limits."""
+    unit, angle, rate = car.drive.unit, car.delta_max_rad, car.delta_rate_max_radps
+    command = f"d [{ ({'1': '–', 'm/s2': 'm/s²'}[unit]) }]"
+    traces = (
+        _Trace(car.drive.command, command, lambda run: _held(run, 0), (car.d_min, car.d_max)),
+        _Trace("steering angle", "δ [rad]", lambda run: run.record.x[:, 6], (-angle, angle)),
+        _Trace("steering rate", "dδ/dt [rad/s]", lambda run: _held(run, 1), (-rate, rate)),
+    )
+    return _figures(track, first_laps(runs, track), traces)
+
+
+def _held(run: DrivenRun, column: int) -> Floats:
+    """An input for each state: the last state's is not known, it keeps the one before."""
+    u = run.record.u[:, column]
+    return np.append(u, u[-1:]) if len(u) else np.zeros(1)
+
+
+def cornering_figures(
+    runs: Sequence[DrivenRun], track: Track, friction: float | None
+) -> list[Figure]:
+    """Lateral acceleration, with what the friction would allow, and slip on the flying lap."""
+    limits = () if friction is None else (-friction, friction)
+    traces = (
+        _Trace("acceleration across the way", "to the left [g]",
+               lambda run: run.record.lateral_mps2 / GRAVITY_MPS2, limits),
+        _Trace("slip of the body", "β [°]", lambda run: np.degrees(run.record.slip_rad)),
+    )  # fmt: skip
+    return _figures(track, _flying_laps(runs, track) or first_laps(runs, track), traces)
+
+
+def caution_figures(runs: Sequence[DrivenRun], track: Track) -> list[Figure]:
+    """What the uncertainty of the model does on the first lap: how far off the plan's last stage
+    may be, the speed that the reference is left with, and by how much the errors that were seen
+    have widened the model's band. Nothing if there was no caution."""
+
+    def cautious(telemetry: Columns) -> bool:
+        return any(map(any, telemetry["tube_m"])) or bool((telemetry["pace"] < 1).any())
+
+    laps = [lap for lap in first_laps(runs, track) if cautious(lap.run.record.telemetry)]
+    traces = (
+        _Trace("uncertainty at the end of the plan", "either side [m]",
+               lambda run: _of_states(run, _ends_of_tube(run.record.telemetry)), floor=0),
+        _Trace("speed of the reference", "share of the line's",
+               lambda run: _of_states(run, run.record.telemetry["pace"]), floor=0),
+        _Trace("band of the model", "widened by",
+               lambda run: _of_states(run, run.record.telemetry["widening"]), floor=0),
+    )  # fmt: skip
+    return _figures(track, laps, traces) if laps else []
+
+
+def _ends_of_tube(telemetry: Columns) -> Floats:
+    return np.array([tube_m[-1] if tube_m else np.nan for tube_m in telemetry["tube_m"]])
+
+
+def _of_states(run: DrivenRun, values: Floats) -> Floats:
+    """The value of each state's cycle; NaN where there was none."""
+    known = dict(zip(run.record.telemetry["state_seq"].tolist(), values, strict=True))
+    return np.array([known.get(seq, np.nan) for seq in run.record.truth["seq"].tolist()])

@@ -1,4 +1,4 @@
-"""The panel of the execution time of the controller's step."""
+"""Panels of whole runs: the states that they have visited, and how long the control steps took."""
 
 from collections.abc import Sequence
 
@@ -6,11 +6,48 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
+from bayesrace.arrays import Floats
+from bayesrace.vehicles.parts import GRAVITY_MPS2
 from operation.analysis.race import DrivenRun
-from operation.report.canvas import PANEL_WIDTH
+from operation.report.canvas import PANEL_WIDTH, panel
 from operation.report.style import INK, look
 
-__all__ = ["solve_figure"]
+__all__ = ["coverage_figures", "solve_figure"]
+
+
+def coverage_figures(training: DrivenRun, runs: Sequence[DrivenRun]) -> list[Figure]:
+    """Speed against yaw rate, speed against slip, and accelerations along and across the way."""
+    shown = [run for run in runs if run.controller == "bayesrace" and len(run.record.x) > 1]
+    rows = (
+        ("speed and yaw rate", "vx [m/s]", "ω [rad/s]", lambda run: run.record.x[:, (3, 5)]),
+        ("speed and slip", "vx [m/s]", "β [°]", _slip),
+        ("accelerations", "to the left [g]", "forwards [g]", _accelerations),
+    )
+    figures = []
+    for title, across, up, values in rows:
+        figure, axes = panel(3.2)
+        for run, size in ((training, 5.0), *((run, 1.6) for run in shown)):
+            appearance = look(run.controller, run.number)
+            x, y = values(run).T
+            axes.plot(
+                x, y, "o", color=appearance.colour, markersize=size, alpha=0.5,
+                markeredgewidth=0, label=appearance.name,
+            )  # fmt: skip
+        axes.set(title=title, xlabel=across, ylabel=up)
+        axes.legend(loc="best", markerscale=1.5)
+        figures.append(figure)
+    return figures
+
+
+def _slip(run: DrivenRun) -> Floats:
+    return np.column_stack([run.record.x[:, 3], np.degrees(run.record.slip_rad)])
+
+
+def _accelerations(run: DrivenRun) -> Floats:
+    """Across and along the way, (n - 1, 2) [g]."""
+    record = run.record
+    forwards = np.diff(np.hypot(record.x[:, 3], record.x[:, 4])) / np.diff(record.time_s)
+    return np.column_stack([record.lateral_mps2[:-1], forwards]) / GRAVITY_MPS2
 
 
 def solve_figure(runs: Sequence[DrivenRun]) -> Figure:
