@@ -112,10 +112,7 @@ def lap(number: int, time_s: float | None, *, flying: bool = True, off_m: float 
     )  # fmt: skip
 
 
-def controller_status(version: str, number: int | None = None, time_ns: int = 1) -> Status:
-    """A heartbeat of a controller that drives with these weights, accepted as ``number``."""
-    counters = {} if number is None else {"weights_number": number}
-    return blank(
-        Status, source_time_ns=time_ns, source="controller", phase="driving",
-        weights_version=version, rate_hz=50.0, counters=counters,
-    )  # fmt: skip
+def controller_status(version: str) -> Status:
+    """A heartbeat of a controller that drives with these weights."""
+    named = {"source": "controller", "phase": "driving", "weights_version": version}
+    return blank(Status, **named, rate_hz=50.0, counters={})

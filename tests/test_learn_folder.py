@@ -12,6 +12,7 @@ from bayesrace.errors import InputError
 from bayesrace.gp.weights import read_weights, zero_weights
 from bayesrace.integrators import PERFECT, PREDICTION
 from bayesrace.vehicles.models import dynamic
+from learning.dataset import concatenate
 from learning.subset import MOST_NEW
 from operation.learn.journal import MOST_WEIGHTS, Journal
 from operation.learn.records import LearnSettings, UpdateRecord
@@ -29,7 +30,7 @@ def opened(folder: Path, settings: LearnSettings = SETTINGS) -> Iterator[Journal
 
 
 def test_a_job_resumes_with_the_record_and_the_samples(tmp_path: Path) -> None:
-    """A sample that was being learned from is learned from again; those kept stay apart."""
+    """A sample that was being learned from is learned from again."""
     samples = drive(dynamic(CAR), 60, seed=1)
     kept = samples.select(slice(20))
     with opened(tmp_path / "job") as journal:
@@ -45,7 +46,9 @@ def test_a_job_resumes_with_the_record_and_the_samples(tmp_path: Path) -> None:
     with opened(tmp_path / "job") as again:
         assert again.resumed
         assert again.record == record
-        assert [one.digest() for one in again.take_samples()] == [kept.digest(), samples.digest()]
+        taken = again.take_samples()
+        assert taken is not None
+        assert taken.digest() == concatenate([kept, samples]).digest()
     assert {path.name for path in (tmp_path / "job").iterdir()} == {"laps.json", "samples.npz"}
     content = json.loads((tmp_path / "job/laps.json").read_text())
     assert content["laps"][0]["time_s"] == 5.0
@@ -58,7 +61,7 @@ def test_samples_stay_bounded(tmp_path: Path) -> None:
     with opened(tmp_path) as journal:
         for _ in range(2):
             journal.add_driven(many)
-        assert [len(one) for one in journal.take_samples()] == [0, MOST_NEW]
+        assert len(journal.take_samples() or ()) == MOST_NEW
 
 
 def test_weights_files_stay_bounded(tmp_path: Path) -> None:

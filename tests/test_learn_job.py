@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from msgspec.structs import replace
 from rich.console import Console
 
 from bayesrace.errors import InputError
@@ -131,23 +130,6 @@ def test_an_answer_after_the_rollback_changes_nothing(rig: PublisherRig) -> None
     rig.roll_back("a")
     rig.work()
     assert rig.verdict("a") == "rolled back"
-
-
-def test_a_rollback_whose_event_was_lost_shows_in_the_status(rig: PublisherRig) -> None:
-    """By the number of the weights in use; a status from before the takeover shows none."""
-    rig.start_controller("old")
-    for number, version in enumerate("ab", 1):
-        rig.learn(version, replace(yes(version, number), source_time_ns=100 * number))
-    for version, number, time_ns in (("old", 0, 90), ("a", 1, 190), ("b", 2, 210)):
-        rig.publisher.heartbeat(controller_status(version, number, time_ns))
-    rig.publisher.heartbeat(controller_status("of another publisher", 3, 220))
-    assert (rig.verdict("a"), rig.verdict("b")) == ("accepted", "accepted")
-    rig.publisher.heartbeat(controller_status("a", 1, 230))
-    assert (rig.verdict("a"), rig.verdict("b")) == ("accepted", "rolled back")
-    assert rig.said[-1].endswith("b (learned after lap 1): the controller drives with a again")
-    rig.start_controller("a")  # another one, which begins its numbers anew
-    rig.publisher.heartbeat(controller_status("a", 0, 240))
-    assert rig.verdict("a") == "accepted"
 
 
 @pytest.mark.parametrize("answer", [None, NOT_NOW], ids=["no answer", "refused for now"])

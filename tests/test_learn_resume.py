@@ -312,7 +312,7 @@ def test_pending_weights_are_sent_by_the_next_job_and_accepted_ones_by_the_one_a
         assert [one.verdict for one in record.updates] == ["accepted"]
     assert sent == ["v1", "v1"]
     jobs.run(tmp_path, *lap_of(SECOND, run=2))
-    assert jobs.tasks[-1].keywords["initial"] == tmp_path / "weights-0000.bin"
+    assert jobs.tasks[-1].args[2] == tmp_path / "weights-0000.bin"
 
 
 # Drives of no use ------------------------------------------------------------------------------

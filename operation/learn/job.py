@@ -195,11 +195,9 @@ class Learner:
         self._due, self._after_lap = False, len(journal.record.laps)
         samples, threads = journal.take_samples(), max(1, (os.cpu_count() or 1) - 1)
         how = TrainingSettings(capacity=settings.points, seed=settings.seed, threads=threads)
-        if len(samples[-1]):
-            model, initial = settings.discretisation, journal.initial
-            self._trainer.start(
-                partial(perform, model, samples, initial=initial, settings=how, keep=settings.keep)
-            )
+        if samples is not None:
+            model, first, keep = settings.discretisation, journal.initial, settings.keep
+            self._trainer.start(partial(perform, model, [samples], first, how, keep))
 
     def _finish_training(self) -> None:
         if (outcome := self._trainer.poll()) is None:

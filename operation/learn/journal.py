@@ -1,8 +1,8 @@
 """The folder of a learning job: ``laps.json``, ``samples.npz``, and the files made beside them.
 
-``laps.json`` is the job's :class:`~.records.Record`. ``samples.npz`` holds its samples, first those
-that the last training kept, then those that no training has learned from to its end. Each file is
-replaced as a whole, so a job that is killed at any moment leaves files that the next one can read.
+``laps.json`` is the job's :class:`~.records.Record`. ``samples.npz`` holds the samples that the
+next training learns from: those that the last one kept, and all driven since. Each file is replaced
+as a whole, so a job that is killed at any moment leaves files that the next one can read.
 """
 
 from contextlib import ExitStack
@@ -27,8 +27,6 @@ MOST_WEIGHTS: Final = 20
 
 _RECORD: Final = "laps.json"
 _SAMPLES: Final = "samples.npz"
-_BEGUN: Final = _SAMPLES, "weights-0000.bin", ".*.part*"
-"""What a job that was killed before its first record may have left."""
 
 
 class Journal:
@@ -41,29 +39,28 @@ class Journal:
         files are damaged, or if another job runs in the folder.
         """
         before = _read_record(folder)
-        there = folder.iterdir() if folder.is_dir() and before is None else ()
-        if not all(any(path.match(one) for one in _BEGUN) for path in there):
+        if before is None and folder.is_dir() and any(folder.iterdir()):
             raise InputError(f"{folder} holds something else; choose another folder")
         self._lock = ExitStack()
         self._lock.enter_context(claimed(folder))
         clear_partials(folder)
         self.folder, self.settings, self.resumed = folder, settings, before is not None
         self.record = before or Record()
-        self._kept = self._learning = self._new = Dataset(
+        self._learning = self._new = Dataset(
             settings.car, settings.discretisation.step_s, *(np.empty((0, n)) for n in (7, 2, 7))
         )
+        """Samples of the training that runs, or ran last; and those driven since it began."""
+        self._unlearned = False
+        """There are samples that no training has learned from to its end."""
         try:
-            self._resume(before)
+            self._resume()
         except InputError:
             self.close()
             raise
 
-    def _resume(self, before: Record | None) -> None:
+    def _resume(self) -> None:
         settings, path = self.settings, self.folder / _SAMPLES
         was, self.record.settings = self.record.settings, settings
-        if before is None:
-            path.unlink(missing_ok=True)
-            return
         for what in ("car", "name", "discretisation"):
             if was is not None and getattr(was, what) != getattr(settings, what):
                 raise InputError(
@@ -72,12 +69,12 @@ class Journal:
                 )
         if path.exists():
             try:
-                samples = dataset_from_npz(path, settings.car, settings.discretisation.step_s)
+                self._new = dataset_from_npz(path, settings.car, settings.discretisation.step_s)
+                trained = (one for one in reversed(self.record.updates) if one.verdict != "failed")
+                kept = next((one.kept for one in trained), 0)
+                self._unlearned = len(self._new) > kept
             except InputError as error:
                 raise InputError(f"{error}; restore it, or choose another folder") from None
-            ended = (one.kept for one in reversed(before.updates) if one.verdict != "failed")
-            kept = next(ended, 0)
-            self._kept, self._new = samples.select(slice(kept)), samples.select(slice(kept, None))
         self.save()
 
     def close(self) -> None:
@@ -109,14 +106,17 @@ class Journal:
             lap.lap = len(self.record.laps)
         if samples is not None:
             self._new = _joined(self._new, samples)
+            self._unlearned |= len(samples) > 0
             self._save_samples()
         if samples is not None or lap is not None:
             self.save()
 
-    def take_samples(self) -> list[Dataset]:
-        """For a training: the samples kept, and all others."""
+    def take_samples(self) -> Dataset | None:
+        """For a training: all samples; None if none of them is new."""
+        if not self._unlearned:
+            return None
         self._learning, self._new = _joined(self._learning, self._new), self._new.select(slice(0))
-        return [self._kept, self._learning]
+        return self._learning
 
     def add_update(
         self, update: UpdateRecord, weights: GpWeights | None, kept: Dataset | None = None
@@ -135,7 +135,7 @@ class Journal:
         self.record.updates.append(update)
         if kept is not None:
             update.kept = len(kept)
-            self._kept, self._learning = kept, self._learning.select(slice(0))
+            self._learning, self._unlearned = kept, len(self._new) > 0
             self._save_samples()
         self.save()
 
@@ -169,7 +169,7 @@ class Journal:
     def _save_samples(self) -> None:
         try:
             with replacing(self.folder / _SAMPLES) as path:
-                write_npz(path, concatenate([self._kept, self._learning, self._new]))
+                write_npz(path, concatenate([self._learning, self._new]))
         except OSError as error:
             raise self._unwritable(error) from None
 

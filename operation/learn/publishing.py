@@ -45,9 +45,6 @@ class Publisher:
         self._thread = ThreadPoolExecutor(1, "learn-publisher")
         self.unanswered: deque[tuple[UpdateRecord, Future[Reply]]] = deque()
         """Updates that were sent, oldest first, with what will be the answer."""
-        self._taken_over: deque[tuple[UpdateRecord, int]] = deque(maxlen=8)
-        """The last updates that the present controller accepted, and the times of its answers [ns];
-        it keeps no more weights to roll back to."""
         self.present = False
         """A heartbeat has come since the controller appeared or disappeared."""
         self.closed = False
@@ -72,35 +69,34 @@ class Publisher:
         """Compares the weights that the controller's status names with those sent.
 
         A controller that has just appeared is sent the pending weights, or else the last accepted
-        ones if it drives with others. A status of later than the takeover, but with a
-        smaller number of the weights in use, shows a rollback, also where its event was lost.
+        ones if it drives with others.
         """
         if status.source != "controller":
             return
         appeared, self.present, self.in_use = not self.present, True, status.weights_version
         update, last = self._journal.update_of(self.in_use), self._journal.last_accepted
         pending = [one for one in self._journal.record.updates if one.verdict == "pending"]
-        if appeared:
-            self._taken_over.clear()
-        drives_with = self.in_use or "no weights"
         if appeared and pending:
             self.offer(pending[-1])
         elif appeared and last is not None and self.in_use != last.version:
-            self._say(f"the controller drives with {drives_with}; sending {last.version}")
+            drives = self.in_use or "no weights"
+            self._say(f"the controller drives with {drives}; sending {last.version}")
             self._send(last)
         elif update and update.verdict in ("pending", "superseded") and not self.unanswered:
             self._note(update, "accepted", "in use")  # the answer was lost
-        number = status.counters.get("weights_number")
-        for update, answered_ns in self._taken_over:
-            earlier = type(number) is int and number < (update.acceptance or 0)
-            # A status from before the takeover may arrive after the answer.
-            if earlier and status.source_time_ns > answered_ns and update.verdict == "accepted":
-                self._roll_back(update.version, f"the controller drives with {drives_with} again")
 
     def event(self, event: Event) -> None:
         """Notes what the controller has rolled back."""
-        if event.source == "controller" and event.kind == "weights_rolled_back":
-            self._roll_back(str(event.data.get("from_version", "")), event.text)
+        if event.source != "controller" or event.kind != "weights_rolled_back":
+            return
+        version = str(event.data.get("from_version", ""))
+        updates = [one for one in self._journal.record.updates if version == one.version != ""]
+        for update in updates:
+            update.verdict, update.answer = "rolled back", event.text
+        if updates:
+            self._journal.save()
+            version += f" (learned after lap {updates[-1].after_lap})"
+        self._say(f"rolled back: {version}: {event.text}")
 
     def poll(self) -> None:
         """Notes the answers that have arrived."""
@@ -115,7 +111,6 @@ class Publisher:
             numbers = {name: one for name, one in reply.data.items() if type(one) is int}
             if reply.accepted:
                 update.cycle, update.acceptance = numbers.get("cycle"), numbers.get("number")
-                self._taken_over.append((update, reply.source_time_ns))
                 self._note(update, "accepted", in_words(reply))
             elif reply.data.get("again") is True:
                 self._note(update, update.verdict, in_words(reply))
@@ -134,15 +129,6 @@ class Publisher:
 
         if not self.closed:
             self.unanswered.append((update, self._thread.submit(call)))
-
-    def _roll_back(self, version: str, why: str) -> None:
-        updates = [one for one in self._journal.record.updates if version == one.version != ""]
-        for update in updates:
-            update.verdict, update.answer = "rolled back", why
-        if updates:
-            self._journal.save()
-            version += f" (learned after lap {updates[-1].after_lap})"
-        self._say(f"rolled back: {version}: {why}")
 
     def _note(self, update: UpdateRecord, verdict: Verdict, answer: str) -> None:
         if update.verdict != "rolled back":  # that event may come before the answer
