@@ -27,7 +27,6 @@ from operation.terminal.progress import Stages
 __all__ = [
     "Comparison",
     "Lap",
-    "check_curve",
     "compare_lines",
     "driven_lap",
     "ideal_lap",
@@ -38,7 +37,6 @@ _LIMIT: Final = 1.5
 """A drive ends at this multiple of the line's time ..."""
 _START_S: Final = 2.0
 """... and so much more for the start."""
-_CURVES: Final = (".csv", ".svg", ".png")
 
 Lap = Callable[[RaceLine], float]
 """Lap time along a line [s]; infinite where there is none."""
@@ -136,34 +134,11 @@ def compare_lines(
 
 
 def write_curve(path: Path, comparison: Comparison) -> None:
-    """Best lap against evaluations: a CSV, and a figure (SVG, PNG) where ``path`` names one.
-
-    Raises InputError for other suffixes.
-    """
-    check_curve(path)
+    """Best lap against evaluations as a CSV, a column for each search."""
     curves = {f"bayesian_{k}": one.best for k, one in enumerate(comparison.bayesian)}
     curves |= {f"random_{k}": one.best for k, one in enumerate(comparison.random)}
     longest = max(map(len, curves.values()))  # a search that stopped early keeps its best value
     table = np.stack([np.pad(one, (0, longest - len(one)), "edge") for one in curves.values()])
     rows = [",".join(["evaluation", *curves])]
     rows += [",".join([str(k + 1), *map(repr, row)]) for k, row in enumerate(table.T.tolist())]
-    write_whole(path.with_suffix(".csv"), "\n".join(rows) + "\n")
-    if path.suffix == ".csv":
-        return
-    from operation.report.canvas import inline_svg, write_png
-    from operation.report.curve import curve_figure
-    from operation.report.style import figure_style
-
-    count = len(comparison.bayesian)
-    with figure_style():
-        figure = curve_figure(table[:count], table[count:], comparison.direct_s)
-        if path.suffix == ".png":
-            write_png(figure, path)
-        else:
-            write_whole(path, inline_svg(figure))
-
-
-def check_curve(path: Path) -> None:
-    """InputError, before the work, for a file that :func:`write_curve` does not write."""
-    if path.suffix not in _CURVES:
-        raise InputError(f"cannot write a curve to {path}: name a file in {', '.join(_CURVES)}")
+    write_whole(path, "\n".join(rows) + "\n")

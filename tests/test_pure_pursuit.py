@@ -69,7 +69,7 @@ def test_it_laps_a_built_in_track_within_the_cars_limits(seed: int) -> None:
     assert (inputs[:, 0] <= CAR.d_max).all()
     assert (np.abs(inputs[:, 1]) <= CAR.delta_rate_max_radps).all()
     assert (np.abs(states[:, 6]) <= CAR.delta_max_rad).all()
-    off = track.off_track_m(track.project_path(states[:, :2]))
+    off = track.project_path(states[:, :2]).off_track_m
     assert off.max() < 0.1
     assert inputs[:, 0].std() > 0.05
     assert inputs[:, 1].std() > 0.3

@@ -90,9 +90,8 @@ def test_projection_inverts_position_plus_offset() -> None:
     np.testing.assert_allclose(found.n_m, n, atol=1e-9)
     np.testing.assert_allclose(found.off_track_m, np.abs(n) - 0.185, atol=1e-9)
     for i in range(5):
-        one = track.project(points[i], s_guess_m=s[i] + 0.1)
-        assert (one.s_m, one.n_m) == pytest.approx((s[i], n[i]), abs=1e-8)
-        assert track.off_track_m(one) == one.off_track_m
+        one = track.project_path(points[i], s[i] + 0.1)
+        assert (one.s_m[0], one.n_m[0]) == pytest.approx((s[i], n[i]), abs=1e-8)
 
 
 @given(x=st.floats(-3, 3), y=st.floats(-3, 3))
@@ -100,22 +99,21 @@ def test_projection_inverts_position_plus_offset() -> None:
 def test_global_projection_is_nowhere_beaten(x: float, y: float) -> None:
     """Nearest over all pieces, also half-way between two of them."""
     track = load_track(DEFAULT_RACE_TRACK)
-    found = track.project((x, y))
+    found = track.project_points((x, y))
     everywhere = track.position(np.linspace(0, track.length_m, 4000))
     best = float(np.min(np.hypot(everywhere[:, 0] - x, everywhere[:, 1] - y)))
-    foot = track.position(found.s_m)
+    foot = track.position(found.s_m[0])
     assert math.hypot(foot[0] - x, foot[1] - y) <= best + 1e-12
-    assert abs(found.n_m) == pytest.approx(math.hypot(foot[0] - x, foot[1] - y), abs=1e-6)
+    assert abs(found.n_m[0]) == pytest.approx(math.hypot(foot[0] - x, foot[1] - y), abs=1e-6)
 
 
 def test_local_projection_stays_on_its_piece_where_the_other_is_nearer() -> None:
     track = stadium()
     point = (1.5, 0.05)  # .30 m from the bottom straight, .20 m from the top one
-    assert track.project(point).s_m > 3.0
-    local = track.project(point, s_guess_m=1.4)
-    assert local.s_m == pytest.approx(1.5, abs=1e-3)
-    assert local.n_m == pytest.approx(0.30, abs=1e-3)
-    assert local.off_track_m == pytest.approx(0.10, abs=1e-3)
+    assert track.project_points(point).s_m[0] > 3.0
+    local = track.project_path(point, 1.4)
+    found = [*local.s_m, *local.n_m, *local.off_track_m]
+    assert found == pytest.approx([1.5, 0.30, 0.10], abs=1e-3)
 
 
 def test_local_projection_works_across_the_start_line() -> None:
@@ -123,7 +121,7 @@ def test_local_projection_works_across_the_start_line() -> None:
     for angle in (-0.05, 0.05):
         point = (0.9 * math.cos(angle), 0.9 * math.sin(angle))
         for guess in (0.02, track.length_m - 0.02, -0.02, 3 * track.length_m):
-            s = track.project(point, s_guess_m=guess).s_m
+            (s,) = track.project_path(point, guess).s_m
             assert s == pytest.approx(angle % track.length_m, abs=1e-4)
 
 
@@ -174,7 +172,7 @@ def test_widths_are_interpolated_and_periodic() -> None:
 def test_mirrored_track_mirrors_offsets_and_widths() -> None:
     track = Track.from_points("m", np.column_stack([circle().x_m, circle().y_m]), 0.1, 0.2)
     mirror = track.mirrored()
-    here, there = track.project((1.05, 0.3)), mirror.project((1.05, -0.3))
+    here, there = track.project_points((1.05, 0.3)), mirror.project_points((1.05, -0.3))
     assert there.n_m == pytest.approx(-here.n_m)
     assert there.s_m == pytest.approx(here.s_m)
     assert there.off_track_m == pytest.approx(here.off_track_m)
@@ -330,7 +328,7 @@ def test_from_points_names_the_point_that_is_wrong(points: Floats, message: str)
 def test_importing_tracks_imports_nothing_slow() -> None:
     """The controller process starts without CasADi, scipy or matplotlib."""
     code = (
-        "import sys, bayesrace.tracks as t; t.load_track('random:1').project((0, 0)); "
+        "import sys, bayesrace.tracks as t; t.load_track('random:1').project_points((0, 0)); "
         "import bayesrace.raceline; "
         "print([m for m in ('casadi', 'scipy', 'matplotlib', 'sklearn') if m in sys.modules])"
     )

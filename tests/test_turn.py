@@ -64,8 +64,9 @@ def test_it_turns_to_the_side_with_more_room(
     """Pointing the other way, its right is the line's left."""
     native.reset()
     x = standing(circuit, 1.0, 0.0, turned_rad)
-    right, left = circuit.track.widths(circuit.track.project(x[:2]).s_m)
-    middle = float((left - right) / 2 - circuit.track.project(x[:2]).n_m)
+    on_track = circuit.track.project_points(x[:2])
+    right, left = circuit.track.widths(on_track.s_m[0])
+    middle = float((left - right) / 2 - on_track.n_m[0])
     x = standing(circuit, 1.0, middle + to_left_m, turned_rad)
     assert native.step(x, 0.0).usable
     assert np.sign(native.u[1]) == np.sign(to_left_m)

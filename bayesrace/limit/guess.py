@@ -9,8 +9,7 @@ from bayesrace.limit.lap import LimitSettings
 from bayesrace.limit.ocp import Lap, usual_interval
 from bayesrace.raceline import RaceLine
 from bayesrace.raceline.gates import Gates
-from bayesrace.tracks.projection import CentrelineSearch
-from bayesrace.tracks.spline import PlaneSpline
+from bayesrace.tracks.spline import CentrelineSearch, PlaneSpline
 from bayesrace.vehicles.parameters import CarParameters
 from bayesrace.vehicles.parts import GRAVITY_MPS2
 

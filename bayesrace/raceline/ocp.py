@@ -154,20 +154,12 @@ def _within(limits: CarLimits, energy: Any, kappa: Any, a: Any, time: Any) -> li
 
 def _bounds(gates: Gates, limits: CarLimits, v_max: float) -> tuple[Floats, Floats]:
     """Lower and upper bounds of x."""
-    one, tuning = np.ones(gates.intervals), limits.car.tuning.raceline
-    kappa, v_min, a_any = (
-        limits.kappa_max_radpm,
-        tuning.speed_min_mps,
-        tuning.acceleration_bound_mps2,
-    )
-    low = [gates.n_min_m[:-1], -_XI_MAX_RAD * one, v_min**2 * one, -kappa * one, -a_any * one]
-    high = [
-        gates.n_max_m[:-1],
-        _XI_MAX_RAD * one,
-        (1.05 * v_max) ** 2 * one,
-        kappa * one,
-        a_any * one,
-    ]
+    tuning = limits.car.tuning.raceline
+    kappa, a = limits.kappa_max_radpm, tuning.acceleration_bound_mps2
+    slowest, fastest = tuning.speed_min_mps**2, (1.05 * v_max) ** 2
+    one = np.ones(gates.intervals)
+    low = [gates.n_min_m[:-1], -_XI_MAX_RAD * one, slowest * one, -kappa * one, -a * one]
+    high = [gates.n_max_m[:-1], _XI_MAX_RAD * one, fastest * one, kappa * one, a * one]
     return np.concatenate(low), np.concatenate(high)
 
 

@@ -1,18 +1,25 @@
 """Tracks: centrelines with widths, projection on them, files, built-in and random circuits."""
 
-from bayesrace.tracks.builtin import DEFAULT_RACE_TRACK, DEFAULT_TRAINING_TRACK, builtin_tracks
-from bayesrace.tracks.files import read_recentred, read_smoothed, read_track, write_track
 from bayesrace.tracks.generator import random_track
-from bayesrace.tracks.library import is_random_track, load_track
+from bayesrace.tracks.library import (
+    DEFAULT_RACE_TRACK,
+    DEFAULT_TRAINING_TRACK,
+    builtin_tracks,
+    is_random_track,
+    load_track,
+    read_recentred,
+    read_smoothed,
+    read_track,
+    write_track,
+)
 from bayesrace.tracks.startline import Crossing, StartLine
-from bayesrace.tracks.track import PathProjection, Projection, Track
+from bayesrace.tracks.track import PathProjection, Track
 
 __all__ = [
     "DEFAULT_RACE_TRACK",
     "DEFAULT_TRAINING_TRACK",
     "Crossing",
     "PathProjection",
-    "Projection",
     "StartLine",
     "Track",
     "builtin_tracks",

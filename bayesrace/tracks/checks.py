@@ -1,6 +1,6 @@
 """Checks that a list of points is a track in metres; each names the point at fault."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,102 +68,76 @@ def find_fault(points: Floats, right: Floats, left: Floats, min_width_m: float) 
 
     ``min_width_m``: the least width, right plus left, normally that of the car.
     """
-    return find_value_fault(points, right, left, min_width_m) or _find_shape_fault(points)
+    return find_value_fault(points, right, left, min_width_m) or next(_shape_faults(points), None)
 
 
 def find_value_fault(
     points: Floats, right: Floats, left: Floats, min_width_m: float
 ) -> Fault | None:
     """:func:`find_fault` of what no smoothing mends: all but the shape."""
+    return next(_value_faults(points, right, left, min_width_m), None)
+
+
+def _value_faults(
+    points: Floats, right: Floats, left: Floats, min_width_m: float
+) -> Iterator[Fault]:
+    """In this order; what is behind the first fault need not make sense."""
     if len(points) < MIN_POINTS:
-        return Fault(
-            None,
-            f"too few points ({len(points)})",
-            f"a closed centreline needs at least {MIN_POINTS}",
-        )
-    finite = np.isfinite(points).all(axis=1) & np.isfinite(right) & np.isfinite(left)
-    if not finite.all():
-        return Fault(
-            int(np.argmin(finite)),
-            "a value is not finite",
-            "give every coordinate and width as a finite number in metres",
-        )
-    return _find_width_fault(right, left, min_width_m) or _find_gap_fault(points)
-
-
-def _find_width_fault(right: Floats, left: Floats, min_width_m: float) -> Fault | None:
+        remedy = f"a closed centreline needs at least {MIN_POINTS}"
+        yield Fault(None, f"too few points ({len(points)})", remedy)
+    bad = ~(np.isfinite(points).all(axis=1) & np.isfinite(right) & np.isfinite(left))
+    if bad.any():
+        remedy = "give every coordinate and width as a finite number in metres"
+        yield Fault(int(np.argmax(bad)), "a value is not finite", remedy)
     negative = (right < 0) | (left < 0)
     if negative.any():
-        return Fault(
-            int(np.argmax(negative)),
-            "a width is negative",
-            "both widths count from the centreline outwards",
-        )
+        remedy = "both widths count from the centreline outwards"
+        yield Fault(int(np.argmax(negative)), "a width is negative", remedy)
     total = right + left
     narrow = (total < min_width_m) | (total <= 0)
     if narrow.any():
         index = int(np.argmax(narrow))
-        return Fault(
+        yield Fault(
             index,
             f"the track is {total[index]:.3g} m wide, the car {min_width_m:.3g} m",
             "widen the track there, check that widths are in metres, or choose a smaller car",
         )
-    return None
-
-
-def _find_gap_fault(points: Floats) -> Fault | None:
     length = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
     if length[-1] > _OPEN * length[:-1].max():
-        return Fault(
+        yield Fault(
             None,
             f"the centreline is not closed: the last point is {length[-1]:.3g} m from the first, "
             f"other neighbours at most {length[:-1].max():.3g} m",
             "give the whole lap, up to the point before the first one",
         )
-    return None
 
 
-def _find_shape_fault(points: Floats) -> Fault | None:
+def _shape_faults(points: Floats) -> Iterator[Fault]:
     edge = np.roll(points, -1, axis=0) - points
-    length = np.linalg.norm(edge, axis=1)
+    before, length = np.roll(edge, 1, axis=0), np.linalg.norm(edge, axis=1)
     if (length < _DUPLICATE_M).any():
         first = int(np.argmax(length < _DUPLICATE_M))
         second = (first + 1) % len(points)
-        return Fault(second, "the same point as", "remove one of the two", other=first)
-    before = np.roll(edge, 1, axis=0)
-    cosine = np.sum(edge * before, axis=1) / (length * np.roll(length, 1))
-    if (cosine < -0.999).any():
-        return Fault(
-            int(np.argmax(cosine < -0.999)),
-            "the centreline turns back on itself",
-            _IN_ORDER,
-        )
+        yield Fault(second, "the same point as", "remove one of the two", other=first)
+    along = np.sum(edge * before, axis=1)
+    back = along / (length * np.roll(length, 1)) < -0.999
+    if back.any():
+        yield Fault(int(np.argmax(back)), "the centreline turns back on itself", _IN_ORDER)
     crossing = find_crossing(points)
     if crossing is not None:
-        return Fault(
-            crossing[1],
-            "the centreline crosses itself: the edge from here meets the one from",
-            f"{_IN_ORDER}; bridges are not supported",
-            other=crossing[0],
-        )
-    return _find_noise_fault(edge, before)
-
-
-def _find_noise_fault(edge: Floats, before: Floats) -> Fault | None:
-    if len(edge) <= _CORNERS:
-        return None
-    across = before[:, 0] * edge[:, 1] - before[:, 1] * edge[:, 0]
-    turn = np.arctan2(across, np.sum(edge * before, axis=1))
+        what = "the centreline crosses itself: the edge from here meets the one from"
+        remedy = f"{_IN_ORDER}; bridges are not supported"
+        yield Fault(crossing[1], what, remedy, other=crossing[0])
+    turn = np.arctan2(before[:, 0] * edge[:, 1] - before[:, 1] * edge[:, 0], along)
     variance = float(np.mean(turn**2))
     alternating = float(np.mean(turn * np.roll(turn, 1))) / max(variance, 1e-30)
-    if variance < _ZIGZAG_RAD**2 or alternating > _ALTERNATING:
-        return None
-    return Fault(
-        None,
-        f"the centreline zigzags: it turns by {np.degrees(variance**0.5):.0f}° (RMS) to one side "
-        "and the other from point to point",
-        f"if the points are measured with noise, {_SMOOTH}",
-    )
+    if len(edge) > _CORNERS and variance > _ZIGZAG_RAD**2 and alternating < _ALTERNATING:
+        yield Fault(
+            None,
+            f"the centreline zigzags: it turns by {np.degrees(variance**0.5):.0f}° (RMS) to one "
+            "side and the other from point to point",
+            f"if the points are measured with noise, {_SMOOTH}",
+        )
 
 
 def find_scale_fault(

@@ -1,17 +1,67 @@
-"""One way to any track: a built-in name, ``random:SEED``, ``random10:SEED`` or a CSV file."""
+"""Where tracks come from: built-in names, ``random:SEED``, ``random10:SEED``, and CSV files.
 
+The built-in circuits are polygons with rounded corners: circuits.toml. Files have the form the TUM
+and F1TENTH communities use, ``x_m, y_m, w_tr_right_m, w_tr_left_m``, one row per centreline point;
+the first may be repeated at the end. tables.py has what all CSV files may look like.
+"""
+
+import tomllib
+from functools import cache
 from pathlib import Path
+from typing import Any, Final
 
+import numpy as np
+
+from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
-from bayesrace.tracks.builtin import builtin_track, builtin_tracks
-from bayesrace.tracks.files import default_car_width_m, read_track
+from bayesrace.tracks.checks import Fault, find_fault, find_scale_fault, find_value_fault
 from bayesrace.tracks.generator import RANDOM_TRACKS, random_track
-from bayesrace.tracks.track import Track
+from bayesrace.tracks.shapes import rounded_polygon, smooth
+from bayesrace.tracks.tables import read_table, write_table
+from bayesrace.tracks.track import Track, drop_repeated
 
-__all__ = ["is_random_track", "load_track"]
+__all__ = [
+    "DEFAULT_RACE_TRACK",
+    "DEFAULT_TRAINING_TRACK",
+    "builtin_tracks",
+    "default_car_width_m",
+    "is_random_track",
+    "load_track",
+    "read_recentred",
+    "read_smoothed",
+    "read_track",
+    "write_track",
+]
 
-_MAPS = (".yaml", ".yml")
-_SEED_DIGITS = 18
+DEFAULT_TRAINING_TRACK: Final = "paddock"
+DEFAULT_RACE_TRACK: Final = "harbour"
+
+_COLUMNS: Final = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")
+_CIRCUITS: Final = Path(__file__).with_name("circuits.toml")
+_MAPS: Final = (".yaml", ".yml")
+_SEED_DIGITS: Final = 18
+
+
+def builtin_tracks() -> tuple[str, ...]:
+    """Names of the built-in tracks, for :func:`load_track`."""
+    return tuple(sorted(_circuits()))
+
+
+@cache
+def _circuits() -> dict[str, Any]:
+    return tomllib.loads(_CIRCUITS.read_text("utf-8"))
+
+
+@cache
+def _builtin_track(name: str) -> Track:
+    circuit = _circuits()[name]
+    scale, width_m = circuit["scale"], circuit["width_m"]
+    points = rounded_polygon(circuit["corners"], 0.04 * scale, 0.05 * scale)
+    if points is None:
+        raise AssertionError(f"the corners of built-in track '{name}' overlap")
+    spacing = float(np.linalg.norm(points[1] - points[0]))
+    points = np.roll(points, round(circuit["start_m"] / spacing), axis=0)
+    return Track.from_points(name, points, width_m / 2, width_m / 2)
 
 
 def is_random_track(name: str) -> bool:
@@ -29,7 +79,7 @@ def load_track(name_or_path: str | Path, car_width_m: float | None = None) -> Tr
     """
     text = str(name_or_path)
     if text in builtin_tracks():
-        return _wide_enough(builtin_track(text), car_width_m)
+        return _wide_enough(_builtin_track(text), car_width_m)
     kind, colon, seed = text.partition(":")
     if colon and kind in RANDOM_TRACKS:
         return _wide_enough(random_track(_seed(text, seed), kind), car_width_m)
@@ -70,3 +120,92 @@ def _wide_enough(track: Track, car_width_m: float | None) -> Track:
             "choose a wider track or a smaller car"
         )
     return track
+
+
+def read_track(path: Path | str, car_width_m: float | None = None) -> Track:
+    """The track in a CSV file, named after the file.
+
+    ``car_width_m``: the track must be at least as wide and of the car's scale; 0: of any scale;
+    default: at least as wide as the default car, of any scale that is usual in metres. Raises
+    InputError naming file, row (line number in the file) and remedy.
+    """
+    return _checked(Path(path), *_read_points(Path(path)), car_width_m)
+
+
+def read_recentred(path: Path | str, car_width_m: float | None = None) -> tuple[Track, Floats]:
+    """The same of a file with a map's coordinates, such as UTM's: the first point is the origin.
+
+    And where that is in the file, (2,) [m].
+    """
+    points, right, left, rows = _read_points(Path(path))
+    origin = points[:1].sum(axis=0)  # zero without a point
+    return _checked(Path(path), points - origin, right, left, rows, car_width_m), origin
+
+
+def _checked(
+    path: Path, points: Floats, right: Floats, left: Floats, rows: list[int], width_m: float | None
+) -> Track:
+    _refuse(path, rows, find_fault(points, right, left, default_car_width_m(width_m)))
+    if width_m != 0:
+        _refuse(path, rows, find_scale_fault(points, right, left, width_m))
+    return Track._from_checked(path.stem, points, right, left)
+
+
+def read_smoothed(path: Path | str, car_width_m: float | None = None) -> tuple[Track, Floats]:
+    """The track in a CSV file of points that were measured with noise, which is taken off; and how
+    far each point is from the smooth centreline, (n,) [m].
+
+    Raises InputError like :func:`read_track`, and where the smooth centreline is no track.
+    """
+    path = Path(path)
+    points, right, left, rows = _read_points(path)
+    least_m = default_car_width_m(car_width_m)
+    moved = (points != np.roll(points, 1, axis=0)).any(axis=1)  # a logger that stood repeats itself
+    distinct = points[moved], right[moved], left[moved]
+    fault = find_value_fault(*distinct, least_m)
+    _refuse(
+        path,
+        [row for row, kept in zip(rows, moved.tolist(), strict=False) if kept],
+        fault or find_scale_fault(*distinct, car_width_m),
+    )
+    smoothed = smooth(*distinct)
+    if find_fault(*smoothed, least_m) is not None:
+        raise InputError(
+            f"{path}: even smoothed, the centreline crosses itself or turns back; give the points "
+            "of one lap in driving order"
+        )
+    track = Track._from_checked(path.stem, *smoothed)
+    away_m = np.abs(track.project_points(points).n_m)
+    if (outlier := away_m > right + left).any():
+        first = int(np.argmax(outlier))
+        raise InputError(
+            f"{path}, row {rows[first]}: the point is {away_m[first]:.3g} m from the smooth "
+            "centreline, farther than the track is wide; leave it out"
+        )
+    return track, away_m
+
+
+def _read_points(path: Path) -> tuple[Floats, Floats, Floats, list[int]]:
+    """Points (n, 2), widths to the right and to the left (n,), number of each row."""
+    table, rows = read_table(path, _COLUMNS)
+    return *drop_repeated(table[:, :2], table[:, 2], table[:, 3]), rows
+
+
+def _refuse(path: Path, rows: list[int], fault: Fault | None) -> None:
+    if fault is not None:
+        raise InputError(fault.text(str(path), "row", rows))
+
+
+def write_track(path: Path | str, track: Track) -> None:
+    """Writes the nodes of a track; reading the file gives the same numbers."""
+    nodes = np.column_stack([track.x_m, track.y_m, track.width_right_m, track.width_left_m])
+    write_table(path, _COLUMNS, nodes, separator=",")
+
+
+def default_car_width_m(car_width_m: float | None) -> float:
+    """The given width, or that of the default car."""
+    if car_width_m is not None:
+        return car_width_m
+    from bayesrace.vehicles import DEFAULT_CAR, get_car
+
+    return get_car(DEFAULT_CAR).width_m

@@ -7,7 +7,6 @@ positive in a left-hand bend. Any real s is accepted and wraps at the start line
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import overload
 
 import numpy as np
 import numpy.typing as npt
@@ -16,27 +15,14 @@ from bayesrace.arrays import Floats
 from bayesrace.cache import digest
 from bayesrace.errors import InputError
 from bayesrace.tracks.checks import find_fault
-from bayesrace.tracks.projection import CentrelineSearch
-from bayesrace.tracks.spline import PlaneSpline, fit_arc_length
+from bayesrace.tracks.spline import CentrelineSearch, PlaneSpline, fit_arc_length
 
-__all__ = ["PathProjection", "Projection", "Track"]
-
-
-@dataclass(frozen=True)
-class Projection:
-    """Where one point is on a track."""
-
-    s_m: float
-    """Arc length of the foot point, in [0, length)."""
-    n_m: float
-    """Lateral offset, positive to the left."""
-    off_track_m: float
-    """Distance outside the track; <= 0 inside."""
+__all__ = ["PathProjection", "Track"]
 
 
 @dataclass(frozen=True, eq=False)
 class PathProjection:
-    """Where the points of a trajectory are on a track; arrays of shape (m,)."""
+    """Where points are on a track; arrays of shape (m,)."""
 
     s_m: Floats
     """Arc length of the foot points, in [0, length)."""
@@ -166,28 +152,14 @@ class Track:
         """x [m], y [m] of node 0 and the heading there [rad]."""
         return float(self.x_m[0]), float(self.y_m[0]), float(self.heading(0.0))
 
-    def project(self, xy: npt.ArrayLike, s_guess_m: float | None = None) -> Projection:
-        """Foot point of one point (2,) on the centreline.
-
-        Without a guess, the nearest over the whole centreline. With one, the foot point reached by
-        going from the guess in the direction in which the distance falls: it stays on the same
-        piece where another one comes near (even nearer).
-        """
-        point = np.asarray(xy, dtype=float).reshape(1, 2)
-        if s_guess_m is None:
-            s = self._search.nearest(point)
-        else:
-            s = self._search.descend(point, s_guess_m)
-        n = self._offsets(point, s)
-        return Projection(float(s[0]), float(n[0]), float(self._off_track(s, n)[0]))
-
     def project_points(self, xy: npt.ArrayLike) -> PathProjection:
         """Nearest foot points of points (m, 2) that need not be a trajectory."""
         points = np.asarray(xy, dtype=float).reshape(-1, 2)
         return self._projected(points, self._search.nearest(points))
 
     def project_path(self, xy: npt.ArrayLike, s_guess_m: float | None = None) -> PathProjection:
-        """Foot points of a trajectory (m, 2), each sought from its predecessor's.
+        """Foot points of a trajectory (m, 2), each sought from its predecessor's, the first from
+        the guess or else everywhere.
 
         A neighbouring piece of the track can't capture the trajectory. After a leap longer than
         the track is wide, or farther than that from the piece, the search is global again.
@@ -195,14 +167,6 @@ class Track:
         points = np.asarray(xy, dtype=float).reshape(-1, 2)
         reach = float(np.max(self.width_right_m + self.width_left_m))
         return self._projected(points, self._search.follow(points, s_guess_m, reach))
-
-    @overload
-    def off_track_m(self, projection: Projection) -> float: ...
-    @overload
-    def off_track_m(self, projection: PathProjection) -> Floats: ...
-    def off_track_m(self, projection: Projection | PathProjection) -> float | Floats:
-        """How far outside the track [m]; <= 0 inside."""
-        return projection.off_track_m
 
     def mirrored(self) -> "Track":
         """The track mirrored at the x axis: left-hand bends become right-hand bends."""

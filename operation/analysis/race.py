@@ -19,8 +19,7 @@ from bayesrace.errors import InputError
 from bayesrace.gp.weights import read_weights
 from bayesrace.raceline import RaceLine
 from bayesrace.tracks import PathProjection, Track
-from bayesrace.tracks.projection import CentrelineSearch
-from bayesrace.tracks.spline import PlaneSpline
+from bayesrace.tracks.spline import CentrelineSearch, PlaneSpline
 from bayesrace.vehicles import CarParameters
 from learning.dataset import Dataset
 from learning.logs import dataset_from_columns

@@ -167,7 +167,7 @@ def raceline(
         "minimum-time, or bayesian (Jain and Morari 2020).", "minimum-time"
     ),
     curve: Path | None = options.new_file(
-        "Best lap against evaluations, beside random search (SVG, PNG, CSV)."
+        "Write the best lap against evaluations, beside random search (CSV)."
     ),
     weights: Path | None = options.value("Weights for --objective driven.", shown="trained"),
 ) -> None:
@@ -191,12 +191,10 @@ def raceline(
         write_raceline(out, line)
         typer.echo(f"{line.length_m:.2f} m in {line.lap_time_s:.3f} s: {out}")
         return
-    from operation.line_search import check_curve, compare_lines, write_curve
+    from operation.line_search import compare_lines, write_curve
 
-    if curve is not None:
-        check_curve(curve)
-        if curve.with_suffix(".csv") == out:
-            raise InputError(f"--curve {curve} writes {out}, too: give --out another name")
+    if curve == out:
+        raise InputError(f"--curve and --out both write {out}: give one of them another name")
     if weights is not None and chosen.objective != "driven":
         raise InputError("--weights needs --objective driven")
     with options.stages_shown() as stages:

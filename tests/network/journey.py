@@ -57,7 +57,7 @@ class Journey:
         """How far outside of the track the car got at most (all states); negative inside."""
         chosen = self.states if states is None else states
         xy = np.array([state.x[:2] for state in chosen])
-        return float(self._track.off_track_m(self._track.project_path(xy)).max())
+        return float(self._track.project_path(xy).off_track_m.max())
 
     def phases(self, begin_ns: int, end_ns: int) -> set[str]:
         """What the controller said of itself in this interval."""

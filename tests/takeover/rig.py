@@ -125,7 +125,7 @@ class Rig:
 
     def off_track_m(self, run: int) -> float:
         xy = np.array([one.x[:2] for one in self.states(run)])
-        return float(self.track.off_track_m(self.track.project_path(xy)).max())
+        return float(self.track.project_path(xy).off_track_m.max())
 
 
 @contextmanager
