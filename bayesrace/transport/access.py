@@ -6,7 +6,7 @@ name that is not in the list of members may do nothing.
 """
 
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, Final
 
 from bayesrace.messages import (
@@ -18,19 +18,37 @@ from bayesrace.messages import (
     SERVICES,
     TOPICS,
     Role,
+    Source,
 )
 from bayesrace.transport.credentials import Members
 
 __all__ = ["access_control"]
 
-_Right = tuple[str, str, str]
-"""Direction as seen by the node that checks ("ingress": from the other end), kind, key."""
-
-_EVERY_KIND: Final = (
-    "put", "delete", "declare_subscriber", "query", "reply", "declare_queryable",
-    "liveliness_token", "liveliness_query", "declare_liveliness_subscriber",
-)  # fmt: skip
 _ANY: Final = "bayesrace/**"
+"""What goes to a process is declared to it first. A declaration alone holds no data, and has the
+widest key that a process of ours uses."""
+
+_MEANS: Final[dict[str, tuple[tuple[str, str, str], ...]]] = {
+    "sends": (("ingress", "put", ""), ("egress", "declare_subscriber", _ANY)),
+    "receives": (("ingress", "declare_subscriber", ""), ("egress", "put", "")),
+    "subscribes": (("ingress", "declare_subscriber", ""),),
+    "asks": (
+        ("ingress", "query", ""), ("egress", "reply", ""), ("egress", "declare_queryable", ""),
+    ),
+    "answers": (
+        ("egress", "query", ""), ("ingress", "reply", ""), ("ingress", "declare_queryable", ""),
+    ),
+    "is seen": (("ingress", "liveliness_token", ""),),
+    "sees": (("egress", "liveliness_token", ""),),
+    "looks for": (
+        ("ingress", "liveliness_query", ""), ("egress", "liveliness_query", _ANY),
+        ("ingress", "declare_liveliness_subscriber", ""),
+        ("egress", "declare_liveliness_subscriber", _ANY),
+    ),
+}  # fmt: skip
+"""What a process at the other end of a link may do, to what the link may carry for it: direction as
+seen by the node that checks ("ingress": from the other end), kind of message, and key if it is not
+that of the topic, service or token."""
 
 
 def access_control(members: Members) -> dict[str, Any]:
@@ -53,14 +71,15 @@ def access_control(members: Members) -> dict[str, Any]:
     }  # fmt: skip
 
 
-_FLOWS: Final = ("ingress", "egress")
-
-
 def _rules(subject: str, role: Role, car: str) -> list[dict[str, Any]]:
     """One rule for each direction and kind of message that such a process may exchange."""
     keys: dict[tuple[str, str], set[str]] = defaultdict(set)
-    for flow, kind, key in _rights(role):
-        keys[flow, kind].add(key.format(car=car, source="*"))
+    for right, key in _rights(role):
+        for flow, kind, other in _MEANS[right]:
+            keys[flow, kind].add(other or key.format(car=car, source="*"))
+    if role == "router":  # forwards everything
+        kinds = {kind for means in _MEANS.values() for _, kind, _ in means} | {"delete"}
+        keys = {(flow, kind): {_ANY} for flow in ("ingress", "egress") for kind in kinds}
     return [
         {
             "id": f"{subject}-{kind}-{flow}", "permission": "allow", "flows": [flow],
@@ -70,58 +89,23 @@ def _rules(subject: str, role: Role, car: str) -> list[dict[str, Any]]:
     ]  # fmt: skip
 
 
-def _rights(role: Role) -> Iterator[_Right]:
-    """Everything that a link to a process of this role may carry.
+def _rights(role: Role) -> Iterator[tuple[str, str]]:
+    """What a process of this role may do, and the key for any car."""
 
-    What goes to it is declared to it first: a declaration alone holds no data, and has the widest
-    key that a process of ours uses.
-    """
-    if role == "router":
-        yield from ((flow, kind, _ANY) for flow in _FLOWS for kind in _EVERY_KIND)
-        return
-    yield from _topic_rights(role)
-    yield from _service_rights(role)
-    yield from _liveliness_rights(role)
+    def own(key: str, sources: Iterable[Source]) -> Iterator[str]:
+        return (key.replace("{source}", one) for one in sources if ROLE_OF[one] == role)
 
-
-def _topic_rights(role: Role) -> Iterator[_Right]:
     for topic in TOPICS:
-        for source in topic.sources:
-            if ROLE_OF[source] == role:
-                yield "ingress", "put", _from(topic.key, source)
-                yield "egress", "declare_subscriber", _ANY
+        yield from (("sends", key) for key in own(topic.key, topic.sources))
         if role in topic.readers:
-            yield "ingress", "declare_subscriber", topic.key
-            yield "egress", "put", topic.key
-    if role in RECORDERS:
-        yield "ingress", "declare_subscriber", EVERYTHING
-
-
-def _service_rights(role: Role) -> Iterator[_Right]:
+            yield "receives", topic.key
+    if role in RECORDERS:  # they receive of it what they may read
+        yield "subscribes", EVERYTHING
     for service in SERVICES:
-        for source in service.servers:
-            key = _from(service.key, source)
-            if role in service.clients:
-                yield "ingress", "query", key
-                yield "egress", "reply", key
-                yield "egress", "declare_queryable", key
-            if ROLE_OF[source] == role:
-                yield "egress", "query", key
-                yield "ingress", "reply", key
-                yield "ingress", "declare_queryable", key
-
-
-def _liveliness_rights(role: Role) -> Iterator[_Right]:
-    """Who is there is no secret among members; only he may say so of himself."""
-    for source in ALIVE_SOURCES:
-        if ROLE_OF[source] == role:
-            yield "ingress", "liveliness_token", _from(ALIVE, source)
-        yield "egress", "liveliness_token", _from(ALIVE, source)
-    for kind in ("liveliness_query", "declare_liveliness_subscriber"):
-        yield "ingress", kind, ALIVE
-        yield "egress", kind, _ANY
-
-
-def _from(key: str, source: str) -> str:
-    """The key of one source, still for any car."""
-    return key.replace("{source}", source)
+        yield from (("answers", key) for key in own(service.key, service.servers))
+        if role in service.clients:
+            yield from (("asks", service.key.replace("{source}", s)) for s in service.servers)
+    # Who is there is no secret among members; only that process may say so of itself.
+    yield from (("is seen", key) for key in own(ALIVE, ALIVE_SOURCES))
+    yield from (("sees", ALIVE.replace("{source}", one)) for one in ALIVE_SOURCES)
+    yield "looks for", ALIVE
