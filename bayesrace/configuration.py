@@ -8,7 +8,7 @@ the same file. Options of a command override it.
 import itertools
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -133,8 +133,8 @@ class Configuration(_Section):
         self,
         role: Role,
         *,
-        listen: Iterable[str] | None = None,
-        connect: Iterable[str] | None = None,
+        listen: Sequence[str] = (),
+        connect: Sequence[str] = (),
         low_latency: bool = False,
     ) -> Endpoints:
         """Where a process in that role listens and connects; what is given overrides the file."""
@@ -147,8 +147,8 @@ class Configuration(_Section):
         if network.by_router and role != "router":
             listens, connects = (), network.router
         return Endpoints(
-            listen=listens if listen is None else tuple(listen),
-            connect=connects if connect is None else tuple(connect),
+            listen=tuple(listen or listens),
+            connect=tuple(connect or connects),
             low_latency=low_latency,
             mode="router" if role == "router" else "peer",
             credentials=self.tls.credentials(role),

@@ -1,7 +1,7 @@
 """How a field of settings is given on the command line, where its name and type do not say it.
 
 Stands beside the field, as ``delay_s: Annotated[float, Option(unit="ms", per_unit=1000)]``;
-:mod:`operation.cli.fields` makes options of fields.
+:mod:`operation.cli.declaration` makes options of fields.
 """
 
 from dataclasses import dataclass

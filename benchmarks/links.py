@@ -38,7 +38,8 @@ def secured(folder: Path) -> Configuration:
 
 def echo(network: Configuration) -> None:
     """Answers each message, until an empty one comes."""
-    with open_session(network.endpoints("controller", listen=()), "controller") as session:
+    silent = network.endpoints("controller").model_copy(update={"listen": ()})
+    with open_session(silent, "controller") as session:
         states = session.declare_subscriber(_THERE, FifoChannel(100))
         answers = session.declare_publisher(_BACK, express=True)
         while states.recv().payload.to_bytes():

@@ -1,8 +1,8 @@
 """Settings of the control cycle around the step: fallback and delay compensation."""
 
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from bayesrace.vehicles.parameters import CarParameters
 
@@ -34,7 +34,10 @@ _Mode = Literal["off", "measured", "fixed"]
 
 
 class CompensationSettings(BaseModel):
-    """Over which delay the state is predicted: see controller/native/br_delay.c."""
+    """Over which delay the state is predicted: see controller/native/br_delay.c.
+
+    Also by a text: the mode, or milliseconds of a fixed delay.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -45,6 +48,18 @@ class CompensationSettings(BaseModel):
     longest_s: float = Field(
         0.5, gt=0, le=1, description="no prediction goes farther; a longer delay is not covered"
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _by_text(cls, value: Any) -> Any:
+        if not isinstance(value, str):
+            return value
+        if value in ("measured", "off"):
+            return {"mode": value}
+        try:
+            return {"mode": "fixed", "delay_s": float(value) * 1e-3}
+        except ValueError:
+            raise ValueError("give 'measured', 'off', or a number of milliseconds") from None
 
 
 def cycle_values(

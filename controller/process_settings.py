@@ -26,7 +26,12 @@ class ControllerSettings(BaseModel):
     budget: Annotated[float, Option(metavar="SHARE")] = Field(
         0.8, ge=0.05, le=1, description="share of the period that a cycle may take, step included"
     )
-    compensation: CompensationSettings = CompensationSettings()
+    compensation: Annotated[
+        CompensationSettings, Option("--delay", metavar="DELAY", default="measured")
+    ] = Field(
+        CompensationSettings(),
+        description="delay over which the state is predicted: measured, off, or milliseconds",
+    )
     fallback: FallbackSettings = FallbackSettings()
     stale_s: float = Field(
         default=0.06, gt=0, le=60, description="age from which a state is not predicted forward"

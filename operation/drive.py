@@ -2,16 +2,19 @@
 
 import time
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 from bayesrace.errors import InputError
-from bayesrace.messages import Event, RunRequest, Scalar
+from bayesrace.messages import EVENT, Event, RunRequest, Scalar
 from bayesrace.raceline import same_track
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import StartLine, Track
-from bayesrace.transport import Director, Publisher, RefusedError
+from bayesrace.transport import Director, Endpoints, Publisher, RefusedError, open_session
+from bayesrace.vehicles import CarParameters, car_text
+from operation.analysis.verdict import Verdict, judge_log
 
-__all__ = ["RunPlan", "announcement", "execute", "run_request"]
+__all__ = ["RunPlan", "announcement", "drive_and_judge", "execute", "run_request"]
 
 _ABSENCE_S = 10.0
 """In real time a process may be away for so long: a link comes back, a controller is started
@@ -116,6 +119,25 @@ def execute(
         raise InputError(f"run {plan.run} ({plan.controller}) ended early: {end.text}")
     director.check_alone()
     return end
+
+
+def drive_and_judge(
+    endpoints: Endpoints, car: CarParameters, name: str, track: Track, plan: RunPlan, log: Path
+) -> tuple[Event, Verdict]:
+    """The next run, after those before, of the processes that wait, with a log: its end, and the
+    verdict. ``name``: the car's in the network. Raises as :func:`execute`."""
+    endpoints.check_car(name)
+    about = {"drive": {"car": car_text(car), "track": track.name}}
+    with (
+        open_session(endpoints, "director") as session,
+        Recorder(session, name, log, about) as recorder,
+    ):
+        director = Director(session, name)
+        director.wait_for(("plant", "controller"), 10.0)
+        publisher: Publisher[Event] = Publisher(session, EVENT, name, "race")
+        plan = replace(plan, run=director.status("plant").run + 1)
+        end = execute(director, publisher, track, plan, recorder)
+    return end, judge_log(log, plan.run, track, plan.laps)
 
 
 def _check_track(track: Track, controllers: str) -> None:

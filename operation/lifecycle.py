@@ -26,7 +26,9 @@ from bayesrace.transport import Endpoints, Inbox, Kind, ask_all, decisive, open_
 from bayesrace.transport.credentials import NEWEST_LIST
 from operation.analysis.network_status import SOURCES, NetworkStatus, ProcessStatus
 
-__all__ = ["Action", "Found", "ask_statuses", "command", "find", "follow", "pick", "route"]
+__all__ = [
+    "Action", "Found", "ask_statuses", "command", "command_cars", "find", "follow", "pick", "route",
+]  # fmt: skip
 
 _log = logging.getLogger("bayesrace.router")
 
@@ -161,6 +163,26 @@ def command(
         keys[key]: decisive(answers.valid) or answers.fault or f"no answer within {timeout_s:g} s"
         for key, answers in ask_all(session, service, keys, request, timeout_s).items()
     }
+
+
+def command_cars(
+    endpoints: Endpoints, action: Action, name: str, all_cars: bool, text: str, timeout_s: float
+) -> tuple[list[str], list[str]]:
+    """:func:`command` for the cars that :func:`pick` chooses: what they answer in words, and what
+    those answer that refuse or are silent."""
+    done, failed = [], []
+    name = endpoints.car_named(name)
+    source = "plant" if action == "end" else "controller"
+    with open_session(endpoints, "director") as session:
+        cars = pick(find(session, endpoints, timeout_s, name, (source,)), name, all_cars, source)
+        answers = command(session, cars, action, text, timeout_s)
+    for car, answer in answers.items():
+        if isinstance(answer, Reply) and answer.accepted:
+            done.append(f"{car}: {answer.text}")
+        else:
+            why = f"refused: {answer.text}" if isinstance(answer, Reply) else f"failed: {answer}"
+            failed.append(f"{action} of car '{car}' {why}")
+    return done, failed
 
 
 def follow(

@@ -34,6 +34,7 @@ from codegen.settings import BuildSettings
 from learning.dataset import Dataset, concatenate
 from learning.logs import CYCLES, STATES, dataset_from_columns
 from learning.settings import Progress, TrainingSettings
+from operation.closed_loop import Driven
 from operation.collect import collect
 from operation.settings import PreparationSettings
 from operation.terminal.progress import Stages
@@ -45,6 +46,7 @@ __all__ = [
     "Prepared",
     "PreparedTrack",
     "Training",
+    "drive_for_training",
     "prepare",
     "progress_artefact",
     "trained_weights",
@@ -207,7 +209,6 @@ def training_drive(
     ``artefact``: a controller built for the car, whose control cycle drives.
     Raises InputError for an FMU or map that cannot be used, FmuFault if the FMU fails.
     """
-    pursuit = settings.pursuit.model_copy(update={"seed": settings.seed})
     files = [path for path in (settings.fmu, settings.fmu_map) if path is not None]
     others = [] if settings.simulator == "equations" else [settings.simulator]
     columns = "s_m", "x_m", "y_m", "vx_mps"
@@ -222,7 +223,8 @@ def training_drive(
             track.width_left_m.tobytes(),
             car.model_dump_json(),
             settings.true_car.model_dump_json(),
-            pursuit.model_dump_json(),
+            settings.pursuit.model_dump_json(),
+            str(settings.seed),
             settings.noise.model_dump_json(),
             f"{settings.delay_s!r} {duration_s!r} {settings.start_speed_mps!r} {len(files)}",
             *(read_whole(path, "the FMU or its map", _LARGEST_FMU) for path in files),
@@ -233,15 +235,7 @@ def training_drive(
     path = cache_folder() / f"drive-{identity}.mcap"
 
     def make(partial: Path) -> None:
-        true_car, files = settings.true_car, (settings.fmu, settings.fmu_map)
-        vehicles = open_vehicle(
-            true_car, *files, 1 / PLANT.step_s, compiled, simulator=settings.simulator
-        )
-        with vehicles as vehicle:
-            collect(
-                track, prepared.line, car, artefact, partial, duration_s, pursuit,
-                settings.start_speed_mps, vehicle, settings.noise, settings.delay_s,
-            )  # fmt: skip
+        drive_for_training(settings, track, prepared.line, car, artefact, partial)
 
     def read(log: Path) -> Dataset:
         columns = LogColumns(log, {STATE: STATES, TELEMETRY: CYCLES}).read()
@@ -251,6 +245,26 @@ def training_drive(
         return dataset_from_columns(columns[STATE], columns[TELEMETRY], car, step_s)
 
     return Training(prepared, path, kept(path, make, read))
+
+
+def drive_for_training(
+    settings: PreparationSettings,
+    track: Track,
+    line: RaceLine,
+    car: CarParameters,
+    artefact: Path,
+    log: Path,
+) -> Driven:
+    """The pure-pursuit drive of the car that the settings simulate, logged; see
+    :func:`training_drive`."""
+    pursuit = settings.pursuit.model_copy(update={"seed": settings.seed})
+    duration_s = settings.collect_s or drive_length_s(car, line)
+    simulated_by = settings.true_car, settings.fmu, settings.fmu_map, 1 / PLANT.step_s, compiled
+    with open_vehicle(*simulated_by, simulator=settings.simulator) as vehicle:
+        return collect(
+            track, line, car, artefact, log, duration_s, pursuit,
+            settings.start_speed_mps, vehicle, settings.noise, settings.delay_s,
+        )  # fmt: skip
 
 
 def training_settings(settings: PreparationSettings) -> TrainingSettings:

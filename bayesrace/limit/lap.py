@@ -36,12 +36,12 @@ class LimitSettings(BaseModel):
     start_speed_mps: float = Field(
         0.1, ge=0, le=5, description="speed at the start of a standing lap"
     )
-    margin_m: float = Field(0.0, ge=0, description="least distance from the track's edge")
+    margin_m: float = Field(0.0, ge=0, description="least distance of the car from the edge")
     body: bool = Field(
         False, description="the car's outline keeps the margin; otherwise its centre of gravity"
     )
     lateral_speed_mps: float | None = Field(
-        None, gt=0, description="largest |vy|, for a lap without slides; None: any"
+        None, gt=0, description="largest lateral speed |vy|, for a lap without slides; None: any"
     )
     max_iterations: int = Field(300, ge=1, description="iteration limit of the optimiser")
 

@@ -9,7 +9,6 @@ import io
 import logging
 import shutil
 import sys
-from copy import copy
 from importlib import import_module
 from tempfile import gettempdir
 from typing import Any, Final
@@ -20,7 +19,7 @@ from typer.main import get_command
 
 from bayesrace.errors import InputError, faults_in
 from bayesrace.interrupts import remembering_interrupts
-from operation.cli.configured import configured
+from operation.cli.declaration import Group, configured
 
 __all__ = ["app", "main"]
 
@@ -41,15 +40,15 @@ _EXTRAS: Final = {
 
 _TASKS: Final = {
     "Race": "race.race race.report",
-    "Prepare": "tracks.tracks tracks.cars tracks.raceline preparation.collect "
-    "learning.train learning.validate preparation.build",
+    "Prepare": "tracks.tracks tracks.cars tracks.raceline learning.collect "
+    "learning.train learning.validate export.build",
     "Drive": "processes.plant processes.controller race.drive processes.status processes.stop "
     "processes.go processes.router processes.doctor configuration.config configuration.certs",
     "Learn while driving": "learning.learn learning.publish learning.rollback",
     "Measure": "tracks.limit race.bench race.latency race.paper",
     "Many laps": "campaign.campaign campaign.campaign_report campaign.campaign_worker "
     "campaign.tune",
-    "Export to other tools": "preparation.export fmu.fmu",
+    "Export to other tools": "export.export export.fmu",
 }
 """Sections of the help: commands, or groups of them, in the modules of this package."""
 
@@ -62,7 +61,7 @@ _PLACES: Final = {_name(place): place for places in _TASKS.values() for place in
 
 
 def _declared(name: str) -> Any:
-    """The function of a command, or the Typer application of a group."""
+    """The function of a command, or a group of them."""
     module, _, attribute = _PLACES[name].partition(".")
     return getattr(import_module(f"operation.cli.{module}"), attribute)
 
@@ -70,14 +69,15 @@ def _declared(name: str) -> Any:
 def _whole(name: str) -> Any:
     """A command, or a group of them, with all options."""
     found = _declared(name)
-    if isinstance(found, typer.Typer):
-        made = copy(found)
-        made.registered_commands = [copy(one) for one in found.registered_commands]
-        for one in made.registered_commands:
-            one.callback = one.callback and configured(one.callback)
-    else:
-        made = typer.Typer(add_completion=False, rich_markup_mode=None)
-        made.command(name)(configured(found))
+    group = found if isinstance(found, Group) else None
+    made = typer.Typer(
+        help=group and group.help,
+        no_args_is_help=group is not None,
+        add_completion=False,
+        rich_markup_mode=None,
+    )
+    for one, function in (group.commands if group else {name: found}).items():
+        made.command(one)(configured(function))
     return get_command(made)
 
 
@@ -90,7 +90,7 @@ class _Commands(TyperGroup):
         if cmd_name not in _PLACES:
             return None
         found = _declared(cmd_name)
-        text = found.info.help if isinstance(found, typer.Typer) else found.__doc__
+        text = found.help if isinstance(found, Group) else found.__doc__
         return TyperCommand(cmd_name, help=text)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:

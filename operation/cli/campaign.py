@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from operation.cli import options
-from operation.cli.fields import Given, options_of
+from operation.cli.declaration import Given, options_of
 
 if TYPE_CHECKING:
     from studies.settings import TuneSettings

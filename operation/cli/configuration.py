@@ -10,6 +10,7 @@ from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from bayesrace.messages import Role
 from operation.cli import options
+from operation.cli.declaration import Group
 
 if TYPE_CHECKING:
     from bayesrace.configuration import Configuration
@@ -17,21 +18,6 @@ if TYPE_CHECKING:
 __all__ = ["certs", "config"]
 
 _CHECKED: Final[tuple[Role, ...]] = ("plant", "controller", "director", "router")
-
-config = typer.Typer(
-    name="config",
-    no_args_is_help=True,
-    add_completion=False,
-    rich_markup_mode=None,
-    help="The configuration, bayesrace.toml: where processes are, how they are secured.",
-)
-certs = typer.Typer(
-    name="certs",
-    no_args_is_help=True,
-    add_completion=False,
-    rich_markup_mode=None,
-    help="Certificates: who may drive, learn, command or look on.",
-)
 
 Folder = Annotated[
     Path | None,
@@ -44,7 +30,6 @@ Folder = Annotated[
 Name = Annotated[str, typer.Argument(metavar="NAME", help="Name in the certificate.")]
 
 
-@config.command()
 def show(configuration: "Configuration") -> None:
     """Print the configuration that commands use here: the file, and the defaults of all else."""
     from bayesrace.configuration import as_toml
@@ -52,7 +37,6 @@ def show(configuration: "Configuration") -> None:
     typer.echo(as_toml(configuration), nl=False)
 
 
-@config.command()
 def check(
     configuration: "Configuration",
     file: Path | None = options.argument(
@@ -91,7 +75,6 @@ def _certificates(found: "Configuration") -> str:
     return "fine; certificates " + ", ".join(f"'{name}' ({role})" for name, role in roles.items())
 
 
-@config.command()
 def example(
     out: Path | None = options.value(
         "File to write; never over another one.",
@@ -118,7 +101,6 @@ def _folder(given: Path | None, configuration: "Configuration") -> Path:
     return given or configuration.tls.folder or Path("certs")
 
 
-@certs.command()
 def init(configuration: "Configuration", folder: Folder = None) -> None:
     """Make the authority of a system, once; its folder 'authority' belongs on no car."""
     from operation.certificates import init as make
@@ -128,7 +110,6 @@ def init(configuration: "Configuration", folder: Folder = None) -> None:
     typer.echo(f"{where}: next, 'bayesrace certs add NAME --role ROLE'")
 
 
-@certs.command()
 def add(
     configuration: "Configuration",
     name: Name,
@@ -154,7 +135,6 @@ def add(
     typer.echo(f"{made}: copy it to its machine, and members.json in it to the others")
 
 
-@certs.command("list")
 def members(configuration: "Configuration", folder: Folder = None) -> None:
     """List the certificates, and when they expire."""
     from operation.certificates import read_register
@@ -167,7 +147,6 @@ def members(configuration: "Configuration", folder: Folder = None) -> None:
         typer.echo(f"{name:<20} {one.role:<10} car {one.car:<12} {state:<18} {hosts}")
 
 
-@certs.command()
 def revoke(configuration: "Configuration", name: Name, folder: Folder = None) -> None:
     """Take a certificate off the list of members, for ever.
 
@@ -180,3 +159,13 @@ def revoke(configuration: "Configuration", name: Name, folder: Folder = None) ->
         f"'{name}' is revoked: copy members.json to each machine, and restart the processes there; "
         "until then they accept it"
     )
+
+
+config = Group(
+    "The configuration, bayesrace.toml: where processes are, how they are secured.",
+    {"show": show, "check": check, "example": example},
+)
+certs = Group(
+    "Certificates: who may drive, learn, command or look on.",
+    {"init": init, "add": add, "list": members, "revoke": revoke},
+)

@@ -1,23 +1,23 @@
-"""``train``, ``validate``, ``learn``, ``publish``, ``rollback``: from logs to weights in use."""
+"""``collect``, ``train``, ``validate``, ``learn``, ``publish``, ``rollback``: from drives to
+weights in use."""
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from bayesrace.files import write_whole
 from operation.cli import options
-from operation.cli.fields import Given, options_of
+from operation.cli.declaration import Given, options_of
 from operation.terminal.notation import UNCERTAIN
 
 if TYPE_CHECKING:
-    from bayesrace.configuration import Configuration
-    from bayesrace.messages import Reply
+    from bayesrace.transport import Endpoints
     from learning.settings import TrainingSettings
     from operation.learn.records import LearnSettings
+    from operation.settings import PreparationSettings
 
-__all__ = ["learn", "publish", "rollback", "train", "validate"]
+__all__ = ["collect", "learn", "publish", "rollback", "train", "validate"]
 
 Artefact = Annotated[
     Path | None,
@@ -41,6 +41,36 @@ Timeout = Annotated[
         help="Time limit [s], once for finding the controller and once for its answer.",
     ),
 ]
+
+
+@options_of(
+    "operation.settings.PreparationSettings",
+    "collect_s=--duration pursuit.style seed fmu fmu_map simulator car",
+)
+def collect(
+    track: options.TrackName,
+    raceline: options.RaceLineFile,
+    settings: "Given[PreparationSettings]",
+    out: options.OutFile = Path("collect.mcap"),
+) -> None:
+    """Drive a track by pure pursuit and log the drive as training data."""
+    from bayesrace.raceline import read_raceline_for
+    from bayesrace.tracks import load_track
+    from codegen.build import build
+    from codegen.settings import BuildSettings
+    from operation.preparation import drive_for_training
+
+    chosen = settings()
+    car = chosen.car
+    course = load_track(track, car.width_m)
+    line = read_raceline_for(raceline, course, car)
+    artefact, _ = build(BuildSettings(car=car))
+    driven = drive_for_training(chosen, course, line, car, artefact, out)
+    off_track_m = course.project_path(driven.x[:, :2]).off_track_m
+    typer.echo(
+        f"{len(driven.u)} samples, {int((off_track_m > 0).sum())} of them off the track, "
+        f"up to {float(driven.x[:, 3].max()):.2f} m/s: {out}"
+    )
 
 
 @options_of("learning.settings.TrainingSettings", "restarts seed")
@@ -90,12 +120,9 @@ def train(
     write_weights(out, weights)
     learning_table.print_kernels(training.kernels, console)
     if plot is not None:
-        from operation.report.canvas import write_png
-        from operation.report.gp import kernel_figure
-        from operation.report.style import figure_style
+        from operation.report.gp import write_kernels
 
-        with figure_style():
-            write_png(kernel_figure(training.kernels), plot)
+        write_kernels(training.kernels, plot)
     typer.echo(
         f"{weights.version}: {len(samples.dataset)} samples "
         f"(left out: {left_out(samples.dataset.dropped)}), "
@@ -152,26 +179,17 @@ def validate(
         if path is not None:
             write_whole(path, text)
     if plot is not None or out is not None:
-        from operation.report.canvas import write_png
-        from operation.report.gp import band_figure, track_figure
-        from operation.report.style import figure_style
+        from operation.report.gp import write_validation
 
-        with figure_style():
-            bands = band_figure(judged.validation, judged.dataset.step_s, threshold)
-            for path in (plot, out and out / "error.png"):
-                if path is not None:
-                    write_png(bands, path)
-            if out is not None:
-                driven = track_figure(judged.dataset, judged.validation, threshold, course)
-                write_png(driven, out / "track.png")
+        bands = [path for path in (plot, out and out / "error.png") if path is not None]
+        write_validation(judged, threshold, bands, out and out / "track.png", course)
     print_validation(judged.result, Terminal())
 
 
 def publish(
-    network: "Configuration",
+    learning: "Endpoints",
     weights: Path = options.argument("WEIGHTS", "Weights file, as 'bayesrace train' writes it."),
     name: Name = "",
-    endpoint: options.Endpoint = None,
     timeout: Timeout = None,
 ) -> None:
     """Send new weights to a running controller, and wait for its answer.
@@ -181,19 +199,15 @@ def publish(
     """
     from bayesrace.gp.weights import encode_weights, read_weights
     from bayesrace.transport import send_weights
+    from operation.learn.publishing import accepted
 
     data = encode_weights(read_weights(weights))
-
-    def send(session: Any, car: str, timeout_s: float) -> "Reply":
-        return send_weights(session, car, data, timeout_s)
-
-    typer.echo(_accepted(network, name, endpoint, timeout, send)[0])
+    typer.echo(accepted(learning, name, timeout, send_weights, data)[0])
 
 
 def rollback(
-    network: "Configuration",
+    learning: "Endpoints",
     name: Name = "",
-    endpoint: options.Endpoint = None,
     reason: str = options.value("Reason, for the controller's event.", "", metavar="TEXT"),
     timeout: Timeout = None,
 ) -> None:
@@ -202,43 +216,17 @@ def rollback(
     Exit code 0 once it drives with them, 1 if there are none, 2 if it cannot be reached.
     """
     from bayesrace.transport import send_rollback
+    from operation.learn.publishing import accepted
 
-    def send(session: Any, car: str, timeout_s: float) -> "Reply":
-        return send_rollback(session, car, reason or "bayesrace rollback", timeout_s)
-
-    text, reply = _accepted(network, name, endpoint, timeout, send)
+    why = reason or "bayesrace rollback"
+    text, reply = accepted(learning, name, timeout, send_rollback, why)
     before = reply.data.get("from_version")
     typer.echo(text + (f", instead of {before}" if before else ""))
 
 
-def _accepted(
-    network: "Configuration",
-    name: str,
-    endpoint: list[str] | None,
-    timeout: float | None,
-    send: "Callable[[Any, str, float], Reply]",
-) -> "tuple[str, Reply]":
-    """What the controller answers to what is sent, in words; NotTakenOverError if it refuses."""
-    from bayesrace.transport import open_session
-
-    endpoints = network.endpoints("learning", connect=endpoint or None)
-    name = endpoints.car_named(name)
-    with open_session(endpoints, "learning") as session:
-        # Imports that take as long as all before: whether there is a link is said first.
-        from operation.learn.publishing import NotTakenOverError, in_words
-        from operation.lifecycle import find, pick
-
-        found = find(session, endpoints, timeout or 5.0, name, ("controller",))
-        car = pick(found, name, False)[0]
-        reply = send(session, car, timeout or 20.0)
-    if not reply.accepted:
-        raise NotTakenOverError(f"{car}: {in_words(reply)}")
-    return f"{car}: {reply.data.get('version', '')} {in_words(reply)}", reply
-
-
 @options_of("operation.learn.records.LearnSettings", "laps points keep track compare seed car name")
 def learn(
-    network: "Configuration",
+    learning: "Endpoints",
     settings: "Given[LearnSettings]",
     watch: bool = options.flag("--watch", "Learn after each lap until Ctrl-C, not after one lap."),
     data: list[Path] = options.value("First samples: log (MCAP) or arrays (.npz); repeatable.", ()),
@@ -248,7 +236,6 @@ def learn(
         "runs/learn-DATE-TIME",
     ),
     artefact: Artefact = None,
-    endpoint: options.Endpoint = None,
 ) -> None:
     """Learn from the laps of a driving car, and send the weights to its controller.
 
@@ -258,16 +245,15 @@ def learn(
     """
     from bayesrace.transport import try_links
 
-    chosen = settings({} if watch else {"laps": 1})
-    endpoints = network.endpoints("learning", connect=endpoint or None)
-    endpoints.check_car(chosen.name)
-    try_links(endpoints, "learning")  # before imports that take seconds
+    chosen = settings() if watch or "--laps" in settings.flags else settings(laps=1)
+    learning.check_car(chosen.name)
+    try_links(learning, "learning")  # before imports that take seconds
     from operation.learn.job import learn as follow
     from operation.learn.report import print_laps
 
     folder = options.run_folder(out, "learn-")
     record = follow(
-        chosen, endpoints, folder, typer.echo, data=data, weights=weights, artefact=artefact
+        chosen, learning, folder, typer.echo, data=data, weights=weights, artefact=artefact
     )
     print_laps(record)
     typer.echo(f"{folder}")

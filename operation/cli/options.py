@@ -1,5 +1,5 @@
 """Options that are no fields of settings: how they are declared, and those that several commands
-have. :func:`operation.cli.configured.configured` adds metavars by type where there are none."""
+have. :func:`operation.cli.declaration.configured` adds metavars by type where there are none."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,14 +13,12 @@ import typer
 from bayesrace.errors import InputError
 
 if TYPE_CHECKING:
-    from bayesrace.vehicles import CarParameters
-    from controller.path_table import PathTable
     from operation.terminal.progress import Stages
 
 __all__ = [
-    "AllSamples", "Car", "CarName", "Course", "Endpoint", "GivenLine", "LowLatency", "MpcFile",
-    "OutFile", "ParentPid", "RaceLineFile", "TrackName", "Tyres", "Weights", "argument", "flag",
-    "new_file", "out_folder", "path_on", "run_folder", "stages_shown", "value", "writable",
+    "AllSamples", "Artefact", "Car", "CarName", "Course", "Endpoint", "GivenLine", "LowLatency",
+    "MpcFile", "OutFile", "ParentPid", "RaceLineFile", "TrackName", "Tyres", "Weights", "argument",
+    "flag", "new_file", "out_folder", "run_folder", "stages_shown", "value", "writable",
 ]  # fmt: skip
 
 
@@ -63,19 +61,6 @@ def writable(path: Path | None) -> Path | None:
     if path is not None and path.is_dir():
         raise InputError(f"cannot write {path}: it is a folder; name a file in it")
     return path
-
-
-def path_on(track: str, raceline: Path | None, car: "CarParameters") -> "PathTable":
-    """What the planner follows: the racing line of the file, or computed where there is none."""
-    from bayesrace.raceline import racing_line, read_raceline_for
-    from bayesrace.tracks import load_track
-    from controller.path_table import make_path_table
-
-    course = load_track(track, car.width_m)
-    line = (
-        racing_line(course, car) if raceline is None else read_raceline_for(raceline, course, car)
-    )
-    return make_path_table(course, line, car.tuning.path.spacing_m)
 
 
 def run_folder(given: Path | None, prefix: str = "") -> Path:
@@ -126,6 +111,10 @@ GivenLine = Annotated[
 Weights = Annotated[
     Path | None, typer.Option(help="GP weights; without them, the uncorrected model.")
 ]
+Artefact = Annotated[
+    Path | None,
+    typer.Option(metavar="DIR", show_default="built", help="Folder of 'bayesrace build'."),
+]
 MpcFile = Annotated[
     Path | None, typer.Option("--settings", help="OCP settings (JSON): controller/settings.py.")
 ]
@@ -139,6 +128,7 @@ AllSamples = Annotated[
 Endpoint = Annotated[
     list[str] | None,
     typer.Option(
+        metavar="ENDPOINT",
         show_default="as configured; tcp/127.0.0.1:7447 and :7448",
         help="Zenoh endpoint of a plant, a controller or a router; repeatable.",
     ),

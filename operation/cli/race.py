@@ -12,10 +12,11 @@ import typer
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from operation.cli import options
-from operation.cli.fields import Given, options_of
+from operation.cli.declaration import Given, options_of
 
 if TYPE_CHECKING:
     from bayesrace.configuration import Configuration
+    from bayesrace.transport import Endpoints
     from operation.analysis.race import RaceAnalysis
     from operation.settings import RaceSettings
     from studies.latency.results import LatencySettings
@@ -105,10 +106,9 @@ def _print_result(analysis: "RaceAnalysis", page: Path) -> None:
 
 @options_of("operation.settings.RaceSettings", "track mode car")
 def drive(
-    network: "Configuration",
+    director: "Endpoints",
     settings: "Given[RaceSettings]",
     laps: int = options.value("Laps to drive, the first from rest.", 2, min=1),
-    endpoint: options.Endpoint = None,
     max_time: float = options.value("Time limit [s].", 60.0, min=1, max=1e6, metavar="S"),
     log: Path = options.new_file("Log to write (MCAP).", default=Path("run.mcap")),
     name: options.CarName = "",
@@ -118,31 +118,13 @@ def drive(
     Exit code 0 if all laps were driven on the track, by the controller's solutions; 1 if not; 2 if
     the run could not be driven to its end.
     """
-    from bayesrace.messages import EVENT, Event
-    from bayesrace.recorder import Recorder
     from bayesrace.tracks import load_track
-    from bayesrace.transport import Director, Publisher, open_session
-    from bayesrace.vehicles import car_text
-    from operation.analysis.verdict import judge_log
-    from operation.drive import RunPlan, execute
+    from operation.drive import RunPlan, drive_and_judge
 
     chosen = settings()
     course = load_track(chosen.track, chosen.car.width_m)
-    name = name or chosen.car.name
-    endpoints = network.endpoints("director", connect=endpoint or None)
-    endpoints.check_car(name)
-    about = {"drive": {"car": car_text(chosen.car), "track": course.name}}
-    with (
-        open_session(endpoints, "director") as session,
-        Recorder(session, name, log, about) as recorder,
-    ):
-        director = Director(session, name)
-        director.wait_for(("plant", "controller"), 10.0)
-        publisher: Publisher[Event] = Publisher(session, EVENT, name, "race")
-        number = director.status("plant").run + 1
-        plan = RunPlan(number, "manual", laps, max_time, chosen.mode == "lockstep")
-        end = execute(director, publisher, course, plan, recorder)
-    verdict = judge_log(log, number, course, laps)
+    plan = RunPlan(0, "manual", laps, max_time, chosen.mode == "lockstep")
+    end, verdict = drive_and_judge(director, chosen.car, name or chosen.car.name, course, plan, log)
     typer.echo(f"{end.text}; log: {log}\n{verdict.text}")
     if not verdict.passed:
         raise typer.Exit(1)
@@ -184,8 +166,7 @@ def latency(
     sleeps runs beside them: its delays are those of the machine, not of the program. Leaves
     latency.json, a picture and HdrHistogram logs; see docs/latency.md.
     """
-    beneath = {"realtime": network.realtime.model_dump()}
-    chosen = settings(beneath)
+    chosen = settings()
     if endpoint and not attach:
         raise InputError("--endpoint is of a running system: add --attach, or leave it out")
     if (attach or chosen.log) and (chosen.weights or chosen.artefact or chosen.raceline):
@@ -195,9 +176,9 @@ def latency(
     if attach:
         from bayesrace.transport import try_links
 
-        running = network.endpoints("director", connect=endpoint or None)
+        running = network.endpoints("director", connect=endpoint or ())
         try_links(running, "director")  # before imports that take seconds
-        chosen = settings(beneath, attach=running, warm_up_s=0.0)
+        chosen = settings(attach=running, warm_up_s=0.0)
 
     from operation.terminal.terminal import Terminal
     from studies.latency.measure import measure

@@ -10,7 +10,7 @@ from bayesrace.clock import die_with_parent
 from bayesrace.defaults import DEFAULT_CAR
 from bayesrace.errors import InputError
 from operation.cli import options
-from operation.cli.fields import Given, options_of
+from operation.cli.declaration import Given, options_of
 
 if TYPE_CHECKING:
     from bayesrace.limit import LimitSettings

@@ -3,16 +3,19 @@
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bayesrace.files import read_whole
 from bayesrace.gp.weights import MAX_BYTES
 from bayesrace.messages import Event, Reply, Status
-from bayesrace.transport import send_weights
-from operation.learn.journal import Journal
+from bayesrace.transport import Endpoints, open_session, send_weights
 from operation.learn.records import UpdateRecord, Verdict
+from operation.lifecycle import find, pick
 
-__all__ = ["NotTakenOverError", "Publisher", "in_words"]
+if TYPE_CHECKING:  # with which all of the training is imported
+    from operation.learn.journal import Journal
+
+__all__ = ["NotTakenOverError", "Publisher", "accepted", "in_words"]
 
 
 class NotTakenOverError(RuntimeError):
@@ -31,6 +34,25 @@ def in_words(reply: Reply) -> str:
     return f"taken over at cycle {data['cycle']}{which}"
 
 
+def accepted(
+    endpoints: Endpoints,
+    name: str,
+    timeout_s: float | None,
+    send: Callable[[Any, str, Any, float], Reply],
+    content: Any,
+) -> tuple[str, Reply]:
+    """What the controller of the car, or of the only one (""), answers to what ``send`` sends, also
+    in words; NotTakenOverError if it refuses."""
+    name = endpoints.car_named(name)
+    with open_session(endpoints, "learning") as session:
+        found = find(session, endpoints, timeout_s or 5.0, name, ("controller",))
+        car = pick(found, name, False)[0]
+        reply = send(session, car, content, timeout_s or 20.0)
+    if not reply.accepted:
+        raise NotTakenOverError(f"{car}: {in_words(reply)}")
+    return f"{car}: {reply.data.get('version', '')} {in_words(reply)}", reply
+
+
 class Publisher:
     """Sends the weights of updates and notes their verdicts; for the job's thread.
 
@@ -39,7 +61,7 @@ class Publisher:
     appears. Weights refused or rolled back are not sent again.
     """
 
-    def __init__(self, session: Any, journal: Journal, say: Callable[[str], None]) -> None:
+    def __init__(self, session: Any, journal: "Journal", say: Callable[[str], None]) -> None:
         self._session, self._journal, self._say = session, journal, say
         self._car = journal.settings.name
         self._thread = ThreadPoolExecutor(1, "learn-publisher")

@@ -1,6 +1,7 @@
 """Figures of what Gaussian processes predict: error with its 95 % band, track, kernels."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -16,12 +17,20 @@ from bayesrace.tracks import Track
 from learning.dataset import Dataset
 from learning.target import KernelScore
 from learning.validation import Validation, unbroken
-from operation.report.canvas import panel
+from operation.analysis.validation import Validated
+from operation.report.canvas import panel, write_png
 from operation.report.maps import draw_edges, show_all
-from operation.report.style import INK, MUTED, PICTURE_WIDTH, WARNING, look
+from operation.report.style import INK, MUTED, PICTURE_WIDTH, WARNING, figure_style, look
 from operation.terminal.notation import SMOOTHNESS, SYMBOLS, UNCERTAIN
 
-__all__ = ["band_figure", "gp_figures", "kernel_figure", "track_figure"]
+__all__ = [
+    "band_figure",
+    "gp_figures",
+    "kernel_figure",
+    "track_figure",
+    "write_kernels",
+    "write_validation",
+]
 
 _BAND: Final = "#bcd7ea"
 _MEAN: Final = "#0072B2"
@@ -183,3 +192,26 @@ def kernel_figure(scores: Sequence[KernelScore]) -> Figure:
     ]
     figure.legend(handles=marks, loc="upper center", ncols=2)
     return figure
+
+
+def write_kernels(scores: Sequence[KernelScore], path: Path) -> None:
+    """Writes the figure of the kernels (PNG)."""
+    with figure_style():
+        write_png(kernel_figure(scores), path)
+
+
+def write_validation(
+    judged: Validated,
+    threshold: float,
+    bands: Sequence[Path],
+    track_path: Path | None,
+    track: Track | None,
+) -> None:
+    """Writes the error with its bands to some files, and where the car was to one (PNG)."""
+    with figure_style():
+        error = band_figure(judged.validation, judged.dataset.step_s, threshold)
+        for path in bands:
+            write_png(error, path)
+        if track_path is not None:
+            driven = track_figure(judged.dataset, judged.validation, threshold, track)
+            write_png(driven, track_path)

@@ -1,18 +1,29 @@
 """The state of all cars on the terminal: a table of numbers, and below it each latest message."""
 
+import json
+import os
+import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Final, Literal
 
 from rich.console import Console, ConsoleOptions, RenderableType
+from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from bayesrace.errors import InputError
 from bayesrace.messages import Status
+from bayesrace.transport import Endpoints, open_session
 from operation.analysis.network_status import SOURCES, NetworkStatus, ProcessStatus
+from operation.lifecycle import ask_statuses, find, follow
 from operation.terminal.printable import printable
-from operation.terminal.terminal import plain_table
+from operation.terminal.terminal import Terminal, plain_table
 
-__all__ = ["COUNTERS_SHOWN", "StatusTable"]
+__all__ = ["COUNTERS_SHOWN", "StatusTable", "show_status"]
+
+_PERIOD_S: Final = 0.2
+"""Period of the display that follows the cars."""
 
 _VALUES: Final[tuple[tuple[str, Literal["left", "right"]], ...]] = (
     ("state", "left"),
@@ -43,6 +54,50 @@ COUNTERS_SHOWN: Final = {
     "plant": (("overruns",), ("", "braked", ""), ("refused", "actuations_lost", "stale")),
 }
 """Counters of each process that are shown as misses, fallbacks, and messages."""
+
+
+def show_status(
+    endpoints: Endpoints, name: str, timeout_s: float, watch: bool, as_json: bool
+) -> None:
+    """Prints the state of a car, or of all (""), once or with ``watch`` until a signal; as a line
+    of JSON each time, or as a table. InputError if no process answers."""
+    name = endpoints.car_named(name)
+    with open_session(endpoints, "viewer") as session, _closed_pipe_allowed():
+        found = ask_statuses(session, find(session, endpoints, timeout_s, name), timeout_s)
+        if watch and as_json:
+            for car in follow(session, found, name, 1.0):
+                if car is not None:
+                    _print_json(found, car)
+        elif watch:
+            with Live(console=Terminal(), auto_refresh=False) as live:
+                for car in follow(session, found, name, _PERIOD_S):
+                    if car is None:  # once a period, not for each heartbeat
+                        live.update(StatusTable(found, brief=True), refresh=True)
+        elif as_json:
+            _print_json(found)
+        else:
+            Terminal().print(StatusTable(found))
+    if not watch and not found.answering:
+        raise InputError(
+            f"no answer within {timeout_s:g} s from the processes found; they hang or are of "
+            "another release, or the network is slow (--timeout)"
+        )
+
+
+def _print_json(found: NetworkStatus, car: str | None = None) -> None:
+    sys.stdout.write(json.dumps(found.as_json(car), allow_nan=False) + "\n")
+    sys.stdout.flush()
+
+
+@contextmanager
+def _closed_pipe_allowed() -> Iterator[None]:
+    """A reader that closes the pipe (``| head -1``) is no error."""
+    try:
+        yield
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # The rest of the buffer must not fail once more at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class StatusTable:

@@ -1,0 +1,195 @@
+"""``build``, ``export``, ``fmu``: the controller, and what other programs exchange with us."""
+
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import typer
+
+from bayesrace.defaults import DEFAULT_CAR
+from bayesrace.errors import InputError
+from bayesrace.files import write_whole
+from operation.cli import options
+from operation.cli.declaration import Given, Group, options_of
+
+if TYPE_CHECKING:
+    from bayesrace.vehicles import CarParameters
+    from codegen.settings import BuildSettings
+
+__all__ = ["build", "export", "fmu"]
+
+
+@options_of("codegen.settings.BuildSettings", "model problem horizon gp_capacity car")
+def build(
+    settings: "Given[BuildSettings]",
+    out: Path | None = options.out_folder("Copy the artefact here."),
+) -> None:
+    """Generate and compile a controller, or take it from the cache; prints its folder."""
+    from bayesrace.integrators import PERFECT
+    from codegen.build import build as make
+
+    chosen = settings()
+    if chosen.model == "dynamic":
+        chosen = settings(discretisation=PERFECT)
+    folder, _ = make(chosen)
+    if out is not None:
+        shutil.copytree(folder, out, dirs_exist_ok=True, copy_function=_replace)
+        folder = out
+    typer.echo(f"{folder}")
+
+
+def _replace(source: str, target: str) -> None:
+    """Copies beside the target and renames: a running controller keeps the library it loaded."""
+    beside = f"{target}.new"
+    shutil.copy2(source, beside)
+    Path(beside).replace(target)
+
+
+def export(
+    out: Path = options.argument("DIR", "Folder to write into."),
+    track: options.TrackName = "",
+    raceline: options.GivenLine = None,
+    weights: options.Weights = None,
+    mpc: options.MpcFile = None,
+    artefact: options.Artefact = None,
+    car: options.Car = DEFAULT_CAR,
+) -> None:
+    """Write racing line, weights and settings for a C program (examples/c_host)."""
+    from bayesrace.manifest import read_manifest
+    from bayesrace.vehicles import get_car
+    from codegen.host_files import export as write
+    from controller.cycle_settings import cycle_values
+    from controller.process_settings import ControllerSettings
+
+    parameters, process = get_car(car), ControllerSettings()
+    folder, given = _controller(parameters, track, raceline, weights, mpc, artefact)
+    manifest = read_manifest(folder)
+    manifest.check_car(parameters, folder)
+    cycle = process.fallback, process.compensation, process.stale_s, process.sensor_tolerance
+    values = given["settings"] | cycle_values(parameters, *cycle)
+    write(out, manifest, given["rows"], given["spacing_m"], values, given["weights"])
+    typer.echo(f"{track or parameters.race_track}, {parameters.name}: {out}")
+
+
+def _controller(
+    car: "CarParameters",
+    track: str,
+    raceline: Path | None,
+    weights: Path | None,
+    mpc: Path | None,
+    artefact: Path | None,
+) -> tuple[Path, dict[str, Any]]:
+    """Artefact of a controller, and what it drives by: the line as a table, settings, weights."""
+    from bayesrace.manifest import read_manifest
+    from bayesrace.raceline import racing_line, read_raceline_for
+    from bayesrace.tracks import load_track
+    from codegen.build import build as make
+    from codegen.settings import BuildSettings
+    from controller.assembly import read_checked, read_settings
+    from controller.path_table import make_path_table
+    from controller.settings import MpcSettings
+
+    course = load_track(track or car.race_track, car.width_m)
+    line = read_raceline_for(raceline, course, car) if raceline else racing_line(course, car)
+    table = make_path_table(course, line, car.tuning.path.spacing_m)
+    folder = artefact or make(BuildSettings(car=car))[0]
+    problem = read_manifest(folder).problem.name
+    return folder, {
+        "rows": table.rows,
+        "spacing_m": table.spacing_m,
+        "settings": read_settings(mpc, MpcSettings).parameters(car, problem),
+        "weights": None if weights is None else read_checked(weights, folder, car),
+    }
+
+
+def export_fmu(
+    out: options.OutFile,
+    car: options.Car = DEFAULT_CAR,
+    version: Literal["2", "3"] = options.value(
+        "Version of the FMI standard: 2 or 3.", "3", metavar="FMI"
+    ),
+    kind: Literal["cs", "me"] = options.value(
+        "cs: Co-Simulation; me: Model Exchange (the car, FMI 3.0).", "cs"
+    ),
+    platform: list[str] = options.value(
+        "x86_64-linux, aarch64-linux or x86_64-windows; repeatable. Others than this one need "
+        "ziglang.",
+        (),
+        shown="this one",
+    ),
+    controller: bool = options.flag("--controller", "Export the controller instead of the car."),
+    track: options.TrackName = "",
+    raceline: options.GivenLine = None,
+    weights: options.Weights = None,
+    mpc: options.MpcFile = None,
+    artefact: options.Artefact = None,
+) -> None:
+    """Write the car, or the controller of a track, as an FMU, C sources inside.
+
+    The options below --controller are for the controller alone.
+    """
+    from bayesrace.vehicles import get_car
+    from codegen.fmu import car_fmu, controller_fmu, pack
+    from controller.cycle_settings import FallbackSettings
+
+    parameters = get_car(car)
+    number: Literal[2, 3] = 2 if version == "2" else 3
+    own = {
+        "--track": track, "--raceline": raceline, "--weights": weights, "--settings": mpc,
+        "--artefact": artefact,
+    }  # fmt: skip
+    if not controller:
+        if given := [flag for flag, value in own.items() if value]:
+            raise InputError(f"{', '.join(given)}: for a controller's FMU; add --controller")
+        definition = car_fmu(parameters, number, kind)
+    elif kind == "me":
+        raise InputError("a controller is sampled, not continuous: export it with --kind cs")
+    else:
+        folder, drives_by = _controller(parameters, track, raceline, weights, mpc, artefact)
+        fallback = FallbackSettings().model_dump() | {"brake_fade_mps": parameters.brake_fade_mps}
+        definition = controller_fmu(
+            folder, parameters, **drives_by, fallback=fallback, version=number
+        )
+    pack(definition, out, platform or None)
+    typer.echo(f"{definition.name}, FMI {number}.0 {kind}: {out}")
+
+
+def exchange_weights(
+    out: options.OutFile,
+    controller: Path = options.argument("FMU", "FMU of a controller."),
+    weights: Path = options.argument("WEIGHTS", "New GP weights."),
+) -> None:
+    """Copy a controller's FMU with other weights, without compiling."""
+    from bayesrace.gp.weights import read_weights
+    from codegen.fmu import exchange_weights as exchange
+
+    loaded = read_weights(weights)
+    exchange(controller, loaded, out)
+    typer.echo(f"{loaded.version}: {out}")
+
+
+def inspect(
+    file: Path = options.argument("FMU", "FMU file."),
+    map_file: Path | None = options.new_file("Write a map to fill in (TOML).", "--map"),
+    every: bool = options.flag("--all", "Print local variables, too."),
+) -> None:
+    """Print an FMU's variables; write a map for 'bayesrace plant --fmu' to fill in."""
+    from operation.terminal.fmu_table import FmuTable
+    from operation.terminal.terminal import Terminal
+    from plant.fmu.inspection import inspect as read
+    from plant.fmu.inspection import platforms
+    from plant.fmu.template import blank_map
+
+    description = read(file)
+    Terminal().print(FmuTable(description, platforms(file), all_=every))
+    if map_file is not None:
+        if map_file.exists():
+            raise InputError(f"{map_file} exists already; choose another name or remove it")
+        write_whole(map_file, blank_map(description))
+        typer.echo(f"map to fill in: {map_file}")
+
+
+fmu = Group(
+    "Export the car or its controller as an FMU; inspect an FMU of another tool.",
+    {"export": export_fmu, "weights": exchange_weights, "inspect": inspect},
+)
