@@ -18,8 +18,7 @@ from bayesrace.errors import InputError
 from bayesrace.limit import LimitLap, write_limit
 from bayesrace.vehicles import default_car
 from bayesrace.vehicles.models import dynamic
-from operation.analysis.between import positions_between
-from operation.analysis.laps import time_laps
+from operation.analysis.laps import positions_between, time_laps
 from operation.analysis.race import analyse, read_race, read_result, write_result
 from operation.analysis.recording import RUN_COLUMNS, read_recording, runs_of
 from operation.analysis.results import LapResult, RaceResult

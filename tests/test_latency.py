@@ -12,8 +12,8 @@ from bayesrace.errors import InputError
 from studies.latency.analysis import Beside, analyse
 from studies.latency.beside import bare_loop, bare_result
 from studies.latency.legs import ANSWER, LEGS
-from studies.latency.results import LatencySettings
-from studies.latency.series import Series, new_histogram
+from studies.latency.results import Series, new_histogram
+from studies.latency.settings import LatencySettings
 from tests.synthetic_latency import PERIOD_NS, Loop, report_of
 
 

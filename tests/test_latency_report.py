@@ -14,8 +14,8 @@ from studies.latency.analysis import Analysis, Beside, analyse
 from studies.latency.beside import bare_result
 from studies.latency.legs import BESIDE, LEGS
 from studies.latency.report import print_report, write_files
-from studies.latency.results import LatencySettings, Memory
-from studies.latency.series import Series
+from studies.latency.results import Memory, Series
+from studies.latency.settings import LatencySettings
 from tests.synthetic_latency import PERIOD_NS, Loop
 
 

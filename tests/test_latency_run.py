@@ -27,7 +27,7 @@ from operation.settings import PreparationSettings
 from operation.terminal.progress import stages_on
 from studies.latency.legs import BESIDE, LEGS
 from studies.latency.measure import _wait_for_run
-from studies.latency.series import new_histogram
+from studies.latency.results import new_histogram
 from tests.command_line import Cli, refused
 from tests.programs import COMMAND, ROOT, environment, finish, leftovers, peanut, start, until
 from tests.shared import session_folder

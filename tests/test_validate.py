@@ -123,7 +123,7 @@ def test_validate_writes_what_it_prints(
     assert result.horizon is not None
     assert (result.one_step.predictions, result.horizon.predictions) == (90, 71)
     drift = result.horizon
-    assert drift.corrected.position_m.max < 0.3 * drift.nominal.position_m.max
+    assert drift.corrected["position_m"].max < 0.3 * drift.nominal["position_m"].max
     for picture in ("band.png", "all/error.png", "all/track.png"):
         assert (files / picture).read_bytes().startswith(b"\x89PNG")
     assert (files / "all/validation.json").read_text() == (files / "v.json").read_text()

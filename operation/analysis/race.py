@@ -24,8 +24,7 @@ from bayesrace.vehicles import CarParameters
 from learning.dataset import Dataset
 from learning.logs import dataset_from_columns
 from learning.validation import Validation, validate
-from operation.analysis.between import positions_between
-from operation.analysis.laps import time_laps, trajectory_digest
+from operation.analysis.laps import positions_between, time_laps, trajectory_digest
 from operation.analysis.recording import PlannedRun, Recording, RunRecord, read_recording
 from operation.analysis.results import (
     GpMetrics,

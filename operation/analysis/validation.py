@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -19,13 +20,16 @@ from operation.analysis.results import GpMetrics
 from operation.terminal.notation import UNCERTAIN
 
 __all__ = [
-    "Drift",
+    "DRIFTS",
     "HorizonResult",
     "Spread",
     "Validated",
     "ValidationResult",
     "validate_weights",
 ]
+
+DRIFTS: Final = "position_m", "heading_rad", "vx_mps", "vy_mps", "omega_radps"
+"""Errors of a prediction, with their units."""
 
 
 class _Frozen(BaseModel):
@@ -39,35 +43,16 @@ class Spread(_Frozen):
     p95: float
     max: float
 
-    @classmethod
-    def of(cls, errors: Floats) -> "Spread":
-        """From errors (m,), m at least 1."""
-        size = np.abs(errors)
-        return cls(
-            mean=float(size.mean()), p95=float(np.percentile(size, 95)), max=float(size.max())
-        )
 
-
-class Drift(_Frozen):
-    """Driven against predicted at the end of a horizon."""
-
-    position_m: Spread
-    heading_rad: Spread
-    vx_mps: Spread
-    vy_mps: Spread
-    omega_radps: Spread
-
-    @classmethod
-    def of(cls, errors: Floats) -> "Drift":
-        """From states driven minus predicted, (m, 7), m at least 1."""
-        x, y, psi, vx, vy, omega, _ = errors.T
-        return cls(
-            position_m=Spread.of(np.hypot(x, y)),
-            heading_rad=Spread.of(psi),
-            vx_mps=Spread.of(vx),
-            vy_mps=Spread.of(vy),
-            omega_radps=Spread.of(omega),
-        )
+def _drift(errors: Floats) -> dict[str, Spread]:
+    """From states driven minus predicted, (m, 7), m at least 1."""
+    x, y, *others = errors.T[:6]
+    found = {}
+    for name, one in zip(DRIFTS, (np.hypot(x, y), *others), strict=True):
+        size = np.abs(one)
+        mean, p95, most = size.mean(), np.percentile(size, 95), size.max()
+        found[name] = Spread(mean=float(mean), p95=float(p95), max=float(most))
+    return found
 
 
 class HorizonResult(_Frozen):
@@ -75,8 +60,8 @@ class HorizonResult(_Frozen):
 
     steps: int
     predictions: int
-    nominal: Drift
-    corrected: Drift
+    nominal: dict[str, Spread] = Field(description="of each of DRIFTS, at the end of the horizon")
+    corrected: dict[str, Spread]
 
 
 class ValidationResult(_Frozen):
@@ -143,8 +128,8 @@ def validate_weights(
         return HorizonResult(
             steps=steps,
             predictions=len(plain),
-            nominal=Drift.of(plain),
-            corrected=Drift.of(corrected),
+            nominal=_drift(plain),
+            corrected=_drift(corrected),
         )
 
     metrics = {
@@ -152,9 +137,7 @@ def validate_weights(
         for output, numbers in validation.metrics.items()
     }
     result = ValidationResult(
-        vx=metrics["vx"],
-        vy=metrics["vy"],
-        omega=metrics["omega"],
+        **metrics,
         one_step=over(1),
         horizon=over(HORIZON),
         weights_version=weights.version,

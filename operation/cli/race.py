@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from bayesrace.transport import Endpoints
     from operation.analysis.race import RaceAnalysis
     from operation.settings import RaceSettings
-    from studies.latency.results import LatencySettings
+    from studies.latency.settings import LatencySettings
     from studies.paper.settings import PaperSettings
     from studies.settings import BenchSettings
 
@@ -147,7 +147,7 @@ def bench(
 
 
 @options_of(
-    "studies.latency.results.LatencySettings",
+    "studies.latency.settings.LatencySettings",
     "rate_hz duration_s load track realtime.fifo realtime.lock_memory weights artefact raceline "
     "log car name",
     file=True,

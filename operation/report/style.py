@@ -2,7 +2,8 @@
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, Final, NamedTuple, cast
+from pathlib import Path
+from typing import Final, NamedTuple
 
 import matplotlib as mpl
 from matplotlib.colors import Colormap, LinearSegmentedColormap, to_hex, to_rgb
@@ -82,44 +83,8 @@ def gain_map() -> Colormap:
     return LinearSegmentedColormap.from_list("gain", ["#0072B2", "#8d8d86", "#C8321E"])
 
 
-_STYLE: Final[dict[str, Any]] = {
-    "font.sans-serif": ["DejaVu Sans", "Arial", "Helvetica"],
-    "font.size": 9.0,
-    "axes.formatter.limits": (-7, 7),
-    "axes.titlesize": 9.5,
-    "axes.titlelocation": "left",
-    "axes.titlepad": 6.0,
-    # Beside nothing but the title is above a panel, and looking for it takes a fifth of drawing.
-    "axes.titley": 1.0,
-    "axes.labelsize": 9.0,
-    "axes.labelcolor": INK,
-    "axes.edgecolor": "#b5b5ae",
-    "axes.linewidth": 0.6,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "#e9e9e4",
-    "grid.linewidth": 0.6,
-    "xtick.color": MUTED,
-    "ytick.color": MUTED,
-    "xtick.labelsize": 8.5,
-    "ytick.labelsize": 8.5,
-    "xtick.major.size": 0,
-    "ytick.major.size": 0,
-    "text.color": INK,
-    "lines.linewidth": 1.2,
-    "legend.frameon": False,
-    "legend.fontsize": 8.5,
-    # Text stays text: smaller, and it can be searched and read out.
-    "svg.fonttype": "none",
-    "svg.hashsalt": "bayesrace",
-    "path.simplify_threshold": 0.2,
-}
-
-
 @contextmanager
 def figure_style() -> Iterator[None]:
     """Figures made and drawn in this context look alike."""
-    with mpl.rc_context(cast(Any, _STYLE)):
+    with mpl.rc_context(fname=Path(__file__).with_name("figures.mplstyle")):
         yield

@@ -1,6 +1,7 @@
 """Results of training and validation on the terminal."""
 
 from collections.abc import Mapping, Sequence
+from typing import Final
 
 from rich.console import Console
 from rich.text import Text
@@ -8,12 +9,14 @@ from rich.text import Text
 from bayesrace.gp.weights import OUTPUTS, UNITS
 from learning.dataset import left_out
 from learning.target import KernelScore
-from operation.analysis.validation import Drift, HorizonResult, Spread, ValidationResult
+from operation.analysis.validation import DRIFTS, HorizonResult, Spread, ValidationResult
 from operation.terminal.notation import SMOOTHNESS
 from operation.terminal.race_table import GP_COLUMNS, gp_cells
 from operation.terminal.terminal import plain_table
 
 __all__ = ["print_beyond_limits", "print_kernels", "print_validation"]
+
+_ERRORS: Final = "position m", "heading rad", "vx m/s", "vy m/s", "omega rad/s"
 
 
 def print_kernels(scores: Sequence[KernelScore], console: Console) -> None:
@@ -71,15 +74,11 @@ def _print_drift(drift: HorizonResult, console: Console) -> None:
     steps = "1 step" if drift.steps == 1 else f"{drift.steps} steps, open loop"
     titles = ("nominal\nmean", "\np95", "\nmax", "corrected\nmean", "\np95", "\nmax")
     table = plain_table("error", *titles)
-    for label, name in (
-        ("position m", "position_m"), ("heading rad", "heading_rad"), ("vx m/s", "vx_mps"),
-        ("vy m/s", "vy_mps"), ("omega rad/s", "omega_radps"),
-    ):  # fmt: skip
-        table.add_row(label, *_cells(drift.nominal, name), *_cells(drift.corrected, name))
+    for label, name in zip(_ERRORS, DRIFTS, strict=True):
+        table.add_row(label, *_cells(drift.nominal[name]), *_cells(drift.corrected[name]))
     console.print(Text(f"{steps} ({drift.predictions} predictions)", style="bold"))
     console.print(table)
 
 
-def _cells(drift: Drift, name: str) -> list[str]:
-    spread: Spread = getattr(drift, name)
+def _cells(spread: Spread) -> list[str]:
     return [f"{value:.2g}" for value in (spread.mean, spread.p95, spread.max)]

@@ -18,12 +18,12 @@ from studies.latency.results import (
     BareLoop,
     Clocks,
     LatencyResult,
-    LatencySettings,
     LegResult,
     Memory,
+    Series,
     Traffic,
 )
-from studies.latency.series import Series
+from studies.latency.settings import LatencySettings
 from studies.latency.tables import MOST_CYCLES, begins_anew, read_tables, split
 
 __all__ = ["Analysis", "Beside", "analyse"]

@@ -25,7 +25,8 @@ from operation.terminal.progress import Stages
 from studies.latency.analysis import Beside, analyse
 from studies.latency.beside import read_bare_loop, read_round_trips, running_beside
 from studies.latency.report import RESULT, write_files
-from studies.latency.results import LatencyResult, LatencySettings, Memory
+from studies.latency.results import LatencyResult, Memory
+from studies.latency.settings import LatencySettings
 
 __all__ = ["LatencyError", "Run", "measure"]
 

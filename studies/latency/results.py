@@ -1,60 +1,22 @@
-"""The settings of one measurement, and the content of ``latency.json``, its result."""
+"""What is measured of a leg over time, and the content of ``latency.json``."""
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any, Final
 
+import numpy as np
+from hdrh.histogram import HdrHistogram
+from hdrh.log import HistogramLogWriter
 from pydantic import BaseModel, ConfigDict, Field
 
-from bayesrace.option import Option
-from bayesrace.realtime import RealtimeSettings
-from bayesrace.transport import Endpoints
-from bayesrace.vehicles import CarSetting, default_car
+from bayesrace.arrays import Floats
+from bayesrace.files import replacing
 
-__all__ = ["BareLoop", "Clocks", "Distribution", "LatencyResult", "LatencySettings", "LegResult"]
-__all__ += ["Memory", "Traffic"]
+__all__ = ["BareLoop", "Clocks", "Distribution", "LatencyResult", "LegResult", "Memory", "Series"]
+__all__ += ["Traffic", "new_histogram"]
 
-
-def _own_track(known: dict[str, Any]) -> str:
-    elsewhere = known.get("log") or known.get("attach")
-    return "" if elsewhere or "car" not in known else str(known["car"].race_track)
-
-
-class LatencySettings(BaseModel):
-    """What to measure, and for how long."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    car: CarSetting = Field(default_factory=default_car)
-    log: Path | None = Field(None, description="log of a run (MCAP), in place of a new run")
-    attach: Endpoints | None = Field(None, description="where a running system is")
-    name: str = Field("", description="name of the car in the network; empty: the car's own")
-    rate_hz: float = Field(50.0, ge=1, le=500, description="rate of plant and controller [Hz]")
-    duration_s: float = Field(
-        default_factory=lambda known: 1e9 if known.get("log") else 20.0,
-        ge=1,
-        le=1e9,
-        description="time that counts, after the warm-up [s]; empty: 20; all of a log",
-    )
-    warm_up_s: float = Field(3.0, ge=0, le=60, description="plant time before cycles count")
-    load: int = Field(0, ge=0, le=1024, description="busy processes to start as load")
-    track: str = Field(
-        default_factory=_own_track,
-        description="track: name, random:SEED, random10:SEED or CSV file; empty: the car's; not "
-        "known of a log or a running system",
-    )
-    realtime: RealtimeSettings = RealtimeSettings()
-    weights: Path | None = Field(None, description="GP weights; None: trained")
-    artefact: Annotated[Path | None, Option(metavar="DIR")] = Field(
-        None, description="folder of 'bayesrace build'; None: built"
-    )
-    raceline: Path | None = Field(
-        None, description="racing line to drive, as 'bayesrace raceline' writes it; None: computed"
-    )
-
-    @property
-    def car_name(self) -> str:
-        """The name of the car in message keys; empty: that of the only car in the log."""
-        return self.name or ("" if self.log else self.car.name)
+_LARGEST_NS: Final = 60_000_000_000
+_PERCENTILES: Final = (50.0, 90.0, 99.0, 99.9, 100.0)
 
 
 class _Frozen(BaseModel):
@@ -71,6 +33,51 @@ class Distribution(_Frozen):
     p999: float
     max: float
     count: int
+
+
+def new_histogram() -> Any:
+    """A histogram of 1 ns to 60 s to three digits."""
+    return HdrHistogram(1, _LARGEST_NS, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """Durations and the times at which they were measured, at least one of them.
+
+    A duration below zero counts as zero: it is shorter than its clocks are uncertain.
+    """
+
+    at_s: Floats
+    """Since the beginning, rising."""
+    ns: Floats
+
+    def distribution(self) -> Distribution:
+        """Percentiles."""
+        values = np.percentile(self.ns, _PERCENTILES, method="inverted_cdf").clip(0) * 1e-3
+        numbers = dict(zip(("p50", "p90", "p99", "p999", "max"), values.tolist(), strict=True))
+        return Distribution(**numbers, count=len(self.ns))
+
+    def intervals(self, edges_s: Floats) -> list[Floats]:
+        """The values of each interval; the outer ones take the values beyond the edges."""
+        return np.split(self.ns, np.searchsorted(self.at_s, edges_s[1:-1]))
+
+    def write_log(self, path: Path, title: str, epoch_s: float, edges_s: Floats) -> None:
+        """An HdrHistogram log in ns, a line for each interval with values; calendar time at the
+        beginning is ``epoch_s``."""
+        with replacing(path) as partial, partial.open("w", encoding="ascii") as file:
+            log = HistogramLogWriter(file)
+            log.output_comment(f"[bayesrace latency: {title.replace('→', 'to')}; values in ns]")
+            log.output_log_format_version()
+            # The library's own output_start_time raises.
+            log.output_comment(f"[StartTime: {epoch_s:.3f} (seconds since epoch)]")
+            log.output_legend()
+            for k, values in enumerate(self.intervals(edges_s)):
+                histogram = new_histogram()
+                for value in np.rint(values).clip(0, _LARGEST_NS).astype(np.int64).tolist():
+                    histogram.record_value(value)
+                if len(values):
+                    begin_s = max(float(edges_s[k]), 1e-6)  # 0 means the histogram's own
+                    log.output_interval_histogram(histogram, begin_s, float(edges_s[k + 1]), 1e3)
 
 
 class LegResult(Distribution):
