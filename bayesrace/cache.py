@@ -7,9 +7,11 @@ Each is made once and read from then on, by every process of the user on this ma
 import fcntl
 import hashlib
 import os
+import platform
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Final, TypeVar
@@ -17,7 +19,17 @@ from typing import Final, TypeVar
 from bayesrace.errors import InputError
 from bayesrace.files import replacing
 
-__all__ = ["cache_folder", "digest", "kept", "locked", "note_use", "software", "uses"]
+__all__ = [
+    "cache_folder",
+    "cpu_digest",
+    "cpu_identity",
+    "digest",
+    "kept",
+    "locked",
+    "note_use",
+    "software",
+    "uses",
+]
 
 Result = TypeVar("Result")
 
@@ -78,6 +90,22 @@ def software(sources: Iterable[str], packages: Iterable[str]) -> Iterator[str | 
                 yield source.name
                 yield source.read_bytes()
     yield from (f"{name} {version(name)}" for name in packages)
+
+
+@cache
+def cpu_identity() -> str:
+    """Model and features: a library built on one CPU may not run on another."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return f"{platform.machine()} {platform.processor()}"
+    wanted = ("model name", "flags", "Features", "CPU part")
+    return "\n".join(dict.fromkeys(s for s in lines if s.startswith(wanted)))
+
+
+def cpu_digest() -> str:
+    """Short form of :func:`cpu_identity`."""
+    return hashlib.sha256(cpu_identity().encode()).hexdigest()[:12]
 
 
 @contextmanager

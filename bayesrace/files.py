@@ -1,9 +1,12 @@
-"""Files that appear whole or not at all, and are read whole or refused."""
+"""Files that appear whole or not at all, and are read whole or refused; locks on folders; temporary
+folders, of which those of killed processes are deleted by the next one."""
 
 import errno
 import fcntl
 import os
 import re
+import shutil
+import tempfile
 import time
 import tomllib
 from collections.abc import Iterator
@@ -21,10 +24,15 @@ __all__ = [
     "read_text",
     "read_whole",
     "replacing",
+    "temporary_folder",
     "write_whole",
 ]
 
 _LARGEST: Final = 1 << 22
+_PREFIX: Final = "bayesrace-held-"
+"""Of temporary folders."""
+_NEW_S: Final = 60.0
+"""Age up to which the owner of a temporary folder may not hold it yet."""
 
 
 def read_whole(
@@ -151,3 +159,29 @@ def _sync(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+@contextmanager
+def temporary_folder(parent: str | None = None) -> Iterator[Path]:
+    """A new folder that only this user may enter, deleted at the block's end; in ``TMPDIR``, or
+    in ``parent``."""
+    _clear_abandoned(Path(parent or tempfile.gettempdir()))
+    with (
+        tempfile.TemporaryDirectory(
+            prefix=_PREFIX, dir=parent, ignore_cleanup_errors=True
+        ) as folder,
+        ExitStack() as stack,
+    ):
+        with suppress(OSError):  # without locks: there, nothing is cleared either
+            stack.enter_context(held(Path(folder)))
+        yield Path(folder)
+
+
+def _clear_abandoned(parent: Path) -> None:
+    """Deletes this user's folders that no process holds."""
+    for folder in parent.glob(f"{_PREFIX}*"):
+        with suppress(OSError):
+            status = folder.lstat()
+            if status.st_uid == os.geteuid() and time.time() - status.st_mtime > _NEW_S:
+                with held(folder):
+                    shutil.rmtree(folder, ignore_errors=True)

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from rich.console import Console
 from rich.table import Table
 
-from bayesrace.cpu import cpu_identity
+from bayesrace.cache import cpu_identity
 from bayesrace.gp.weights import read_weights
 from controller.assembly import compiled_controller
 from controller.mpc import PredictiveController

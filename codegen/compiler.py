@@ -17,12 +17,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from bayesrace.cache import cache_folder, digest, kept, software
-from bayesrace.cpu import cpu_identity
+from bayesrace.cache import cache_folder, cpu_identity, digest, kept, software
 from bayesrace.errors import InputError
+from bayesrace.files import temporary_folder
 from bayesrace.interpreter import RUN_MODULE
 from bayesrace.manifest import check_owner
-from bayesrace.temporary import temporary_folder
 
 if TYPE_CHECKING:
     import casadi as ca

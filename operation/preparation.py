@@ -10,9 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal
 
-from bayesrace.cache import cache_folder, digest, kept, software
+from bayesrace.cache import cache_folder, cpu_identity, digest, kept, software
 from bayesrace.columns import LogColumns
-from bayesrace.cpu import cpu_identity
 from bayesrace.errors import InputError
 from bayesrace.files import read_whole, replacing
 from bayesrace.gp.weights import GpWeights, encode_weights, read_weights, write_weights

@@ -6,8 +6,7 @@ from typing import Final, Literal
 
 from fmpy import extract
 
-from bayesrace.cache import software
-from bayesrace.cpu import cpu_identity
+from bayesrace.cache import cpu_identity, software
 from bayesrace.vehicles import get_car
 from codegen.compiler import FLAGS, find_compiler
 from codegen.fmu import car_fmu, pack

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from bayesrace.temporary import temporary_folder
+from bayesrace.files import temporary_folder
 
 HOLD = """
 import time
-from bayesrace.temporary import temporary_folder
+from bayesrace.files import temporary_folder
 with temporary_folder() as folder:
     (folder / "content").touch()
     print(folder, flush=True)

@@ -11,8 +11,7 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
-from bayesrace.cache import cache_folder, digest, kept, software
-from bayesrace.cpu import cpu_identity
+from bayesrace.cache import cache_folder, cpu_identity, digest, kept, software
 from bayesrace.raceline.line import (
     LineIdentity,
     RaceLine,

@@ -16,7 +16,9 @@ from bayesrace.tracks.shapes import resample_closed, smooth_closed
 from bayesrace.tracks.spline import PlaneSpline, fit_arc_length
 from bayesrace.vehicles.tuning import RacelineTuning
 
-__all__ = ["Gates", "even_places", "flying_gates", "smooth_centreline", "standing_gates"]
+__all__ = [
+    "Gates", "check_room", "even_places", "flying_gates", "smooth_centreline", "standing_gates",
+]  # fmt: skip
 
 _OVERSAMPLING: Final = 8
 
@@ -87,7 +89,7 @@ def flying_gates(
     InputError if the margin leaves no room somewhere.
     """
     room = track.width_left_m + track.width_right_m - 2 * margin_m
-    _check_room(track, track.s_m, room, margin_m, tuning.room_m)
+    check_room(track, track.s_m, room, margin_m, tuning.room_m)
     xy, first, second = curve.derivatives(places)
     tangent = first / np.linalg.norm(first, axis=1, keepdims=True)
     normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
@@ -99,11 +101,12 @@ def flying_gates(
         reach = fold / np.abs(kappa)
     n_max = np.where(kappa > 0, np.minimum(n_max, reach), n_max)
     n_min = np.where(kappa < 0, np.maximum(n_min, -reach), n_min)
-    _check_room(track, places, n_max - n_min, margin_m, tuning.room_m)
+    check_room(track, places, n_max - n_min, margin_m, tuning.room_m)
     return Gates(places, xy, normal, heading, kappa, n_min, n_max)
 
 
-def _check_room(track: Track, s: Floats, room: Floats, margin_m: float, least_m: float) -> None:
+def check_room(track: Track, s: Floats, room: Floats, margin_m: float, least_m: float) -> None:
+    """InputError if the margins on both sides leave less room (n,) than that at one of s (n,)."""
     tight = room < least_m
     if tight.any():
         at = float(s[int(np.argmax(tight))])

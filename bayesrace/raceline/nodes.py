@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 
 from bayesrace.arrays import Floats
-from bayesrace.errors import InputError
 from bayesrace.raceline.friction import car_limits
+from bayesrace.raceline.gates import check_room
 from bayesrace.raceline.line import RaceLine, RaceLineSettings
 from bayesrace.tracks import Track
 from bayesrace.tracks.spline import PlaneSpline, fit_arc_length
@@ -48,12 +48,8 @@ class NodeLines:
         right, left = track.widths(s)
         self._low, self._high = self._margin_m - right, left - self._margin_m
         self._xy, self._normal = track.position(s), track.normal(s)
-        tight = self._high - self._low < car.tuning.raceline.room_m
-        if tight.any():
-            raise InputError(
-                f"track '{track.name}' is too narrow for a margin of {self._margin_m:.3g} m "
-                f"near s = {s[int(np.argmax(tight))]:.2f} m; choose a smaller margin"
-            )
+        room = self._high - self._low
+        check_room(track, s, room, self._margin_m, car.tuning.raceline.room_m)
 
     def line(self, shares: Floats) -> RaceLine | None:
         """The closed line through the nodes with the fastest speeds of a flying lap.

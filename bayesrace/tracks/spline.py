@@ -52,16 +52,7 @@ class PlaneSpline:
 
     def __call__(self, s: npt.ArrayLike, derivative: int = 0) -> Floats:
         """Point (..., 2), or its first or second derivative, at any real ``s`` (...)."""
-        local, piece = self._locate(np.asarray(s, dtype=float))
-        c0, c1, c2, c3 = self._table[:, piece]
-        t = local[..., None]
-        if derivative == 0:
-            value = c0 + t * (c1 + t * (c2 + t * c3))
-        elif derivative == 1:
-            value = c1 + t * (2.0 * c2 + t * 3.0 * c3)
-        else:
-            value = 2.0 * c2 + 6.0 * t * c3
-        return np.asarray(value)
+        return self.derivatives(np.asarray(s, dtype=float))[derivative]
 
     def derivatives(self, s: Floats) -> tuple[Floats, Floats, Floats]:
         """Point, first and second derivative in one look-up."""

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Final, Literal, NamedTuple
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue
 
 from bayesrace.errors import InputError
-from bayesrace.temporary import temporary_folder
+from bayesrace.files import temporary_folder
 from bayesrace.transport.credentials import Credentials
 
 __all__ = [

@@ -23,7 +23,7 @@ from typing import Annotated, Any, Final
 from msgspec import Meta, MsgspecError, msgpack
 
 from bayesrace.errors import InputError
-from bayesrace.temporary import temporary_folder
+from bayesrace.files import temporary_folder
 from plant.fmu.inspection import extract, library
 from plant.fmu.wiring import Value
 from plant.fmu.worker import LONGEST, serve

@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from rich.console import Console
 
-from bayesrace.cpu import cpu_digest
+from bayesrace.cache import cpu_digest
 from bayesrace.gp.weights import GpWeights, read_weights
 from controller.assembly import compiled_controller
 from controller.path_table import make_path_table

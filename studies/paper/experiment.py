@@ -9,9 +9,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from bayesrace.cache import cache_folder, digest, kept, software
+from bayesrace.cache import cache_folder, cpu_identity, digest, kept, software
 from bayesrace.columns import LogColumns
-from bayesrace.cpu import cpu_identity
 from bayesrace.errors import InputError
 from bayesrace.files import read_text
 from bayesrace.gp.weights import GpWeights, read_weights
