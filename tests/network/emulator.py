@@ -4,17 +4,11 @@
 
 forwards every Ethernet frame between the two interfaces, which must not do so themselves (two veth
 ends in a network namespace of their own). It does what Linux's ``netem`` does, for kernels
-without it. It takes commands as lines on stdin, and answers each with one line of JSON:
-
-    set KEY VALUE ...    delay, jitter [s], loss [share of frames], reorder [0 or 1]
-    cut / join           no frame gets through / they do again
-    counts               only the answer
-
-A line may end in ``forth`` (left to right) or ``back``; without, it is for both directions. The
-end of stdin ends the program, so it does not outlive its starter. It imports nothing of ours.
+without it. A line of JSON on stdin sets :class:`Conditions`, by direction: ``forth`` is from left
+to right, ``back`` the other. It answers each line with the :class:`Counts` by direction. The end
+of stdin ends the program, so it does not outlive its starter. It imports nothing of ours.
 """
 
-import heapq
 import json
 import os
 import random
@@ -22,10 +16,11 @@ import select
 import socket
 import sys
 import time
-from dataclasses import asdict, dataclass, field, fields
+from collections import deque
+from dataclasses import asdict, dataclass, field
 from typing import Final
 
-__all__ = ["Conditions", "Counts", "Direction", "Emulator", "main"]
+__all__ = ["Conditions", "Counts", "Direction", "main"]
 
 _EVERY_PROTOCOL: Final = 3  # ETH_P_ALL
 _IGNORE_OUTGOING: Final = 23  # PACKET_IGNORE_OUTGOING, Linux 4.20
@@ -39,13 +34,13 @@ class Conditions:
     """What a direction of the link does to each frame."""
 
     delay: float = 0.0
-    """Mean time on the way [s]."""
+    """Mean time on the way [s]; a frame waits for the one before, as on a wire."""
     jitter: float = 0.0
     """The time is uniform in ``delay`` ± this [s]."""
     loss: float = 0.0
     """Probability that a frame is lost, each for itself."""
-    reorder: float = 0.0
-    """0: a frame waits for the one before, as on a wire; else jitter changes the order."""
+    cut: bool = False
+    """No frame gets through."""
 
 
 @dataclass
@@ -67,30 +62,22 @@ class Direction:
     random: random.Random
     conditions: Conditions = field(default_factory=Conditions)
     counts: Counts = field(default_factory=Counts)
-    is_cut: bool = False
-    _way: list[tuple[float, int, bytes]] = field(default_factory=list)
+    _way: deque[tuple[float, bytes]] = field(default_factory=deque)
     _last_due: float = 0.0
-    _number: int = 0
 
     def enter(self, frame: bytes, now: float) -> None:
         """A frame sets off, or does not."""
-        if self.is_cut:
+        given = self.conditions
+        if given.cut:
             self.counts.cut += 1
-        elif self.random.random() < self.conditions.loss:
+        elif self.random.random() < given.loss:
             self.counts.lost += 1
         elif len(self._way) >= _CAPACITY:
             self.counts.overflowed += 1
         else:
-            heapq.heappush(self._way, (self._due(now), self._number, frame))
-            self._number += 1
-
-    def _due(self, now: float) -> float:
-        jitter = self.conditions.jitter
-        due = now + max(self.conditions.delay + self.random.uniform(-jitter, jitter), 0.0)
-        if not self.conditions.reorder:
-            due = max(due, self._last_due)
-            self._last_due = due
-        return due
+            due = now + max(given.delay + self.random.uniform(-given.jitter, given.jitter), 0.0)
+            self._last_due = max(due, self._last_due)
+            self._way.append((self._last_due, frame))
 
     @property
     def next_due(self) -> float:
@@ -101,48 +88,9 @@ class Direction:
         """The frames whose time has come."""
         frames = []
         while self._way and self._way[0][0] <= now:
-            frames.append(heapq.heappop(self._way)[2])
+            frames.append(self._way.popleft()[1])
         self.counts.forwarded += len(frames)
         return frames
-
-
-class Emulator:
-    """Both directions, and the commands they take."""
-
-    def __init__(self, seed: int = 0) -> None:
-        self.directions = {
-            name: Direction(random.Random(f"{seed} {name}")) for name in ("forth", "back")
-        }
-
-    def obey(self, line: str) -> str:
-        """Executes one line; the answer, which has an ``error`` if there is one in the line."""
-        words = line.split()
-        chosen = list(self.directions.values())
-        if words and words[-1] in self.directions:
-            chosen = [self.directions[words.pop()]]
-        try:
-            self._execute(words, chosen)
-        except (KeyError, ValueError, TypeError) as error:
-            return json.dumps({"error": f"'{line.strip()}': {error!r}"})
-        return json.dumps({name: asdict(one.counts) for name, one in self.directions.items()})
-
-    @staticmethod
-    def _execute(words: list[str], chosen: list[Direction]) -> None:
-        match words:
-            case ["set", *pairs]:
-                known = {one.name for one in fields(Conditions)}
-                given = dict(zip(pairs[::2], map(float, pairs[1::2]), strict=True))
-                if unknown := given.keys() - known:
-                    raise KeyError(*unknown)
-                for direction in chosen:
-                    direction.conditions = Conditions(**given)
-            case ["cut" | "join" as word]:
-                for direction in chosen:
-                    direction.is_cut = word == "cut"
-            case ["counts"]:
-                pass
-            case _:
-                raise KeyError("set, cut, join or counts")
 
 
 def _open(interface: str) -> socket.socket:
@@ -176,17 +124,21 @@ def _take(direction: Direction, source: socket.socket) -> None:
             return
 
 
-def _say(text: str) -> None:
-    os.write(1, f"{text}\n".encode())
+def _obey(directions: dict[str, Direction], line: str) -> None:
+    for name, given in json.loads(line).items():
+        directions[name].conditions = Conditions(**given)
+    answer = json.dumps({name: asdict(one.counts) for name, one in directions.items()})
+    os.write(1, f"{answer}\n".encode())
 
 
 def main(left: str, right: str, seed: int = 0) -> int:
     """Forwards until stdin ends."""
-    emulator = Emulator(seed)
-    forth, back = emulator.directions.values()
+    names = ("forth", "back")
+    directions = {name: Direction(random.Random(f"{seed} {name}")) for name in names}
+    forth, back = directions.values()
     at_left, at_right = _open(left), _open(right)
     ways = ((forth, at_left, at_right), (back, at_right, at_left))
-    _say(emulator.obey("counts"))
+    _obey(directions, "{}")
     watched: list[socket.socket | int] = [at_left, at_right, 0]
     heard = b""
     while True:
@@ -202,7 +154,7 @@ def main(left: str, right: str, seed: int = 0) -> int:
                 return 0
             *lines, heard = (heard + data).split(b"\n")
             for line in lines:
-                _say(emulator.obey(line.decode()))
+                _obey(directions, line.decode())
 
 
 if __name__ == "__main__":

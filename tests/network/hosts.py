@@ -19,10 +19,12 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import count
 from pathlib import Path
 from typing import Any, Final, TypeVar
+
+from tests.network.emulator import Conditions
 
 __all__ = ["CONTROLLER_IP", "PLANT_IP", "Host", "Link", "Network", "network", "why_not_here"]
 
@@ -147,43 +149,44 @@ class Link:
             bufsize=1,
             start_new_session=True,  # Ctrl-C is for the tests, which end it in order
         )
+        self._conditions = {name: Conditions() for name in ("forth", "back")}
         self._answer()
+
+    def set(
+        self, delay: float = 0.0, jitter: float = 0.0, loss: float = 0.0, direction: str = ""
+    ) -> None:
+        """Conditions of both directions, or of one; a partition is over with it."""
+        self._change(direction, delay=delay, jitter=jitter, loss=loss, cut=False)
+
+    def cut(self, direction: str = "") -> None:
+        """Nothing gets through any more."""
+        self._change(direction, cut=True)
+
+    def join(self, direction: str = "") -> None:
+        """The end of a partition."""
+        self._change(direction, cut=False)
+
+    def counts(self) -> dict[str, dict[str, int]]:
+        """Frames by direction, see :class:`tests.network.emulator.Counts`."""
+        return self._send({})
+
+    def _change(self, direction: str, **given: Any) -> None:
+        for name in [direction] if direction else self._conditions:
+            self._conditions[name] = replace(self._conditions[name], **given)
+        self._send({name: asdict(one) for name, one in self._conditions.items()})
+
+    def _send(self, conditions: dict[str, dict[str, Any]]) -> dict[str, dict[str, int]]:
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{json.dumps(conditions)}\n")
+        return self._answer()
 
     def _answer(self) -> dict[str, dict[str, int]]:
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
         if not line:
             raise OSError(f"the emulator ended with code {self._process.wait()}")
-        answer: dict[str, Any] = json.loads(line)
-        if "error" in answer:
-            raise ValueError(answer["error"])
+        answer: dict[str, dict[str, int]] = json.loads(line)
         return answer
-
-    def send(self, line: str) -> dict[str, dict[str, int]]:
-        """One line of the emulator's language; the counts by direction."""
-        assert self._process.stdin is not None
-        self._process.stdin.write(f"{line}\n")
-        return self._answer()
-
-    def set(
-        self, delay: float = 0.0, jitter: float = 0.0, loss: float = 0.0, *, reorder: bool = False,
-        direction: str = "",
-    ) -> None:  # fmt: skip
-        """Conditions, see :class:`tests.network.emulator.Conditions`."""
-        values = f"delay {delay} jitter {jitter} loss {loss} reorder {int(reorder)}"
-        self.send(f"set {values} {direction}")
-
-    def cut(self, direction: str = "") -> None:
-        """Nothing gets through any more."""
-        self.send(f"cut {direction}")
-
-    def join(self, direction: str = "") -> None:
-        """The end of a partition."""
-        self.send(f"join {direction}")
-
-    def counts(self) -> dict[str, dict[str, int]]:
-        """Frames by direction, see :class:`tests.network.emulator.Counts`."""
-        return self.send("counts")
 
     def close(self) -> None:
         """Ends the program."""

@@ -3,7 +3,6 @@
 Bounds are generous where they are about time: nothing arrives early, and the rest is statistics.
 """
 
-import json
 import os
 import select
 import signal
@@ -15,7 +14,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.network.emulator import Emulator
 from tests.network.hosts import CONTROLLER_IP, PLANT_IP, Network, network, why_not_here
 from tests.programs import ROOT
 
@@ -88,17 +86,12 @@ def test_loss_is_as_likely_as_asked_for_and_counted(net: Network) -> None:
     assert 124 < counts["lost"] < 276
 
 
-@pytest.mark.parametrize("reorder", [False, True])
-def test_delay_and_jitter(net: Network, reorder: bool) -> None:
-    net.link.set(delay=0.02, jitter=0.005, reorder=reorder)
+def test_delay_and_jitter(net: Network) -> None:
+    net.link.set(delay=0.02, jitter=0.005)
     with Pair(net) as pair:
         numbers, took_s = pair.flood(300)
-    assert sorted(numbers) == list(range(300))
-    assert (numbers == sorted(numbers)) is not reorder
+    assert numbers == list(range(300))
     assert min(took_s) >= 0.015
-    if reorder:  # uniform: some of three hundred in the lower half (certain to 1e-90)
-        assert min(took_s) < 0.02
-        assert sorted(took_s)[150] >= 0.018
 
 
 def test_delay_of_one_direction_is_not_that_of_the_other(net: Network) -> None:
@@ -124,50 +117,6 @@ def test_a_partition_lets_nothing_through_and_ends(net: Network) -> None:
         assert net.link.counts()["forth"]["cut"] == 20
         net.link.join()
         assert pair.flood(20)[0] == list(range(20))
-
-
-def test_a_stream_gets_through_a_bad_link_whole(net: Network) -> None:
-    """TCP, so checksums and segment sizes are those of a real wire."""
-    sent = os.urandom(300_000)
-    net.link.set(delay=0.005, jitter=0.001, loss=0.05)
-    server = net.plant.socket(socket.SOCK_STREAM)
-    client = net.controller.socket(socket.SOCK_STREAM)
-    with server, client:
-        server.bind((PLANT_IP, PORT))
-        server.listen()
-        client.settimeout(60.0)
-        client.connect((PLANT_IP, PORT))
-        stream, _ = server.accept()
-        with stream:
-            stream.setblocking(False)
-            left, heard = memoryview(sent), bytearray()
-            while len(heard) < len(sent):
-                readable, writable, _ = select.select([client], [stream] if left else [], [], 60.0)
-                assert readable or writable, "the stream stands still"
-                if writable:
-                    left = left[stream.send(left) :]
-                if readable:
-                    heard += client.recv(1 << 16)
-    assert bytes(heard) == sent
-    assert net.link.counts()["forth"]["lost"] > 0
-
-
-@pytest.mark.check
-def test_a_seed_repeats_the_same_losses(namespaces: None) -> None:
-    arrived = []
-    for seed in (1, 1, 2):
-        with network(seed) as net, Pair(net) as pair:
-            net.link.set(loss=0.3)
-            arrived.append(pair.flood(100)[0])
-    assert arrived[0] == arrived[1] != arrived[2]
-
-
-@pytest.mark.parametrize("line", ["", "set", "set delay", "set speed 1", "set delay x", "cut up"])
-def test_what_the_emulator_does_not_understand(line: str) -> None:
-    emulator = Emulator()
-    answer = json.loads(emulator.obey(line))
-    assert ("error" in answer) is (line != "set")
-    assert not any(one.is_cut for one in emulator.directions.values())
 
 
 def test_nothing_is_left_behind(namespaces: None) -> None:
