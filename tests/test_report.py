@@ -160,11 +160,11 @@ def test_the_papers_numbers_stand_only_beside_laps_on_its_track(
         update={"settings": result.settings.model_copy(update={"track": "ethz"})}
     )
     rows = compare_laps(on_ethz)
-    assert [row.controller for row in rows] == [lap.controller for lap in result.laps]
-    assert (rows[0].paper_lap, rows[1].paper_lap, rows[1].paper_off) == (
+    assert [row["controller"] for row in rows] == [lap.controller for lap in result.laps]
+    assert (rows[0]["paper_lap"], rows[1]["paper_lap"], rows[1]["paper_off"]) == (
         "DNF", "7.988", "9 / 0.015",
     )  # fmt: skip
-    assert [row.output for row in compare_gp(on_ethz)] == ["vx", "vy", "omega"]
+    assert [row["output"] for row in compare_gp(on_ethz)] == ["vx", "vy", "omega"]
 
 
 def test_a_race_that_was_cut_off_still_gets_its_page(tmp_path: Path) -> None:

@@ -9,18 +9,7 @@ from typing import Final, NamedTuple
 
 from operation.analysis.results import RaceResult
 
-__all__ = [
-    "GP",
-    "LAPS_OFF",
-    "LAPS_ON",
-    "LIMIT",
-    "SOURCE",
-    "Comparison",
-    "GpComparison",
-    "Lap",
-    "compare_gp",
-    "compare_laps",
-]
+__all__ = ["GP", "LAPS_OFF", "LAPS_ON", "LIMIT", "SOURCE", "Lap", "compare_gp", "compare_laps"]
 
 SOURCE: Final = (
     "A. Jain, M. O'Kelly, P. Chaudhari, M. Morari: BayesRace: Learning to race autonomously using "
@@ -68,75 +57,49 @@ GP: Final = {  # RMSE without the GP, RMSE and R² before, RMSE and R² after th
 }
 
 
-class Comparison(NamedTuple):
-    """One row, ready to print."""
-
-    controller: str
-    paper_lap: str
-    our_lap: str
-    paper_off: str
-    our_off: str
-    paper_solve: str
-    our_solve: str
-    faster: str
-
-
-class GpComparison(NamedTuple):
-    """One output's row, ready to print."""
-
-    output: str
-    paper: str
-    ours: str
-    paper_updated: str
-    ours_updated: str
-
-
-def compare_laps(result: RaceResult) -> list[Comparison]:
-    """Rows for the controllers that drove; none on any other track than the paper's."""
-    if result.settings.track.lower() != _TRACK:
-        return []
+def compare_laps(result: RaceResult) -> list[dict[str, str]]:
+    """A row for each controller that drove, the paper's numbers as ``paper_*`` and these as
+    ``our_*``, ready to print; none on any other track than the paper's."""
     published = LAPS_ON if result.settings.constraints else LAPS_OFF
     rows = []
-    for lap in result.laps:
-        paper = published.get(lap.controller)
-        if paper is None:
+    for lap in result.laps if result.settings.track.lower() == _TRACK else ():
+        if (paper := published.get(lap.controller)) is None:
             continue
-        p50, p99, most = _SOLVE_MS[lap.controller]
-        ours = lap.solve_us
-        rows.append(
-            Comparison(
-                lap.controller,
-                _time(paper.time_s),
-                _time(lap.lap_time_s),
-                _off(paper.off_samples, paper.off_max_m),
-                _off(lap.off_track_samples, lap.off_track_max_m),
-                f"{p50:g} / {p99:g} / {most:g}",
-                "–"
-                if ours is None
-                else f"{ours.p50 / 1e3:.2f} / {ours.p99 / 1e3:.2f} / {ours.max / 1e3:.2f}",
-                "–" if ours is None or ours.p50 <= 0 else f"{p50 * 1e3 / ours.p50:.0f} ×",
-            )
-        )
+        solve, ours = _SOLVE_MS[lap.controller], lap.solve_us
+        row = {
+            "controller": lap.controller,
+            "paper_lap": _time(paper.time_s),
+            "our_lap": _time(lap.lap_time_s),
+            "paper_off": _off(paper.off_samples, paper.off_max_m),
+            "our_off": _off(lap.off_track_samples, lap.off_track_max_m),
+            "paper_solve": " / ".join(f"{one:g}" for one in solve),
+            "our_solve": "–",
+            "faster": "–",
+        }
+        if ours is not None:
+            own = (ours.p50, ours.p99, ours.max)
+            row["our_solve"] = " / ".join(f"{one / 1e3:.2f}" for one in own)
+        if ours is not None and ours.p50 > 0:
+            row["faster"] = f"{solve[0] * 1e3 / ours.p50:.0f} ×"
+        rows.append(row)
     return rows
 
 
-def compare_gp(result: RaceResult) -> list[GpComparison]:
-    """Rows per output; none on any other track, or without GPs."""
-    if result.settings.track.lower() != _TRACK:
-        return []
+def compare_gp(result: RaceResult) -> list[dict[str, str]]:
+    """A row for each output, as for laps; none on any other track, or without GPs."""
     rows = []
     for output, (plain, before, r2_before, after, r2_after) in GP.items():
         ours, updated = result.gp.get(output), result.gp_updated.get(output)
-        if ours is not None:
-            rows.append(
-                GpComparison(
-                    output,
-                    f"{before:g} ({plain:g}) · {r2_before:g}",
-                    f"{ours.rmse:.3g} ({ours.uncorrected_rmse:.3g}) · {ours.r2:.4f}",
-                    f"{after:g} · {r2_after:g}",
-                    "–" if updated is None else f"{updated.rmse:.3g} · {updated.r2:.4f}",
-                )
-            )
+        if ours is None or result.settings.track.lower() != _TRACK:
+            continue
+        row = {
+            "output": output,
+            "paper": f"{before:g} ({plain:g}) · {r2_before:g}",
+            "ours": f"{ours.rmse:.3g} ({ours.uncorrected_rmse:.3g}) · {ours.r2:.4f}",
+            "paper_updated": f"{after:g} · {r2_after:g}",
+            "ours_updated": "–" if updated is None else f"{updated.rmse:.3g} · {updated.r2:.4f}",
+        }
+        rows.append(row)
     return rows
 
 

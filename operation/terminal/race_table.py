@@ -38,33 +38,21 @@ def _decimals(value: float | None, count: int) -> str:
     return "–" if value is None else f"{value:.{count}f}"
 
 
-def _first_lap(lap: LapResult) -> str:
-    return _decimals(lap.lap_time_s, 3) if lap.finished else "refused" if lap.refused else "DNF"
-
-
-def _solve(name: str) -> Callable[[LapResult], str]:
-    return lambda lap: _decimals(getattr(lap.solve_us, name, None), 0)
-
-
 def _metres(value: float | None) -> str:
     return _decimals(value, 3 if value is None or value < 10 else 0)
+
+
+def _first_lap(lap: LapResult) -> str:
+    return _decimals(lap.lap_time_s, 3) if lap.finished else "refused" if lap.refused else "DNF"
 
 
 def _excursion(lap: LapResult) -> str:
     return _metres(lap.off_track_max_m) if lap.off_track_samples else "–"
 
 
-def _off_track_ms(lap: LapResult) -> str:
-    return _decimals(lap.off_track_ms, 0)
-
-
-def _ratio(lap: LapResult, number: int) -> str:
-    ratios = lap.limit_ratios or []
-    return _decimals(ratios[number] if number < len(ratios) else None, 3)
-
-
-def _flying_ratio(lap: LapResult) -> str:
-    return _decimals(min((lap.limit_ratios or [])[1:], default=None), 3)
+def _ratio(ratios: list[float] | None, laps: slice) -> str:
+    """The smallest of some laps' ratios to the limit."""
+    return _decimals(min((ratios or [])[laps], default=None), 3)
 
 
 def _lateral(lap: LapResult) -> str:
@@ -75,54 +63,37 @@ def _slip(lap: LapResult) -> str:
     return "–" if lap.slip_max_rad is None else f"{math.degrees(lap.slip_max_rad):.0f}"
 
 
+def _solve(name: str) -> Callable[[LapResult], str]:
+    return lambda lap: _decimals(getattr(lap.solve_us, name, None), 0)
+
+
 COLUMNS: Final = (
     Column("controller", "", lambda lap: lap.name, "name of the controller", number=False),
     Column("lap", "s", _first_lap, "first lap, from standstill; DNF: did not finish one; "
-        "refused: the controller refused its weights, and was not driven"),
+           "refused: the controller refused its weights, and was not driven"),
     Column("flying", "s", lambda lap: _decimals(lap.flying_lap_time_s, 3), "best later lap"),
-    Column(
-        "lap / limit", "", lambda lap: _ratio(lap, 0),
-        "first lap over the fastest that the car can drive from standstill", narrow=False,
-    ),
-    Column(
-        "flying / limit", "", _flying_ratio,
-        "best later lap over the fastest that the car can drive", narrow=False,
-    ),
-    Column(
-        "off track", "", lambda lap: str(lap.off_track_samples),
-        "samples with the centre of gravity off the track",
-    ),
-    Column(
-        "off track", "ms", _off_track_ms,
-        "the same each millisecond, between the samples; –: not the built-in car",
-        narrow=False,
-    ),
+    Column("lap / limit", "", lambda lap: _ratio(lap.limit_ratios, slice(1)),
+           "first lap over the fastest that the car can drive from standstill", narrow=False),
+    Column("flying / limit", "", lambda lap: _ratio(lap.limit_ratios, slice(1, None)),
+           "best later lap over the fastest that the car can drive", narrow=False),
+    Column("off track", "", lambda lap: str(lap.off_track_samples),
+           "samples with the centre of gravity off the track"),
+    Column("off track", "ms", lambda lap: _decimals(lap.off_track_ms, 0),
+           "the same each millisecond, between the samples; –: not the built-in car", narrow=False),
     Column("deepest", "m", _excursion, "largest distance off the track"),
-    Column(
-        "dev mean", "m", lambda lap: _metres(lap.deviation_mean_m),
-        "mean distance from the racing line",
-    ),
-    Column(
-        "dev max", "m", lambda lap: _metres(lap.deviation_max_m),
-        "largest distance from the racing line",
-    ),
-    Column(
-        "lateral", "g", _lateral, "largest acceleration across the way",
-        narrow=False,
-    ),
-    Column(
-        "slip", "°", _slip, "largest angle between the car's axis and its velocity",
-        narrow=False,
-    ),
+    Column("dev mean", "m", lambda lap: _metres(lap.deviation_mean_m),
+           "mean distance from the racing line"),
+    Column("dev max", "m", lambda lap: _metres(lap.deviation_max_m),
+           "largest distance from the racing line"),
+    Column("lateral", "g", _lateral, "largest acceleration across the way", narrow=False),
+    Column("slip", "°", _slip, "largest angle between the car's axis and its velocity",
+           narrow=False),
     Column("step p50", "µs", _solve("p50"), "median execution time of the control step"),
     Column("step p99", "µs", _solve("p99"), "99th percentile of the same"),
     Column("step max", "µs", _solve("max"), "largest of the same"),
     Column("fall-backs", "", lambda lap: str(lap.fallbacks), "cycles that the fallback drove"),
-    Column(
-        "weights", "", lambda lap: lap.weights_version or "–",
-        "version of the residual's weights", number=False,
-        narrow=False,
-    ),
+    Column("weights", "", lambda lap: lap.weights_version or "–",
+           "version of the residual's weights", number=False, narrow=False),
 )  # fmt: skip
 """The result table's columns; the report shows the same cells."""
 
@@ -202,7 +173,7 @@ def _print_limit(result: RaceResult, console: Console) -> None:
     for lap in result.laps:
         ratios = " ".join(f"{ratio:.3f}" for ratio in lap.limit_ratios or ()) or "–"
         deepest = _metres(lap.off_track_ms_max_m) if lap.off_track_ms else "–"
-        table.add_row(lap.name, ratios, _off_track_ms(lap), deepest)
+        table.add_row(lap.name, ratios, _decimals(lap.off_track_ms, 0), deepest)
     console.print(table)
 
 
@@ -248,15 +219,16 @@ def _print_published(result: RaceResult, console: Console) -> None:
         "controller", "paper\nlap s", "here\nlap s", "paper\noff track / m", "here\noff track / m"
     )
     for lap in laps:
-        table.add_row(lap.controller, lap.paper_lap, lap.our_lap, lap.paper_off, lap.our_off)
+        names = "controller", "paper_lap", "our_lap", "paper_off", "our_off"
+        table.add_row(*(lap[name] for name in names))
     console.print(table)
     if not outputs:
         return
     rmse = "RMSE (without GP) · R²"
     table = plain_table("output", "GP of", f"paper\n{rmse}", f"here\n{rmse}", left=2)
     for row in outputs:
-        table.add_row(row.output, "bayesrace", row.paper, row.ours)
-        table.add_row("", "updated", row.paper_updated, row.ours_updated)
+        table.add_row(row["output"], "bayesrace", row["paper"], row["ours"])
+        table.add_row("", "updated", row["paper_updated"], row["ours_updated"])
     console.print(table)
 
 
