@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, get_args
 if TYPE_CHECKING:
     from pydantic import ValidationError
 
-__all__ = ["InputError", "fault_in_words", "faults_in"]
+__all__ = ["InputError", "faults_in"]
 
 _KINDS: Final = {
     "int": "a whole number", "float": "a number", "finite": "a finite number",
@@ -38,7 +38,9 @@ def faults_in(
     model, whose fields are named and explained. ``tags``: of unions, which are no part of a place.
     ``names``: of places that the user knows by others, such as options.
     """
-    return "; ".join(_fault(one, whole, form, tags, names or {}) for one in error.errors())
+    follow = "default_factory_not_called"  # values derived from those that have faults
+    faults = (one for one in error.errors() if one["type"] != follow)
+    return "; ".join(_fault(one, whole, form, tags, names or {}) for one in faults)
 
 
 def _fault(one: Any, whole: str, form: Any, tags: Collection[str], names: Mapping[str, str]) -> str:
@@ -50,17 +52,17 @@ def _fault(one: Any, whole: str, form: Any, tags: Collection[str], names: Mappin
     meaning = getattr(fields.get(loc[-1]) if loc else None, "description", None)
     about = f" ({meaning})" if meaning else ""
     if one["type"] == "value_error":  # our own words
-        return f"{place}: {fault_in_words(one)}"
+        return f"{place}: {_in_words(one)}"
     if one["type"] == "missing":
         return f"{place} is missing: add it{about}"
     if one["type"] == "extra_forbidden":
         return f"unknown setting '{place}': {_instead(str(loc[-1]), fields)}"
     value = repr(one["input"])
     value = value if len(value) <= 40 else f"{value[:39]}…"
-    return f"{place}{f' = {value}' if loc else ''}: {fault_in_words(one)}{about}"
+    return f"{place}{f' = {value}' if loc else ''}: {_in_words(one)}{about}"
 
 
-def fault_in_words(one: Any) -> str:
+def _in_words(one: Any) -> str:
     """The fault that one of pydantic's errors describes, in our words."""
     kind = next((words for kind, words in _KINDS.items() if one["type"].startswith(kind)), None)
     if kind is not None:

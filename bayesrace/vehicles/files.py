@@ -6,16 +6,15 @@ of. Numbers are in SI units; their names, bounds and meanings are those of
 :class:`~bayesrace.vehicles.parameters.CarParameters`.
 """
 
-import re
-from collections.abc import Mapping
+from collections.abc import Collection
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from pydantic import BaseModel, BeforeValidator, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError, create_model
 
 from bayesrace.defaults import DEFAULT_CAR
-from bayesrace.errors import InputError, fault_in_words
+from bayesrace.errors import InputError, faults_in
 from bayesrace.files import parse_toml, read_text, write_whole
 from bayesrace.option import Option
 from bayesrace.vehicles.parameters import CarParameters
@@ -52,6 +51,8 @@ MODELS: Final[dict[str, dict[str, type[Part]]]] = {
 """Section with a ``model``, a field of CarParameters as a whole, to what each model holds."""
 
 _ORDER: Final = ("geometry", "tyres", "drive", "limits", "tracks", "learning")
+
+_TAGS: Final = frozenset(model for models in MODELS.values() for model in models)
 
 _FOLDER: Final = Path(__file__).resolve().parents[1] / "cars"
 
@@ -107,7 +108,8 @@ def described_car(description: object) -> CarParameters:
             return CarParameters.model_validate_json(description)
         return CarParameters.model_validate(description)
     except ValidationError as error:
-        raise InputError(f"the car described there is unusable: {_faults(error)}") from None
+        faults = faults_in(error, "the car", CarParameters, _TAGS)
+    raise InputError(f"the car described there is unusable: {faults}")
 
 
 def car_text(car: CarParameters) -> str:
@@ -131,103 +133,48 @@ CarSetting = Annotated[
 def read_car(path: Path | str) -> CarParameters:
     """The car in a TOML file.
 
-    Raises InputError, one line that names file, field, value, unit and remedy of every fault.
+    Raises InputError, one line that names file, field, value and meaning of every fault.
     """
     path = Path(path)
     text = read_text(path, "the car's file", f"{_REMEDY}; built-in cars have no suffix")
     content = parse_toml(text, path, _REMEDY)
+    form: Any = _form()
     try:
-        return CarParameters.model_validate(_flat(content))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+        for section, models in MODELS.items():
+            _check_model(section, models, content.get(section))
+        values = form.model_validate(content).model_dump(exclude_unset=True)
+        for section in SECTIONS:
+            values |= values.pop(section, {})
+        form = CarParameters
+        return CarParameters.model_validate(values)
     except ValidationError as error:
-        raise InputError(f"{path}: {_faults(error)}") from None
+        faults = faults_in(error, "the file", form, _TAGS)
+    except InputError as error:
+        faults = str(error)
+    raise InputError(f"{path}: {faults}")
 
 
-def _flat(content: Mapping[str, Any]) -> dict[str, Any]:
-    """The file's values by the names of CarParameters."""
-    _only(content, ("name", *_ORDER, "tuning"), "")
-    values = {name: content[name] for name in ("name", "tuning") if name in content}
-    for section in _ORDER:
-        given = content.get(section, {})
-        if not isinstance(given, dict):
-            raise InputError(f"{section} = {given!r} is no section; write [{section}]")
-        if section in MODELS:
-            _check_model(section, given)
-            values[section] = given
-        else:
-            _only(given, SECTIONS[section], section)
-            values |= given
-    return values
+@cache
+def _form() -> type[Part]:
+    """A car's file; its tuning is checked with the whole car, whose size it depends on."""
+    fields: dict[str, Any] = {
+        name: (field.annotation, field) for name, field in CarParameters.model_fields.items()
+    }
+    form = {name: fields[name] for name in ("name", *MODELS)}
+    for section, names in SECTIONS.items():
+        model = create_model(section, __base__=Part, **{name: fields[name] for name in names})
+        form[section] = model, Field({}, validate_default=True)
+    return create_model("car", __base__=Part, tuning=(dict[str, Any], {}), **form)
 
 
-def _check_model(section: str, given: Mapping[str, Any]) -> None:
-    models, chosen = MODELS[section], given.get("model")
-    if not isinstance(chosen, str) or chosen not in models:
+def _check_model(section: str, models: Collection[str], given: Any) -> None:
+    chosen = given.get("model") if isinstance(given, dict) else None
+    if chosen not in list(models):
         found = "is missing" if chosen is None else f"= {chosen!r} is unknown"
         raise InputError(
-            f"{section}.model {found}; write model = "
-            f"{' or '.join(repr(name) for name in models)} in [{section}]"
+            f"{section}.model {found}; write model = {' or '.join(map(repr, models))} in "
+            f"[{section}]"
         )
-    _only(given, tuple(models[chosen].model_fields), section)
-
-
-def _only(given: Mapping[str, Any], names: tuple[str, ...], section: str) -> None:
-    for name, value in given.items():
-        if name not in names:
-            place = f"{section}.{name}" if section else name
-            where = f"[{section}]" if section else "a car's file"
-            raise InputError(
-                f"{place} = {str(value)[:40]} is unknown; {where} has {', '.join(names)}"
-            )
-
-
-def _faults(error: ValidationError) -> str:
-    """All faults in one line, by the places of the file."""
-    follow = "default_factory_not_called"  # values derived from those that have faults
-    return "; ".join(_fault(one) for one in error.errors() if one["type"] != follow)
-
-
-def _fault(one: Any) -> str:
-    full = [str(part) for part in one["loc"]]
-    loc = [full[0], *full[2:]] if full[0] in MODELS else full  # without the name of the model
-    section = next((name for name, fields in SECTIONS.items() if loc[0] in fields), "")
-    place = ".".join([*([section] if section else []), *loc])
-    field = _field(full)
-    text = (field.description or "") if field is not None else ""
-    unit = re.search(r" \[([^]]*)\]$", text)
-    meaning = text[: unit.start()] if unit else text
-    units = "" if unit is None or unit[1] == "-" else f" {unit[1]}"
-    table = ".".join([*([section] if section else []), *loc[:-1]])
-    where = f"[{table}]" if table else "the first lines"
-    if one["type"] == "missing":
-        in_unit = f" in {units.strip()}" if units else ""
-        return f"{place} is missing: {meaning}; add {loc[-1]} = NUMBER{in_unit} to {where}"
-    if one["type"] == "extra_forbidden":
-        known = _field(full[:-1]) if len(full) > 1 else None
-        form: Any = known.annotation if known is not None else None
-        names = ", ".join(form.model_fields) if _is_model(form) else ""
-        return f"{place} = {str(one['input'])[:40]} is unknown; {where} has {names}"
-    value = str(one["input"])[:40]
-    return f"{place} = {value}{units}: {fault_in_words(one)}; correct it in {where} ({meaning})"
-
-
-def _is_model(form: Any) -> bool:
-    return isinstance(form, type) and issubclass(form, BaseModel)
-
-
-def _field(loc: list[str]) -> Any:
-    """The field of CarParameters, or below it, at a place; None for one that it does not have."""
-    form: Any = CarParameters
-    field = None
-    if loc[0] in MODELS and len(loc) > 1:
-        form, loc = MODELS[loc[0]].get(loc[1]), loc[2:]
-    for part in loc:
-        if not _is_model(form) or part not in form.model_fields:
-            return None
-        field = form.model_fields[part]
-        form = field.annotation
-    return field
 
 
 def write_car(path: Path | str, car: CarParameters) -> None:
