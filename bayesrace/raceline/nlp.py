@@ -90,19 +90,26 @@ class Piece:
         sigma, lam = ca.SX.sym("sigma"), ca.SX.sym("lam", self.g.numel())
         jacobian = ca.jacobian(self.g, self.w)
         hessian, _ = ca.hessian(sigma * self.cost + ca.dot(lam, self.g), self.w)
-        first = ca.Function("first", [self.w, self.p], [self.cost, self.g, jacobian])
-        second = ca.Function("second", [self.w, self.p, sigma, lam], [hessian])
+
         # w of all places is chosen @ x: with it, blocks on the diagonal become derivatives by x.
         rows, columns = list(range(places * n)), self.index.ravel().tolist()
         chosen = ca.DM(ca.Sparsity.triplet(places * n, x.numel(), rows, columns), 1.0)
-        values = ca.reshape(chosen @ x, n, places), ca.DM(self.numbers.T)
-        multipliers = ca.repmat(lam_f, 1, places), ca.reshape(lam_g, -1, places)
-        cost, g, slopes = first.map(places)(*values)
-        bends = second.map(places)(*values, *multipliers)
-        slopes, bends = (
-            ca.MX(ca.diagcat(*[block.sparsity()] * places), ca.vec(entries.nz[:]))
-            for block, entries in ((jacobian, slopes), (hessian, bends))
-        )
+        symbols = [self.w, self.p, sigma, lam]
+        values = [ca.reshape(chosen @ x, n, places), ca.DM(self.numbers.T)]
+        values += [ca.repmat(lam_f, 1, places), ca.reshape(lam_g, -1, places)]
+
+        def everywhere(count: int, *expressions: Any) -> Any:
+            """The expressions, of the first ``count`` symbols, at all places."""
+            function = ca.Function("piece", symbols[:count], expressions)
+            return function.map(places)(*values[:count])
+
+        def blocks(count: int, matrix: Any) -> Any:
+            """The matrices of all places on the diagonal of one."""
+            entries = ca.vec(everywhere(count, matrix).nz[:])
+            return ca.MX(ca.diagcat(*[matrix.sparsity()] * places), entries)
+
+        cost, g = everywhere(2, self.cost, self.g)
+        slopes, bends = blocks(2, jacobian), blocks(4, hessian)
         return ca.sum2(cost), ca.vec(g), slopes @ chosen, chosen.T @ bends @ chosen
 
 
