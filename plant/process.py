@@ -146,9 +146,9 @@ class PlantProcess:
             return f"{count} controllers drive car '{self.name}'; end all but one"
         try:
             self._run = Run(
-                message,
-                self._simulator,
-                self.inbox,
+                request=message,
+                simulator=self._simulator,
+                inbox=self.inbox,
                 states=self._states,
                 truths=self._truths,
                 decoder=self._decoder,

@@ -51,48 +51,36 @@ class _Waiting(NamedTuple):
     actuation: Actuation
 
 
+@dataclass(eq=False, kw_only=True)
 class Run:
-    """Executes one accepted request.
+    """Executes one accepted request."""
 
-    ``react`` handles what is neither an actuation nor the controller's going (requests, signals);
-    what it returns, if anything, ends the run. ``beat``, called once a period, does so, too.
-    """
+    request: RunRequest
+    simulator: Vehicle
+    inbox: Inbox
+    states: Publisher[State]
+    truths: Publisher[Truth]
+    decoder: Decoder[Actuation]
+    counters: RunCounters
+    numbering: Numbering
+    react: Callable[[Item], End | None]
+    """Handles what is neither an actuation nor the controller's going (requests, signals); what it
+    returns, if anything, ends the run."""
+    beat: Callable[[], End | None]
+    """Called once a period; what it returns ends the run, too."""
+    suspended: Callable[[float], None]
+    """Called when the process has not run for so many seconds in real time."""
+    epoch: int
+    delay_s: float = 0.0
+    """Added to states and to actuations."""
+    sensors: Sensors | None = None
+    """Exact without."""
+    takes_commands: bool = True
+    """Actuations count; else the car brakes, or in lockstep the run ends for want of them."""
 
-    def __init__(
-        self,
-        request: RunRequest,
-        simulator: Vehicle,
-        inbox: Inbox,
-        *,
-        states: Publisher[State],
-        truths: Publisher[Truth],
-        decoder: Decoder[Actuation],
-        counters: RunCounters,
-        numbering: Numbering,
-        react: Callable[[Item], End | None],
-        beat: Callable[[], End | None],
-        suspended: Callable[[float], None],
-        epoch: int,
-        delay_s: float = 0.0,
-        sensors: Sensors | None = None,
-    ) -> None:
-        """``suspended`` is called when the process has not run for so many seconds in real time.
-        ``delay_s``: added to states and actuations alike. ``sensors``: exact without."""
-        self.request = request
-        self._car = CarRun(request, simulator, epoch, sensors, 2 * delay_s)
-        self._epoch = epoch
-        self._delay_ns = round(delay_s * 1e9)
-        self._simulator = simulator
-        self._inbox = inbox
-        self._states, self._truths = states, truths
-        self._decoder = decoder
-        self._counters = counters
-        self._react = react
-        self._beat = beat
-        self._suspended = suspended
-        self._numbering = numbering
-        self.takes_commands = True
-        """Actuations count; else the car brakes, or in lockstep the run ends for want of them."""
+    def __post_init__(self) -> None:
+        self._car = CarRun(self.request, self.simulator, self.epoch, self.sensors, 2 * self.delay_s)
+        self._delay_ns = round(self.delay_s * 1e9)
         # In real time:
         self._outbox: deque[tuple[int, State, tuple[float, ...]]] = deque()
         self._sampled_ns: dict[int, int] = {}
@@ -114,19 +102,19 @@ class Run:
     def execute(self) -> End:
         """Drive until something ends the run."""
         if self.request.lockstep:
-            self._inbox.spin_s = LOCKSTEP_SPIN_S
+            self.inbox.spin_s = LOCKSTEP_SPIN_S
             try:
-                first = self._states.next_seq
-                return drive_lockstep(self._car, first, self._exchange, self._beat)
+                first = self.states.next_seq
+                return drive_lockstep(self._car, first, self._exchange, self.beat)
             finally:
-                self._inbox.spin_s = 0.0
-        with self._inbox.stamped():
+                self.inbox.spin_s = 0.0
+        with self.inbox.stamped():
             return self._real_time()
 
     def _send(self, state: State, x: tuple[float, ...]) -> None:
         """The truth goes second: it must not delay the measurement."""
-        self._states.put(state, lockstep=state.lockstep)
-        self._truths.put(truth_behind(state, x), lockstep=state.lockstep)
+        self.states.put(state, lockstep=state.lockstep)
+        self.truths.put(truth_behind(state, x), lockstep=state.lockstep)
 
     # Lockstep ----------------------------------------------------------------------------------
 
@@ -140,47 +128,47 @@ class Run:
         deadline = time.monotonic() + self.request.actuation_timeout_s
         run = self.request.run
         while True:
-            item = self._inbox.get(deadline - time.monotonic())
+            item = self.inbox.get(deadline - time.monotonic())
             if item is None:
                 return self._timed_out(seq)
             if item.kind is Kind.MESSAGE:
                 actuation: Actuation | None = item.value
                 if actuation is None or item.name != ACTUATION.name:
                     continue
-                self._numbering.note(actuation.seq)
+                self.numbering.note(actuation.seq)
                 answered = (actuation.epoch, actuation.run, actuation.state_seq)
-                if self.takes_commands and answered == (self._epoch, run, seq):
+                if self.takes_commands and answered == (self.epoch, run, seq):
                     return actuation.u
-                self._counters.stale += 1
+                self.counters.stale += 1
             elif item.kind is Kind.GONE and item.name == "controller":
                 return End("controller_lost", "the controller vanished: killed or unreachable")
-            elif (end := self._react(item)) is not None:
+            elif (end := self.react(item)) is not None:
                 return end
 
     def _timed_out(self, seq: int) -> End:
         text = f"no actuation for state {seq} within {self.request.actuation_timeout_s:g} s"
-        if self._decoder.last_reason:
-            text += f"; last refused message: {self._decoder.last_reason}"
+        if self.decoder.last_reason:
+            text += f"; last refused message: {self.decoder.last_reason}"
         return End("actuation_timeout", text)
 
     # Free-running ------------------------------------------------------------------------------
 
     def _real_time(self) -> End:
-        period_ns = round(self._simulator.step_s * 1e9)
-        seq = self._states.next_seq
+        period_ns = round(self.simulator.step_s * 1e9)
+        seq = self.states.next_seq
         first = self._car.sample(seq)
         start_ns, late_ns = first[0].source_time_ns, 0
         self._enqueue(*first)
         while True:
-            begin_ns = start_ns + self._simulator.steps * period_ns
+            begin_ns = start_ns + self.simulator.steps * period_ns
             self._sleep_and_send(begin_ns + period_ns)
             before_ns, late_ns = late_ns, time.monotonic_ns() - begin_ns - period_ns
             if late_ns - before_ns > SUSPENDED_S * 1e9:
                 # Not to be made up for: nobody could have driven the car meanwhile.
-                self._counters.suspended += 1
-                self._suspended(late_ns * 1e-9)
+                self.counters.suspended += 1
+                self.suspended(late_ns * 1e-9)
                 start_ns, begin_ns, late_ns = start_ns + late_ns, begin_ns + late_ns, 0
-            self._counters.overruns += late_ns > period_ns
+            self.counters.overruns += late_ns > period_ns
             end = self._receive()
             if end is not None:
                 return end
@@ -194,7 +182,7 @@ class Run:
                 if self._outbox:
                     self._sleep_and_send(self._outbox[-1][0])
                 return end
-            if (end := self._beat()) is not None:
+            if (end := self.beat()) is not None:
                 return end
 
     def _enqueue(self, state: State, x: tuple[float, ...]) -> None:
@@ -216,30 +204,30 @@ class Run:
     def _receive(self) -> End | None:
         """Takes what has arrived by now, and no more: requests without end must not hold up the
         car. Returns what ends the run, if anything."""
-        for _ in range(self._inbox.queued):
-            item = self._inbox.get()
+        for _ in range(self.inbox.queued):
+            item = self.inbox.get()
             if item is None:
                 break
             if item.kind is Kind.MESSAGE:
                 actuation = item.value
                 if actuation is None:
                     continue
-                mine = (actuation.epoch, actuation.run) == (self._epoch, self.request.run)
+                mine = (actuation.epoch, actuation.run) == (self.epoch, self.request.run)
                 if item.name != ACTUATION.name:
                     self._braking = actuation if mine and self.takes_commands else self._braking
                     continue
-                self._numbering.note(actuation.seq)
+                self.numbering.note(actuation.seq)
                 # one from the future would never grow old, and every later one would be overtaken
-                ahead = actuation.decided_at_s > self._simulator.time_s + 2 * self._simulator.step_s
+                ahead = actuation.decided_at_s > self.simulator.time_s + 2 * self.simulator.step_s
                 known = actuation.state_seq in self._sampled_ns
                 if not self.takes_commands or not mine or ahead or not known:
-                    self._counters.stale += 1
+                    self.counters.stale += 1
                     continue
                 waiting = _Waiting(
-                    item.received_ns + self._delay_ns, self._numbering.received, actuation
+                    item.received_ns + self._delay_ns, self.numbering.received, actuation
                 )
                 heapq.heappush(self._waiting, waiting)
-            elif (end := self._react(item)) is not None:
+            elif (end := self.react(item)) is not None:
                 return end
         return None
 
@@ -247,7 +235,7 @@ class Run:
         self, begin_ns: int, end_ns: int, seq: int
     ) -> tuple[tuple[float, ...], End | None]:
         """Drive one period of zero-order hold: ``State.actuation_delays``, and a fault if any."""
-        simulator = self._simulator
+        simulator = self.simulator
         substep_ns = simulator.step_s * 1e9 / simulator.substeps
         commands: list[tuple[int, Command]] = []
         delays: list[float] = []
@@ -256,7 +244,7 @@ class Run:
             acts_ns, _, new = heapq.heappop(self._waiting)
             arrival_s = (acts_ns - self._sampled_ns.get(new.state_seq, acts_ns)) * 1e-9
             if self._held is not None and new.decided_at_s <= self._held.decided_at_s:
-                self._counters.stale += 1
+                self.counters.stale += 1
                 delays += (float(new.state_seq), arrival_s, -1.0)
                 continue
             # It acts from the first substep that begins after its arrival.
@@ -277,7 +265,7 @@ class Run:
         except FmuFault as fault:
             end = fault_end(fault)
         if self._held is None or self._held.state_seq < seq:
-            self._counters.late += 1
+            self.counters.late += 1
         return tuple(delays[: 3 * _MOST_DELAYS]), end
 
     def _fresh(self, substep: int) -> Command:
@@ -285,7 +273,7 @@ class Run:
         there is none the held command for a while, or None: brake."""
         if self._held is None:
             return None
-        simulator = self._simulator
+        simulator = self.simulator
         now_s = simulator.time_s + substep * simulator.step_s / simulator.substeps
         overdue_s = _OVERDUE * max(self._interval_s, simulator.step_s)
         if now_s - self._held_since_s <= overdue_s:

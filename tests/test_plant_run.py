@@ -109,7 +109,8 @@ def execute(
         actuation_timeout_s=0.1,
     )
     run = Run(
-        request, simulator, cast(Inbox, controller), states=cast(Publisher[State], controller),
+        request=request, simulator=simulator, inbox=cast(Inbox, controller),
+        states=cast(Publisher[State], controller),
         truths=cast(Publisher[Truth], controller), decoder=Decoder(Actuation), counters=counters,
         numbering=Numbering(), react=controller.ask_again, beat=lambda: None, epoch=EPOCH,
         suspended=suspensions.append, delay_s=delay_s,
