@@ -176,9 +176,8 @@ def inspect(
     """Print an FMU's variables; write a map for 'bayesrace plant --fmu' to fill in."""
     from operation.terminal.fmu_table import FmuTable
     from operation.terminal.terminal import Terminal
+    from plant.fmu.inspection import blank_map, platforms
     from plant.fmu.inspection import inspect as read
-    from plant.fmu.inspection import platforms
-    from plant.fmu.template import blank_map
 
     description = read(file)
     Terminal().print(FmuTable(description, platforms(file), all_=every))
