@@ -157,13 +157,10 @@ class Target:
         mean, sigma = posterior.predict_without(self.folds[rows], self.z[tests], own)
         return PredictionErrors(self.y[tests] - mean, sigma)
 
-    def calibrated(self, errors: PredictionErrors) -> PredictionErrors:
-        """Errors of :meth:`errors_from`, each fold's variances scaled by those of the others."""
-        return errors.calibrated(self.folds[self.tests])
-
     def metrics(self, errors: PredictionErrors) -> dict[str, float]:
-        """The scores of :meth:`errors_from`, :meth:`calibrated`, in SI units."""
-        return self.calibrated(errors).metrics(self.y[self.tests], self.y_mean, self.y_scale)
+        """Scores of :meth:`errors_from` in SI units, each fold's variances scaled by the others."""
+        held = errors.calibrated(self.folds[self.tests])
+        return held.metrics(self.y[self.tests], self.y_mean, self.y_scale)
 
     def choose_kernel(self, fits: Sequence[Fit]) -> tuple[Fit, list[KernelScore]]:
         """The kernel of largest held-out log density, of fits with one kernel each."""
