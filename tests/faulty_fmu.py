@@ -77,10 +77,9 @@ def faulty_fmu(
     platform: str = "",
 ) -> Path:
     """Packs the library into an FMU; the parameters ``mode`` and ``at_s`` say what goes wrong."""
-    describe = _description_3 if version == 3 else _description_2
     folder = platform or (fmpy.platform_tuple if version == 3 else fmpy.platform)
     with zipfile.ZipFile(out, "w") as archive:
-        archive.writestr("modelDescription.xml", describe(guid, attributes))
+        archive.writestr("modelDescription.xml", _description(version, guid, attributes))
         archive.write(library, f"binaries/{folder}/faulty{fmpy.sharedLibraryExtension}")
     return out
 
@@ -108,67 +107,52 @@ def folder_of(process: SpawnProcess) -> Path:
     return Path(f"/proc/{process.pid}/cwd").readlink()
 
 
-def _description_2(guid: str, attributes: str) -> str:
-    fixed = 'causality="parameter" variability="fixed"'
-    discrete = 'variability="discrete"'
-    variables = [
-        ("d", 'causality="input"', '<Real start="0"/>'),
-        ("delta_rate", 'causality="input"', '<Real start="0" unit="rad/s"/>'),
-        *((name, 'causality="output" initial="exact"', '<Real start="0"/>') for name in STATES),
-        ("at_s", fixed, '<Real start="0"/>'),
-        ("mode", fixed, '<Real start="0"/>'),
-        ("gear", f'causality="input" {discrete}', '<Integer start="0"/>'),
-        ("light", f'causality="input" {discrete}', '<Boolean start="false"/>'),
-        ("gear_read", 'causality="output"', "<Real/>"),
-        ("light_read", 'causality="output"', "<Real/>"),
-        ("label", fixed, '<String start=""/>'),
-        ("label_length", 'causality="output"', "<Real/>"),
-        ("instances", 'causality="output"', "<Real/>"),
-    ]
-    lines = "\n".join(
-        f'<ScalarVariable name="{name}" valueReference="{reference}" {how}>{kind}</ScalarVariable>'
-        for reference, (name, how, kind) in enumerate(variables)
-    )
-    return f"""<?xml version="1.0" encoding="UTF-8"?>
-<fmiModelDescription fmiVersion="2.0" modelName="faulty" guid="{guid}">
-<CoSimulation modelIdentifier="faulty" {attributes}/>
-<ModelVariables>
-{lines}
-</ModelVariables>
-<ModelStructure/>
-</fmiModelDescription>
-"""
+_REAL = ("Real", "Float64")
+_VARIABLES: Final[tuple[tuple[str, tuple[str, str], str, str | None], ...]] = (
+    ("d", _REAL, "input", "0"),
+    ("delta_rate", _REAL, "input", "0"),
+    *((name, _REAL, "output", "0") for name in STATES),
+    ("at_s", _REAL, "parameter", "0"),
+    ("mode", _REAL, "parameter", "0"),
+    ("gear", ("Integer", "UInt8"), "input", "0"),
+    ("light", ("Boolean", "Boolean"), "input", "false"),
+    ("gear_read", _REAL, "output", None),
+    ("light_read", ("Real", "Float32"), "output", None),
+    ("label", ("String", "String"), "parameter", ""),
+    ("label_length", _REAL, "output", None),
+    ("instances", _REAL, "output", None),
+    ("soft", ("", "Float32"), "parameter", "1"),
+    ("small", ("", "UInt8"), "parameter", "1"),
+)
+"""Name, types in FMI 2.0 and 3.0, causality and start value, in the order of value references."""
 
 
-def _description_3(guid: str, attributes: str) -> str:
-    variables = [
-        ("Float64", "d", 'causality="input" start="0"'),
-        ("Float64", "delta_rate", 'causality="input" start="0"'),
-        *(("Float64", name, 'causality="output" initial="exact" start="0"') for name in STATES),
-        ("Float64", "at_s", 'causality="parameter" start="0"'),
-        ("Float64", "mode", 'causality="parameter" start="0"'),
-        ("UInt8", "gear", 'causality="input" start="0"'),
-        ("Boolean", "light", 'causality="input" start="false"'),
-        ("Float64", "gear_read", 'causality="output"'),
-        ("Float32", "light_read", 'causality="output"'),
-        ("String", "label", 'causality="parameter"'),
-        ("Float64", "label_length", 'causality="output"'),
-        ("Float64", "instances", 'causality="output"'),
-        ("Float32", "soft", 'causality="parameter" start="1"'),
-        ("UInt8", "small", 'causality="parameter" start="1"'),
-    ]
-    lines = "\n".join(
-        f'<{kind} name="{name}" valueReference="{reference}" {how}/>'
-        if kind != "String"
-        else f'<{kind} name="{name}" valueReference="{reference}" {how}><Start value=""/></{kind}>'
-        for reference, (kind, name, how) in enumerate(variables)
-    )
+def _description(version: int, guid: str, attributes: str) -> str:
+    """The model description."""
+    lines = []
+    for reference, (name, kinds, causality, start) in enumerate(_VARIABLES):
+        kind = kinds[version - 2]
+        how = f'name="{name}" valueReference="{reference}" causality="{causality}"'
+        how += ' initial="exact"' * (causality == "output" and start is not None)
+        value = "" if start is None else f' start="{start}"'
+        if kind == "":
+            continue
+        if version == 2:
+            how += ' variability="fixed"' * (causality == "parameter")
+            how += ' variability="discrete"' * (kind in ("Integer", "Boolean"))
+            lines.append(f"<ScalarVariable {how}><{kind}{value}/></ScalarVariable>")
+        elif kind == "String":
+            lines.append(f'<{kind} {how}><Start value="{start}"/></{kind}>')
+        else:
+            lines.append(f"<{kind} {how}{value}/>")
+    if version == 3:
+        lines.append('<Float64 name="time" valueReference="99" causality="independent"/>')
+    token = "guid" if version == 2 else "instantiationToken"
     return f"""<?xml version="1.0" encoding="UTF-8"?>
-<fmiModelDescription fmiVersion="3.0" modelName="faulty" instantiationToken="{guid}">
+<fmiModelDescription fmiVersion="{version}.0" modelName="faulty" {token}="{guid}">
 <CoSimulation modelIdentifier="faulty" {attributes}/>
 <ModelVariables>
-<Float64 name="time" valueReference="99" causality="independent"/>
-{lines}
+{"".join(lines)}
 </ModelVariables>
 <ModelStructure/>
 </fmiModelDescription>
