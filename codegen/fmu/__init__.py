@@ -2,8 +2,8 @@
 
 In the order of their use: :mod:`.car` and :mod:`.controller` say what the FMU is, as a
 :class:`FmuDefinition` (:mod:`.definition`); :mod:`.build` writes its C around the hand-written
-files in ``native`` and compiles it; :mod:`.description` writes its XML; :func:`pack` makes the
-file (:mod:`.archive`), and :func:`exchange_weights` one with other weights.
+files in ``native`` and compiles it; :func:`pack` makes the file with its XML (:mod:`.archive`), and
+:func:`exchange_weights` one with other weights.
 
 In ``native``, ``fmu.h`` says what the C of a model implements; ``fmu.c`` and ``fmi2.c`` or
 ``fmi3.c`` are the same for every model.

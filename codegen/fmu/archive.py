@@ -1,4 +1,8 @@
-"""The FMU file: descriptions, sources that rebuild it, binaries, documentation, licences."""
+"""The FMU file: descriptions, sources that rebuild it, binaries, documentation, licences.
+
+The texts are those of the templates beside this module: the model description of FMI 2.0 and 3.0,
+the build description of FMI 3.0, the page of documentation.
+"""
 
 import re
 import shlex
@@ -6,14 +10,20 @@ import tempfile
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
+from functools import cache
 from importlib.metadata import distribution
+from math import isfinite
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
+
+import pint
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from bayesrace.errors import InputError
 from bayesrace.files import replacing
 from bayesrace.gp.weights import GpWeights
 from codegen.fmu.build import (
+    FLAGS,
     PLATFORMS,
     Platform,
     arguments,
@@ -24,13 +34,19 @@ from codegen.fmu.build import (
     sources_of,
     write_sources,
 )
-from codegen.fmu.definition import FmuDefinition
-from codegen.fmu.description import build_description, model_description, rendered
+from codegen.fmu.definition import FmuDefinition, Variable
 from codegen.host_files import HEAD, IDENTITY_BYTES, WEIGHTS_FILE, weights_file
 
-__all__ = ["Part", "exchange_weights", "licence_files", "pack", "third_parties"]
+__all__ = ["exchange_weights", "licence_files", "pack", "third_parties"]
 
 _LARGEST: Final = 1 << 30
+_TYPES: Final = {
+    2: {"real": "Real", "integer": "Integer", "boolean": "Boolean"},
+    3: {"real": "Float64", "integer": "Int32", "boolean": "Boolean"},
+}
+_BASE: Final = {"kilogram": "kg", "meter": "m", "second": "s", "radian": "rad"}
+
+_registry: Final[Any] = cache(pint.UnitRegistry)
 
 
 class Part(NamedTuple):
@@ -107,16 +123,106 @@ def licence_files(parts: Sequence[Part]) -> dict[str, bytes]:
     return {f"documentation/licenses/{name}": text.encode() for name, text in texts.items()}
 
 
+def _rendered(template: str, definition: FmuDefinition, **values: Any) -> bytes:
+    """A template's text with these values, escaped as XML and HTML need it."""
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent), autoescape=True,
+        undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    text = environment.get_template(f"{template}.j2").render(fmu=definition, **values)
+    return f"{text}\n".encode()
+
+
+def _model_description(definition: FmuDefinition, token: str, linked: Sequence[str]) -> bytes:
+    """``modelDescription.xml``; ``linked``: what the compiler is given."""
+    units = sorted({v.unit for v in definition.all_variables if v.unit is not None})
+    return _rendered(
+        "modelDescription.xml",
+        definition,
+        token=token,
+        files=[name for name in linked if name.endswith(".c")],
+        units={unit: _base_units(unit) for unit in units},
+        variables=[_described(definition, *one) for one in enumerate(definition.all_variables)],
+        structure=_structure(definition),
+    )
+
+
+def _build_description(definition: FmuDefinition, linked: Sequence[str]) -> bytes:
+    """``sources/buildDescription.xml`` of FMI 3.0."""
+    files, libraries = ([name for name in linked if name.endswith(end)] for end in (".c", ".a"))
+    flags = (*FLAGS, *definition.flags)
+    return _rendered(
+        "buildDescription.xml", definition, files=files, libraries=libraries, flags=flags
+    )
+
+
+def _base_units(unit: str) -> dict[str, int]:
+    """Exponents of kg, m, s, rad in a unit like ``N.s2/m2``; InputError if it has a factor."""
+    expression = re.sub(r"([a-z])(-?[0-9])", r"\1**\2", unit, flags=re.IGNORECASE)
+    base = _registry().Quantity(expression.replace(".", "*")).to_base_units()
+    if base.magnitude != 1:
+        raise InputError(f"unit '{unit}' is not made of kg, m, s and rad alone")
+    return {_BASE[name]: int(power) for name, power in base.unit_items()}
+
+
+def _number(value: float, kind: str) -> str:
+    if kind == "boolean":
+        return "true" if value else "false"
+    return str(int(value)) if kind == "integer" else repr(float(value))
+
+
+def _described(
+    definition: FmuDefinition, reference: int, variable: Variable
+) -> tuple[str, dict[str, Any], dict[str, Any]]:
+    """A variable's type, and its attributes: those of every type, and those of its own."""
+    common = {
+        "name": variable.name,
+        "valueReference": reference,
+        "description": variable.description,
+        "causality": variable.causality,
+        "variability": variable.variability,
+    }
+    if variable.causality not in ("input", "independent"):  # FMI gives these no 'initial'
+        common["initial"] = "calculated" if variable.start is None else "exact"
+    typed: dict[str, Any] = {"unit": variable.unit}  # what is None is left out
+    for name in ("min", "max", "nominal", "start"):
+        value = getattr(variable, name)
+        if value is not None and isfinite(value):
+            typed[name] = _number(value, variable.kind)
+    if variable.derivative_of is not None:
+        typed["derivative"] = definition.states.index(variable.derivative_of)
+    return _TYPES[definition.version][variable.kind], common, typed
+
+
+def _structure(definition: FmuDefinition) -> dict[str, list[dict[str, Any]]]:
+    """Unknowns and what they depend on: by index, from 1, in FMI 2.0, else by reference."""
+    two = definition.version == 2
+    place = {v.name: i for i, v in enumerate(definition.variables, start=int(two))}
+    outputs = [v for v in definition.variables if v.causality == "output"]
+    derivatives = [v for v in definition.variables if v.derivative_of is not None]
+    # before the run, calculated outputs are constants, derivatives may depend on all that is set
+    given = tuple(v.name for v in definition.variables if v.start is not None)
+
+    def row(unknown: Variable, known: Sequence[str] | None) -> dict[str, Any]:
+        dependencies = None if known is None else " ".join(str(place[name]) for name in known)
+        where = "index" if two else "valueReference"
+        return {where: place[unknown.name], "dependencies": dependencies}
+
+    return {
+        "Output": [row(v, v.dependencies) for v in outputs],
+        "ContinuousStateDerivative": [row(v, v.dependencies) for v in derivatives],
+        "InitialUnknown": [row(v, ()) for v in outputs if v.start is None]
+        + [row(v, given) for v in derivatives],
+    }
+
+
 def _page(definition: FmuDefinition, linked: Sequence[str], parts: Sequence[Part]) -> bytes:
     """``documentation/index.html``, with the one command that makes the Linux binary."""
     linux = PLATFORMS["x86_64-linux"]
     line = arguments(linux, linked, f"{definition.identifier}.so", definition.flags)
-    return rendered(
-        "index.html",
-        definition,
-        line=shlex.join(["cc", *line]),
-        folder=linux.folder(definition.version),
-        parts=parts,
+    folder = linux.folder(definition.version)
+    return _rendered(
+        "index.html", definition, line=shlex.join(["cc", *line]), folder=folder, parts=parts
     )
 
 
@@ -140,14 +246,14 @@ def pack(definition: FmuDefinition, out: Path, platforms: Sequence[str] | None =
     token, sources = sources_of(definition)
     linked = linked_files(sources)
     contents = {
-        "modelDescription.xml": model_description(definition, token, linked),
+        "modelDescription.xml": _model_description(definition, token, linked),
         "documentation/index.html": _page(definition, linked, parts),
         **licence_files(parts),
         **{f"sources/{name}": content for name, content in sources.items()},
         **{f"resources/{name}": content for name, content in definition.resources.items()},
     }
     if definition.version == 3:
-        contents["sources/buildDescription.xml"] = build_description(definition, linked)
+        contents["sources/buildDescription.xml"] = _build_description(definition, linked)
     with tempfile.TemporaryDirectory(prefix="fmu-") as temporary:
         folder = Path(temporary) / "sources"
         write_sources(sources, folder)
