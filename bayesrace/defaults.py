@@ -1,11 +1,33 @@
-"""Names that options have by default; a module of its own, so that ``--help`` needs no other."""
+"""Names that options have by default, and what of an option does not follow from its field of
+settings; a module of its own, so that ``--help`` needs no other.
 
+An :class:`Option` stands beside the field, as ``delay_s: Annotated[float, Option(unit="ms",
+per_unit=1000)]``; :mod:`operation.cli.declaration` makes options of fields.
+"""
+
+from dataclasses import dataclass
 from typing import Final
 
-__all__ = ["CONFIGURATION_VARIABLE", "DEFAULT_CAR"]
+__all__ = ["CONFIGURATION_VARIABLE", "DEFAULT_CAR", "Option"]
 
 CONFIGURATION_VARIABLE: Final = "BAYESRACE_CONFIG"
 """Environment variable that names the configuration."""
 
 DEFAULT_CAR: Final = "orca"
 """Name of the car that is meant where none is named."""
+
+
+@dataclass(frozen=True)
+class Option:
+    """What of an option does not follow from its field."""
+
+    flag: str = ""
+    """Without: the field's name, without its unit."""
+    metavar: str = ""
+    """Without: the unit, or what kind of value it is."""
+    unit: str = ""
+    """Unit on the command line, if that is not the field's."""
+    per_unit: float = 1
+    """So many of :attr:`unit` are one of the field's."""
+    default: str = ""
+    """As it would be typed, where the field's own default cannot be."""

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Final
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from bayesrace.option import Option
+from bayesrace.defaults import Option
 from bayesrace.vehicles import CarParameters
 
 __all__ = ["MpcSettings"]

@@ -1,28 +1,44 @@
 """Training data: a pure-pursuit drive of the car, logged as a race's drives are.
 
-It follows the racing line where that leaves room to the track's edges, and else a line made of it.
-A drive that leaves the track is driven again, slower.
+A racing line touches the edges of the track, and a driver that is disturbed on purpose, and slides,
+leaves it there. So the drive follows the racing line where that leaves room to the edges, and else
+a line made of it; a drive that leaves the track is driven again, slower.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
+from bayesrace.arrays import Floats
 from bayesrace.log import LogWriter
-from bayesrace.raceline import RaceLine
+from bayesrace.raceline import RaceLine, RaceLineSettings
+from bayesrace.raceline.nodes import timed_line
 from bayesrace.tracks import Track
+from bayesrace.tracks.spline import fit_arc_length
 from bayesrace.vehicles import CarParameters, car_text
-from controller.pure_pursuit import PurePursuit, PurePursuitSettings
+from controller.pure_pursuit import DrivingStyle, PurePursuit, PurePursuitSettings
 from controller.python_controller import PythonController
 from operation.closed_loop import ClosedLoop, Driven, built_in_car
-from operation.training_line import room_beside, training_line
 from plant.settings import SensorNoise
 from plant.vehicle import FmuFault, Vehicle
 
-__all__ = ["collect"]
+__all__ = ["collect", "drive_length_s", "room_beside", "training_line", "training_margin_m"]
 
 _ATTEMPTS: Final = 8
 _SLOWER: Final = 0.93
 """Speed of an attempt over that of the one before; that of the last is 0.6 times the style's."""
+_MOST: Final = 0.3
+"""Of a track's width: the most that the line keeps from each edge."""
+_LAPS: Final = 1.5
+"""Of the line, flying: the least length of a drive, which begins at rest and is slower."""
+_WAVE: Final = 0.4
+"""Amplitude of the weaving style, over the room that the line keeps ..."""
+_WAVELENGTH: Final = 32.0
+"""... and its wavelength in wheelbases."""
+_THINNED: Final = 4
+"""Points of the racing line to a node of a line made of it."""
 
 
 def collect(
@@ -69,3 +85,54 @@ def collect(
         if float(track.project_path(driven.x[:, :2]).off_track_m.max()) <= 0:
             break
     return driven
+
+
+def training_margin_m(track: Track, car: CarParameters, margin_m: float | None = None) -> float:
+    """Margin of a racing line that is made for a training drive; no less than ``margin_m``."""
+    narrowest_m = float(np.min(track.width_right_m + track.width_left_m))
+    room_m = min(car.tuning.pursuit.keep_m, _MOST * narrowest_m)
+    return max(room_m, car.width_m / 2 if margin_m is None else margin_m)
+
+
+def drive_length_s(car: CarParameters, line: RaceLine) -> float:
+    """Length of a training drive along a line, by default: a lap at least."""
+    return max(car.tuning.pursuit.drive_s, _LAPS * line.lap_time_s)
+
+
+def training_line(
+    track: Track, line: RaceLine, car: CarParameters, style: DrivingStyle
+) -> RaceLine:
+    """What a training drive follows: a racing line; where that is too near to the edges, the same
+    moved inwards; or one that weaves about it. No faster than friction and the given line allow.
+    """
+    near = track.project_path(line.xy_m)
+    keep_m = training_margin_m(track, car)
+    if -float(near.off_track_m.max()) < 0.95 * keep_m:
+        right, left = track.widths(near.s_m)
+        middle, half = (left - right) / 2, (left + right) / 2
+        outermost = float((np.abs(near.n_m - middle) / half).max())
+        share = (1 - keep_m / float(half.min())) / outermost
+        line = _moved(track, line, car, (share - 1) * (near.n_m - middle))
+    if style == "weave":
+        waves = max(1, round(line.length_m / (_WAVELENGTH * car.wheelbase_m)))
+        phase = 2 * np.pi * waves * line.s_m / line.length_m
+        line = _moved(track, line, car, _WAVE * keep_m * np.sin(phase))
+    return line
+
+
+def room_beside(track: Track, line: RaceLine) -> tuple[Floats, Floats]:
+    """Distances from the line's points to the right and to the left edge, (n,) each [m]."""
+    near = track.project_path(line.xy_m)
+    right, left = track.widths(near.s_m)
+    return right + near.n_m, left - near.n_m
+
+
+def _moved(track: Track, line: RaceLine, car: CarParameters, by_m: Floats) -> RaceLine:
+    """The line moved to the left by so much at each point (n,), with speeds for its bends."""
+    normal = track.normal(track.project_path(line.xy_m).s_m)
+    path = fit_arc_length((line.xy_m + by_m[:, None] * normal)[::_THINNED])
+    moved = timed_line(track.name, path, car, RaceLineSettings())
+    beside, s = (track.project_path(one.xy_m).s_m for one in (line, moved))
+    order = np.argsort(beside)
+    speeds = np.interp(s, beside[order], line.vx_mps[order], period=track.length_m)
+    return replace(moved, vx_mps=np.minimum(moved.vx_mps, speeds))

@@ -16,8 +16,8 @@ from bayesrace.cache import note_use
 from bayesrace.errors import InputError
 from bayesrace.limit import LimitSettings, known_limit, read_limit, write_limit
 from bayesrace.tracks import load_track
-from operation.processes import Child, child
 from operation.settings import RaceSettings
+from operation.system import Child, child
 
 __all__ = ["limits_beside", "limits_in"]
 

@@ -34,14 +34,14 @@ from learning.dataset import Dataset, concatenate
 from learning.logs import CYCLES, STATES, dataset_from_columns
 from learning.settings import Progress, TrainingSettings
 from operation.closed_loop import Driven
-from operation.collect import collect
+from operation.collect import collect, drive_length_s, training_margin_m
 from operation.settings import PreparationSettings
 from operation.terminal.progress import Stages
-from operation.training_line import drive_length_s, training_margin_m
 from plant.simulator import PLANT
 from plant.vehicle import open_vehicle
 
 __all__ = [
+    "SOURCES",
     "Prepared",
     "PreparedTrack",
     "Training",
@@ -55,28 +55,17 @@ __all__ = [
     "updated_weights",
 ]
 
-_WEIGHTS_SOURCES: Final = (
-    "bayesrace/vehicles",
-    "bayesrace/integrators.py",
-    "bayesrace/gp",
-    "learning",
-)
-_DRIVE_SOURCES: Final = (
-    "bayesrace/vehicles",
-    "bayesrace/integrators.py",
-    "bayesrace/log.py",
-    "bayesrace/messages",
-    "bayesrace/raceline",
-    "bayesrace/tracks",
-    "controller",
-    "controller/native",
-    "plant",
-    "plant/fmu",
-    "operation/closed_loop.py",
-    "operation/collect.py",
-    "operation/drive.py",
-    "operation/training_line.py",
-)
+SOURCES: Final = (
+    "bayesrace", "bayesrace/gp", "bayesrace/messages", "bayesrace/raceline", "bayesrace/tracks",
+    "bayesrace/vehicles", "controller", "controller/native", "learning", "plant", "plant/fmu",
+    "operation/closed_loop.py", "operation/collect.py", "operation/drive.py",
+)  # fmt: skip
+"""Our code that shapes a training drive and what is learned from it."""
+
+_SHAPES_A_DRIVE: Final = {
+    "pursuit", "seed", "noise", "delay_s", "start_speed_mps", "true_grip", "simulator",
+}  # fmt: skip
+"""Settings, beside the car, its line and how long it is driven."""
 
 _TRACK: Final = "race.csv"
 
@@ -210,31 +199,24 @@ def training_drive(
     """
     files = [path for path in (settings.fmu, settings.fmu_map) if path is not None]
     others = [] if settings.simulator == "equations" else [settings.simulator]
-    columns = "s_m", "x_m", "y_m", "vx_mps"
-    track = prepared.track
-    duration_s = settings.collect_s or drive_length_s(car, prepared.line)
+    track, line = prepared.track, prepared.line
+    duration_s = settings.collect_s or drive_length_s(car, line)
     identity = digest(
         [
-            track.name,
-            *(getattr(prepared.line, name).tobytes() for name in columns),
-            *(getattr(track, name).tobytes() for name in columns[1:3]),
-            track.width_right_m.tobytes(),
-            track.width_left_m.tobytes(),
+            track.identity,
+            *(column.tobytes() for column in (line.s_m, line.x_m, line.y_m, line.vx_mps)),
             car.model_dump_json(),
-            settings.true_car.model_dump_json(),
-            settings.pursuit.model_dump_json(),
-            str(settings.seed),
-            settings.noise.model_dump_json(),
-            f"{settings.delay_s!r} {duration_s!r} {settings.start_speed_mps!r} {len(files)}",
+            settings.model_dump_json(include=_SHAPES_A_DRIVE),
+            f"{duration_s!r} {len(files)}",
             *(read_whole(path, "the FMU or its map", _LARGEST_FMU) for path in files),
             cpu_identity(),
-            *software(_DRIVE_SOURCES, ("casadi", "mcap", "numpy", *others)),
+            *software(SOURCES, ("casadi", "mcap", "numpy", *others)),
         ]
     )
     path = cache_folder() / f"drive-{identity}.mcap"
 
     def make(partial: Path) -> None:
-        drive_for_training(settings, track, prepared.line, car, artefact, partial)
+        drive_for_training(settings, track, line, car, artefact, partial)
 
     def read(log: Path) -> Dataset:
         columns = LogColumns(log, {STATE: STATES, TELEMETRY: CYCLES}).read()
@@ -302,7 +284,7 @@ def trained_weights(
             settings.model_dump_json(exclude={"threads"}),
             b"" if initial is None else encode_weights(replace(initial, created_utc_ns=0)),
             cpu_identity(),
-            *software(_WEIGHTS_SOURCES, ("casadi", "numpy", "scipy")),
+            *software(SOURCES, ("casadi", "numpy", "scipy")),
         ]
     )
     path = cache_folder() / f"weights-{identity}.bin"

@@ -79,8 +79,7 @@ class _Race:
 
     def prepare(self) -> Prepared:
         """Everything made, or taken from the cache; copies in the run directory."""
-        fmu, fmu_map = self.fmu_files
-        settings = self.settings.model_copy(update={"fmu": fmu, "fmu_map": fmu_map})
+        settings = self.settings
         with _faults_named():
             prepared = prepare(settings, (settings.track,), self.stages, self.models, settings.line)
         if prepared.training is not None:
@@ -99,18 +98,21 @@ class _Race:
         return PreparedTrack(track.track, track.line, *files)
 
     def keep_fmu(self) -> None:
-        """Copies FMU and map, if there are any, into the run directory, and tries them."""
-        settings = self.settings
-        for source, target in zip((settings.fmu, settings.fmu_map), self.fmu_files, strict=True):
-            if source is not None and target is not None:
-                shutil.copyfile(source, target)
+        """Copies FMU and map, if there are any, into the run directory, and tries them there."""
+        settings, names = self.settings, {"fmu": FILES.fmu, "fmu_map": FILES.fmu_map}
+        given = {name: file for name in names if (file := getattr(settings, name)) is not None}
+        copies = {
+            name: Path(shutil.copyfile(file, self.out / names[name]))
+            for name, file in given.items()
+        }
+        self.settings = settings = settings.model_copy(update=copies)
         # An FMU that cannot be the car is reported now, not in half a minute.
-        with _faults_named():
-            tried = open_vehicle(
-                self.car, *self.fmu_files, 1 / PLANT.step_s, simulator=settings.simulator
-            )
-            with tried:
-                pass
+        files, rate_hz = (settings.fmu, settings.fmu_map), 1 / PLANT.step_s
+        with (
+            _faults_named(),
+            open_vehicle(self.car, *files, rate_hz, simulator=settings.simulator),
+        ):
+            pass
 
     @property
     def car_file(self) -> str:
@@ -118,19 +120,10 @@ class _Race:
         return str(self.out / FILES.car)
 
     @property
-    def fmu_files(self) -> tuple[Path | None, Path | None]:
-        """FMU and map in the run directory; None for what there is not."""
-        settings = self.settings
-        return (
-            None if settings.fmu is None else self.out / FILES.fmu,
-            None if settings.fmu_map is None else self.out / FILES.fmu_map,
-        )
-
-    @property
     def plant_options(self) -> list[str]:
         """Of ``bayesrace plant``."""
         settings = self.settings
-        files = zip(("--fmu", "--map"), self.fmu_files, strict=True)
+        files = ("--fmu", settings.fmu), ("--map", settings.fmu_map)
         noise = [("--noise", f"{name}={value!r}") for name, value in settings.noise if value]
         pairs = [
             ("--car", self.car_file), ("--simulator", settings.simulator),
@@ -259,7 +252,7 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> Recording:
 
 
 def _compare(this: _Race) -> Recording:
-    settings, out, stages = this.settings, this.out, this.stages
+    settings, out, stages = this.settings, this.out, this.stages  # as given, with no file copied
     this.keep_fmu()
     write_car(this.car_file, this.car)
     write_whole(out / FILES.settings, settings.model_dump_json(indent=1) + "\n")

@@ -5,8 +5,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from bayesrace.defaults import Option
 from bayesrace.integrators import PREDICTION, Discretisation
-from bayesrace.option import Option
 from bayesrace.raceline import RaceLineSettings
 from bayesrace.vehicles import CarParameters
 from codegen.settings import ProblemName

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from bayesrace.option import Option
+from bayesrace.defaults import Option
 from bayesrace.vehicles import CarSetting, default_car
 
 __all__ = ["CarSimulation", "SensorNoise", "SimulatorName"]

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Final
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
-from bayesrace.option import Option
+from bayesrace.defaults import Option
 from bayesrace.tracks import DEFAULT_RACE_TRACK
 from bayesrace.vehicles import CarSetting, default_car
 from codegen.settings import ProblemName

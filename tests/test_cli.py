@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from operation.processes import child
+from operation.system import child
 from tests.command_line import Cli, refused
 from tests.programs import environment, finish, run, start
 

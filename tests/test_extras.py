@@ -42,7 +42,7 @@ def test_the_controller_drives_with_its_own_extra_alone(
     with stages_on(Console(quiet=True)) as stages:
         files = prepare(PreparationSettings(), (str(peanut(tmp_path / "peanut.csv")),), stages)
     with started_system(DEFAULT_CAR, tmp_path) as system:
-        monkeypatch.setattr("operation.processes.RUN_MODULE", (python, "-P", "-m"))
+        monkeypatch.setattr("operation.system.RUN_MODULE", (python, "-P", "-m"))
         with system.controller(files.arguments):
             end = system.drive(files.first.track, RunPlan(1, "bayesrace", 1, 20.0, lockstep=True))
     assert end.data["reason"] == "laps"

@@ -20,10 +20,9 @@ from controller import pure_pursuit
 from controller.pure_pursuit import DrivingStyle, PurePursuitSettings
 from operation.analysis.race import analyse
 from operation.closed_loop import Driven, built_in_car
-from operation.collect import collect
+from operation.collect import collect, drive_length_s, training_line, training_margin_m
 from operation.report import write_report
 from operation.terminal.race_table import print_table
-from operation.training_line import drive_length_s, training_line, training_margin_m
 from tests.command_line import Cli
 from tests.conftest import offset_line
 from tests.synthetic_race import Drive, circle, write_race

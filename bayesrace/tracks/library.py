@@ -8,7 +8,7 @@ the first may be repeated at the end. tables.py has what all CSV files may look 
 import tomllib
 from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -20,12 +20,16 @@ from bayesrace.tracks.shapes import rounded_polygon, smooth
 from bayesrace.tracks.tables import read_table, write_table
 from bayesrace.tracks.track import Track, drop_repeated
 
+if TYPE_CHECKING:
+    from bayesrace.tracks.maps import RosMap
+
 __all__ = [
     "DEFAULT_RACE_TRACK",
     "DEFAULT_TRAINING_TRACK",
     "builtin_tracks",
     "default_car_width_m",
     "is_random_track",
+    "load_any",
     "load_track",
     "read_recentred",
     "read_smoothed",
@@ -95,6 +99,33 @@ def load_track(name_or_path: str | Path, car_width_m: float | None = None) -> Tr
             "a track of it, and a picture to check it by"
         )
     return read_track(path, car_width_m)
+
+
+def load_any(
+    name: str, car_width_m: float | None, smoothed: bool = False, recentred: bool = False
+) -> "tuple[Track, RosMap | None, str]":
+    """:func:`load_track`, or the track in a ROS map or in a file of measured points; the map that
+    it was found in, and what was done to the points. InputError as for ``bayesrace tracks``."""
+    is_map = Path(name).suffix in _MAPS
+    if smoothed and recentred:
+        raise InputError("--recentre and --smooth are a step each: smooth the file of the first")
+    if (smoothed or recentred) and (is_map or not Path(name).is_file()):
+        option = "--smooth" if smoothed else "--recentre"
+        raise InputError(f"{option} is for a CSV file of measured points, not for '{name}'")
+    if is_map:
+        from bayesrace.tracks.maps import read_map, track_of_map  # with packages for pictures
+
+        grid = read_map(name)
+        return track_of_map(grid, car_width_m), grid, ""
+    if smoothed:
+        track, away_m = read_smoothed(name, car_width_m)
+        rms_mm, largest_mm = 1e3 * np.sqrt(np.mean(away_m**2)), 1e3 * away_m.max()
+        away = f"{rms_mm:.1f} mm (RMS) and at most {largest_mm:.1f} mm away"
+        return track, None, f"{len(away_m)} points are {away} from the smooth centreline"
+    if recentred:
+        track, (x, y) = read_recentred(name, car_width_m)
+        return track, None, f"the origin is at x = {float(x)}, y = {float(y)} of the file"
+    return load_track(name, car_width_m), None, ""
 
 
 def _seed(text: str, digits: str) -> int:

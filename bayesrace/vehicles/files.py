@@ -13,10 +13,9 @@ from typing import Annotated, Any, Final
 
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError, create_model
 
-from bayesrace.defaults import DEFAULT_CAR
+from bayesrace.defaults import DEFAULT_CAR, Option
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import parse_toml, read_text, write_whole
-from bayesrace.option import Option
 from bayesrace.vehicles.parameters import CarParameters
 from bayesrace.vehicles.parts import AccelerationDrive, DcMotor, LinearTyres, PacejkaTyres, Part
 from bayesrace.vehicles.tuning import Tuning

@@ -31,10 +31,9 @@ from typing import (
 import typer
 from typer.models import OptionInfo
 
-from bayesrace.defaults import CONFIGURATION_VARIABLE
+from bayesrace.defaults import CONFIGURATION_VARIABLE, Option
 from bayesrace.errors import InputError, faults_in
 from bayesrace.messages import Role
-from bayesrace.option import Option
 from operation.cli.options import Endpoint
 
 if TYPE_CHECKING:

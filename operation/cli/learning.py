@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from bayesrace.files import write_whole
 from operation.cli import options
 from operation.cli.declaration import Given, options_of
 from operation.terminal.notation import UNCERTAIN
@@ -174,10 +173,8 @@ def validate(
     )
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-    text = judged.result.model_dump_json(indent=1) + "\n"
     for path in (json_file, out and out / "validation.json"):
-        if path is not None:
-            write_whole(path, text)
+        options.write_json(path, judged.result)
     if plot is not None or out is not None:
         from operation.report.gp import write_validation
 

@@ -4,29 +4,25 @@ have. :func:`operation.cli.declaration.configured` adds metavars by type where t
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from bayesrace.errors import InputError
+from bayesrace.files import write_whole
 
 if TYPE_CHECKING:
+    from pydantic import BaseModel
+
     from operation.terminal.progress import Stages
 
 __all__ = [
     "AllSamples", "Artefact", "Car", "CarName", "Course", "Endpoint", "GivenLine", "LowLatency",
     "MpcFile", "OutFile", "ParentPid", "RaceLineFile", "TrackName", "Tyres", "Weights", "argument",
     "flag", "new_file", "out_folder", "run_folder", "stages_shown", "value", "writable",
+    "write_json",
 ]  # fmt: skip
-
-
-class TyreModel(StrEnum):
-    """Models of tyres that a car can be put on."""
-
-    pacejka = "pacejka"
-    linear = "linear"
 
 
 def value(text: str, default: Any = None, *names: str, shown: str = "", **more: Any) -> Any:
@@ -63,6 +59,12 @@ def writable(path: Path | None) -> Path | None:
     return path
 
 
+def write_json(path: Path | None, result: "BaseModel") -> None:
+    """Writes a result to the file, if one is given."""
+    if path is not None:
+        write_whole(path, result.model_dump_json(indent=1) + "\n")
+
+
 def run_folder(given: Path | None, prefix: str = "") -> Path:
     """The folder given, or one named after the time."""
     stamp = datetime.now(UTC).astimezone().strftime("%Y%m%d-%H%M%S")
@@ -84,7 +86,7 @@ CarName = Annotated[
     str, typer.Option(show_default="the car's own", help="Name of the car in the network.")
 ]
 Tyres = Annotated[
-    TyreModel | None,
+    Literal["pacejka", "linear"] | None,
     typer.Option(
         metavar="TYRES",
         show_default="the car's",

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import typer
 
 from bayesrace.errors import InputError
-from bayesrace.files import write_whole
 from operation.cli import options
 from operation.cli.declaration import Given, options_of
 
@@ -142,8 +141,7 @@ def bench(
     with options.stages_shown() as stages:
         result = run_bench(settings(), stages)
     result.print(Terminal())
-    if json_file:
-        write_whole(json_file, result.model_dump_json(indent=1) + "\n")
+    options.write_json(json_file, result)
 
 
 @options_of(
@@ -188,8 +186,7 @@ def latency(
     with options.stages_shown() as stages:
         result, run = measure(chosen, folder, stages)
     print_report(result, Terminal())
-    if json_file:
-        write_whole(json_file, result.model_dump_json(indent=1) + "\n")
+    options.write_json(json_file, result)
     typer.echo(f"{folder}")
     if run.error is not None:
         raise run.error

@@ -15,7 +15,6 @@ from operation.cli.declaration import Given, options_of
 if TYPE_CHECKING:
     from bayesrace.limit import LimitSettings
     from bayesrace.tracks import Track
-    from bayesrace.tracks.maps import RosMap
     from operation.settings import BayesianSettings
 
 __all__ = ["cars", "limit", "raceline", "tracks"]
@@ -45,7 +44,7 @@ def tracks(
     """List the built-in tracks, check a track, turn a ROS map into one, write or draw it."""
     from rich.table import Table
 
-    from bayesrace.tracks import builtin_tracks, write_track
+    from bayesrace.tracks import builtin_tracks, load_any, write_track
     from bayesrace.vehicles import get_car
     from operation.terminal.terminal import Terminal
 
@@ -60,7 +59,7 @@ def tracks(
     car_width_m = get_car(car).width_m if car else None
     table = Table("track", "length m", "width m", "tightest radius m", "points")
     for one in [name] if name else builtin_tracks():
-        track, grid, remark = _loaded(one, car_width_m, smooth, recentre)
+        track, grid, remark = load_any(one, car_width_m, smooth, recentre)
         if place is not None or reverse:
             track = track.driven_from(place, reverse)
         table.add_row(*_cells(track))
@@ -71,37 +70,6 @@ def tracks(
     Terminal().print(table)
     if remark:
         typer.echo(remark)
-
-
-def _loaded(
-    name: str, car_width_m: float | None, smooth: bool, recentre: bool
-) -> "tuple[Track, RosMap | None, str]":
-    """The track, the map that it was found in, and what was done to its points."""
-    import numpy as np
-
-    from bayesrace.tracks import load_track, read_recentred, read_smoothed
-
-    is_map = Path(name).suffix in (".yaml", ".yml")
-    if smooth and recentre:
-        raise InputError("--recentre and --smooth are a step each: smooth the file of the first")
-    if (smooth or recentre) and (is_map or not Path(name).is_file()):
-        option = "--smooth" if smooth else "--recentre"
-        raise InputError(f"{option} is for a CSV file of measured points, not for '{name}'")
-    if is_map:
-        from bayesrace.tracks.maps import read_map, track_of_map
-
-        grid = read_map(name)
-        return track_of_map(grid, car_width_m), grid, ""
-    if smooth:
-        track, away_m = read_smoothed(name, car_width_m)
-        rms_mm, largest_mm = 1e3 * np.sqrt(np.mean(away_m**2)), 1e3 * away_m.max()
-        away = f"{rms_mm:.1f} mm (RMS) and at most {largest_mm:.1f} mm away"
-        return track, None, f"{len(away_m)} points are {away} from the smooth centreline"
-    if recentre:
-        track, origin = read_recentred(name, car_width_m)
-        x, y = origin.tolist()
-        return track, None, f"the origin is at x = {x}, y = {y} of the file"
-    return load_track(name, car_width_m), None, ""
 
 
 def _cells(track: "Track") -> tuple[str, ...]:

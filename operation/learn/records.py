@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from bayesrace.defaults import Option
 from bayesrace.integrators import PREDICTION, Discretisation
-from bayesrace.option import Option
 from bayesrace.vehicles import CarSetting, default_car
 
 __all__ = ["LapRecord", "LearnSettings", "Record", "UpdateRecord", "Verdict"]

@@ -14,6 +14,7 @@ from pydantic.fields import FieldInfo
 from bayesrace.cache import cache_folder, digest, software
 from bayesrace.files import read_whole, write_whole
 from bayesrace.vehicles import CarParameters
+from operation.preparation import SOURCES
 from operation.settings import RaceSettings
 
 __all__ = ["CONTROLLERS", "LEARNS_FROM", "PAPER", "Case", "Controller", "Files", "car_identity"]
@@ -44,11 +45,8 @@ _LEFT_OUT: Final = {"car", "threads", "fmu", "fmu_map", "simulator", "line"}
 """Settings that a row has in other columns, or that no campaign has."""
 
 _SOURCES: Final = (
-    "bayesrace", "bayesrace/gp", "bayesrace/messages", "bayesrace/raceline", "bayesrace/tracks",
-    "bayesrace/vehicles", "codegen", "codegen/problems", "controller", "controller/native",
-    "learning", "plant", "operation/analysis/laps.py", "operation/closed_loop.py",
-    "operation/collect.py", "operation/drive.py", "operation/preparation.py",
-    "operation/settings.py", "operation/training_line.py", "studies/campaign/case.py",
+    *SOURCES, "codegen", "codegen/problems", "operation/analysis/laps.py",
+    "operation/preparation.py", "operation/settings.py", "studies/campaign/case.py",
     "studies/campaign/execute.py",
 )  # fmt: skip
 _PACKAGES: Final = ("casadi", "mcap", "numpy", "scipy")

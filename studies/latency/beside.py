@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from bayesrace.clock import die_with_parent, sleep_until_ns
 from bayesrace.realtime import RealtimeSettings, prepare_thread
 from bayesrace.transport import Endpoints, open_session, private_endpoints
-from operation.processes import child
+from operation.system import child
 from studies.latency.results import BareLoop, Series
 
 __all__ = ["bare_loop", "bare_result", "read_bare_loop", "read_round_trips", "running_beside"]

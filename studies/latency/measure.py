@@ -18,9 +18,8 @@ from bayesrace.transport import Director, Item, Kind, open_session
 from bayesrace.vehicles import write_car
 from operation.drive import RunPlan, run_request
 from operation.preparation import Prepared, prepare
-from operation.processes import Child, endings
 from operation.settings import PreparationSettings
-from operation.system import started_system
+from operation.system import Child, endings, started_system
 from operation.terminal.progress import Stages
 from studies.latency.analysis import Beside, analyse
 from studies.latency.beside import read_bare_loop, read_round_trips, running_beside

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from bayesrace.option import Option
+from bayesrace.defaults import Option
 from bayesrace.realtime import RealtimeSettings
 from bayesrace.transport import Endpoints
 from bayesrace.vehicles import CarSetting, default_car

@@ -7,9 +7,9 @@ from typing import Annotated, Any, Final
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from bayesrace.defaults import Option
 from bayesrace.errors import InputError
 from bayesrace.files import read_text
-from bayesrace.option import Option
 from bayesrace.raceline import RaceLineSettings
 from operation.settings import RaceSettings
 
