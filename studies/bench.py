@@ -13,7 +13,6 @@ code does: forward Euler, expanded to scalars, IPOPT with its default options, f
 discretisation, whose pose depends on the GP too, that takes four times as long: no fair peer.)
 """
 
-import ctypes as ct
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Final, Literal, NamedTuple
@@ -304,14 +303,15 @@ class _Drive:
     def _converged(self, native: NativeStep, state: State) -> _Solution | None:
         """What the next step would iterate to; leaves the controller as it was."""
         size = native.artefact.library.br_mpc_memory_size()
-        memory = ct.string_at(native.handle, size)
+        memory = native.artefact.ffi.buffer(native.handle, size)
+        before = memory[:]
         native.set_parameters(self._car, self._exact)
         x = np.array(state.x)
         status = native.step(x, state.u_applied)
         plan_x, plan_u = native.read_plan()
         plan = plan_x.copy(), plan_u.copy()
         solution = _Solution(x, state.u_applied[0], native.read_reference(), plan)
-        ct.memmove(native.handle, memory, size)
+        memory[:] = before
         return solution if status is StepStatus.CONVERGED else None
 
 
