@@ -11,7 +11,6 @@ from bayesrace.gp.weights import (
     GpWeights,
     decode_weights,
     encode_weights,
-    pack_weights,
     read_weights,
 )
 from bayesrace.raceline import RaceLine, read_raceline_for
@@ -108,7 +107,6 @@ def predictive_controller(
         digest=digest_of(data),
         proven=True,
         data=data,
-        packed=b"" if loaded is None else pack_weights(loaded),
     )
     folder = None if store is None else Store(store, step.manifest.discretisation)
     history = History(entries=[first]) if folder is None else folder.restore(first)

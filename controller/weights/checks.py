@@ -1,29 +1,108 @@
-"""What new weights must pass before the controller adopts them."""
+"""What new weights must pass before the controller adopts them, and the process that checks them.
 
+Decoding and checking take some 0.1 s of the interpreter's lock, which the control thread must not
+wait for; and a file that brings the checks down does not bring down the controller. So a process of
+its own checks each file.
+"""
+
+import os
+import subprocess
+import sys
 import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
+import msgpack
 import numpy as np
 
 from bayesrace.arrays import Floats
+from bayesrace.clock import die_with_parent
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import OUTPUTS, decode_weights, pack_weights
+from bayesrace.gp.weights import FEATURES, OUTPUTS, GpWeights, decode_weights, pack_weights
+from bayesrace.interpreter import RUN_MODULE
 from bayesrace.messages import Scalar
+from bayesrace.vehicles import described_car
 from bayesrace.vehicles.parameters import CarParameters
-from controller.weights.comparison import compare, slack_of
-from controller.weights.prediction import Correction, Samples, plausible_features
-from controller.weights.settings import GateSettings
+from bayesrace.vehicles.parts import GRAVITY_MPS2
+from controller.native_step import NativeStep
+from controller.settings import MpcSettings
+from controller.weights.settings import GateSettings, compare, slack_of
 
-__all__ = ["NO_SAMPLES", "Checks", "Verdict"]
-
-NO_SAMPLES: Final = Samples(np.zeros((0, 6)), np.zeros((0, 3)))
+__all__ = [
+    "NO_SAMPLES",
+    "Checks",
+    "Correction",
+    "Samples",
+    "Verdict",
+    "judged",
+    "plausible_features",
+]
 
 _CLOCKS_APART_S: Final = 3600.0
 """By which the clock of the training host may be ahead."""
 _ONE_SIDED: Final = 0.5
 """Share of the nominal errors that the mean error on a file's own samples may have."""
+_MOST: Final = 15.0
+"""Times its usable acceleration, no car corners: more than the 1:43 car at full lock and speed."""
+_NICE: Final = 10
+"""Of the process, below the controller."""
+_POLL_S: Final = 0.02
+
+
+class Samples(NamedTuple):
+    """What the car did: features (n, 6), and the residuals (n, 3) of the nominal model."""
+
+    features: Floats
+    residuals: Floats
+
+
+NO_SAMPLES: Final = Samples(np.zeros((0, 6)), np.zeros((0, 3)))
+
+
+class Correction:
+    """The correction that one set of weights makes; None: none."""
+
+    def __init__(self, artefact: Path, car: CarParameters, weights: GpWeights | None) -> None:
+        """InputError if the weights are for another model, too large, or overflow."""
+        self.weights = weights
+        self._nominal, self._corrected = (
+            NativeStep(artefact, car, MpcSettings()) for _ in range(2)
+        )
+        self.step_s = self._nominal.manifest.step_s
+        if weights is not None:
+            self._corrected.set_weights(weights)
+
+    def mean(self, features: Floats) -> Floats:
+        """Of vx, vy, omega (n, 3), per step; NaN where the model has no value."""
+        found = np.full((len(features), len(OUTPUTS)), np.nan)
+        for row, one in zip(found, features, strict=True):
+            x, u = np.concatenate([np.zeros(3), one[:4]]), one[4:]
+            try:
+                corrected = self._corrected.predict(x, u, self.step_s)[3:6].copy()
+                row[:] = corrected - self._nominal.predict(x, u, self.step_s)[3:6]
+            except InputError:  # a state that is absurd, or that the weights make absurd
+                continue
+        return found
+
+    def errors(self, samples: Samples) -> Floats:
+        """What is left of the residuals (n, 3); infinite where the model has no value."""
+        left = samples.residuals - self.mean(samples.features)
+        return np.where(np.isfinite(left), left, np.inf)
+
+
+def plausible_features(car: CarParameters, count: int) -> Floats:
+    """Features (count, 6) over the whole range of the car, always the same ones."""
+    vx, slip, turn, steer, push, rate = np.random.default_rng(5).uniform(-1, 1, (count, 6)).T
+    vx = 0.5 * (vx + 1) * car.drive.top_speed_mps(car.d_max)
+    sharpest = vx * np.tan(car.delta_max_rad) / car.wheelbase_m
+    with np.errstate(divide="ignore"):
+        omega = turn * np.minimum(sharpest, _MOST * car.friction * GRAVITY_MPS2 / vx)
+    delta = steer * car.delta_max_rad
+    d = car.d_min + 0.5 * (push + 1) * (car.d_max - car.d_min)
+    return np.column_stack([vx, 0.3 * slip * vx, omega, delta, d, rate * car.delta_rate_max_radps])
 
 
 class Verdict(NamedTuple):
@@ -170,3 +249,56 @@ def _rms(errors: Floats) -> Floats:
     """Of each column; 0 without rows."""
     squares: Floats = np.sqrt((errors**2).sum(axis=0) / max(len(errors), 1))
     return squares
+
+
+# The process -------------------------------------------------------------------------------------
+
+
+def judged(question: Mapping[str, Any], until_s: float, follow: Callable[[], None]) -> Any:
+    """The fields of a :class:`Verdict` on the question, from another process.
+
+    ``question``: artefact and car (texts), settings (JSON), features and residuals of the recent
+    samples (bytes), the files and the time of :meth:`Checks.judge` by name. ``until_s``: deadline
+    on the monotonic clock, when the process is killed. ``follow`` is called meanwhile. InputError
+    without a verdict.
+    """
+    line = [*RUN_MODULE, __name__, str(os.getpid())]
+    pipes: Any = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    try:
+        process = subprocess.Popen(line, **pipes)
+    except OSError as error:
+        raise InputError(f"no process to check them: {error.strerror}") from None
+    with process, ThreadPoolExecutor(1) as pool:
+        exchanged = pool.submit(process.communicate, msgpack.packb(question))
+        try:
+            while not exchanged.done():
+                if time.monotonic() > until_s:
+                    raise InputError("the check of the weights did not end in time")
+                follow()
+                time.sleep(_POLL_S)
+        finally:
+            process.kill()
+        answer, words = exchanged.result()
+    if process.returncode:
+        last = words.decode(errors="replace").strip().splitlines()[-1:]
+        how = f"ended with code {process.returncode}"
+        raise InputError(f"the check of the weights {': '.join([how, *last])}")
+    return msgpack.unpackb(answer)
+
+
+def main() -> int:
+    """The program: a question on standard input, the verdict on standard output."""
+    die_with_parent(int(sys.argv[1]))
+    os.nice(_NICE)
+    question = msgpack.unpackb(sys.stdin.buffer.read())
+    settings = GateSettings.model_validate_json(question.pop("settings"))
+    car, artefact = described_car(question.pop("car")), Path(question.pop("artefact"))
+    features, residuals = (np.frombuffer(question.pop(name)) for name in Samples._fields)
+    recent = Samples(features.reshape(-1, len(FEATURES)), residuals.reshape(-1, len(OUTPUTS)))
+    verdict = Checks(settings, artefact, car).judge(recent=recent, **question)
+    sys.stdout.buffer.write(msgpack.packb(verdict._asdict()))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

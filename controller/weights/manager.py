@@ -18,12 +18,10 @@ from bayesrace.messages import ROLLBACK, WEIGHTS, Reply, Scalar
 from bayesrace.transport import Request, declare_service, decode_request
 from bayesrace.vehicles import car_text
 from controller.interface import Controller
-from controller.weights.adoption import Adoption, Offer, WeightsPort
-from controller.weights.checks import NO_SAMPLES
-from controller.weights.judge import judged
+from controller.weights.adoption import Adoption, Offer, Ruling, WeightsPort
+from controller.weights.checks import NO_SAMPLES, judged
 from controller.weights.settings import GateSettings
 from controller.weights.store import AcceptedWeights, StoreWriter, digest_of
-from controller.weights.watch import Ruling
 
 __all__ = ["WeightUpdateManager"]
 
@@ -185,7 +183,7 @@ class WeightUpdateManager:
             raise _RefusalError(verdict["text"], verdict["data"])
         version = verdict["data"]["version"]
         offer = self._adopt(verdict["packed"], version, watched, due_s)
-        new = history.accept(version, data, verdict["packed"], proven=not watched)
+        new = history.accept(version, data, proven=not watched)
         self._counts["accepted"] += 1
         in_use = f"in use from cycle {offer.cycle} on, as number {new.number}"
         text = f"weights {new.version} {in_use}; {verdict['text']}"
@@ -250,11 +248,12 @@ class WeightUpdateManager:
         with suppress(_RefusalError):  # without the car's samples, on probation
             until_s = min(time.monotonic() + _ADOPT_S, due_s)
             self._wait(lambda: adoption.samples is not None, until_s, "no samples")
+        recent = adoption.samples or NO_SAMPLES
         question = {
             "artefact": str(self._port.artefact), "car": car_text(self._port.car),
             "settings": self._settings.model_dump_json(), "data": data,
-            "recent": adoption.samples or NO_SAMPLES, "in_use": history.in_use.data,
-            "reference": history.reference.data,
+            "features": recent.features.tobytes(), "residuals": recent.residuals.tobytes(),
+            "in_use": history.in_use.data, "reference": history.reference.data,
             "accepted_utc_ns": history.in_use.accepted_utc_ns,
         }  # fmt: skip
         try:

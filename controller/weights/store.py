@@ -47,7 +47,11 @@ class AcceptedWeights(BaseModel):
     proven: bool = Field(description="not watched, or no longer")
     accepted_utc_ns: int = Field(0, ge=0, description="since 1970; 0: not known")
     data: bytes = Field(b"", exclude=True, repr=False, description="empty: without correction")
-    packed: bytes = Field(b"", exclude=True, repr=False, description="by pack_weights")
+
+    @property
+    def packed(self) -> bytes:
+        """Their arrays for the compiled step."""
+        return pack_weights(decode_weights(self.data)) if self.data else b""
 
     @property
     def file(self) -> str:
@@ -76,11 +80,11 @@ class History(BaseModel):
         """The newest proven weights: the watch compares with them and returns to them."""
         return next(one for one in reversed(self.entries) if one.proven)
 
-    def accept(self, version: str, data: bytes, packed: bytes, proven: bool) -> AcceptedWeights:
+    def accept(self, version: str, data: bytes, proven: bool) -> AcceptedWeights:
         """Puts new weights into use, under the next number."""
         new = AcceptedWeights(
             number=self.next_number, version=version, digest=digest_of(data), proven=proven,
-            accepted_utc_ns=time.time_ns(), data=data, packed=packed,
+            accepted_utc_ns=time.time_ns(), data=data,
         )  # fmt: skip
         self.next_number += 1
         reference, kept = self.reference, [*self.entries, new][-HISTORY:]
@@ -129,9 +133,9 @@ class Store:
         for one in self._index.entries:
             with suppress(InputError):
                 data = read_whole(self._folder / one.file, "weights file", MAX_BYTES)
+                decode_weights(data)
                 if digest_of(data) == one.digest:
-                    read = {"data": data, "packed": pack_weights(decode_weights(data))}
-                    entries.append(one.model_copy(update=read))
+                    entries.append(one.model_copy(update={"data": data}))
         return self._index.model_copy(update={"entries": entries})
 
     def keep(self, history: History) -> None:

@@ -168,6 +168,6 @@ def judges(of: int) -> list[int]:
             parent = int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1])
         except (OSError, ValueError, IndexError):
             continue
-        if b"controller.weights.judge" in words and parent == of:
+        if b"controller.weights.checks" in words and parent == of:
             found.append(int(entry.name))
     return found

@@ -15,9 +15,9 @@ from pathlib import Path
 import pytest
 
 from bayesrace.gp.weights import GpWeights
+from controller.weights.adoption import Ruling
 from controller.weights.settings import GateSettings
 from controller.weights.store import History, Store
-from controller.weights.watch import Ruling
 from operation.learn.publishing import in_words
 from tests.network.cars import Course
 from tests.programs import until
@@ -114,12 +114,12 @@ def test_a_check_that_hangs_is_killed_by_its_deadline(
     """The request is refused for now, what is in use stays, and the next one is served."""
     with bench(course) as made:
         monkeypatch.setattr("controller.weights.manager._RETURN_S", 14.0)  # leaves a second
-        monkeypatch.setattr("controller.weights.judge.RUN_MODULE", (sys.executable, "-c", SLEEP))
+        monkeypatch.setattr("controller.weights.checks.RUN_MODULE", (sys.executable, "-c", SLEEP))
         reply = made.reply(made.send(again))
         assert (reply.accepted, reply.data) == (False, {"again": True})
         assert "did not end in time" in reply.text
         assert made.version == good.version
-        monkeypatch.setattr("controller.weights.judge.RUN_MODULE", (sys.executable, "-c", FAIL))
+        monkeypatch.setattr("controller.weights.checks.RUN_MODULE", (sys.executable, "-c", FAIL))
         assert "ended with code 3: no memory" in made.reply(made.send(again)).text
         monkeypatch.undo()
         assert made.accept(again).data["number"] == 1

@@ -17,8 +17,8 @@ from bayesrace.vehicles import CarParameters
 from controller.native_step import NativeStep
 from controller.path_table import make_path_table
 from controller.settings import MpcSettings
+from controller.weights.adoption import Ruling, Watch
 from controller.weights.settings import SAMPLES, WATCHED, GateSettings
-from controller.weights.watch import Ruling, Watch
 from tests.conftest import Circuit, fit_weights, smooth_drive
 from tests.takeover.rig import KINDS
 from tests.takeover.spoilt_weights import SPOILT, spoilt

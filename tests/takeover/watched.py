@@ -13,10 +13,9 @@ from controller.assembly import compiled_controller
 from controller.interface import Environment
 from controller.mpc import PredictiveController
 from controller.native_step import NativeStep
-from controller.weights.adoption import limits_at, slowed_down
+from controller.weights.adoption import Ruling, Watch, limits_at, slowed_down
 from controller.weights.checks import Checks
 from controller.weights.settings import GateSettings
-from controller.weights.watch import Ruling, Watch
 from operation.closed_loop import ClosedLoop, Driven
 
 __all__ = ["Course"]
