@@ -12,13 +12,13 @@ from enum import IntEnum, StrEnum
 from bayesrace.messages import SENSOR_FAULTS, BrakingPlan, State
 from bayesrace.transport import Numbering
 from bayesrace.vehicles.parameters import CarParameters
-from controller.cycle_settings import (
+from controller.interface import Controller, Environment, StepOutput
+from controller.settings import (
     CompensationSettings,
     FallbackSettings,
     cycle_values,
     input_limits,
 )
-from controller.interface import Controller, Environment, StepOutput
 
 __all__ = [
     "DOUBTED",

@@ -8,7 +8,7 @@ from bayesrace.defaults import Option
 from bayesrace.realtime import RealtimeSettings
 from bayesrace.transport import CONTROLLER_ENDPOINT, PLANT_ENDPOINT, Endpoints
 from bayesrace.vehicles import CarSetting, default_car
-from controller.cycle_settings import CompensationSettings, FallbackSettings
+from controller.settings import CompensationSettings, FallbackSettings
 from controller.weights.settings import GateSettings
 
 __all__ = ["ControllerSettings"]

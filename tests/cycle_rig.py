@@ -7,10 +7,10 @@ from typing import Any
 from bayesrace.arrays import Floats
 from bayesrace.messages import State
 from bayesrace.vehicles import CarParameters, default_car
-from controller.cycle_settings import CompensationSettings, FallbackSettings
 from controller.driver import Driver
 from controller.interface import Environment, StepOutput
 from controller.python_controller import PythonController
+from controller.settings import CompensationSettings, FallbackSettings
 
 __all__ = ["STEP_S", "ScriptedLaw", "scripted_driver", "state"]
 

@@ -19,10 +19,10 @@ from bayesrace.messages import State
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import STATES, dynamic
 from codegen.fmu import FmuDefinition, controller_fmu, pack
-from controller.cycle_settings import CompensationSettings, FallbackSettings
 from controller.driver import Driver
 from controller.mpc import PredictiveController
 from controller.native_step import NativeStep, StepStatus
+from controller.settings import CompensationSettings, FallbackSettings
 from plant.simulator import Simulator
 from tests.car_fmu import packed_car
 from tests.conftest import SETTINGS, Circuit

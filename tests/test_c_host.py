@@ -19,11 +19,11 @@ from bayesrace.vehicles import CarParameters
 from codegen.build import HOST
 from codegen.compiler import find_compiler
 from codegen.host_files import SETTINGS_FILE, export
-from controller.cycle_settings import cycle_values
 from controller.driver import Level
 from controller.mpc import PredictiveController
 from controller.native_step import NativeStep
 from controller.process_settings import ControllerSettings
+from controller.settings import cycle_values
 from operation.closed_loop import ClosedLoop
 from tests.conftest import SETTINGS, Circuit
 from tests.native_programs import SANITIZED, native_program

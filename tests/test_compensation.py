@@ -10,9 +10,9 @@ import pytest
 
 from bayesrace.arrays import Floats
 from bayesrace.transport import Numbering
-from controller.cycle_settings import CompensationSettings
 from controller.driver import Driver
 from controller.interface import StepOutput
+from controller.settings import CompensationSettings
 from tests.cycle_rig import STEP_S, ScriptedLaw, scripted_driver, state
 
 

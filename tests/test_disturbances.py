@@ -11,9 +11,8 @@ from bayesrace.messages import RunRequest
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
 from controller.assembly import compiled_controller
-from controller.cycle_settings import CompensationSettings
 from controller.process_settings import ControllerSettings
-from controller.settings import MpcSettings
+from controller.settings import CompensationSettings, MpcSettings
 from operation.closed_loop import ClosedLoop, Driven
 from plant.lockstep import CarRun, Sensors
 from plant.settings import SensorNoise

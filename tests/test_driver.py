@@ -12,7 +12,6 @@ from bayesrace.arrays import Floats
 from bayesrace.messages import State
 from bayesrace.vehicles import CarParameters, default_car
 from bayesrace.vehicles.models import dynamic
-from controller.cycle_settings import CompensationSettings, FallbackSettings
 from controller.driver import (
     HALTED,
     NO_STATE,
@@ -26,6 +25,7 @@ from controller.driver import (
 from controller.interface import Environment, StepOutput
 from controller.mpc import PredictiveController
 from controller.native_step import NativeStep, StepStatus
+from controller.settings import CompensationSettings, FallbackSettings
 from tests.conftest import SETTINGS, Circuit, discrete
 from tests.cycle_rig import ScriptedLaw, scripted_driver, state
 

@@ -16,9 +16,9 @@ from bayesrace.vehicles.models import dynamic
 from codegen.build import build
 from codegen.fmu import car_fmu, pack
 from codegen.settings import BuildSettings
-from controller.cycle_settings import FallbackSettings
 from controller.pure_pursuit import PurePursuit
 from controller.python_controller import PythonController
+from controller.settings import FallbackSettings
 from learning.settings import TrainingSettings
 from learning.training import train
 from operation.analysis.results import read_result

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bayesrace.vehicles import default_car
-from controller.cycle_settings import FallbackSettings
 from controller.driver import Level
 from controller.interface import StepOutput
+from controller.settings import FallbackSettings
 from tests.cycle_rig import ScriptedLaw, scripted_driver, state
 
 CAR = default_car()

@@ -14,11 +14,10 @@ from bayesrace.integrators import PREDICTION
 from bayesrace.messages import State
 from bayesrace.vehicles import CarParameters
 from controller.assembly import compiled_controller
-from controller.cycle_settings import CompensationSettings, FallbackSettings
 from controller.driver import Driver
 from controller.mpc import PredictiveController
 from controller.native_step import NativeStep
-from controller.settings import MpcSettings
+from controller.settings import CompensationSettings, FallbackSettings, MpcSettings
 from learning.validation import predictive_sigma
 from operation.closed_loop import ClosedLoop, built_in_car
 from operation.preparation import prepare

@@ -17,7 +17,6 @@ import pytest
 import controller.cycle
 import controller.process
 import controller.service
-import controller.telemetry
 from bayesrace.arrays import Floats
 from bayesrace.messages import Actuation, State, Telemetry, decode, encode
 from bayesrace.transport import Item, Kind, inbox, publisher
@@ -159,7 +158,7 @@ Make = Callable[..., Loop]
 def loop(kinematic_artefact: Path, monkeypatch: pytest.MonkeyPatch) -> Make:
     """Makes a loop in simulated time."""
     clock = Clock()
-    modules = controller.process, controller.cycle, controller.service, controller.telemetry
+    modules = controller.process, controller.cycle, controller.service
     for module in (*modules, inbox, publisher):
         monkeypatch.setattr(module, "time", clock)
     monkeypatch.setattr(controller.process, "sleep_until_ns", clock.sleep_until_ns)

@@ -58,8 +58,8 @@ def export(
     from bayesrace.manifest import read_manifest
     from bayesrace.vehicles import get_car
     from codegen.host_files import export as write
-    from controller.cycle_settings import cycle_values
     from controller.process_settings import ControllerSettings
+    from controller.settings import cycle_values
 
     parameters, process = get_car(car), ControllerSettings()
     folder, given = _controller(parameters, track, raceline, weights, mpc, artefact)
@@ -130,7 +130,7 @@ def export_fmu(
     """
     from bayesrace.vehicles import get_car
     from codegen.fmu import car_fmu, controller_fmu, pack
-    from controller.cycle_settings import FallbackSettings
+    from controller.settings import FallbackSettings
 
     parameters = get_car(car)
     number: Literal[2, 3] = 2 if version == "2" else 3
