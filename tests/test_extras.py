@@ -18,7 +18,7 @@ from tests.car_fmu import packed_car
 from tests.command_line import Cli, refused
 from tests.programs import ROOT, peanut
 
-NEEDED = {"eclipse-zenoh", "msgpack", "numpy", "pydantic", "typer"}
+NEEDED = {"cffi", "eclipse-zenoh", "msgpack", "numpy", "pydantic", "typer"}
 NOT_NEEDED = {"casadi", "fmpy", "jinja2", "matplotlib", "mcap", "pint", "scipy"}
 
 
