@@ -1,9 +1,10 @@
 """From settings to a loadable controller: generate C, compile, cache by a hash of everything.
 
-The artefact folder holds the library, its manifest and everything it was made from (our C, CasADi's
-C, DAQP's headers and static library for this platform, MIT licence), so that it can be rebuilt or
-embedded without Python: ``cc -O3 *.c libdaqpstat.a -I. -lm``. Its folder ``host`` has C that loads
-racing line, weights and settings from files.
+The artefact folder holds the library, what its headers declare in the form that Python reads, the
+manifest, and everything it was made from (our C, CasADi's C, DAQP's headers and static library for
+this platform, MIT licence), so that it can be rebuilt or embedded without Python:
+``cc -O3 *.c libdaqpstat.a -I. -lm``. Its folder ``host`` has C that loads racing line, weights and
+settings from files.
 """
 
 import hashlib
@@ -54,7 +55,8 @@ HOST: Final = "host"
 """Folder of the C that is for hosts, and no part of the library."""
 
 _MODE: Final = 0o755
-"""Of what is loaded, whatever the umask: what others may write is refused."""
+"""Of the files that are loaded: the umask may allow more, and files that others may write are
+refused."""
 
 _SHAPED_BY: Final = (
     "controller/native",

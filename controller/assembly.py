@@ -91,9 +91,9 @@ def predictive_controller(
 ) -> PredictiveController:
     """The compiled controller of ``artefact`` on a track, ready to drive.
 
-    ``store``: folder of the weights that it accepts; the newest of an earlier life are in use from
-    the start, whatever ``weights`` are. ``gate``: thresholds that ``weights`` must pass; those in
-    the store have. Raises InputError naming the file that cannot be used.
+    ``store``: folder of the weights that it accepts; the newest that an earlier controller kept
+    there are in use from the start, in place of ``weights``. ``gate``: thresholds that ``weights``
+    must pass; those in the store have passed them. InputError names the file that cannot be used.
     """
     loaded = None if weights is None else read_checked(weights, artefact, car, gate)
     driven_on = load_track(track, car.width_m)

@@ -275,5 +275,5 @@ class Driver:
         self._library.br_cycle_prepare(self._cycle, period_s, budget_s)
 
     def rehearse(self) -> None:
-        """Walks the way of a cycle without effect, so that its code and data are in the caches."""
+        """Runs through a cycle without any effect, so that its code and data are in the caches."""
         self._library.br_cycle_rehearse(self._cycle)

@@ -157,7 +157,7 @@ typedef struct {
 /* What a control cycle has counted. */
 typedef struct {
     int64_t levels[BR_STOP + 1]; /* cycles by level of the fallback; commanded ones left out */
-    int64_t failed;              /* steps that were broken */
+    int64_t failed;              /* steps that refused the call or raised an exception */
     int64_t second_starts;       /* steps that looked for another plan */
     int64_t cost_jumps;          /* steps whose plan costs much more than to go on as before */
     int64_t stale;               /* states of the current run that were not newer than one before */
@@ -170,7 +170,7 @@ typedef struct {
 } br_counters;
 
 /* What a cycle drives: the compiled controller (br_cycle_drive_mpc), or another with these
- * functions. None may block; self comes back as it was given. */
+ * functions. None may block; self is their first argument. */
 typedef struct {
     void *self;
     /* 0, or a status of its own (1 to 250, or BR_STEP_FAILED) that says why solution is not usable.
@@ -240,12 +240,12 @@ BR_API br_mpc_error br_cycle_answer(br_cycle *cycle, const br_measured *state,
 /* br_mpc_prepare for a state that is expected a period after the last one, where one is. */
 BR_API void br_cycle_prepare(br_cycle *cycle, double period_s, double budget_s);
 
-/* What the car's guard shall do if nothing more comes: the newest input, then the plan for as long
- * as the fallback drives on it, then braking along the line to standstill. To be sent after the
- * decision. BR_ERROR_NOT_READY for a car that is halted, or a controller that knows no line. */
+/* What the car's guard shall do if no actuation comes any more: the newest input, then the plan for
+ * as long as the fallback drives on it, then braking along the line to standstill. To be sent after
+ * the decision. BR_ERROR_NOT_READY for a car that is halted, or a controller that knows no line. */
 BR_API br_mpc_error br_cycle_brake(const br_cycle *cycle, br_braking *braking);
 
-/* The way of a cycle without effect, so that its code and data are in the caches. */
+/* Runs through a cycle without any effect, so that its code and data are in the caches. */
 BR_API void br_cycle_rehearse(br_cycle *cycle);
 
 /* From the next cycle on slow down along the line to standstill, and stay; or drive, and believe
@@ -253,11 +253,11 @@ BR_API void br_cycle_rehearse(br_cycle *cycle);
 BR_API void br_cycle_stop(br_cycle *cycle);
 BR_API void br_cycle_go(br_cycle *cycle);
 
-/* The run is over, or its plant has gone: another may follow. */
+/* The run is over, or its plant has gone: the states of another run may follow. */
 BR_API void br_cycle_end(br_cycle *cycle);
 
-/* Nothing has come for long: anything may follow. 1 if the last state that was not driven on is one
- * of a lockstep run, whose plant may still want an answer: observe it again. */
+/* No state has arrived for long: those of any run may follow. 1 if the last state that was refused
+ * belongs to a lockstep run, whose plant may still wait for an answer: observe it again. */
 BR_API int br_cycle_forget(br_cycle *cycle);
 
 /* Counts and state, kept up to date there. */

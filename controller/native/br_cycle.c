@@ -272,7 +272,8 @@ static int slowing(br_cycle *cycle, double decided_at_s, br_environment *environ
     }
     const double since_s = decided_at_s - cycle->stopping_s;
     const double limit_mps = fmax(cycle->stopping_mps - s->stop_mps2 * since_s, 0);
-    /* Both limits are kept by the lower one falling at the higher rate; NaN is left to be refused.
+    /* Both limits are kept by the lower one falling at the higher rate; NaN is passed on: the step
+     * refuses it.
      */
     if (limit_mps < environment->speed_limit_mps) environment->speed_limit_mps = limit_mps;
     if (s->stop_mps2 > environment->speed_limit_rate_mps2)

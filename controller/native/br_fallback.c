@@ -30,7 +30,7 @@ static int usable(const br_driving *s, const double u[BR_NU]) {
     return 1;
 }
 
-/* The plan is kept only of solutions that were fit to be driven, and none that is no number. */
+/* Keeps the plan of a solution that may be driven, if all of its numbers are finite. */
 static void keep(br_fallback *fallback, const br_solution *solution, double time_s) {
     const int rows = solution->rows < BR_N ? solution->rows : BR_N;
     fallback->rows = rows;

@@ -296,8 +296,8 @@ struct br_mpc {
     double merit;   /* ... beside its cost */
     double worth;   /* cost, to first order, once the defects are gone: costates price them */
     br_mpc_info info;
-    br_gp gp[3]; /* in use, proven, spare; last: what of it no weights are loaded into is never
-                    touched */
+    br_gp gp[3]; /* in use, proven, spare. The last member of br_mpc, so that memory for points that
+                    the weights do not have is never written to */
 };
 
 /* The result and all before it have to be computed again: what they are made from has changed. */

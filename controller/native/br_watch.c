@@ -1,10 +1,10 @@
-/* What weights say beside what the car does: the newest samples, and the errors on them of the
- * weights in use, of the proven ones, and of none.
+/* The newest samples of what the car did, and the errors that the weights in use, the proven ones,
+ * and the model without correction make on them.
  *
  * A sample is what a Gaussian process learns from: features, and the residual of the nominal model,
- * per stage. It is taken in the preparation from what br_mpc_observe has been shown, and judged
- * there: the newest first, then older ones back to before the weights came into use, a few at a
- * time, so that no preparation takes longer than some microseconds more. */
+ * per stage. The preparation makes it of the newest transition given to br_mpc_observe, and
+ * compares the weights on it: on the newest sample first, then on older ones, also from before the
+ * weights came into use; on a few at a time, so that it takes some microseconds at most. */
 #include <math.h>
 #include <string.h>
 

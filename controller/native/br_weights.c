@@ -1,10 +1,10 @@
 /* New weights between two steps: staged by any one thread, adopted by the control thread, which
  * goes back to the proven ones if they are worse.
  *
- * There are three buffers: in use, proven, and spare; the former two may be one. mpc->spare says
- * whose the spare buffer is. Who changes it to BR_SPARE_TAKEN (acquire) may write that buffer, and
- * hands it on with a store (release); so the exchange, and the steps that read the buffer before
- * it, happen before the next staging.
+ * There are three buffers: in use, proven, and spare; the former two may be the same one.
+ * mpc->spare is the state of the spare buffer. The thread that changes it to BR_SPARE_TAKEN
+ * (acquire) may write the buffer, and releases it by storing another state; so the exchange, and
+ * the steps that read the buffer before it, happen before the next staging.
  */
 #include <math.h>
 
