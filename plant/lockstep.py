@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from bayesrace.messages import RunRequest, State, Truth
-from bayesrace.tracks.startline import CrossingLine
+from bayesrace.tracks.track import CrossingLine
 from plant.settings import SensorNoise
 from plant.vehicle import FmuFault, Vehicle
 

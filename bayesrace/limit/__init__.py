@@ -1,9 +1,9 @@
 """The limit: the fastest lap that a car can drive on a track, by minimum-time optimal control.
 
 With the true model, tyres and actuators' limits as the plant has them; gates, first guess and IPOPT
-are the racing line's (:mod:`bayesrace.raceline`). Order: the lap as a file (lap.py), the racing
-line on the gates (guess.py), the nonlinear programme (ocp.py; outline.py for the car's outline),
-solved on meshes twice as fine each (solve.py).
+are the racing line's (:mod:`bayesrace.raceline`). Order: the lap as a file (lap.py), the nonlinear
+programme (ocp.py; outline.py for the car's outline), solved from the racing line on, on meshes
+twice as fine each (solve.py).
 
 CasADi is imported on the first call of :func:`compute_limit`, not with this package.
 """

@@ -13,8 +13,7 @@ from bayesrace.tracks.library import (
     read_track,
     write_track,
 )
-from bayesrace.tracks.startline import Crossing, StartLine
-from bayesrace.tracks.track import PathProjection, Track
+from bayesrace.tracks.track import Crossing, PathProjection, StartLine, Track
 
 __all__ = [
     "DEFAULT_RACE_TRACK",
