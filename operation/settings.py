@@ -181,7 +181,7 @@ class RaceSettings(PreparationSettings):
 
 
 class BayesianSettings(RaceLineSettings):
-    """Everything that a line found by :func:`operation.line_search.compare_lines` depends on, but
+    """Everything that a line found by :func:`operation.line_search.searched_line` depends on, but
     for weights."""
 
     objective: Annotated[Literal["ideal", "driven"], Option(metavar="LAP")] = Field(
@@ -189,4 +189,3 @@ class BayesianSettings(RaceLineSettings):
     )
     nodes: int = Field(21, ge=6, le=60, description="nodes of the line, the search's dimension")
     search: SearchSettings = SearchSettings()
-    trials: int = Field(1, ge=1, le=100, description="searches, from one seed after the other")

@@ -15,14 +15,11 @@ from bayesrace.raceline.friction import speed_profile
 from bayesrace.raceline.nodes import NodeLines, roughness
 from bayesrace.tracks import StartLine, load_track
 from bayesrace.vehicles import get_car
-from learning.search import Search, _surrogate, log_improvement, search
+from learning.search import _surrogate, log_improvement, search
 from learning.settings import SearchSettings
-from operation.line_search import Comparison, driven_lap, write_curve
+from operation.line_search import driven_lap
 from tests.command_line import Cli, refused
-from tests.published_line import (
-    PUBLISHED,
-    objective,
-)
+from tests.published_line import PUBLISHED, objective
 from tests.reference import reference_file
 
 CAR = get_car("orca")
@@ -125,9 +122,9 @@ def test_a_margin_without_room_is_refused() -> None:
 
 
 def test_command(cli: Cli, tmp_path: Path) -> None:
-    """The file is that of its seed and says what it was made for; the curve has its form."""
+    """The file is that of its seed and says what it was made for."""
     how = ("--method", "bayesian", "--evaluations", "12", "--nodes", "14")
-    done = cli("raceline", "paddock", *how, "--out", "a.csv", "--curve", "curve.csv")
+    done = cli("raceline", "paddock", *how, "--out", "a.csv")
     assert done.code == 0, done.err
     assert "ideal lap; along the minimum-time line" in done.out
     cli("raceline", "paddock", *how, "--out", "b.csv")
@@ -135,16 +132,11 @@ def test_command(cli: Cli, tmp_path: Path) -> None:
     cli("raceline", "paddock", *how, "--out", "c.csv", "--seed", "3")
     lines = [read_raceline_for(tmp_path / f"{one}.csv", PADDOCK, CAR) for one in "ac"]
     assert lines[0].made_for != lines[1].made_for
-    rows = (tmp_path / "curve.csv").read_text().splitlines()
-    assert rows[0] == "evaluation,bayesian_0,random_0"
-    assert len(rows) == 13
 
 
 def test_refusals(cli: Cli) -> None:
-    refused(cli("raceline", "paddock", "--curve", "x.csv"), "--method bayesian")
     refused(cli("raceline", "paddock", "--nodes", "12"), "--nodes needs --method bayesian")
     bayesian = ("raceline", "paddock", "--method", "bayesian")
-    refused(cli(*bayesian, "--curve", "x.csv", "--out", "x.csv"), "x.csv", "another name")
     refused(cli(*bayesian, "--nodes", "3"), "--nodes")
     refused(cli(*bayesian, "--weights", "w.bin"), "--objective driven")
 
@@ -157,15 +149,6 @@ def test_the_driven_lap_is_the_objective(dynamic_artefact: Path) -> None:
     assert 0.8 * line.lap_time_s < lap(line) < 1.5 * line.lap_time_s
     hurried = replace(line, vx_mps=10 * line.vx_mps)
     assert math.isinf(lap(hurried))
-
-
-def test_a_search_that_ended_early_keeps_its_best_lap_in_the_curve(tmp_path: Path) -> None:
-    one = Search(np.zeros((3, 2)), np.array([math.inf, 2.0, 3.0]))
-    line = NodeLines(PADDOCK, CAR, RaceLineSettings(), 16).line(np.full(16, 0.5))
-    assert line is not None
-    compared = Comparison(line, 2.0, (one, Search(one.x[:2], one.y[1:])), (), 1.5)
-    write_curve(tmp_path / "curve.csv", compared)
-    assert (tmp_path / "curve.csv").read_text().splitlines()[-1] == "3,2.0,2.0"
 
 
 @pytest.mark.check

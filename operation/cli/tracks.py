@@ -124,7 +124,7 @@ def cars(
 
 @options_of(
     "operation.settings.BayesianSettings",
-    "friction margin_m objective nodes search.evaluations search.patience trials search.seed",
+    "friction margin_m objective nodes search.evaluations search.patience search.seed",
 )
 def raceline(
     settings: "Given[BayesianSettings]",
@@ -134,15 +134,12 @@ def raceline(
     method: Literal["minimum-time", "bayesian"] = options.value(
         "minimum-time, or bayesian (Jain and Morari 2020).", "minimum-time"
     ),
-    curve: Path | None = options.new_file(
-        "Write the best lap against evaluations, beside random search (CSV)."
-    ),
     weights: Path | None = options.value("Weights for --objective driven.", shown="trained"),
 ) -> None:
     """Compute a racing line of a track: of minimum time, or by Bayesian optimisation.
 
-    --friction and --margin are for both methods; the options from --objective to --seed, --curve
-    and --weights are for the second.
+    --friction and --margin are for both methods; the options from --objective to --seed and
+    --weights are for the second.
     """
     from bayesrace.raceline import RaceLineSettings, racing_line, write_raceline
     from bayesrace.tracks import load_track
@@ -150,8 +147,7 @@ def raceline(
 
     parameters, chosen = get_car(car), settings()
     if method == "minimum-time":
-        own = {"--curve": curve, "--weights": weights}
-        given = {*settings.flags, *(flag for flag, file in own.items() if file)}
+        given = {*settings.flags, *(["--weights"] if weights else [])}
         if wrong := sorted(given - {"--friction", "--margin"}):
             raise InputError(f"{wrong[0]} needs --method bayesian")
         plain = RaceLineSettings(friction=chosen.friction, margin_m=chosen.margin_m)
@@ -159,17 +155,13 @@ def raceline(
         write_raceline(out, line)
         typer.echo(f"{line.length_m:.2f} m in {line.lap_time_s:.3f} s: {out}")
         return
-    from operation.line_search import compare_lines, write_curve
+    from operation.line_search import searched_line
 
-    if curve == out:
-        raise InputError(f"--curve and --out both write {out}: give one of them another name")
     if weights is not None and chosen.objective != "driven":
         raise InputError("--weights needs --objective driven")
     with options.stages_shown() as stages:
-        found = compare_lines(track, parameters, chosen, stages, weights, curve is not None)
+        found = searched_line(track, parameters, chosen, stages, weights)
     write_raceline(out, found.line)
-    if curve is not None:
-        write_curve(curve, found)
     typer.echo(
         f"{found.line.length_m:.2f} m in {found.lap_s:.3f} s ({chosen.objective} lap; along the "
         f"minimum-time line {found.direct_s:.3f} s): {out}"
