@@ -11,6 +11,7 @@ from controller.driver import Driver
 from controller.interface import Environment, StepOutput
 from controller.python_controller import PythonController
 from controller.settings import CompensationSettings, FallbackSettings
+from tests import sample_messages as messages
 
 __all__ = ["STEP_S", "ScriptedLaw", "scripted_driver", "state"]
 
@@ -67,9 +68,4 @@ def scripted_driver(
 
 def state(seq: int, **changes: Any) -> State:
     """A state of a free-running plant that samples every 20 ms."""
-    values: dict[str, Any] = {
-        "source_time_ns": 0, "epoch": 1, "run": 1, "time_s": seq * STEP_S, "x": (0.0,) * 7,
-        "u_applied": (0.0, 0.0), "lap": 0, "lockstep": False, "actuation_delays": (),
-        "final": False,
-    }  # fmt: skip
-    return State(seq=seq, **(values | changes))
+    return messages.state(seq, **({"time_s": seq * STEP_S} | changes))

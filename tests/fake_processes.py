@@ -20,6 +20,7 @@ from bayesrace.transport import (
 )
 from operation.analysis.network_status import NetworkStatus
 from operation.lifecycle import ask_statuses, find
+from tests import sample_messages as messages
 
 __all__ = ["COUNTERS", "PATIENCE_S", "Fake", "Fakes", "fakes", "options", "status_of", "where"]
 
@@ -45,21 +46,10 @@ class Fake:
     def status(self, seq: int) -> Status:
         rate, age = (50.0, 0.012) if self.source == "controller" else (0.0, -1.0)
         phase = "driving" if self.source == "controller" else "idle"
-        return Status(
-            seq=seq,
-            source_time_ns=0,
-            source=self.source,
-            phase=phase,
-            epoch=7,
-            run=2,
-            text=self.text,
-            weights_version="v3",
-            track="",
-            rate_hz=rate,
-            state_age_s=age,
-            delay_s=0.034,
-            counters=COUNTERS,
-        )
+        return messages.status(
+            seq=seq, source=self.source, phase=phase, epoch=7, run=2, text=self.text,
+            weights_version="v3", rate_hz=rate, state_age_s=age, delay_s=0.034, counters=COUNTERS,
+        )  # fmt: skip
 
     def serve(self, ready: threading.Event, over: threading.Event) -> None:
         role: Role = "plant" if self.source == "plant" else "controller"

@@ -15,7 +15,6 @@ import pytest
 
 from bayesrace.arrays import Floats
 from bayesrace.gp.weights import GpWeights
-from bayesrace.messages import State
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import STATES, dynamic
 from codegen.fmu import FmuDefinition, controller_fmu, pack
@@ -24,6 +23,7 @@ from controller.mpc import PredictiveController
 from controller.native_step import NativeStep, StepStatus
 from controller.settings import CompensationSettings, FallbackSettings
 from plant.simulator import Simulator
+from tests import sample_messages as messages
 from tests.car_fmu import packed_car
 from tests.conftest import SETTINGS, Circuit
 from tests.fmu_master import Slave
@@ -76,10 +76,9 @@ class Lockstep:
 
     def answer(self, seq: int, x: Floats) -> Floats:
         """The input for one state."""
-        state = State(
-            source_time_ns=0, run=1, time_s=seq * STEP_S, x=tuple(x), lap=0, seq=seq, epoch=1,
-            u_applied=self.plant.u_applied, lockstep=not self.delay_s, actuation_delays=(),
-            final=False,
+        state = messages.state(
+            seq, time_s=seq * STEP_S, x=tuple(x), u_applied=self.plant.u_applied,
+            lockstep=not self.delay_s,
         )  # fmt: skip
         self.driver.observe(state)
         decision = self.driver.decide(state.time_s)

@@ -25,6 +25,7 @@ from controller.native_step import NativeStep
 from controller.process_settings import ControllerSettings
 from controller.settings import cycle_values
 from operation.closed_loop import ClosedLoop
+from tests import sample_messages as messages
 from tests.conftest import SETTINGS, Circuit
 from tests.native_programs import SANITIZED, native_program
 from tests.programs import ROOT
@@ -122,19 +123,7 @@ def test_over_udp_states_are_answered_and_silence_ends_at_the_fallback(
     plant: socket.socket, circuit: Circuit
 ) -> None:
     x = tuple(map(float, circuit.start(v_mps=1.5)))
-    state = State(
-        seq=0,
-        source_time_ns=0,
-        epoch=7,
-        run=3,
-        time_s=0.0,
-        x=x,
-        u_applied=(0.0, 0.0),
-        lap=0,
-        lockstep=False,
-        actuation_delays=(),
-        final=False,
-    )
+    state = messages.state(epoch=7, run=3, x=x)
     plant.send(b"no state")
     plant.send(line_of(state).encode())
     rows = [plant.recv(4096).split()]
@@ -156,19 +145,7 @@ def test_over_udp_no_other_sender_ends_the_run_or_takes_its_answers(
     plant: socket.socket, circuit: Circuit
 ) -> None:
     x = tuple(map(float, circuit.start(v_mps=1.5)))
-    state = State(
-        seq=0,
-        source_time_ns=0,
-        epoch=7,
-        run=3,
-        time_s=0.0,
-        x=x,
-        u_applied=(0.0, 0.0),
-        lap=0,
-        lockstep=False,
-        actuation_delays=(),
-        final=False,
-    )
+    state = messages.state(epoch=7, run=3, x=x)
     plant.send(line_of(state).encode())
     plant.recv(4096)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
@@ -225,18 +202,8 @@ def test_no_sanitizer_finds_anything_whatever_the_states_say(
     for k in range(300):
         delays = (0.0, 0.0, 0.02) * int(random.integers(0, 64))
         lockstep = bool(k // 100 % 2)
-        sent = State(
-            seq=k,
-            source_time_ns=0,
-            epoch=1,
-            run=1,
-            time_s=0.02 * k,
-            x=x,
-            u_applied=(0.0, 0.0),
-            lap=0,
-            lockstep=lockstep,
-            actuation_delays=delays,
-            final=k % 90 == 89,
+        sent = messages.state(
+            k, time_s=0.02 * k, x=x, lockstep=lockstep, actuation_delays=delays, final=k % 90 == 89
         )
         words = line_of(sent).split()
         for _ in range(int(random.integers(0, 3)) if k % 3 == 0 else 0):

@@ -26,6 +26,7 @@ from controller.interface import Environment, StepOutput
 from controller.mpc import PredictiveController
 from controller.native_step import NativeStep, StepStatus
 from controller.settings import CompensationSettings, FallbackSettings
+from tests import sample_messages as messages
 from tests.conftest import SETTINGS, Circuit, discrete
 from tests.cycle_rig import ScriptedLaw, scripted_driver, state
 
@@ -65,11 +66,10 @@ class Rig:
 
     def state(self, **changes: Any) -> State:
         values: dict[str, Any] = {
-            "source_time_ns": 0, "run": 1, "time_s": self.seq * STEP_S, "x": tuple(self.x),
-            "u_applied": tuple(self.u), "lap": 0, "lockstep": False, "actuation_delays": (),
-            "final": False,
+            "epoch": self.epoch, "time_s": self.seq * STEP_S, "x": tuple(self.x),
+            "u_applied": tuple(self.u),
         }  # fmt: skip
-        return State(seq=self.seq, epoch=self.epoch, **(values | changes))
+        return messages.state(self.seq, **(values | changes))
 
     def cycle(self, late_s: float = 0.0, budget_s: float = 0.0, **changes: Any) -> Decision:
         """A state arrives, is answered, and the plant drives on."""

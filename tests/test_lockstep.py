@@ -20,9 +20,10 @@ import pytest
 
 from bayesrace.errors import InputError
 from bayesrace.log import LogReader
-from bayesrace.messages import ACTUATION, EVENT, STATE, STATUS, TELEMETRY, Status
+from bayesrace.messages import ACTUATION, EVENT, STATE, STATUS, TELEMETRY
 from bayesrace.recorder import Recorder
 from bayesrace.transport import Endpoints, Request, declare_service, open_session
+from tests import sample_messages as messages
 from tests.car_fmu import packed_car
 from tests.programs import until
 from tests.pursuit_rig import CONTROLLER, PATIENCE_S, PLANT, Rig, running_rig, start
@@ -236,21 +237,7 @@ def test_a_run_is_stopped_on_request_and_another_refused_meanwhile(rig: Rig) -> 
 
 def test_a_run_of_two_controllers_is_refused_or_no_success(rig: Rig) -> None:
     """Only the plant is connected to both: each would drive now and then."""
-    status = Status(
-        seq=0,
-        source_time_ns=0,
-        source="controller",
-        phase="waiting",
-        epoch=0,
-        run=0,
-        text="",
-        weights_version="",
-        track="",
-        rate_hz=0.0,
-        state_age_s=-1.0,
-        delay_s=0.0,
-        counters={},
-    )
+    status = messages.status(source="controller", phase="waiting")
 
     @contextlib.contextmanager
     def another() -> Iterator[None]:

@@ -22,16 +22,15 @@ from bayesrace.messages import (
     HEARTBEAT,
     STATE,
     Actuation,
-    Event,
     Message,
     State,
-    Status,
     Telemetry,
     Truth,
     encode,
 )
 from bayesrace.recorder import Recorder
 from bayesrace.transport import Endpoints, Inbox, Publisher, free_endpoint, open_session
+from tests import sample_messages as messages
 from tests.driven import blank
 from tests.programs import ROOT, until
 from tests.test_messages import conforms
@@ -40,34 +39,14 @@ KEY, EVENT_KEY = "bayesrace/orca/state", "bayesrace/orca/event/plant"
 
 
 def state(seq: int) -> State:
-    return State(
-        seq=seq,
-        source_time_ns=0,
-        epoch=0,
-        run=1,
-        time_s=0.02 * seq,
-        x=(0.0,) * 7,
-        u_applied=(0.0, 0.0),
-        lap=0,
-        lockstep=True,
-        actuation_delays=(),
-        final=False,
-    )
+    return messages.state(seq, epoch=0, time_s=0.02 * seq, lockstep=True)
 
 
 def write(path: Path, count: int = 50) -> None:
     writer = LogWriter(path, {"settings": {"track": "ethz"}})
     for seq in range(count):
         writer.write(KEY, encode(state(seq)), time.monotonic_ns())
-    event = Event(
-        seq=0,
-        source_time_ns=0,
-        run=1,
-        source="plant",
-        kind="run_ended",
-        text="done",
-        data={"laps": 1},
-    )
+    event = messages.event(run=1, kind="run_ended", text="done", data={"laps": 1})
     writer.write(EVENT_KEY, encode(event), time.monotonic_ns())
     writer.write(KEY, b"junk", time.monotonic_ns())
     writer.write("bayesrace/orca/unknown", b"junk", time.monotonic_ns())
@@ -368,21 +347,7 @@ def test_heartbeats_do_not_keep_a_recorder_from_settling(tmp_path: Path) -> None
         def beats() -> None:
             while not stop.wait(0.02):
                 seq = publisher.next_seq
-                status = Status(
-                    seq=seq,
-                    source_time_ns=0,
-                    source="plant",
-                    phase="idle",
-                    epoch=0,
-                    run=0,
-                    text="",
-                    weights_version="",
-                    track="",
-                    rate_hz=0.0,
-                    state_age_s=-1.0,
-                    delay_s=0.0,
-                    counters={},
-                )
+                status = messages.status(seq=seq)
                 publisher.put(status, lockstep=False)
 
         beating = threading.Thread(target=beats)
@@ -460,19 +425,16 @@ WRITER = """
 import sys, time
 from pathlib import Path
 from bayesrace.recorder import Recorder
-from bayesrace.messages import STATE, State
+from bayesrace.messages import STATE
 from bayesrace.transport import Endpoints, Publisher, free_endpoint, open_session
+from tests import sample_messages as messages
 endpoint = free_endpoint()
 with open_session(Endpoints(listen=(endpoint,))) as plant:
     with open_session(Endpoints(connect=(endpoint,))) as session:
         Recorder(session, "orca", Path(sys.argv[1]))
         publisher = Publisher(plant, STATE, "orca")
         for seq in range(10**6):
-            state = State(
-                seq=seq, source_time_ns=0, epoch=0, run=1, time_s=0.0, x=(0.0,) * 7,
-                u_applied=(0.0, 0.0), lap=0, lockstep=True, actuation_delays=(), final=False,
-            )
-            publisher.put(state, lockstep=True)
+            publisher.put(messages.state(seq), lockstep=True)
             time.sleep(0.005)
 """
 

@@ -7,10 +7,11 @@ import pytest
 
 from bayesrace.messages import STATE, Role
 from bayesrace.transport import Endpoints, Inbox, Kind, Publisher, free_endpoint, open_session
+from tests import sample_messages as messages
 from tests.command_line import Cli, refused
 from tests.fake_processes import Fakes, fakes, status_of
 from tests.programs import finish, run, start, until
-from tests.test_transport import state, take
+from tests.test_transport import take
 
 __all__ = ["fakes"]
 
@@ -44,7 +45,7 @@ def test_a_router_forwards_between_plant_controller_and_observer_and_a_peer_does
         theirs.watch("controller")
         for inbox in (theirs, *receivers):
             take(inbox, Kind.ALIVE)
-        Publisher(plant, STATE, "a").put(state(0), lockstep=True)
+        Publisher(plant, STATE, "a").put(messages.state(0), lockstep=True)
         for inbox in receivers:
             take(inbox, Kind.MESSAGE)
 

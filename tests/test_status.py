@@ -10,11 +10,11 @@ import pytest
 from rich.console import Console
 
 from bayesrace.errors import InputError
-from bayesrace.messages import Status
 from bayesrace.transport import Endpoints, free_endpoint, open_session
 from operation.analysis.network_status import NetworkStatus, ProcessStatus
 from operation.lifecycle import follow
 from operation.terminal.status_table import StatusTable
+from tests import sample_messages as messages
 from tests.command_line import Cli, refused
 from tests.fake_processes import COUNTERS, PATIENCE_S, Fakes, fakes, options, status_of, where
 from tests.programs import ROOT, environment, finish, start, until
@@ -105,21 +105,7 @@ def test_a_narrow_terminal_shows_the_same(fakes: Fakes) -> None:
 
 
 def test_a_heartbeat_that_stops_is_no_answer_any_more() -> None:
-    status = Status(
-        seq=0,
-        source_time_ns=0,
-        source="plant",
-        phase="idle",
-        epoch=1,
-        run=0,
-        text="",
-        weights_version="",
-        track="",
-        rate_hz=50.0,
-        state_age_s=-1.0,
-        delay_s=0.0,
-        counters={},
-    )
+    status = messages.status(epoch=1, rate_hz=50.0)
     network = NetworkStatus({"a": {"plant": ProcessStatus(status, "", 1, arrived_s=100.0)}})
     answering = []
     for now_s in (100.5, 102.0):

@@ -21,12 +21,8 @@ from bayesrace.messages import (
     STATUS,
     STOP,
     WEIGHTS,
-    Event,
-    Reply,
     RollbackRequest,
     Service,
-    State,
-    Status,
     StatusRequest,
     StopRequest,
     car_key,
@@ -49,6 +45,7 @@ from bayesrace.transport import (
     private_endpoints,
 )
 from bayesrace.transport.session import unlinked
+from tests import sample_messages as messages
 from tests.programs import until
 
 pytestmark = pytest.mark.wall_clock
@@ -62,22 +59,6 @@ def pair() -> Iterator[tuple[Any, Any]]:
         one = stack.enter_context(open_session(Endpoints(listen=(endpoint,))))
         two = stack.enter_context(open_session(Endpoints(connect=(endpoint,))))
         yield one, two
-
-
-def state(seq: int) -> State:
-    return State(
-        seq=seq,
-        source_time_ns=0,
-        epoch=0,
-        run=1,
-        time_s=0.0,
-        x=(0.0,) * 7,
-        u_applied=(0.0, 0.0),
-        lap=0,
-        lockstep=True,
-        actuation_delays=(),
-        final=False,
-    )
 
 
 def take(inbox: Inbox, kind: Kind, timeout_s: float = 5.0) -> Item:
@@ -105,11 +86,11 @@ def test_nothing_is_lost_or_reordered_in_lockstep(pair: tuple[Any, Any]) -> None
     meet(sender, receiver)
     publisher = Publisher(pair[0], STATE, "orca")
     for _ in range(3000):
-        publisher.put(state(publisher.next_seq), lockstep=True)
+        publisher.put(messages.state(publisher.next_seq), lockstep=True)
     for seq in range(3000):
         item = take(receiver, Kind.MESSAGE)
         assert item.name == "state"
-        assert item.value == state(seq)
+        assert item.value == messages.state(seq)
     assert receiver.overflowed == 0
 
 
@@ -123,8 +104,8 @@ def test_an_inbox_receives_its_own_car_or_all_and_counts_what_its_queue_cannot_t
         inbox.subscribe(STATE)
     meet(sender, own)
     for seq, car in enumerate(("two", "one", "two", "two")):
-        Publisher(pair[0], STATE, car).put(state(seq), lockstep=True)
-    assert take(own, Kind.MESSAGE).value == state(1)
+        Publisher(pair[0], STATE, car).put(messages.state(seq), lockstep=True)
+    assert take(own, Kind.MESSAGE).value == messages.state(1)
     deadline = time.monotonic() + 5.0
     while not every.overflowed and time.monotonic() < deadline:
         time.sleep(0.01)
@@ -139,38 +120,16 @@ def test_requests_are_answered_and_silence_is_an_error(pair: tuple[Any, Any]) ->
     server.serve(WEIGHTS)
     server.serve(STOP)
     meet(server, client)
-    status = Status(
-        seq=0,
-        source_time_ns=1,
-        source="plant",
-        phase="idle",
-        epoch=5,
-        run=0,
-        text="fine",
-        weights_version="",
-        track="",
-        rate_hz=50.0,
-        state_age_s=-1.0,
-        delay_s=0.0,
-        counters={"late": 3},
-    )
+    status = messages.status(epoch=5, text="fine", rate_hz=50.0, counters={"late": 3})
 
     def answer() -> None:
         take(server, Kind.REQUEST).value.answer(status)
         request = take(server, Kind.REQUEST).value
-        request.answer(
-            Reply(
-                seq=0,
-                source_time_ns=0,
-                accepted=True,
-                text=f"{len(request.payload)} bytes",
-                data={},
-            )
-        )
+        request.answer(messages.reply(True, f"{len(request.payload)} bytes"))
         request = take(server, Kind.REQUEST).value
         message, why_not = decode_request(request)
         assert (message, why_not) == (StopRequest(seq=0, source_time_ns=0, text="enough"), "")
-        request.answer(Reply(seq=0, source_time_ns=0, accepted=False, text="no", data={}))
+        request.answer(messages.reply(False, "no"))
 
     thread = threading.Thread(target=answer)
     thread.start()
@@ -207,10 +166,7 @@ def answering(pair: tuple[Any, Any], service: Service[Any, Any], *data: bytes) -
 
 def test_of_several_under_one_name_a_refusal_is_the_answer(pair: tuple[Any, Any]) -> None:
     """All are heard, and a yes of one does not hide the no of another."""
-    replies = [
-        Reply(seq=0, source_time_ns=0, accepted=accepted, text="", data={})
-        for accepted in (True, False, True)
-    ]
+    replies = [messages.reply(accepted) for accepted in (True, False, True)]
     request, key = StopRequest(seq=0, source_time_ns=0, text=""), car_key(STOP.key, "orca")
     encoded = [encode(one) for one in replies]
     with answering(pair, STOP, *encoded):
@@ -224,7 +180,7 @@ def test_of_several_under_one_name_a_refusal_is_the_answer(pair: tuple[Any, Any]
 def test_a_malformed_answer_does_not_hide_the_valid_ones(pair: tuple[Any, Any]) -> None:
     request, reply = (
         StopRequest(seq=0, source_time_ns=0, text=""),
-        Reply(seq=0, source_time_ns=0, accepted=True, text="", data={}),
+        messages.reply(True),
     )
     with answering(pair, STOP, b"junk", encode(reply), b"more junk"):
         assert ask(pair[1], STOP, "orca", request) == reply
@@ -237,23 +193,7 @@ def test_a_malformed_answer_does_not_hide_the_valid_ones(pair: tuple[Any, Any]) 
 
 def test_several_processes_of_one_name_are_reported(pair: tuple[Any, Any]) -> None:
     """Their messages would be mixed, in the car and in the log."""
-    status = encode(
-        Status(
-            seq=0,
-            source_time_ns=0,
-            source="controller",
-            phase="waiting",
-            epoch=0,
-            run=0,
-            text="",
-            weights_version="",
-            track="",
-            rate_hz=0.0,
-            state_age_s=-1.0,
-            delay_s=0.0,
-            counters={},
-        )
-    )
+    status = encode(messages.status(source="controller", phase="waiting"))
 
     def there(number: int) -> None:
         with ExitStack() as stack:
@@ -289,9 +229,7 @@ def test_a_request_beyond_the_limit_is_rejected_as_busy(
         ask(pair[1], STOP, "orca", request)
     assert server.requests_rejected == 1
     for _ in waiting:
-        take(server, Kind.REQUEST).value.answer(
-            Reply(seq=0, source_time_ns=0, accepted=True, text="", data={})
-        )
+        take(server, Kind.REQUEST).value.answer(messages.reply(True))
     assert all(len(list(answers)) == 1 for answers in waiting)
 
 
@@ -303,7 +241,7 @@ def test_a_malformed_request_is_refused_with_a_reason(pair: tuple[Any, Any]) -> 
     thread.start()
     request = take(server, Kind.REQUEST).value
     message, why_not = decode_request(request)
-    request.answer(Reply(seq=0, source_time_ns=0, accepted=False, text=why_not, data={}))
+    request.answer(messages.reply(False, why_not))
     thread.join()
     assert message is None
     assert why_not.startswith("StopRequest: ")
@@ -319,7 +257,7 @@ def test_a_lost_request_is_repeated_but_for_a_rollback(pair: tuple[Any, Any]) ->
         if len(heard) % 2:
             threading.Timer(0.8, request._query.drop).start()
         else:
-            request.answer(Reply(seq=0, source_time_ns=0, accepted=True, text="yes", data={}))
+            request.answer(messages.reply(True, "yes"))
 
     _kept = [declare_service(answerer, one, "orca", answer) for one in (WEIGHTS, ROLLBACK)]
     time.sleep(0.5)  # the declarations travel
@@ -417,9 +355,7 @@ def test_events_of_all_sources_arrive(pair: tuple[Any, Any]) -> None:
     receiver.subscribe(EVENT)
     meet(sender, receiver)
     for source in ("plant", "race"):
-        event = Event(
-            seq=0, source_time_ns=0, run=0, source=source, kind="kind", text="text", data={}
-        )
+        event = messages.event(source=source)
         Publisher(pair[0], EVENT, "orca", source).put(event, lockstep=True)
     assert {take(receiver, Kind.MESSAGE).name for _ in range(2)} == {"event"}
 
@@ -433,13 +369,8 @@ def test_an_inbox_takes_several_topics_each_with_its_own_depth_and_decoder(
     meet(sender, receiver)
     publishers = Publisher(pair[0], STATE, "orca"), Publisher(pair[0], EVENT, "orca", "plant")
     for seq in range(100):
-        publishers[0].put(state(seq), lockstep=True)
-        publishers[1].put(
-            Event(
-                seq=seq, source_time_ns=0, run=0, source="plant", kind="kind", text="text", data={}
-            ),
-            lockstep=True,
-        )
+        publishers[0].put(messages.state(seq), lockstep=True)
+        publishers[1].put(messages.event(seq), lockstep=True)
     pair[0].put(car_key(EVENT.key, "orca", "plant"), b"junk")
     time.sleep(0.5)  # all of it arrives
     found: dict[str, list[Any]] = {"state": [], "event": []}
@@ -451,20 +382,15 @@ def test_an_inbox_takes_several_topics_each_with_its_own_depth_and_decoder(
     assert (states.accepted, events.accepted, events.refused) == (10, 100, 1)
     for number in range(100):
         receiver.put(Item(Kind.SIGNAL, "", number, 0))
-    publishers[0].put(state(99), lockstep=True)
+    publishers[0].put(messages.state(99), lockstep=True)
     time.sleep(0.5)
     kinds = [item.kind for item in (receiver.get(), receiver.get()) if item is not None]
     assert kinds == [Kind.SIGNAL, Kind.MESSAGE]  # the queue does not go first until it is empty
     while receiver.queued:
         take(receiver, Kind.SIGNAL)
     with receiver.stamped():
-        publishers[0].put(state(100), lockstep=True)
-        publishers[1].put(
-            Event(
-                seq=100, source_time_ns=0, run=0, source="plant", kind="kind", text="text", data={}
-            ),
-            lockstep=True,
-        )
+        publishers[0].put(messages.state(100), lockstep=True)
+        publishers[1].put(messages.event(100), lockstep=True)
         assert {take(receiver, Kind.MESSAGE).name for _ in range(2)} == {"state", "event"}
 
 
@@ -483,7 +409,7 @@ def test_threads_of_the_transport_have_shorter_slices_than_their_owner(
     sender, receiver = Inbox(pair[0], "orca"), Inbox(pair[1], "orca")
     receiver.subscribe(STATE)
     meet(sender, receiver)
-    Publisher(pair[0], STATE, "orca").put(state(0), lockstep=True)
+    Publisher(pair[0], STATE, "orca").put(messages.state(0), lockstep=True)
     take(receiver, Kind.MESSAGE)
     owner = Path(f"/proc/self/task/{threading.get_native_id()}")
     names = {task: (task / "comm").read_text()[:3] for task in owner.parent.iterdir()}
