@@ -173,7 +173,7 @@ def command_cars(
     done, failed = [], []
     name = endpoints.car_named(name)
     source = "plant" if action == "end" else "controller"
-    with open_session(endpoints, "director") as session:
+    with open_session(endpoints, "director", reports_absence=False) as session:
         cars = pick(find(session, endpoints, timeout_s, name, (source,)), name, all_cars, source)
         answers = command(session, cars, action, text, timeout_s)
     for car, answer in answers.items():

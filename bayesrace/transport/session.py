@@ -125,6 +125,7 @@ def open_session(
     role: Role = "viewer",
     *,
     peers_follow: bool = False,
+    reports_absence: bool = True,
     grace_s: float = 0.0,
 ) -> Iterator[Any]:
     """A Zenoh session of a process in that role, closed at the end of the block.
@@ -136,6 +137,7 @@ def open_session(
 
     ``peers_follow``: the caller starts the peers itself, just before or after this call. Opening
     the session then does not wait for them, and the log does not say that they are absent.
+    ``reports_absence`` False: nor does it where the caller reports that, after a time limit.
 
     Where the process's certificate expires, the main thread gets a SIGINT ``grace_s`` later, and
     the end of the block raises InputError with the reason.
@@ -150,7 +152,8 @@ def open_session(
     own = endpoints.credentials
     ending = nullcontext() if own is None else ending_on_expiry(own, grace_s)
     with _opened(endpoints, role, peers_follow) as session, ending:
-        if not peers_follow and (missing := unlinked(session, endpoints, _LINK_S)):
+        reports = reports_absence and not peers_follow
+        if reports and (missing := unlinked(session, endpoints, _LINK_S)):
             _log.warning(
                 "no link to %s yet; this goes on trying, and 'bayesrace doctor' says why there is "
                 "none", ", ".join(missing),

@@ -44,7 +44,7 @@ def accepted(
     """What the controller of the car, or of the only one (""), answers to what ``send`` sends, also
     in words; NotTakenOverError if it refuses."""
     name = endpoints.car_named(name)
-    with open_session(endpoints, "learning") as session:
+    with open_session(endpoints, "learning", reports_absence=False) as session:
         found = find(session, endpoints, timeout_s or 5.0, name, ("controller",))
         car = pick(found, name, False)[0]
         reply = send(session, car, content, timeout_s or 20.0)

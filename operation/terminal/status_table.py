@@ -62,7 +62,10 @@ def show_status(
     """Prints the state of a car, or of all (""), once or with ``watch`` until a signal; as a line
     of JSON each time, or as a table. InputError if no process answers."""
     name = endpoints.car_named(name)
-    with open_session(endpoints, "viewer") as session, _closed_pipe_allowed():
+    with (
+        open_session(endpoints, "viewer", reports_absence=False) as session,
+        _closed_pipe_allowed(),
+    ):
         found = ask_statuses(session, find(session, endpoints, timeout_s, name), timeout_s)
         if watch and as_json:
             for car in follow(session, found, name, 1.0):

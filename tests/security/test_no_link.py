@@ -118,7 +118,7 @@ def arguments(
 @pytest.mark.parametrize(("command", "role"), COMMANDS)
 def test_every_command_that_cannot_work_says_why_and_ends(
     cli: Cli, bundles: Bundles, tmp_path: Path, command: str, role: str,
-    arguments: dict[str, tuple[str | Path, ...]],
+    arguments: dict[str, tuple[str | Path, ...]], caplog: pytest.LogCaptureFixture,
 ) -> None:  # fmt: skip
     """A certificate for another role; an expired one; for commands, no link in time."""
     where, others = free_endpoint("tls"), arguments.get(command, ())
@@ -134,6 +134,7 @@ def test_every_command_that_cannot_work_says_why_and_ends(
             config = written(tmp_path, bundles, where, where)
             outcome = cli(command, *others, "--timeout", "0.5", "--config", config)
         refused(outcome, f"no connection to {where}", "bayesrace doctor")
+        assert NO_LINK.format(where) not in caplog.text  # said once
 
 
 @pytest.mark.parametrize("command", ["plant", "controller", "drive", "learn"])
