@@ -1,13 +1,10 @@
 """The report: one file with the numbers of the result, from whatever a race has left."""
 
-import os
 import re
 import shutil
-import signal
 import subprocess
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -110,26 +107,6 @@ def test_printed_it_has_few_pages_and_nothing_cut_off(
 def test_a_picture_lies_beside_the_page(rendered: tuple[Path, RaceResult]) -> None:
     assert (rendered[0].parent / "lap.png").read_bytes().startswith(b"\x89PNG")
     assert not list(rendered[0].parent.glob("*.part*"))
-
-
-def test_a_report_does_not_need_the_process_that_draws_its_maps(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    here = os.getpid()
-    path = write_race(tmp_path, [Drive("bestcase", circle(TWO_LAPS, 1.0))])
-    text = write_report(path).read_bytes()
-    picture = (path / "lap.png").read_bytes()
-    (path / "lap.png").unlink()
-
-    class Killed(LapMaps):
-        def __init__(self, *given: Any) -> None:
-            if os.getpid() != here:
-                os.kill(os.getpid(), signal.SIGKILL)
-            super().__init__(*given)
-
-    monkeypatch.setattr(render, "LapMaps", Killed)
-    assert write_report(path).read_bytes() == text
-    assert (path / "lap.png").read_bytes() == picture
 
 
 @pytest.mark.parametrize("part", ["_maps", "_panels"])

@@ -213,7 +213,7 @@ class RaceAnalysis:
     def __init__(self, recording: Recording) -> None:
         self.recording = recording
         self.track, self.line = recording.track, recording.line
-        car = recording.car if recording.built_in else None
+        car = recording.settings.car if recording.built_in else None
         drives = Counter(run.plan.controller for run in recording.runs)
         driven: Counter[str] = Counter()
         self.runs: list[DrivenRun] = []
@@ -235,8 +235,8 @@ class RaceAnalysis:
         run = self.recording.run_of("bestcase")
         if run is None:
             return None
-        car = self.recording.car
-        step_s = self.recording.discretisation.step_s
+        settings = self.recording.settings
+        car, step_s = settings.car, settings.discretisation.step_s
         try:
             return dataset_from_columns(run.truth, run.telemetry, car, step_s)
         except InputError:  # cut off before its second state
@@ -253,7 +253,9 @@ class RaceAnalysis:
                 weights = read_weights(path)
                 # On a busy machine the threads of BLAS wait for each other longer than they work.
                 with threadpool_limits(1):
-                    found[controller] = validate(weights, data, self.recording.discretisation)
+                    found[controller] = validate(
+                        weights, data, self.recording.settings.discretisation
+                    )
         return found
 
     @cached_property
@@ -262,10 +264,9 @@ class RaceAnalysis:
         gaps = sum(run.record.gaps for run in self.runs)
         recording = self.recording
         limit_s = limits_in(recording.directory)
-        laps = int(recording.settings.get("laps", 0))
         return RaceResult(
             settings=_summary(recording),
-            laps=[run.result(laps, limit_s) for run in self.runs],
+            laps=[run.result(recording.settings.laps, limit_s) for run in self.runs],
             limit_s=limit_s,
             training=None if self.training is None else self.training.result(),
             gp=self._metrics("bayesrace"),
@@ -287,24 +288,19 @@ class RaceAnalysis:
 
 
 def _summary(recording: Recording) -> SettingsSummary:
-    settings = recording.settings
-
-    def name(key: str) -> str:
-        return Path(str(settings.get(key, ""))).stem
-
-    mpc, simulator = settings.get("mpc"), str(settings.get("simulator", "equations"))
-    other = "" if simulator == "equations" else simulator
+    settings, line = recording.settings, recording.line
+    other = "" if settings.simulator == "equations" else settings.simulator
     return SettingsSummary(
-        car=recording.car.name,
-        tyres=recording.car.tyres.model,
-        friction=recording.line.made_for.friction if recording.line.made_for else None,
-        track=name("track"),
-        train_track=name("train_track"),
-        mode=str(settings.get("mode", "")),
-        seed=int(settings.get("seed", 0)),
-        laps=int(settings.get("laps", 0)),
-        constraints=bool(mpc.get("constraints", True)) if isinstance(mpc, dict) else True,
-        fmu=Path(str(settings.get("fmu") or other)).name,
+        car=settings.car.name,
+        tyres=settings.car.tyres.model,
+        friction=line.made_for.friction if line.made_for else None,
+        track=Path(settings.track).stem,
+        train_track=Path(settings.train_track).stem,
+        mode=settings.mode,
+        seed=settings.seed,
+        laps=settings.laps,
+        constraints=settings.mpc.constraints,
+        fmu=Path(settings.fmu or other).name,
     )
 
 

@@ -1,14 +1,13 @@
 """A run directory in memory: settings, track, racing line, and the messages of each run."""
 
-import json
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 
 from bayesrace.columns import Columns, LogColumns
 from bayesrace.errors import InputError, faults_in
@@ -18,7 +17,7 @@ from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY, TRUTH, Topic
 from bayesrace.raceline import RaceLine, read_raceline
 from bayesrace.tracks import Track, read_track
 from bayesrace.transport import Numbering
-from bayesrace.vehicles import DEFAULT_CAR, CarParameters, described_car
+from bayesrace.vehicles import CarParameters, default_car, described_car
 from learning.logs import CYCLES, STATES
 from operation.analysis.laps import Trajectory
 
@@ -172,12 +171,34 @@ class TrainingRecord:
     line: RaceLine
 
 
+class _Mpc(BaseModel):
+    constraints: bool = True
+    caution: float = 0.0
+
+
+class RunSettings(BaseModel):
+    """What is needed of a race's ``settings.json``, also of one that an earlier version wrote."""
+
+    car: Annotated[CarParameters, BeforeValidator(described_car)] = Field(
+        default_factory=default_car
+    )
+    track: str = "race"
+    train_track: str = "train"
+    mode: str = ""
+    seed: int = 0
+    laps: int = 0
+    discretisation: Discretisation = PREDICTION
+    mpc: _Mpc = _Mpc()
+    fmu: str | None = None
+    simulator: str = "equations"
+
+
 @dataclass(eq=False, kw_only=True)
 class Recording:
     """A run directory: settings, track, racing line, and each run's messages."""
 
     directory: Path
-    settings: dict[str, Any]
+    settings: RunSettings
     track: Track
     line: RaceLine
     runs: list[RunRecord]
@@ -193,34 +214,9 @@ class Recording:
     """Calendar time of the first message [ns since 1970]."""
 
     @property
-    def car(self) -> CarParameters:
-        """The car that was driven, as the settings describe it."""
-        try:
-            return described_car(self.settings.get("car", DEFAULT_CAR))
-        except InputError as error:
-            raise InputError(f"settings.json, car: {error}") from None
-
-    @property
     def built_in(self) -> bool:
         """Whether the log is that of the built-in equations: the truth, of no other simulator."""
-        other = self.settings.get("fmu") or self.settings.get("simulator", "equations")
-        return self.truth and other == "equations"
-
-    @property
-    def discretisation(self) -> Discretisation:
-        """The discretisation of the controller's prediction and of the residual."""
-        given = self.settings.get("discretisation")
-        try:
-            return PREDICTION if given is None else Discretisation.model_validate(given)
-        except ValidationError as error:
-            raise InputError(f"settings.json, discretisation: {faults_in(error)}") from None
-
-    @property
-    def caution(self) -> float:
-        """The probability that the controllers are cautious at; 0: they are not."""
-        mpc = self.settings.get("mpc")
-        value = mpc.get("caution") if isinstance(mpc, dict) else None
-        return float(value) if isinstance(value, int | float) else 0.0
+        return self.truth and not self.settings.fmu and self.settings.simulator == "equations"
 
     def run_of(self, controller: str) -> RunRecord | None:
         """The last run of that controller, None if it did not drive."""
@@ -233,7 +229,7 @@ def read_recording(run_dir: Path, log: LogColumns | None = None) -> Recording:
     ``log``: its ``run.mcap`` with :data:`RUN_COLUMNS`, of which only the rest is read then.
     """
     settings = _read_settings(run_dir / "settings.json")
-    track, line = _driven_on(run_dir, settings, "track", "race")
+    track, line = _driven_on(run_dir, settings.track, "race")
     log = (log or LogColumns(run_dir / "run.mcap", RUN_COLUMNS)).read()
     firsts = [log[topic]["wall_ns"][:1] for topic in RUN_COLUMNS]
     runs, truth = _planned(log)
@@ -245,16 +241,14 @@ def read_recording(run_dir: Path, log: LogColumns | None = None) -> Recording:
     )  # fmt: skip
 
 
-def _driven_on(
-    run_dir: Path, settings: dict[str, Any], setting: str, label: str
-) -> tuple[Track, RaceLine]:
+def _driven_on(run_dir: Path, setting: str, label: str) -> tuple[Track, RaceLine]:
     """A track of the run directory, named as in the settings, and its line."""
-    name = Path(str(settings.get(setting, label))).stem
+    name = Path(setting).stem
     track = replace(read_track(run_dir / f"{label}.csv", car_width_m=0.0), name=name)
     return track, read_raceline(run_dir / f"{label}_raceline.csv", name)
 
 
-def _read_training(run_dir: Path, settings: dict[str, Any]) -> tuple[TrainingRecord | None, bool]:
+def _read_training(run_dir: Path, settings: RunSettings) -> tuple[TrainingRecord | None, bool]:
     """The training drive, if there was one, and whether its log is whole.
 
     The race does not need it: where it cannot be read, it is left out.
@@ -264,7 +258,7 @@ def _read_training(run_dir: Path, settings: dict[str, Any]) -> tuple[TrainingRec
         return None, True
     try:
         log = LogColumns(path, RUN_COLUMNS).read()
-        track, line = _driven_on(run_dir, settings, "train_track", "train")
+        track, line = _driven_on(run_dir, settings.train_track, "train")
     except InputError as error:
         _log.warning("the training drive is left out: %s", error)
         return None, False
@@ -286,12 +280,9 @@ def _planned(log: LogColumns) -> tuple[list[RunRecord], bool]:
     return [replace(run, truth=run.states[columns]) for run in runs], False
 
 
-def _read_settings(path: Path) -> dict[str, Any]:
+def _read_settings(path: Path) -> RunSettings:
     text = read_text(path, "the settings", "give the directory of a race")
     try:
-        settings = json.loads(text)
-    except ValueError as error:
-        raise InputError(f"{path} is no JSON: {error}") from None
-    if not isinstance(settings, dict):
-        raise InputError(f"{path} holds no settings; give the directory of a race")
-    return settings
+        return RunSettings.model_validate_json(text)
+    except ValidationError as error:
+        raise InputError(f"{path} holds no settings of a race: {faults_in(error)}") from None

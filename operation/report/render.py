@@ -80,11 +80,11 @@ def _page(run_dir: Path, analysis: RaceAnalysis, figures: Mapping[str, Sequence[
         versions=_versions(run_dir),
         figures=figures,
         uncertain=_uncertain(analysis),
-        period_us=round(analysis.recording.discretisation.step_s * 1e6),
+        period_us=round(analysis.recording.settings.discretisation.step_s * 1e6),
         limit_sigma=UNCERTAIN,
         laps_compared=compare_laps(result),
         gp_compared=compare_gp(result),
-        caution=analysis.recording.caution,
+        caution=analysis.recording.settings.mpc.caution,
         source=SOURCE,
         limit=LIMIT,
         title=f"{result.settings.track} · {analysis.track.length_m:.2f} m",
@@ -177,7 +177,7 @@ def _panels(analysis: RaceAnalysis, result: RaceResult) -> dict[str, list[Figure
     if driven:
         figures["time"] = time_figures(driven, track)
         figures["speed"] = speed_figures(driven, track, line)
-        figures["inputs"] = input_figures(driven, track, analysis.recording.car)
+        figures["inputs"] = input_figures(driven, track, analysis.recording.settings.car)
         figures["cornering"] = cornering_figures(driven, track, result.settings.friction)
         figures["deviation"] = deviation_figures(driven, track)
         figures["caution"] = caution_figures(driven, track)
