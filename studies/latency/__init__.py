@@ -4,7 +4,6 @@ All times are in the messages. A measurement records a run and computes the legs
 same code whether the run was started here, was driven elsewhere, or was recorded earlier.
 
 In the order of use: ``settings``; ``measure`` records the run, with the processes of ``beside``.
-``tables`` reads the log and counts messages, ``clocks`` relates the clocks of plant and controller,
-and ``legs`` joins the messages of a cycle. ``analysis`` makes the ``results`` of these; ``report``
-shows them.
+``tables`` reads the log, and ``legs`` joins the messages of a cycle, relates the clocks of plant
+and controller, and counts messages. ``analysis`` makes the ``results``; ``report`` shows them.
 """

@@ -12,8 +12,7 @@ import numpy as np
 from bayesrace.arrays import Floats
 from bayesrace.columns import Columns
 from bayesrace.tracks import Track
-from studies.latency.clocks import ClockMap
-from studies.latency.legs import ANSWER, LEGS, Cycles
+from studies.latency.legs import ANSWER, LEGS, ClockMap, Cycles
 from studies.latency.results import (
     BareLoop,
     Clocks,

@@ -1,21 +1,21 @@
 """The legs of a control cycle, each computed from the message fields that hold its two times.
 
 Durations that one process measured are exact. Durations between the clocks of both processes are as
-good as the map of one clock to the other (:mod:`studies.latency.clocks`).
+good as the map of one clock to the other (:class:`ClockMap`).
 """
 
 from collections import Counter
-from typing import Final
+from dataclasses import dataclass
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesrace.arrays import Floats
 from bayesrace.columns import Columns
-from studies.latency.clocks import ClockMap
-from studies.latency.tables import Tables, heartbeats, traffic
+from studies.latency.tables import Tables, begins_anew
 
-__all__ = ["ANSWER", "BESIDE", "LEGS", "Cycles"]
+__all__ = ["ANSWER", "BESIDE", "LEGS", "ClockMap", "Cycles"]
 
 
 LEGS: Final = {
@@ -43,6 +43,60 @@ BESIDE: Final = {
 
 ANSWER: Final = "state_to_actuation"
 """The leg that counts."""
+
+
+_DRIFT: Final = 200e-6
+"""Of one clock against another at most: quartz is within 100 ppm on either side."""
+
+_SECOND: Final = 10
+"""Heartbeats in a second."""
+
+
+@dataclass(frozen=True, eq=False)
+class ClockMap:
+    """The offset of the controller's clock, controller minus plant, at some times [ns].
+
+    A state and its answer are an exchange of four timestamps, as in NTP (RFC 5905, section 8): the
+    plant samples, the controller receives and later sends the answer, and the plant receives that.
+    Neither message arrives before it was sent, so the offset between both clocks is bounded from
+    both sides: the middle is wrong by at most half of the round trip less the controller's own
+    time, however unequal the two ways are. An exchange counts if none near it bounds the offset at
+    its time more closely, drift included. Between two that count the offset is interpolated, so the
+    truth stays within the bounds as long as the clocks run evenly from one to the next.
+    """
+
+    shared: bool
+    """It is one clock: no exchange contradicts an offset of zero."""
+    exchanges: int
+    uncertainty: float
+    """The largest of the run, from the first exchange to the last one; 0 if shared."""
+    at: Floats
+    """Controller's clock, rising."""
+    offset: Floats
+
+    @classmethod
+    def of(cls, sampled: Floats, received: Floats, sent: Floats, arrived: Floats) -> Self | None:
+        """The map that exchanges give, in the order of their four times: the first and the last one
+        by the plant's clock, the others by the controller's. None without any."""
+        if not len(received):
+            return None
+        order = np.argsort(received, kind="stable")
+        at, most, least = received[order], (received - sampled)[order], (sent - arrived)[order]
+        shared = bool((most >= 0).all() and (least <= 0).all())
+        # The clocks run apart also during an exchange.
+        half = (most - least) / 2 + _DRIFT * (arrived - sampled)[order]
+        drifted = _DRIFT * (at - at[0])
+        before = np.minimum.accumulate(half - drifted) + drifted
+        after = np.minimum.accumulate((half + drifted)[::-1])[::-1] - drifted
+        bound = np.minimum(before, after) + 1.0
+        best = half <= bound
+        offset = (most + least)[best] / 2
+        return cls(shared, len(at), 0.0 if shared else float(bound.max()), at[best], offset)
+
+    def to_plant(self, controller: Floats) -> Floats:
+        """Readings of the controller's clock in terms of the plant's."""
+        offset = 0.0 if self.shared else np.interp(controller, self.at, self.offset)
+        return np.asarray(controller - offset)
 
 
 class Cycles:
@@ -112,11 +166,11 @@ class Cycles:
         return legs
 
     def counts(self) -> Counter[str]:
-        """What can be added up over the parts of a log; messages as :func:`traffic` names them."""
+        """What can be added up over the parts of a log; messages as :func:`_traffic` names them."""
         ticks, answers, releases = self.ticks, self.answers, self._releases
         late = len(ticks) - len(releases)
         streams = self.states, self.actuations, self._tables["ticks"]
-        beats = heartbeats(self._tables, "controller")
+        beats = _heartbeats(self._tables, "controller")
         found = {
             "releases": len(releases),
             "late_states": late,
@@ -132,7 +186,7 @@ class Cycles:
             "unobserved": sum((np.diff(np.unique(one["seq"])) - 1.0).sum() for one in streams),
         }
         if self.clock is not None:
-            found |= traffic(self._tables, self.clock)
+            found |= _traffic(self._tables, self.clock)
         return Counter({name: int(count) for name, count in found.items()})
 
     def _sampled(self, rows: Columns) -> Floats:
@@ -161,3 +215,45 @@ def _paired(one: Columns, other: Columns) -> tuple[Columns, Columns]:
     common, i, j = np.intersect1d(keys, others, return_indices=True)
     whole = common[counts[i] == more[j]]
     return one[np.isin(one["state_seq"], whole)], other[np.isin(other["state_seq"], whole)]
+
+
+def _heartbeats(tables: Tables, source: str) -> Columns:
+    """Those of one process, up to a restart of it: its counters begin anew there."""
+    beats = tables["heartbeats"]
+    beats = beats[beats["source"] == source]
+    return np.split(beats, np.flatnonzero(begins_anew(beats)) + 1)[0]
+
+
+def _traffic(tables: Tables, clock: ClockMap) -> dict[str, float]:
+    """``states_sent``, ``…_received``, ``…_lost``, ``actuations_sent`` and so on; of a direction
+    without heartbeats nothing.
+
+    A heartbeat of the receiver carries what it had received and counted as lost until then; what
+    had been sent until then follows from the numbers and times in the log. Messages are counted
+    between two heartbeats, of the first and of the last second, at which the fewest were in flight.
+    """
+    states, actuations = tables["states"], tables["actuations"]
+    actuations = actuations[actuations["state_seq"] >= states["seq"][0]]  # none of the warm-up
+    plant, controller = (_heartbeats(tables, one) for one in ("plant", "controller"))
+    at = clock.to_plant(controller["source_time_ns"])
+    found = _counted("states", states["seq"], states["source_time_ns"], controller, at)
+    sent_at = clock.to_plant(actuations["source_time_ns"])
+    return found | _counted(
+        "actuations", actuations["seq"], sent_at, plant, plant["source_time_ns"]
+    )
+
+
+def _counted(
+    stream: str, numbers: Floats, sent_at: Floats, beats: Columns, at: Floats
+) -> dict[str, float]:
+    """``sent_at`` of the messages and ``at`` of the receiver's heartbeats are on one clock."""
+    before = np.searchsorted(sent_at, at, side="right")
+    inside = (before > 0) & (before < len(sent_at))
+    if not inside.any():
+        return {}
+    sent, beats = numbers[before[inside] - 1], beats[inside]
+    columns = {one: beats[f"counters.{stream}_{one}"] for one in ("received", "lost")}
+    left = sent - columns["received"] - columns["lost"]
+    begin, end = left[:_SECOND].argmin(), len(left) - 1 - left[::-1][:_SECOND].argmin()
+    columns["sent"] = sent
+    return {f"{stream}_{name}": one[end] - one[begin] for name, one in columns.items()}

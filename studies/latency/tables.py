@@ -1,5 +1,4 @@
-"""The tables of a measurement: columns of the log, split where numbers or clocks begin anew, and
-the messages that were sent, received and lost by them."""
+"""The tables of a measurement: columns of the log, split where numbers or clocks begin anew."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -8,14 +7,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesrace.arrays import Floats
 from bayesrace.columns import Columns, LogColumns
 from bayesrace.errors import InputError
 from bayesrace.log import LogReader, topic_of
 from bayesrace.messages import ACTUATION, HEARTBEAT, STATE, TELEMETRY, TRUTH, Topic
-from studies.latency.clocks import ClockMap
 
-__all__ = ["MOST_CYCLES", "Tables", "begins_anew", "heartbeats", "read_tables", "split", "traffic"]
+__all__ = ["MOST_CYCLES", "Tables", "begins_anew", "read_tables", "split"]
 
 Tables = dict[str, Columns]
 """``states``, ``truth``, ``actuations``, ``ticks`` (telemetry), ``heartbeats``; and ``answers``, a
@@ -40,9 +37,6 @@ _COLUMNS: Final[Mapping[str, tuple[Topic[Any], str]]] = {
         counters.actuations_received counters.actuations_lost""",
     ),
 }
-
-_SECOND: Final = 10
-"""Heartbeats in a second."""
 
 
 def read_tables(
@@ -111,45 +105,3 @@ def begins_anew(table: Columns) -> NDArray[np.bool_]:
     """Whether the sender began its numbers again, from each row to the next one."""
     found: NDArray[np.bool_] = np.diff(table["seq"]) <= 0
     return found
-
-
-def heartbeats(tables: Tables, source: str) -> Columns:
-    """Those of one process, up to a restart of it: its counters begin anew there."""
-    beats = tables["heartbeats"]
-    beats = beats[beats["source"] == source]
-    return np.split(beats, np.flatnonzero(begins_anew(beats)) + 1)[0]
-
-
-def traffic(tables: Tables, clock: ClockMap) -> dict[str, float]:
-    """``states_sent``, ``…_received``, ``…_lost``, ``actuations_sent`` and so on; of a direction
-    without heartbeats nothing.
-
-    A heartbeat of the receiver carries what it had received and counted as lost until then; what
-    had been sent until then follows from the numbers and times in the log. Messages are counted
-    between two heartbeats, of the first and of the last second, at which the fewest were in flight.
-    """
-    states, actuations = tables["states"], tables["actuations"]
-    actuations = actuations[actuations["state_seq"] >= states["seq"][0]]  # none of the warm-up
-    plant, controller = (heartbeats(tables, one) for one in ("plant", "controller"))
-    at = clock.to_plant(controller["source_time_ns"])
-    found = _counted("states", states["seq"], states["source_time_ns"], controller, at)
-    sent_at = clock.to_plant(actuations["source_time_ns"])
-    return found | _counted(
-        "actuations", actuations["seq"], sent_at, plant, plant["source_time_ns"]
-    )
-
-
-def _counted(
-    stream: str, numbers: Floats, sent_at: Floats, beats: Columns, at: Floats
-) -> dict[str, float]:
-    """``sent_at`` of the messages and ``at`` of the receiver's heartbeats are on one clock."""
-    before = np.searchsorted(sent_at, at, side="right")
-    inside = (before > 0) & (before < len(sent_at))
-    if not inside.any():
-        return {}
-    sent, beats = numbers[before[inside] - 1], beats[inside]
-    columns = {one: beats[f"counters.{stream}_{one}"] for one in ("received", "lost")}
-    left = sent - columns["received"] - columns["lost"]
-    begin, end = left[:_SECOND].argmin(), len(left) - 1 - left[::-1][:_SECOND].argmin()
-    columns["sent"] = sent
-    return {f"{stream}_{name}": one[end] - one[begin] for name, one in columns.items()}
