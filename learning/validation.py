@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from bayesrace.arrays import Flags, Floats, Rows
 from bayesrace.errors import InputError
@@ -89,7 +90,9 @@ def validate(weights: GpWeights, dataset: Dataset, discretisation: Discretisatio
     if len(dataset) == 0:
         raise InputError("validation: no samples left; drive longer")
     z, truth = dataset.features, residual(dataset, discretisation)
-    mean, sigma = evaluate_mean(weights, z), predictive_sigma(weights, z)
+    # On a busy machine the threads of BLAS wait for each other longer than they work.
+    with threadpool_limits(1):
+        mean, sigma = evaluate_mean(weights, z), predictive_sigma(weights, z)
     with np.errstate(all="ignore"):
         metrics = {
             output: PredictionErrors(truth[:, i] - mean[:, i], sigma[:, i]).metrics(truth[:, i])

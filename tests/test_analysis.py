@@ -19,9 +19,9 @@ from bayesrace.limit import LimitLap, write_limit
 from bayesrace.vehicles import default_car
 from bayesrace.vehicles.models import dynamic
 from operation.analysis.laps import positions_between, time_laps
-from operation.analysis.race import analyse, read_race, read_result, write_result
+from operation.analysis.race import analyse, read_race
 from operation.analysis.recording import RUN_COLUMNS, read_recording, runs_of
-from operation.analysis.results import LapResult, RaceResult
+from operation.analysis.results import LapResult, RaceResult, read_result, write_result
 from operation.report import write_report
 from operation.terminal.race_table import COLUMNS, print_table
 from plant.simulator import Simulator, plant_discretisation

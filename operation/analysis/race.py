@@ -12,7 +12,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
@@ -25,47 +24,31 @@ from learning.dataset import Dataset
 from learning.logs import dataset_from_columns
 from learning.validation import Validation, validate
 from operation.analysis.laps import positions_between, time_laps, trajectory_digest
-from operation.analysis.recording import PlannedRun, Recording, RunRecord, read_recording
+from operation.analysis.recording import Recording, RunRecord, read_recording
 from operation.analysis.results import (
-    GpMetrics,
     LapResult,
     Percentiles,
     RaceResult,
     SettingsSummary,
-    read_result,
-    write_result,
+    gp_metrics,
 )
 from operation.analysis.verdict import Cycles, judge
 from operation.limits import limits_in
 
-__all__ = [
-    "DrivenRun",
-    "GpMetrics",
-    "LapResult",
-    "Percentiles",
-    "PlannedRun",
-    "RaceAnalysis",
-    "RaceResult",
-    "SettingsSummary",
-    "analyse",
-    "line_offset",
-    "read_race",
-    "read_result",
-    "write_result",
-]
+__all__ = ["DrivenRun", "RaceAnalysis", "analyse", "read_race"]
 
 
 _SURELY: Final = 1.5
 """The distance from the edge changes by less than so much of the way, as wide as the track may
 become."""
 
-WEIGHTS_FILES: Final = {
+_WEIGHTS_FILES: Final = {
     "bayesrace": "weights-bayesrace.bin",
     "bayesrace-updated": "weights-updated.bin",
 }
 
 
-def line_offset(line: RaceLine, xy: Floats, reach_m: float) -> Floats:
+def _line_offset(line: RaceLine, xy: Floats, reach_m: float) -> Floats:
     """Signed distance (n,) of a trajectory (n, 2) from the racing line, positive to its left."""
     curve = PlaneSpline(line.s_m, line.xy_m, line.length_m)
     s = CentrelineSearch(curve, reach_m / 16).follow(xy, None, reach_m)
@@ -96,7 +79,7 @@ class DrivenRun:
         self.on_track: PathProjection = track.project_path(xy)
         self.laps = time_laps(track, record.time_s, xy, self.on_track.s_m)
         reach_m = float(np.max(track.width_right_m + track.width_left_m))
-        self.offset_m = line_offset(line, xy, reach_m)
+        self.offset_m = _line_offset(line, xy, reach_m)
 
     @property
     def finished(self) -> bool:
@@ -247,21 +230,19 @@ class RaceAnalysis:
         """Controller whose weights they are → what they predict of the BestCase run."""
         data = self.best_case
         found = {}
-        for controller, name in WEIGHTS_FILES.items():
+        for controller, name in _WEIGHTS_FILES.items():
             path = self.recording.directory / name
             if data is not None and len(data) and path.is_file():
                 weights = read_weights(path)
-                # On a busy machine the threads of BLAS wait for each other longer than they work.
-                with threadpool_limits(1):
-                    found[controller] = validate(
-                        weights, data, self.recording.settings.discretisation
-                    )
+                discretisation = self.recording.settings.discretisation
+                found[controller] = validate(weights, data, discretisation)
         return found
 
     @cached_property
     def result(self) -> RaceResult:
         """The race in numbers."""
         gaps = sum(run.record.gaps for run in self.runs)
+        metrics = {who: gp_metrics(one.metrics) for who, one in self.validations.items()}
         recording = self.recording
         limit_s = limits_in(recording.directory)
         return RaceResult(
@@ -269,22 +250,13 @@ class RaceAnalysis:
             laps=[run.result(recording.settings.laps, limit_s) for run in self.runs],
             limit_s=limit_s,
             training=None if self.training is None else self.training.result(),
-            gp=self._metrics("bayesrace"),
-            gp_updated=self._metrics("bayesrace-updated"),
+            gp=metrics.get("bayesrace", {}),
+            gp_updated=metrics.get("bayesrace-updated", {}),
             real_time_factor=_real_time_factor(recording.runs),
             complete=not (gaps or recording.truncated or recording.refused),
             gaps=gaps,
             judged_by="truth" if recording.truth else "measurement",
         )
-
-    def _metrics(self, controller: str) -> dict[str, GpMetrics]:
-        validation = self.validations.get(controller)
-        if validation is None:
-            return {}
-        return {
-            output: GpMetrics.model_validate(dict(metrics))
-            for output, metrics in validation.metrics.items()
-        }
 
 
 def _summary(recording: Recording) -> SettingsSummary:

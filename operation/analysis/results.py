@@ -1,5 +1,6 @@
 """The outcome of a race: the content of ``result.json``, and nothing that is not in it."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -14,6 +15,7 @@ __all__ = [
     "Percentiles",
     "RaceResult",
     "SettingsSummary",
+    "gp_metrics",
     "read_result",
     "write_result",
 ]
@@ -113,6 +115,11 @@ class GpMetrics(_Frozen):
     r2: float
     coverage: float = Field(description="share of the residuals in the 95 % interval")
     log_density: float = Field(description="mean log predictive density")
+
+
+def gp_metrics(metrics: Mapping[str, Mapping[str, float]]) -> dict[str, GpMetrics]:
+    """Of each output, from those of a :class:`learning.validation.Validation`."""
+    return {output: GpMetrics.model_validate(dict(one)) for output, one in metrics.items()}
 
 
 class SettingsSummary(_Frozen):

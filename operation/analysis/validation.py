@@ -6,7 +6,6 @@ from typing import Final
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
-from threadpoolctl import threadpool_limits
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
@@ -16,7 +15,7 @@ from learning.dataset import Dataset, left_out
 from learning.residual import discretisation_of
 from learning.sources import read_samples
 from learning.validation import HORIZON, Validation, mismatch, validate
-from operation.analysis.results import GpMetrics
+from operation.analysis.results import GpMetrics, gp_metrics
 from operation.terminal.notation import UNCERTAIN
 
 __all__ = [
@@ -117,9 +116,7 @@ def validate_weights(
     if len(data) == 0:
         counts = left_out(data.dropped)
         raise InputError(f"validation: no samples left (left out: {counts}); drive longer")
-    # On a busy machine the threads of BLAS wait for each other longer than they work.
-    with threadpool_limits(1):
-        validation = validate(weights, data, discretisation)
+    validation = validate(weights, data, discretisation)
 
     def over(steps: int) -> HorizonResult | None:
         plain, corrected = (mismatch(data, discretisation, w, steps) for w in (None, weights))
@@ -132,12 +129,8 @@ def validate_weights(
             corrected=_drift(corrected),
         )
 
-    metrics = {
-        output: GpMetrics.model_validate(dict(numbers))
-        for output, numbers in validation.metrics.items()
-    }
     result = ValidationResult(
-        **metrics,
+        **gp_metrics(validation.metrics),
         one_step=over(1),
         horizon=over(HORIZON),
         weights_version=weights.version,

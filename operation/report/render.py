@@ -16,8 +16,8 @@ from bayesrace.files import write_whole
 from bayesrace.interrupts import raise_if_interrupted
 from bayesrace.manifest import Manifest
 from operation.analysis.published import LIMIT, SOURCE, compare_gp, compare_laps
-from operation.analysis.race import DrivenRun, RaceAnalysis, read_race, write_result
-from operation.analysis.results import RaceResult
+from operation.analysis.race import DrivenRun, RaceAnalysis, read_race
+from operation.analysis.results import RaceResult, write_result
 from operation.report.canvas import inline_svg, png
 from operation.report.gp import gp_figures
 from operation.report.maps import LapMaps
