@@ -7,6 +7,7 @@ promise is written to the working folder.
 """
 
 import importlib
+import random
 import sys
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,10 @@ atheris: Any = importlib.import_module("atheris")
 with atheris.instrument_imports(include=["bayesrace.messages", "bayesrace.gp.weights"]):
     from bayesrace.errors import InputError
     from bayesrace.gp.weights import encode_weights
-    from tests.mutations import KINDS, MessageMutator
+    from bayesrace.messages import encode
     from tests.test_decoder_fuzz import check_message, check_weights
     from tests.test_gp_weights import BODY, make_weights, reseal
+    from tests.test_messages import KINDS, values
 
 __all__: list[str] = []
 
@@ -43,8 +45,8 @@ def _expect(complaint: str) -> None:
 def _seeds(target: str) -> list[bytes]:
     if target == "weights":
         return [encode_weights(make_weights(count))[BODY:] for count in (0, 1)]
-    mutator = MessageMutator(0)
-    return [bytes([i]) + mutator.valid(kind) for i, kind in enumerate(KINDS)]
+    pick = random.Random(0)
+    return [bytes([i]) + encode(kind(**values(kind, pick))) for i, kind in enumerate(KINDS)]
 
 
 _HEAD = encode_weights(make_weights())[:BODY]

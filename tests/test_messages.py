@@ -4,7 +4,7 @@ import json
 import logging
 import math
 import random
-from typing import Any
+from typing import Any, Final
 
 import msgpack
 import numpy as np
@@ -36,8 +36,21 @@ from bayesrace.messages import (
     schema_version,
     to_json,
 )
-from tests.mutations import KINDS, values
 
+KINDS: Final[tuple[type[Message], ...]] = tuple(
+    dict.fromkeys(
+        kind
+        for kind in (
+            *(topic.message for topic in TOPICS),
+            *(service.request for service in SERVICES),
+            *(service.answer for service in SERVICES),
+        )
+        if kind is not None
+    )
+)
+"""Every message of the table."""
+
+_TEXTS: Final = ("", "a", "go", "x" * 2001, "\0", "\x1b[2J", "é" * 200, "😀" * 200, "nan")
 X0 = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 0.1)
 STATE = State(
     seq=3,
@@ -55,6 +68,40 @@ STATE = State(
 EVENT = Event(
     seq=0, source_time_ns=0, run=0, source="plant", kind="kind", text="text", data={"a": 1.0}
 )
+
+
+def values(kind: type[Message], pick: random.Random) -> dict[str, Any]:
+    """Valid values of a class's fields, by name, at their limits more often than by chance.
+
+    AssertionError if a field has no limits: it would let NaN in, or texts without end.
+    """
+    described = inspect.type_info(kind)
+    assert isinstance(described, inspect.StructType)
+    return {field.name: _value(field.type, pick) for field in described.fields}
+
+
+def _value(form: inspect.Type, pick: random.Random, row: int = 1) -> Any:
+    match form:
+        case inspect.Metadata(extra_json_schema={"enum": words}):
+            return pick.choice(words)
+        case inspect.Metadata(type=inner, extra=extra):
+            return _value(inner, pick, len(extra["names"]) if extra else 1)
+        case inspect.IntType(ge=int() as low, le=int() as high):
+            return pick.choice((low, high, pick.randint(low, high)))
+        case inspect.FloatType(ge=float() as low, le=float() as high):
+            return pick.choice((low, high, max(low, -0.0), pick.uniform(low, high)))
+        case inspect.BoolType():
+            return pick.random() < 0.5
+        case inspect.StrType(max_length=int() as most):
+            return pick.choice(_TEXTS)[:most]
+        case inspect.UnionType(types=kinds):
+            return _value(pick.choice(kinds), pick)
+        case inspect.DictType(value_type=content, max_length=int()):
+            return {f"n{i}": _value(content, pick) for i in range(pick.randint(0, 7))}
+        case inspect.VarTupleType(item_type=number, min_length=least, max_length=int()):
+            count = least or row * pick.choice((0, 1, 3))
+            return tuple(_value(number, pick) for _ in range(count))
+    raise AssertionError(f"{form} without limits")
 
 
 @st.composite
