@@ -14,16 +14,17 @@ from bayesrace.errors import InputError
 from bayesrace.vehicles.parameters import CarParameters
 
 __all__ = [
+    "ROUNDING",
     "Dataset",
     "concatenate",
     "dataset_from_arrays",
     "filter_dataset",
     "left_out",
-    "tolerances",
 ]
 
-_ROUNDING: Final = 1e-6
-"""Larger than the error of a plant in single precision: 2.4e-7 at 5 rad/s."""
+ROUNDING: Final = 1e-6
+"""Permitted error of times, inputs and angles [SI units]; a plant in single precision errs by 2.4e-7
+at 5 rad/s."""
 
 _MIRRORED_STATE: Final = np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0, -1.0])
 _MIRRORED_INPUT: Final = np.array([1.0, -1.0])
@@ -135,31 +136,23 @@ def concatenate(datasets: Sequence[Dataset]) -> Dataset:
     )
 
 
-def tolerances(car: CarParameters) -> dict[str, float]:
-    """Permitted error of each signal in SI units; docs/learning.md gives the reasons.
-
-    "vx" is the least speed.
-    """
-    rounding = dict.fromkeys(("time", "d", "delta_rate", "delta", "delta change"), _ROUNDING)
-    return {"vx": car.tuning.gate.moving_mps, **rounding}
-
-
 def filter_dataset(dataset: Dataset, *, limits: bool = True) -> Dataset:
     """Leaves out standstill, samples outside the car's limits, those of a spin, and steering that
     does not add up.
 
-    Each within its tolerance, :func:`tolerances`. The last means delta_{k+1} != delta_k + step *
-    delta_rate. Without ``limits``, samples outside the car's limits and those of a spin stay.
+    Slower than ``moving_mps`` of its tuning the car stands; all else is up to :data:`ROUNDING`. The
+    last means delta_{k+1} != delta_k + step * delta_rate. Without ``limits``, samples outside the
+    car's limits and those of a spin stay.
     """
-    car, slack = dataset.car, tolerances(dataset.car)
-    kept = dataset.select(dataset.x[:, 3] >= slack["vx"], "standstill")
+    car = dataset.car
+    kept = dataset.select(dataset.x[:, 3] >= car.tuning.gate.moving_mps, "standstill")
     d, rate = kept.u.T
     angle = np.maximum(np.abs(kept.x[:, 6]), np.abs(kept.x_next[:, 6]))
     within = (
-        (d >= car.d_min - slack["d"])
-        & (d <= car.d_max + slack["d"])
-        & (np.abs(rate) <= car.delta_rate_max_radps + slack["delta_rate"])
-        & (angle <= car.delta_max_rad + slack["delta"])
+        (d >= car.d_min - ROUNDING)
+        & (d <= car.d_max + ROUNDING)
+        & (np.abs(rate) <= car.delta_rate_max_radps + ROUNDING)
+        & (angle <= car.delta_max_rad + ROUNDING)
     )
     if limits:
         kept = kept.select(within, "outside limits")
@@ -167,4 +160,4 @@ def filter_dataset(dataset: Dataset, *, limits: bool = True) -> Dataset:
         vx, vy = kept.x[:, 3:5].T
         kept = kept.select(np.abs(np.arctan2(vy, vx)) <= car.tuning.gate.spin_rad, "spinning")
     drift = kept.x_next[:, 6] - kept.x[:, 6] - kept.step_s * kept.u[:, 1]
-    return kept.select(np.abs(drift) <= slack["delta change"], "steering does not match its rate")
+    return kept.select(np.abs(drift) <= ROUNDING, "steering does not match its rate")

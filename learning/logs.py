@@ -17,7 +17,7 @@ from bayesrace.integrators import Discretisation
 from bayesrace.log import LogReader, topic_of
 from bayesrace.messages import STATE, TELEMETRY, TRUTH
 from bayesrace.vehicles import CarParameters, described_car
-from learning.dataset import Dataset, filter_dataset, tolerances
+from learning.dataset import ROUNDING, Dataset, filter_dataset
 
 __all__ = ["CYCLES", "STATES", "LogFacts", "dataset_from_columns", "dataset_from_log", "log_facts"]
 
@@ -97,7 +97,7 @@ def dataset_from_columns(
     # A fault of the plant repeats the last state: no time has passed.
     pair = (now["run"] == after["run"]) & (passed_s != 0)
     following = pair & (after["seq"] == now["seq"] + 1)
-    found = following & (np.abs(passed_s - step_s) <= tolerances(car)["time"])
+    found = following & (np.abs(passed_s - step_s) <= ROUNDING)
     if not found.any():
         if not following.any():
             raise InputError(

@@ -15,6 +15,7 @@ from tests.test_problems import (
     IPOPT,
     STEP_S,
     VALUES,
+    assert_preparation_changes_no_bit,
     compiled,
     corrected,
     craft,
@@ -141,19 +142,7 @@ def test_blocks_of_one_stage_change_nothing(problem: Problem) -> None:
 
 
 def test_the_preparation_changes_no_bit(native: NativeProblem) -> None:
-    plans = []
-    for prepares in (False, True):
-        native.reset()
-        x, u = START, np.zeros(3)
-        for k in range(8):
-            assert native.solve(x, u, stages(k)).usable
-            u = native.u.copy()
-            if prepares:
-                native.prepare()
-                native.rehearse()
-            x = native.predict(x, u, STEP_S)
-        plans.append(native.read_plan()[1].tobytes())
-    assert plans[0] == plans[1]
+    assert_preparation_changes_no_bit(native, START)
 
 
 def test_the_car_states_its_blocks_and_settings_others() -> None:

@@ -244,13 +244,19 @@ def test_no_compiler_is_an_input_error_with_the_remedy(
         build(SMALL)
 
 
-def test_a_chosen_compiler_that_does_not_work_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CC", "no-such-compiler -m64")
-    with pytest.raises(InputError, match="no-such-compiler"):
-        find_compiler()
-    find_compiler.cache_clear()
-    monkeypatch.setenv("CC", "false")
-    with pytest.raises(InputError, match="false"):
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        ("no-such-compiler -m64", "no-such-compiler"),
+        ("false", "false"),
+        ("gcc 'unbalanced", r"CC=gcc 'unbalanced: No closing quotation"),
+    ],
+)
+def test_a_chosen_compiler_that_does_not_work_is_named(
+    monkeypatch: pytest.MonkeyPatch, command: str, words: str
+) -> None:
+    monkeypatch.setenv("CC", command)
+    with pytest.raises(InputError, match=words):
         find_compiler()
 
 
@@ -332,20 +338,6 @@ def test_what_is_built_may_be_loaded_whatever_the_umask(car: CarParameters) -> N
         os.umask(before)
 
 
-def test_a_compiler_command_that_cannot_be_read_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CC", "gcc 'unbalanced")
-    with pytest.raises(InputError, match=r"CC=gcc 'unbalanced: No closing quotation"):
-        find_compiler()
-
-
-def test_a_manifest_of_another_interface_is_refused(artefact: Path, car: CarParameters) -> None:
-    manifest = read_manifest(artefact)
-    other = manifest.model_copy(update={"abi": manifest.abi + 1})
-    (artefact / MANIFEST).write_text(other.model_dump_json())
-    with pytest.raises(InputError, match=r"built for interface .*build"):
-        load(artefact, car)
-
-
 def test_the_names_and_numbers_in_python_are_those_of_the_header(kinematic_artefact: Path) -> None:
     artefact = Artefact(kinematic_artefact)
     no_steps = {"DOUBTED": DOUBTED, "UNPREDICTABLE": UNPREDICTABLE, "HALTED": HALTED,
@@ -369,20 +361,21 @@ def test_the_names_and_numbers_in_python_are_those_of_the_header(kinematic_artef
     assert numbers == (BRAKING_ROWS, SAMPLES, WATCHED)
 
 
-@pytest.mark.parametrize("text", ["", "{", "{}", '{"abi": "one"}'])
-def test_a_broken_manifest_is_refused(artefact: Path, car: CarParameters, text: str) -> None:
-    (artefact / MANIFEST).write_text(text)
-    with pytest.raises(InputError, match=r"is no manifest .*: run 'bayesrace build'"):
-        load(artefact, car)
-
-
-def test_a_folder_that_is_no_controller_and_another_car_are_refused(
+def test_what_is_no_controller_of_this_car_and_release_is_refused(
     artefact: Path, tmp_path: Path, car: CarParameters
 ) -> None:
     with pytest.raises(InputError, match="not a built controller"):
         load(tmp_path, car)
     with pytest.raises(InputError, match="built for car"):
         load(artefact, car.model_copy(update={"name": "other"}))
+    manifest = read_manifest(artefact)
+    other = manifest.model_copy(update={"abi": manifest.abi + 1}).model_dump_json()
+    broken = r"is no manifest .*: run 'bayesrace build'"
+    texts = dict.fromkeys(["", "{", "{}", '{"abi": "one"}'], broken)
+    for text, words in {**texts, other: r"built for interface .*build"}.items():
+        (artefact / MANIFEST).write_text(text)
+        with pytest.raises(InputError, match=words):
+            load(artefact, car)
 
 
 @pytest.mark.check

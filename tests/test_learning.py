@@ -11,7 +11,7 @@ from bayesrace.gp.expression import evaluate_mean
 from bayesrace.gp.weights import FEATURES, KERNELS, OUTPUTS, zero_weights
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.vehicles.models import dynamic, e_kinematic
-from learning.dataset import Dataset, concatenate, filter_dataset, tolerances
+from learning.dataset import ROUNDING, Dataset, concatenate, filter_dataset
 from learning.likelihood import MarginalLikelihood, PairDistances, starts
 from learning.posterior import Covariance, Posterior
 from learning.residual import identity, residual
@@ -21,7 +21,6 @@ from learning.training import train
 from learning.validation import predictive_sigma, validate
 from tests.conftest import discrete
 from tests.driven import CAR, QUICK, STEP_S, dataset_of, drive, logged, telemetry
-from tests.programs import ROOT
 from tests.scikit import scikit_gp
 
 
@@ -77,7 +76,7 @@ def test_filter_counts_what_it_leaves_out(driven: Dataset) -> None:
 @pytest.mark.parametrize("share", [0.9, 1.1])
 @pytest.mark.parametrize("signal", ["vx", "d", "delta_rate", "delta", "delta change"])
 def test_a_sample_is_kept_within_the_tolerance_of_each_signal(signal: str, share: float) -> None:
-    slack = tolerances(CAR)[signal]
+    slack = CAR.tuning.gate.moving_mps if signal == "vx" else ROUNDING
     x, u = np.array([0, 0, 0, 1.0, 0, 0, 0]), np.array([0.5, 0.0])
     if signal == "vx":
         x[3] = slack / share
@@ -95,19 +94,11 @@ def test_a_sample_is_kept_within_the_tolerance_of_each_signal(signal: str, share
 
 @pytest.mark.parametrize("share", [0.9, 1.1])
 def test_states_are_consecutive_within_the_tolerance_of_time(driven: Dataset, share: float) -> None:
-    late_s = share * tolerances(CAR)["time"]
+    late_s = share * ROUNDING
     states = logged(driven, 0)
     states[-1] = replace(states[-1], time_s=states[-1].time_s + late_s)
     data = dataset_of(states)
     assert dict(data.dropped) == ({} if share < 1 else {"gap": 1})
-
-
-def test_the_table_of_tolerances_is_that_of_the_documentation() -> None:
-    text = (ROOT / "docs/learning.md").read_text()
-    rows = [line.split(" | ") for line in text.splitlines() if line.startswith("| ")]
-    documented = {row[0].strip("| "): row[2] for row in rows if len(row) == 4}
-    for signal, value in tolerances(CAR).items():
-        assert documented[signal] == f"{value:g}"
 
 
 def test_datasets_are_checked(driven: Dataset) -> None:
