@@ -23,8 +23,8 @@ __all__ = [
 ]
 
 ROUNDING: Final = 1e-6
-"""Permitted error of times, inputs and angles [SI units]; a plant in single precision errs by 2.4e-7
-at 5 rad/s."""
+"""Permitted error of times, inputs and angles [SI units]; a plant in single precision errs by
+2.4e-7 at 5 rad/s."""
 
 _MIRRORED_STATE: Final = np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0, -1.0])
 _MIRRORED_INPUT: Final = np.array([1.0, -1.0])
