@@ -19,7 +19,7 @@ from typing import Final
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["RealtimeSettings", "prepare_thread", "short_slices"]
+__all__ = ["RealtimeSettings", "prepare_thread", "short_slices", "uncollected"]
 
 _PR_SET_TIMERSLACK = 29
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
@@ -40,6 +40,19 @@ class RealtimeSettings(BaseModel):
         None, ge=1, le=99, description="SCHED_FIFO priority of the control thread"
     )
     lock_memory: bool = Field(False, description="lock the memory of the process against paging")
+
+
+@contextmanager
+def uncollected() -> Iterator[None]:
+    """No cyclic garbage collection within the block: for work that keeps many objects and leaves no
+    cycles, where looking for garbage among them takes a tenth to a quarter of the time."""
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
 
 
 def prepare_thread(settings: RealtimeSettings) -> list[str]:

@@ -5,10 +5,8 @@ equal to the bit to the same run of two processes over Zenoh (tests/test_closed_
 weights are the caller's: nothing validates them, and no command can stop the run.
 """
 
-import gc
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -38,6 +36,7 @@ from bayesrace.messages import (
     encode,
 )
 from bayesrace.raceline import RaceLine
+from bayesrace.realtime import uncollected
 from bayesrace.tracks import PathProjection, Track
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
@@ -217,7 +216,7 @@ class ClosedLoop:
         if self._log is not None:
             self._log.begins(plan, self._controller.weights_version)
         try:
-            with _no_collection():
+            with uncollected():
                 end = drive_lockstep(run, self._seq, self._exchange)
         finally:
             self._cycle.driver.lost(silent=False)
@@ -269,19 +268,6 @@ class ClosedLoop:
             seq = cycle.timing.ticks
             self._log.write(ACTUATION, cycle.actuation(seq, state, decision))
             self._log.write(TELEMETRY, cycle.telemetry(seq, state, decision, received_ns))
-
-
-@contextmanager
-def _no_collection() -> Iterator[None]:
-    """A run keeps its states and leaves no cycles: to search it for garbage again and again takes a
-    tenth of its time."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
 
 
 class _Messages:

@@ -16,10 +16,11 @@ from bayesrace.messages import Role
 from bayesrace.transport import Credentials, Endpoints, open_session
 from bayesrace.transport.credentials import CERTIFICATE_EXPIRED, CERTIFICATE_NOT_YET, NEWEST_LIST
 from bayesrace.transport.endpoints import Address, address_of
+from bayesrace.transport.session import zenoh_config
 from operation.analysis.network_status import SOURCES
 from operation.lifecycle import find
 
-__all__ = ["Check", "examine", "probe"]
+__all__ = ["Check", "check_configuration", "examine", "probe"]
 
 _CARS_S: Final = 1.0
 _ROLES: Final[tuple[Role, ...]] = (
@@ -67,6 +68,27 @@ class Check(NamedTuple):
     fine: bool
     text: str
     """What was found; of a fault, with its remedy."""
+
+
+def check_configuration(found: Configuration) -> str:
+    """What there is of certificates, each of which is read; InputError if the network, or one of
+    them, cannot be used."""
+    found.network.check()
+    folder, there = found.tls.folder, found.tls.certificates()
+    if folder is not None and not there:
+        raise InputError(
+            f"no certificates in {folder}: make them with 'bayesrace certs', or correct "
+            "[tls] folder"
+        )
+    roles = {one.name: "revoked" if one.member is None else one.member.role for one in there}
+    for role in _ROLES:
+        if folder is None or role in roles.values():
+            (ends := found.endpoints(role)).check()
+            zenoh_config(ends, role)
+    if folder is None:
+        reach = "open to everyone in the network" if found.network.insecure else "for loopback only"
+        return f"fine; no certificates, so links are {reach}"
+    return "fine; certificates " + ", ".join(f"'{name}' ({role})" for name, role in roles.items())
 
 
 def examine(configuration: Configuration) -> Iterator[Check]:

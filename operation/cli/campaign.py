@@ -1,7 +1,7 @@
 """``campaign``, ``campaign-report``, ``campaign-worker``, ``tune``: laps by the thousand."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Final
 
 import typer
 
@@ -13,25 +13,19 @@ if TYPE_CHECKING:
 
 __all__ = ["campaign", "campaign_report", "campaign_worker", "tune"]
 
-Scheduler = Annotated[
-    str | None,
-    typer.Option(
-        metavar="ADDRESS",
-        show_default="embedded",
-        help="Dask scheduler, as tcp://HOST:8786 or tls://HOST:8786.",
-    ),
-]
-Workers = Annotated[
-    int,
-    typer.Option(min=0, max=1024, show_default="one a core", help="Processes on this machine."),
-]
+_SCHEDULER: Final = options.value(
+    "Dask scheduler, as tcp://HOST:8786 or tls://HOST:8786.", metavar="ADDRESS", shown="embedded"
+)
+_WORKERS: Final = options.value(
+    "Processes on this machine.", 0, min=0, max=1024, shown="one a core"
+)
 
 
 def campaign(
     plan: Path = options.argument("PLAN", "TOML file that says what varies: docs/campaigns.md."),
     out: Path | None = options.out_folder("Folder of results.", "runs/NAME-OF-PLAN"),
-    scheduler: Scheduler = None,
-    workers: Workers = 0,
+    scheduler: str | None = _SCHEDULER,
+    workers: int = _WORKERS,
     again: bool = options.flag("--again", "Compute cases that failed once more."),
 ) -> None:
     """Drive all cases of a plan, on this machine or on many; one row a lap in Parquet.
@@ -62,7 +56,7 @@ def campaign_report(
 
 
 def campaign_worker(
-    scheduler: str = options.argument("ADDRESS", "As tcp://HOST:8786."), workers: Workers = 0
+    scheduler: str = options.argument("ADDRESS", "As tcp://HOST:8786."), workers: int = _WORKERS
 ) -> None:
     """Compute for a campaign elsewhere until its Dask scheduler ends."""
     from studies.campaign.campaign import run_worker
@@ -73,12 +67,12 @@ def campaign_worker(
 @options_of("studies.settings.TuneSettings", "track held_out trials batch car seed")
 def tune(
     settings: "Given[TuneSettings]",
-    out: options.OutFile = Path("tuned.toml"),
+    out: Path = options.out_file(Path("tuned.toml")),
     study: Path | None = options.value(
         "SQLite of trials.", metavar="FILE", shown="beside --out", callback=options.writable
     ),
-    scheduler: Scheduler = None,
-    workers: Workers = 0,
+    scheduler: str | None = _SCHEDULER,
+    workers: int = _WORKERS,
 ) -> None:
     """Search weights of the OCP, margin, line friction and horizon that lap faster.
 

@@ -2,7 +2,7 @@
 
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, get_args
+from typing import TYPE_CHECKING, Final, get_args
 
 import typer
 
@@ -17,17 +17,12 @@ if TYPE_CHECKING:
 
 __all__ = ["certs", "config"]
 
-_CHECKED: Final[tuple[Role, ...]] = ("plant", "controller", "director", "router")
-
-Folder = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="DIR",
-        show_default="[tls] folder as configured; certs",
-        help="Folder of the certificates and of the authority that signs them.",
-    ),
-]
-Name = Annotated[str, typer.Argument(metavar="NAME", help="Name in the certificate.")]
+_FOLDER: Final = options.value(
+    "Folder of the certificates and of the authority that signs them.",
+    metavar="DIR",
+    shown="[tls] folder as configured; certs",
+)
+_NAME: Final = options.argument("NAME", "Name in the certificate.")
 
 
 def show(configuration: "Configuration") -> None:
@@ -48,31 +43,10 @@ def check(
     'bayesrace doctor' tries the links, too.
     """
     from bayesrace.configuration import read_configuration
+    from operation.doctor import check_configuration
 
     found = configuration if file is None else read_configuration(file)
-    found.network.check()
-    typer.echo(f"{file or 'configuration'}: {_certificates(found)}")
-
-
-def _certificates(found: "Configuration") -> str:
-    """What there is of certificates, each of which is read; InputError if one cannot be used."""
-    from bayesrace.transport.session import zenoh_config
-
-    folder, there = found.tls.folder, found.tls.certificates()
-    if folder is not None and not there:
-        raise InputError(
-            f"no certificates in {folder}: make them with 'bayesrace certs', or correct "
-            "[tls] folder"
-        )
-    roles = {one.name: "revoked" if one.member is None else one.member.role for one in there}
-    for role in _CHECKED:
-        if folder is None or role in roles.values():
-            (ends := found.endpoints(role)).check()
-            zenoh_config(ends, role)
-    if folder is None:
-        reach = "open to everyone in the network" if found.network.insecure else "for loopback only"
-        return f"fine; no certificates, so links are {reach}"
-    return "fine; certificates " + ", ".join(f"'{name}' ({role})" for name, role in roles.items())
+    typer.echo(f"{file or 'configuration'}: {check_configuration(found)}")
 
 
 def example(
@@ -101,7 +75,7 @@ def _folder(given: Path | None, configuration: "Configuration") -> Path:
     return given or configuration.tls.folder or Path("certs")
 
 
-def init(configuration: "Configuration", folder: Folder = None) -> None:
+def init(configuration: "Configuration", folder: Path | None = _FOLDER) -> None:
     """Make the authority of a system, once; its folder 'authority' belongs on no car."""
     from operation.certificates import init as make
 
@@ -112,7 +86,7 @@ def init(configuration: "Configuration", folder: Folder = None) -> None:
 
 def add(
     configuration: "Configuration",
-    name: Name,
+    name: str = _NAME,
     role: Role | None = options.value(f"One of {', '.join(get_args(Role))}."),
     car: str | None = options.value("The one car that it is for, by its name.", shown="every car"),
     host: list[str] = options.value(
@@ -122,7 +96,7 @@ def add(
     ),
     days: int = options.value("Days until it expires.", 365, min=1, max=3650),
     renew: bool = options.flag("--renew", "Replace the one of this name; what is not given stays."),
-    folder: Folder = None,
+    folder: Path | None = _FOLDER,
 ) -> None:
     """Make a certificate: a folder to copy to the machine of its process.
 
@@ -135,7 +109,7 @@ def add(
     typer.echo(f"{made}: copy it to its machine, and members.json in it to the others")
 
 
-def members(configuration: "Configuration", folder: Folder = None) -> None:
+def members(configuration: "Configuration", folder: Path | None = _FOLDER) -> None:
     """List the certificates, and when they expire."""
     from operation.certificates import read_register
 
@@ -147,7 +121,9 @@ def members(configuration: "Configuration", folder: Folder = None) -> None:
         typer.echo(f"{name:<20} {one.role:<10} car {one.car:<12} {state:<18} {hosts}")
 
 
-def revoke(configuration: "Configuration", name: Name, folder: Folder = None) -> None:
+def revoke(
+    configuration: "Configuration", name: str = _NAME, folder: Path | None = _FOLDER
+) -> None:
     """Take a certificate off the list of members, for ever.
 
     It counts no more where the new list is and the process has been restarted.

@@ -34,7 +34,7 @@ from typer.models import OptionInfo
 from bayesrace.defaults import CONFIGURATION_VARIABLE, Option
 from bayesrace.errors import InputError, faults_in
 from bayesrace.messages import Role
-from operation.cli.options import Endpoint
+from operation.cli.options import ENDPOINT, flag, value
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -46,31 +46,23 @@ __all__ = ["Given", "Group", "configured", "options_of"]
 Command = TypeVar("Command", bound=Callable[..., None])
 Settings = TypeVar("Settings", bound="BaseModel")
 
-_INSECURE: Final = Annotated[
-    bool,
-    typer.Option(
-        "--insecure",
-        help="Allow endpoints beyond loopback without certificates, where anyone could drive the "
-        "car.",
-    ),
-]
-_CONFIG: Final = Annotated[
-    Path | None,
-    typer.Option(
-        "--config",
-        metavar="FILE",
-        show_default=f"that of {CONFIGURATION_VARIABLE}, if any",
-        help="Configuration, as 'bayesrace config example' writes it.",
-    ),
-]
-_SETTINGS: Final = Annotated[
-    Path | None,
-    typer.Option(
-        "--settings",
-        metavar="FILE",
-        help="Settings of an earlier run (its settings.json); options that are given override it.",
-    ),
-]
+_INSECURE: Final = flag(
+    "--insecure",
+    "Allow endpoints beyond loopback without certificates, where anyone could drive the car.",
+)
+_CONFIG: Final = value(
+    "Configuration, as 'bayesrace config example' writes it.",
+    None,
+    "--config",
+    metavar="FILE",
+    shown=f"that of {CONFIGURATION_VARIABLE}, if any",
+)
+_SETTINGS: Final = value(
+    "Settings of an earlier run (its settings.json); options that are given override it.",
+    None,
+    "--settings",
+    metavar="FILE",
+)
 _ROLES: Final[tuple[Role, ...]] = ("director", "learning", "viewer")
 _UNITS: Final = {"s": "s", "m": "m", "hz": "Hz", "mps": "m/s"}
 _UNIT: Final = re.compile(f"(.+?)(?:_({'|'.join(_UNITS)}))?$")
@@ -114,9 +106,9 @@ def configured(command: Callable[..., None]) -> Callable[..., None]:
         for name, parameter in own.items()
         for one in (places if model and name == "settings" else [_with_metavar(parameter)])
     ]
-    parameters += [_keyword("endpoint", Endpoint)] if role else []
-    parameters += [_keyword("insecure", _INSECURE, False)] if role or "network" in taken else []
-    parameters += [_keyword("config", _CONFIG)]
+    parameters += [_keyword("endpoint", list[str], ENDPOINT)] if role else []
+    parameters += [_keyword("insecure", bool, _INSECURE)] if role or "network" in taken else []
+    parameters += [_keyword("config", Path | None, _CONFIG)]
 
     @functools.wraps(command)
     def run(config: Path | None, insecure: bool = False, **options: Any) -> None:
@@ -134,7 +126,7 @@ def configured(command: Callable[..., None]) -> Callable[..., None]:
                 typed = {one: all_[one] for one in all_ if sources(one.name).name == "COMMANDLINE"}
                 options["settings"] = Given(model, found, file, typed)
             if role is not None:
-                options[role] = found.endpoints(role, connect=options.pop("endpoint") or ())
+                options[role] = found.endpoints(role, connect=options.pop("endpoint"))
             command(**options, **dict.fromkeys(taken, found))
 
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
@@ -150,23 +142,24 @@ def _settings_of(command: Callable[..., None]) -> "tuple[Any, list[_FieldOption]
     module, _, name = place.rpartition(".")
     model = getattr(import_module(module), name)
     fields = [_FieldOption(model, one) for one in names.split()]
-    parameters = [*(one.parameter for one in fields), _keyword("context", typer.Context, ...)]
-    return model, fields, parameters + ([_keyword("settings_file", _SETTINGS)] if file else [])
+    parameters = [*(one.parameter for one in fields), _keyword("context", typer.Context)]
+    return (
+        model,
+        fields,
+        parameters + ([_keyword("settings_file", Path | None, _SETTINGS)] if file else []),
+    )
 
 
-def _keyword(name: str, kind: Any, default: Any = None) -> Parameter:
-    """A parameter of the function that Typer calls; ``...``: without a default."""
-    default = Parameter.empty if default is ... else default
+def _keyword(name: str, kind: Any, default: Any = Parameter.empty) -> Parameter:
+    """A parameter of the function that Typer calls."""
     return Parameter(name, Parameter.KEYWORD_ONLY, annotation=kind, default=default)
 
 
 def _with_metavar(parameter: Parameter) -> Parameter:
     """Of a command's own option, which may lack one."""
-    kind, option = parameter.annotation, parameter.default
-    if get_origin(kind) is Annotated:
-        kind, option = get_args(kind)
+    option = parameter.default
     if isinstance(option, OptionInfo) and option.metavar is None:
-        option.metavar = _metavar(_inner_type(kind), parameter.name)
+        option.metavar = _metavar(_inner_type(parameter.annotation), parameter.name)
     return parameter.replace(kind=Parameter.KEYWORD_ONLY)
 
 

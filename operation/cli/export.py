@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
-from bayesrace.defaults import DEFAULT_CAR
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from operation.cli import options
@@ -47,12 +46,12 @@ def _replace(source: str, target: str) -> None:
 
 def export(
     out: Path = options.argument("DIR", "Folder to write into."),
-    track: options.TrackName = "",
-    raceline: options.GivenLine = None,
-    weights: options.Weights = None,
-    mpc: options.MpcFile = None,
-    artefact: options.Artefact = None,
-    car: options.Car = DEFAULT_CAR,
+    track: str = options.TRACK,
+    raceline: Path | None = options.GIVEN_LINE,
+    weights: Path | None = options.WEIGHTS,
+    mpc: Path | None = options.MPC,
+    artefact: Path | None = options.ARTEFACT,
+    car: str = options.CAR,
 ) -> None:
     """Write racing line, weights and settings for a C program (examples/c_host)."""
     from bayesrace.manifest import read_manifest
@@ -103,8 +102,8 @@ def _controller(
 
 
 def export_fmu(
-    out: options.OutFile,
-    car: options.Car = DEFAULT_CAR,
+    out: Path = options.out_file(...),
+    car: str = options.CAR,
     version: Literal["2", "3"] = options.value(
         "Version of the FMI standard: 2 or 3.", "3", metavar="FMI"
     ),
@@ -118,11 +117,11 @@ def export_fmu(
         shown="this one",
     ),
     controller: bool = options.flag("--controller", "Export the controller instead of the car."),
-    track: options.TrackName = "",
-    raceline: options.GivenLine = None,
-    weights: options.Weights = None,
-    mpc: options.MpcFile = None,
-    artefact: options.Artefact = None,
+    track: str = options.TRACK,
+    raceline: Path | None = options.GIVEN_LINE,
+    weights: Path | None = options.WEIGHTS,
+    mpc: Path | None = options.MPC,
+    artefact: Path | None = options.ARTEFACT,
 ) -> None:
     """Write the car, or the controller of a track, as an FMU, C sources inside.
 
@@ -155,7 +154,7 @@ def export_fmu(
 
 
 def exchange_weights(
-    out: options.OutFile,
+    out: Path = options.out_file(...),
     controller: Path = options.argument("FMU", "FMU of a controller."),
     weights: Path = options.argument("WEIGHTS", "New GP weights."),
 ) -> None:

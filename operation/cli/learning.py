@@ -2,7 +2,7 @@
 weights in use."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 import typer
 
@@ -18,28 +18,19 @@ if TYPE_CHECKING:
 
 __all__ = ["collect", "learn", "publish", "rollback", "train", "validate"]
 
-Artefact = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="DIR", show_default="the default one", help="Built controller to learn for."
-    ),
-]
-Name = Annotated[
-    str,
-    typer.Option(
-        "--name", "--car", show_default="the only one that is found", help="Name of the car."
-    ),
-]
-Timeout = Annotated[
-    float | None,
-    typer.Option(
-        metavar="S",
-        min=0.1,
-        max=600.0,
-        show_default="5 and 20",
-        help="Time limit [s], once for finding the controller and once for its answer.",
-    ),
-]
+_ARTEFACT: Final = options.value(
+    "Built controller to learn for.", metavar="DIR", shown="the default one"
+)
+_NAME: Final = options.value(
+    "Name of the car.", "", "--name", "--car", shown="the only one that is found"
+)
+_TIMEOUT: Final = options.value(
+    "Time limit [s], once for finding the controller and once for its answer.",
+    metavar="S",
+    min=0.1,
+    max=600.0,
+    shown="5 and 20",
+)
 
 
 @options_of(
@@ -47,10 +38,10 @@ Timeout = Annotated[
     "collect_s=--duration pursuit.style seed fmu fmu_map simulator car",
 )
 def collect(
-    track: options.TrackName,
-    raceline: options.RaceLineFile,
     settings: "Given[PreparationSettings]",
-    out: options.OutFile = Path("collect.mcap"),
+    track: str = options.TRACK_GIVEN,
+    raceline: Path = options.RACELINE,
+    out: Path = options.out_file(Path("collect.mcap")),
 ) -> None:
     """Drive a track by pure pursuit and log the drive as training data."""
     from bayesrace.raceline import read_raceline_for
@@ -80,13 +71,13 @@ def train(
     kernel: Literal["rbf", "matern05", "matern15", "matern25", "auto"] = options.value(
         "rbf, matern05, matern15, matern25; auto: the best per output.", "auto"
     ),
-    out: options.OutFile = Path("weights.bin"),
+    out: Path = options.out_file(Path("weights.bin")),
     points: int = options.value("Points per output.", 400, min=20, max=20000),
     plot: Path | None = options.new_file("Draw the error against the kernel's smoothness (PNG)."),
-    artefact: Artefact = None,
+    artefact: Path | None = _ARTEFACT,
     car: str = options.value("Car that drove.", "", shown="named by the files"),
-    name: options.CarName = "",
-    all_samples: options.AllSamples = False,
+    name: str = options.CAR_NAME,
+    all_samples: bool = options.ALL_SAMPLES,
 ) -> None:
     """Train the three GPs on the residual in run logs or plain arrays.
 
@@ -144,8 +135,8 @@ def validate(
     ),
     run: list[int] = options.value("Only this run of the log; repeatable.", ()),
     car: str = options.value("TOML file of the weights' car if it is not built in.", ""),
-    name: options.CarName = "",
-    all_samples: options.AllSamples = False,
+    name: str = options.CAR_NAME,
+    all_samples: bool = options.ALL_SAMPLES,
 ) -> None:
     """Validate weights on a drive: error, coverage, and drift over one step and the horizon.
 
@@ -186,8 +177,8 @@ def validate(
 def publish(
     learning: "Endpoints",
     weights: Path = options.argument("WEIGHTS", "Weights file, as 'bayesrace train' writes it."),
-    name: Name = "",
-    timeout: Timeout = None,
+    name: str = _NAME,
+    timeout: float | None = _TIMEOUT,
 ) -> None:
     """Send new weights to a running controller, and wait for its answer.
 
@@ -204,9 +195,9 @@ def publish(
 
 def rollback(
     learning: "Endpoints",
-    name: Name = "",
+    name: str = _NAME,
     reason: str = options.value("Reason, for the controller's event.", "", metavar="TEXT"),
-    timeout: Timeout = None,
+    timeout: float | None = _TIMEOUT,
 ) -> None:
     """Let a controller return to the weights before those in use.
 
@@ -232,7 +223,7 @@ def learn(
         "Folder for results, or of a job to resume (--data and --weights do not count then).",
         "runs/learn-DATE-TIME",
     ),
-    artefact: Artefact = None,
+    artefact: Path | None = _ARTEFACT,
 ) -> None:
     """Learn from the laps of a driving car, and send the weights to its controller.
 

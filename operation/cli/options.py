@@ -5,10 +5,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import typer
 
+from bayesrace.defaults import DEFAULT_CAR
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 
@@ -18,10 +19,10 @@ if TYPE_CHECKING:
     from operation.terminal.progress import Stages
 
 __all__ = [
-    "AllSamples", "Artefact", "Car", "CarName", "Course", "Endpoint", "GivenLine", "LowLatency",
-    "MpcFile", "OutFile", "ParentPid", "RaceLineFile", "TrackName", "Tyres", "Weights", "argument",
-    "flag", "new_file", "out_folder", "run_folder", "stages_shown", "value", "writable",
-    "write_json",
+    "ALL_SAMPLES", "ARTEFACT", "CAR", "CAR_NAME", "COURSE", "ENDPOINT", "GIVEN_LINE", "LOW_LATENCY",
+    "MPC", "PARENT_PID", "RACELINE", "TRACK", "TRACK_GIVEN", "TYRES", "WEIGHTS", "Tyres",
+    "argument", "flag", "new_file", "out_file", "out_folder", "run_folder", "stages_shown", "value",
+    "writable", "write_json",
 ]  # fmt: skip
 
 
@@ -43,6 +44,11 @@ def flag(name: str, text: str) -> Any:
 def new_file(text: str, *names: str, default: Path | None = None) -> Any:
     """A file to write, refused before the work if it cannot be."""
     return value(text, default, *names, metavar="FILE", callback=writable)
+
+
+def out_file(default: Any) -> Any:
+    """The file that the command is for."""
+    return value("File to write.", default, "--out", "-o", metavar="FILE", callback=writable)
 
 
 def out_folder(text: str, shown: str = "") -> Any:
@@ -81,66 +87,36 @@ def stages_shown() -> Iterator["Stages"]:
         yield stages
 
 
-Car = Annotated[str, typer.Option(help="Car: built-in name or TOML file.")]
-CarName = Annotated[
-    str, typer.Option(show_default="the car's own", help="Name of the car in the network.")
-]
-Tyres = Annotated[
-    Literal["pacejka", "linear"] | None,
-    typer.Option(
-        metavar="TYRES",
-        show_default="the car's",
-        help="pacejka: of the same stiffness as the car's linear tyres, saturating.",
-    ),
-]
-TrackName = Annotated[
-    str,
-    typer.Option(
-        show_default="the car's", help="Built-in name, random:SEED, random10:SEED or CSV file."
-    ),
-]
-Course = Annotated[
-    str,
-    typer.Argument(metavar="TRACK", help="Built-in name, random:SEED, random10:SEED or CSV file."),
-]
-RaceLineFile = Annotated[Path, typer.Option(help="Racing line, as 'bayesrace raceline' writes it.")]
-GivenLine = Annotated[
-    Path | None,
-    typer.Option(
-        show_default="computed", help="Racing line to drive, as 'bayesrace raceline' writes it."
-    ),
-]
-Weights = Annotated[
-    Path | None, typer.Option(help="GP weights; without them, the uncorrected model.")
-]
-Artefact = Annotated[
-    Path | None,
-    typer.Option(metavar="DIR", show_default="built", help="Folder of 'bayesrace build'."),
-]
-MpcFile = Annotated[
-    Path | None, typer.Option("--settings", help="OCP settings (JSON): controller/settings.py.")
-]
-AllSamples = Annotated[
-    bool,
-    typer.Option(
-        "--all-samples",
-        help="Keep samples beyond the car's limits, as the paper's published drives have them.",
-    ),
-]
-Endpoint = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="ENDPOINT",
-        show_default="as configured; tcp/127.0.0.1:7447 and :7448",
-        help="Zenoh endpoint of a plant, a controller or a router; repeatable.",
-    ),
-]
-OutFile = Annotated[Path, typer.Option("--out", "-o", callback=writable, help="File to write.")]
-LowLatency = Annotated[
-    bool,
-    typer.Option(
-        "--low-latency",
-        help="Send in the calling thread: in lockstep only, on both plant and controller.",
-    ),
-]
-ParentPid = Annotated[int | None, typer.Option(hidden=True, help="End when this parent ends.")]
+_RACELINE = "as 'bayesrace raceline' writes it."
+_TRACKS = "Built-in name, random:SEED, random10:SEED or CSV file."
+
+Tyres = Literal["pacejka", "linear"] | None
+
+ALL_SAMPLES: Final = flag(
+    "--all-samples",
+    "Keep samples beyond the car's limits, as the paper's published drives have them.",
+)
+ARTEFACT: Final = value("Folder of 'bayesrace build'.", metavar="DIR", shown="built")
+CAR: Final = value("Car: built-in name or TOML file.", DEFAULT_CAR)
+CAR_NAME: Final = value("Name of the car in the network.", "", shown="the car's own")
+COURSE: Final = argument("TRACK", _TRACKS)
+ENDPOINT: Final = value(
+    "Zenoh endpoint of a plant, a controller or a router; repeatable.",
+    (),
+    metavar="ENDPOINT",
+    shown="as configured; tcp/127.0.0.1:7447 and :7448",
+)
+GIVEN_LINE: Final = value(f"Racing line to drive, {_RACELINE}", shown="computed")
+LOW_LATENCY: Final = flag(
+    "--low-latency",
+    "Send in the calling thread: in lockstep only, on both plant and controller.",
+)
+MPC: Final = value("OCP settings (JSON): controller/settings.py.", None, "--settings")
+PARENT_PID: Final = value("End when this parent ends.", hidden=True)
+RACELINE: Final = value(f"Racing line, {_RACELINE}", ...)
+TRACK: Final = value(_TRACKS, "", shown="the car's")
+TRACK_GIVEN: Final = value(_TRACKS, ...)
+TYRES: Final = value(
+    "pacejka: of the same stiffness as the car's linear tyres, saturating.", shown="the car's"
+)
+WEIGHTS: Final = value("GP weights; without them, the uncorrected model.")

@@ -2,7 +2,7 @@
 and commands for those that run: ``status``, ``stop``, ``go``, ``doctor``."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import typer
 
@@ -20,19 +20,17 @@ if TYPE_CHECKING:
 
 __all__ = ["controller", "doctor", "go", "plant", "router", "status", "stop"]
 
-Name = Annotated[str, typer.Option(show_default="", help="Name of the car.")]
-Timeout = Annotated[
-    float,
-    typer.Option(
-        metavar="S",
-        min=0.1,
-        max=60.0,
-        help="Time limit [s], once for finding the cars and once for their answers.",
-    ),
-]
-Reason = Annotated[
-    str, typer.Option(metavar="TEXT", help="Reason, which the controller's status then shows.")
-]
+_NAME: Final = options.value("Name of the car.", "")
+_REASON: Final = options.value(
+    "Reason, which the controller's status then shows.", "", metavar="TEXT"
+)
+_TIMEOUT: Final = options.value(
+    "Time limit [s], once for finding the cars and once for their answers.",
+    2.0,
+    metavar="S",
+    min=0.1,
+    max=60.0,
+)
 
 
 def _endpoint(text: str, shown: str = "as configured") -> Any:
@@ -51,8 +49,8 @@ def plant(
         "Zenoh endpoint to listen on; repeatable.", "as configured; tcp/127.0.0.1:7447"
     ),
     connect: list[str] = _endpoint("Endpoint to connect to, as of a router; repeatable."),
-    low_latency: options.LowLatency = False,
-    parent_pid: options.ParentPid = None,
+    low_latency: bool = options.LOW_LATENCY,
+    parent_pid: int | None = options.PARENT_PID,
 ) -> None:
     """Simulate the car: waits for runs, as of 'bayesrace drive', until Ctrl-C."""
     die_with_parent(parent_pid)
@@ -73,11 +71,11 @@ def plant(
 def controller(
     network: "Configuration",
     settings: "Given[ControllerSettings]",
-    track: options.TrackName,
-    raceline: options.RaceLineFile,
+    track: str = options.TRACK_GIVEN,
+    raceline: Path = options.RACELINE,
     artefact: Path = options.value("Folder that 'bayesrace build' printed.", ..., metavar="DIR"),
-    weights: options.Weights = None,
-    mpc: options.MpcFile = None,
+    weights: Path | None = options.WEIGHTS,
+    mpc: Path | None = options.MPC,
     store: Path | None = options.value(
         "Folder that keeps accepted weights for the next start.", metavar="DIR"
     ),
@@ -89,8 +87,8 @@ def controller(
         "as configured; tcp/127.0.0.1:7448",
     ),
     gate: Path | None = options.value("Thresholds for new weights (JSON): docs/learning.md."),
-    low_latency: options.LowLatency = False,
-    parent_pid: options.ParentPid = None,
+    low_latency: bool = options.LOW_LATENCY,
+    parent_pid: int | None = options.PARENT_PID,
 ) -> None:
     """Drive the car of a plant process with the compiled controller, until Ctrl-C."""
     die_with_parent(parent_pid)
@@ -113,7 +111,7 @@ def router(
     network: "Configuration",
     listen: list[str] = _endpoint("Zenoh endpoint to listen on; repeatable."),
     connect: list[str] = _endpoint("Endpoint of another router; repeatable.", shown="none"),
-    parent_pid: options.ParentPid = None,
+    parent_pid: int | None = options.PARENT_PID,
 ) -> None:
     """Forward messages between all processes that connect to it, until Ctrl-C.
 
@@ -131,14 +129,14 @@ def router(
 
 def status(
     viewer: "Endpoints",
-    name: Name = "",
+    name: str = _NAME,
     as_json: bool = options.flag(
         "--json", 'Print {"cars": {NAME: {"plant": ..., "controller": ...}}} instead.'
     ),
     watch: bool = options.flag(
         "--watch", "Update until Ctrl-C; with --json, print a line for each heartbeat."
     ),
-    timeout: Timeout = 2.0,
+    timeout: float = _TIMEOUT,
 ) -> None:
     """Show plants and controllers: phase, rate, deadline misses, fallbacks, counters.
 
@@ -152,11 +150,11 @@ def status(
 
 def stop(
     director: "Endpoints",
-    name: Name = "",
-    reason: Reason = "",
+    name: str = _NAME,
+    reason: str = _REASON,
     all_cars: bool = options.flag("--all", "All cars that are found."),
     run: bool = options.flag("--run", "End the plant's run instead, such as an abandoned one."),
-    timeout: Timeout = 2.0,
+    timeout: float = _TIMEOUT,
 ) -> None:
     """Brake a car to standstill and keep it there.
 
@@ -170,9 +168,9 @@ def stop(
 
 def go(
     director: "Endpoints",
-    name: Name = "",
-    reason: Reason = "",
-    timeout: Timeout = 2.0,
+    name: str = _NAME,
+    reason: str = _REASON,
+    timeout: float = _TIMEOUT,
 ) -> None:
     """Let a stopped or held controller drive.
 

@@ -1,9 +1,6 @@
 """``race``, ``report``, ``drive``, ``bench``, ``latency``, ``paper``: whole runs, and measurements
 that are made of them."""
 
-import gc
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,19 +22,6 @@ if TYPE_CHECKING:
 __all__ = ["bench", "drive", "latency", "paper", "race", "report"]
 
 
-@contextmanager
-def _uncollected() -> Iterator[None]:
-    """No cyclic garbage collection within the block: the messages of a log live until its report is
-    written, and looking for garbage among them takes a quarter of the time of both."""
-    was_on = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_on:
-            gc.enable()
-
-
 @options_of(
     "operation.settings.RaceSettings",
     "car track train_track line collect_s pursuit.style laps problem progress_drives mode "
@@ -46,7 +30,7 @@ def _uncollected() -> Iterator[None]:
 )
 def race(
     settings: "Given[RaceSettings]",
-    tyres: options.Tyres = None,
+    tyres: options.Tyres = options.TYRES,
     out: Path | None = options.out_folder("Run directory.", "runs/DATE-TIME"),
 ) -> None:
     """Drive the paper's comparison: WorstCase, BayesRace, BayesRace-updated, BestCase; and
@@ -56,6 +40,7 @@ def race(
     controllers, and drives them as two processes over Zenoh. Leaves a run directory with the log,
     result.json and report.html.
     """
+    from bayesrace.realtime import uncollected
     from bayesrace.transport import check_descriptors
     from operation.race import race as drive_all
 
@@ -64,7 +49,7 @@ def race(
     if tyres is not None:
         chosen = settings(car=chosen.car.on_tyres(tyres))
     folder = options.run_folder(out)
-    with _uncollected(), options.stages_shown() as stages:
+    with uncollected(), options.stages_shown() as stages:
         recording = drive_all(chosen, folder, stages)
         with stages.stage("result and report"):
             # They take a second to import, in which nothing would be seen of a race.
@@ -82,12 +67,13 @@ def report(
     ),
 ) -> None:
     """Compute result.json, the table and report.html again from a run's log."""
+    from bayesrace.realtime import uncollected
     from operation.analysis.race import read_race
     from operation.report import write_report
 
     if run.suffix == ".mcap" and run.is_file():
         run = run.parent
-    with _uncollected():
+    with uncollected():
         analysis = read_race(run)
         if not analysis.runs:
             raise InputError(f"{run}: no run in its log; drive again with 'bayesrace race'")
@@ -110,7 +96,7 @@ def drive(
     laps: int = options.value("Laps to drive, the first from rest.", 2, min=1),
     max_time: float = options.value("Time limit [s].", 60.0, min=1, max=1e6, metavar="S"),
     log: Path = options.new_file("Log to write (MCAP).", default=Path("run.mcap")),
-    name: options.CarName = "",
+    name: str = options.CAR_NAME,
 ) -> None:
     """Start a run on a plant and a controller that are already running, and record it.
 
@@ -156,7 +142,7 @@ def latency(
     out: Path | None = options.out_folder("Folder for results.", "runs/latency-DATE-TIME"),
     json_file: Path | None = options.new_file("Write the numbers to this file as well.", "--json"),
     attach: bool = options.flag("--attach", "Measure a run started elsewhere, or wait for one."),
-    endpoint: options.Endpoint = None,
+    endpoint: list[str] = options.ENDPOINT,
 ) -> None:
     """Measure each leg of a control cycle, from the sampled state to the acting input.
 
@@ -174,7 +160,7 @@ def latency(
     if attach:
         from bayesrace.transport import try_links
 
-        running = network.endpoints("director", connect=endpoint or ())
+        running = network.endpoints("director", connect=endpoint)
         try_links(running, "director")  # before imports that take seconds
         chosen = settings(attach=running, warm_up_s=0.0)
 

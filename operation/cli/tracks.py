@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Literal
 import typer
 
 from bayesrace.clock import die_with_parent
-from bayesrace.defaults import DEFAULT_CAR
 from bayesrace.errors import InputError
 from operation.cli import options
 from operation.cli.declaration import Given, options_of
@@ -100,7 +99,7 @@ def _point(text: str | None) -> tuple[float, float] | None:
 def cars(
     car: str | None = options.argument("CAR", "Built-in name or TOML file.", None, "all built in"),
     out: Path | None = options.new_file("Write the car as TOML, tuning included.", "--out", "-o"),
-    tyres: options.Tyres = None,
+    tyres: options.Tyres = options.TYRES,
 ) -> None:
     """List the built-in cars, check a car's file, or write a car to a file with all its values."""
     from rich.table import Table
@@ -128,9 +127,9 @@ def cars(
 )
 def raceline(
     settings: "Given[BayesianSettings]",
-    track: options.Course,
-    out: options.OutFile = Path("raceline.csv"),
-    car: options.Car = DEFAULT_CAR,
+    track: str = options.COURSE,
+    out: Path = options.out_file(Path("raceline.csv")),
+    car: str = options.CAR,
     method: Literal["minimum-time", "bayesian"] = options.value(
         "minimum-time, or bayesian (Jain and Morari 2020).", "minimum-time"
     ),
@@ -173,11 +172,11 @@ def raceline(
 )
 def limit(
     settings: "Given[LimitSettings]",
-    track: options.Course,
-    car: options.Car = DEFAULT_CAR,
-    tyres: options.Tyres = None,
+    track: str = options.COURSE,
+    car: str = options.CAR,
+    tyres: options.Tyres = options.TYRES,
     out: Path | None = options.new_file("Write the lap as CSV.", "--out", "-o"),
-    parent_pid: options.ParentPid = None,
+    parent_pid: int | None = options.PARENT_PID,
 ) -> None:
     """Compute the fastest lap of the true car: minimum-time optimal control.
 
