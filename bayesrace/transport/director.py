@@ -98,12 +98,8 @@ class Director:
 
     def stop(self, text: str) -> Reply:
         """End the current run."""
-        return ask(
-            self._session,
-            STOP,
-            self._car,
-            StopRequest(seq=0, source_time_ns=time.monotonic_ns(), text=text),
-        )
+        request = StopRequest(seq=0, source_time_ns=time.monotonic_ns(), text=text)
+        return ask(self._session, STOP, self._car, request)
 
     def send_weights(self, data: bytes) -> Reply:
         """:func:`send_weights`; RefusedError with the reasons if they are refused."""

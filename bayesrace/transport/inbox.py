@@ -159,7 +159,8 @@ class Inbox:
                 self.requests_rejected += 1
                 request.reject(f"{_REQUESTS} requests are waiting; try again")
 
-        self._serve(service, on_request, source)
+        served = declare_service(self._session, service, self._car or "", on_request, source=source)
+        self._declared.append(served)
 
     def announce(self, source: str) -> None:
         """Declare this process's liveliness token: last, when everything else is in place."""
@@ -258,13 +259,6 @@ class Inbox:
         if self._car is None:
             return template.format(car="*", source=source)
         return car_key(template, self._car, source)
-
-    def _serve(
-        self, service: Service[Any, Any], on_request: Callable[[Request], None], source: str
-    ) -> None:
-        self._declared.append(
-            declare_service(self._session, service, self._car or "", on_request, source=source)
-        )
 
     def _into_queue(self, name: str, key: str) -> Any:
         def on_sample(sample: Any) -> None:
