@@ -2,22 +2,11 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from bayesrace.log import LogReader
-from bayesrace.messages import (
-    ACTUATION,
-    HEARTBEAT,
-    STATE,
-    TELEMETRY,
-    Actuation,
-    Message,
-    State,
-    Status,
-    Telemetry,
-)
+from bayesrace.messages import ACTUATION, HEARTBEAT, STATE, TELEMETRY, Actuation, State, Status
 from bayesrace.tracks import Track
 
 __all__ = ["STANDING_MPS", "Journey"]
@@ -32,18 +21,11 @@ class Journey:
     def __init__(self, log: Path, track: Track) -> None:
         reader = LogReader(log)
         self._track = track
-        self.states: list[State] = []
-        self.actuations: list[Actuation] = []
-        self.telemetry: list[Telemetry] = []
-        self.heartbeats: list[Status] = []
-        lists: dict[type[Message], list[Any]] = {
-            State: self.states,
-            Actuation: self.actuations,
-            Telemetry: self.telemetry,
-            Status: self.heartbeats,
-        }
-        for entry in reader.messages((STATE, ACTUATION, TELEMETRY, HEARTBEAT)):
-            lists[type(entry.message)].append(entry.message)
+        topics = (STATE, ACTUATION, TELEMETRY, HEARTBEAT)
+        messages = [entry.message for entry in reader.messages(topics)]
+        self.states = [one for one in messages if isinstance(one, State)]
+        self.actuations = [one for one in messages if isinstance(one, Actuation)]
+        self.heartbeats = [one for one in messages if isinstance(one, Status)]
         # Once in some hundred drives over a link that fails, the transport has delivered a garbled
         # telemetry message to the recorder; it is refused, as it should be.
         assert reader.refused <= 1, reader.last_reason

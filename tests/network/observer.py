@@ -14,7 +14,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import msgspec.structs
 import zenoh
@@ -28,28 +28,12 @@ from operation.drive import RunPlan, run_request
 from tests.network.hosts import Host
 from tests.programs import PATIENCE_S, ROOT, environment, until
 
-__all__ = ["Follower", "Observer", "Remote", "drive_on", "observing", "observing_from"]
+__all__ = ["Observer", "Remote", "drive_on", "observing", "observing_from"]
 
 _ENDLESS_S = 1e5
 
 
-class Follower(Protocol):
-    """What tests need of either kind."""
-
-    def start(self, run: int) -> int:
-        """Starts a run without end; its number."""
-
-    def state(self) -> dict[str, Any]:
-        """Fields of the newest state; empty before the first."""
-
-    def status(self, source: str) -> dict[str, Any]:
-        """Fields of a process's status; ``error`` if it does not answer."""
-
-    def stop(self) -> None:
-        """Ends the run."""
-
-
-def drive_on(follower: Follower, away_m: float = 0.8) -> None:
+def drive_on(follower: "Observer | Remote", away_m: float = 0.8) -> None:
     """Waits until the car is that far from where it is now: it drives, and by itself."""
     until(lambda: bool(follower.state()), "a first state")
     begin = follower.state()["x"]
