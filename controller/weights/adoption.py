@@ -19,7 +19,8 @@ from bayesrace.vehicles.parts import GRAVITY_MPS2
 from controller.interface import Controller, Environment
 from controller.native_step import NativeStep
 from controller.weights.checks import Samples
-from controller.weights.settings import WATCHED, GateSettings, compare, slack_of
+from controller.weights.comparison import compare, slack_of
+from controller.weights.settings import WATCHED, GateSettings
 from controller.weights.store import History, Store
 
 __all__ = ["Adoption", "Offer", "Ruling", "Watch", "WeightsPort", "limits_at", "slowed_down"]

@@ -29,7 +29,8 @@ from bayesrace.vehicles.parameters import CarParameters
 from bayesrace.vehicles.parts import GRAVITY_MPS2
 from controller.native_step import NativeStep
 from controller.settings import MpcSettings
-from controller.weights.settings import GateSettings, compare, slack_of
+from controller.weights.comparison import compare, slack_of
+from controller.weights.settings import GateSettings
 
 __all__ = [
     "NO_SAMPLES",

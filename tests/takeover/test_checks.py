@@ -15,7 +15,8 @@ from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpOutput, GpWeights, encode_weights, zero_weights
 from bayesrace.vehicles import CarParameters
 from controller.weights.checks import NO_SAMPLES, Checks, Samples, Verdict, plausible_features
-from controller.weights.settings import GateSettings, compare, slack_of
+from controller.weights.comparison import compare, slack_of
+from controller.weights.settings import GateSettings
 from tests.conftest import fit_weights
 from tests.takeover.rig import KINDS
 from tests.takeover.spoilt_weights import SPOILT, spoilt
