@@ -151,7 +151,8 @@ class CompensationSettings(BaseModel):
         try:
             return {"mode": "fixed", "delay_s": float(value) * 1e-3}
         except ValueError:
-            raise ValueError("give 'measured', 'off', or a number of milliseconds") from None
+            known = "'measured', 'off', or a number of milliseconds"
+            raise ValueError(f"give {known}, not '{value}'") from None
 
 
 def cycle_values(

@@ -73,6 +73,11 @@ class _Race:
     def __init__(self, settings: RaceSettings, out: Path, stages: Stages) -> None:
         self.settings, self.out, self.stages = settings, out, stages
         self.car = settings.driven_car
+        self.car_file = str(out / FILES.car)
+        """The car, as the processes read it."""
+        # Nothing predicts with what is inside another simulator.
+        self.models = _MODELS if settings.simulator == "equations" else _MODELS[:1]
+        self.lockstep = settings.mode == "lockstep"
         self._run = 0
 
     # Preparation -------------------------------------------------------------------------------
@@ -115,11 +120,6 @@ class _Race:
             pass
 
     @property
-    def car_file(self) -> str:
-        """The car, as the processes read it."""
-        return str(self.out / FILES.car)
-
-    @property
     def plant_options(self) -> list[str]:
         """Of ``bayesrace plant``."""
         settings = self.settings
@@ -131,16 +131,6 @@ class _Race:
             ("--delay", 1e3 * settings.delay_s), ("--seed", settings.seed),
         ]  # fmt: skip
         return [str(one) for pair in pairs for one in pair]
-
-    @property
-    def models(self) -> tuple[PredictionModel, ...]:
-        """Of the controllers: nothing predicts with what is inside another simulator."""
-        return _MODELS if self.settings.simulator == "equations" else _MODELS[:1]
-
-    @property
-    def lockstep(self) -> bool:
-        """Whether its runs are in lockstep."""
-        return self.settings.mode == "lockstep"
 
     def update(self, samples: Sequence[Dataset], weights: Path, name: str, stage: Stage) -> Path:
         """Weights learned from all samples, beginning with ``weights``, as that file."""

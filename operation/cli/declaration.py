@@ -33,13 +33,13 @@ from typer.models import OptionInfo
 
 from bayesrace.defaults import CONFIGURATION_VARIABLE, Option
 from bayesrace.errors import InputError, faults_in
-from bayesrace.messages import Role
 from operation.cli.options import ENDPOINT, flag, value
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
     from bayesrace.configuration import Configuration
+    from bayesrace.messages import Role
 
 __all__ = ["Given", "Group", "configured", "options_of"]
 
@@ -63,7 +63,7 @@ _SETTINGS: Final = value(
     "--settings",
     metavar="FILE",
 )
-_ROLES: Final[tuple[Role, ...]] = ("director", "learning", "viewer")
+_ROLES: "Final[tuple[Role, ...]]" = ("director", "learning", "viewer")
 _UNITS: Final = {"s": "s", "m": "m", "hz": "Hz", "mps": "m/s"}
 _UNIT: Final = re.compile(f"(.+?)(?:_({'|'.join(_UNITS)}))?$")
 """Name of a field, without its unit, and the unit."""

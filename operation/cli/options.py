@@ -51,9 +51,9 @@ def out_file(default: Any) -> Any:
     return value("File to write.", default, "--out", "-o", metavar="FILE", callback=writable)
 
 
-def out_folder(text: str, shown: str = "") -> Any:
+def out_folder(text: str, shown: str = "", default: Path | None = None) -> Any:
     """A folder to write into."""
-    return value(text, None, "--out", "-o", metavar="DIR", shown=shown)
+    return value(text, default, "--out", "-o", metavar="DIR", shown=shown)
 
 
 def writable(path: Path | None) -> Path | None:

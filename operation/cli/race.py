@@ -181,9 +181,7 @@ def latency(
 @options_of("studies.paper.settings.PaperSettings", "tracks data raceline quick seed")
 def paper(
     settings: "Given[PaperSettings]",
-    out: Path = options.value(
-        "Folder for page and figures.", Path("runs/paper"), "--out", "-o", metavar="DIR"
-    ),
+    out: Path = options.out_folder("Folder for page and figures.", default=Path("runs/paper")),
 ) -> None:
     """Make every figure and number of the paper from scratch, and compare them with it.
 
