@@ -152,8 +152,11 @@ def open_session(
     own = endpoints.credentials
     ending = nullcontext() if own is None else ending_on_expiry(own, grace_s)
     with _opened(endpoints, role, peers_follow) as session, ending:
-        reports = reports_absence and not peers_follow
-        if reports and (missing := unlinked(session, endpoints, _LINK_S)):
+        missing: list[str] = []
+        if reports_absence and not peers_follow:
+            with short_slices():  # Zenoh may start threads for these calls, too
+                missing = unlinked(session, endpoints, _LINK_S)
+        if missing:
             _log.warning(
                 "no link to %s yet; this goes on trying, and 'bayesrace doctor' says why there is "
                 "none", ", ".join(missing),
@@ -203,9 +206,12 @@ def _opened(endpoints: Endpoints, role: Role, peers_follow: bool) -> Iterator[An
             "choose another endpoint or end the process that uses it"
         ) from None
     on_link = in_transport_thread(lambda _: _close_without_waiting())
-    with session, session.info.declare_link_events_listener(on_link):
-        _close_without_waiting()  # links that stand already; to list them, low-latency, panics
-        yield session
+    with session:
+        with short_slices():
+            listener = session.info.declare_link_events_listener(on_link)
+        with listener:
+            _close_without_waiting()  # links that stand already; to list them, low-latency, panics
+            yield session
 
 
 def _close_without_waiting() -> None:
