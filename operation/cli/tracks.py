@@ -51,7 +51,7 @@ def tracks(
         those = "--out, --picture, --start, --reverse, --smooth and --recentre"
         raise InputError(f"{those} need the name of the track")
     if picture is not None:
-        from operation.report.track_picture import check_picture, write_picture
+        from operation.report.maps import check_picture, write_picture
 
         check_picture(picture)
     place = _point(start)

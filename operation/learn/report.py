@@ -12,8 +12,7 @@ from rich.text import Text
 
 from operation.analysis.results import read_result
 from operation.learn.records import LapRecord, Record, UpdateRecord
-from operation.report.canvas import write_png
-from operation.report.style import INK, MUTED, WARNING, figure_style, look
+from operation.report.style import INK, MUTED, WARNING, figure_style, look, write_png
 from operation.terminal.terminal import Terminal, plain_table
 
 __all__ = ["References", "draw", "print_laps", "references"]

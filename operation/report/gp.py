@@ -18,9 +18,17 @@ from learning.dataset import Dataset
 from learning.target import KernelScore
 from learning.validation import Validation, unbroken
 from operation.analysis.validation import Validated
-from operation.report.canvas import panel, write_png
 from operation.report.maps import draw_edges, show_all
-from operation.report.style import INK, MUTED, PICTURE_WIDTH, WARNING, figure_style, look
+from operation.report.style import (
+    INK,
+    MUTED,
+    PICTURE_WIDTH,
+    WARNING,
+    figure_style,
+    look,
+    panel,
+    write_png,
+)
 from operation.terminal.notation import SMOOTHNESS, SYMBOLS, UNCERTAIN
 
 __all__ = [

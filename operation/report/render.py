@@ -18,11 +18,10 @@ from bayesrace.manifest import Manifest
 from operation.analysis.published import LIMIT, SOURCE, compare_gp, compare_laps
 from operation.analysis.race import DrivenRun, RaceAnalysis, read_race
 from operation.analysis.results import RaceResult, write_result
-from operation.report.canvas import inline_svg, png
 from operation.report.gp import gp_figures
 from operation.report.maps import LapMaps
 from operation.report.runs import coverage_figures, solve_figure
-from operation.report.style import figure_style, look
+from operation.report.style import figure_style, inline_svg, look, png
 from operation.report.traces import (
     caution_figures,
     cornering_figures,

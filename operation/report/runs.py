@@ -9,8 +9,7 @@ from matplotlib.ticker import LogLocator, NullLocator
 from bayesrace.arrays import Floats
 from bayesrace.vehicles.parts import GRAVITY_MPS2
 from operation.analysis.race import DrivenRun
-from operation.report.canvas import PANEL_WIDTH, panel
-from operation.report.style import INK, look
+from operation.report.style import INK, PANEL_WIDTH, look, panel
 
 __all__ = ["coverage_figures", "solve_figure"]
 

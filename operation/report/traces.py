@@ -15,8 +15,7 @@ from bayesrace.tracks import Track
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.parts import GRAVITY_MPS2
 from operation.analysis.race import DrivenRun
-from operation.report.canvas import panel
-from operation.report.style import INK, MUTED, look
+from operation.report.style import INK, MUTED, look, panel
 
 __all__ = [
     "Lap",

@@ -12,9 +12,8 @@ from matplotlib.figure import Figure
 
 from bayesrace.arrays import Floats
 from bayesrace.files import write_whole
-from operation.report.canvas import PANEL_WIDTH, inline_svg, panel
 from operation.report.render import template
-from operation.report.style import INK, figure_style, look
+from operation.report.style import INK, PANEL_WIDTH, figure_style, inline_svg, look, panel
 from studies.campaign import summary
 from studies.campaign.summary import Levels, summarised
 

@@ -14,8 +14,7 @@ from rich.console import Console
 from rich.text import Text
 
 from bayesrace.files import write_whole
-from operation.report.canvas import write_png
-from operation.report.style import INK, MUTED, figure_style
+from operation.report.style import INK, MUTED, figure_style, write_png
 from operation.terminal.terminal import plain_table
 from studies.latency.analysis import Analysis
 from studies.latency.legs import ANSWER, BESIDE, LEGS

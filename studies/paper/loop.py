@@ -23,9 +23,8 @@ from bayesrace.vehicles.models import dynamic
 from bayesrace.vehicles.parts import GRAVITY_MPS2
 from operation.analysis.published import LAPS_OFF, LAPS_ON
 from operation.analysis.race import DrivenRun
-from operation.report.canvas import panel
 from operation.report.maps import draw_edges, show_all
-from operation.report.style import MUTED, WARNING, look
+from operation.report.style import MUTED, WARNING, look, panel
 from operation.report.traces import input_figures
 from plant.simulator import PLANT
 from studies.paper.experiment import Experiment

@@ -13,9 +13,8 @@ from bayesrace.raceline import write_raceline
 from learning.sources import dataset_from_npz
 from operation.analysis.published import SOURCE
 from operation.preparation import training_settings
-from operation.report.canvas import inline_svg, write_pdf
 from operation.report.render import template
-from operation.report.style import figure_style
+from operation.report.style import figure_style, inline_svg, write_pdf
 from operation.settings import PreparationSettings
 from operation.terminal.progress import Stages
 from studies.bench import BenchResult, run_bench

@@ -9,8 +9,7 @@ from bayesrace.integrators import Discretisation
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import Model, dynamic, e_kinematic, kinematic
 from bayesrace.vehicles.parts import AccelerationDrive
-from operation.report.canvas import panel
-from operation.report.style import look
+from operation.report.style import look, panel
 from studies.paper.finding import Finding, Section
 
 __all__ = ["model_section"]

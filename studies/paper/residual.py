@@ -26,9 +26,8 @@ from learning.target import Target
 from learning.validation import Validation, validate
 from operation.analysis.published import GP
 from operation.preparation import trained_weights
-from operation.report.canvas import panel
 from operation.report.gp import gp_figures
-from operation.report.style import INK, WARNING, look
+from operation.report.style import INK, WARNING, look, panel
 from operation.terminal.notation import SMOOTHNESS, SYMBOLS, UNCERTAIN
 from operation.terminal.progress import Stage, Stages
 from studies.paper.experiment import stored
