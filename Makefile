@@ -106,6 +106,9 @@ $(VENV)/.created:
 		echo "BayesRace needs Python 3.11 or newer; '$(or $(PYTHON),python3)' is not" \
 			"($$("$(or $(PYTHON),python3)" --version 2>&1))." \
 			"Name one with 'make PYTHON=/path/to/python3.12 ...'." >&2; exit 1; }
+	@test -d bayesrace/controller || { \
+		echo "bayesrace/controller is a file, not a link to a folder: clone again on a system with symbolic" \
+			"links, with 'git clone -c core.symlinks=true'; do not unpack with Python's zipfile." >&2; exit 1; }
 	@echo "virtual environment: $(VENV)"
 	rm -rf $(VENV)
 	"$(PYTHON)" -m venv $(VENV)

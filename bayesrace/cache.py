@@ -33,7 +33,7 @@ __all__ = [
 
 Result = TypeVar("Result")
 
-_ROOT: Final = Path(__file__).resolve().parents[1]
+_PACKAGE: Final = Path(__file__).parent
 
 
 _uses: ContextVar[list[bool] | None] = ContextVar("uses", default=None)
@@ -79,12 +79,12 @@ def digest(parts: Iterable[str | bytes]) -> str:
 
 
 def software(sources: Iterable[str], packages: Iterable[str]) -> Iterator[str | bytes]:
-    """Contents of our sources, given as files or as folders of files, and package versions.
+    """Contents of our sources, files or folders of files in ``bayesrace``, and package versions.
 
     Parts for :func:`digest`: a result is made anew when the code that makes it changes.
     """
     for name in sources:
-        path = _ROOT / name
+        path = _PACKAGE / name
         for source in sorted(path.iterdir()) if path.is_dir() else [path]:
             if source.suffix in (".py", ".c", ".h"):
                 yield source.name

@@ -2,7 +2,7 @@
 settings; a module of its own, so that ``--help`` needs no other.
 
 An :class:`Option` stands beside the field, as ``delay_s: Annotated[float, Option(unit="ms",
-per_unit=1000)]``; :mod:`operation.cli.declaration` makes options of fields.
+per_unit=1000)]``; :mod:`bayesrace.operation.cli.declaration` makes options of fields.
 """
 
 from dataclasses import dataclass

@@ -39,7 +39,7 @@ DECLARATIONS: Final = "libmpc_interface.py"
 """What the headers of the library declare, as cffi reads it fastest."""
 MANIFEST: Final = "manifest.json"
 _HEADERS: Final = tuple(
-    Path(__file__).resolve().parents[1] / "controller" / "native" / name
+    Path(__file__).parent / "controller" / "native" / name
     for name in ("bayesrace_mpc.h", "bayesrace_cycle.h")
 )
 DRIVING_PROBLEMS: Final = ("tracking", "progress")

@@ -16,14 +16,14 @@ from statistics import NormalDist
 import numpy as np
 
 from bayesrace.gp.weights import OUTPUTS, GpWeights, read_weights
+from bayesrace.learning.dataset import Dataset
+from bayesrace.learning.validation import Validation, validate
+from bayesrace.operation.closed_loop import drive_compiled
+from bayesrace.operation.preparation import updated_weights
+from bayesrace.operation.settings import PreparationSettings
+from bayesrace.studies.settings import spread
 from bayesrace.vehicles import DEFAULT_CAR, get_car
 from benchmarks.harness import Row, arguments, prepared, report
-from learning.dataset import Dataset
-from learning.validation import Validation, validate
-from operation.closed_loop import drive_compiled
-from operation.preparation import updated_weights
-from operation.settings import PreparationSettings
-from studies.settings import spread
 
 _PROBABILITIES, _METRICS = (0.9, 0.95, 0.99), ("coverage", "log_density", "rmse")
 

@@ -16,12 +16,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final, Literal
 
+from bayesrace.codegen.fmu import car_fmu, pack
+from bayesrace.plant.fmu.simulator import open_fmu
+from bayesrace.plant.simulator import PLANT, Simulator
 from bayesrace.vehicles import default_car
 from bayesrace.vehicles.models import STATES, dynamic
 from benchmarks.harness import Row, arguments, in_turn, percentiles, report
-from codegen.fmu import car_fmu, pack
-from plant.fmu.simulator import open_fmu
-from plant.simulator import PLANT, Simulator
 from tests.fmu_master import Slave
 
 _VERSIONS: Final[tuple[Literal[2, 3], ...]] = (2, 3)

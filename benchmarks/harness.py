@@ -21,12 +21,12 @@ from rich.console import Console
 from rich.table import Table
 
 from bayesrace.cache import cpu_identity
+from bayesrace.controller.assembly import compiled_controller
+from bayesrace.controller.mpc import PredictiveController
 from bayesrace.gp.weights import read_weights
-from controller.assembly import compiled_controller
-from controller.mpc import PredictiveController
-from operation.preparation import Prepared, prepare
-from operation.settings import PreparationSettings
-from operation.terminal.progress import stages_on
+from bayesrace.operation.preparation import Prepared, prepare
+from bayesrace.operation.settings import PreparationSettings
+from bayesrace.operation.terminal.progress import stages_on
 
 ROOT = Path(__file__).resolve().parents[1]
 Row = dict[str, Any]  # what is measured, in words, and numbers

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
+from bayesrace.learning.search import search
+from bayesrace.learning.settings import SearchSettings
 from bayesrace.raceline.nodes import roughness
 from benchmarks.harness import Row, arguments, report
-from learning.search import search
-from learning.settings import SearchSettings
 from tests.published_line import PUBLISHED, objective
 
 _COUNTS = (20, 30, 40, 50, 110)

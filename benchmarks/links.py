@@ -19,9 +19,9 @@ from zenoh.handlers import FifoChannel
 
 from bayesrace.configuration import Configuration, NetworkSettings, TlsSettings
 from bayesrace.messages import ACTUATION, STATE
+from bayesrace.operation.certificates import add, init
 from bayesrace.transport import free_endpoint, open_session
 from benchmarks.harness import arguments, in_turn, ratio, report
-from operation.certificates import add, init
 
 _THERE, _BACK = STATE.key.format(car="orca"), ACTUATION.key.format(car="orca")
 _STATE, _ANSWER, _PAUSE_S = bytes(250), bytes(120), 0.002

@@ -18,13 +18,13 @@ import numpy as np
 
 from bayesrace.log import LogReader, LogWriter
 from bayesrace.messages import TRUTH
+from bayesrace.operation.closed_loop import ClosedLoop
+from bayesrace.operation.drive import RunPlan
+from bayesrace.operation.system import started_system
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import DEFAULT_RACE_TRACK
 from bayesrace.vehicles import default_car
 from benchmarks.harness import Row, arguments, controller, in_turn, prepared, ratio, report
-from operation.closed_loop import ClosedLoop
-from operation.drive import RunPlan
-from operation.system import started_system
 
 
 def main() -> None:

@@ -23,13 +23,13 @@ from bayesrace.arrays import Floats
 from bayesrace.configuration import Configuration
 from bayesrace.log import LogReader
 from bayesrace.messages import STATE
+from bayesrace.operation.drive import RunPlan, run_request
+from bayesrace.operation.system import System, started_system
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import DEFAULT_RACE_TRACK
 from bayesrace.transport import free_endpoint
 from bayesrace.vehicles import DEFAULT_CAR
 from benchmarks.harness import Row, arguments, percentiles, prepared, report
-from operation.drive import RunPlan, run_request
-from operation.system import System, started_system
 
 
 @contextmanager

@@ -60,7 +60,7 @@ def main() -> None:
     folder = Path("runs") / datetime.now(UTC).astimezone().strftime("soak-%Y%m%d-%H%M%S")
     for run in given.runs:
         duration_s, options, promises = PROMISES[run]
-        line = [sys.executable, "-m", "operation.cli", "latency", *options]
+        line = [sys.executable, "-m", "bayesrace.operation.cli", "latency", *options]
         line += ["--duration", f"{max(duration_s * given.share, 5.0):g}", "--out"]
         subprocess.run([*line, str(folder / run)], check=True)
         found = figures(json.loads((folder / run / "latency.json").read_text()))

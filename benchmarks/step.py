@@ -16,17 +16,17 @@ from typing import Any
 import numpy as np
 
 from bayesrace.arrays import Floats
+from bayesrace.codegen.build import build
+from bayesrace.codegen.settings import BuildSettings
+from bayesrace.controller.native_step import NativeStep
+from bayesrace.controller.path_table import PathTable, make_path_table
+from bayesrace.controller.settings import MpcSettings
 from bayesrace.gp.weights import read_weights
+from bayesrace.plant.simulator import PLANT, Simulator
 from bayesrace.tracks import DEFAULT_RACE_TRACK
 from bayesrace.vehicles import default_car
 from bayesrace.vehicles.models import dynamic
 from benchmarks.harness import Row, arguments, controller, percentiles, prepared, report
-from codegen.build import build
-from codegen.settings import BuildSettings
-from controller.native_step import NativeStep
-from controller.path_table import PathTable, make_path_table
-from controller.settings import MpcSettings
-from plant.simulator import PLANT, Simulator
 
 _TRACKS = (DEFAULT_RACE_TRACK, "random:11", "random:15")
 _BUDGETS_S = {"": None, " in lockstep": 0.0, " in real time": 0.016}  # of the preparation

@@ -12,11 +12,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from bayesrace.gp.weights import encode_weights, read_weights
+from bayesrace.operation.drive import RunPlan, run_request
+from bayesrace.operation.system import started_system
 from bayesrace.tracks import DEFAULT_RACE_TRACK
 from bayesrace.vehicles import DEFAULT_CAR
 from benchmarks.harness import arguments, percentiles, prepared, report
-from operation.drive import RunPlan, run_request
-from operation.system import started_system
 
 _PAUSE_S = 0.25
 

@@ -3,9 +3,10 @@
     python -m benchmarks.training [--points 800] [--restarts 4] [--kernel rbf] [--seed 0]
 
 scikit-learn's ``GaussianProcessRegressor`` optimises one start after another with its own L-BFGS-B
-and tolerances, on as many BLAS threads as it likes. Ours is all of ``learning.training.fit``:
-optimisation, factorisation, cross-validation. The samples are those of the pure-pursuit drive that
-every race begins with, each with its mirror image. Takes minutes, nearly all scikit-learn's.
+and tolerances, on as many BLAS threads as it likes. Ours is all of
+``bayesrace.learning.training.fit``: optimisation, factorisation, cross-validation. The samples are
+those of the pure-pursuit drive that every race begins with, each with its mirror image. Takes
+minutes, nearly all scikit-learn's.
 """
 
 import time
@@ -17,14 +18,14 @@ from sklearn.exceptions import ConvergenceWarning
 from bayesrace.arrays import Floats
 from bayesrace.gp.weights import OUTPUTS
 from bayesrace.integrators import PREDICTION
+from bayesrace.learning.likelihood import BOUNDS, starts
+from bayesrace.learning.residual import residual
+from bayesrace.learning.settings import TrainingSettings
+from bayesrace.learning.target import Target
+from bayesrace.learning.training import fit
+from bayesrace.operation.preparation import training_samples
+from bayesrace.operation.settings import PreparationSettings
 from benchmarks.harness import Row, arguments, report
-from learning.likelihood import BOUNDS, starts
-from learning.residual import residual
-from learning.settings import TrainingSettings
-from learning.target import Target
-from learning.training import fit
-from operation.preparation import training_samples
-from operation.settings import PreparationSettings
 from tests.scikit import scikit_gp
 
 

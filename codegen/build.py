@@ -17,6 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from bayesrace.cache import cache_folder, digest, kept, locked, note_use, software
+from bayesrace.codegen.compiler import FLAGS, Compiler, find_compiler
+from bayesrace.codegen.settings import BuildSettings
 from bayesrace.errors import InputError
 from bayesrace.manifest import (
     DECLARATIONS,
@@ -31,11 +33,9 @@ from bayesrace.manifest import (
     read_manifest,
 )
 from bayesrace.vehicles import get_car
-from codegen.compiler import FLAGS, Compiler, find_compiler
-from codegen.settings import BuildSettings
 
 if TYPE_CHECKING:
-    from codegen.problems.problem import Problem
+    from bayesrace.codegen.problems.problem import Problem
 
 __all__ = [
     "HOST",
@@ -46,9 +46,7 @@ __all__ = [
     "problem_of",
 ]
 
-_ROOT: Final = Path(__file__).resolve().parents[1]
-
-NATIVE: Final = _ROOT / "controller" / "native"
+NATIVE: Final = Path(__file__).parents[1] / "controller" / "native"
 """The hand-written part of the step: read as files, not imported."""
 
 HOST: Final = "host"
@@ -62,8 +60,8 @@ _SHAPED_BY: Final = (
     "controller/native",
     "controller/native/host",
     "codegen",
-    "bayesrace/vehicles",
-    "bayesrace/integrators.py",
+    "vehicles",
+    "integrators.py",
 )
 
 
@@ -90,16 +88,16 @@ def build_hash(
 def _identity_of(problem: "Problem | None") -> list[str]:
     if problem is None:
         return []
-    from codegen.problems.generate import c_header, functions
+    from bayesrace.codegen.problems.generate import c_header, functions
 
     return [c_header(problem), *(one.serialize() for one in functions(problem))]
 
 
 def problem_of(settings: BuildSettings) -> "Problem":
     """The control problem that these settings name."""
+    from bayesrace.codegen.problems.progress import progress
+    from bayesrace.codegen.problems.tracking import tracking
     from bayesrace.vehicles.models import MODELS
-    from codegen.problems.progress import progress
-    from codegen.problems.tracking import tracking
 
     make = {"tracking": tracking, "progress": progress}[settings.problem]
     return make(MODELS[settings.model](get_car(settings.car)), settings.discretisation)
@@ -109,7 +107,7 @@ def generate(problem: "Problem", settings: BuildSettings, folder: Path) -> None:
     """Writes br_model.c, br_model.h, br_config.h and br_problem.h into a folder."""
     import casadi as ca
 
-    from codegen.problems.generate import c_header, functions
+    from bayesrace.codegen.problems.generate import c_header, functions
 
     # CasADi derives the include guard from the name and writes into the working folder
     generator = ca.CodeGenerator(

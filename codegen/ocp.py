@@ -1,9 +1,9 @@
 """Any control problem as one CasADi NLP, solved by IPOPT.
 
-Made from the same description as the native step (:mod:`codegen.problems`), by another formulation:
-multiple shooting with slack variables, all of them in one vector. It is the oracle of the tests,
-and, expanded to scalars and started cold as the published code does, the peer of ``bayesrace
-bench``.
+Made from the same description as the native step (:mod:`bayesrace.codegen.problems`), by another
+formulation: multiple shooting with slack variables, all of them in one vector. It is the oracle of
+the tests, and, expanded to scalars and started cold as the published code does, the peer of
+``bayesrace bench``.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bayesrace.arrays import Floats
-from codegen.problems.problem import Problem
+from bayesrace.codegen.problems.problem import Problem
 
 __all__ = ["OcpNlp", "OcpSolution"]
 

@@ -5,6 +5,14 @@ from typing import TypeVar
 
 from pydantic import BaseModel, ValidationError
 
+from bayesrace.controller.mpc import PredictiveController
+from bayesrace.controller.native_step import NativeStep
+from bayesrace.controller.path_table import PathTable, make_path_table
+from bayesrace.controller.settings import MpcSettings
+from bayesrace.controller.weights.adoption import WeightsPort
+from bayesrace.controller.weights.checks import Checks
+from bayesrace.controller.weights.settings import GateSettings
+from bayesrace.controller.weights.store import AcceptedWeights, History, Store, digest_of
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_whole
 from bayesrace.gp.weights import (
@@ -16,14 +24,6 @@ from bayesrace.gp.weights import (
 from bayesrace.raceline import RaceLine, read_raceline_for
 from bayesrace.tracks import Track, load_track
 from bayesrace.vehicles import CarParameters
-from controller.mpc import PredictiveController
-from controller.native_step import NativeStep
-from controller.path_table import PathTable, make_path_table
-from controller.settings import MpcSettings
-from controller.weights.adoption import WeightsPort
-from controller.weights.checks import Checks
-from controller.weights.settings import GateSettings
-from controller.weights.store import AcceptedWeights, History, Store, digest_of
 
 __all__ = ["compiled_controller", "predictive_controller", "read_checked", "read_settings"]
 

@@ -1,7 +1,7 @@
 """The control cycle with its execution times and telemetry, for the loops that carry the messages.
 
-:mod:`controller.process` receives states and sends actuations over the network;
-``operation.closed_loop`` does so by function calls. Both answer a lockstep state by
+:mod:`bayesrace.controller.process` receives states and sends actuations over the network;
+``bayesrace.operation.closed_loop`` does so by function calls. Both answer a lockstep state by
 :meth:`Cycle.answer`, so their runs are equal to the bit.
 """
 
@@ -14,11 +14,11 @@ from typing import Any, Final
 import numpy as np
 
 from bayesrace.arrays import Floats
+from bayesrace.controller.driver import Decision, Driver
+from bayesrace.controller.interface import NO_PLAN, Controller, Environment, StepOutput
+from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.messages import NOT_REPORTED, SENSOR_FAULTS, Actuation, State, Telemetry
 from bayesrace.vehicles.parameters import CarParameters
-from controller.driver import Decision, Driver
-from controller.interface import NO_PLAN, Controller, Environment, StepOutput
-from controller.process_settings import ControllerSettings
 
 __all__ = ["Cycle", "Timing", "telemetry_of"]
 

@@ -9,16 +9,16 @@ import time
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 
-from bayesrace.messages import SENSOR_FAULTS, BrakingPlan, State
-from bayesrace.transport import Numbering
-from bayesrace.vehicles.parameters import CarParameters
-from controller.interface import Controller, Environment, StepOutput
-from controller.settings import (
+from bayesrace.controller.interface import Controller, Environment, StepOutput
+from bayesrace.controller.settings import (
     CompensationSettings,
     FallbackSettings,
     cycle_values,
     input_limits,
 )
+from bayesrace.messages import SENSOR_FAULTS, BrakingPlan, State
+from bayesrace.transport import Numbering
+from bayesrace.vehicles.parameters import CarParameters
 
 __all__ = [
     "DOUBTED",

@@ -10,8 +10,8 @@ import numpy as np
 from bayesrace.arrays import Floats
 
 if TYPE_CHECKING:
-    from controller.native_step import Artefact
-    from controller.weights.adoption import WeightsPort
+    from bayesrace.controller.native_step import Artefact
+    from bayesrace.controller.weights.adoption import WeightsPort
 
 __all__ = ["NO_LIMITS", "NO_PLAN", "ControlLaw", "Controller", "Environment", "StepOutput"]
 
@@ -105,7 +105,8 @@ class Controller(Protocol):
 
 
 class ControlLaw(Protocol):
-    """A controller written in Python, for :class:`controller.python_controller.PythonController`.
+    """A controller written in Python, for
+    :class:`bayesrace.controller.python_controller.PythonController`.
 
     None of its methods may block or do input/output. What a method raises ends in the fallback.
     """

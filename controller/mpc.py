@@ -2,11 +2,11 @@
 
 from typing import Any, Final
 
+from bayesrace.controller.interface import StepOutput
+from bayesrace.controller.native_step import Artefact, NativeStep, StepStatus
+from bayesrace.controller.weights.adoption import WeightsPort
 from bayesrace.gp.weights import decode_weights
 from bayesrace.messages import NOT_REPORTED
-from controller.interface import StepOutput
-from controller.native_step import Artefact, NativeStep, StepStatus
-from controller.weights.adoption import WeightsPort
 
 __all__ = ["PredictiveController"]
 
@@ -20,7 +20,7 @@ _IN_C: Final = {
 
 
 class PredictiveController:
-    """See :class:`controller.interface.Controller`; BestCase, WorstCase and BayesRace alike."""
+    """See :class:`.Controller`; BestCase, WorstCase and BayesRace alike."""
 
     def __init__(
         self,

@@ -16,13 +16,13 @@ import numpy as np
 import numpy.typing as npt
 
 from bayesrace.arrays import Floats
+from bayesrace.controller.interface import Environment
+from bayesrace.controller.path_table import PATH_COLUMNS, PathTable
+from bayesrace.controller.settings import MpcSettings
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights, pack_weights
 from bayesrace.manifest import DECLARATIONS, check_library, read_manifest
 from bayesrace.vehicles import CarParameters
-from controller.interface import Environment
-from controller.path_table import PATH_COLUMNS, PathTable
-from controller.settings import MpcSettings
 
 __all__ = ["Artefact", "NativeProblem", "NativeStep", "Reference", "StepStatus"]
 

@@ -14,6 +14,14 @@ import time
 from typing import Any, Final
 
 from bayesrace.clock import die_with_parent, sleep_until_ns
+from bayesrace.controller.cycle import Cycle
+from bayesrace.controller.driver import Decision
+from bayesrace.controller.interface import Controller, Environment
+from bayesrace.controller.process_settings import ControllerSettings
+from bayesrace.controller.schedule import Schedule
+from bayesrace.controller.service import Service
+from bayesrace.controller.weights.adoption import Adoption
+from bayesrace.controller.weights.manager import WeightUpdateManager
 from bayesrace.messages import (
     ACTUATION,
     BRAKING,
@@ -37,14 +45,6 @@ from bayesrace.transport import (
     Publisher,
     open_session,
 )
-from controller.cycle import Cycle
-from controller.driver import Decision
-from controller.interface import Controller, Environment
-from controller.process_settings import ControllerSettings
-from controller.schedule import Schedule
-from controller.service import Service
-from controller.weights.adoption import Adoption
-from controller.weights.manager import WeightUpdateManager
 
 __all__ = ["ControllerProcess", "ControllerSettings", "main"]
 

@@ -4,12 +4,12 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from bayesrace.controller.settings import CompensationSettings, FallbackSettings
+from bayesrace.controller.weights.settings import GateSettings
 from bayesrace.defaults import Option
 from bayesrace.realtime import RealtimeSettings
 from bayesrace.transport import CONTROLLER_ENDPOINT, PLANT_ENDPOINT, Endpoints
 from bayesrace.vehicles import CarSetting, default_car
-from controller.settings import CompensationSettings, FallbackSettings
-from controller.weights.settings import GateSettings
 
 __all__ = ["ControllerSettings"]
 

@@ -14,9 +14,9 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.arrays import Floats
+from bayesrace.controller.interface import NO_LIMITS, Environment, StepOutput
 from bayesrace.errors import InputError
 from bayesrace.vehicles.parameters import CarParameters
-from controller.interface import NO_LIMITS, Environment, StepOutput
 
 __all__ = ["DrivingStyle", "PurePursuit", "PurePursuitSettings"]
 
@@ -81,7 +81,7 @@ class _Place(NamedTuple):
 
 
 class PurePursuit:
-    """See the module; a :class:`controller.interface.ControlLaw`."""
+    """See the module; a :class:`bayesrace.controller.interface.ControlLaw`."""
 
     def __init__(
         self,

@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 
 from bayesrace.arrays import Floats
+from bayesrace.controller.driver import DOUBTED, STEP_FAILED
+from bayesrace.controller.interface import ControlLaw, Environment, StepOutput
+from bayesrace.controller.native_step import Artefact
 from bayesrace.errors import InputError
-from controller.driver import DOUBTED, STEP_FAILED
-from controller.interface import ControlLaw, Environment, StepOutput
-from controller.native_step import Artefact
 
 __all__ = ["PythonController"]
 
 
 class PythonController:
-    """See :class:`controller.interface.Controller`."""
+    """See :class:`bayesrace.controller.interface.Controller`."""
 
     port = None
     """It has nowhere to put weights."""

@@ -5,6 +5,8 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
+from bayesrace.controller.driver import Driver, Level
+from bayesrace.controller.interface import Controller
 from bayesrace.errors import InputError
 from bayesrace.messages import (
     COMMAND,
@@ -17,8 +19,6 @@ from bayesrace.messages import (
     Status,
 )
 from bayesrace.transport import Heartbeat, Inbox, Item, Kind, Publisher, Request, decode_request
-from controller.driver import Driver, Level
-from controller.interface import Controller
 
 __all__ = ["Service"]
 

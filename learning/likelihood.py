@@ -39,8 +39,8 @@ from scipy.optimize import LinearConstraint, minimize
 from bayesrace.arrays import Floats
 from bayesrace.gp.expression import kernel, kernel_slope
 from bayesrace.gp.weights import FEATURES
-from learning.posterior import Covariance
-from learning.settings import TOLERANCE
+from bayesrace.learning.posterior import Covariance
+from bayesrace.learning.settings import TOLERANCE
 
 __all__ = ["BOUNDS", "Fit", "MarginalLikelihood", "PairDistances", "maximise", "refine", "starts"]
 

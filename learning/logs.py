@@ -14,10 +14,10 @@ from bayesrace.arrays import Flags
 from bayesrace.columns import Columns, LogColumns
 from bayesrace.errors import InputError, faults_in
 from bayesrace.integrators import Discretisation
+from bayesrace.learning.dataset import ROUNDING, Dataset, filter_dataset
 from bayesrace.log import LogReader, topic_of
 from bayesrace.messages import STATE, TELEMETRY, TRUTH
 from bayesrace.vehicles import CarParameters, described_car
-from learning.dataset import ROUNDING, Dataset, filter_dataset
 
 __all__ = ["CYCLES", "STATES", "LogFacts", "dataset_from_columns", "dataset_from_log", "log_facts"]
 
@@ -88,7 +88,7 @@ def dataset_from_columns(
     fallback acted, and those that were not believed, with the states just before, which may be as
     wrong. The input of sample k is ``u_applied`` of the state after it, which acted, not the
     requested one. A missing state is counted as "gap". ``limits``: as of
-    :func:`~learning.dataset.filter_dataset`.
+    :func:`~bayesrace.learning.dataset.filter_dataset`.
     """
     if runs is not None:
         states = states[np.isin(states["run"], list(runs))]

@@ -11,9 +11,9 @@ from bayesrace.errors import InputError
 from bayesrace.gp.expression import evaluate_mean
 from bayesrace.gp.weights import OUTPUTS, GpWeights
 from bayesrace.integrators import Discretisation
+from bayesrace.learning.dataset import Dataset
 from bayesrace.vehicles.models import STATES, e_kinematic
 from bayesrace.vehicles.parameters import CarParameters
-from learning.dataset import Dataset
 
 __all__ = ["NOMINAL", "discretisation_of", "identity", "recalled", "residual"]
 

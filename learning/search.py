@@ -22,7 +22,7 @@ from threadpoolctl import threadpool_limits
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
-from learning.settings import SearchSettings
+from bayesrace.learning.settings import SearchSettings
 
 __all__ = ["Search", "log_improvement", "search"]
 

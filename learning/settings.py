@@ -65,7 +65,7 @@ class TrainingSettings(BaseModel):
 
 
 class SearchSettings(BaseModel):
-    """How long and from where :func:`learning.search.search` looks, which gives its result."""
+    """How long and from where :func:`.search` looks, which gives its result."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 

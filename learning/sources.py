@@ -3,8 +3,8 @@
 A file of arrays (``.npz``, made by ``numpy.savez``; reading executes nothing) holds ``car`` (a
 built-in name, or all values as JSON), ``step_s`` [s], and either single samples, ``x`` (n, 7),
 ``u`` (n, 2), ``x_next`` (n, 7), or one unbroken drive, ``states`` (n + 1, 7), ``inputs`` (n, 2), as
-:class:`learning.dataset.Dataset` describes them. Any other array is refused: it may be a misspelt
-one.
+:class:`bayesrace.learning.dataset.Dataset` describes them. Any other array is refused: it may be a
+misspelt one.
 
 The published form, the drives of the paper's code, is read as well: ``states`` (6 or 7, n + 1),
 their rates ``dstates``, ``inputs`` (2, n) with duty cycle and **steering angle**, any other arrays,
@@ -31,9 +31,9 @@ import numpy as np
 from bayesrace.arrays import AnyArray
 from bayesrace.errors import InputError
 from bayesrace.integrators import PREDICTION, Discretisation
+from bayesrace.learning.dataset import Dataset, concatenate, dataset_from_arrays, filter_dataset
+from bayesrace.learning.logs import LogFacts, dataset_from_log, log_facts
 from bayesrace.vehicles import CarParameters, builtin_cars, car_text, described_car
-from learning.dataset import Dataset, concatenate, dataset_from_arrays, filter_dataset
-from learning.logs import LogFacts, dataset_from_log, log_facts
 
 __all__ = ["MAX_BYTES", "Samples", "dataset_from_npz", "read_samples", "write_npz"]
 

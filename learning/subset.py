@@ -29,7 +29,7 @@ from bayesrace.arrays import Floats, Rows
 from bayesrace.errors import InputError
 from bayesrace.gp.expression import kernel
 from bayesrace.gp.weights import OUTPUTS, GpWeights
-from learning.dataset import Dataset
+from bayesrace.learning.dataset import Dataset
 
 __all__ = ["MOST_NEW", "bounded", "evenly", "most_informative", "spans", "stretches"]
 

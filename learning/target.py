@@ -1,7 +1,7 @@
 """One output to learn: its samples in standardised units, and how well some predict the others.
 
 Every score is held out: a GP predicts a sample without its part of the drive (kernels) or its
-stretch of the track (choices of samples); see :mod:`learning.subset`.
+stretch of the track (choices of samples); see :mod:`bayesrace.learning.subset`.
 
 A prediction of one output is a mean and a standard deviation sigma, with the learned noise in it.
 With error = truth - mean, over n samples
@@ -22,9 +22,9 @@ import numpy as np
 from bayesrace.arrays import Floats, Rows
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpOutput
-from learning.likelihood import Fit
-from learning.posterior import Covariance, Posterior
-from learning.subset import evenly
+from bayesrace.learning.likelihood import Fit
+from bayesrace.learning.posterior import Covariance, Posterior
+from bayesrace.learning.subset import evenly
 
 __all__ = ["NORMAL_95", "KernelScore", "PredictionErrors", "Target"]
 

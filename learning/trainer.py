@@ -19,10 +19,10 @@ from bayesrace.clock import die_with_parent
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.integrators import Discretisation
-from learning.dataset import Dataset, concatenate
-from learning.settings import TrainingSettings
-from learning.subset import bounded
-from learning.training import train
+from bayesrace.learning.dataset import Dataset, concatenate
+from bayesrace.learning.settings import TrainingSettings
+from bayesrace.learning.subset import bounded
+from bayesrace.learning.training import train
 
 __all__ = ["NICE", "Outcome", "Trainer", "perform"]
 

@@ -1,14 +1,14 @@
 """From samples to weights of the mean function: one GP per output of the residual.
 
 1. Add each sample's mirror image, if the car's file says so, and standardise features and targets
-   (:mod:`learning.target`). A sample and its image are in the same stretch.
+   (:mod:`bayesrace.learning.target`). A sample and its image are in the same stretch.
 2. Per output and candidate kernel: hyperparameters by marginal likelihood
-   (:mod:`learning.likelihood`) on at most ``hyper_points`` samples. Seeded starts, or given
-   weights, are followed on a third of them, where an evaluation costs a tenth; the best is refined
-   on all.
+   (:mod:`bayesrace.learning.likelihood`) on at most ``hyper_points`` samples. Seeded starts, or
+   given weights, are followed on a third of them, where an evaluation costs a tenth; the best is
+   refined on all.
 3. Per output: the kernel of largest log density held out by spans of the drive
-   (:mod:`learning.subset`).
-4. Factorise all samples, or the most informative ones that fit (:mod:`learning.subset`).
+   (:mod:`bayesrace.learning.subset`).
+4. Factorise all samples, or the most informative ones that fit (:mod:`bayesrace.learning.subset`).
 5. Scale all variances so that the 95 % interval holds 95 % of the errors held out by stretches of
    the track, if it held less. The mean does not change. A likelihood that finds the data
    noise-free and smooth is over-confident when the model is not quite right; setting the variance
@@ -37,13 +37,13 @@ from bayesrace.arrays import Floats, Rows
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import FEATURES, OUTPUTS, GpOutput, GpWeights, encode_weights
 from bayesrace.integrators import Discretisation
-from learning.dataset import Dataset, left_out
-from learning.likelihood import Fit, PairDistances, maximise, refine, starts
-from learning.posterior import Posterior
-from learning.residual import identity, residual
-from learning.settings import MIN_SAMPLES, Progress, TrainingSettings
-from learning.subset import evenly, most_informative, spans, stretches
-from learning.target import KernelScore, Target
+from bayesrace.learning.dataset import Dataset, left_out
+from bayesrace.learning.likelihood import Fit, PairDistances, maximise, refine, starts
+from bayesrace.learning.posterior import Posterior
+from bayesrace.learning.residual import identity, residual
+from bayesrace.learning.settings import MIN_SAMPLES, Progress, TrainingSettings
+from bayesrace.learning.subset import evenly, most_informative, spans, stretches
+from bayesrace.learning.target import KernelScore, Target
 
 __all__ = ["MAX_SAMPLES", "Training", "fit", "train"]
 

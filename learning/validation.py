@@ -19,11 +19,11 @@ from bayesrace.errors import InputError
 from bayesrace.gp.expression import corrected_function, evaluate_mean
 from bayesrace.gp.weights import OUTPUTS, GpWeights
 from bayesrace.integrators import Discretisation
-from learning.dataset import Dataset
-from learning.posterior import Covariance, Posterior
-from learning.residual import NOMINAL, identity, residual
-from learning.subset import evenly
-from learning.target import NORMAL_95, PredictionErrors
+from bayesrace.learning.dataset import Dataset
+from bayesrace.learning.posterior import Covariance, Posterior
+from bayesrace.learning.residual import NOMINAL, identity, residual
+from bayesrace.learning.subset import evenly
+from bayesrace.learning.target import NORMAL_95, PredictionErrors
 
 __all__ = ["HORIZON", "Validation", "mismatch", "predictive_sigma", "unbroken", "validate"]
 

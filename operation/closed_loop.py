@@ -17,8 +17,16 @@ from msgspec import structs
 from numpy.typing import NDArray
 
 from bayesrace.arrays import Floats
+from bayesrace.codegen.compiler import compiled
 from bayesrace.columns import Columns, columns_of
+from bayesrace.controller.assembly import compiled_controller
+from bayesrace.controller.cycle import Cycle
+from bayesrace.controller.driver import Decision
+from bayesrace.controller.interface import Controller, Environment
+from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.gp.weights import GpWeights
+from bayesrace.learning.dataset import Dataset
+from bayesrace.learning.logs import CYCLES, STATES, dataset_from_columns
 from bayesrace.log import LogWriter
 from bayesrace.messages import (
     ACTUATION,
@@ -35,25 +43,17 @@ from bayesrace.messages import (
     car_key,
     encode,
 )
+from bayesrace.operation.analysis.laps import LapTimes, Trajectory, time_laps
+from bayesrace.operation.drive import RunPlan, announcement, run_request
+from bayesrace.plant.lockstep import CarRun, End, Sensors, drive_lockstep, truth_behind
+from bayesrace.plant.settings import SensorNoise
+from bayesrace.plant.simulator import Simulator
+from bayesrace.plant.vehicle import Vehicle
 from bayesrace.raceline import RaceLine
 from bayesrace.realtime import uncollected
 from bayesrace.tracks import PathProjection, Track
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
-from codegen.compiler import compiled
-from controller.assembly import compiled_controller
-from controller.cycle import Cycle
-from controller.driver import Decision
-from controller.interface import Controller, Environment
-from controller.process_settings import ControllerSettings
-from learning.dataset import Dataset
-from learning.logs import CYCLES, STATES, dataset_from_columns
-from operation.analysis.laps import LapTimes, Trajectory, time_laps
-from operation.drive import RunPlan, announcement, run_request
-from plant.lockstep import CarRun, End, Sensors, drive_lockstep, truth_behind
-from plant.settings import SensorNoise
-from plant.simulator import Simulator
-from plant.vehicle import Vehicle
 
 __all__ = ["ClosedLoop", "Driven", "built_in_car", "drive_compiled"]
 
@@ -80,9 +80,9 @@ class Driven(Trajectory):
     statuses: NDArray[np.int64]
     """Of the controller's steps, shape (m,); m is n - 1, or n if the car failed or left."""
     levels: NDArray[np.int64]
-    """Of the fallback, shape (m,); see :class:`controller.driver.Level`."""
+    """Of the fallback, shape (m,); see :class:`bayesrace.controller.driver.Level`."""
     faults: NDArray[np.int64]
-    """What speaks against each state, shape (m,); see :attr:`controller.driver.Decision.fault`."""
+    """What speaks against each state, shape (m,); see :attr:`.fault`."""
     step_us: Floats
     """Execution times of the steps that were made, shape (at most m,)."""
     second_starts: int

@@ -12,17 +12,17 @@ from typing import Final
 import numpy as np
 
 from bayesrace.arrays import Floats
+from bayesrace.controller.pure_pursuit import DrivingStyle, PurePursuit, PurePursuitSettings
+from bayesrace.controller.python_controller import PythonController
 from bayesrace.log import LogWriter
+from bayesrace.operation.closed_loop import ClosedLoop, Driven, built_in_car
+from bayesrace.plant.settings import SensorNoise
+from bayesrace.plant.vehicle import FmuFault, Vehicle
 from bayesrace.raceline import RaceLine, RaceLineSettings
 from bayesrace.raceline.nodes import timed_line
 from bayesrace.tracks import Track
 from bayesrace.tracks.spline import fit_arc_length
 from bayesrace.vehicles import CarParameters, car_text
-from controller.pure_pursuit import DrivingStyle, PurePursuit, PurePursuitSettings
-from controller.python_controller import PythonController
-from operation.closed_loop import ClosedLoop, Driven, built_in_car
-from plant.settings import SensorNoise
-from plant.vehicle import FmuFault, Vehicle
 
 __all__ = ["collect", "drive_length_s", "room_beside", "training_line", "training_margin_m"]
 

@@ -13,12 +13,12 @@ from typing import Final, NamedTuple
 from bayesrace.configuration import Configuration
 from bayesrace.errors import InputError
 from bayesrace.messages import Role
+from bayesrace.operation.analysis.network_status import SOURCES
+from bayesrace.operation.lifecycle import find
 from bayesrace.transport import Credentials, Endpoints, open_session
 from bayesrace.transport.credentials import CERTIFICATE_EXPIRED, CERTIFICATE_NOT_YET, NEWEST_LIST
 from bayesrace.transport.endpoints import Address, address_of
 from bayesrace.transport.session import zenoh_config
-from operation.analysis.network_status import SOURCES
-from operation.lifecycle import find
 
 __all__ = ["Check", "check_configuration", "examine", "probe"]
 

@@ -7,12 +7,12 @@ from pathlib import Path
 
 from bayesrace.errors import InputError
 from bayesrace.messages import EVENT, Event, RunRequest, Scalar
+from bayesrace.operation.analysis.verdict import Verdict, judge_log
 from bayesrace.raceline import same_track
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import StartLine, Track
 from bayesrace.transport import Director, Endpoints, Publisher, RefusedError, open_session
 from bayesrace.vehicles import CarParameters, car_text
-from operation.analysis.verdict import Verdict, judge_log
 
 __all__ = ["RunPlan", "announcement", "drive_and_judge", "execute", "run_request"]
 
@@ -89,8 +89,8 @@ def execute(
 ) -> Event:
     """Announces and starts the run and waits for its end; the plant's ``run_ended`` event.
 
-    How the car was driven is for :func:`operation.analysis.verdict.judge`. InputError if the
-    controller drives another track, the plant refuses, the recorder fails, or the run ended by
+    How the car was driven is for :func:`bayesrace.operation.analysis.verdict.judge`. InputError if
+    the controller drives another track, the plant refuses, the recorder fails, or the run ended by
     anything but its laps, its time limit or the car's leaving the world, or several plants or
     controllers of one name are there, before or after; KeyboardInterrupt on a signal.
     """

@@ -22,9 +22,9 @@ from bayesrace.messages import (
     car_key,
     is_car_name,
 )
+from bayesrace.operation.analysis.network_status import SOURCES, NetworkStatus, ProcessStatus
 from bayesrace.transport import Endpoints, Inbox, Kind, ask_all, decisive, open_session
 from bayesrace.transport.credentials import NEWEST_LIST
-from operation.analysis.network_status import SOURCES, NetworkStatus, ProcessStatus
 
 __all__ = [
     "Action", "Found", "ask_statuses", "command", "command_cars", "find", "follow", "pick", "route",

@@ -15,9 +15,9 @@ from typing import Final
 from bayesrace.cache import note_use
 from bayesrace.errors import InputError
 from bayesrace.limit import LimitSettings, known_limit, read_limit, write_limit
+from bayesrace.operation.settings import RaceSettings
+from bayesrace.operation.system import Child, child
 from bayesrace.tracks import load_track
-from operation.settings import RaceSettings
-from operation.system import Child, child
 
 __all__ = ["limits_beside", "limits_in"]
 

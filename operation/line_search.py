@@ -7,19 +7,19 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from bayesrace.arrays import Floats
+from bayesrace.controller.assembly import compiled_controller
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import read_weights
+from bayesrace.learning.search import search
+from bayesrace.operation.closed_loop import ClosedLoop, built_in_car
+from bayesrace.operation.preparation import prepare
+from bayesrace.operation.settings import BayesianSettings, PreparationSettings
+from bayesrace.operation.terminal.progress import Stages
 from bayesrace.raceline import RaceLine, RaceLineSettings, racing_line
 from bayesrace.raceline.line import line_identity
 from bayesrace.raceline.nodes import NodeLines, roughness
 from bayesrace.tracks import Track, load_track
 from bayesrace.vehicles import CarParameters
-from controller.assembly import compiled_controller
-from learning.search import search
-from operation.closed_loop import ClosedLoop, built_in_car
-from operation.preparation import prepare
-from operation.settings import BayesianSettings, PreparationSettings
-from operation.terminal.progress import Stages
 
 __all__ = ["Lap", "SearchedLine", "driven_lap", "searched_line"]
 

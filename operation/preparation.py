@@ -11,12 +11,24 @@ from pathlib import Path
 from typing import Final, Literal
 
 from bayesrace.cache import cache_folder, cpu_identity, digest, kept, software
+from bayesrace.codegen.build import build
+from bayesrace.codegen.compiler import compiled, find_compiler
+from bayesrace.codegen.settings import BuildSettings
 from bayesrace.columns import LogColumns
 from bayesrace.errors import InputError
 from bayesrace.files import read_whole, replacing
 from bayesrace.gp.weights import GpWeights, encode_weights, read_weights, write_weights
 from bayesrace.integrators import Discretisation
+from bayesrace.learning.dataset import Dataset, concatenate
+from bayesrace.learning.logs import CYCLES, STATES, dataset_from_columns
+from bayesrace.learning.settings import Progress, TrainingSettings
 from bayesrace.messages import STATE, TELEMETRY
+from bayesrace.operation.closed_loop import Driven
+from bayesrace.operation.collect import collect, drive_length_s, training_margin_m
+from bayesrace.operation.settings import PreparationSettings
+from bayesrace.operation.terminal.progress import Stages
+from bayesrace.plant.simulator import PLANT
+from bayesrace.plant.vehicle import open_vehicle
 from bayesrace.raceline import (
     RaceLine,
     RaceLineError,
@@ -27,18 +39,6 @@ from bayesrace.raceline import (
 )
 from bayesrace.tracks import Track, load_track, write_track
 from bayesrace.vehicles import CarParameters
-from codegen.build import build
-from codegen.compiler import compiled, find_compiler
-from codegen.settings import BuildSettings
-from learning.dataset import Dataset, concatenate
-from learning.logs import CYCLES, STATES, dataset_from_columns
-from learning.settings import Progress, TrainingSettings
-from operation.closed_loop import Driven
-from operation.collect import collect, drive_length_s, training_margin_m
-from operation.settings import PreparationSettings
-from operation.terminal.progress import Stages
-from plant.simulator import PLANT
-from plant.vehicle import open_vehicle
 
 __all__ = [
     "SOURCES",
@@ -56,8 +56,8 @@ __all__ = [
 ]
 
 SOURCES: Final = (
-    "bayesrace", "bayesrace/gp", "bayesrace/messages", "bayesrace/raceline", "bayesrace/tracks",
-    "bayesrace/vehicles", "controller", "controller/native", "learning", "plant", "plant/fmu",
+    ".", "gp", "messages", "raceline", "tracks",
+    "vehicles", "controller", "controller/native", "learning", "plant", "plant/fmu",
     "operation/closed_loop.py", "operation/collect.py", "operation/drive.py",
 )  # fmt: skip
 """Our code that shapes a training drive and what is learned from it."""
@@ -291,7 +291,7 @@ def trained_weights(
 
     def make(partial: Path) -> None:
         # Imported here: it takes a second, and most commands find their weights in the cache.
-        from learning.training import train
+        from bayesrace.learning.training import train
 
         weights = train(samples, discretisation, settings, initial, progress)
         write_weights(partial, weights)

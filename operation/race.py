@@ -11,22 +11,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
+from bayesrace.codegen.compiler import find_compiler
 from bayesrace.columns import LogColumns
 from bayesrace.errors import InputError
 from bayesrace.files import claimed, write_whole
 from bayesrace.gp.weights import read_weights
+from bayesrace.learning.dataset import Dataset
+from bayesrace.learning.logs import dataset_from_columns
 from bayesrace.manifest import MANIFEST
-from bayesrace.recorder import Recorder
-from bayesrace.tracks import load_track
-from bayesrace.transport import RefusedError
-from bayesrace.vehicles import write_car
-from codegen.compiler import find_compiler
-from learning.dataset import Dataset
-from learning.logs import dataset_from_columns
-from operation.analysis.recording import RUN_COLUMNS, Recording, read_recording, runs_of
-from operation.drive import RunPlan
-from operation.limits import limits_beside
-from operation.preparation import (
+from bayesrace.operation.analysis.recording import RUN_COLUMNS, Recording, read_recording, runs_of
+from bayesrace.operation.drive import RunPlan
+from bayesrace.operation.limits import limits_beside
+from bayesrace.operation.preparation import (
     PredictionModel,
     Prepared,
     PreparedTrack,
@@ -34,11 +30,15 @@ from operation.preparation import (
     progress_artefact,
     updated_weights,
 )
-from operation.settings import RaceSettings
-from operation.system import System, started_system
-from operation.terminal.progress import Stage, Stages
-from plant.simulator import PLANT
-from plant.vehicle import FmuFault, open_vehicle
+from bayesrace.operation.settings import RaceSettings
+from bayesrace.operation.system import System, started_system
+from bayesrace.operation.terminal.progress import Stage, Stages
+from bayesrace.plant.simulator import PLANT
+from bayesrace.plant.vehicle import FmuFault, open_vehicle
+from bayesrace.recorder import Recorder
+from bayesrace.tracks import load_track
+from bayesrace.transport import RefusedError
+from bayesrace.vehicles import write_car
 
 __all__ = ["FILES", "RaceError", "race"]
 

@@ -5,15 +5,15 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from bayesrace.codegen.settings import ProblemName
+from bayesrace.controller.pure_pursuit import PurePursuitSettings
+from bayesrace.controller.settings import MpcSettings
 from bayesrace.defaults import Option
 from bayesrace.integrators import PREDICTION, Discretisation
+from bayesrace.learning.settings import DEFAULT_KERNELS, WIDEN, Kernel, SearchSettings
+from bayesrace.plant.settings import CarSimulation
 from bayesrace.raceline import RaceLineSettings
 from bayesrace.vehicles import CarParameters
-from codegen.settings import ProblemName
-from controller.pure_pursuit import PurePursuitSettings
-from controller.settings import MpcSettings
-from learning.settings import DEFAULT_KERNELS, WIDEN, Kernel, SearchSettings
-from plant.settings import CarSimulation
 
 __all__ = ["BayesianSettings", "PreparationSettings", "RaceSettings", "TimeMode"]
 
@@ -166,7 +166,7 @@ class RaceSettings(PreparationSettings):
         """One seed and one sampling time hold for all parts; the plant's time is not to choose."""
         if self.fmu is None and self.fmu_map is not None:
             raise ValueError(f"map {self.fmu_map} without an FMU to apply it to: add --fmu")
-        from plant.simulator import PLANT  # with CasADi, which the help does not need
+        from bayesrace.plant.simulator import PLANT  # with CasADi, which the help does not need
 
         steps = {self.discretisation.step_s, self.pursuit.step_s, PLANT.step_s}
         if len(steps) > 1:
@@ -181,8 +181,8 @@ class RaceSettings(PreparationSettings):
 
 
 class BayesianSettings(RaceLineSettings):
-    """Everything that a line found by :func:`operation.line_search.searched_line` depends on, but
-    for weights."""
+    """Everything that a line found by :func:`bayesrace.operation.line_search.searched_line` depends
+    on, but for weights."""
 
     objective: Annotated[Literal["ideal", "driven"], Option(metavar="LAP")] = Field(
         "ideal", description="lap to minimise, ideal (by the line's own speeds) or driven"

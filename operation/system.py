@@ -22,6 +22,7 @@ from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from bayesrace.interpreter import RUN_MODULE
 from bayesrace.messages import EVENT, Event
+from bayesrace.operation.drive import RunPlan, announcement, execute
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import Track
 from bayesrace.transport import (
@@ -31,7 +32,6 @@ from bayesrace.transport import (
     open_session,
     private_endpoints,
 )
-from operation.drive import RunPlan, announcement, execute
 
 __all__ = ["Child", "System", "child", "endings", "started_system"]
 
@@ -48,7 +48,9 @@ _PATIENCE_S: Final = 3.0
 class Child:
     """A running ``bayesrace`` subcommand, or other module, whose output goes to a file."""
 
-    def __init__(self, arguments: list[str], output: Path, module: str = "operation.cli") -> None:
+    def __init__(
+        self, arguments: list[str], output: Path, module: str = "bayesrace.operation.cli"
+    ) -> None:
         self.output = output
         self._file = output.open("ab")
         self._process = subprocess.Popen(
@@ -97,7 +99,9 @@ class Child:
 
 
 @contextmanager
-def child(arguments: list[str], output: Path, module: str = "operation.cli") -> Iterator[Child]:
+def child(
+    arguments: list[str], output: Path, module: str = "bayesrace.operation.cli"
+) -> Iterator[Child]:
     """A child process that does not outlive the block, however the block ends.
 
     With ``--parent-pid`` among the arguments it does not outlive this process either.
@@ -159,7 +163,7 @@ class System:
             raise InputError("; ".join(words)) from error
 
     def drive(self, track: Track, plan: RunPlan, recorder: Recorder | None = None) -> Event:
-        """Drives one run to its end; see :func:`operation.drive.execute`."""
+        """Drives one run to its end; see :func:`bayesrace.operation.drive.execute`."""
         self._wait_for_recording()
         return execute(self.director, self._events, track, plan, recorder)
 

@@ -1,8 +1,8 @@
 """A run of the car without transport or clock: start, laps, end, and the loop of a lockstep run.
 
-The plant process exchanges states for inputs over the network; ``operation.closed_loop`` does so
-by a function call. Both drive the car through :func:`drive_lockstep`, so their runs are equal to
-the bit.
+The plant process exchanges states for inputs over the network; ``bayesrace.operation.closed_loop``
+does so by a function call. Both drive the car through :func:`drive_lockstep`, so their runs are
+equal to the bit.
 """
 
 import time
@@ -14,9 +14,9 @@ from typing import Final
 import numpy as np
 
 from bayesrace.messages import RunRequest, State, Truth
+from bayesrace.plant.settings import SensorNoise
+from bayesrace.plant.vehicle import FmuFault, Vehicle
 from bayesrace.tracks.track import CrossingLine
-from plant.settings import SensorNoise
-from plant.vehicle import FmuFault, Vehicle
 
 __all__ = ["CarRun", "End", "LineCounter", "Sensors", "drive_lockstep", "fault_end", "truth_behind"]
 

@@ -24,6 +24,10 @@ from bayesrace.messages import (
     Scalar,
     Status,
 )
+from bayesrace.plant.lockstep import End, Sensors
+from bayesrace.plant.process_settings import PlantSettings
+from bayesrace.plant.run import Run, RunCounters
+from bayesrace.plant.vehicle import Compile, FmuFault, Vehicle, open_vehicle
 from bayesrace.realtime import prepare_thread
 from bayesrace.transport import (
     HEARTBEAT_S,
@@ -39,10 +43,6 @@ from bayesrace.transport import (
     decode_request,
     open_session,
 )
-from plant.lockstep import End, Sensors
-from plant.process_settings import PlantSettings
-from plant.run import Run, RunCounters
-from plant.vehicle import Compile, FmuFault, Vehicle, open_vehicle
 
 __all__ = ["PlantProcess", "PlantSettings", "main"]
 
@@ -325,7 +325,7 @@ def _simulated_by(settings: PlantSettings) -> str:
 def main(settings: PlantSettings, compiled: Compile | None = None) -> int:
     """Run a plant until SIGINT or SIGTERM; returns the exit code. Raises InputError at a bad start.
 
-    ``compiled``: of the car's equations, see :class:`plant.simulator.Simulator`.
+    ``compiled``: of the car's equations, see :class:`bayesrace.plant.simulator.Simulator`.
     Call it from the main thread of a process: it takes over the signals.
     """
     die_with_parent(settings.parent_pid)

@@ -2,9 +2,9 @@
 
 from pydantic import Field
 
+from bayesrace.plant.settings import CarSimulation
 from bayesrace.realtime import RealtimeSettings
 from bayesrace.transport import PLANT_ENDPOINT, Endpoints
-from plant.settings import CarSimulation
 
 __all__ = ["PlantSettings"]
 

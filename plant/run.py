@@ -9,10 +9,10 @@ from typing import Final, NamedTuple
 
 from bayesrace.clock import SUSPENDED_S, sleep_until_ns
 from bayesrace.messages import ACTUATION, Actuation, BrakingPlan, Decoder, RunRequest, State, Truth
+from bayesrace.plant.guard import Command, planned_at
+from bayesrace.plant.lockstep import CarRun, End, Sensors, drive_lockstep, fault_end, truth_behind
+from bayesrace.plant.vehicle import FmuFault, Vehicle
 from bayesrace.transport import LOCKSTEP_SPIN_S, Inbox, Item, Kind, Numbering, Publisher
-from plant.guard import Command, planned_at
-from plant.lockstep import CarRun, End, Sensors, drive_lockstep, fault_end, truth_behind
-from plant.vehicle import FmuFault, Vehicle
 
 __all__ = ["Run", "RunCounters"]
 

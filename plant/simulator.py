@@ -7,9 +7,9 @@ import numpy as np
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.integrators import PLANT_SCHEME, PLANT_SUBSTEP_HZ, Discretisation
+from bayesrace.plant.guard import Command
+from bayesrace.plant.vehicle import Compile, Vehicle
 from bayesrace.vehicles.models import Model
-from plant.guard import Command
-from plant.vehicle import Compile, Vehicle
 
 __all__ = ["PLANT", "Simulator", "plant_discretisation"]
 

@@ -18,10 +18,10 @@ import slipx
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
+from bayesrace.plant.guard import Command
+from bayesrace.plant.simulator import plant_discretisation
+from bayesrace.plant.vehicle import FmuFault, Vehicle
 from bayesrace.vehicles.parameters import CarParameters
-from plant.guard import Command
-from plant.simulator import plant_discretisation
-from plant.vehicle import FmuFault, Vehicle
 
 __all__ = ["SlipxSimulator"]
 

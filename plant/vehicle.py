@@ -10,9 +10,9 @@ import numpy as np
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
+from bayesrace.plant.guard import Command, PlantGuard
+from bayesrace.plant.settings import SimulatorName
 from bayesrace.vehicles.parameters import CarParameters
-from plant.guard import Command, PlantGuard
-from plant.settings import SimulatorName
 
 if TYPE_CHECKING:
     import casadi as ca
@@ -125,7 +125,7 @@ def open_vehicle(
 ) -> Iterator[Vehicle]:
     """The car by the built-in equations, by slipx, or by an FMU and the map of its variables.
 
-    ``compiled``: of the equations, see :class:`plant.simulator.Simulator`.
+    ``compiled``: of the equations, see :class:`bayesrace.plant.simulator.Simulator`.
 
     Raises InputError if the FMU, the map, the rate or the car cannot be used.
     """
@@ -133,18 +133,18 @@ def open_vehicle(
         if fmu_map is not None:
             raise InputError(f"map {fmu_map} without an FMU to apply it to: add --fmu")
         if simulator == "slipx":
-            from plant.slipx_car import SlipxSimulator
+            from bayesrace.plant.slipx_car import SlipxSimulator
 
             yield SlipxSimulator(car, rate_hz)
             return
+        from bayesrace.plant.simulator import Simulator, plant_discretisation
         from bayesrace.vehicles.models import dynamic
-        from plant.simulator import Simulator, plant_discretisation
 
         yield Simulator(dynamic(car), plant_discretisation(rate_hz), compiled)
         return
     if simulator != "equations":
         raise InputError(f"--simulator {simulator} and --fmu {fmu}: only one can be the car")
-    from plant.fmu.simulator import open_fmu  # the built-in car does not wait for fmpy
+    from bayesrace.plant.fmu.simulator import open_fmu  # the built-in car does not wait for fmpy
 
     with open_fmu(car, fmu, fmu_map, rate_hz) as vehicle:
         yield vehicle

@@ -22,31 +22,31 @@ from pydantic import BaseModel
 from rich.console import Console
 
 from bayesrace.arrays import Floats
+from bayesrace.codegen.ocp import OcpNlp
+from bayesrace.codegen.problems.tracking import tracking
+from bayesrace.codegen.settings import ProblemName
+from bayesrace.controller.assembly import compiled_controller
+from bayesrace.controller.cycle import Cycle
+from bayesrace.controller.mpc import PredictiveController
+from bayesrace.controller.native_step import NativeStep, StepStatus
+from bayesrace.controller.process_settings import ControllerSettings
+from bayesrace.controller.settings import MpcSettings
 from bayesrace.gp.expression import corrected_function
 from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.messages import State
+from bayesrace.operation.closed_loop import built_in_car
+from bayesrace.operation.drive import RunPlan, run_request
+from bayesrace.operation.preparation import prepare, progress_artefact
+from bayesrace.operation.terminal.progress import Stages
+from bayesrace.operation.terminal.terminal import plain_table
+from bayesrace.plant.lockstep import CarRun, drive_lockstep
+from bayesrace.plant.simulator import PLANT
+from bayesrace.plant.vehicle import Vehicle
+from bayesrace.studies.settings import PUBLISHED, BenchSettings
 from bayesrace.tracks import Track
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import e_kinematic
-from codegen.ocp import OcpNlp
-from codegen.problems.tracking import tracking
-from codegen.settings import ProblemName
-from controller.assembly import compiled_controller
-from controller.cycle import Cycle
-from controller.mpc import PredictiveController
-from controller.native_step import NativeStep, StepStatus
-from controller.process_settings import ControllerSettings
-from controller.settings import MpcSettings
-from operation.closed_loop import built_in_car
-from operation.drive import RunPlan, run_request
-from operation.preparation import prepare, progress_artefact
-from operation.terminal.progress import Stages
-from operation.terminal.terminal import plain_table
-from plant.lockstep import CarRun, drive_lockstep
-from plant.simulator import PLANT
-from plant.vehicle import Vehicle
-from studies.settings import PUBLISHED, BenchSettings
 
 __all__ = ["BenchResult", "BenchSettings", "run_bench"]
 

@@ -5,12 +5,12 @@ from typing import Annotated, Any, Final
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
+from bayesrace.codegen.settings import ProblemName
+from bayesrace.controller.settings import MpcSettings
 from bayesrace.defaults import Option
+from bayesrace.operation.settings import PreparationSettings
 from bayesrace.tracks import DEFAULT_RACE_TRACK
 from bayesrace.vehicles import CarSetting, default_car
-from codegen.settings import ProblemName
-from controller.settings import MpcSettings
-from operation.settings import PreparationSettings
 
 __all__ = ["PUBLISHED", "BenchSettings", "Case", "TuneSettings", "spread"]
 

@@ -7,16 +7,16 @@ from typing import Final, Literal
 from fmpy import extract
 
 from bayesrace.cache import cpu_identity, software
+from bayesrace.codegen.compiler import FLAGS, find_compiler
+from bayesrace.codegen.fmu import car_fmu, pack
 from bayesrace.vehicles import get_car
-from codegen.compiler import FLAGS, find_compiler
-from codegen.fmu import car_fmu, pack
 from tests.shared import shared_folder
 
 __all__ = ["packed_car", "unpacked_car"]
 
 _SOURCES: Final = (
-    "bayesrace",
-    "bayesrace/vehicles",
+    ".",
+    "vehicles",
     "codegen",
     "codegen/fmu",
     "codegen/fmu/native",

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from bayesrace.operation.cli import main
 from bayesrace.raceline import write_raceline
 from bayesrace.raceline.line import RaceLine
 from bayesrace.tracks import Track, write_track
-from operation.cli import main
 
 __all__ = ["Cli", "Outcome", "cli", "course_files", "refused"]
 

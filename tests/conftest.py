@@ -14,6 +14,12 @@ import pytest
 from numpy.typing import ArrayLike
 
 from bayesrace.arrays import Floats
+from bayesrace.codegen.build import build
+from bayesrace.codegen.problems.tracking import tracking
+from bayesrace.codegen.settings import BuildSettings
+from bayesrace.controller.native_step import NativeStep
+from bayesrace.controller.path_table import PathTable, make_path_table
+from bayesrace.controller.settings import MpcSettings
 from bayesrace.gp.expression import kernel_matrix
 from bayesrace.gp.weights import KERNELS, GpOutput, GpWeights
 from bayesrace.integrators import PREDICTION, Discretisation
@@ -21,12 +27,6 @@ from bayesrace.raceline.line import RaceLine
 from bayesrace.tracks import Track
 from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import Model, dynamic, e_kinematic
-from codegen.build import build
-from codegen.problems.tracking import tracking
-from codegen.settings import BuildSettings
-from controller.native_step import NativeStep
-from controller.path_table import PathTable, make_path_table
-from controller.settings import MpcSettings
 from tests.command_line import cli
 from tests.peanut_race import peanut_race, peanut_track
 from tests.zig import ziglang

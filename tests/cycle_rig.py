@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import Any
 
 from bayesrace.arrays import Floats
+from bayesrace.controller.driver import Driver
+from bayesrace.controller.interface import Environment, StepOutput
+from bayesrace.controller.python_controller import PythonController
+from bayesrace.controller.settings import CompensationSettings, FallbackSettings
 from bayesrace.messages import State
 from bayesrace.vehicles import CarParameters, default_car
-from controller.driver import Driver
-from controller.interface import Environment, StepOutput
-from controller.python_controller import PythonController
-from controller.settings import CompensationSettings, FallbackSettings
 from tests import sample_messages as messages
 
 __all__ = ["STEP_S", "ScriptedLaw", "scripted_driver", "state"]

@@ -9,13 +9,13 @@ import numpy as np
 from bayesrace.arrays import Floats
 from bayesrace.columns import columns_of
 from bayesrace.integrators import PREDICTION, Discretisation
+from bayesrace.learning.dataset import Dataset, dataset_from_arrays
+from bayesrace.learning.logs import CYCLES, STATES, dataset_from_columns
+from bayesrace.learning.settings import TrainingSettings
 from bayesrace.log import LogWriter
 from bayesrace.messages import Message, State, Telemetry, Truth, encode
 from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import Model
-from learning.dataset import Dataset, dataset_from_arrays
-from learning.logs import CYCLES, STATES, dataset_from_columns
-from learning.settings import TrainingSettings
 
 __all__ = ["CAR", "QUICK", "STEP_S", "blank", "dataset_of", "drive", "logged", "state"]
 __all__ += ["telemetry", "write_log"]

@@ -8,6 +8,8 @@ from typing import Any
 import pytest
 
 from bayesrace.messages import COMMAND, HEARTBEAT, STATUS, Command, Reply, Role, Status
+from bayesrace.operation.analysis.network_status import NetworkStatus
+from bayesrace.operation.lifecycle import ask_statuses, find
 from bayesrace.transport import (
     Endpoints,
     Inbox,
@@ -18,8 +20,6 @@ from bayesrace.transport import (
     free_endpoint,
     open_session,
 )
-from operation.analysis.network_status import NetworkStatus
-from operation.lifecycle import ask_statuses, find
 from tests import sample_messages as messages
 
 __all__ = ["COUNTERS", "PATIENCE_S", "Fake", "Fakes", "fakes", "options", "status_of", "where"]

@@ -15,10 +15,10 @@ from fmpy.fmi2 import FMU2Slave
 from fmpy.fmi3 import FMU3Slave
 
 from bayesrace.cache import software
+from bayesrace.codegen.compiler import find_compiler
+from bayesrace.plant.fmu.host import FmuHost
+from bayesrace.plant.fmu.inspection import inspect as inspect_fmu
 from bayesrace.vehicles.models import STATES
-from codegen.compiler import find_compiler
-from plant.fmu.host import FmuHost
-from plant.fmu.inspection import inspect as inspect_fmu
 from tests.shared import shared_folder
 
 __all__ = [

@@ -6,9 +6,9 @@ from typing import Literal
 import numpy as np
 
 from bayesrace.arrays import Floats
+from bayesrace.plant.simulator import Simulator, plant_discretisation
 from bayesrace.vehicles.models import STATES, dynamic
 from bayesrace.vehicles.parameters import CarParameters
-from plant.simulator import Simulator, plant_discretisation
 from tests.car_fmu import packed_car, unpacked_car
 from tests.fmu_master import Slave
 

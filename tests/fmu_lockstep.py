@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 
 from bayesrace.arrays import Floats
+from bayesrace.codegen.fmu import FmuDefinition, controller_fmu, pack
+from bayesrace.controller.driver import Driver
+from bayesrace.controller.mpc import PredictiveController
+from bayesrace.controller.native_step import NativeStep, StepStatus
+from bayesrace.controller.settings import CompensationSettings, FallbackSettings
 from bayesrace.gp.weights import GpWeights
+from bayesrace.plant.simulator import Simulator
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import STATES, dynamic
-from codegen.fmu import FmuDefinition, controller_fmu, pack
-from controller.driver import Driver
-from controller.mpc import PredictiveController
-from controller.native_step import NativeStep, StepStatus
-from controller.settings import CompensationSettings, FallbackSettings
-from plant.simulator import Simulator
 from tests import sample_messages as messages
 from tests.car_fmu import packed_car
 from tests.conftest import SETTINGS, Circuit

@@ -17,8 +17,8 @@ from fmpy.model_description import (
 )
 
 from bayesrace.arrays import Floats
-from plant.fmu.units import unit_of
-from plant.fmu.wiring import STATES, Wiring
+from bayesrace.plant.fmu.units import unit_of
+from bayesrace.plant.fmu.wiring import STATES, Wiring
 
 __all__ = [
     "OWN", "STATE", "TOLERANCE", "U", "assert_same", "description", "given",

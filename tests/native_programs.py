@@ -13,8 +13,8 @@ from typing import Final
 import pytest
 
 from bayesrace.cache import software
-from codegen.build import casadi_includes
-from codegen.compiler import FLAGS
+from bayesrace.codegen.build import casadi_includes
+from bayesrace.codegen.compiler import FLAGS
 from tests.shared import shared_folder
 
 __all__ = [

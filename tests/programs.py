@@ -34,7 +34,7 @@ __all__ = [
 ]
 
 ROOT: Final = Path(__file__).resolve().parents[1]
-COMMAND: Final = (sys.executable, "-m", "operation.cli")
+COMMAND: Final = (sys.executable, "-m", "bayesrace.operation.cli")
 PATIENCE_S: Final = 240.0
 """For what takes seconds on an idle machine; the tests' machine is not idle."""
 
@@ -95,7 +95,7 @@ def started_by(race: int) -> dict[str, int]:
     for entry in Path("/proc").glob("[0-9]*"):
         words = _arguments(entry.name)
         if "--parent-pid" in words and words[words.index("--parent-pid") + 1] == str(race):
-            found[words[words.index("operation.cli") + 1]] = int(entry.name)
+            found[words[words.index("bayesrace.operation.cli") + 1]] = int(entry.name)
     return found
 
 

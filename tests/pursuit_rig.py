@@ -14,11 +14,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from bayesrace.codegen.build import build
+from bayesrace.codegen.settings import BuildSettings
 from bayesrace.messages import STATE, Event, RunRequest, State, car_key, decode
 from bayesrace.recorder import Recorder
 from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
-from codegen.build import build
-from codegen.settings import BuildSettings
 from tests.programs import ROOT, until
 
 __all__ = [
@@ -37,8 +37,8 @@ PATIENCE_S = 60.0
 
 PLANT = """
 import json, sys
-from plant.process import main
-from plant.process_settings import PlantSettings
+from bayesrace.plant.process import main
+from bayesrace.plant.process_settings import PlantSettings
 sys.exit(main(PlantSettings.model_validate_json(sys.argv[1])))
 """
 
@@ -47,9 +47,9 @@ import sys
 from pathlib import Path
 import numpy as np
 from bayesrace.vehicles import get_car
-from controller.process import ControllerSettings, main
-from controller.pure_pursuit import PurePursuit, PurePursuitSettings
-from controller.python_controller import PythonController
+from bayesrace.controller.process import ControllerSettings, main
+from bayesrace.controller.pure_pursuit import PurePursuit, PurePursuitSettings
+from bayesrace.controller.python_controller import PythonController
 assert not {"casadi", "sklearn", "matplotlib", "scipy"} & set(sys.modules), "slow imports"
 s = np.linspace(0, 2 * np.pi, 200, endpoint=False)
 law = PurePursuit(get_car("orca"), 2 * np.cos(s), np.sin(s), np.full(200, 1.5),

@@ -8,16 +8,16 @@ from typing import Any
 from rich.console import Console
 
 from bayesrace.arrays import Floats
+from bayesrace.controller.assembly import compiled_controller
+from bayesrace.controller.mpc import PredictiveController
 from bayesrace.gp.weights import GpWeights, read_weights
+from bayesrace.operation.closed_loop import ClosedLoop, Driven
+from bayesrace.operation.preparation import Prepared, prepare
+from bayesrace.operation.settings import PreparationSettings
+from bayesrace.operation.terminal.progress import stages_on
 from bayesrace.raceline import RaceLine
 from bayesrace.tracks import Track
 from bayesrace.vehicles import CarParameters, get_car
-from controller.assembly import compiled_controller
-from controller.mpc import PredictiveController
-from operation.closed_loop import ClosedLoop, Driven
-from operation.preparation import Prepared, prepare
-from operation.settings import PreparationSettings
-from operation.terminal.progress import stages_on
 
 __all__ = ["Racing", "prepared", "racing"]
 

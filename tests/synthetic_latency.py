@@ -6,8 +6,8 @@ from typing import Any
 
 from bayesrace.log import LogWriter
 from bayesrace.messages import Actuation, Message, State, Status, Telemetry, Truth, encode
-from studies.latency.analysis import Analysis, Beside, analyse
-from studies.latency.settings import LatencySettings
+from bayesrace.studies.latency.analysis import Analysis, Beside, analyse
+from bayesrace.studies.latency.settings import LatencySettings
 from tests.driven import blank
 
 __all__ = ["PERIOD_NS", "Loop", "report_of"]

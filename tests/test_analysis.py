@@ -16,15 +16,15 @@ from bayesrace.arrays import Floats
 from bayesrace.columns import LogColumns
 from bayesrace.errors import InputError
 from bayesrace.limit import LimitLap, write_limit
+from bayesrace.operation.analysis.laps import positions_between, time_laps
+from bayesrace.operation.analysis.race import analyse, read_race
+from bayesrace.operation.analysis.recording import RUN_COLUMNS, read_recording, runs_of
+from bayesrace.operation.analysis.results import LapResult, RaceResult, read_result, write_result
+from bayesrace.operation.report import write_report
+from bayesrace.operation.terminal.race_table import COLUMNS, print_table
+from bayesrace.plant.simulator import Simulator, plant_discretisation
 from bayesrace.vehicles import default_car
 from bayesrace.vehicles.models import dynamic
-from operation.analysis.laps import positions_between, time_laps
-from operation.analysis.race import analyse, read_race
-from operation.analysis.recording import RUN_COLUMNS, read_recording, runs_of
-from operation.analysis.results import LapResult, RaceResult, read_result, write_result
-from operation.report import write_report
-from operation.terminal.race_table import COLUMNS, print_table
-from plant.simulator import Simulator, plant_discretisation
 from tests.synthetic_race import LAP_S, LINE_M, STEP_S, Drive, circle, track, write_race
 
 TWO_LAPS: Floats = np.asarray(

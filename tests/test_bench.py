@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bayesrace.controller.assembly import compiled_controller
+from bayesrace.controller.settings import MpcSettings
 from bayesrace.gp.weights import GpWeights
+from bayesrace.operation.closed_loop import ClosedLoop
+from bayesrace.studies.bench import _Drive
 from bayesrace.vehicles import CarParameters
-from controller.assembly import compiled_controller
-from controller.settings import MpcSettings
-from operation.closed_loop import ClosedLoop
-from studies.bench import _Drive
 from tests.conftest import Circuit
 from tests.programs import run
 

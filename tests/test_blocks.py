@@ -5,11 +5,11 @@ import pytest
 from pydantic import ValidationError
 
 from bayesrace.arrays import Floats
+from bayesrace.codegen.ocp import OcpNlp
+from bayesrace.codegen.problems.problem import Problem
+from bayesrace.codegen.settings import BuildSettings
+from bayesrace.controller.native_step import NativeProblem, StepStatus
 from bayesrace.vehicles import CarParameters, default_car
-from codegen.ocp import OcpNlp
-from codegen.problems.problem import Problem
-from codegen.settings import BuildSettings
-from controller.native_step import NativeProblem, StepStatus
 from tests.test_problems import (
     HORIZON,
     IPOPT,

@@ -14,14 +14,14 @@ import msgspec
 import numpy as np
 import pytest
 
+from bayesrace.controller.driver import NO_STATE, Level
 from bayesrace.log import LogReader
 from bayesrace.messages import TRUTH, BrakingPlan, State
+from bayesrace.operation.closed_loop import ClosedLoop
+from bayesrace.operation.drive import RunPlan, run_request
+from bayesrace.operation.system import started_system
+from bayesrace.plant.guard import planned_at
 from bayesrace.recorder import Recorder
-from controller.driver import NO_STATE, Level
-from operation.closed_loop import ClosedLoop
-from operation.drive import RunPlan, run_request
-from operation.system import started_system
-from plant.guard import planned_at
 from tests.racing import Racing, prepared, racing
 from tests.reference import reference_file
 

@@ -11,20 +11,20 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from bayesrace.codegen.build import HOST
+from bayesrace.codegen.compiler import find_compiler
+from bayesrace.codegen.host_files import SETTINGS_FILE, export
+from bayesrace.controller.driver import Level
+from bayesrace.controller.mpc import PredictiveController
+from bayesrace.controller.native_step import NativeStep
+from bayesrace.controller.process_settings import ControllerSettings
+from bayesrace.controller.settings import cycle_values
 from bayesrace.gp.weights import GpWeights
 from bayesrace.log import LogReader, LogWriter
 from bayesrace.manifest import read_manifest
 from bayesrace.messages import ACTUATION, STATE, TELEMETRY, State
+from bayesrace.operation.closed_loop import ClosedLoop
 from bayesrace.vehicles import CarParameters
-from codegen.build import HOST
-from codegen.compiler import find_compiler
-from codegen.host_files import SETTINGS_FILE, export
-from controller.driver import Level
-from controller.mpc import PredictiveController
-from controller.native_step import NativeStep
-from controller.process_settings import ControllerSettings
-from controller.settings import cycle_values
-from operation.closed_loop import ClosedLoop
 from tests import sample_messages as messages
 from tests.conftest import SETTINGS, Circuit
 from tests.native_programs import SANITIZED, native_program

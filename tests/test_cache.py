@@ -12,12 +12,12 @@ from bayesrace.cache import digest, kept
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.integrators import PREDICTION
+from bayesrace.learning.settings import TrainingSettings
+from bayesrace.operation import preparation
 from bayesrace.raceline import RaceLine, RaceLineSettings, racing_line
 from bayesrace.tracks import load_track
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
-from learning.settings import TrainingSettings
-from operation import preparation
 from tests.conftest import mirrored_weights, offset_line
 from tests.driven import CAR, drive
 
@@ -114,7 +114,7 @@ def test_weights_are_kept_for_their_samples_settings_and_beginning(
         trained.append(arguments)
         return replace(weights, version=f"{len(trained)}")
 
-    monkeypatch.setattr("learning.training.train", train)
+    monkeypatch.setattr("bayesrace.learning.training.train", train)
     samples, settings = drive(dynamic(CAR), 30, seed=1), TrainingSettings()
     one_sided = CAR.model_copy(update={"mirrored_samples": False})
 

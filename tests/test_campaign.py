@@ -70,7 +70,7 @@ def whole(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def rows(folder: Path) -> list[dict[str, Any]]:
     """Of all columns that may not differ between machines and times, in one order."""
-    from studies.campaign.results import read_results
+    from bayesrace.studies.campaign.results import read_results
 
     table = read_results(folder).drop_columns(MEASURED)
     return sorted(table.to_pylist(), key=lambda row: (row["key"], row["controller"], row["lap"]))
@@ -211,11 +211,11 @@ def test_the_report_is_made_of_the_parquet_files(whole: Path, cli: Cli, tmp_path
 def test_a_case_whose_workers_die_is_a_failed_row_and_reported(tmp_path: Path) -> None:
     from distributed.scheduler import KilledWorker
 
-    from operation.settings import RaceSettings
-    from studies.campaign.campaign import CampaignError, rows_of
-    from studies.campaign.case import Case
-    from studies.campaign.page import render_campaign
-    from studies.campaign.results import writing
+    from bayesrace.operation.settings import RaceSettings
+    from bayesrace.studies.campaign.campaign import CampaignError, rows_of
+    from bayesrace.studies.campaign.case import Case
+    from bayesrace.studies.campaign.page import render_campaign
+    from bayesrace.studies.campaign.results import writing
 
     class Lost:
         status = "error"
@@ -236,7 +236,7 @@ def test_rows_are_those_of_a_race_over_zenoh(
     peanut_race: Race, peanut_track: Path, tmp_path: Path
 ) -> None:
     plan = tmp_path / "race.toml"
-    from studies.campaign.case import CONTROLLERS
+    from bayesrace.studies.campaign.case import CONTROLLERS
 
     controllers = f"controllers = {json.dumps(CONTROLLERS)}\n"
     tracks = f'[grid]\ntrack = "{peanut_track}"\ntrain_track = "{peanut_track}"\n'

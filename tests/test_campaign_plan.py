@@ -11,16 +11,16 @@ from rich.console import Console
 
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights, read_weights, write_weights
+from bayesrace.learning.dataset import Dataset
+from bayesrace.operation.preparation import updated_weights
+from bayesrace.operation.race import race
+from bayesrace.operation.settings import RaceSettings
+from bayesrace.operation.terminal.progress import stages_on
+from bayesrace.studies.campaign.case import Case, factors
+from bayesrace.studies.campaign.execute import FAILED, run_case
+from bayesrace.studies.campaign.plan import Campaign, read_plan
 from bayesrace.vehicles import CarParameters, write_car
 from bayesrace.vehicles.parts import PacejkaTyres
-from learning.dataset import Dataset
-from operation.preparation import updated_weights
-from operation.race import race
-from operation.settings import RaceSettings
-from operation.terminal.progress import stages_on
-from studies.campaign.case import Case, factors
-from studies.campaign.execute import FAILED, run_case
-from studies.campaign.plan import Campaign, read_plan
 from tests.programs import peanut
 
 Read = Callable[[str], Campaign]
@@ -188,7 +188,7 @@ def test_a_case_travels_as_plain_data_and_for_its_own_software_alone(
     there = Case.of_task(task, campaign.files)
     assert Path(there.settings.track).read_bytes() in campaign.files.values()
     assert there.settings.threads == 1
-    monkeypatch.setattr("studies.campaign.case.software_identity", lambda: "another")
+    monkeypatch.setattr("bayesrace.studies.campaign.case.software_identity", lambda: "another")
     with pytest.raises(RuntimeError, match="another version"):
         Case.of_task(task, campaign.files)
 
@@ -228,7 +228,7 @@ def test_each_update_learns_from_all_laps_before_it(
         learned.append(([len(one) for one in samples], first.version, read_weights(made).version))
         return made
 
-    monkeypatch.setattr("operation.preparation.updated_weights", recorded)
+    monkeypatch.setattr("bayesrace.operation.preparation.updated_weights", recorded)
     text = """
         controllers = ["bayesrace-updated-twice", "bayesrace-updated", "bayesrace"]
         [grid]

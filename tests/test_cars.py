@@ -6,7 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bayesrace.codegen.build import problem_of
+from bayesrace.codegen.problems.generate import c_header
+from bayesrace.codegen.settings import BuildSettings
 from bayesrace.errors import InputError
+from bayesrace.operation.settings import RaceSettings
 from bayesrace.raceline import RaceLine
 from bayesrace.vehicles import (
     CarParameters,
@@ -20,10 +24,6 @@ from bayesrace.vehicles import (
 )
 from bayesrace.vehicles.files import MODELS, SECTIONS
 from bayesrace.vehicles.parts import Pacejka
-from codegen.build import problem_of
-from codegen.problems.generate import c_header
-from codegen.settings import BuildSettings
-from operation.settings import RaceSettings
 from tests.command_line import Cli
 
 ORCA = Path(__file__).parents[1] / "bayesrace" / "cars" / "orca.toml"

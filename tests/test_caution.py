@@ -10,20 +10,20 @@ from pydantic import ValidationError
 from rich.console import Console
 
 from bayesrace.arrays import Floats
+from bayesrace.codegen.problems.tracking import tracking
+from bayesrace.controller.assembly import compiled_controller
+from bayesrace.controller.native_step import NativeStep, StepStatus
+from bayesrace.controller.settings import MpcSettings
 from bayesrace.gp.weights import KERNELS, GpOutput, GpWeights, read_weights
 from bayesrace.integrators import PREDICTION
+from bayesrace.learning.validation import predictive_sigma
+from bayesrace.operation.closed_loop import ClosedLoop, built_in_car
+from bayesrace.operation.preparation import prepare
+from bayesrace.operation.settings import RaceSettings
+from bayesrace.operation.terminal.progress import stages_on
 from bayesrace.vehicles import CarParameters, default_car
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from bayesrace.vehicles.tuning import CautionTuning
-from codegen.problems.tracking import tracking
-from controller.assembly import compiled_controller
-from controller.native_step import NativeStep, StepStatus
-from controller.settings import MpcSettings
-from learning.validation import predictive_sigma
-from operation.closed_loop import ClosedLoop, built_in_car
-from operation.preparation import prepare
-from operation.settings import RaceSettings
-from operation.terminal.progress import stages_on
 from tests.conftest import CAUTIOUS, SETTINGS, Circuit, discrete, fit_weights, ready, smooth_drive
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from operation.system import child
+from bayesrace.operation.system import child
 from tests.command_line import Cli, refused
 from tests.programs import environment, finish, run, start
 
@@ -49,7 +49,7 @@ def test_every_option_says_what_it_is(cli: Cli) -> None:
     import typer
     from typer.core import TyperGroup
 
-    from operation.cli.app import app
+    from bayesrace.operation.cli.app import app
 
     def leaves(command: Any, *names: str) -> dict[str, Any]:
         if not isinstance(command, TyperGroup):

@@ -7,28 +7,28 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bayesrace.controller.assembly import compiled_controller
+from bayesrace.controller.mpc import PredictiveController
+from bayesrace.controller.pure_pursuit import PurePursuit, PurePursuitSettings
+from bayesrace.controller.python_controller import PythonController
+from bayesrace.controller.settings import MpcSettings
 from bayesrace.gp.weights import read_weights
+from bayesrace.learning.logs import dataset_from_log
 from bayesrace.log import LogReader, LogWriter
 from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY, TRUTH, Event, State
+from bayesrace.operation.closed_loop import ClosedLoop
+from bayesrace.operation.collect import collect
+from bayesrace.operation.drive import RunPlan, execute
+from bayesrace.plant.guard import Command
+from bayesrace.plant.settings import SensorNoise
+from bayesrace.plant.simulator import Simulator
+from bayesrace.plant.vehicle import FmuFault
 from bayesrace.raceline import read_raceline
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import load_track
 from bayesrace.transport import Director, Endpoints, Publisher, free_endpoint, open_session
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
-from controller.assembly import compiled_controller
-from controller.mpc import PredictiveController
-from controller.pure_pursuit import PurePursuit, PurePursuitSettings
-from controller.python_controller import PythonController
-from controller.settings import MpcSettings
-from learning.logs import dataset_from_log
-from operation.closed_loop import ClosedLoop
-from operation.collect import collect
-from operation.drive import RunPlan, execute
-from plant.guard import Command
-from plant.settings import SensorNoise
-from plant.simulator import Simulator
-from plant.vehicle import FmuFault
 from tests.conftest import Circuit
 from tests.network.cars import gentle_course, start_controller, start_plant
 from tests.programs import PATIENCE_S

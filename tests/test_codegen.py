@@ -12,21 +12,14 @@ import casadi as ca
 import numpy as np
 import pytest
 
-import codegen.build as build_module
+import bayesrace.codegen.build as build_module
 from bayesrace.cache import cache_folder
-from bayesrace.errors import InputError
-from bayesrace.integrators import PERFECT, PREDICTION, Discretisation
-from bayesrace.interpreter import RUN_MODULE
-from bayesrace.manifest import LIBRARY, MANIFEST, read_manifest
-from bayesrace.messages.types import BRAKING_ROWS, SENSOR_FAULTS
-from bayesrace.vehicles import CarParameters, get_car
-from bayesrace.vehicles.models import MODELS
-from codegen.build import build, build_hash, generate
-from codegen.compiler import FLAGS, CompileError, Compiler, find_compiler
-from codegen.problems.problem import Problem
-from codegen.settings import BuildSettings
-from codegen.stage import linearise_function
-from controller.driver import (
+from bayesrace.codegen.build import build, build_hash, generate
+from bayesrace.codegen.compiler import FLAGS, CompileError, Compiler, find_compiler
+from bayesrace.codegen.problems.problem import Problem
+from bayesrace.codegen.settings import BuildSettings
+from bayesrace.codegen.stage import linearise_function
+from bayesrace.controller.driver import (
     DOUBTED,
     HALTED,
     NO_STATE,
@@ -35,9 +28,16 @@ from controller.driver import (
     Level,
     Phase,
 )
-from controller.native_step import Artefact, NativeStep, StepStatus
-from controller.settings import MpcSettings
-from controller.weights.settings import SAMPLES, WATCHED
+from bayesrace.controller.native_step import Artefact, NativeStep, StepStatus
+from bayesrace.controller.settings import MpcSettings
+from bayesrace.controller.weights.settings import SAMPLES, WATCHED
+from bayesrace.errors import InputError
+from bayesrace.integrators import PERFECT, PREDICTION, Discretisation
+from bayesrace.interpreter import RUN_MODULE
+from bayesrace.manifest import LIBRARY, MANIFEST, read_manifest
+from bayesrace.messages.types import BRAKING_ROWS, SENSOR_FAULTS
+from bayesrace.vehicles import CarParameters, get_car
+from bayesrace.vehicles.models import MODELS
 
 SMALL = BuildSettings(
     horizon=3, gp_capacity=8, discretisation=Discretisation(scheme="euler", pose="integrated")
@@ -239,7 +239,7 @@ def test_no_compiler_is_an_input_error_with_the_remedy(
 ) -> None:
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setattr("codegen.compiler.find_spec", lambda _: None)
+    monkeypatch.setattr("bayesrace.codegen.compiler.find_spec", lambda _: None)
     with pytest.raises(InputError, match=r"no C compiler.*install gcc.*ziglang"):
         build(SMALL)
 
@@ -271,7 +271,7 @@ def test_a_compiler_that_has_built_a_library_is_not_asked_again(
         asked.append(line[-1])
         return found.version
 
-    monkeypatch.setattr("codegen.compiler._run", answer)
+    monkeypatch.setattr("bayesrace.codegen.compiler._run", answer)
     assert find_compiler() == found
     assert asked == ["--version"]
 
@@ -418,7 +418,7 @@ def test_ziglang_builds_the_controller_where_there_is_no_compiler(
     ziglang: None, cache: Path, monkeypatch: pytest.MonkeyPatch, car: CarParameters
 ) -> None:
     monkeypatch.delenv("CC", raising=False)
-    monkeypatch.setattr("codegen.compiler.shutil.which", lambda _: None)
+    monkeypatch.setattr("bayesrace.codegen.compiler.shutil.which", lambda _: None)
     compiler = find_compiler()
     assert compiler.command == (*RUN_MODULE, "ziglang", "cc")
     folder, manifest = build(BuildSettings(gp_capacity=8))

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from bayesrace.arrays import Floats
+from bayesrace.controller.driver import Driver
+from bayesrace.controller.interface import StepOutput
+from bayesrace.controller.settings import CompensationSettings
 from bayesrace.transport import Numbering
-from controller.driver import Driver
-from controller.interface import StepOutput
-from controller.settings import CompensationSettings
 from tests.cycle_rig import STEP_S, ScriptedLaw, scripted_driver, state
 
 

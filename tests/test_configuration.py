@@ -15,6 +15,9 @@ from typer.main import get_command
 from bayesrace.configuration import Configuration, as_toml, read_configuration
 from bayesrace.defaults import CONFIGURATION_VARIABLE
 from bayesrace.errors import InputError
+from bayesrace.operation.cli.app import app
+from bayesrace.operation.settings import RaceSettings
+from bayesrace.operation.system import CONFIGURATION, started_system
 from bayesrace.transport import (
     Credentials,
     Endpoints,
@@ -24,9 +27,6 @@ from bayesrace.transport import (
     private_endpoints,
 )
 from bayesrace.vehicles import get_car
-from operation.cli.app import app
-from operation.settings import RaceSettings
-from operation.system import CONFIGURATION, started_system
 from tests.command_line import Cli, refused
 from tests.programs import ROOT, finish, start
 
@@ -278,8 +278,8 @@ def test_a_race_repeats_the_settings_of_another(
         seen.append(settings)
         raise StopError
 
-    StopError.__module__ = "operation.race"
-    monkeypatch.setattr("operation.race.race", record)
+    StopError.__module__ = "bayesrace.operation.race"
+    monkeypatch.setattr("bayesrace.operation.race.race", record)
     first = ("--laps", "5", "--seed", "3", "--style", "calm", "--no-constraints", "--delay", "20")
     line = ("--raceline", "line.csv", "--car", "f1tenth")
     cli("race", *first, *line, "--track", "paddock", "--noise", "speed_mps=0.5")

@@ -6,17 +6,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bayesrace.controller.assembly import compiled_controller
+from bayesrace.controller.process_settings import ControllerSettings
+from bayesrace.controller.settings import CompensationSettings, MpcSettings
 from bayesrace.gp.weights import GpWeights
 from bayesrace.messages import RunRequest
+from bayesrace.operation.closed_loop import ClosedLoop, Driven
+from bayesrace.plant.lockstep import CarRun, Sensors
+from bayesrace.plant.settings import SensorNoise
+from bayesrace.plant.simulator import Simulator
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
-from controller.assembly import compiled_controller
-from controller.process_settings import ControllerSettings
-from controller.settings import CompensationSettings, MpcSettings
-from operation.closed_loop import ClosedLoop, Driven
-from plant.lockstep import CarRun, Sensors
-from plant.settings import SensorNoise
-from plant.simulator import Simulator
 from tests.command_line import Cli, refused
 from tests.conftest import Circuit
 from tests.driven import blank

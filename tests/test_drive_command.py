@@ -13,8 +13,8 @@ import pytest
 
 from bayesrace.log import LogReader
 from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY
+from bayesrace.operation.doctor import probe
 from bayesrace.transport import free_endpoint
-from operation.doctor import probe
 from tests.command_line import Cli, course_files, refused
 from tests.conftest import Circuit
 from tests.programs import finish, peanut, run, start, until

@@ -9,10 +9,7 @@ import numpy as np
 import pytest
 
 from bayesrace.arrays import Floats
-from bayesrace.messages import State
-from bayesrace.vehicles import CarParameters, default_car
-from bayesrace.vehicles.models import dynamic
-from controller.driver import (
+from bayesrace.controller.driver import (
     HALTED,
     NO_STATE,
     STEP_FAILED,
@@ -22,10 +19,13 @@ from controller.driver import (
     Level,
     Phase,
 )
-from controller.interface import Environment, StepOutput
-from controller.mpc import PredictiveController
-from controller.native_step import NativeStep, StepStatus
-from controller.settings import CompensationSettings, FallbackSettings
+from bayesrace.controller.interface import Environment, StepOutput
+from bayesrace.controller.mpc import PredictiveController
+from bayesrace.controller.native_step import NativeStep, StepStatus
+from bayesrace.controller.settings import CompensationSettings, FallbackSettings
+from bayesrace.messages import State
+from bayesrace.vehicles import CarParameters, default_car
+from bayesrace.vehicles.models import dynamic
 from tests import sample_messages as messages
 from tests.conftest import SETTINGS, Circuit, discrete
 from tests.cycle_rig import ScriptedLaw, scripted_driver, state

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from bayesrace.operation.drive import RunPlan
+from bayesrace.operation.preparation import prepare
+from bayesrace.operation.settings import PreparationSettings
+from bayesrace.operation.system import started_system
+from bayesrace.operation.terminal.progress import stages_on
 from bayesrace.vehicles import DEFAULT_CAR
-from operation.drive import RunPlan
-from operation.preparation import prepare
-from operation.settings import PreparationSettings
-from operation.system import started_system
-from operation.terminal.progress import stages_on
 from tests.car_fmu import packed_car
 from tests.command_line import Cli, refused
 from tests.programs import ROOT, peanut
@@ -30,8 +30,8 @@ def test_the_controller_drives_with_its_own_extra_alone(
     python = str(tmp_path / "env" / "bin" / "python")
     subprocess.run([sys.executable, "-m", "venv", tmp_path / "env"], check=True)
     install = [python, "-m", "pip", "install", "--quiet", "--no-compile", "-c", "constraints.txt"]
-    subprocess.run([*install, "hatchling", "editables"], cwd=ROOT, check=True)
-    project = ["--no-build-isolation", "--editable", f"{ROOT}[controller]"]
+    subprocess.run([*install, "hatchling"], cwd=ROOT, check=True)
+    project = ["--no-build-isolation", f"{ROOT}[controller]"]  # as a wheel
     subprocess.run([*install, *project], cwd=ROOT, check=True)
     listed = subprocess.run(
         [python, "-m", "pip", "list", "--format", "json"], capture_output=True, check=True
@@ -42,7 +42,7 @@ def test_the_controller_drives_with_its_own_extra_alone(
     with stages_on(Console(quiet=True)) as stages:
         files = prepare(PreparationSettings(), (str(peanut(tmp_path / "peanut.csv")),), stages)
     with started_system(DEFAULT_CAR, tmp_path) as system:
-        monkeypatch.setattr("operation.system.RUN_MODULE", (python, "-P", "-m"))
+        monkeypatch.setattr("bayesrace.operation.system.RUN_MODULE", (python, "-P", "-m"))
         with system.controller(files.arguments):
             end = system.drive(files.first.track, RunPlan(1, "bayesrace", 1, 20.0, lockstep=True))
     assert end.data["reason"] == "laps"
@@ -52,7 +52,7 @@ def test_a_missing_package_of_campaigns_is_named_with_its_extra(
     cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     for name in ("page", "summary", "results"):
-        monkeypatch.delitem(sys.modules, f"studies.campaign.{name}", raising=False)
+        monkeypatch.delitem(sys.modules, f"bayesrace.studies.campaign.{name}", raising=False)
     monkeypatch.setitem(sys.modules, "pandas", None)
     refused(cli("campaign-report", tmp_path), "pandas", "bayesrace[campaign]")
 
@@ -60,7 +60,7 @@ def test_a_missing_package_of_campaigns_is_named_with_its_extra(
 def test_a_missing_package_of_certificates_is_named_with_its_extra(
     cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.delitem(sys.modules, "operation.certificates", raising=False)
+    monkeypatch.delitem(sys.modules, "bayesrace.operation.certificates", raising=False)
     monkeypatch.setitem(sys.modules, "cryptography", None)
     refused(cli("certs", "init"), "cryptography", "bayesrace[certificates]")
 
@@ -69,7 +69,7 @@ def test_a_missing_package_is_named_with_the_extra_that_brings_it(
     cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fmu = packed_car()
-    for name in [one for one in sys.modules if one.startswith(("plant.fmu", "fmpy"))]:
+    for name in [one for one in sys.modules if one.startswith(("bayesrace.plant.fmu", "fmpy"))]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "fmpy", None)
     refused(cli("fmu", "inspect", fmu), "fmpy", "bayesrace[fmu]")

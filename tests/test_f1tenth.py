@@ -7,26 +7,26 @@ import pytest
 from fmpy.validation import validate_fmu
 
 from bayesrace.arrays import Floats
+from bayesrace.codegen.build import build
+from bayesrace.codegen.fmu import car_fmu, pack
+from bayesrace.codegen.settings import BuildSettings
+from bayesrace.controller.pure_pursuit import PurePursuit
+from bayesrace.controller.python_controller import PythonController
+from bayesrace.controller.settings import FallbackSettings
 from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.integrators import PREDICTION
+from bayesrace.learning.settings import TrainingSettings
+from bayesrace.learning.training import train
+from bayesrace.operation.analysis.results import read_result
+from bayesrace.operation.closed_loop import ClosedLoop, drive_compiled
+from bayesrace.operation.preparation import trained_weights, training_samples, training_settings
+from bayesrace.operation.settings import PreparationSettings, RaceSettings
+from bayesrace.plant.simulator import Simulator
+from bayesrace.plant.vehicle import Vehicle, open_vehicle
 from bayesrace.raceline import RaceLine, racing_line, read_raceline_for
 from bayesrace.tracks import load_track
 from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import dynamic
-from codegen.build import build
-from codegen.fmu import car_fmu, pack
-from codegen.settings import BuildSettings
-from controller.pure_pursuit import PurePursuit
-from controller.python_controller import PythonController
-from controller.settings import FallbackSettings
-from learning.settings import TrainingSettings
-from learning.training import train
-from operation.analysis.results import read_result
-from operation.closed_loop import ClosedLoop, drive_compiled
-from operation.preparation import trained_weights, training_samples, training_settings
-from operation.settings import PreparationSettings, RaceSettings
-from plant.simulator import Simulator
-from plant.vehicle import Vehicle, open_vehicle
 from tests.cycle_rig import STEP_S, ScriptedLaw, scripted_driver, state
 from tests.programs import Race
 from tests.takeover.spoilt_weights import SPOILT, spoilt

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bayesrace.controller.driver import Level
+from bayesrace.controller.interface import StepOutput
+from bayesrace.controller.settings import FallbackSettings
 from bayesrace.vehicles import default_car
-from controller.driver import Level
-from controller.interface import StepOutput
-from controller.settings import FallbackSettings
 from tests.cycle_rig import ScriptedLaw, scripted_driver, state
 
 CAR = default_car()

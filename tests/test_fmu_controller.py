@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from fmpy.validation import validate_fmu
 
+from bayesrace.controller.driver import DOUBTED, UNPREDICTABLE, Level
+from bayesrace.controller.native_step import StepStatus
 from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import STATES
-from controller.driver import DOUBTED, UNPREDICTABLE, Level
-from controller.native_step import StepStatus
 from tests.fmu_lockstep import (  # noqa: F401 - a fixture is used by name
     RACING,
     STEP_S,

@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bayesrace.codegen import host_files
+from bayesrace.codegen.build import HOST
+from bayesrace.codegen.build import NATIVE as HEADERS
+from bayesrace.codegen.host_files import PATH_FILE, WEIGHTS_FILE, path_file, weights_file
+from bayesrace.controller import driver, path_table
+from bayesrace.controller.native_step import StepStatus
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
 from bayesrace.manifest import read_manifest
-from codegen import host_files
-from codegen.build import HOST
-from codegen.build import NATIVE as HEADERS
-from codegen.host_files import PATH_FILE, WEIGHTS_FILE, path_file, weights_file
-from controller import driver, path_table
-from controller.native_step import StepStatus
 from tests.conftest import Circuit
 from tests.fmu_lockstep import Exported, exported_controllers  # noqa: F401 - a fixture
 from tests.native_programs import PROGRAMS, SANITIZED, native_program

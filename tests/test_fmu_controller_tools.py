@@ -15,11 +15,11 @@ from fmpy.fmi1 import FMICallException
 from fmpy.fmi2 import FMU2Slave
 from fmpy.validation import validate_fmu
 
+from bayesrace.codegen.fmu import exchange_weights, pack
+from bayesrace.codegen.fmu.build import sources_of, write_sources
+from bayesrace.codegen.host_files import WEIGHTS_FILE, path_file
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import zero_weights
-from codegen.fmu import exchange_weights, pack
-from codegen.fmu.build import sources_of, write_sources
-from codegen.host_files import WEIGHTS_FILE, path_file
 from tests.conftest import fit_weights
 from tests.fmu_lockstep import (  # noqa: F401 - a fixture is used by name
     Exported,

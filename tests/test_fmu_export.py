@@ -15,11 +15,11 @@ from fmpy.validation import validate_fmu
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bayesrace.codegen.fmu import Variable, car_fmu, pack
 from bayesrace.errors import InputError
+from bayesrace.plant.guard import PlantGuard
 from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import STATES
-from codegen.fmu import Variable, car_fmu, pack
-from plant.guard import PlantGuard
 from tests.car_fmu import packed_car, unpacked_car
 from tests.cars import with_numbers
 from tests.fmu_exports import Kind, Version, built_in, commands, driven, slave

@@ -10,6 +10,7 @@ from fmpy import instantiate_fmu, read_model_description, simulate_fmu
 from fmpy.fmi1 import FMICallException
 
 from bayesrace.arrays import Floats
+from bayesrace.plant.simulator import Simulator
 from bayesrace.vehicles import CarParameters, default_car
 from bayesrace.vehicles.models import (
     INPUTS,
@@ -17,7 +18,6 @@ from bayesrace.vehicles.models import (
     dynamic,
     dynamic_with_parameters,
 )
-from plant.simulator import Simulator
 from tests.car_fmu import packed_car, unpacked_car
 
 KNOWN = (*STATES, *INPUTS, *default_car().equation_numbers)

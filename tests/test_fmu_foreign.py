@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bayesrace.plant.fmu.simulator import open_fmu
+from bayesrace.plant.simulator import Simulator
 from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import dynamic
-from plant.fmu.simulator import open_fmu
-from plant.simulator import Simulator
 from tests.foreign_fmu import FOREIGN_MAP, build_foreign_fmu
 
 START = [1.0, 2.0, -math.pi / 4, 0.1, 0.0, 0.0, 0.1]

@@ -17,10 +17,10 @@ from pathlib import Path
 import pytest
 
 from bayesrace.errors import InputError
+from bayesrace.plant.fmu.host import FmuHost
+from bayesrace.plant.fmu.simulator import open_fmu
+from bayesrace.plant.vehicle import FmuFault
 from bayesrace.vehicles import get_car
-from plant.fmu.host import FmuHost
-from plant.fmu.simulator import open_fmu
-from plant.vehicle import FmuFault
 from tests.faulty_fmu import (
     PATIENCE_S,
     STATES,
@@ -314,7 +314,7 @@ def test_what_is_no_fmu_for_this_plant_is_refused(
         with pytest.raises(InputError, match=why) as caught, open_fmu(get_car("orca"), path):
             pass
         assert "\n" not in str(caught.value)
-    monkeypatch.setattr("plant.fmu.inspection._MOST_BYTES", 1000)
+    monkeypatch.setattr("bayesrace.plant.fmu.inspection._MOST_BYTES", 1000)
     with pytest.raises(InputError, match="claims to unpack to"):
         faulty_host(good)
     assert not (tmp_path.parent / "evil.txt").exists()

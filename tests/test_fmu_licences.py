@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
+from bayesrace.codegen.fmu import car_fmu
+from bayesrace.codegen.fmu.archive import licence_files, third_parties
+from bayesrace.codegen.fmu.build import get_platform
 from bayesrace.vehicles import get_car
-from codegen.fmu import car_fmu
-from codegen.fmu.archive import licence_files, third_parties
-from codegen.fmu.build import get_platform
 from tests.car_fmu import packed_car
 from tests.fmu_exports import Kind, Version
 from tests.fmu_lockstep import Exported, exported_controllers  # noqa: F401 - a fixture

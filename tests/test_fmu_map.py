@@ -14,11 +14,18 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from bayesrace.errors import InputError
-from operation.terminal.fmu_table import FmuTable
-from plant.fmu.inspection import blank_map, inspect, is_settable, platforms, range_of, steps_s
-from plant.fmu.map import wire
-from plant.fmu.map_file import parse_map, read_map
-from plant.fmu.units import parse_quantity, to_si, unit_of
+from bayesrace.operation.terminal.fmu_table import FmuTable
+from bayesrace.plant.fmu.inspection import (
+    blank_map,
+    inspect,
+    is_settable,
+    platforms,
+    range_of,
+    steps_s,
+)
+from bayesrace.plant.fmu.map import wire
+from bayesrace.plant.fmu.map_file import parse_map, read_map
+from bayesrace.plant.fmu.units import parse_quantity, to_si, unit_of
 from tests.fmu_variables import OWN, description, given, own_fmu, taken, variable, write_fmu
 
 # -- the file -------------------------------------------------------------------------------------

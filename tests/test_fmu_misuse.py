@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from fmpy.fmi1 import FMICallException
 
+from bayesrace.codegen.fmu import car_fmu
+from bayesrace.codegen.fmu.build import sources_of, write_sources
 from bayesrace.vehicles import CarParameters
-from codegen.fmu import car_fmu
-from codegen.fmu.build import sources_of, write_sources
 from tests.fmu_exports import Kind, Version, commands, driven, slave
 from tests.fmu_master import Slave
 from tests.native_programs import PROGRAMS, SANITIZERS, gcc

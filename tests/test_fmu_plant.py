@@ -19,12 +19,12 @@ import pytest
 
 from bayesrace.columns import LogColumns
 from bayesrace.errors import InputError
+from bayesrace.learning.logs import dataset_from_log
 from bayesrace.log import LogReader, LogWriter
 from bayesrace.messages import STATE, TELEMETRY, TRUTH, Truth, car_key, encode
+from bayesrace.operation.analysis.recording import RUN_COLUMNS, runs_of
 from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
 from bayesrace.vehicles import get_car
-from learning.logs import dataset_from_log
-from operation.analysis.recording import RUN_COLUMNS, runs_of
 from tests import programs
 from tests.car_fmu import Version, packed_car
 from tests.driven import state

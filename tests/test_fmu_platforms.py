@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from fmpy import extract
 
+from bayesrace.codegen.compiler import find_compiler
+from bayesrace.codegen.fmu import car_fmu, pack
+from bayesrace.codegen.fmu.build import FLAGS, get_platform, host_platform
 from bayesrace.errors import InputError
 from bayesrace.vehicles import CarParameters
-from codegen.compiler import find_compiler
-from codegen.fmu import car_fmu, pack
-from codegen.fmu.build import FLAGS, get_platform, host_platform
 from tests.car_fmu import packed_car, unpacked_car
 from tests.fmu_exports import Version, built_in, commands, driven, slave
 from tests.fmu_master import Slave
@@ -67,7 +67,7 @@ def test_the_sources_rebuild_the_binary_with_the_line_they_state(
 def test_another_platform_needs_ziglang(
     car: CarParameters, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("codegen.fmu.build.find_spec", lambda name: None)
+    monkeypatch.setattr("bayesrace.codegen.fmu.build.find_spec", lambda name: None)
     host = host_platform().name
     other = "aarch64-linux" if host == "x86_64-linux" else "x86_64-linux"
     with pytest.raises(InputError, match=f"{other}.*pip install ziglang"):

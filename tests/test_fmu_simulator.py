@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from bayesrace.errors import InputError
+from bayesrace.plant.fmu.host import FmuHost
+from bayesrace.plant.fmu.inspection import inspect
+from bayesrace.plant.fmu.simulator import FmuSimulator, communication_step
+from bayesrace.plant.fmu.wiring import Link, Wiring
+from bayesrace.plant.vehicle import FmuFault
 from bayesrace.vehicles import get_car
-from plant.fmu.host import FmuHost
-from plant.fmu.inspection import inspect
-from plant.fmu.simulator import FmuSimulator, communication_step
-from plant.fmu.wiring import Link, Wiring
-from plant.vehicle import FmuFault
 from tests.faulty_fmu import (
     STATES,
     Mode,

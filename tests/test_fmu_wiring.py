@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
-from plant.fmu.map import wire
-from plant.fmu.map_file import parse_map
-from plant.fmu.wiring import Wiring
+from bayesrace.plant.fmu.map import wire
+from bayesrace.plant.fmu.map_file import parse_map
+from bayesrace.plant.fmu.wiring import Wiring
 from tests.fmu_variables import (
     STATE,
     TOLERANCE,

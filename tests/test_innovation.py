@@ -8,21 +8,21 @@ import pytest
 from rich.console import Console
 
 from bayesrace.arrays import Floats
+from bayesrace.controller.assembly import compiled_controller
+from bayesrace.controller.driver import Driver
+from bayesrace.controller.mpc import PredictiveController
+from bayesrace.controller.native_step import NativeStep
+from bayesrace.controller.settings import CompensationSettings, FallbackSettings, MpcSettings
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.integrators import PREDICTION
+from bayesrace.learning.validation import predictive_sigma
 from bayesrace.messages import State
+from bayesrace.operation.closed_loop import ClosedLoop, built_in_car
+from bayesrace.operation.preparation import prepare
+from bayesrace.operation.settings import RaceSettings
+from bayesrace.operation.terminal.progress import stages_on
 from bayesrace.vehicles import CarParameters
-from controller.assembly import compiled_controller
-from controller.driver import Driver
-from controller.mpc import PredictiveController
-from controller.native_step import NativeStep
-from controller.settings import CompensationSettings, FallbackSettings, MpcSettings
-from learning.validation import predictive_sigma
-from operation.closed_loop import ClosedLoop, built_in_car
-from operation.preparation import prepare
-from operation.settings import RaceSettings
-from operation.terminal.progress import stages_on
 from tests.conftest import CAUTIOUS, Circuit, ready
 from tests.cycle_rig import state
 

@@ -9,11 +9,11 @@ import pytest
 from hdrh.log import HistogramLogReader
 
 from bayesrace.errors import InputError
-from studies.latency.analysis import Beside, analyse
-from studies.latency.beside import bare_loop, bare_result
-from studies.latency.legs import ANSWER, LEGS
-from studies.latency.results import Series, new_histogram
-from studies.latency.settings import LatencySettings
+from bayesrace.studies.latency.analysis import Beside, analyse
+from bayesrace.studies.latency.beside import bare_loop, bare_result
+from bayesrace.studies.latency.legs import ANSWER, LEGS
+from bayesrace.studies.latency.results import Series, new_histogram
+from bayesrace.studies.latency.settings import LatencySettings
 from tests.synthetic_latency import PERIOD_NS, Loop, report_of
 
 

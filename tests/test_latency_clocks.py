@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from studies.latency.legs import ANSWER, ClockMap
+from bayesrace.studies.latency.legs import ANSWER, ClockMap
 from tests.synthetic_latency import PERIOD_NS, Loop, report_of
 
 delays = st.one_of(st.integers(0, 500_000), st.integers(0, 80_000_000))

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from bayesrace.studies.latency.analysis import Analysis, Beside, analyse
+from bayesrace.studies.latency.beside import bare_result
+from bayesrace.studies.latency.legs import BESIDE, LEGS
+from bayesrace.studies.latency.report import print_report, write_files
+from bayesrace.studies.latency.results import Memory, Series
+from bayesrace.studies.latency.settings import LatencySettings
 from bayesrace.transport import Endpoints
-from studies.latency.analysis import Analysis, Beside, analyse
-from studies.latency.beside import bare_result
-from studies.latency.legs import BESIDE, LEGS
-from studies.latency.report import print_report, write_files
-from studies.latency.results import Memory, Series
-from studies.latency.settings import LatencySettings
 from tests.synthetic_latency import PERIOD_NS, Loop
 
 

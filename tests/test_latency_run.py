@@ -19,15 +19,15 @@ from hdrh.log import HistogramLogReader
 from bayesrace.errors import InputError
 from bayesrace.log import LogReader
 from bayesrace.messages import STATE
+from bayesrace.operation.drive import RunPlan, run_request
+from bayesrace.operation.preparation import Prepared, prepare
+from bayesrace.operation.settings import PreparationSettings
+from bayesrace.operation.terminal.progress import stages_on
+from bayesrace.studies.latency.legs import BESIDE, LEGS
+from bayesrace.studies.latency.measure import _wait_for_run
+from bayesrace.studies.latency.results import new_histogram
 from bayesrace.tracks import Track
 from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
-from operation.drive import RunPlan, run_request
-from operation.preparation import Prepared, prepare
-from operation.settings import PreparationSettings
-from operation.terminal.progress import stages_on
-from studies.latency.legs import BESIDE, LEGS
-from studies.latency.measure import _wait_for_run
-from studies.latency.results import new_histogram
 from tests.command_line import Cli, refused
 from tests.programs import COMMAND, ROOT, environment, finish, leftovers, peanut, start, until
 from tests.shared import session_folder
@@ -322,7 +322,7 @@ def test_a_run_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
         )
     )
     _wait_for_run(director, "orca")
-    monkeypatch.setattr("studies.latency.measure._RUN_S", 0.0)
+    monkeypatch.setattr("bayesrace.studies.latency.measure._RUN_S", 0.0)
     with pytest.raises(InputError, match=r"plant: idle.*bayesrace drive --mode realtime"):
         _wait_for_run(director, "orca")
 

@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 
 from bayesrace.gp.weights import read_weights, write_weights, zero_weights
+from bayesrace.learning.sources import write_npz
 from bayesrace.vehicles.models import dynamic
-from learning.sources import write_npz
 from tests.driven import CAR, drive
 from tests.learning_rig import Rig, learn_arguments, record, rigged
 from tests.network.cars import Course, Program, gentle_course

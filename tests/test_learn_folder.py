@@ -11,11 +11,11 @@ import pytest
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import read_weights, zero_weights
 from bayesrace.integrators import PERFECT, PREDICTION
+from bayesrace.learning.dataset import concatenate
+from bayesrace.learning.subset import MOST_NEW
+from bayesrace.operation.learn.journal import MOST_WEIGHTS, Journal
+from bayesrace.operation.learn.records import LearnSettings, UpdateRecord
 from bayesrace.vehicles.models import dynamic
-from learning.dataset import concatenate
-from learning.subset import MOST_NEW
-from operation.learn.journal import MOST_WEIGHTS, Journal
-from operation.learn.records import LearnSettings, UpdateRecord
 from tests.driven import CAR, drive
 from tests.learning_rig import lap
 

@@ -12,11 +12,11 @@ from bayesrace.errors import InputError
 from bayesrace.gp.weights import decode_weights, zero_weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.messages import Event, Reply, Scalar
-from operation.learn import publishing
-from operation.learn.journal import Journal
-from operation.learn.publishing import Publisher
-from operation.learn.records import LapRecord, LearnSettings, Record, UpdateRecord
-from operation.learn.report import draw, print_laps, references
+from bayesrace.operation.learn import publishing
+from bayesrace.operation.learn.journal import Journal
+from bayesrace.operation.learn.publishing import Publisher
+from bayesrace.operation.learn.records import LapRecord, LearnSettings, Record, UpdateRecord
+from bayesrace.operation.learn.report import draw, print_laps, references
 from tests.driven import CAR, blank
 from tests.learning_rig import controller_status, lap
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from bayesrace.learning.dataset import Dataset
 from bayesrace.messages import Actuation, State
+from bayesrace.operation.learn import collector
+from bayesrace.operation.learn.collector import Collector, Stretch
 from bayesrace.tracks import Track
 from bayesrace.vehicles.models import dynamic
-from learning.dataset import Dataset
-from operation.learn import collector
-from operation.learn.collector import Collector, Stretch
 from tests.driven import CAR, STEP_S, blank, dataset_of, drive, logged, state, telemetry
 
 

@@ -23,17 +23,17 @@ from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights, decode_weights, write_weights, zero_weights
 from bayesrace.integrators import PERFECT, PREDICTION
+from bayesrace.learning.dataset import Dataset, concatenate
+from bayesrace.learning.residual import recalled
+from bayesrace.learning.sources import write_npz
+from bayesrace.learning.trainer import Outcome
 from bayesrace.messages import HEARTBEAT, STATE, Message, Reply, Role, State, Status, encode
+from bayesrace.operation.learn import collector, job, journal, publishing
+from bayesrace.operation.learn.publishing import Publisher
+from bayesrace.operation.learn.records import LearnSettings, Record
+from bayesrace.operation.learn.report import print_laps
 from bayesrace.transport import Endpoints, Inbox, Item, Kind
 from bayesrace.vehicles.models import dynamic
-from learning.dataset import Dataset, concatenate
-from learning.residual import recalled
-from learning.sources import write_npz
-from learning.trainer import Outcome
-from operation.learn import collector, job, journal, publishing
-from operation.learn.publishing import Publisher
-from operation.learn.records import LearnSettings, Record
-from operation.learn.report import print_laps
 from tests.driven import CAR, blank, drive, logged
 from tests.learning_rig import controller_status
 from tests.programs import until

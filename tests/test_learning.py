@@ -10,15 +10,15 @@ from bayesrace.errors import InputError
 from bayesrace.gp.expression import evaluate_mean
 from bayesrace.gp.weights import FEATURES, KERNELS, OUTPUTS, zero_weights
 from bayesrace.integrators import PREDICTION, Discretisation
+from bayesrace.learning.dataset import ROUNDING, Dataset, concatenate, filter_dataset
+from bayesrace.learning.likelihood import MarginalLikelihood, PairDistances, starts
+from bayesrace.learning.posterior import Covariance, Posterior
+from bayesrace.learning.residual import identity, residual
+from bayesrace.learning.settings import TrainingSettings
+from bayesrace.learning.subset import most_informative
+from bayesrace.learning.training import train
+from bayesrace.learning.validation import predictive_sigma, validate
 from bayesrace.vehicles.models import dynamic, e_kinematic
-from learning.dataset import ROUNDING, Dataset, concatenate, filter_dataset
-from learning.likelihood import MarginalLikelihood, PairDistances, starts
-from learning.posterior import Covariance, Posterior
-from learning.residual import identity, residual
-from learning.settings import TrainingSettings
-from learning.subset import most_informative
-from learning.training import train
-from learning.validation import predictive_sigma, validate
 from tests.conftest import discrete
 from tests.driven import CAR, QUICK, STEP_S, dataset_of, drive, logged, telemetry
 from tests.scikit import scikit_gp
@@ -255,7 +255,7 @@ def test_the_posterior_equals_scikit_learn(kind: str, monkeypatch: pytest.Monkey
     new, _ = gp_problem(15, seed=5)
     theta = np.log([2.0] + [1.5] * 6 + [0.02])
     mean, sigma = scikit_gp(kind, theta, z, y).predict(new, return_std=True)
-    monkeypatch.setattr("learning.posterior._AT_ONCE", 7)
+    monkeypatch.setattr("bayesrace.learning.posterior._AT_ONCE", 7)
     ours = Posterior(Covariance.of(kind, theta), z, y).predict(new)
     assert ours[0] == pytest.approx(mean, abs=1e-10)
     assert ours[1] == pytest.approx(sigma, abs=1e-10)

@@ -18,11 +18,11 @@ from bayesrace.limit import (
     read_limit,
     write_limit,
 )
+from bayesrace.operation.settings import RaceSettings
+from bayesrace.plant.simulator import Simulator, plant_discretisation
 from bayesrace.tracks import StartLine
 from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import command_limits, dynamic, top_command
-from operation.settings import RaceSettings
-from plant.simulator import Simulator, plant_discretisation
 from tests.command_line import Cli, refused
 from tests.test_raceline import circle, track_called
 

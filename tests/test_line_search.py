@@ -10,14 +10,14 @@ import pytest
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
+from bayesrace.learning.search import _surrogate, log_improvement, search
+from bayesrace.learning.settings import SearchSettings
+from bayesrace.operation.line_search import driven_lap
 from bayesrace.raceline import RaceLineSettings, read_raceline_for
 from bayesrace.raceline.friction import speed_profile
 from bayesrace.raceline.nodes import NodeLines, roughness
 from bayesrace.tracks import StartLine, load_track
 from bayesrace.vehicles import get_car
-from learning.search import _surrogate, log_improvement, search
-from learning.settings import SearchSettings
-from operation.line_search import driven_lap
 from tests.command_line import Cli, refused
 from tests.published_line import PUBLISHED, objective
 from tests.reference import reference_file

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from bayesrace.controller.assembly import compiled_controller
+from bayesrace.controller.native_step import StepStatus
 from bayesrace.gp.weights import read_weights
+from bayesrace.operation.closed_loop import drive_compiled
+from bayesrace.operation.preparation import prepare, updated_weights
+from bayesrace.operation.settings import PreparationSettings
+from bayesrace.operation.terminal.progress import stages_on
 from bayesrace.vehicles import default_car
-from controller.assembly import compiled_controller
-from controller.native_step import StepStatus
-from operation.closed_loop import drive_compiled
-from operation.preparation import prepare, updated_weights
-from operation.settings import PreparationSettings
-from operation.terminal.progress import stages_on
 
 
 @pytest.mark.check

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from bayesrace.arrays import Floats
+from bayesrace.controller.native_step import NativeStep
 from bayesrace.gp.weights import GpWeights, zero_weights
 from bayesrace.vehicles import CarParameters
-from controller.native_step import NativeStep
 from tests.conftest import SETTINGS, Circuit, Problem, native_numbers
 from tests.native_programs import (
     OPTIMISED,

@@ -11,8 +11,8 @@ from typing import Final
 
 import pytest
 
-from codegen.build import build, casadi_includes
-from codegen.settings import BuildSettings
+from bayesrace.codegen.build import build, casadi_includes
+from bayesrace.codegen.settings import BuildSettings
 
 pytestmark = pytest.mark.check
 

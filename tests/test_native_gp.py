@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from bayesrace.arrays import Floats
+from bayesrace.controller.native_step import NativeStep
+from bayesrace.controller.settings import MpcSettings
 from bayesrace.errors import InputError
 from bayesrace.gp.expression import corrected_function
 from bayesrace.gp.weights import KERNELS, GpWeights, zero_weights
 from bayesrace.integrators import PERFECT, PREDICTION
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic, e_kinematic
-from controller.native_step import NativeStep
-from controller.settings import MpcSettings
 from tests.conftest import LENGTH_SCALES, fit_weights, smooth_drive
 from tests.scikit import scikit_gp
 

@@ -6,15 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bayesrace.controller.native_step import NativeStep
+from bayesrace.controller.settings import MpcSettings
 from bayesrace.errors import InputError
 from bayesrace.gp.expression import corrected_function
 from bayesrace.gp.weights import KERNELS
 from bayesrace.integrators import PREDICTION
+from bayesrace.learning.validation import predictive_sigma
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import e_kinematic
-from controller.native_step import NativeStep
-from controller.settings import MpcSettings
-from learning.validation import predictive_sigma
 from tests.conftest import Problem, fit_weights
 from tests.test_native_gp import check, points
 from tests.test_native_time import Make, make, solve

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from bayesrace.arrays import Floats
+from bayesrace.controller.native_step import NativeStep
+from bayesrace.controller.path_table import PathTable, make_path_table
+from bayesrace.controller.settings import MpcSettings
 from bayesrace.errors import InputError
 from bayesrace.vehicles import CarParameters, default_car
-from controller.native_step import NativeStep
-from controller.path_table import PathTable, make_path_table
-from controller.settings import MpcSettings
 from tests.conftest import Circuit
 
 TS, HORIZON = 0.02, 20

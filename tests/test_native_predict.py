@@ -9,14 +9,14 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from bayesrace.arrays import Floats
+from bayesrace.codegen.stage import advance_function, linearise_function
+from bayesrace.controller.native_step import NativeStep
 from bayesrace.errors import InputError
 from bayesrace.gp.expression import mean_function
 from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import PERFECT, PREDICTION, Discretisation
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import MODELS, Model, dynamic, e_kinematic
-from codegen.stage import advance_function, linearise_function
-from controller.native_step import NativeStep
 from tests.conftest import SETTINGS, Problem, smooth_drive
 
 TS = 0.02

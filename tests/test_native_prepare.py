@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from bayesrace.arrays import Floats
+from bayesrace.controller.native_step import NativeStep
+from bayesrace.controller.settings import MpcSettings
 from bayesrace.gp.weights import GpWeights
 from bayesrace.vehicles import CarParameters
-from controller.native_step import NativeStep
-from controller.settings import MpcSettings
 from tests.conftest import SETTINGS, Circuit, Problem
 from tests.test_native_time import TS, Clock, Make, make, residual, solve
 

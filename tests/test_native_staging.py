@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from bayesrace.arrays import Floats
+from bayesrace.controller.native_step import NativeStep
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights, pack_weights
 from bayesrace.vehicles import CarParameters
-from controller.native_step import NativeStep
 from tests.conftest import SETTINGS, Circuit, Problem, fit_weights, mirrored_weights
 from tests.native_programs import OPTIMISED, PROGRAMS, native_program
 

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bayesrace.controller.native_step import NativeStep, StepStatus
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
 from bayesrace.vehicles import CarParameters
-from controller.native_step import NativeStep, StepStatus
 from tests.conftest import SETTINGS, Circuit, Problem
 
 

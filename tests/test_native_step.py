@@ -9,17 +9,17 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from bayesrace.arrays import Floats
+from bayesrace.codegen.build import problem_of
+from bayesrace.codegen.ocp import OcpNlp
+from bayesrace.codegen.settings import BuildSettings
+from bayesrace.controller.native_step import NativeStep, StepStatus
+from bayesrace.controller.path_table import make_path_table
+from bayesrace.controller.settings import MpcSettings
 from bayesrace.gp.expression import corrected_function
 from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import PERFECT, PREDICTION
 from bayesrace.vehicles import CarParameters, default_car
 from bayesrace.vehicles.models import dynamic, e_kinematic
-from codegen.build import problem_of
-from codegen.ocp import OcpNlp
-from codegen.settings import BuildSettings
-from controller.native_step import NativeStep, StepStatus
-from controller.path_table import make_path_table
-from controller.settings import MpcSettings
 from tests.conftest import (
     MIRROR_INPUT,
     MIRROR_STATE,

@@ -8,12 +8,12 @@ import pytest
 
 from bayesrace.errors import InputError
 from bayesrace.messages import Reply
+from bayesrace.operation.drive import RunPlan, run_request
+from bayesrace.operation.lifecycle import command, find, pick
+from bayesrace.operation.terminal.status_table import COUNTERS_SHOWN
 from bayesrace.raceline.line import write_raceline
 from bayesrace.tracks import write_track
 from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
-from operation.drive import RunPlan, run_request
-from operation.lifecycle import command, find, pick
-from operation.terminal.status_table import COUNTERS_SHOWN
 from tests.command_line import Cli, refused
 from tests.conftest import Circuit
 from tests.fake_processes import PATIENCE_S, Fakes, fakes, options, status_of, where

@@ -12,21 +12,21 @@ from rich.progress import TaskID
 
 from bayesrace.errors import InputError
 from bayesrace.integrators import PREDICTION
+from bayesrace.learning.likelihood import PairDistances, maximise, starts
+from bayesrace.learning.residual import residual
+from bayesrace.operation.settings import RaceSettings
+from bayesrace.operation.terminal.progress import Stage, stages_on
+from bayesrace.studies.paper import make
+from bayesrace.studies.paper import residual as learning
+from bayesrace.studies.paper.experiment import Experiment
+from bayesrace.studies.paper.finding import Finding, at_most
+from bayesrace.studies.paper.loop import line_section, published_line, tenth_section
+from bayesrace.studies.paper.models import model_section
+from bayesrace.studies.paper.residual import gains, kernel_section, smoothness
+from bayesrace.studies.paper.settings import DRIVES, PaperSettings
 from bayesrace.vehicles import CarParameters, builtin_cars, files, get_car
 from bayesrace.vehicles.models import dynamic
 from bayesrace.vehicles.tuning import PursuitTuning
-from learning.likelihood import PairDistances, maximise, starts
-from learning.residual import residual
-from operation.settings import RaceSettings
-from operation.terminal.progress import Stage, stages_on
-from studies.paper import make
-from studies.paper import residual as learning
-from studies.paper.experiment import Experiment
-from studies.paper.finding import Finding, at_most
-from studies.paper.loop import line_section, published_line, tenth_section
-from studies.paper.models import model_section
-from studies.paper.residual import gains, kernel_section, smoothness
-from studies.paper.settings import DRIVES, PaperSettings
 from tests.command_line import Cli, refused
 from tests.conftest import Circuit
 from tests.driven import CAR, drive

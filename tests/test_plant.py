@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bayesrace.codegen.compiler import Compiler, compiled
 from bayesrace.errors import InputError
 from bayesrace.integrators import Discretisation
+from bayesrace.plant.lockstep import LineCounter
+from bayesrace.plant.simulator import Simulator
 from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import dynamic
-from codegen.compiler import Compiler, compiled
-from plant.lockstep import LineCounter
-from plant.simulator import Simulator
 
 CAR = get_car("orca")
 SIMULATOR = Simulator(dynamic(CAR))
@@ -192,7 +192,7 @@ def test_without_a_compiler_the_equations_are_interpreted(
         raise InputError("no C compiler found")
 
     monkeypatch.setenv("BAYESRACE_CACHE", str(tmp_path))
-    monkeypatch.setattr("codegen.compiler.find_compiler", none)
+    monkeypatch.setattr("bayesrace.codegen.compiler.find_compiler", none)
     simulator = Simulator(dynamic(CAR), compiled=compiled)
     assert "no C compiler found" in caplog.text
     SIMULATOR.reset(START)

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from bayesrace.messages import Actuation, BrakingPlan, Decoder, RunRequest, State, Truth
+from bayesrace.plant.guard import GuardCounters
+from bayesrace.plant.run import Run, RunCounters
+from bayesrace.plant.vehicle import Vehicle, open_vehicle
 from bayesrace.transport import Inbox, Item, Kind, Numbering, Publisher
 from bayesrace.vehicles import get_car
-from plant.guard import GuardCounters
-from plant.run import Run, RunCounters
-from plant.vehicle import Vehicle, open_vehicle
 from tests.car_fmu import packed_car
 
 pytestmark = pytest.mark.wall_clock

@@ -10,11 +10,11 @@ from rich.console import Console
 
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
+from bayesrace.operation.preparation import Prepared, prepare
+from bayesrace.operation.settings import PreparationSettings
+from bayesrace.operation.terminal.progress import stages_on
 from bayesrace.raceline import RaceLineSettings
 from bayesrace.tracks import Track
-from operation.preparation import Prepared, prepare
-from operation.settings import PreparationSettings
-from operation.terminal.progress import stages_on
 from tests.car_fmu import packed_car
 from tests.conftest import offset_line
 
@@ -39,7 +39,7 @@ def preparing(
         return offset_line(track, 0.01, 5.0, 2.5)
 
     monkeypatch.setattr("bayesrace.raceline.compute_raceline", compute)
-    monkeypatch.setattr("learning.training.train", lambda *_: weights)
+    monkeypatch.setattr("bayesrace.learning.training.train", lambda *_: weights)
 
     def run(**changes: object) -> tuple[Prepared, list[str]]:
         console = Console(file=io.StringIO(), width=200)
@@ -72,8 +72,8 @@ def test_a_second_preparation_computes_nothing_and_says_so(
         raise AssertionError("computed again")
 
     for name in (
-        "bayesrace.raceline.compute_raceline", "operation.preparation.collect",
-        "learning.training.train",
+        "bayesrace.raceline.compute_raceline", "bayesrace.operation.preparation.collect",
+        "bayesrace.learning.training.train",
     ):  # fmt: skip
         monkeypatch.setattr(name, never)
     again, stages = preparing()

@@ -12,14 +12,22 @@ import numpy as np
 import pytest
 
 from bayesrace.arrays import Floats
+from bayesrace.codegen.build import build
+from bayesrace.codegen.ocp import OcpNlp
+from bayesrace.codegen.problems.problem import (
+    NO_BOUND,
+    Input,
+    Parameter,
+    Problem,
+    Row,
+    State,
+    Symbols,
+)
+from bayesrace.codegen.settings import BuildSettings
+from bayesrace.codegen.stage import linearised
+from bayesrace.controller.native_step import NativeProblem, StepStatus
 from bayesrace.errors import InputError
 from bayesrace.integrators import Discretisation
-from codegen.build import build
-from codegen.ocp import OcpNlp
-from codegen.problems.problem import NO_BOUND, Input, Parameter, Problem, Row, State, Symbols
-from codegen.settings import BuildSettings
-from codegen.stage import linearised
-from controller.native_step import NativeProblem, StepStatus
 
 HORIZON, STEP_S, CAPACITY = 12, 0.15, 24
 VALUES = {

@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 
 from bayesrace.arrays import Floats
+from bayesrace.codegen.build import build, problem_of
+from bayesrace.codegen.ocp import OcpNlp
+from bayesrace.codegen.settings import BuildSettings
+from bayesrace.controller.interface import NO_LIMITS, Environment
+from bayesrace.controller.native_step import NativeStep, StepStatus
+from bayesrace.controller.path_table import PathTable, make_path_table
+from bayesrace.controller.settings import MpcSettings
 from bayesrace.gp.expression import corrected_function
 from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import PREDICTION
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic, e_kinematic
-from codegen.build import build, problem_of
-from codegen.ocp import OcpNlp
-from codegen.settings import BuildSettings
-from controller.interface import NO_LIMITS, Environment
-from controller.native_step import NativeStep, StepStatus
-from controller.path_table import PathTable, make_path_table
-from controller.settings import MpcSettings
 from tests.conftest import SETTINGS, Circuit, discrete, offset_line
 from tests.test_native_planner import nearest
 from tests.test_native_prepare import Between, change_weights, reset, result

@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bayesrace.codegen.build import build
+from bayesrace.codegen.settings import BuildSettings
+from bayesrace.controller.pure_pursuit import PurePursuit, PurePursuitSettings
+from bayesrace.controller.python_controller import PythonController
 from bayesrace.errors import InputError
+from bayesrace.operation.closed_loop import ClosedLoop, Driven
+from bayesrace.plant.simulator import Simulator
 from bayesrace.tracks import DEFAULT_TRAINING_TRACK, Track, load_track
 from bayesrace.vehicles import default_car
 from bayesrace.vehicles.models import dynamic
-from codegen.build import build
-from codegen.settings import BuildSettings
-from controller.pure_pursuit import PurePursuit, PurePursuitSettings
-from controller.python_controller import PythonController
-from operation.closed_loop import ClosedLoop, Driven
-from plant.simulator import Simulator
 from tests.conftest import offset_line
 
 CAR = default_car()

@@ -15,19 +15,19 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from bayesrace.codegen.build import build
+from bayesrace.codegen.settings import BuildSettings
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import read_weights, write_weights
+from bayesrace.operation import race as driving
+from bayesrace.operation.analysis.race import analyse
+from bayesrace.operation.analysis.results import RaceResult, read_result
+from bayesrace.operation.drive import RunPlan
+from bayesrace.operation.preparation import Prepared, prepare, updated_weights
+from bayesrace.operation.settings import RaceSettings
+from bayesrace.operation.terminal.progress import stages_on
 from bayesrace.raceline import read_raceline, write_raceline
 from bayesrace.vehicles import default_car, read_car, write_car
-from codegen.build import build
-from codegen.settings import BuildSettings
-from operation import race as driving
-from operation.analysis.race import analyse
-from operation.analysis.results import RaceResult, read_result
-from operation.drive import RunPlan
-from operation.preparation import Prepared, prepare, updated_weights
-from operation.settings import RaceSettings
-from operation.terminal.progress import stages_on
 from tests.car_fmu import packed_car
 from tests.command_line import Cli, refused
 from tests.foreign_fmu import FOREIGN_MAP, build_foreign_fmu

@@ -14,18 +14,18 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
-import controller.cycle
-import controller.process
-import controller.service
+import bayesrace.controller.cycle
+import bayesrace.controller.process
+import bayesrace.controller.service
 from bayesrace.arrays import Floats
+from bayesrace.controller.interface import Environment, StepOutput
+from bayesrace.controller.process import ControllerProcess, ControllerSettings
+from bayesrace.controller.python_controller import PythonController
+from bayesrace.controller.weights.adoption import Adoption, Offer
+from bayesrace.controller.weights.settings import GateSettings
 from bayesrace.messages import Actuation, State, Telemetry, decode, encode
 from bayesrace.transport import Item, Kind, inbox, publisher
 from bayesrace.vehicles import get_car
-from controller.interface import Environment, StepOutput
-from controller.process import ControllerProcess, ControllerSettings
-from controller.python_controller import PythonController
-from controller.weights.adoption import Adoption, Offer
-from controller.weights.settings import GateSettings
 from tests.cycle_rig import ScriptedLaw, state
 
 MS = 1_000_000
@@ -158,10 +158,10 @@ Make = Callable[..., Loop]
 def loop(kinematic_artefact: Path, monkeypatch: pytest.MonkeyPatch) -> Make:
     """Makes a loop in simulated time."""
     clock = Clock()
-    modules = controller.process, controller.cycle, controller.service
+    modules = bayesrace.controller.process, bayesrace.controller.cycle, bayesrace.controller.service
     for module in (*modules, inbox, publisher):
         monkeypatch.setattr(module, "time", clock)
-    monkeypatch.setattr(controller.process, "sleep_until_ns", clock.sleep_until_ns)
+    monkeypatch.setattr(bayesrace.controller.process, "sleep_until_ns", clock.sleep_until_ns)
     return lambda **settings: Loop(kinematic_artefact, clock=clock, **settings)
 
 

@@ -13,12 +13,12 @@ import pytest
 from rich.console import Console
 
 from bayesrace.integrators import PREDICTION
+from bayesrace.learning.dataset import Dataset, concatenate, filter_dataset
+from bayesrace.learning.sources import dataset_from_npz
+from bayesrace.learning.training import train
+from bayesrace.learning.validation import Validation, validate
+from bayesrace.operation.terminal.learning_table import print_beyond_limits
 from bayesrace.vehicles import get_car
-from learning.dataset import Dataset, concatenate, filter_dataset
-from learning.sources import dataset_from_npz
-from learning.training import train
-from learning.validation import Validation, validate
-from operation.terminal.learning_table import print_beyond_limits
 from tests.command_line import Cli
 from tests.reference import reference_file
 

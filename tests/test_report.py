@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from operation.analysis.published import compare_gp, compare_laps
-from operation.analysis.race import analyse, read_race
-from operation.analysis.results import RaceResult
-from operation.report import render, write_report
-from operation.report.maps import LapMaps
-from operation.terminal.race_table import COLUMNS
+from bayesrace.operation.analysis.published import compare_gp, compare_laps
+from bayesrace.operation.analysis.race import analyse, read_race
+from bayesrace.operation.analysis.results import RaceResult
+from bayesrace.operation.report import render, write_report
+from bayesrace.operation.report.maps import LapMaps
+from bayesrace.operation.terminal.race_table import COLUMNS
 from tests.command_line import Cli, refused
 from tests.synthetic_race import LAP_S, Drive, circle, write_race
 from tests.test_analysis import TWO_LAPS, race
@@ -202,7 +202,7 @@ def test_names_from_files_are_text_not_markup(tmp_path: Path) -> None:
 
 def test_time_lost_along_the_track_is_known(tmp_path: Path) -> None:
     """A car that is 1 % slower everywhere loses evenly."""
-    from operation.report.traces import first_laps, reference_of
+    from bayesrace.operation.report.traces import first_laps, reference_of
 
     drives = [
         Drive("bayesrace", circle(TWO_LAPS / 1.01, 1.0)),
@@ -227,7 +227,7 @@ def test_nothing_but_tables_is_wider_than_a_telephone(rendered: tuple[Path, Race
 
 
 def test_a_car_that_wanders_off_does_not_shrink_the_track(tmp_path: Path) -> None:
-    from operation.report.style import figure_style
+    from bayesrace.operation.report.style import figure_style
 
     far = circle(TWO_LAPS[:100], np.linspace(1.0, 50.0, 100))
     analysis = read_race(write_race(tmp_path, [Drive("worstcase", far)]))

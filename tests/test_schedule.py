@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller.schedule import Schedule
+from bayesrace.controller.schedule import Schedule
 
 MS = 1_000_000
 

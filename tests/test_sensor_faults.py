@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from bayesrace.controller.assembly import compiled_controller
+from bayesrace.controller.driver import Level
 from bayesrace.messages import State
+from bayesrace.operation.closed_loop import ClosedLoop, Driven, built_in_car
+from bayesrace.plant.settings import SensorNoise
 from bayesrace.vehicles import get_car
-from controller.assembly import compiled_controller
-from controller.driver import Level
-from operation.closed_loop import ClosedLoop, Driven, built_in_car
-from plant.settings import SensorNoise
 from tests.racing import Racing, racing
 
 STEP_S = 0.02

@@ -15,11 +15,11 @@ from vehiclemodels.vehicle_parameters import VehicleParameters
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
+from bayesrace.plant.guard import PlantGuard
+from bayesrace.plant.simulator import Simulator
 from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import dynamic, e_kinematic, top_command
 from bayesrace.vehicles.parts import LinearTyres
-from plant.guard import PlantGuard
-from plant.simulator import Simulator
 from tests.cars import with_numbers
 
 CAR = get_car("f1tenth")

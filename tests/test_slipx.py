@@ -10,11 +10,11 @@ pytest.importorskip("slipx", reason="there are no wheels of slipx for this Pytho
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
+from bayesrace.operation.analysis.results import read_result
+from bayesrace.operation.settings import RaceSettings
+from bayesrace.plant.slipx_car import SlipxSimulator
+from bayesrace.plant.vehicle import FmuFault, open_vehicle
 from bayesrace.vehicles import get_car
-from operation.analysis.results import read_result
-from operation.settings import RaceSettings
-from plant.slipx_car import SlipxSimulator
-from plant.vehicle import FmuFault, open_vehicle
 from tests.command_line import Cli, refused
 from tests.programs import Race
 

@@ -10,10 +10,10 @@ import pytest
 from rich.console import Console
 
 from bayesrace.errors import InputError
+from bayesrace.operation.analysis.network_status import NetworkStatus, ProcessStatus
+from bayesrace.operation.lifecycle import follow
+from bayesrace.operation.terminal.status_table import StatusTable
 from bayesrace.transport import Endpoints, free_endpoint, open_session
-from operation.analysis.network_status import NetworkStatus, ProcessStatus
-from operation.lifecycle import follow
-from operation.terminal.status_table import StatusTable
 from tests import sample_messages as messages
 from tests.command_line import Cli, refused
 from tests.fake_processes import COUNTERS, PATIENCE_S, Fakes, fakes, options, status_of, where
@@ -169,7 +169,7 @@ def test_watching_on_a_terminal_redraws_and_sees_coming_and_going(fakes: Fakes) 
     controlling, terminal = os.openpty()
     env = {**environment(), "TERM": "xterm", "COLUMNS": "150", "LINES": "40"}
     process = subprocess.Popen(
-        [sys.executable, "-m", "operation.cli", "status", "--watch", *options(one)],
+        [sys.executable, "-m", "bayesrace.operation.cli", "status", "--watch", *options(one)],
         stdin=terminal, stdout=terminal, stderr=terminal, env=env, cwd=ROOT,
     )  # fmt: skip
     os.close(terminal)

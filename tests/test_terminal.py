@@ -5,8 +5,8 @@ import logging
 
 from rich.table import Table
 
-from operation.terminal.printable import PrintableFormatter
-from operation.terminal.terminal import Terminal
+from bayesrace.operation.terminal.printable import PrintableFormatter
+from bayesrace.operation.terminal.terminal import Terminal
 
 EVIL = "a\x1b[2Jb\x07c"
 

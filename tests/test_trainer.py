@@ -14,13 +14,13 @@ import pytest
 from bayesrace.gp.expression import evaluate_mean
 from bayesrace.gp.weights import GpWeights, write_weights, zero_weights
 from bayesrace.integrators import PREDICTION
+from bayesrace.learning.dataset import Dataset, concatenate
+from bayesrace.learning.residual import recalled, residual
+from bayesrace.learning.settings import TrainingSettings
+from bayesrace.learning.subset import MOST_NEW, bounded
+from bayesrace.learning.trainer import NICE, Outcome, Trainer, perform
+from bayesrace.learning.training import train
 from bayesrace.vehicles.models import dynamic
-from learning.dataset import Dataset, concatenate
-from learning.residual import recalled, residual
-from learning.settings import TrainingSettings
-from learning.subset import MOST_NEW, bounded
-from learning.trainer import NICE, Outcome, Trainer, perform
-from learning.training import train
 from tests.driven import CAR, QUICK, drive
 from tests.programs import until
 
@@ -155,7 +155,7 @@ def test_training_is_a_niced_process_that_may_die_or_hang(
         died = outcome_of(trainer)
         assert (died.error, died.kept) == ("the training was killed by signal 9", None)
         os.kill(start(), signal.SIGSTOP)
-        monkeypatch.setattr("learning.trainer._LONGEST_S", 0.5)
+        monkeypatch.setattr("bayesrace.learning.trainer._LONGEST_S", 0.5)
         assert "no result after 0 s and was killed" in outcome_of(trainer).error
         monkeypatch.undo()
         start()

@@ -18,15 +18,15 @@ from bayesrace.errors import InputError
 from bayesrace.gp.expression import evaluate_mean
 from bayesrace.gp.weights import KERNELS, OUTPUTS, decode_weights, encode_weights
 from bayesrace.integrators import PREDICTION, Discretisation
+from bayesrace.learning.dataset import Dataset, concatenate
+from bayesrace.learning.likelihood import BOUNDS, Fit, PairDistances, maximise, refine, starts
+from bayesrace.learning.posterior import Covariance
+from bayesrace.learning.residual import discretisation_of, identity, residual
+from bayesrace.learning.subset import stretches
+from bayesrace.learning.target import PredictionErrors, Target
+from bayesrace.learning.training import MAX_SAMPLES, Training, fit, train
+from bayesrace.learning.validation import predictive_sigma, validate
 from bayesrace.vehicles.models import dynamic, e_kinematic
-from learning.dataset import Dataset, concatenate
-from learning.likelihood import BOUNDS, Fit, PairDistances, maximise, refine, starts
-from learning.posterior import Covariance
-from learning.residual import discretisation_of, identity, residual
-from learning.subset import stretches
-from learning.target import PredictionErrors, Target
-from learning.training import MAX_SAMPLES, Training, fit, train
-from learning.validation import predictive_sigma, validate
 from tests.driven import CAR, QUICK, STEP_S, drive
 from tests.scikit import correlation
 
@@ -120,7 +120,7 @@ def test_training_that_is_interrupted_begins_nothing_more(
         interruption.set()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("learning.training.maximise", counted)
+    monkeypatch.setattr("bayesrace.learning.training.maximise", counted)
     settings = QUICK.model_copy(update={"restarts": 10, "threads": 1})
     with pytest.raises(KeyboardInterrupt):
         fit(driven, PREDICTION, settings, progress=interrupted)
@@ -195,7 +195,7 @@ def test_weights_are_reproducible_and_named_by_content_not_by_time_and_program(
     driven: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = train(driven, PREDICTION, QUICK)
-    monkeypatch.setattr("learning.training.__version__", "9.9")
+    monkeypatch.setattr("bayesrace.learning.training.__version__", "9.9")
     again = train(driven, PREDICTION, QUICK)
     assert again.program == "bayesrace 9.9"
     assert again.version == first.version

@@ -15,13 +15,13 @@ from msgspec.structs import replace
 
 from bayesrace.errors import InputError
 from bayesrace.integrators import PREDICTION, Discretisation
+from bayesrace.learning.dataset import Dataset
+from bayesrace.learning.logs import dataset_from_log, log_facts
+from bayesrace.learning.sources import dataset_from_npz, read_samples, write_npz
 from bayesrace.log import LogReader, LogWriter
 from bayesrace.messages import encode
 from bayesrace.vehicles import car_text
 from bayesrace.vehicles.models import dynamic
-from learning.dataset import Dataset
-from learning.logs import dataset_from_log, log_facts
-from learning.sources import dataset_from_npz, read_samples, write_npz
 from tests.driven import CAR, STEP_S, drive, telemetry, write_log
 
 
@@ -130,7 +130,7 @@ def test_arrays_too_large_are_refused_unread(tmp_path: Path, driven: Dataset) ->
     """A small archive may unpack to more than there is memory."""
     path = save(tmp_path / "x.npz", driven)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("learning.sources.MAX_BYTES", 1000)
+        patch.setattr("bayesrace.learning.sources.MAX_BYTES", 1000)
         with pytest.raises(InputError, match="split it"):
             dataset_from_npz(path)
 

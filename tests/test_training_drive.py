@@ -11,18 +11,18 @@ import pytest
 from rich.console import Console
 
 from bayesrace.arrays import Floats
+from bayesrace.codegen.build import build
+from bayesrace.codegen.settings import BuildSettings
+from bayesrace.controller import pure_pursuit
+from bayesrace.controller.pure_pursuit import DrivingStyle, PurePursuitSettings
+from bayesrace.operation.analysis.race import analyse
+from bayesrace.operation.closed_loop import Driven, built_in_car
+from bayesrace.operation.collect import collect, drive_length_s, training_line, training_margin_m
+from bayesrace.operation.report import write_report
+from bayesrace.operation.terminal.race_table import print_table
 from bayesrace.raceline import RaceLine, write_raceline
 from bayesrace.tracks import Track, load_track, write_track
 from bayesrace.vehicles import get_car
-from codegen.build import build
-from codegen.settings import BuildSettings
-from controller import pure_pursuit
-from controller.pure_pursuit import DrivingStyle, PurePursuitSettings
-from operation.analysis.race import analyse
-from operation.closed_loop import Driven, built_in_car
-from operation.collect import collect, drive_length_s, training_line, training_margin_m
-from operation.report import write_report
-from operation.terminal.race_table import print_table
 from tests.command_line import Cli
 from tests.conftest import offset_line
 from tests.synthetic_race import Drive, circle, write_race

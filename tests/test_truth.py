@@ -8,21 +8,21 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bayesrace.controller.pure_pursuit import PurePursuit, PurePursuitSettings
+from bayesrace.controller.python_controller import PythonController
 from bayesrace.gp.weights import zero_weights
 from bayesrace.integrators import PREDICTION
+from bayesrace.learning.logs import dataset_from_log
+from bayesrace.learning.residual import identity
 from bayesrace.log import LogReader, LogWriter
 from bayesrace.messages import STATE, TRUTH, State, Truth
+from bayesrace.operation.analysis.race import analyse, read_race
+from bayesrace.operation.analysis.results import RaceResult
+from bayesrace.operation.analysis.validation import validate_weights
+from bayesrace.operation.closed_loop import ClosedLoop, Driven
+from bayesrace.plant.lockstep import Sensors
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
-from controller.pure_pursuit import PurePursuit, PurePursuitSettings
-from controller.python_controller import PythonController
-from learning.logs import dataset_from_log
-from learning.residual import identity
-from operation.analysis.race import analyse, read_race
-from operation.analysis.results import RaceResult
-from operation.analysis.validation import validate_weights
-from operation.closed_loop import ClosedLoop, Driven
-from plant.lockstep import Sensors
 from tests.conftest import Circuit
 from tests.driven import CAR, STEP_S, drive, write_log
 from tests.synthetic_race import LAP_S, Drive, circle, write_race

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from bayesrace.arrays import Floats
+from bayesrace.controller.interface import Environment
+from bayesrace.controller.native_step import NativeStep
+from bayesrace.controller.path_table import make_path_table
 from bayesrace.tracks import Track
 from bayesrace.vehicles import CarParameters, default_car
-from controller.interface import Environment
-from controller.native_step import NativeStep
-from controller.path_table import make_path_table
 from tests.conftest import SETTINGS, Circuit, offset_line
 from tests.test_driver import Rig
 

@@ -13,15 +13,15 @@ from bayesrace.errors import InputError
 from bayesrace.gp.expression import corrected_function
 from bayesrace.gp.weights import OUTPUTS, GpWeights, read_weights, write_weights, zero_weights
 from bayesrace.integrators import PREDICTION, Discretisation
+from bayesrace.learning.dataset import Dataset, concatenate
+from bayesrace.learning.residual import identity
+from bayesrace.learning.sources import write_npz
+from bayesrace.learning.target import KernelScore
+from bayesrace.learning.training import train
+from bayesrace.learning.validation import mismatch, unbroken, validate
+from bayesrace.operation.analysis.validation import ValidationResult, validate_weights
+from bayesrace.operation.terminal.learning_table import print_kernels, print_validation
 from bayesrace.vehicles.models import dynamic, e_kinematic
-from learning.dataset import Dataset, concatenate
-from learning.residual import identity
-from learning.sources import write_npz
-from learning.target import KernelScore
-from learning.training import train
-from learning.validation import mismatch, unbroken, validate
-from operation.analysis.validation import ValidationResult, validate_weights
-from operation.terminal.learning_table import print_kernels, print_validation
 from tests.command_line import Cli, refused
 from tests.driven import CAR, QUICK, STEP_S, drive, write_log
 

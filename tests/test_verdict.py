@@ -12,13 +12,13 @@ import pytest
 from msgspec.structs import replace
 
 from bayesrace.columns import columns_of
+from bayesrace.controller.driver import Level
+from bayesrace.learning.logs import CYCLES
 from bayesrace.log import LogWriter
 from bayesrace.messages import Telemetry
-from controller.driver import Level
-from learning.logs import CYCLES
-from operation.analysis.laps import LapTimes
-from operation.analysis.verdict import Cycles, judge, judge_log
-from operation.closed_loop import ClosedLoop
+from bayesrace.operation.analysis.laps import LapTimes
+from bayesrace.operation.analysis.verdict import Cycles, judge, judge_log
+from bayesrace.operation.closed_loop import ClosedLoop
 from tests.driven import telemetry
 from tests.racing import racing
 

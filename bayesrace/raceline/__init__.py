@@ -75,7 +75,7 @@ def raceline_file(track: Track, car: CarParameters, settings: RaceLineSettings) 
 
 def optimised_identity(track: Track, car: CarParameters, settings: BaseModel) -> str:
     """Digest of all that shapes a racing line or a limit of a car on a track."""
-    sources = [f"bayesrace/{part}" for part in ("vehicles", "tracks", "raceline", "limit")]
+    sources = ("vehicles", "tracks", "raceline", "limit")
     inputs = [car.model_dump_json(), settings.model_dump_json(), track.identity]
     # The last bits depend on the processor.
     return digest([*inputs, cpu_identity(), *software(sources, ("casadi", "numpy"))])

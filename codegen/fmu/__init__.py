@@ -9,9 +9,9 @@ In ``native``, ``fmu.h`` says what the C of a model implements; ``fmu.c`` and ``
 ``fmi3.c`` are the same for every model.
 """
 
-from codegen.fmu.archive import exchange_weights, pack
-from codegen.fmu.car import car_fmu
-from codegen.fmu.controller import controller_fmu
-from codegen.fmu.definition import FmuDefinition, Variable
+from bayesrace.codegen.fmu.archive import exchange_weights, pack
+from bayesrace.codegen.fmu.car import car_fmu
+from bayesrace.codegen.fmu.controller import controller_fmu
+from bayesrace.codegen.fmu.definition import FmuDefinition, Variable
 
 __all__ = ["FmuDefinition", "Variable", "car_fmu", "controller_fmu", "exchange_weights", "pack"]

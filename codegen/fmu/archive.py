@@ -19,10 +19,7 @@ from typing import Any, Final, NamedTuple
 import pint
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from bayesrace.errors import InputError
-from bayesrace.files import replacing
-from bayesrace.gp.weights import GpWeights
-from codegen.fmu.build import (
+from bayesrace.codegen.fmu.build import (
     FLAGS,
     PLATFORMS,
     Platform,
@@ -34,8 +31,11 @@ from codegen.fmu.build import (
     sources_of,
     write_sources,
 )
-from codegen.fmu.definition import FmuDefinition, Variable
-from codegen.host_files import HEAD, IDENTITY_BYTES, WEIGHTS_FILE, weights_file
+from bayesrace.codegen.fmu.definition import FmuDefinition, Variable
+from bayesrace.codegen.host_files import HEAD, IDENTITY_BYTES, WEIGHTS_FILE, weights_file
+from bayesrace.errors import InputError
+from bayesrace.files import replacing
+from bayesrace.gp.weights import GpWeights
 
 __all__ = ["exchange_weights", "licence_files", "pack", "third_parties"]
 

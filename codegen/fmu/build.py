@@ -16,10 +16,10 @@ from uuid import UUID
 
 import fmpy
 
+from bayesrace.codegen.compiler import Compiler, find_compiler
+from bayesrace.codegen.fmu.definition import NATIVE, FmuDefinition, Variable
 from bayesrace.errors import InputError
 from bayesrace.interpreter import RUN_MODULE
-from codegen.compiler import Compiler, find_compiler
-from codegen.fmu.definition import NATIVE, FmuDefinition, Variable
 
 __all__ = [
     "FLAGS", "PLATFORMS", "Platform", "arguments", "fmi_headers", "get_platform", "host_platform",

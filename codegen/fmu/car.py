@@ -1,7 +1,7 @@
 """The car as an FMU: the plant's own equations and guard, in C (``native/car.c``).
 
-Co-Simulation does what :class:`plant.simulator.Simulator` does in a period, with the communication
-step as the period; Model Exchange gives the bare equations of the dynamic model.
+Co-Simulation does what :class:`bayesrace.plant.simulator.Simulator` does in a period, with the
+communication step as the period; Model Exchange gives the bare equations of the dynamic model.
 """
 
 import re
@@ -13,13 +13,13 @@ from typing import Any, Final, Literal
 
 import casadi as ca
 
+from bayesrace.codegen.fmu.definition import NATIVE, FmuDefinition, Variable
 from bayesrace.errors import InputError
 from bayesrace.integrators import PLANT_SCHEME, PLANT_SUBSTEP_HZ, SCHEMES
 from bayesrace.vehicles import models
 from bayesrace.vehicles.models import INPUTS, STATES
 from bayesrace.vehicles.parameters import CarParameters
 from bayesrace.vehicles.parts import LinearTyres, Pacejka
-from codegen.fmu.definition import NATIVE, FmuDefinition, Variable
 
 __all__ = ["STATE", "car_fmu"]
 

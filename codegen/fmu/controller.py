@@ -11,16 +11,16 @@ from typing import Any, Final, Literal
 
 from numpy.typing import ArrayLike
 
+from bayesrace.codegen.build import HOST
+from bayesrace.codegen.compiler import FLAGS
+from bayesrace.codegen.fmu.car import STATE
+from bayesrace.codegen.fmu.definition import NATIVE, FmuDefinition, Variable
+from bayesrace.codegen.host_files import PATH_FILE, WEIGHTS_FILE, path_file, weights_file
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
 from bayesrace.manifest import Manifest, read_manifest
 from bayesrace.vehicles.parameters import CarParameters
 from bayesrace.vehicles.parts import Drive
-from codegen.build import HOST
-from codegen.compiler import FLAGS
-from codegen.fmu.car import STATE
-from codegen.fmu.definition import NATIVE, FmuDefinition, Variable
-from codegen.host_files import PATH_FILE, WEIGHTS_FILE, path_file, weights_file
 
 __all__ = ["controller_fmu"]
 
@@ -80,13 +80,14 @@ def controller_fmu(
     weights: GpWeights | None = None,
     version: Literal[2, 3] = 3,
 ) -> FmuDefinition:
-    """The controller of a built artefact on one racing line, ready for :func:`codegen.fmu.pack`.
+    """The controller of a built artefact on one racing line, ready for
+    :func:`bayesrace.codegen.fmu.pack`.
 
-    ``rows`` (n, 7), ``spacing_m``: the table of ``controller.path_table``; ``settings``: the
-    parameters of problem and solver (``controller.settings.MpcSettings.parameters``); ``fallback``:
-    the fields of ``FallbackSettings``; both become start values of parameters. Built by the same
-    compiler, it gives the bits of the artefact's own library on the same processor. InputError for
-    an artefact of another car, foreign weights, a bad table.
+    ``rows`` (n, 7), ``spacing_m``: the table of ``bayesrace.controller.path_table``; ``settings``:
+    the parameters of problem and solver (``bayesrace.controller.settings.MpcSettings.parameters``);
+    ``fallback``: the fields of ``FallbackSettings``; both become start values of parameters. Built
+    by the same compiler, it gives the bits of the artefact's own library on the same processor.
+    InputError for an artefact of another car, foreign weights, a bad table.
     """
     manifest = read_manifest(artefact)
     manifest.check_car(car, artefact)

@@ -53,7 +53,7 @@ TIME: Final = Variable("time", "independent", "simulation time", unit="s")
 
 @dataclass(frozen=True, kw_only=True)
 class FmuDefinition:
-    """An FMU of FMI 2.0 or 3.0, ready for :func:`codegen.fmu.pack`.
+    """An FMU of FMI 2.0 or 3.0, ready for :func:`bayesrace.codegen.fmu.pack`.
 
     ``name``: shown to people; ``identifier``: of the binaries, in C; ``description``: one line.
     """

@@ -1,1 +1,1 @@
-"""Control problems: one module each; :mod:`codegen.problems.problem` says what one consists of."""
+"""Control problems: one module each; :mod:`.problem` says what one consists of."""

@@ -13,12 +13,12 @@ from collections.abc import Callable
 
 import casadi as ca
 
+from bayesrace.codegen.problems.problem import Input, Parameter, Problem, Row, State, Symbols
+from bayesrace.codegen.stage import advance_function, linearise_function
 from bayesrace.integrators import Discretisation
 from bayesrace.vehicles.models import STATES, Model, top_command
 from bayesrace.vehicles.parameters import CarParameters
 from bayesrace.vehicles.tuning import Tuning
-from codegen.problems.problem import Input, Parameter, Problem, Row, State, Symbols
-from codegen.stage import advance_function, linearise_function
 
 __all__ = ["REFERENCE", "StateCost", "driving_problem"]
 

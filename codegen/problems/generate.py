@@ -7,7 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from codegen.problems.problem import Parameter, Problem
+from bayesrace.codegen.problems.problem import Parameter, Problem
 
 __all__ = ["c_header", "functions"]
 

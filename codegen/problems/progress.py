@@ -10,16 +10,16 @@ that of Liniger, Domahidi and Morari ("Optimization-based autonomous racing of 1
 takes for a metre of the car's way at distance n from it: what is maximised is the time on the line
 that the car gets ahead by within the horizon. That cost is linear where it counts, so the QP is
 kept near the plan by a proximal term. A stage with ``follows = 0``, for a stop or a turn, tracks
-the point (x, y) as :mod:`codegen.problems.tracking` does; :mod:`codegen.problems.driving` has the
-rest.
+the point (x, y) as :mod:`bayesrace.codegen.problems.tracking` does;
+:mod:`bayesrace.codegen.problems.driving` has the rest.
 """
 
 import casadi as ca
 
+from bayesrace.codegen.problems.driving import driving_problem
+from bayesrace.codegen.problems.problem import Parameter, Problem
 from bayesrace.integrators import Discretisation
 from bayesrace.vehicles.models import Model
-from codegen.problems.driving import driving_problem
-from codegen.problems.problem import Parameter, Problem
 
 __all__ = ["progress"]
 

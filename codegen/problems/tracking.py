@@ -1,14 +1,14 @@
 """Tracking of a racing line, equation (8) of the paper: l_states = q |p_k - p_ref,k|^2.
 
-The rest is in :mod:`codegen.problems.driving`.
+The rest is in :mod:`bayesrace.codegen.problems.driving`.
 """
 
 import casadi as ca
 
+from bayesrace.codegen.problems.driving import driving_problem
+from bayesrace.codegen.problems.problem import Problem
 from bayesrace.integrators import Discretisation
 from bayesrace.vehicles.models import Model
-from codegen.problems.driving import driving_problem
-from codegen.problems.problem import Problem
 
 __all__ = ["tracking"]
 

@@ -12,16 +12,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
+from bayesrace.controller.interface import Controller, Environment
+from bayesrace.controller.native_step import NativeStep
+from bayesrace.controller.weights.checks import Samples
+from bayesrace.controller.weights.comparison import compare, slack_of
+from bayesrace.controller.weights.settings import WATCHED, GateSettings
+from bayesrace.controller.weights.store import History, Store
 from bayesrace.errors import InputError
 from bayesrace.messages import Scalar
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.parts import GRAVITY_MPS2
-from controller.interface import Controller, Environment
-from controller.native_step import NativeStep
-from controller.weights.checks import Samples
-from controller.weights.comparison import compare, slack_of
-from controller.weights.settings import WATCHED, GateSettings
-from controller.weights.store import History, Store
 
 __all__ = ["Adoption", "Offer", "Ruling", "Watch", "WeightsPort", "limits_at", "slowed_down"]
 

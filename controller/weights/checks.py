@@ -20,6 +20,10 @@ import numpy as np
 
 from bayesrace.arrays import Floats
 from bayesrace.clock import die_with_parent
+from bayesrace.controller.native_step import NativeStep
+from bayesrace.controller.settings import MpcSettings
+from bayesrace.controller.weights.comparison import compare, slack_of
+from bayesrace.controller.weights.settings import GateSettings
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import FEATURES, OUTPUTS, GpWeights, decode_weights, pack_weights
 from bayesrace.interpreter import RUN_MODULE
@@ -27,10 +31,6 @@ from bayesrace.messages import Scalar
 from bayesrace.vehicles import described_car
 from bayesrace.vehicles.parameters import CarParameters
 from bayesrace.vehicles.parts import GRAVITY_MPS2
-from controller.native_step import NativeStep
-from controller.settings import MpcSettings
-from controller.weights.comparison import compare, slack_of
-from controller.weights.settings import GateSettings
 
 __all__ = [
     "NO_SAMPLES",

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesrace.arrays import Floats
+from bayesrace.controller.weights.settings import WATCHED, GateSettings
 from bayesrace.gp.weights import OUTPUTS, UNITS
 from bayesrace.messages import Scalar
 from bayesrace.vehicles.parameters import CarParameters
-from controller.weights.settings import WATCHED, GateSettings
 
 __all__ = ["Comparison", "compare", "slack_of"]
 

@@ -13,15 +13,15 @@ from contextlib import suppress
 from queue import Empty, Full, Queue
 from typing import Any, Final
 
+from bayesrace.controller.interface import Controller
+from bayesrace.controller.weights.adoption import Adoption, Offer, Ruling, WeightsPort
+from bayesrace.controller.weights.checks import NO_SAMPLES, judged
+from bayesrace.controller.weights.settings import GateSettings
+from bayesrace.controller.weights.store import AcceptedWeights, StoreWriter, digest_of
 from bayesrace.errors import InputError
 from bayesrace.messages import ROLLBACK, WEIGHTS, Reply, Scalar
 from bayesrace.transport import Request, declare_service, decode_request
 from bayesrace.vehicles import car_text
-from controller.interface import Controller
-from controller.weights.adoption import Adoption, Offer, Ruling, WeightsPort
-from controller.weights.checks import NO_SAMPLES, judged
-from controller.weights.settings import GateSettings
-from controller.weights.store import AcceptedWeights, StoreWriter, digest_of
 
 __all__ = ["WeightUpdateManager"]
 

@@ -7,7 +7,7 @@ experience", CoRL 2020: its published code run again on the paper's ETHZ track (
 
 from typing import Final, NamedTuple
 
-from operation.analysis.results import RaceResult
+from bayesrace.operation.analysis.results import RaceResult
 
 __all__ = ["GP", "LAPS_OFF", "LAPS_ON", "LIMIT", "SOURCE", "Lap", "compare_gp", "compare_laps"]
 

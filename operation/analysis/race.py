@@ -16,24 +16,24 @@ from numpy.typing import NDArray
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import read_weights
-from bayesrace.raceline import RaceLine
-from bayesrace.tracks import PathProjection, Track
-from bayesrace.tracks.spline import CentrelineSearch, PlaneSpline
-from bayesrace.vehicles import CarParameters
-from learning.dataset import Dataset
-from learning.logs import dataset_from_columns
-from learning.validation import Validation, validate
-from operation.analysis.laps import positions_between, time_laps, trajectory_digest
-from operation.analysis.recording import Recording, RunRecord, read_recording
-from operation.analysis.results import (
+from bayesrace.learning.dataset import Dataset
+from bayesrace.learning.logs import dataset_from_columns
+from bayesrace.learning.validation import Validation, validate
+from bayesrace.operation.analysis.laps import positions_between, time_laps, trajectory_digest
+from bayesrace.operation.analysis.recording import Recording, RunRecord, read_recording
+from bayesrace.operation.analysis.results import (
     LapResult,
     Percentiles,
     RaceResult,
     SettingsSummary,
     gp_metrics,
 )
-from operation.analysis.verdict import Cycles, judge
-from operation.limits import limits_in
+from bayesrace.operation.analysis.verdict import Cycles, judge
+from bayesrace.operation.limits import limits_in
+from bayesrace.raceline import RaceLine
+from bayesrace.tracks import PathProjection, Track
+from bayesrace.tracks.spline import CentrelineSearch, PlaneSpline
+from bayesrace.vehicles import CarParameters
 
 __all__ = ["DrivenRun", "RaceAnalysis", "analyse", "read_race"]
 

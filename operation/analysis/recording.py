@@ -13,13 +13,13 @@ from bayesrace.columns import Columns, LogColumns
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_text
 from bayesrace.integrators import PREDICTION, Discretisation
+from bayesrace.learning.logs import CYCLES, STATES
 from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY, TRUTH, Topic
+from bayesrace.operation.analysis.laps import Trajectory
 from bayesrace.raceline import RaceLine, read_raceline
 from bayesrace.tracks import Track, read_track
 from bayesrace.transport import Numbering
 from bayesrace.vehicles import CarParameters, default_car, described_car
-from learning.logs import CYCLES, STATES
-from operation.analysis.laps import Trajectory
 
 __all__ = [
     "RUN_COLUMNS",

@@ -118,7 +118,7 @@ class GpMetrics(_Frozen):
 
 
 def gp_metrics(metrics: Mapping[str, Mapping[str, float]]) -> dict[str, GpMetrics]:
-    """Of each output, from those of a :class:`learning.validation.Validation`."""
+    """Of each output, from those of a :class:`bayesrace.learning.validation.Validation`."""
     return {output: GpMetrics.model_validate(dict(one)) for output, one in metrics.items()}
 
 
@@ -138,7 +138,7 @@ class SettingsSummary(_Frozen):
 
 
 class RaceResult(_Frozen):
-    """``result.json``: made from a run directory by :func:`operation.analysis.race.analyse`."""
+    """``result.json``: made from a run directory by :func:`.analyse`."""
 
     settings: SettingsSummary
     laps: list[LapResult]

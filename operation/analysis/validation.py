@@ -10,13 +10,13 @@ from pydantic import BaseModel, ConfigDict, Field
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
+from bayesrace.learning.dataset import Dataset, left_out
+from bayesrace.learning.residual import discretisation_of
+from bayesrace.learning.sources import read_samples
+from bayesrace.learning.validation import HORIZON, Validation, mismatch, validate
+from bayesrace.operation.analysis.results import GpMetrics, gp_metrics
+from bayesrace.operation.terminal.notation import UNCERTAIN
 from bayesrace.vehicles import CarParameters, get_car
-from learning.dataset import Dataset, left_out
-from learning.residual import discretisation_of
-from learning.sources import read_samples
-from learning.validation import HORIZON, Validation, mismatch, validate
-from operation.analysis.results import GpMetrics, gp_metrics
-from operation.terminal.notation import UNCERTAIN
 
 __all__ = [
     "DRIFTS",

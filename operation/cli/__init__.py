@@ -1,5 +1,5 @@
 """Command line: ``bayesrace``. Each subcommand imports only its own part when it is called."""
 
-from operation.cli.app import main
+from bayesrace.operation.cli.app import main
 
 __all__ = ["main"]

@@ -1,5 +1,5 @@
-"""``python -m operation.cli``, which is how the race starts its processes."""
+"""``python -m bayesrace.operation.cli``, which is how the race starts its processes."""
 
-from operation.cli.app import main
+from bayesrace.operation.cli.app import main
 
 main()

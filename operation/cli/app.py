@@ -19,12 +19,11 @@ from typer.main import get_command
 
 from bayesrace.errors import InputError, faults_in
 from bayesrace.interrupts import remembering_interrupts
-from operation.cli.declaration import Group, configured
+from bayesrace.operation.cli.declaration import Group, configured
 
 __all__ = ["app", "main"]
 
 _INTERRUPTED: Final = 130
-_OUR_OWN: Final = ("bayesrace", "codegen", "operation", "plant", "studies")
 
 _EXTRAS: Final = {
     "fmu": ("fmpy", "pint"),
@@ -133,7 +132,7 @@ def _options(
         False, "--version", callback=_version, is_eager=True, help="Print the version and exit."
     ),
 ) -> None:
-    from operation.terminal.printable import PrintableFormatter
+    from bayesrace.operation.terminal.printable import PrintableFormatter
 
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(PrintableFormatter("%(name)s: %(message)s"))
@@ -184,7 +183,7 @@ def _in_words(error: Exception) -> str | None:
         case RecursionError():
             return "a file or an option is nested too deeply to be read"
         case RuntimeError():  # our own: RaceError, RaceLineError, CompileError, FmuFault
-            return str(error) if type(error).__module__.split(".")[0] in _OUR_OWN else None
+            return str(error) if type(error).__module__.startswith("bayesrace.") else None
     explain = getattr(error, "format_message", None)  # Click's
     return None if explain is None else str(explain())
 
@@ -198,7 +197,7 @@ def _missing(package: str) -> str | None:
 
 
 def _fail(text: str, code: int = 2) -> None:
-    from operation.terminal.printable import printable
+    from bayesrace.operation.terminal.printable import printable
 
     lines = [printable(line.strip()) for line in text.splitlines() if line.strip()]
     several = any(line.startswith("- ") for line in lines)  # faults, as of a map: a line each

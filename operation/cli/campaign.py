@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING, Final
 
 import typer
 
-from operation.cli import options
-from operation.cli.declaration import Given, options_of
+from bayesrace.operation.cli import options
+from bayesrace.operation.cli.declaration import Given, options_of
 
 if TYPE_CHECKING:
-    from studies.settings import TuneSettings
+    from bayesrace.studies.settings import TuneSettings
 
 __all__ = ["campaign", "campaign_report", "campaign_worker", "tune"]
 
@@ -33,10 +33,10 @@ def campaign(
     What is there already is not computed again: the same command goes on after an interruption.
     Leaves laps.parquet and report.html.
     """
-    from operation.terminal.terminal import Terminal
-    from studies.campaign.campaign import run_campaign
-    from studies.campaign.page import render_campaign
-    from studies.campaign.plan import read_plan
+    from bayesrace.operation.terminal.terminal import Terminal
+    from bayesrace.studies.campaign.campaign import run_campaign
+    from bayesrace.studies.campaign.page import render_campaign
+    from bayesrace.studies.campaign.plan import read_plan
 
     read = read_plan(plan)
     folder = out or Path("runs") / plan.stem
@@ -50,7 +50,7 @@ def campaign_report(
     folder: Path = options.argument("DIR", "Folder of a campaign's results."),
 ) -> None:
     """Make the report of a campaign again from its Parquet files."""
-    from studies.campaign.page import render_campaign
+    from bayesrace.studies.campaign.page import render_campaign
 
     typer.echo(str(render_campaign(folder)))
 
@@ -59,12 +59,12 @@ def campaign_worker(
     scheduler: str = options.argument("ADDRESS", "As tcp://HOST:8786."), workers: int = _WORKERS
 ) -> None:
     """Compute for a campaign elsewhere until its Dask scheduler ends."""
-    from studies.campaign.campaign import run_worker
+    from bayesrace.studies.campaign.campaign import run_worker
 
     run_worker(scheduler, workers)
 
 
-@options_of("studies.settings.TuneSettings", "track held_out trials batch car seed")
+@options_of("bayesrace.studies.settings.TuneSettings", "track held_out trials batch car seed")
 def tune(
     settings: "Given[TuneSettings]",
     out: Path = options.out_file(Path("tuned.toml")),
@@ -79,9 +79,9 @@ def tune(
     Held-out tracks judge what is found. Leaves a car's file with it, which every command takes as
     --car; the same command goes on with the study after an interruption.
     """
-    from operation.terminal.terminal import Terminal
-    from studies.campaign.tune import print_verdict
-    from studies.campaign.tune import tune as search
+    from bayesrace.operation.terminal.terminal import Terminal
+    from bayesrace.studies.campaign.tune import print_verdict
+    from bayesrace.studies.campaign.tune import tune as search
 
     with options.stages_shown() as stages:
         storage = study or out.with_suffix(".sqlite")

@@ -9,8 +9,8 @@ import typer
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from bayesrace.messages import Role
-from operation.cli import options
-from operation.cli.declaration import Group
+from bayesrace.operation.cli import options
+from bayesrace.operation.cli.declaration import Group
 
 if TYPE_CHECKING:
     from bayesrace.configuration import Configuration
@@ -43,7 +43,7 @@ def check(
     'bayesrace doctor' tries the links, too.
     """
     from bayesrace.configuration import read_configuration
-    from operation.doctor import check_configuration
+    from bayesrace.operation.doctor import check_configuration
 
     found = configuration if file is None else read_configuration(file)
     typer.echo(f"{file or 'configuration'}: {check_configuration(found)}")
@@ -77,7 +77,7 @@ def _folder(given: Path | None, configuration: "Configuration") -> Path:
 
 def init(configuration: "Configuration", folder: Path | None = _FOLDER) -> None:
     """Make the authority of a system, once; its folder 'authority' belongs on no car."""
-    from operation.certificates import init as make
+    from bayesrace.operation.certificates import init as make
 
     where = _folder(folder, configuration)
     make(where)
@@ -103,7 +103,7 @@ def add(
     The list of members in all the folders changes: copy that, too, to where they are, and restart
     the processes there.
     """
-    from operation.certificates import add as make
+    from bayesrace.operation.certificates import add as make
 
     made = make(_folder(folder, configuration), name, role, car, host, days, renew)
     typer.echo(f"{made}: copy it to its machine, and members.json in it to the others")
@@ -111,7 +111,7 @@ def add(
 
 def members(configuration: "Configuration", folder: Path | None = _FOLDER) -> None:
     """List the certificates, and when they expire."""
-    from operation.certificates import read_register
+    from bayesrace.operation.certificates import read_register
 
     for name, one in sorted(read_register(_folder(folder, configuration)).items()):
         state = "revoked" if one.revoked else f"until {one.ends:%Y-%m-%d}"
@@ -128,7 +128,7 @@ def revoke(
 
     It counts no more where the new list is and the process has been restarted.
     """
-    from operation.certificates import revoke as take_off
+    from bayesrace.operation.certificates import revoke as take_off
 
     take_off(_folder(folder, configuration), name)
     typer.echo(

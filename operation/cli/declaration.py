@@ -33,7 +33,7 @@ from typer.models import OptionInfo
 
 from bayesrace.defaults import CONFIGURATION_VARIABLE, Option
 from bayesrace.errors import InputError, faults_in
-from operation.cli.options import ENDPOINT, flag, value
+from bayesrace.operation.cli.options import ENDPOINT, flag, value
 
 if TYPE_CHECKING:
     from pydantic import BaseModel

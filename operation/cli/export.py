@@ -8,24 +8,24 @@ import typer
 
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
-from operation.cli import options
-from operation.cli.declaration import Given, Group, options_of
+from bayesrace.operation.cli import options
+from bayesrace.operation.cli.declaration import Given, Group, options_of
 
 if TYPE_CHECKING:
+    from bayesrace.codegen.settings import BuildSettings
     from bayesrace.vehicles import CarParameters
-    from codegen.settings import BuildSettings
 
 __all__ = ["build", "export", "fmu"]
 
 
-@options_of("codegen.settings.BuildSettings", "model problem horizon gp_capacity car")
+@options_of("bayesrace.codegen.settings.BuildSettings", "model problem horizon gp_capacity car")
 def build(
     settings: "Given[BuildSettings]",
     out: Path | None = options.out_folder("Copy the artefact here."),
 ) -> None:
     """Generate and compile a controller, or take it from the cache; prints its folder."""
+    from bayesrace.codegen.build import build as make
     from bayesrace.integrators import PERFECT
-    from codegen.build import build as make
 
     chosen = settings()
     if chosen.model == "dynamic":
@@ -54,11 +54,11 @@ def export(
     car: str = options.CAR,
 ) -> None:
     """Write racing line, weights and settings for a C program (examples/c_host)."""
+    from bayesrace.codegen.host_files import export as write
+    from bayesrace.controller.process_settings import ControllerSettings
+    from bayesrace.controller.settings import cycle_values
     from bayesrace.manifest import read_manifest
     from bayesrace.vehicles import get_car
-    from codegen.host_files import export as write
-    from controller.process_settings import ControllerSettings
-    from controller.settings import cycle_values
 
     parameters, process = get_car(car), ControllerSettings()
     folder, given = _controller(parameters, track, raceline, weights, mpc, artefact)
@@ -79,14 +79,14 @@ def _controller(
     artefact: Path | None,
 ) -> tuple[Path, dict[str, Any]]:
     """Artefact of a controller, and what it drives by: the line as a table, settings, weights."""
+    from bayesrace.codegen.build import build as make
+    from bayesrace.codegen.settings import BuildSettings
+    from bayesrace.controller.assembly import read_checked, read_settings
+    from bayesrace.controller.path_table import make_path_table
+    from bayesrace.controller.settings import MpcSettings
     from bayesrace.manifest import read_manifest
     from bayesrace.raceline import racing_line, read_raceline_for
     from bayesrace.tracks import load_track
-    from codegen.build import build as make
-    from codegen.settings import BuildSettings
-    from controller.assembly import read_checked, read_settings
-    from controller.path_table import make_path_table
-    from controller.settings import MpcSettings
 
     course = load_track(track or car.race_track, car.width_m)
     line = read_raceline_for(raceline, course, car) if raceline else racing_line(course, car)
@@ -127,9 +127,9 @@ def export_fmu(
 
     The options below --controller are for the controller alone.
     """
+    from bayesrace.codegen.fmu import car_fmu, controller_fmu, pack
+    from bayesrace.controller.settings import FallbackSettings
     from bayesrace.vehicles import get_car
-    from codegen.fmu import car_fmu, controller_fmu, pack
-    from controller.settings import FallbackSettings
 
     parameters = get_car(car)
     number: Literal[2, 3] = 2 if version == "2" else 3
@@ -159,8 +159,8 @@ def exchange_weights(
     weights: Path = options.argument("WEIGHTS", "New GP weights."),
 ) -> None:
     """Copy a controller's FMU with other weights, without compiling."""
+    from bayesrace.codegen.fmu import exchange_weights as exchange
     from bayesrace.gp.weights import read_weights
-    from codegen.fmu import exchange_weights as exchange
 
     loaded = read_weights(weights)
     exchange(controller, loaded, out)
@@ -173,10 +173,10 @@ def inspect(
     every: bool = options.flag("--all", "Print local variables, too."),
 ) -> None:
     """Print an FMU's variables; write a map for 'bayesrace plant --fmu' to fill in."""
-    from operation.terminal.fmu_table import FmuTable
-    from operation.terminal.terminal import Terminal
-    from plant.fmu.inspection import blank_map, platforms
-    from plant.fmu.inspection import inspect as read
+    from bayesrace.operation.terminal.fmu_table import FmuTable
+    from bayesrace.operation.terminal.terminal import Terminal
+    from bayesrace.plant.fmu.inspection import blank_map, platforms
+    from bayesrace.plant.fmu.inspection import inspect as read
 
     description = read(file)
     Terminal().print(FmuTable(description, platforms(file), all_=every))

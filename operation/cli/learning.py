@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import typer
 
-from operation.cli import options
-from operation.cli.declaration import Given, options_of
-from operation.terminal.notation import UNCERTAIN
+from bayesrace.operation.cli import options
+from bayesrace.operation.cli.declaration import Given, options_of
+from bayesrace.operation.terminal.notation import UNCERTAIN
 
 if TYPE_CHECKING:
+    from bayesrace.learning.settings import TrainingSettings
+    from bayesrace.operation.learn.records import LearnSettings
+    from bayesrace.operation.settings import PreparationSettings
     from bayesrace.transport import Endpoints
-    from learning.settings import TrainingSettings
-    from operation.learn.records import LearnSettings
-    from operation.settings import PreparationSettings
 
 __all__ = ["collect", "learn", "publish", "rollback", "train", "validate"]
 
@@ -34,7 +34,7 @@ _TIMEOUT: Final = options.value(
 
 
 @options_of(
-    "operation.settings.PreparationSettings",
+    "bayesrace.operation.settings.PreparationSettings",
     "collect_s=--duration pursuit.style seed fmu fmu_map simulator car",
 )
 def collect(
@@ -44,11 +44,11 @@ def collect(
     out: Path = options.out_file(Path("collect.mcap")),
 ) -> None:
     """Drive a track by pure pursuit and log the drive as training data."""
+    from bayesrace.codegen.build import build
+    from bayesrace.codegen.settings import BuildSettings
+    from bayesrace.operation.preparation import drive_for_training
     from bayesrace.raceline import read_raceline_for
     from bayesrace.tracks import load_track
-    from codegen.build import build
-    from codegen.settings import BuildSettings
-    from operation.preparation import drive_for_training
 
     chosen = settings()
     car = chosen.car
@@ -63,7 +63,7 @@ def collect(
     )
 
 
-@options_of("learning.settings.TrainingSettings", "restarts seed")
+@options_of("bayesrace.learning.settings.TrainingSettings", "restarts seed")
 def train(
     settings: "Given[TrainingSettings]",
     logs: list[Path] = options.argument("LOG", "Run logs (MCAP).", ()),
@@ -84,14 +84,14 @@ def train(
     Of more samples than --points, those with the largest predictive variance are chosen one by one.
     """
     from bayesrace.gp.weights import KERNELS, write_weights
+    from bayesrace.learning.dataset import left_out
+    from bayesrace.learning.residual import discretisation_of
+    from bayesrace.learning.sources import read_samples
+    from bayesrace.learning.training import fit
     from bayesrace.manifest import read_manifest
+    from bayesrace.operation.terminal import learning_table
+    from bayesrace.operation.terminal.terminal import Terminal
     from bayesrace.vehicles import get_car
-    from learning.dataset import left_out
-    from learning.residual import discretisation_of
-    from learning.sources import read_samples
-    from learning.training import fit
-    from operation.terminal import learning_table
-    from operation.terminal.terminal import Terminal
 
     wanted, parameters = None, get_car(car) if car else None
     if artefact is not None:
@@ -110,7 +110,7 @@ def train(
     write_weights(out, weights)
     learning_table.print_kernels(training.kernels, console)
     if plot is not None:
-        from operation.report.gp import write_kernels
+        from bayesrace.operation.report.gp import write_kernels
 
         write_kernels(training.kernels, plot)
     typer.echo(
@@ -145,11 +145,11 @@ def validate(
     """
 
     from bayesrace.gp.weights import read_weights
+    from bayesrace.operation.analysis.validation import validate_weights
+    from bayesrace.operation.terminal.learning_table import print_validation
+    from bayesrace.operation.terminal.terminal import Terminal
     from bayesrace.tracks import load_track
     from bayesrace.vehicles import get_car
-    from operation.analysis.validation import validate_weights
-    from operation.terminal.learning_table import print_validation
-    from operation.terminal.terminal import Terminal
 
     parameters = get_car(car) if car else None
     course = None if track is None else load_track(track)
@@ -167,7 +167,7 @@ def validate(
     for path in (json_file, out and out / "validation.json"):
         options.write_json(path, judged.result)
     if plot is not None or out is not None:
-        from operation.report.gp import write_validation
+        from bayesrace.operation.report.gp import write_validation
 
         bands = [path for path in (plot, out and out / "error.png") if path is not None]
         write_validation(judged, threshold, bands, out and out / "track.png", course)
@@ -186,8 +186,8 @@ def publish(
     can succeed), 2 if it cannot be reached.
     """
     from bayesrace.gp.weights import encode_weights, read_weights
+    from bayesrace.operation.learn.publishing import accepted
     from bayesrace.transport import send_weights
-    from operation.learn.publishing import accepted
 
     data = encode_weights(read_weights(weights))
     typer.echo(accepted(learning, name, timeout, send_weights, data)[0])
@@ -203,8 +203,8 @@ def rollback(
 
     Exit code 0 once it drives with them, 1 if there are none, 2 if it cannot be reached.
     """
+    from bayesrace.operation.learn.publishing import accepted
     from bayesrace.transport import send_rollback
-    from operation.learn.publishing import accepted
 
     why = reason or "bayesrace rollback"
     text, reply = accepted(learning, name, timeout, send_rollback, why)
@@ -212,7 +212,10 @@ def rollback(
     typer.echo(text + (f", instead of {before}" if before else ""))
 
 
-@options_of("operation.learn.records.LearnSettings", "laps points keep track compare seed car name")
+@options_of(
+    "bayesrace.operation.learn.records.LearnSettings",
+    "laps points keep track compare seed car name",
+)
 def learn(
     learning: "Endpoints",
     settings: "Given[LearnSettings]",
@@ -236,8 +239,8 @@ def learn(
     chosen = settings() if watch or "--laps" in settings.flags else settings(laps=1)
     learning.check_car(chosen.name)
     try_links(learning, "learning")  # before imports that take seconds
-    from operation.learn.job import learn as follow
-    from operation.learn.report import print_laps
+    from bayesrace.operation.learn.job import learn as follow
+    from bayesrace.operation.learn.report import print_laps
 
     folder = options.run_folder(out, "learn-")
     record = follow(

@@ -1,5 +1,6 @@
 """Options that are no fields of settings: how they are declared, and those that several commands
-have. :func:`operation.cli.declaration.configured` adds metavars by type where there are none."""
+have. :func:`bayesrace.operation.cli.declaration.configured` adds metavars by type where there are
+none."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,7 +17,7 @@ from bayesrace.files import write_whole
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-    from operation.terminal.progress import Stages
+    from bayesrace.operation.terminal.progress import Stages
 
 __all__ = [
     "ALL_SAMPLES", "ARTEFACT", "CAR", "CAR_NAME", "COURSE", "ENDPOINT", "GIVEN_LINE", "LOW_LATENCY",
@@ -80,8 +81,8 @@ def run_folder(given: Path | None, prefix: str = "") -> Path:
 @contextmanager
 def stages_shown() -> Iterator["Stages"]:
     """The stages of the work, shown on the terminal."""
-    from operation.terminal.progress import stages_on
-    from operation.terminal.terminal import Terminal
+    from bayesrace.operation.terminal.progress import stages_on
+    from bayesrace.operation.terminal.terminal import Terminal
 
     with stages_on(Terminal()) as stages:
         yield stages

@@ -8,15 +8,15 @@ import typer
 
 from bayesrace.clock import die_with_parent
 from bayesrace.errors import InputError
-from operation.cli import options
-from operation.cli.declaration import Given, options_of
+from bayesrace.operation.cli import options
+from bayesrace.operation.cli.declaration import Given, options_of
 
 if TYPE_CHECKING:
     from bayesrace.configuration import Configuration
+    from bayesrace.controller.process_settings import ControllerSettings
+    from bayesrace.operation.lifecycle import Action
+    from bayesrace.plant.process_settings import PlantSettings
     from bayesrace.transport import Endpoints
-    from controller.process_settings import ControllerSettings
-    from operation.lifecycle import Action
-    from plant.process_settings import PlantSettings
 
 __all__ = ["controller", "doctor", "go", "plant", "router", "status", "stop"]
 
@@ -38,7 +38,7 @@ def _endpoint(text: str, shown: str = "as configured") -> Any:
 
 
 @options_of(
-    "plant.process_settings.PlantSettings",
+    "bayesrace.plant.process_settings.PlantSettings",
     "car name rate_hz fmu fmu_map simulator delay_s noise seed realtime.cpu realtime.fifo "
     "realtime.lock_memory",
 )
@@ -54,8 +54,8 @@ def plant(
 ) -> None:
     """Simulate the car: waits for runs, as of 'bayesrace drive', until Ctrl-C."""
     die_with_parent(parent_pid)
-    from codegen.compiler import compiled
-    from plant.process import main
+    from bayesrace.codegen.compiler import compiled
+    from bayesrace.plant.process import main
 
     endpoints = network.endpoints(
         "plant", listen=endpoint, connect=connect, low_latency=low_latency
@@ -64,7 +64,7 @@ def plant(
 
 
 @options_of(
-    "controller.process_settings.ControllerSettings",
+    "bayesrace.controller.process_settings.ControllerSettings",
     "car name rate_hz budget hold compensation sensor_tolerance realtime.cpu realtime.fifo "
     "realtime.lock_memory",
 )
@@ -92,9 +92,9 @@ def controller(
 ) -> None:
     """Drive the car of a plant process with the compiled controller, until Ctrl-C."""
     die_with_parent(parent_pid)
-    from controller.assembly import predictive_controller, read_settings
-    from controller.process import main
-    from controller.weights.settings import GateSettings
+    from bayesrace.controller.assembly import predictive_controller, read_settings
+    from bayesrace.controller.process import main
+    from bayesrace.controller.weights.settings import GateSettings
 
     endpoints = network.endpoints(
         "controller", listen=listen, connect=endpoint, low_latency=low_latency
@@ -119,7 +119,7 @@ def router(
     network, and for machines that cannot reach each other directly.
     """
     die_with_parent(parent_pid)
-    from operation.lifecycle import route
+    from bayesrace.operation.lifecycle import route
 
     endpoints = network.endpoints("router", listen=listen, connect=connect)
     if not endpoints.listen:
@@ -143,7 +143,7 @@ def status(
     Without --name: all cars found. A process that is present and does not answer is shown as such;
     if none answers, that is an error.
     """
-    from operation.terminal.status_table import show_status
+    from bayesrace.operation.terminal.status_table import show_status
 
     show_status(viewer, name, timeout, watch, as_json)
 
@@ -182,8 +182,8 @@ def go(
 def _command(
     action: "Action", name: str, endpoints: "Endpoints", reason: str, all_cars: bool, timeout: float
 ) -> None:
-    from operation.lifecycle import command_cars
-    from operation.terminal.printable import printable
+    from bayesrace.operation.lifecycle import command_cars
+    from bayesrace.operation.terminal.printable import printable
 
     done, failed = command_cars(endpoints, action, name, all_cars, reason, timeout)
     for answer in done:
@@ -197,8 +197,8 @@ def doctor(network: "Configuration") -> None:
 
     Tries everything as a process of this machine would. Exit code 1 if something is wrong.
     """
-    from operation.doctor import examine
-    from operation.terminal.printable import printable
+    from bayesrace.operation.doctor import examine
+    from bayesrace.operation.terminal.printable import printable
 
     faults = 0
     for check in examine(network):

@@ -7,23 +7,23 @@ from typing import TYPE_CHECKING
 import typer
 
 from bayesrace.errors import InputError
-from operation.cli import options
-from operation.cli.declaration import Given, options_of
+from bayesrace.operation.cli import options
+from bayesrace.operation.cli.declaration import Given, options_of
 
 if TYPE_CHECKING:
     from bayesrace.configuration import Configuration
+    from bayesrace.operation.analysis.race import RaceAnalysis
+    from bayesrace.operation.settings import RaceSettings
+    from bayesrace.studies.latency.settings import LatencySettings
+    from bayesrace.studies.paper.settings import PaperSettings
+    from bayesrace.studies.settings import BenchSettings
     from bayesrace.transport import Endpoints
-    from operation.analysis.race import RaceAnalysis
-    from operation.settings import RaceSettings
-    from studies.latency.settings import LatencySettings
-    from studies.paper.settings import PaperSettings
-    from studies.settings import BenchSettings
 
 __all__ = ["bench", "drive", "latency", "paper", "race", "report"]
 
 
 @options_of(
-    "operation.settings.RaceSettings",
+    "bayesrace.operation.settings.RaceSettings",
     "car track train_track line collect_s pursuit.style laps problem progress_drives mode "
     "mpc.constraints mpc.caution seed fmu fmu_map simulator delay_s noise limit",
     file=True,
@@ -40,9 +40,9 @@ def race(
     controllers, and drives them as two processes over Zenoh. Leaves a run directory with the log,
     result.json and report.html.
     """
+    from bayesrace.operation.race import race as drive_all
     from bayesrace.realtime import uncollected
     from bayesrace.transport import check_descriptors
-    from operation.race import race as drive_all
 
     check_descriptors()  # before the preparation, which takes a while
     chosen = settings()
@@ -53,8 +53,8 @@ def race(
         recording = drive_all(chosen, folder, stages)
         with stages.stage("result and report"):
             # They take a second to import, in which nothing would be seen of a race.
-            from operation.analysis.race import RaceAnalysis
-            from operation.report import write_report
+            from bayesrace.operation.analysis.race import RaceAnalysis
+            from bayesrace.operation.report import write_report
 
             analysis = RaceAnalysis(recording)
             page = write_report(folder, analysis)
@@ -67,9 +67,9 @@ def report(
     ),
 ) -> None:
     """Compute result.json, the table and report.html again from a run's log."""
+    from bayesrace.operation.analysis.race import read_race
+    from bayesrace.operation.report import write_report
     from bayesrace.realtime import uncollected
-    from operation.analysis.race import read_race
-    from operation.report import write_report
 
     if run.suffix == ".mcap" and run.is_file():
         run = run.parent
@@ -82,14 +82,14 @@ def report(
 
 
 def _print_result(analysis: "RaceAnalysis", page: Path) -> None:
-    from operation.terminal.race_table import print_table
-    from operation.terminal.terminal import Terminal
+    from bayesrace.operation.terminal.race_table import print_table
+    from bayesrace.operation.terminal.terminal import Terminal
 
     print_table(analysis.result, Terminal())
     typer.echo(f"{page}")
 
 
-@options_of("operation.settings.RaceSettings", "track mode car")
+@options_of("bayesrace.operation.settings.RaceSettings", "track mode car")
 def drive(
     director: "Endpoints",
     settings: "Given[RaceSettings]",
@@ -103,8 +103,8 @@ def drive(
     Exit code 0 if all laps were driven on the track, by the controller's solutions; 1 if not; 2 if
     the run could not be driven to its end.
     """
+    from bayesrace.operation.drive import RunPlan, drive_and_judge
     from bayesrace.tracks import load_track
-    from operation.drive import RunPlan, drive_and_judge
 
     chosen = settings()
     course = load_track(chosen.track, chosen.car.width_m)
@@ -115,14 +115,14 @@ def drive(
         raise typer.Exit(1)
 
 
-@options_of("studies.settings.BenchSettings", "tracks problems peers points seed car")
+@options_of("bayesrace.studies.settings.BenchSettings", "tracks problems peers points seed car")
 def bench(
     settings: "Given[BenchSettings]",
     json_file: Path | None = options.new_file("Write the numbers to this file.", "--json"),
 ) -> None:
     """Time the compiled step and the paper's formulation (CasADi, IPOPT) on the same problems."""
-    from operation.terminal.terminal import Terminal
-    from studies.bench import run_bench
+    from bayesrace.operation.terminal.terminal import Terminal
+    from bayesrace.studies.bench import run_bench
 
     with options.stages_shown() as stages:
         result = run_bench(settings(), stages)
@@ -131,7 +131,7 @@ def bench(
 
 
 @options_of(
-    "studies.latency.settings.LatencySettings",
+    "bayesrace.studies.latency.settings.LatencySettings",
     "rate_hz duration_s load track realtime.fifo realtime.lock_memory weights artefact raceline "
     "log car name",
     file=True,
@@ -164,9 +164,9 @@ def latency(
         try_links(running, "director")  # before imports that take seconds
         chosen = settings(attach=running, warm_up_s=0.0)
 
-    from operation.terminal.terminal import Terminal
-    from studies.latency.measure import measure
-    from studies.latency.report import print_report
+    from bayesrace.operation.terminal.terminal import Terminal
+    from bayesrace.studies.latency.measure import measure
+    from bayesrace.studies.latency.report import print_report
 
     folder = options.run_folder(out, "latency-")
     with options.stages_shown() as stages:
@@ -178,7 +178,7 @@ def latency(
         raise run.error
 
 
-@options_of("studies.paper.settings.PaperSettings", "tracks data raceline quick seed")
+@options_of("bayesrace.studies.paper.settings.PaperSettings", "tracks data raceline quick seed")
 def paper(
     settings: "Given[PaperSettings]",
     out: Path = options.out_folder("Folder for page and figures.", default=Path("runs/paper")),
@@ -188,8 +188,8 @@ def paper(
     Leaves paper.html, the figures as SVG and PDF, and numbers.json. What is computed is kept: the
     same command goes on after an interruption.
     """
-    from operation.terminal.printable import printable
-    from studies.paper.make import make_paper
+    from bayesrace.operation.terminal.printable import printable
+    from bayesrace.studies.paper.make import make_paper
 
     with options.stages_shown() as stages:
         page, sections = make_paper(settings(), out, stages)

@@ -8,13 +8,13 @@ import typer
 
 from bayesrace.clock import die_with_parent
 from bayesrace.errors import InputError
-from operation.cli import options
-from operation.cli.declaration import Given, options_of
+from bayesrace.operation.cli import options
+from bayesrace.operation.cli.declaration import Given, options_of
 
 if TYPE_CHECKING:
     from bayesrace.limit import LimitSettings
+    from bayesrace.operation.settings import BayesianSettings
     from bayesrace.tracks import Track
-    from operation.settings import BayesianSettings
 
 __all__ = ["cars", "limit", "raceline", "tracks"]
 
@@ -43,15 +43,15 @@ def tracks(
     """List the built-in tracks, check a track, turn a ROS map into one, write or draw it."""
     from rich.table import Table
 
+    from bayesrace.operation.terminal.terminal import Terminal
     from bayesrace.tracks import builtin_tracks, load_any, write_track
     from bayesrace.vehicles import get_car
-    from operation.terminal.terminal import Terminal
 
     if name is None and (out or picture or start or reverse or smooth or recentre):
         those = "--out, --picture, --start, --reverse, --smooth and --recentre"
         raise InputError(f"{those} need the name of the track")
     if picture is not None:
-        from operation.report.maps import check_picture, write_picture
+        from bayesrace.operation.report.maps import check_picture, write_picture
 
         check_picture(picture)
     place = _point(start)
@@ -104,8 +104,8 @@ def cars(
     """List the built-in cars, check a car's file, or write a car to a file with all its values."""
     from rich.table import Table
 
+    from bayesrace.operation.terminal.terminal import Terminal
     from bayesrace.vehicles import builtin_cars, get_car, write_car
-    from operation.terminal.terminal import Terminal
 
     if out is not None and car is None:
         raise InputError("--out needs the name of the car to write")
@@ -122,7 +122,7 @@ def cars(
 
 
 @options_of(
-    "operation.settings.BayesianSettings",
+    "bayesrace.operation.settings.BayesianSettings",
     "friction margin_m objective nodes search.evaluations search.patience search.seed",
 )
 def raceline(
@@ -154,7 +154,7 @@ def raceline(
         write_raceline(out, line)
         typer.echo(f"{line.length_m:.2f} m in {line.lap_time_s:.3f} s: {out}")
         return
-    from operation.line_search import searched_line
+    from bayesrace.operation.line_search import searched_line
 
     if weights is not None and chosen.objective != "driven":
         raise InputError("--weights needs --objective driven")

@@ -16,19 +16,19 @@ from typing import Any, Final
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import read_weights
 from bayesrace.interrupts import deferred_interrupt
+from bayesrace.learning.residual import discretisation_of, recalled
+from bayesrace.learning.settings import TrainingSettings
+from bayesrace.learning.sources import read_samples
+from bayesrace.learning.trainer import Trainer, perform
 from bayesrace.manifest import read_manifest
 from bayesrace.messages import TOPICS, TRUTH, Actuation, Event, State, Status, Telemetry
+from bayesrace.operation.learn.collector import Collector, Stretch
+from bayesrace.operation.learn.journal import Journal, resumable_settings
+from bayesrace.operation.learn.publishing import Publisher
+from bayesrace.operation.learn.records import LapRecord, LearnSettings, Record, UpdateRecord
+from bayesrace.operation.learn.report import References, draw, references
 from bayesrace.tracks import Track, load_track
 from bayesrace.transport import NEWEST, Endpoints, Inbox, Item, Kind, open_session
-from learning.residual import discretisation_of, recalled
-from learning.settings import TrainingSettings
-from learning.sources import read_samples
-from learning.trainer import Trainer, perform
-from operation.learn.collector import Collector, Stretch
-from operation.learn.journal import Journal, resumable_settings
-from operation.learn.publishing import Publisher
-from operation.learn.records import LapRecord, LearnSettings, Record, UpdateRecord
-from operation.learn.report import References, draw, references
 
 __all__ = ["Learner", "learn"]
 

@@ -15,10 +15,10 @@ from pydantic import ValidationError
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import claimed, clear_partials, read_text, replacing, write_whole
 from bayesrace.gp.weights import OUTPUTS, GpWeights, write_weights
-from learning.dataset import Dataset, concatenate
-from learning.sources import dataset_from_npz, write_npz
-from learning.subset import MOST_NEW, evenly
-from operation.learn.records import LapRecord, LearnSettings, Record, UpdateRecord
+from bayesrace.learning.dataset import Dataset, concatenate
+from bayesrace.learning.sources import dataset_from_npz, write_npz
+from bayesrace.learning.subset import MOST_NEW, evenly
+from bayesrace.operation.learn.records import LapRecord, LearnSettings, Record, UpdateRecord
 
 __all__ = ["MOST_WEIGHTS", "Journal", "resumable_settings"]
 

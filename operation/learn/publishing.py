@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 from bayesrace.files import read_whole
 from bayesrace.gp.weights import MAX_BYTES
 from bayesrace.messages import Event, Reply, Status
+from bayesrace.operation.learn.records import UpdateRecord, Verdict
+from bayesrace.operation.lifecycle import find, pick
 from bayesrace.transport import Endpoints, open_session, send_weights
-from operation.learn.records import UpdateRecord, Verdict
-from operation.lifecycle import find, pick
 
 if TYPE_CHECKING:  # with which all of the training is imported
-    from operation.learn.journal import Journal
+    from bayesrace.operation.learn.journal import Journal
 
 __all__ = ["NotTakenOverError", "Publisher", "accepted", "in_words"]
 

@@ -10,10 +10,10 @@ from matplotlib.ticker import MaxNLocator
 from rich.console import Console
 from rich.text import Text
 
-from operation.analysis.results import read_result
-from operation.learn.records import LapRecord, Record, UpdateRecord
-from operation.report.style import INK, MUTED, WARNING, figure_style, look, write_png
-from operation.terminal.terminal import Terminal, plain_table
+from bayesrace.operation.analysis.results import read_result
+from bayesrace.operation.learn.records import LapRecord, Record, UpdateRecord
+from bayesrace.operation.report.style import INK, MUTED, WARNING, figure_style, look, write_png
+from bayesrace.operation.terminal.terminal import Terminal, plain_table
 
 __all__ = ["References", "draw", "print_laps", "references"]
 

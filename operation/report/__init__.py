@@ -1,5 +1,5 @@
 """The report of a race: one self-contained HTML file, and one picture. Imports matplotlib."""
 
-from operation.report.render import write_report
+from bayesrace.operation.report.render import write_report
 
 __all__ = ["write_report"]

@@ -13,13 +13,12 @@ from matplotlib.patches import Patch
 
 from bayesrace.arrays import Flags, Floats
 from bayesrace.gp.weights import OUTPUTS, UNITS
-from bayesrace.tracks import Track
-from learning.dataset import Dataset
-from learning.target import KernelScore
-from learning.validation import Validation, unbroken
-from operation.analysis.validation import Validated
-from operation.report.maps import draw_edges, show_all
-from operation.report.style import (
+from bayesrace.learning.dataset import Dataset
+from bayesrace.learning.target import KernelScore
+from bayesrace.learning.validation import Validation, unbroken
+from bayesrace.operation.analysis.validation import Validated
+from bayesrace.operation.report.maps import draw_edges, show_all
+from bayesrace.operation.report.style import (
     INK,
     MUTED,
     PICTURE_WIDTH,
@@ -29,7 +28,8 @@ from operation.report.style import (
     panel,
     write_png,
 )
-from operation.terminal.notation import SMOOTHNESS, SYMBOLS, UNCERTAIN
+from bayesrace.operation.terminal.notation import SMOOTHNESS, SYMBOLS, UNCERTAIN
+from bayesrace.tracks import Track
 
 __all__ = [
     "band_figure",

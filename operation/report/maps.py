@@ -17,10 +17,8 @@ from matplotlib.transforms import Affine2D
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
-from bayesrace.raceline import RaceLine
-from bayesrace.tracks import Track
-from operation.analysis.race import DrivenRun
-from operation.report.style import (
+from bayesrace.operation.analysis.race import DrivenRun
+from bayesrace.operation.report.style import (
     INK,
     MUTED,
     PANEL_WIDTH,
@@ -34,7 +32,9 @@ from operation.report.style import (
     speed_map,
     write_png,
 )
-from operation.report.traces import Lap, first_laps, reference_of
+from bayesrace.operation.report.traces import Lap, first_laps, reference_of
+from bayesrace.raceline import RaceLine
+from bayesrace.tracks import Track
 
 if TYPE_CHECKING:
     from bayesrace.tracks.maps import RosMap

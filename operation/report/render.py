@@ -15,14 +15,14 @@ from pydantic import ValidationError
 from bayesrace.files import write_whole
 from bayesrace.interrupts import raise_if_interrupted
 from bayesrace.manifest import Manifest
-from operation.analysis.published import LIMIT, SOURCE, compare_gp, compare_laps
-from operation.analysis.race import DrivenRun, RaceAnalysis, read_race
-from operation.analysis.results import RaceResult, write_result
-from operation.report.gp import gp_figures
-from operation.report.maps import LapMaps
-from operation.report.runs import coverage_figures, solve_figure
-from operation.report.style import figure_style, inline_svg, look, png
-from operation.report.traces import (
+from bayesrace.operation.analysis.published import LIMIT, SOURCE, compare_gp, compare_laps
+from bayesrace.operation.analysis.race import DrivenRun, RaceAnalysis, read_race
+from bayesrace.operation.analysis.results import RaceResult, write_result
+from bayesrace.operation.report.gp import gp_figures
+from bayesrace.operation.report.maps import LapMaps
+from bayesrace.operation.report.runs import coverage_figures, solve_figure
+from bayesrace.operation.report.style import figure_style, inline_svg, look, png
+from bayesrace.operation.report.traces import (
     caution_figures,
     cornering_figures,
     deviation_figures,
@@ -30,8 +30,8 @@ from operation.report.traces import (
     speed_figures,
     time_figures,
 )
-from operation.terminal.notation import UNCERTAIN
-from operation.terminal.race_table import COLUMNS, GP_COLUMNS, drive_text, gp_cells
+from bayesrace.operation.terminal.notation import UNCERTAIN
+from bayesrace.operation.terminal.race_table import COLUMNS, GP_COLUMNS, drive_text, gp_cells
 
 __all__ = ["PICTURE", "REPORT", "RESULT", "template", "write_report"]
 

@@ -7,9 +7,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
 from bayesrace.arrays import Floats
+from bayesrace.operation.analysis.race import DrivenRun
+from bayesrace.operation.report.style import INK, PANEL_WIDTH, look, panel
 from bayesrace.vehicles.parts import GRAVITY_MPS2
-from operation.analysis.race import DrivenRun
-from operation.report.style import INK, PANEL_WIDTH, look, panel
 
 __all__ = ["coverage_figures", "solve_figure"]
 

@@ -10,12 +10,12 @@ from scipy.interpolate import CubicSpline
 
 from bayesrace.arrays import Floats
 from bayesrace.columns import Columns
+from bayesrace.operation.analysis.race import DrivenRun
+from bayesrace.operation.report.style import INK, MUTED, look, panel
 from bayesrace.raceline import RaceLine
 from bayesrace.tracks import Track
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.parts import GRAVITY_MPS2
-from operation.analysis.race import DrivenRun
-from operation.report.style import INK, MUTED, look, panel
 
 __all__ = [
     "Lap",

@@ -7,12 +7,12 @@ from rich.console import Console
 from rich.text import Text
 
 from bayesrace.gp.weights import OUTPUTS, UNITS
-from learning.dataset import left_out
-from learning.target import KernelScore
-from operation.analysis.validation import DRIFTS, HorizonResult, Spread, ValidationResult
-from operation.terminal.notation import SMOOTHNESS
-from operation.terminal.race_table import GP_COLUMNS, gp_cells
-from operation.terminal.terminal import plain_table
+from bayesrace.learning.dataset import left_out
+from bayesrace.learning.target import KernelScore
+from bayesrace.operation.analysis.validation import DRIFTS, HorizonResult, Spread, ValidationResult
+from bayesrace.operation.terminal.notation import SMOOTHNESS
+from bayesrace.operation.terminal.race_table import GP_COLUMNS, gp_cells
+from bayesrace.operation.terminal.terminal import plain_table
 
 __all__ = ["print_beyond_limits", "print_kernels", "print_validation"]
 

@@ -10,10 +10,10 @@ from rich.table import Table
 from rich.text import Text
 
 from bayesrace.gp.weights import UNITS
+from bayesrace.operation.analysis.published import SOURCE, compare_gp, compare_laps
+from bayesrace.operation.analysis.results import GpMetrics, LapResult, RaceResult
+from bayesrace.operation.terminal.terminal import plain_table
 from bayesrace.vehicles.parts import GRAVITY_MPS2
-from operation.analysis.published import SOURCE, compare_gp, compare_laps
-from operation.analysis.results import GpMetrics, LapResult, RaceResult
-from operation.terminal.terminal import plain_table
 
 __all__ = ["COLUMNS", "GP_COLUMNS", "Column", "drive_text", "gp_cells", "print_table"]
 

@@ -14,11 +14,11 @@ from rich.text import Text
 
 from bayesrace.errors import InputError
 from bayesrace.messages import Status
+from bayesrace.operation.analysis.network_status import SOURCES, NetworkStatus, ProcessStatus
+from bayesrace.operation.lifecycle import ask_statuses, find, follow
+from bayesrace.operation.terminal.printable import printable
+from bayesrace.operation.terminal.terminal import Terminal, plain_table
 from bayesrace.transport import Endpoints, open_session
-from operation.analysis.network_status import SOURCES, NetworkStatus, ProcessStatus
-from operation.lifecycle import ask_statuses, find, follow
-from operation.terminal.printable import printable
-from operation.terminal.terminal import Terminal, plain_table
 
 __all__ = ["COUNTERS_SHOWN", "StatusTable", "show_status"]
 

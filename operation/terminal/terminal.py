@@ -7,7 +7,7 @@ from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 from rich.table import Table
 
-from operation.terminal.printable import printable_lines
+from bayesrace.operation.terminal.printable import printable_lines
 
 __all__ = ["Terminal", "plain_table"]
 

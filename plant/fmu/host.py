@@ -24,10 +24,10 @@ from msgspec import Meta, MsgspecError, msgpack
 
 from bayesrace.errors import InputError
 from bayesrace.files import temporary_folder
-from plant.fmu.inspection import extract, library
-from plant.fmu.wiring import Value
-from plant.fmu.worker import LONGEST, serve
-from plant.vehicle import FmuFault
+from bayesrace.plant.fmu.inspection import extract, library
+from bayesrace.plant.fmu.wiring import Value
+from bayesrace.plant.fmu.worker import LONGEST, serve
+from bayesrace.plant.vehicle import FmuFault
 
 __all__ = ["FmuHost"]
 

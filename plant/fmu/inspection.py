@@ -18,8 +18,8 @@ from fmpy import platform, platform_tuple, read_model_description, sharedLibrary
 from fmpy.simulation import settable_in_instantiated
 
 from bayesrace.errors import InputError
-from plant.fmu.units import unit_of
-from plant.fmu.wiring import COMMANDS, STATES
+from bayesrace.plant.fmu.units import unit_of
+from bayesrace.plant.fmu.wiring import COMMANDS, STATES
 
 __all__ = [
     "blank_map", "extract", "inspect", "is_readable", "is_real", "is_settable", "items_of",

@@ -1,4 +1,4 @@
-"""A map checked against an FMU: what fits becomes a :class:`~plant.fmu.wiring.Wiring`.
+"""A map checked against an FMU: what fits becomes a :class:`~bayesrace.plant.fmu.wiring.Wiring`.
 
 One error names all that is missing or wrong, each with what to write into the map instead. Units
 become factors here, and constants get the type of their variable.
@@ -11,16 +11,16 @@ from typing import Any, Final
 import numpy as np
 
 from bayesrace.errors import InputError
-from plant.fmu.inspection import (
+from bayesrace.plant.fmu.inspection import (
     is_readable,
     is_real,
     is_settable,
     items_of,
     range_of,
 )
-from plant.fmu.map_file import Driven, FmuMap, Pick, Value
-from plant.fmu.units import FREQUENCY, parse_quantity, to_si, unit_of
-from plant.fmu.wiring import COMMANDS, READINGS, STARTS, STATES, Link, Wiring
+from bayesrace.plant.fmu.map_file import Driven, FmuMap, Pick, Value
+from bayesrace.plant.fmu.units import FREQUENCY, parse_quantity, to_si, unit_of
+from bayesrace.plant.fmu.wiring import COMMANDS, READINGS, STARTS, STATES, Link, Wiring
 
 __all__ = ["wire"]
 

@@ -14,7 +14,7 @@ from pydantic import Discriminator, Field, Tag, model_validator
 
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import parse_toml, read_text
-from plant.fmu.wiring import COMMANDS, STARTS
+from bayesrace.plant.fmu.wiring import COMMANDS, STARTS
 
 __all__ = ["Driven", "FmuMap", "Pick", "Value", "parse_map", "read_map"]
 

@@ -8,16 +8,16 @@ from typing import Any, Final
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
+from bayesrace.plant.fmu.host import FmuHost
+from bayesrace.plant.fmu.inspection import inspect, steps_s
+from bayesrace.plant.fmu.map import wire
+from bayesrace.plant.fmu.map_file import FmuMap, read_map
+from bayesrace.plant.fmu.wiring import Wiring
+from bayesrace.plant.guard import Command
+from bayesrace.plant.simulator import plant_discretisation
+from bayesrace.plant.vehicle import Vehicle
 from bayesrace.vehicles.models import STATES
 from bayesrace.vehicles.parameters import CarParameters
-from plant.fmu.host import FmuHost
-from plant.fmu.inspection import inspect, steps_s
-from plant.fmu.map import wire
-from plant.fmu.map_file import FmuMap, read_map
-from plant.fmu.wiring import Wiring
-from plant.guard import Command
-from plant.simulator import plant_discretisation
-from plant.vehicle import Vehicle
 
 __all__ = ["FmuSimulator", "communication_step", "open_fmu"]
 

@@ -1,8 +1,8 @@
 """The process that an FMU runs in: whatever the FMU does to its process, it does to this one.
 
-:class:`plant.fmu.host.FmuHost` starts it by :func:`serve`. A question is a mapping of start values,
-or what :meth:`_Instance.step` takes; the answer is the outputs, or a text that says what failed.
-Loading is answered without a question, its outputs are zero.
+:class:`bayesrace.plant.fmu.host.FmuHost` starts it by :func:`serve`. A question is a mapping of
+start values, or what :meth:`_Instance.step` takes; the answer is the outputs, or a text that says
+what failed. Loading is answered without a question, its outputs are zero.
 """
 
 import os

@@ -24,11 +24,11 @@ from rich.console import Console
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from bayesrace.interrupts import raise_if_interrupted
+from bayesrace.studies.campaign.case import Case, Files, car_identity, software_identity
+from bayesrace.studies.campaign.execute import FAILED, Row, run_case
+from bayesrace.studies.campaign.plan import Campaign
+from bayesrace.studies.campaign.results import writing
 from bayesrace.vehicles import write_car
-from studies.campaign.case import Case, Files, car_identity, software_identity
-from studies.campaign.execute import FAILED, Row, run_case
-from studies.campaign.plan import Campaign
-from studies.campaign.results import writing
 
 __all__ = ["run_campaign", "CampaignError", "computed", "connected", "rows_of", "run_worker"]
 

@@ -13,9 +13,9 @@ from pydantic.fields import FieldInfo
 
 from bayesrace.cache import cache_folder, digest, software
 from bayesrace.files import read_whole, write_whole
+from bayesrace.operation.preparation import SOURCES
+from bayesrace.operation.settings import RaceSettings
 from bayesrace.vehicles import CarParameters
-from operation.preparation import SOURCES
-from operation.settings import RaceSettings
 
 __all__ = ["CONTROLLERS", "LEARNS_FROM", "PAPER", "Case", "Controller", "Files", "car_identity"]
 __all__ += ["factors", "software_identity"]

@@ -16,16 +16,16 @@ import numpy as np
 from rich.console import Console
 
 from bayesrace.cache import cpu_digest
+from bayesrace.controller.assembly import compiled_controller
+from bayesrace.controller.path_table import make_path_table
 from bayesrace.gp.weights import GpWeights, read_weights
-from controller.assembly import compiled_controller
-from controller.path_table import make_path_table
-from learning.dataset import Dataset
-from operation import preparation
-from operation.analysis.laps import trajectory_digest
-from operation.closed_loop import ClosedLoop, Driven, built_in_car
-from operation.settings import PreparationSettings
-from operation.terminal.progress import stages_on
-from studies.campaign.case import LEARNS_FROM, Case, Controller, software_identity
+from bayesrace.learning.dataset import Dataset
+from bayesrace.operation import preparation
+from bayesrace.operation.analysis.laps import trajectory_digest
+from bayesrace.operation.closed_loop import ClosedLoop, Driven, built_in_car
+from bayesrace.operation.settings import PreparationSettings
+from bayesrace.operation.terminal.progress import stages_on
+from bayesrace.studies.campaign.case import LEARNS_FROM, Case, Controller, software_identity
 
 __all__ = ["FAILED", "Row", "run_case"]
 
@@ -42,7 +42,7 @@ _one_at_a_time = threading.Lock()
 
 
 def run_case(task: str, files: dict[str, bytes]) -> list[Row]:
-    """The rows of a case (:meth:`studies.campaign.case.Case.task`): one a lap.
+    """The rows of a case (:meth:`bayesrace.studies.campaign.case.Case.task`): one a lap.
 
     A run that fails has a row with its reason; the others are driven all the same. Raises
     RuntimeError where this is another version of the software than made the case.

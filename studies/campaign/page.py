@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 
 from bayesrace.arrays import Floats
 from bayesrace.files import write_whole
-from operation.report.render import template
-from operation.report.style import INK, PANEL_WIDTH, figure_style, inline_svg, look, panel
-from studies.campaign import summary
-from studies.campaign.summary import Levels, summarised
+from bayesrace.operation.report.render import template
+from bayesrace.operation.report.style import INK, PANEL_WIDTH, figure_style, inline_svg, look, panel
+from bayesrace.studies.campaign import summary
+from bayesrace.studies.campaign.summary import Levels, summarised
 
 __all__ = ["render_campaign"]
 

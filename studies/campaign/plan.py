@@ -1,8 +1,8 @@
 """The plan of a campaign: a TOML file that says what varies, as docs/campaigns.md shows it.
 
-Every setting of :class:`~operation.settings.RaceSettings` may stand in [grid], whose values are
-combined, or in [random], whose values are drawn for each combination, but for a few that a campaign
-fixes. A text that ends in ``A..B`` stands for the whole numbers from A to B.
+Every setting of :class:`~bayesrace.operation.settings.RaceSettings` may stand in [grid], whose
+values are combined, or in [random], whose values are drawn for each combination, but for a few that
+a campaign fixes. A text that ends in ``A..B`` stands for the whole numbers from A to B.
 """
 
 import itertools
@@ -20,11 +20,19 @@ from bayesrace.cache import digest
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import parse_toml, read_text
 from bayesrace.gp.weights import decode_weights
+from bayesrace.operation.settings import RaceSettings
+from bayesrace.studies.campaign.case import (
+    CONTROLLERS,
+    LEARNS_FROM,
+    PAPER,
+    Case,
+    Controller,
+    Files,
+    factors,
+)
+from bayesrace.studies.settings import spread
 from bayesrace.tracks import builtin_tracks, is_random_track, load_track
 from bayesrace.vehicles import CarParameters, get_car
-from operation.settings import RaceSettings
-from studies.campaign.case import CONTROLLERS, LEARNS_FROM, PAPER, Case, Controller, Files, factors
-from studies.settings import spread
 
 __all__ = ["Campaign", "read_plan"]
 

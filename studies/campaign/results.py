@@ -20,8 +20,8 @@ from pydantic.fields import FieldInfo
 
 from bayesrace.errors import InputError
 from bayesrace.files import clear_partials, replacing
-from studies.campaign.case import factors
-from studies.campaign.execute import FAILED, Row
+from bayesrace.studies.campaign.case import factors
+from bayesrace.studies.campaign.execute import FAILED, Row
 
 __all__ = ["Results", "read_results", "writing"]
 

@@ -14,9 +14,9 @@ import numpy as np
 import pandas as pd
 
 from bayesrace.errors import InputError
-from studies.campaign.case import CONTROLLERS, factors
-from studies.campaign.execute import FAILED
-from studies.campaign.results import read_results
+from bayesrace.studies.campaign.case import CONTROLLERS, factors
+from bayesrace.studies.campaign.execute import FAILED
+from bayesrace.studies.campaign.results import read_results
 
 __all__ = ["Levels", "by_controller", "facts", "failures", "in_order", "levels", "pairs"]
 __all__ += ["read_laps", "shown", "summarised", "varied", "worst"]

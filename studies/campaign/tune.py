@@ -19,15 +19,15 @@ from rich.console import Console
 from rich.text import Text
 
 from bayesrace.errors import InputError
+from bayesrace.operation.preparation import prepare
+from bayesrace.operation.settings import RaceSettings
+from bayesrace.operation.terminal.progress import Stages
+from bayesrace.operation.terminal.terminal import plain_table
+from bayesrace.studies.campaign.campaign import computed, connected
+from bayesrace.studies.campaign.case import Case, Controller, Files
+from bayesrace.studies.campaign.execute import FAILED, Row
+from bayesrace.studies.settings import TuneSettings
 from bayesrace.vehicles import CarParameters, write_car
-from operation.preparation import prepare
-from operation.settings import RaceSettings
-from operation.terminal.progress import Stages
-from operation.terminal.terminal import plain_table
-from studies.campaign.campaign import computed, connected
-from studies.campaign.case import Case, Controller, Files
-from studies.campaign.execute import FAILED, Row
-from studies.settings import TuneSettings
 
 __all__ = ["Verdict", "print_verdict", "tune"]
 

@@ -11,9 +11,8 @@ import numpy as np
 
 from bayesrace.arrays import Floats
 from bayesrace.columns import Columns
-from bayesrace.tracks import Track
-from studies.latency.legs import ANSWER, LEGS, ClockMap, Cycles
-from studies.latency.results import (
+from bayesrace.studies.latency.legs import ANSWER, LEGS, ClockMap, Cycles
+from bayesrace.studies.latency.results import (
     BareLoop,
     Clocks,
     LatencyResult,
@@ -22,8 +21,9 @@ from studies.latency.results import (
     Series,
     Traffic,
 )
-from studies.latency.settings import LatencySettings
-from studies.latency.tables import MOST_CYCLES, begins_anew, read_tables, split
+from bayesrace.studies.latency.settings import LatencySettings
+from bayesrace.studies.latency.tables import MOST_CYCLES, begins_anew, read_tables, split
+from bayesrace.tracks import Track
 
 __all__ = ["Analysis", "Beside", "analyse"]
 

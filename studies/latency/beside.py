@@ -24,10 +24,10 @@ import zenoh
 from numpy.typing import NDArray
 
 from bayesrace.clock import die_with_parent, sleep_until_ns
+from bayesrace.operation.system import child
 from bayesrace.realtime import RealtimeSettings, prepare_thread
+from bayesrace.studies.latency.results import BareLoop, Series
 from bayesrace.transport import Endpoints, open_session, private_endpoints
-from operation.system import child
-from studies.latency.results import BareLoop, Series
 
 __all__ = ["bare_loop", "bare_result", "read_bare_loop", "read_round_trips", "running_beside"]
 
@@ -52,7 +52,9 @@ def running_beside(
         def start(log: str, **task: Any) -> Any:
             task |= {"realtime": realtime.model_dump(), "period_ns": round(1e9 / rate_hz)}
             line = ["--parent-pid", str(os.getpid()), json.dumps(task)]
-            return stack.enter_context(child(line, out / f"{log}.log", "studies.latency.beside"))
+            return stack.enter_context(
+                child(line, out / f"{log}.log", "bayesrace.studies.latency.beside")
+            )
 
         for _ in range(load):
             start("load", work="load")

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bayesrace.arrays import Floats
 from bayesrace.columns import Columns
-from studies.latency.tables import Tables, begins_anew
+from bayesrace.studies.latency.tables import Tables, begins_anew
 
 __all__ = ["ANSWER", "BESIDE", "LEGS", "ClockMap", "Cycles"]
 

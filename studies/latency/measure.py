@@ -12,20 +12,20 @@ from typing import Final
 from bayesrace.errors import InputError
 from bayesrace.files import claimed, write_whole
 from bayesrace.messages import Event
+from bayesrace.operation.drive import RunPlan, run_request
+from bayesrace.operation.preparation import Prepared, prepare
+from bayesrace.operation.settings import PreparationSettings
+from bayesrace.operation.system import Child, endings, started_system
+from bayesrace.operation.terminal.progress import Stages
 from bayesrace.recorder import Recorder
+from bayesrace.studies.latency.analysis import Beside, analyse
+from bayesrace.studies.latency.beside import read_bare_loop, read_round_trips, running_beside
+from bayesrace.studies.latency.report import RESULT, write_files
+from bayesrace.studies.latency.results import LatencyResult, Memory
+from bayesrace.studies.latency.settings import LatencySettings
 from bayesrace.tracks import Track, load_track
 from bayesrace.transport import Director, Item, Kind, open_session
 from bayesrace.vehicles import write_car
-from operation.drive import RunPlan, run_request
-from operation.preparation import Prepared, prepare
-from operation.settings import PreparationSettings
-from operation.system import Child, endings, started_system
-from operation.terminal.progress import Stages
-from studies.latency.analysis import Beside, analyse
-from studies.latency.beside import read_bare_loop, read_round_trips, running_beside
-from studies.latency.report import RESULT, write_files
-from studies.latency.results import LatencyResult, Memory
-from studies.latency.settings import LatencySettings
 
 __all__ = ["LatencyError", "Run", "measure"]
 

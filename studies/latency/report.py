@@ -14,11 +14,11 @@ from rich.console import Console
 from rich.text import Text
 
 from bayesrace.files import write_whole
-from operation.report.style import INK, MUTED, figure_style, write_png
-from operation.terminal.terminal import plain_table
-from studies.latency.analysis import Analysis
-from studies.latency.legs import ANSWER, BESIDE, LEGS
-from studies.latency.results import Distribution, LatencyResult
+from bayesrace.operation.report.style import INK, MUTED, figure_style, write_png
+from bayesrace.operation.terminal.terminal import plain_table
+from bayesrace.studies.latency.analysis import Analysis
+from bayesrace.studies.latency.legs import ANSWER, BESIDE, LEGS
+from bayesrace.studies.latency.results import Distribution, LatencyResult
 
 __all__ = ["RESULT", "print_report", "write_files"]
 

@@ -11,23 +11,23 @@ import numpy as np
 
 from bayesrace.cache import cache_folder, cpu_identity, digest, kept, software
 from bayesrace.columns import LogColumns
+from bayesrace.controller.assembly import compiled_controller
+from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.errors import InputError
 from bayesrace.files import read_text
 from bayesrace.gp.weights import GpWeights, read_weights
+from bayesrace.learning.dataset import Dataset
+from bayesrace.learning.logs import dataset_from_columns
 from bayesrace.log import LogWriter
 from bayesrace.messages import TELEMETRY
+from bayesrace.operation.analysis.race import DrivenRun
+from bayesrace.operation.analysis.recording import RUN_COLUMNS, runs_of
+from bayesrace.operation.closed_loop import ClosedLoop, built_in_car
+from bayesrace.operation.preparation import PredictionModel, prepare, updated_weights
+from bayesrace.operation.settings import RaceSettings
+from bayesrace.operation.terminal.progress import Stages
 from bayesrace.raceline import RaceLine
-from controller.assembly import compiled_controller
-from controller.process_settings import ControllerSettings
-from learning.dataset import Dataset
-from learning.logs import dataset_from_columns
-from operation.analysis.race import DrivenRun
-from operation.analysis.recording import RUN_COLUMNS, runs_of
-from operation.closed_loop import ClosedLoop, built_in_car
-from operation.preparation import PredictionModel, prepare, updated_weights
-from operation.settings import RaceSettings
-from operation.terminal.progress import Stages
-from studies.campaign.case import software_identity
+from bayesrace.studies.campaign.case import software_identity
 
 __all__ = ["Experiment", "stored"]
 
@@ -42,7 +42,7 @@ class Experiment:
         models: Sequence[PredictionModel] = ("e_kinematic", "dynamic"),
     ) -> None:  # fmt: skip
         """``models``: that laps are predicted by. Raises as
-        :func:`~operation.preparation.prepare`."""
+        :func:`~bayesrace.operation.preparation.prepare`."""
         self.settings, self.car = settings, settings.driven_car
         prepared = prepare(settings, (settings.track,), stages, models, settings.line)
         if prepared.training is None:

@@ -13,22 +13,22 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bayesrace.arrays import Floats
+from bayesrace.operation.analysis.published import LAPS_OFF, LAPS_ON
+from bayesrace.operation.analysis.race import DrivenRun
+from bayesrace.operation.report.maps import draw_edges, show_all
+from bayesrace.operation.report.style import MUTED, WARNING, look, panel
+from bayesrace.operation.report.traces import input_figures
+from bayesrace.plant.simulator import PLANT
 from bayesrace.raceline import RaceLine, RaceLineSettings
 from bayesrace.raceline.nodes import timed_line
+from bayesrace.studies.paper.experiment import Experiment
+from bayesrace.studies.paper.finding import ELSEWHERE, Figures, Finding, Section, at_most
 from bayesrace.tracks import Track
 from bayesrace.tracks.spline import fit_arc_length
 from bayesrace.tracks.tables import read_table
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
 from bayesrace.vehicles.parts import GRAVITY_MPS2
-from operation.analysis.published import LAPS_OFF, LAPS_ON
-from operation.analysis.race import DrivenRun
-from operation.report.maps import draw_edges, show_all
-from operation.report.style import MUTED, WARNING, look, panel
-from operation.report.traces import input_figures
-from plant.simulator import PLANT
-from studies.paper.experiment import Experiment
-from studies.paper.finding import ELSEWHERE, Figures, Finding, Section, at_most
 
 __all__ = ["course", "loop_sections", "line_section", "published_line", "tenth_section"]
 

@@ -9,22 +9,28 @@ from typing import Final
 
 from bayesrace.files import write_whole
 from bayesrace.integrators import PREDICTION
+from bayesrace.learning.sources import dataset_from_npz
+from bayesrace.operation.analysis.published import SOURCE
+from bayesrace.operation.preparation import training_settings
+from bayesrace.operation.report.render import template
+from bayesrace.operation.report.style import figure_style, inline_svg, write_pdf
+from bayesrace.operation.settings import PreparationSettings
+from bayesrace.operation.terminal.progress import Stages
 from bayesrace.raceline import write_raceline
-from learning.sources import dataset_from_npz
-from operation.analysis.published import SOURCE
-from operation.preparation import training_settings
-from operation.report.render import template
-from operation.report.style import figure_style, inline_svg, write_pdf
-from operation.settings import PreparationSettings
-from operation.terminal.progress import Stages
-from studies.bench import BenchResult, run_bench
-from studies.paper.experiment import Experiment, stored
-from studies.paper.finding import Finding, Section
-from studies.paper.loop import line_section, loop_sections, published_line, tenth_section
-from studies.paper.models import model_section
-from studies.paper.residual import Learned, kernel_section, learned, learning_sections, smoothness
-from studies.paper.settings import LINE, PaperSettings
-from studies.settings import BenchSettings
+from bayesrace.studies.bench import BenchResult, run_bench
+from bayesrace.studies.paper.experiment import Experiment, stored
+from bayesrace.studies.paper.finding import Finding, Section
+from bayesrace.studies.paper.loop import line_section, loop_sections, published_line, tenth_section
+from bayesrace.studies.paper.models import model_section
+from bayesrace.studies.paper.residual import (
+    Learned,
+    kernel_section,
+    learned,
+    learning_sections,
+    smoothness,
+)
+from bayesrace.studies.paper.settings import LINE, PaperSettings
+from bayesrace.studies.settings import BenchSettings
 
 __all__ = ["make_paper"]
 
@@ -39,7 +45,7 @@ _FIGURES: Final = "figures"
 def make_paper(settings: PaperSettings, out: Path, stages: Stages) -> tuple[Path, list[Section]]:
     """Writes the page into the folder; its path, and what is on it.
 
-    Raises InputError for missing files, and as :func:`~operation.preparation.prepare`.
+    Raises InputError for missing files, and as :func:`~bayesrace.operation.preparation.prepare`.
     """
     orca, tenth, drives = settings.orca, settings.tenth, settings.drives
     out.mkdir(parents=True, exist_ok=True)

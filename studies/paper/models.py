@@ -6,11 +6,11 @@ import numpy as np
 
 from bayesrace.arrays import Floats
 from bayesrace.integrators import Discretisation
+from bayesrace.operation.report.style import look, panel
+from bayesrace.studies.paper.finding import Finding, Section
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import Model, dynamic, e_kinematic, kinematic
 from bayesrace.vehicles.parts import AccelerationDrive
-from operation.report.style import look, panel
-from studies.paper.finding import Finding, Section
 
 __all__ = ["model_section"]
 

@@ -16,23 +16,23 @@ from threadpoolctl import threadpool_limits
 from bayesrace.arrays import Floats, Rows
 from bayesrace.gp.weights import OUTPUTS, UNITS, GpWeights, read_weights
 from bayesrace.integrators import PREDICTION
+from bayesrace.learning.dataset import Dataset, concatenate
+from bayesrace.learning.likelihood import PairDistances, maximise, starts
+from bayesrace.learning.posterior import Posterior
+from bayesrace.learning.residual import residual
+from bayesrace.learning.settings import TrainingSettings
+from bayesrace.learning.target import Target
+from bayesrace.learning.validation import Validation, validate
+from bayesrace.operation.analysis.published import GP
+from bayesrace.operation.preparation import trained_weights
+from bayesrace.operation.report.gp import gp_figures
+from bayesrace.operation.report.style import INK, WARNING, look, panel
+from bayesrace.operation.terminal.notation import SMOOTHNESS, SYMBOLS, UNCERTAIN
+from bayesrace.operation.terminal.progress import Stage, Stages
+from bayesrace.studies.paper.experiment import stored
+from bayesrace.studies.paper.finding import Figures, Finding, Section, at_most
+from bayesrace.studies.paper.loop import course
 from bayesrace.tracks import Track
-from learning.dataset import Dataset, concatenate
-from learning.likelihood import PairDistances, maximise, starts
-from learning.posterior import Posterior
-from learning.residual import residual
-from learning.settings import TrainingSettings
-from learning.target import Target
-from learning.validation import Validation, validate
-from operation.analysis.published import GP
-from operation.preparation import trained_weights
-from operation.report.gp import gp_figures
-from operation.report.style import INK, WARNING, look, panel
-from operation.terminal.notation import SMOOTHNESS, SYMBOLS, UNCERTAIN
-from operation.terminal.progress import Stage, Stages
-from studies.paper.experiment import stored
-from studies.paper.finding import Figures, Finding, Section, at_most
-from studies.paper.loop import course
 
 __all__ = [
     "Learned",

@@ -10,8 +10,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from bayesrace.defaults import Option
 from bayesrace.errors import InputError
 from bayesrace.files import read_text
+from bayesrace.operation.settings import RaceSettings
 from bayesrace.raceline import RaceLineSettings
-from operation.settings import RaceSettings
 
 __all__ = ["DRIVES", "LINE", "PaperSettings"]
 

@@ -18,8 +18,8 @@ import pytest
 
 from bayesrace.log import LogReader
 from bayesrace.messages import STATE, Role
+from bayesrace.operation.certificates import add, init
 from bayesrace.transport import free_endpoint
-from operation.certificates import add, init
 from tests.containers.images import Store, missing_tools
 from tests.network.cars import gentle_course
 from tests.programs import PATIENCE_S

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from bayesrace.codegen.build import build
+from bayesrace.codegen.settings import BuildSettings
 from bayesrace.gp.weights import GpWeights, write_weights
 from bayesrace.raceline.line import RaceLine, write_raceline
 from bayesrace.tracks import Track, write_track
 from bayesrace.vehicles import get_car
-from codegen.build import build
-from codegen.settings import BuildSettings
 from tests.conftest import fit_weights, offset_line
 from tests.network.hosts import Host
 from tests.programs import COMMAND, PATIENCE_S, ROOT, environment

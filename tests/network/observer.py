@@ -21,10 +21,10 @@ import zenoh
 
 from bayesrace.errors import InputError
 from bayesrace.messages import STATE, State, car_key, decode
+from bayesrace.operation.drive import RunPlan, run_request
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import Track, load_track
 from bayesrace.transport import Director, Endpoints, open_session
-from operation.drive import RunPlan, run_request
 from tests.network.hosts import Host
 from tests.programs import PATIENCE_S, ROOT, environment, until
 

@@ -7,8 +7,8 @@ from typing import Final
 import pytest
 
 from bayesrace.messages import Role
+from bayesrace.operation.certificates import add, init, revoke
 from bayesrace.transport import Credentials, Endpoints
-from operation.certificates import add, init, revoke
 from tests.shared import session_folder
 
 __all__ = ["CAR", "OTHER", "Bundles", "bundles", "make_bundles", "written"]

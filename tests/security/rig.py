@@ -9,9 +9,9 @@ import pytest
 
 from bayesrace.configuration import read_configuration
 from bayesrace.messages import Event
+from bayesrace.operation.drive import RunPlan, run_request
 from bayesrace.recorder import Recorder
 from bayesrace.transport import Director, free_endpoint, open_session
-from operation.drive import RunPlan, run_request
 from tests.network.cars import Course, Program, gentle_course
 from tests.network.journey import Journey
 from tests.programs import PATIENCE_S

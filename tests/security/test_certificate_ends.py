@@ -13,8 +13,8 @@ import pytest
 from bayesrace.configuration import read_configuration
 from bayesrace.errors import InputError
 from bayesrace.messages import Role
+from bayesrace.operation.certificates import add, init
 from bayesrace.transport import Endpoints, free_endpoint, open_session
-from operation.certificates import add, init
 from tests.network.cars import Course, Program
 from tests.network.journey import STANDING_MPS
 from tests.programs import PATIENCE_S, ROOT, until

@@ -12,8 +12,8 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from bayesrace.errors import InputError
 from bayesrace.files import claimed
+from bayesrace.operation import certificates
 from bayesrace.transport import Credentials
-from operation import certificates
 from tests.command_line import Cli, refused
 from tests.security.authority import Bundles, bundles
 

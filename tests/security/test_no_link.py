@@ -8,11 +8,11 @@ from typing import Final
 import pytest
 
 from bayesrace.gp.weights import write_weights, zero_weights
+from bayesrace.operation.certificates import add, init
+from bayesrace.operation.doctor import probe
 from bayesrace.raceline.line import write_raceline
 from bayesrace.tracks import write_track
 from bayesrace.transport import Credentials, Endpoints, free_endpoint, open_session
-from operation.certificates import add, init
-from operation.doctor import probe
 from tests.command_line import Cli, refused
 from tests.conftest import Circuit
 from tests.programs import finish, start, until

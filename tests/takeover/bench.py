@@ -11,14 +11,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from bayesrace.controller.assembly import predictive_controller
+from bayesrace.controller.mpc import PredictiveController
+from bayesrace.controller.weights.manager import WeightUpdateManager
+from bayesrace.controller.weights.settings import GateSettings
 from bayesrace.gp.weights import GpWeights, encode_weights
 from bayesrace.messages import ROLLBACK, WEIGHTS, Reply, RollbackRequest
 from bayesrace.transport import Endpoints, ask, open_session
 from bayesrace.vehicles import get_car
-from controller.assembly import predictive_controller
-from controller.mpc import PredictiveController
-from controller.weights.manager import WeightUpdateManager
-from controller.weights.settings import GateSettings
 from tests.network.cars import Course
 from tests.programs import until
 

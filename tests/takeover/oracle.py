@@ -6,16 +6,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bayesrace.arrays import Floats
+from bayesrace.controller.assembly import predictive_controller
+from bayesrace.controller.cycle import Cycle
+from bayesrace.controller.driver import Decision
+from bayesrace.controller.native_step import NativeStep
+from bayesrace.controller.path_table import make_path_table
+from bayesrace.controller.process_settings import ControllerSettings
+from bayesrace.controller.settings import MpcSettings
 from bayesrace.gp.weights import GpWeights, encode_weights
 from bayesrace.messages import State
 from bayesrace.vehicles import get_car
-from controller.assembly import predictive_controller
-from controller.cycle import Cycle
-from controller.driver import Decision
-from controller.native_step import NativeStep
-from controller.path_table import make_path_table
-from controller.process_settings import ControllerSettings
-from controller.settings import MpcSettings
 from tests.network.cars import Course
 
 __all__ = ["converged", "replayed"]

@@ -13,9 +13,12 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from bayesrace.codegen.build import build
+from bayesrace.codegen.settings import BuildSettings
 from bayesrace.gp.weights import GpWeights, encode_weights, write_weights
 from bayesrace.log import LogReader
 from bayesrace.messages import EVENT, STATE, TELEMETRY, Event, State, car_key, decode
+from bayesrace.operation.drive import RunPlan, run_request
 from bayesrace.raceline.line import write_raceline
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import Track, write_track
@@ -27,9 +30,6 @@ from bayesrace.transport import (
     open_session,
 )
 from bayesrace.vehicles import get_car
-from codegen.build import build
-from codegen.settings import BuildSettings
-from operation.drive import RunPlan, run_request
 from tests.conftest import fit_weights, offset_line
 from tests.network.cars import Course, Program, start_controller, start_plant
 
@@ -168,6 +168,6 @@ def judges(of: int) -> list[int]:
             parent = int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1])
         except (OSError, ValueError, IndexError):
             continue
-        if b"controller.weights.checks" in words and parent == of:
+        if b"bayesrace.controller.weights.checks" in words and parent == of:
             found.append(int(entry.name))
     return found

@@ -11,12 +11,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bayesrace.controller.weights.checks import (
+    NO_SAMPLES,
+    Checks,
+    Samples,
+    Verdict,
+    plausible_features,
+)
+from bayesrace.controller.weights.comparison import compare, slack_of
+from bayesrace.controller.weights.settings import GateSettings
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpOutput, GpWeights, encode_weights, zero_weights
 from bayesrace.vehicles import CarParameters
-from controller.weights.checks import NO_SAMPLES, Checks, Samples, Verdict, plausible_features
-from controller.weights.comparison import compare, slack_of
-from controller.weights.settings import GateSettings
 from tests.conftest import fit_weights
 from tests.takeover.rig import KINDS
 from tests.takeover.spoilt_weights import SPOILT, spoilt

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import pytest
 
+from bayesrace.controller.weights.adoption import Ruling
+from bayesrace.controller.weights.settings import GateSettings
+from bayesrace.controller.weights.store import History, Store
 from bayesrace.gp.weights import GpWeights
-from controller.weights.adoption import Ruling
-from controller.weights.settings import GateSettings
-from controller.weights.store import History, Store
-from operation.learn.publishing import in_words
+from bayesrace.operation.learn.publishing import in_words
 from tests.network.cars import Course
 from tests.programs import until
 from tests.takeover.bench import bench
@@ -29,7 +29,7 @@ pytestmark = pytest.mark.wall_clock
 def test_an_offer_that_the_control_loop_does_not_adopt_is_withdrawn(
     course: Course, good: GpWeights, again: GpWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("controller.weights.manager._ADOPT_S", 0.1)
+    monkeypatch.setattr("bayesrace.controller.weights.manager._ADOPT_S", 0.1)
     with bench(course) as made:
         refusal = made.send(again).result(60.0)
         assert not refusal.accepted
@@ -44,7 +44,7 @@ def test_an_offer_that_the_control_loop_does_not_adopt_is_withdrawn(
 def test_a_request_when_too_many_wait_is_refused_for_now(
     course: Course, again: GpWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("controller.weights.manager._MOST_WAITING", 1)
+    monkeypatch.setattr("bayesrace.controller.weights.manager._MOST_WAITING", 1)
     with bench(course) as made:
         answers = [made.send(again)]
         made.offered()
@@ -60,7 +60,7 @@ def test_every_refusal_is_counted(
     course: Course, again: GpWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By a full queue, by a fault of the controller's own, and at its end."""
-    monkeypatch.setattr("controller.weights.manager._MOST_WAITING", 1)
+    monkeypatch.setattr("bayesrace.controller.weights.manager._MOST_WAITING", 1)
     with bench(course) as made:
 
         def fails(*_: object) -> None:
@@ -113,13 +113,19 @@ def test_a_check_that_hangs_is_killed_by_its_deadline(
 ) -> None:
     """The request is refused for now, what is in use stays, and the next one is served."""
     with bench(course) as made:
-        monkeypatch.setattr("controller.weights.manager._RETURN_S", 14.0)  # leaves a second
-        monkeypatch.setattr("controller.weights.checks.RUN_MODULE", (sys.executable, "-c", SLEEP))
+        monkeypatch.setattr(
+            "bayesrace.controller.weights.manager._RETURN_S", 14.0
+        )  # leaves a second
+        monkeypatch.setattr(
+            "bayesrace.controller.weights.checks.RUN_MODULE", (sys.executable, "-c", SLEEP)
+        )
         reply = made.reply(made.send(again))
         assert (reply.accepted, reply.data) == (False, {"again": True})
         assert "did not end in time" in reply.text
         assert made.version == good.version
-        monkeypatch.setattr("controller.weights.checks.RUN_MODULE", (sys.executable, "-c", FAIL))
+        monkeypatch.setattr(
+            "bayesrace.controller.weights.checks.RUN_MODULE", (sys.executable, "-c", FAIL)
+        )
         assert "ended with code 3: no memory" in made.reply(made.send(again)).text
         monkeypatch.undo()
         assert made.accept(again).data["number"] == 1
@@ -183,8 +189,8 @@ def test_back_to_weights_that_were_never_proven(
 @pytest.fixture
 def disk(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
     """A disk that hangs until this is set; requests wait a second for it."""
-    monkeypatch.setattr("controller.weights.manager._RETURN_S", 12.0)
-    monkeypatch.setattr("controller.weights.manager._STORE_S", 1.0)
+    monkeypatch.setattr("bayesrace.controller.weights.manager._RETURN_S", 12.0)
+    monkeypatch.setattr("bayesrace.controller.weights.manager._STORE_S", 1.0)
     free, keep = threading.Event(), Store.keep
 
     def hangs(store: Store, history: History) -> None:
@@ -232,7 +238,7 @@ def test_a_disk_that_hangs_does_not_keep_the_process_from_ending(tmp_path: Path)
     program = """
 import sys, threading
 from pathlib import Path
-from controller.weights.store import History, Store, StoreWriter
+from bayesrace.controller.weights.store import History, Store, StoreWriter
 begun = threading.Event()
 Store.keep = lambda *_: begun.set() or threading.Event().wait()
 StoreWriter(Store(Path(sys.argv[1]), "d"), History(), print).write()

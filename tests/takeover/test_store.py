@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from bayesrace.controller.weights.store import HISTORY, AcceptedWeights, History, Store, digest_of
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import encode_weights, zero_weights
 from bayesrace.vehicles import CarParameters
-from controller.weights.store import HISTORY, AcceptedWeights, History, Store, digest_of
 
 START = AcceptedWeights(number=0, version="", digest=digest_of(b""), proven=True)
 

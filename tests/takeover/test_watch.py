@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from bayesrace.arrays import Floats
+from bayesrace.controller.native_step import NativeStep
+from bayesrace.controller.path_table import make_path_table
+from bayesrace.controller.settings import MpcSettings
+from bayesrace.controller.weights.adoption import Ruling, Watch
+from bayesrace.controller.weights.settings import SAMPLES, WATCHED, GateSettings
 from bayesrace.gp.weights import GpWeights, pack_weights, zero_weights
 from bayesrace.vehicles import CarParameters
-from controller.native_step import NativeStep
-from controller.path_table import make_path_table
-from controller.settings import MpcSettings
-from controller.weights.adoption import Ruling, Watch
-from controller.weights.settings import SAMPLES, WATCHED, GateSettings
 from tests.conftest import Circuit, fit_weights, smooth_drive
 from tests.takeover.rig import KINDS
 from tests.takeover.spoilt_weights import SPOILT, spoilt

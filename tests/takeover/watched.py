@@ -2,21 +2,21 @@
 
 import math
 
+from bayesrace.codegen.build import build
+from bayesrace.codegen.settings import BuildSettings
+from bayesrace.controller.assembly import compiled_controller
+from bayesrace.controller.interface import Environment
+from bayesrace.controller.mpc import PredictiveController
+from bayesrace.controller.native_step import NativeStep
+from bayesrace.controller.weights.adoption import Ruling, Watch, limits_at, slowed_down
+from bayesrace.controller.weights.checks import Checks
+from bayesrace.controller.weights.settings import GateSettings
 from bayesrace.gp.weights import GpWeights, encode_weights, pack_weights, zero_weights
 from bayesrace.messages import State
+from bayesrace.operation.closed_loop import ClosedLoop, Driven
 from bayesrace.raceline import racing_line
 from bayesrace.tracks import load_track
 from bayesrace.vehicles import CarParameters
-from codegen.build import build
-from codegen.settings import BuildSettings
-from controller.assembly import compiled_controller
-from controller.interface import Environment
-from controller.mpc import PredictiveController
-from controller.native_step import NativeStep
-from controller.weights.adoption import Ruling, Watch, limits_at, slowed_down
-from controller.weights.checks import Checks
-from controller.weights.settings import GateSettings
-from operation.closed_loop import ClosedLoop, Driven
 
 __all__ = ["Course"]
 
