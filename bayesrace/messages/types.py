@@ -39,7 +39,7 @@ SENSOR_FAULTS: Final = (
 controller/native/bayesrace_cycle.h, which says what each means."""
 
 BRAKING_ROWS: Final = 192
-"""BRBRAKING_ROWS there."""
+"""BR_BRAKING_ROWS there."""
 
 
 def _one_of(words: Sequence[str]) -> Meta:
@@ -176,7 +176,7 @@ class Telemetry(Message, frozen=True, kw_only=True, tag=5):
     state_seq: Count
     status: StatusCode
     fallback: Annotated[int, Meta(ge=0, le=9)]
-    """0 solution, 1 shifted previous plan, 2 braking with the last safe steering, 3 stop."""
+    """0 solution, 1 shifted previous plan, 2 braking along the line, 3 stop."""
     iterations: Annotated[int, Meta(ge=0, le=100_000)]
     tick: Count
     """Number of the cycle's release since the process started; missing numbers are releases passed

@@ -46,9 +46,9 @@ _MEANS: Final[dict[str, tuple[tuple[str, str, str], ...]]] = {
         ("egress", "declare_liveliness_subscriber", _ANY),
     ),
 }  # fmt: skip
-"""What a process at the other end of a link may do, to what the link may carry for it: direction as
-seen by the node that checks ("ingress": from the other end), kind of message, and key if it is not
-that of the topic, service or token."""
+"""For each right of the process at the other end, the messages that its link may carry: direction
+as seen by the node that checks ("ingress": from the other end), kind of message, and key; an empty
+key is that of the topic, service or token."""
 
 
 def access_control(members: Members) -> dict[str, Any]:

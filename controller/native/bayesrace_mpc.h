@@ -31,8 +31,9 @@ extern "C" {
 #endif
 
 #define BR_SECOND_START_ITERATIONS 12 /* at most; most often it needs eight */
-/* A step without a plan tries so many guesses at most, all but the first so long; then as long each
- * without the soft rows and from there with them. */
+/* A step without a plan tries up to BR_COLD_GUESSES guesses; each after the first gets at most
+ * BR_SECOND_START_ITERATIONS. If none gives a usable plan, the problem is solved without its soft
+ * rows, and from that result with them; each of the two gets as many again. */
 #define BR_COLD_GUESSES 4
 #define BR_NV (BR_NX + BR_NU) /* stage variables v = [x; u] */
 #define BR_PATH_COLUMNS 7     /* see br_mpc_set_path */

@@ -2,9 +2,9 @@
  * goes back to the proven ones if they are worse.
  *
  * There are three buffers: in use, proven, and spare; the former two may be the same one.
- * mpc->spare is the state of the spare buffer. The thread that changes it to BR_SPARE_TAKEN
- * (acquire) may write the buffer, and releases it by storing another state; so the exchange, and
- * the steps that read the buffer before it, happen before the next staging.
+ * mpc->spare is the state of the spare buffer. A thread takes the buffer by setting BR_SPARE_TAKEN
+ * (acquire) and gives it back by storing another state (release), so no staging writes a buffer
+ * that an earlier step may still be reading.
  */
 #include <math.h>
 

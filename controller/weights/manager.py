@@ -291,8 +291,8 @@ class WeightUpdateManager:
         return offer
 
     def _follow(self, count: float = math.inf) -> None:
-        """Enters into the history what the watch has found and the control thread has done; at
-        most the first ``count`` rulings, as those later are about weights that are not in it."""
+        """Records the watch's rulings in the history, in order. With ``count``, stops after that
+        many in all: later ones are about weights just adopted, which are not in the history."""
         while self.adoption.rulings and self._entered < count:
             self._entered += 1
             self._enter(*self.adoption.rulings.popleft())

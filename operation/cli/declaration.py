@@ -250,8 +250,8 @@ def _pairs(given: list[str], remedy: str) -> dict[str, str]:
 
 
 class Given(Generic[Settings]):
-    """What the command line says of settings; called with what the command says, it makes them:
-    those of the configuration, overridden by the file, by the options, and by the command."""
+    """Makes the settings of a command when it is called. Later sources override earlier ones: the
+    configuration, the file of ``--settings``, the options, and the arguments of the call."""
 
     def __init__(
         self,
