@@ -60,6 +60,7 @@ _SHAPED_BY: Final = (
     "controller/native",
     "controller/native/host",
     "codegen",
+    "codegen/problems",
     "vehicles",
     "integrators.py",
 )

@@ -44,8 +44,11 @@ class PythonController:
             "predict": self._predict,
             "reset": self._reset,
         }  # without "steer": braking, its steering is held
+        # An interrupt may strike before a function's own handler; the call fails then, too.
+        failed = {"step": STEP_FAILED, "predict": -1}
         self._functions = {
-            name: ffi.callback(types[name].type, function) for name, function in functions.items()
+            name: ffi.callback(types[name].type, function, failed.get(name), self._struck)
+            for name, function in functions.items()
         }
 
     def begin_cycle(self, memory: Any, size: int, hold: bool, cycle: Any) -> int:
@@ -80,6 +83,10 @@ class PythonController:
         self.last_error = f"{type(error).__name__}: {error}"
         if not isinstance(error, Exception):
             self._pending = error
+
+    def _struck(self, _kind: Any, error: BaseException, _traceback: Any) -> None:
+        self._was_reset = False  # it may have been the reset
+        self._caught(error)
 
     def _reset(self, _: Any) -> None:
         self._was_reset = False

@@ -33,7 +33,7 @@ from bayesrace.transport.requests import (
     send_rollback,
     send_weights,
 )
-from bayesrace.transport.session import open_session, try_links
+from bayesrace.transport.session import check_session, open_session
 
 __all__ = [
     "CONTROLLER_ENDPOINT", "HEARTBEAT_S", "LOCKSTEP_SPIN_S", "NEWEST", "PLANT_ENDPOINT", "POLL_S",
@@ -41,5 +41,5 @@ __all__ = [
     "Kind", "LinkLimits", "Member", "Members", "Numbering", "Publisher", "RefusedError", "Request",
     "ask", "ask_all", "check_descriptors", "count_processes", "decisive",
     "declare_service", "decode_request", "free_endpoint", "open_session", "private_endpoints",
-    "send_rollback", "send_weights", "try_links",
+    "send_rollback", "send_weights", "check_session",
 ]  # fmt: skip

@@ -29,7 +29,7 @@ from bayesrace.transport.endpoints import Endpoints, address_of, check_descripto
 from bayesrace.transport.expiry import ending_on_expiry
 from bayesrace.transport.requests import in_transport_thread
 
-__all__ = ["open_session", "try_links", "unlinked", "zenoh_config"]
+__all__ = ["open_session", "check_session", "unlinked", "zenoh_config"]
 
 _log = logging.getLogger("bayesrace.links")
 
@@ -143,7 +143,7 @@ def open_session(
     the end of the block raises InputError with the reason.
     """
     os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)
-    try_links(endpoints, role)
+    check_session(endpoints, role)
     if endpoints.exposed:
         _log.warning(
             "INSECURE: links by %s are open to everyone in that network, who could drive the car; "
@@ -164,7 +164,7 @@ def open_session(
         yield session
 
 
-def try_links(endpoints: Endpoints, role: Role) -> None:
+def check_session(endpoints: Endpoints, role: Role) -> None:
     """InputError for what no session can be opened with: certificate, endpoints, limits.
 
     For commands with seconds of work before they open one.

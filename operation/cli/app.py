@@ -62,7 +62,7 @@ _PLACES: Final = {_name(place): place for places in _TASKS.values() for place in
 def _declared(name: str) -> Any:
     """The function of a command, or a group of them."""
     module, _, attribute = _PLACES[name].partition(".")
-    return getattr(import_module(f"operation.cli.{module}"), attribute)
+    return getattr(import_module(f"bayesrace.operation.cli.{module}"), attribute)
 
 
 def _whole(name: str) -> Any:

@@ -280,7 +280,8 @@ class Given(Generic[Settings]):
             inner = content
             for name in option.path[:-1]:
                 inner = inner.setdefault(name, {})
-            inner[option.path[-1]] = option.value(given)
+            value, name = option.value(given), option.path[-1]
+            inner[name] = {**inner.get(name, {}), **value} if isinstance(value, dict) else value
         try:
             return self._model.model_validate({**content, **above})
         except ValidationError as error:

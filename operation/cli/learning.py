@@ -234,11 +234,11 @@ def learn(
     and publishes the weights. Plant and controller may start before or after this command, and
     restart; with the same --out, this command resumes. Start a run with 'bayesrace drive'.
     """
-    from bayesrace.transport import try_links
+    from bayesrace.transport import check_session
 
     chosen = settings() if watch or "--laps" in settings.flags else settings(laps=1)
     learning.check_car(chosen.name)
-    try_links(learning, "learning")  # before imports that take seconds
+    check_session(learning, "learning")  # before imports that take seconds
     from bayesrace.operation.learn.job import learn as follow
     from bayesrace.operation.learn.report import print_laps
 

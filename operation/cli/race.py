@@ -158,10 +158,10 @@ def latency(
     if chosen.log and (attach or chosen.load):
         raise InputError("--log is of a run that is over: leave out --attach and --load")
     if attach:
-        from bayesrace.transport import try_links
+        from bayesrace.transport import check_session
 
         running = network.endpoints("director", connect=endpoint)
-        try_links(running, "director")  # before imports that take seconds
+        check_session(running, "director")  # before imports that take seconds
         chosen = settings(attach=running, warm_up_s=0.0)
 
     from bayesrace.operation.terminal.terminal import Terminal

@@ -38,7 +38,7 @@ _REMEDIES: Final = {
     "steering does not match its rate": "the steering angle does not follow the rate that the "
     "plant reports; correct the FMU's map, or the plant",
 }
-"""Remedy by the reason why samples are left out (:mod:`.dataset`, :mod:`.logs`)."""
+"""Remedy by the reason why samples are left out (:mod:`bayesrace.learning.logs`)."""
 
 
 @dataclass(eq=False)

@@ -39,7 +39,11 @@ class Journal:
         files are damaged, or if another job runs in the folder.
         """
         before = _read_record(folder)
-        if before is None and folder.is_dir() and any(folder.iterdir()):
+        if (
+            before is None
+            and folder.is_dir()
+            and any(not one.match(".*.part*") for one in folder.iterdir())
+        ):
             raise InputError(f"{folder} holds something else; choose another folder")
         self._lock = ExitStack()
         self._lock.enter_context(claimed(folder))
