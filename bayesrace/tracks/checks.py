@@ -9,6 +9,7 @@ import numpy.typing as npt
 from bayesrace.arrays import Floats
 
 __all__ = [
+    "default_car_width_m",
     "MIN_POINTS",
     "Fault",
     "clearance_m",
@@ -226,3 +227,12 @@ def _edges_meet(a: Floats, b: Floats, c: Floats, d: Floats) -> npt.NDArray[np.bo
     )
     crosses = (side(a, b, c) * side(a, b, d) <= 0) & (side(c, d, a) * side(c, d, b) <= 0)
     return np.asarray(boxes & crosses)
+
+
+def default_car_width_m(car_width_m: float | None) -> float:
+    """The given width, or that of the default car."""
+    if car_width_m is not None:
+        return car_width_m
+    from bayesrace.vehicles import DEFAULT_CAR, get_car
+
+    return get_car(DEFAULT_CAR).width_m

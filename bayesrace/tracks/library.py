@@ -14,7 +14,13 @@ import numpy as np
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
-from bayesrace.tracks.checks import Fault, find_fault, find_scale_fault, find_value_fault
+from bayesrace.tracks.checks import (
+    Fault,
+    default_car_width_m,
+    find_fault,
+    find_scale_fault,
+    find_value_fault,
+)
 from bayesrace.tracks.generator import RANDOM_TRACKS, random_track
 from bayesrace.tracks.shapes import rounded_polygon, smooth
 from bayesrace.tracks.tables import read_table, write_table
@@ -27,7 +33,6 @@ __all__ = [
     "DEFAULT_RACE_TRACK",
     "DEFAULT_TRAINING_TRACK",
     "builtin_tracks",
-    "default_car_width_m",
     "is_random_track",
     "load_any",
     "load_track",
@@ -231,12 +236,3 @@ def write_track(path: Path | str, track: Track) -> None:
     """Writes the nodes of a track; reading the file gives the same numbers."""
     nodes = np.column_stack([track.x_m, track.y_m, track.width_right_m, track.width_left_m])
     write_table(path, _COLUMNS, nodes, separator=",")
-
-
-def default_car_width_m(car_width_m: float | None) -> float:
-    """The given width, or that of the default car."""
-    if car_width_m is not None:
-        return car_width_m
-    from bayesrace.vehicles import DEFAULT_CAR, get_car
-
-    return get_car(DEFAULT_CAR).width_m

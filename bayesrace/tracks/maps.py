@@ -21,8 +21,7 @@ from scipy import ndimage
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_text
-from bayesrace.tracks.checks import find_fault
-from bayesrace.tracks.library import default_car_width_m
+from bayesrace.tracks.checks import default_car_width_m, find_fault
 from bayesrace.tracks.shapes import resample_closed, smooth_closed
 from bayesrace.tracks.track import Track
 
