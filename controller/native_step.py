@@ -125,6 +125,9 @@ class NativeProblem:
         self._reference_shape = (n, len(problem.stage_parameters))
         self._parameters = ffi.new("br_mpc_parameters *")
         self.info, self._status = ffi.new("br_mpc_info *"), ffi.new("br_mpc_status *")
+        # Made once: to make arguments of arrays takes longer than to copy into these.
+        self._x, self._x_given = self._made(nx)
+        self._u_before, self._u_before_given = self._made(nu)
         self.u, self._u = self._made(nu)
         self.plan_x, self._plan_x = self._made(n + 1, nx)
         self.plan_u, self._plan_u = self._made(n, nu)
@@ -288,8 +291,10 @@ class NativeProblem:
         return self._solved("solve", x, u_before, self._elapsed(elapsed_s), budget_s, stages)
 
     def _solved(self, what: str, x: Floats, u_before: npt.ArrayLike, *arguments: Any) -> StepStatus:
-        u = np.broadcast_to(np.asarray(u_before, dtype=np.float64), self._nu)
-        given = self._given("x", x, self._nx), self._given("u_before", u, self._nu)
+        if np.shape(x) != (self._nx,):
+            raise InputError(f"x has shape {np.shape(x)}, not ({self._nx},)")
+        self._x[:], self._u_before[:] = x, u_before
+        given = self._x_given, self._u_before_given
         results = self._u, self._status, self.info
         call = getattr(self._library, f"br_mpc_{what}")
         self._check(call(self.handle, *given, *arguments, *results), what)
