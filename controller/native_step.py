@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from enum import IntEnum
 from mmap import ACCESS_COPY, mmap
 from pathlib import Path
-from struct import Struct
 from typing import Any, Final
 
 import numpy as np
@@ -20,7 +19,7 @@ from bayesrace.controller.interface import Environment
 from bayesrace.controller.path_table import PATH_COLUMNS, PathTable
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import GpWeights, pack_weights
+from bayesrace.gp.weights import OUTPUT_HEAD, GpWeights, pack_weights
 from bayesrace.manifest import DECLARATIONS, check_library, read_manifest
 from bayesrace.vehicles import CarParameters
 
@@ -29,9 +28,6 @@ __all__ = ["Artefact", "NativeProblem", "NativeStep", "Reference", "StepStatus"]
 
 Reference = Floats
 """Parameters of the stages 1..N, shape (N, np), in the order of the manifest."""
-
-_GP_HEAD: Final = Struct("<II4d")
-"""Kernel, points, offset, scale, signal and noise: see bayesrace.gp.weights.pack_weights."""
 
 
 class StepStatus(IntEnum):
@@ -79,8 +75,8 @@ class Artefact:
     def memory(self, size: int) -> Any:
         """A block for an object of the library, zeros.
 
-        Of pages of its own: those that nobody writes, as for weights of more points, take no
-        memory.
+        It is mapped page by page: a page that is never written, such as one for more GP points than
+        the weights have, takes no physical memory.
         """
         return self.ffi.from_buffer(mmap(-1, size, access=ACCESS_COPY))
 
@@ -189,11 +185,11 @@ class NativeProblem:
         nz, data = len(problem.features), ffi.from_buffer(packed)
         outputs = ffi.new("br_mpc_gp[]", problem.outputs)
         for one in outputs if packed else ():
-            if at + _GP_HEAD.size > len(packed):
+            if at + OUTPUT_HEAD.size > len(packed):
                 break
-            one.kernel, one.n, *amplitudes = _GP_HEAD.unpack_from(packed, at)
+            one.kernel, one.n, *amplitudes = OUTPUT_HEAD.unpack_from(packed, at)
             one.offset, one.scale, one.signal, one.noise = amplitudes
-            at += _GP_HEAD.size
+            at += OUTPUT_HEAD.size
             one.length_scales = numbers = ffi.cast("double *", data + at)
             one.inputs, one.alpha = numbers + nz, numbers + nz * (1 + one.n)
             at += 8 * (nz * (1 + one.n) + one.n)

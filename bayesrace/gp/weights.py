@@ -41,6 +41,7 @@ __all__ = [
     "GpWeights",
     "decode_weights",
     "encode_weights",
+    "OUTPUT_HEAD",
     "pack_weights",
     "read_weights",
     "write_weights",
@@ -73,6 +74,9 @@ SCHEMA: Final = 3
 """Version of the encoded form; any other version is refused, older ones included: train again."""
 
 _MAGIC: Final = b"BRACEGP\n"
+OUTPUT_HEAD: Final = struct.Struct("<II4d")
+"""What :func:`pack_weights` has before the arrays of an output: kernel, points, offset, scale,
+signal and noise."""
 _HEAD: Final = struct.Struct("<8sI")
 _BODY_START: Final = _HEAD.size + hashlib.sha256().digest_size
 
@@ -346,7 +350,7 @@ def pack_weights(weights: GpWeights) -> bytes:
     parts = []
     for output in weights.outputs:
         kernel = KERNELS.index(output.kernel)
-        parts.append(struct.pack("<IIdddd", kernel, output.count, *output.amplitudes))
+        parts.append(OUTPUT_HEAD.pack(kernel, output.count, *output.amplitudes))
         numbers = (output.length_scales, output.inputs, output.alpha)
         parts += [np.ascontiguousarray(array, dtype="<f8").tobytes() for array in numbers]
     return b"".join(parts)
