@@ -84,8 +84,6 @@ class PlantProcess:
         self._news: tuple[float, str, dict[str, Scalar]] | None = None
         """When and what to report of a suspension: links that have expired are there again by
         then."""
-        self._expired_ns: int | None = None
-        """Since when the certificate has expired, as noticed."""
         inbox = self.inbox = Inbox(session, self.name)
         self._decoder = inbox.subscribe(ACTUATION, newest=NEWEST, logger=_log)
         inbox.subscribe(BRAKING, newest=1, logger=_log)
@@ -272,27 +270,11 @@ class PlantProcess:
             _, text, data = self._news
             self._news = None
             self._publish_event("suspended", text, data)
-        self._check_certificate()
-        now_ns = time.monotonic_ns()
-        for since_ns, what in (
-            (self._director_gone_ns, "the process that started the run has been gone"),
-            (self._expired_ns, "the plant's certificate has been expired, and the car braking,"),
-        ):
-            if since_ns is not None and now_ns - since_ns >= _ABANDONED_S * 1e9:
-                return End("abandoned", f"{what} for {_ABANDONED_S:g} s")
+        gone_ns = self._director_gone_ns
+        if gone_ns is not None and time.monotonic_ns() - gone_ns >= _ABANDONED_S * 1e9:
+            gone = "the process that started the run has been gone"
+            return End("abandoned", f"{gone} for {_ABANDONED_S:g} s")
         return None
-
-    def _check_certificate(self) -> None:
-        """Once it has expired, no command is taken any more, so that the car brakes.
-
-        Zenoh closes such links, and opens them again without looking at the certificate.
-        """
-        credentials = self._settings.endpoints.credentials
-        if credentials is None or time.time() < credentials.ends_s:
-            return
-        self._expired_ns = self._expired_ns or time.monotonic_ns()
-        if self._run is not None:
-            self._run.takes_commands = False
 
     def _status(self, seq: int = 0) -> Status:
         phase = "idle" if self._run is None else "running"
@@ -334,11 +316,7 @@ def main(settings: PlantSettings, compiled: Compile | None = None) -> int:
         simulator=settings.simulator,
     )  # fmt: skip
     settings.endpoints.check_car(settings.name or settings.car.name)
-    with (
-        vehicles as vehicle,
-        # A run is abandoned, and the car stands, when the process ends because of its certificate.
-        open_session(settings.endpoints, "plant", grace_s=_ABANDONED_S + 1.0) as session,
-    ):
+    with vehicles as vehicle, open_session(settings.endpoints, "plant") as session:
         process = PlantProcess(session, settings, vehicle)
         for refusal in prepare_thread(settings.realtime):
             _log.warning("%s", refusal)

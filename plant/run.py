@@ -75,8 +75,6 @@ class Run:
     """Added to states and to actuations."""
     sensors: Sensors | None = None
     """Exact without."""
-    takes_commands: bool = True
-    """Actuations count; else the car brakes, or in lockstep the run ends for want of them."""
 
     def __post_init__(self) -> None:
         self._car = CarRun(self.request, self.simulator, self.epoch, self.sensors, 2 * self.delay_s)
@@ -137,7 +135,7 @@ class Run:
                     continue
                 self.numbering.note(actuation.seq)
                 answered = (actuation.epoch, actuation.run, actuation.state_seq)
-                if self.takes_commands and answered == (self.epoch, run, seq):
+                if answered == (self.epoch, run, seq):
                     return actuation.u
                 self.counters.stale += 1
             elif item.kind is Kind.GONE and item.name == "controller":
@@ -214,13 +212,13 @@ class Run:
                     continue
                 mine = (actuation.epoch, actuation.run) == (self.epoch, self.request.run)
                 if item.name != ACTUATION.name:
-                    self._braking = actuation if mine and self.takes_commands else self._braking
+                    self._braking = actuation if mine else self._braking
                     continue
                 self.numbering.note(actuation.seq)
                 # one from the future would never grow old, and every later one would be overtaken
                 ahead = actuation.decided_at_s > self.simulator.time_s + 2 * self.simulator.step_s
                 known = actuation.state_seq in self._sampled_ns
-                if not self.takes_commands or not mine or ahead or not known:
+                if not mine or ahead or not known:
                     self.counters.stale += 1
                     continue
                 waiting = _Waiting(

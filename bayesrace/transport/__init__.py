@@ -2,9 +2,8 @@
 
 ``endpoints`` says where a process listens and connects, ``credentials`` holds its certificate,
 ``access`` makes Zenoh's access control of the table of messages, and ``session`` opens a session
-with all of that; ``expiry`` ends a process whose certificate expires. ``publisher`` sends messages
-and counts what is lost of them, ``inbox`` is the one subscriber, ``requests`` sends requests and
-serves them; ``director`` starts and follows runs.
+with all of that. ``publisher`` sends messages and counts what is lost of them, ``inbox`` is the one
+subscriber, ``requests`` sends requests and serves them; ``director`` starts and follows runs.
 """
 
 from bayesrace.transport.credentials import Credentials, Member, Members

@@ -1,14 +1,18 @@
-"""A process's certificate: the files, whose it is, and what the others are.
+"""A process's certificate: the files, whose it is, what the others are, and what ends with it.
 
 A folder holds what one process needs, as ``bayesrace certs`` writes it: the authority's certificate
 (``ca.pem``), its own (``certificate.pem``) with the private key (``key.pem``), and
 ``members.json``, which says what each name may do. A name that is not in it may do nothing.
 """
 
+import logging
 import os
+import signal
 import stat
+import threading
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
@@ -23,8 +27,10 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AUTHORITY", "CERTIFICATE", "CERTIFICATE_EXPIRED", "CERTIFICATE_NOT_YET", "COVERS", "EVERY_CAR",
-    "KEY", "MEMBERS", "NEWEST_LIST", "Credentials", "Member", "Members",
+    "KEY", "MEMBERS", "NEWEST_LIST", "Credentials", "Member", "Members", "ending_on_expiry",
 ]  # fmt: skip
+
+_log = logging.getLogger("bayesrace.links")
 
 AUTHORITY: Final = "ca.pem"
 CERTIFICATE: Final = "certificate.pem"
@@ -48,6 +54,14 @@ CERTIFICATE_NOT_YET: Final = 9
 """OpenSSL's numbers of what is wrong with a certificate."""
 
 _SOON_S: Final = 14 * 86400
+_REMINDER_S: Final = 86400.0
+_CALENDAR_S: Final = 1.0
+"""Longest time between two looks at the calendar, which somebody may set."""
+
+_interrupting: Final = threading.Lock()
+"""Held once an expiry interrupts the process, which may have several sessions with one certificate;
+until the process, which has not ended, opens another session."""
+
 _COPY: Final = "copy the folder again, as 'bayesrace certs' wrote it"
 _UNUSABLE: Final = {
     CERTIFICATE_EXPIRED: "has expired: renew it with 'bayesrace certs add NAME --renew'",
@@ -159,6 +173,57 @@ class Credentials(BaseModel):
             f"certificate '{self.name}' has expired, and its links are closed: renew it with "
             f"'bayesrace certs add {self.name} --renew', and start this process again with it"
         )
+
+
+@contextmanager
+def ending_on_expiry(credentials: Credentials) -> Iterator[None]:
+    """For the block, the expiry of the certificate interrupts the main thread; then the end of the
+    block raises InputError with the reason. Zenoh closes such links, but opens them again.
+
+    Started in another thread, it only logs the reason. The log warns of the expiry each day for two
+    weeks before.
+    """
+    in_main = threading.current_thread() is threading.main_thread()
+    if in_main and _interrupting.locked():
+        _interrupting.release()
+    over, expired = threading.Event(), threading.Event()
+
+    def watch() -> None:
+        if not _outlasted(credentials, over):
+            return
+        expired.set()
+        if not in_main:
+            _log.error("%s", credentials.expired())
+        elif _interrupting.acquire(blocking=False):
+            # Not to the process: another thread would get it, and the main one would sleep on.
+            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+
+    thread = threading.Thread(target=watch, name="expiry", daemon=True)
+    thread.start()
+    try:
+        try:
+            yield
+        finally:
+            over.set()
+            thread.join()
+    except (InputError, KeyboardInterrupt) as error:
+        if expired.is_set():
+            raise InputError(credentials.expired()) from error
+        raise
+    if expired.is_set():
+        raise InputError(credentials.expired())
+
+
+def _outlasted(credentials: Credentials, over: threading.Event) -> bool:
+    """Waits for the expiry; False if it is over before."""
+    remind_s = 0.0
+    while (left_s := credentials.ends_s - time.time()) > 0:
+        if time.monotonic() >= remind_s and (warning := credentials.expires_soon()):
+            _log.warning("%s", warning)
+            remind_s = time.monotonic() + _REMINDER_S
+        if over.wait(min(left_s, _CALENDAR_S)):
+            return False
+    return True
 
 
 def _members(path: Path) -> Members:

@@ -24,9 +24,14 @@ from bayesrace.errors import InputError
 from bayesrace.messages import Role
 from bayesrace.realtime import short_slices
 from bayesrace.transport.access import access_control
-from bayesrace.transport.credentials import AUTHORITY, CERTIFICATE, KEY, Credentials
+from bayesrace.transport.credentials import (
+    AUTHORITY,
+    CERTIFICATE,
+    KEY,
+    Credentials,
+    ending_on_expiry,
+)
 from bayesrace.transport.endpoints import Endpoints, address_of, check_descriptors, leaves
-from bayesrace.transport.expiry import ending_on_expiry
 from bayesrace.transport.requests import in_transport_thread
 
 __all__ = ["open_session", "check_session", "unlinked", "zenoh_config"]
@@ -126,7 +131,6 @@ def open_session(
     *,
     peers_follow: bool = False,
     reports_absence: bool = True,
-    grace_s: float = 0.0,
 ) -> Iterator[Any]:
     """A Zenoh session of a process in that role, closed at the end of the block.
 
@@ -139,8 +143,8 @@ def open_session(
     the session then does not wait for them, and the log does not say that they are absent.
     ``reports_absence`` False: nor does it where the caller reports that, after a time limit.
 
-    Where the process's certificate expires, the main thread gets a SIGINT ``grace_s`` later, and
-    the end of the block raises InputError with the reason.
+    Where the process's certificate expires, the main thread gets a SIGINT, and the end of the block
+    raises InputError with the reason.
     """
     os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)
     check_session(endpoints, role)
@@ -150,7 +154,7 @@ def open_session(
             "see docs/security.md", ", ".join(endpoints.exposed),
         )  # fmt: skip
     own = endpoints.credentials
-    ending = nullcontext() if own is None else ending_on_expiry(own, grace_s)
+    ending = nullcontext() if own is None else ending_on_expiry(own)
     with _opened(endpoints, role, peers_follow) as session, ending:
         missing: list[str] = []
         if reports_absence and not peers_follow:

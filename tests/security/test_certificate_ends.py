@@ -1,9 +1,5 @@
-"""A certificate that ends while processes run: each says so and ends, and the car stands before."""
+"""A certificate that ends while processes run: each says so and ends."""
 
-import re
-import signal
-import subprocess
-import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -17,7 +13,7 @@ from bayesrace.operation.certificates import add, init
 from bayesrace.transport import Endpoints, free_endpoint, open_session
 from tests.network.cars import Course, Program
 from tests.network.journey import STANDING_MPS
-from tests.programs import PATIENCE_S, ROOT, until
+from tests.programs import PATIENCE_S, until
 from tests.security.authority import CAR, Bundles, bundles, written
 from tests.security.rig import course, secured
 
@@ -61,20 +57,13 @@ def test_a_controller_ends_and_its_car_brakes(tmp_path: Path, course: Course) ->
 
 
 @pytest.mark.check
-def test_a_plant_ends_when_its_car_stands(tmp_path: Path, course: Course) -> None:
-    """Commands do not count from then on, though Zenoh opens the link again."""
+def test_a_plant_ends_and_its_controller_goes_on(tmp_path: Path, course: Course) -> None:
+    """Though Zenoh opens the link of an expired certificate again."""
     with secured(tmp_path, course, certified(tmp_path / "certs", "plant")) as rig:
         rig.drive(1, lockstep=False, laps=0)
         until(lambda: rig.phase() == "driving", "driving")
         check_ended(rig.plant, "plant")
-        assert "this process ends in" in rig.plant.said()
-        assert re.search("run 1 ended .* for 10 s", rig.plant.said())
         assert rig.controller.process.poll() is None
-        journey = rig.journey()
-    assert max(state.x[3] for state in journey.states) > 0.5
-    # The recording's own link closes, too, and does not always open again: it may end there.
-    if journey.states[-1].time_s > 86400 * BRIEF_DAYS + 3:
-        assert abs(journey.states[-1].x[3]) < STANDING_MPS
 
 
 @pytest.mark.check
@@ -133,28 +122,3 @@ def test_a_process_is_interrupted_once(bundles: Bundles) -> None:
     with pytest.raises(InputError, match="has expired"):
         work()
     assert ended == ["in order"]
-
-
-IGNORING = """
-import signal, sys, time
-from pathlib import Path
-from bayesrace.transport import Credentials, Endpoints, open_session
-
-own = Credentials.read(Path(sys.argv[1])).model_copy(update={"ends_s": time.time() + 2.0})
-with open_session(Endpoints(connect=(sys.argv[2],), credentials=own), "director"):
-    signal.raise_signal(signal.SIGINT)  # of somebody else, which counts as little as before
-    print("goes on", flush=True)
-    time.sleep(60)
-"""
-
-
-def test_a_process_that_ignores_interrupts_ends_as_well(bundles: Bundles) -> None:
-    """As a background job of a script does."""
-    done = subprocess.run(
-        [sys.executable, "-c", IGNORING, bundles.path("director"),
-         free_endpoint("tls")],
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN), cwd=ROOT,
-        capture_output=True, text=True, check=False, timeout=30,
-    )  # fmt: skip
-    assert done.stdout == "goes on\n"
-    assert "InputError: certificate 'director' has expired" in done.stderr
