@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Final
 from bayesrace.cache import cache_folder, cpu_identity, digest, kept, software
 from bayesrace.errors import InputError
 from bayesrace.files import temporary_folder
-from bayesrace.interpreter import RUN_MODULE
 from bayesrace.manifest import check_owner
+from bayesrace.processes import RUN_MODULE
 
 if TYPE_CHECKING:
     import casadi as ca

@@ -13,7 +13,6 @@ import sys
 import time
 from typing import Any, Final
 
-from bayesrace.clock import die_with_parent, sleep_until_ns
 from bayesrace.controller.cycle import Cycle
 from bayesrace.controller.driver import Decision
 from bayesrace.controller.interface import Controller, Environment
@@ -33,7 +32,8 @@ from bayesrace.messages import (
     decode,
     encode,
 )
-from bayesrace.realtime import prepare_thread
+from bayesrace.processes import die_with_parent
+from bayesrace.realtime import prepare_thread, sleep_until_ns
 from bayesrace.transport import (
     HEARTBEAT_S,
     LOCKSTEP_SPIN_S,

@@ -15,7 +15,6 @@ from typing import Final
 
 from threadpoolctl import threadpool_limits
 
-from bayesrace.clock import die_with_parent
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.integrators import Discretisation
@@ -23,6 +22,7 @@ from bayesrace.learning.dataset import Dataset, concatenate
 from bayesrace.learning.settings import TrainingSettings
 from bayesrace.learning.subset import bounded
 from bayesrace.learning.training import train
+from bayesrace.processes import die_with_parent
 
 __all__ = ["NICE", "Outcome", "Trainer", "perform"]
 

@@ -7,7 +7,6 @@ from collections.abc import Collection, Iterator, Mapping
 from typing import Any, Final, Literal, NamedTuple
 
 from bayesrace.errors import InputError
-from bayesrace.interrupts import catching_signals
 from bayesrace.messages import (
     ALIVE,
     COMMAND,
@@ -23,6 +22,7 @@ from bayesrace.messages import (
     is_car_name,
 )
 from bayesrace.operation.analysis.network_status import SOURCES, NetworkStatus, ProcessStatus
+from bayesrace.processes import catching_signals
 from bayesrace.transport import Endpoints, Inbox, Kind, ask_all, decisive, open_session
 from bayesrace.transport.credentials import NEWEST_LIST
 

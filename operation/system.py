@@ -20,9 +20,9 @@ from typing import Any, Final
 from bayesrace.configuration import Configuration, as_toml, configured
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
-from bayesrace.interpreter import RUN_MODULE
 from bayesrace.messages import EVENT, Event
 from bayesrace.operation.drive import RunPlan, announcement, execute
+from bayesrace.processes import RUN_MODULE
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import Track
 from bayesrace.transport import (

@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
-from bayesrace.clock import die_with_parent, suspension
 from bayesrace.errors import InputError
 from bayesrace.messages import (
     ACTUATION,
@@ -28,7 +27,8 @@ from bayesrace.plant.lockstep import End, Sensors
 from bayesrace.plant.process_settings import PlantSettings
 from bayesrace.plant.run import Run, RunCounters
 from bayesrace.plant.vehicle import Compile, FmuFault, Vehicle, open_vehicle
-from bayesrace.realtime import prepare_thread
+from bayesrace.processes import die_with_parent
+from bayesrace.realtime import prepare_thread, suspension
 from bayesrace.transport import (
     HEARTBEAT_S,
     NEWEST,

@@ -33,9 +33,9 @@ from bayesrace.controller.settings import MpcSettings
 from bayesrace.controller.weights.settings import SAMPLES, WATCHED
 from bayesrace.errors import InputError
 from bayesrace.integrators import PERFECT, PREDICTION, Discretisation
-from bayesrace.interpreter import RUN_MODULE
 from bayesrace.manifest import LIBRARY, MANIFEST, read_manifest
 from bayesrace.messages.types import BRAKING_ROWS, SENSOR_FAULTS
+from bayesrace.processes import RUN_MODULE
 from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import MODELS
 

@@ -13,12 +13,12 @@ from typing import Any
 
 import pytest
 
-from bayesrace.interrupts import catching_signals
+from bayesrace.processes import catching_signals
 from tests.programs import ROOT
 
 SWALLOWED = """
 import os, signal, sys, weakref
-from bayesrace.interrupts import raise_if_interrupted, remembering_interrupts
+from bayesrace.processes import raise_if_interrupted, remembering_interrupts
 
 class Thing: ...
 

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bayesrace.arrays import Floats
-from bayesrace.interrupts import deferred_interrupt
+from bayesrace.processes import deferred_interrupt
 
 __all__ = ["Indices", "Piece", "Solution", "minimise", "solve_nlp"]
 

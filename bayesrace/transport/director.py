@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable, Collection
 from typing import Any, Final
 
-from bayesrace.clock import SUSPENDED_S, suspension
 from bayesrace.errors import InputError
 from bayesrace.messages import (
     EVENT,
@@ -19,6 +18,7 @@ from bayesrace.messages import (
     StatusRequest,
     StopRequest,
 )
+from bayesrace.realtime import SUSPENDED_S, suspension
 from bayesrace.transport.inbox import Inbox, Item, Kind
 from bayesrace.transport.requests import ask, count_processes, send_rollback, send_weights
 

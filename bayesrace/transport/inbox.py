@@ -21,8 +21,8 @@ from typing import Any, Final, NamedTuple, TypeVar
 
 import zenoh
 
-from bayesrace.interrupts import catching_signals
 from bayesrace.messages import ALIVE, Decoder, Message, Service, Topic, car_key
+from bayesrace.processes import catching_signals
 from bayesrace.transport.requests import Request, declare_service, in_transport_thread
 
 __all__ = ["LOCKSTEP_SPIN_S", "NEWEST", "POLL_S", "Inbox", "Item", "Kind"]

@@ -19,7 +19,7 @@ import fmpy
 from bayesrace.codegen.compiler import Compiler, find_compiler
 from bayesrace.codegen.fmu.definition import NATIVE, FmuDefinition, Variable
 from bayesrace.errors import InputError
-from bayesrace.interpreter import RUN_MODULE
+from bayesrace.processes import RUN_MODULE
 
 __all__ = [
     "FLAGS", "PLATFORMS", "Platform", "arguments", "fmi_headers", "get_platform", "host_platform",

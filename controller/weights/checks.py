@@ -19,15 +19,14 @@ import msgpack
 import numpy as np
 
 from bayesrace.arrays import Floats
-from bayesrace.clock import die_with_parent
 from bayesrace.controller.native_step import NativeStep
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.controller.weights.comparison import compare, slack_of
 from bayesrace.controller.weights.settings import GateSettings
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import FEATURES, OUTPUTS, GpWeights, decode_weights, pack_weights
-from bayesrace.interpreter import RUN_MODULE
 from bayesrace.messages import Scalar
+from bayesrace.processes import RUN_MODULE, die_with_parent
 from bayesrace.vehicles import described_car
 from bayesrace.vehicles.parameters import CarParameters
 from bayesrace.vehicles.parts import GRAVITY_MPS2

@@ -18,8 +18,8 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 from bayesrace.errors import InputError, faults_in
-from bayesrace.interrupts import remembering_interrupts
 from bayesrace.operation.cli.declaration import Group, configured
+from bayesrace.processes import remembering_interrupts
 
 __all__ = ["app", "main"]
 

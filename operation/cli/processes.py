@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import typer
 
-from bayesrace.clock import die_with_parent
 from bayesrace.errors import InputError
 from bayesrace.operation.cli import options
 from bayesrace.operation.cli.declaration import Given, options_of
+from bayesrace.processes import die_with_parent
 
 if TYPE_CHECKING:
     from bayesrace.configuration import Configuration

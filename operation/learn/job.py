@@ -15,7 +15,6 @@ from typing import Any, Final
 
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import read_weights
-from bayesrace.interrupts import deferred_interrupt
 from bayesrace.learning.residual import discretisation_of, recalled
 from bayesrace.learning.settings import TrainingSettings
 from bayesrace.learning.sources import read_samples
@@ -27,6 +26,7 @@ from bayesrace.operation.learn.journal import Journal, resumable_settings
 from bayesrace.operation.learn.publishing import Publisher
 from bayesrace.operation.learn.records import LapRecord, LearnSettings, Record, UpdateRecord
 from bayesrace.operation.learn.report import References, draw, references
+from bayesrace.processes import deferred_interrupt
 from bayesrace.tracks import Track, load_track
 from bayesrace.transport import NEWEST, Endpoints, Inbox, Item, Kind, open_session
 

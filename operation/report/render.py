@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 from pydantic import ValidationError
 
 from bayesrace.files import write_whole
-from bayesrace.interrupts import raise_if_interrupted
 from bayesrace.manifest import Manifest
 from bayesrace.operation.analysis.published import LIMIT, SOURCE, compare_gp, compare_laps
 from bayesrace.operation.analysis.race import DrivenRun, RaceAnalysis, read_race
@@ -32,6 +31,7 @@ from bayesrace.operation.report.traces import (
 )
 from bayesrace.operation.terminal.notation import UNCERTAIN
 from bayesrace.operation.terminal.race_table import COLUMNS, GP_COLUMNS, drive_text, gp_cells
+from bayesrace.processes import raise_if_interrupted
 
 __all__ = ["PICTURE", "REPORT", "RESULT", "template", "write_report"]
 

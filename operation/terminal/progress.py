@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
 
 from bayesrace.cache import uses
-from bayesrace.interrupts import raise_if_interrupted
+from bayesrace.processes import raise_if_interrupted
 
 __all__ = ["Stage", "Stages", "stages_on"]
 

@@ -1,21 +1,44 @@
-"""Signals: as items of a thread's queue, or as a Ctrl-C that is never lost, wherever it strikes."""
+"""Processes: how our own Python programs are started, end with their parent, and take signals.
 
+A signal arrives as an item of a thread's queue, or as a Ctrl-C that is never lost, wherever it
+strikes.
+"""
+
+import ctypes
+import os
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any
+from typing import Any, Final
 
 __all__ = [
-    "catching_signals",
-    "deferred_interrupt",
-    "raise_if_interrupted",
-    "remembering_interrupts",
-]
+    "RUN_MODULE", "catching_signals", "deferred_interrupt", "die_with_parent",
+    "raise_if_interrupted", "remembering_interrupts",
+]  # fmt: skip
+
+RUN_MODULE: Final = (sys.executable, "-P", "-m")
+"""Then the module and its arguments. -P: a file of the current folder that is called like a module
+of ours, or of the standard library, is not imported."""
+
+_PR_SET_PDEATHSIG: Final = 1
 
 _pending = threading.Event()
+
+
+def die_with_parent(pid: int | None) -> None:
+    """Ask for SIGTERM when the parent ``pid`` dies, however it dies (Linux; elsewhere nothing).
+
+    Call it first of all: a parent that died while this process was starting is noticed by its
+    number. None does nothing.
+    """
+    if pid is None or not sys.platform.startswith("linux"):
+        return
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+    if os.getppid() != pid:  # it died before we asked
+        os.kill(os.getpid(), signal.SIGTERM)
 
 
 @contextmanager
