@@ -1,7 +1,6 @@
 """Where a process listens and connects, and how its links are limited and secured."""
 
 import ipaddress
-import os
 import re
 import resource
 import socket
@@ -44,8 +43,6 @@ _ENDPOINT: Final = re.compile(
 
 _SOCKETS: Final = re.compile(r"[^\s#?]{1,65}")
 """Folders in which sockets can be made; the system allows 108 characters of a socket's name."""
-_OTHER_PLACES: Final = ("/tmp", "/dev/shm")  # noqa: S108 (a folder of one's own is made there)
-
 
 _DESCRIPTORS: Final = 64
 """Files and connections of a process with sessions: a race has up to 40 at once."""
@@ -245,14 +242,8 @@ def free_endpoint(protocol: Literal["tcp", "tls"] = "tcp") -> str:
 def private_endpoints(*names: str) -> Iterator[list[str]]:
     """Unix sockets of these names in a folder that only this user may enter, for the block.
 
-    It is in TMPDIR, or elsewhere if the path of that folder cannot be part of an endpoint.
+    It is in TMPDIR, or in /tmp if the path of that folder cannot be part of an endpoint.
     """
-    places = (gettempdir(), *_OTHER_PLACES)
-    usable = (one for one in places if _SOCKETS.fullmatch(one) and os.access(one, os.W_OK))
-    if (parent := next(usable, None)) is None:
-        raise InputError(
-            f"no sockets can be made in {', '.join(places)}: set TMPDIR to a folder whose name has "
-            "65 characters at most, without blanks, '#' and '?'"
-        )
-    with temporary_folder(parent) as folder:
+    fits = _SOCKETS.fullmatch(gettempdir()) is not None
+    with temporary_folder(None if fits else "/tmp") as folder:  # noqa: S108 (of one's own)
         yield [f"unixsock-stream/{folder}/{name}" for name in names]
