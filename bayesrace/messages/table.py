@@ -3,7 +3,7 @@ and who may send and receive it.
 
 A topic is published; a service is a request with an answer. ``{car}`` and ``{source}`` in a key
 stand for the car's name and the process. Who may do what is said by role: the access control of
-secured links (:mod:`bayesrace.transport.access`) is generated from these columns.
+secured links (:mod:`bayesrace.transport.session`) is generated from these columns.
 """
 
 import re

@@ -1,8 +1,8 @@
 """Zenoh, wrapped thinly.
 
-``endpoints`` says where a process listens and connects, ``credentials`` holds its certificate,
-``access`` makes Zenoh's access control of the table of messages, and ``session`` opens a session
-with all of that. ``publisher`` sends messages and counts what is lost of them, ``inbox`` is the one
+``endpoints`` says where a process listens and connects, ``credentials`` holds its certificate, and
+``session`` opens a session with both, and with the access control that follows from the table of
+messages. ``publisher`` sends messages and counts what is lost of them, ``inbox`` is the one
 subscriber, ``requests`` sends requests and serves them; ``director`` starts and follows runs.
 """
 

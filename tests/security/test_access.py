@@ -12,7 +12,7 @@ import pytest
 from bayesrace.messages import SERVICES, TOPICS
 from bayesrace.transport import Members, free_endpoint, open_session
 from bayesrace.transport import session as session_module
-from bayesrace.transport.access import access_control
+from bayesrace.transport.session import access_control
 from tests.programs import ROOT
 from tests.security.authority import CAR, OTHER, Bundles, bundles
 from tests.security.intruder import ALIVE_KEYS, FORGED, KEYS, SERVICE_KEYS, TOPIC_KEYS
