@@ -152,11 +152,9 @@ class Link:
         self._conditions = {name: Conditions() for name in ("forth", "back")}
         self._answer()
 
-    def set(
-        self, delay: float = 0.0, jitter: float = 0.0, loss: float = 0.0, direction: str = ""
-    ) -> None:
-        """Conditions of both directions, or of one; a partition is over with it."""
-        self._change(direction, delay=delay, jitter=jitter, loss=loss, cut=False)
+    def set(self, delay: float = 0.0, jitter: float = 0.0, loss: float = 0.0) -> None:
+        """Conditions of both directions; a partition is over with it."""
+        self._change("", delay=delay, jitter=jitter, loss=loss, cut=False)
 
     def cut(self, direction: str = "") -> None:
         """Nothing gets through any more."""
