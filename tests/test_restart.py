@@ -39,8 +39,7 @@ from tests.network.cars import (
     start_plant,
     start_router,
 )
-from tests.network.journey import Journey
-from tests.network.observer import Observer, drive_on, observing
+from tests.network.observer import Journey, Observer, drive_on, observing
 from tests.network.proxy import Proxy
 from tests.programs import until
 

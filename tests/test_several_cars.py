@@ -20,8 +20,7 @@ from tests.network.cars import (
     start_plant,
     start_router,
 )
-from tests.network.journey import Journey
-from tests.network.observer import drive_on, observing
+from tests.network.observer import Journey, drive_on, observing
 
 pytestmark = [pytest.mark.check, pytest.mark.wall_clock, pytest.mark.unmeasured]
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+import signal
 import threading
 import time
 from collections.abc import Iterator
@@ -11,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import zenoh
 
 from bayesrace.errors import InputError
 from bayesrace.messages import (
@@ -21,6 +21,7 @@ from bayesrace.messages import (
     STATUS,
     STOP,
     WEIGHTS,
+    Role,
     RollbackRequest,
     Service,
     StatusRequest,
@@ -44,9 +45,13 @@ from bayesrace.transport import (
     open_session,
     private_endpoints,
 )
-from bayesrace.transport.session import unlinked
+from bayesrace.transport.session import unlinked, zenoh_config
 from tests import sample_messages as messages
-from tests.programs import until
+from tests.command_line import Cli, refused
+from tests.fake_processes import Fakes, fakes, status_of
+from tests.programs import finish, run, start, until
+
+__all__ = ["fakes"]
 
 pytestmark = pytest.mark.wall_clock
 
@@ -130,6 +135,10 @@ def test_requests_are_answered_and_silence_is_an_error(pair: tuple[Any, Any]) ->
         message, why_not = decode_request(request)
         assert (message, why_not) == (StopRequest(seq=0, source_time_ns=0, text="enough"), "")
         request.answer(messages.reply(False, "no"))
+        request = take(server, Kind.REQUEST).value
+        message, why_not = decode_request(request)
+        assert message is None
+        request.answer(messages.reply(False, why_not))
 
     thread = threading.Thread(target=answer)
     thread.start()
@@ -143,6 +152,7 @@ def test_requests_are_answered_and_silence_is_an_error(pair: tuple[Any, Any]) ->
         assert not ask(
             session, STOP, "orca", StopRequest(seq=0, source_time_ns=0, text="enough")
         ).accepted
+        assert ask(session, STOP, "orca", b"junk").text.startswith("StopRequest: ")
     finally:
         thread.join()
     with pytest.raises(InputError, match="no answer on bayesrace/other/plant/status"):
@@ -233,20 +243,6 @@ def test_a_request_beyond_the_limit_is_rejected_as_busy(
     assert all(len(list(answers)) == 1 for answers in waiting)
 
 
-def test_a_malformed_request_is_refused_with_a_reason(pair: tuple[Any, Any]) -> None:
-    server, client = Inbox(pair[0], "orca"), Inbox(pair[1], "orca")
-    server.serve(STOP)
-    meet(server, client)
-    thread = threading.Thread(target=ask, args=(pair[1], STOP, "orca", b"junk"))
-    thread.start()
-    request = take(server, Kind.REQUEST).value
-    message, why_not = decode_request(request)
-    request.answer(messages.reply(False, why_not))
-    thread.join()
-    assert message is None
-    assert why_not.startswith("StopRequest: ")
-
-
 def test_a_lost_request_is_repeated_but_for_a_rollback(pair: tuple[Any, Any]) -> None:
     """As when a link breaks because a machine stalls."""
     asker, answerer = pair
@@ -268,21 +264,7 @@ def test_a_lost_request_is_repeated_but_for_a_rollback(pair: tuple[Any, Any]) ->
     assert heard == ["weights", "weights", "rollback"]
 
 
-def test_liveliness_of_a_process_is_seen() -> None:
-    endpoint = free_endpoint()
-    with open_session(Endpoints(listen=(endpoint,))) as session:
-        inbox = Inbox(session, "orca")
-        inbox.watch("controller")
-        with open_session(Endpoints(connect=(endpoint,))) as other:
-            theirs = Inbox(other, "orca")
-            theirs.announce("controller")
-            assert take(inbox, Kind.ALIVE).name == "controller"
-            assert inbox.alive == {"controller"}
-        assert take(inbox, Kind.GONE).name == "controller"
-        assert inbox.alive == set()
-
-
-def test_a_session_connects_when_its_peer_appears() -> None:
+def test_a_session_connects_when_its_peer_appears_and_sees_its_liveliness() -> None:
     endpoint = free_endpoint()
     with open_session(Endpoints(connect=(endpoint,))) as session:
         inbox = Inbox(session, "orca")
@@ -291,7 +273,10 @@ def test_a_session_connects_when_its_peer_appears() -> None:
         with open_session(Endpoints(listen=(endpoint,))) as other:
             theirs = Inbox(other, "orca")
             theirs.announce("plant")
-            take(inbox, Kind.ALIVE)
+            assert take(inbox, Kind.ALIVE).name == "plant"
+            assert inbox.alive == {"plant"}
+        assert take(inbox, Kind.GONE).name == "plant"
+        assert inbox.alive == set()
 
 
 def test_an_absent_peer_is_an_error_that_says_what_to_do() -> None:
@@ -321,24 +306,10 @@ def test_a_malformed_endpoint_is_refused_by_name(endpoint: str) -> None:
 
 
 @pytest.mark.parametrize("peers_follow", [True, False])
-def test_opening_a_session_waits_only_for_peers_that_may_be_there(
-    peers_follow: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    opened: list[zenoh.Config] = []
-
-    def recorded(config: zenoh.Config) -> zenoh.Session:
-        opened.append(config)
-        return really(config)
-
-    really = zenoh.open
-    monkeypatch.setattr("bayesrace.transport.session.zenoh.open", recorded)
-    with (
-        private_endpoints("absent") as ends,
-        open_session(Endpoints(connect=tuple(ends)), peers_follow=peers_follow),
-    ):
-        (config,) = opened
-        waits = json.loads(config.get_json("open/return_conditions/connect_scouted"))
-        assert waits is not peers_follow
+def test_opening_a_session_waits_only_for_peers_that_may_be_there(peers_follow: bool) -> None:
+    config = zenoh_config(Endpoints(), "viewer", peers_follow=peers_follow)
+    waits = json.loads(config.get_json("open/return_conditions/connect_scouted"))
+    assert waits is not peers_follow
 
 
 def test_each_unix_socket_is_a_link_of_its_own() -> None:
@@ -348,16 +319,6 @@ def test_each_unix_socket_is_a_link_of_its_own() -> None:
         open_session(wanted := Endpoints(connect=tuple(ends)), peers_follow=True) as session,
     ):
         until(lambda: unlinked(session, wanted) == ends[1:], "the link")
-
-
-def test_events_of_all_sources_arrive(pair: tuple[Any, Any]) -> None:
-    sender, receiver = Inbox(pair[0], "orca"), Inbox(pair[1], "orca")
-    receiver.subscribe(EVENT)
-    meet(sender, receiver)
-    for source in ("plant", "race"):
-        event = messages.event(source=source)
-        Publisher(pair[0], EVENT, "orca", source).put(event, lockstep=True)
-    assert {take(receiver, Kind.MESSAGE).name for _ in range(2)} == {"event"}
 
 
 def test_an_inbox_takes_several_topics_each_with_its_own_depth_and_decoder(
@@ -371,7 +332,7 @@ def test_an_inbox_takes_several_topics_each_with_its_own_depth_and_decoder(
     for seq in range(100):
         publishers[0].put(messages.state(seq), lockstep=True)
         publishers[1].put(messages.event(seq), lockstep=True)
-    pair[0].put(car_key(EVENT.key, "orca", "plant"), b"junk")
+    pair[0].put(car_key(EVENT.key, "orca", "race"), b"junk")  # events of all sources arrive
     time.sleep(0.5)  # all of it arrives
     found: dict[str, list[Any]] = {"state": [], "event": []}
     while None not in found["event"]:  # the refused one is the last
@@ -416,3 +377,66 @@ def test_threads_of_the_transport_have_shorter_slices_than_their_owner(
     transport = {task: name for task, name in names.items() if name in ("app", "net", "rx-", "tx-")}
     assert {"net", "rx-"} <= set(transport.values())
     assert max(map(slice_ns, transport)) < slice_ns(owner)
+
+
+# Routers -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", ["peer", "router"])
+def test_a_router_forwards_between_plant_controller_and_observer_and_a_peer_does_not(
+    mode: str,
+) -> None:
+    """Tokens, messages and requests: all that know only the router."""
+    endpoint = free_endpoint()
+    middle = Endpoints.model_validate({"listen": (endpoint,), "mode": mode})
+    roles: tuple[Role, ...] = ("plant", "controller", "viewer")
+    with ExitStack() as stack:
+        stack.enter_context(open_session(middle))
+        plant, controller, observer = (
+            stack.enter_context(open_session(Endpoints(connect=(endpoint,)), role))
+            for role in roles
+        )
+        theirs = Inbox(plant, "a")
+        theirs.announce("plant")
+        receivers = [Inbox(controller, "a"), Inbox(observer, "a")]
+        for inbox in receivers:
+            inbox.subscribe(STATE)
+            inbox.watch("plant")
+        if mode == "peer":
+            assert [inbox.get(0.5) for inbox in receivers] == [None, None]
+            return
+        receivers[0].announce("controller")
+        theirs.watch("controller")
+        for inbox in (theirs, *receivers):
+            take(inbox, Kind.ALIVE)
+        Publisher(plant, STATE, "a").put(messages.state(0), lockstep=True)
+        for inbox in receivers:
+            take(inbox, Kind.MESSAGE)
+
+
+@pytest.mark.check
+def test_the_router_command_forwards_and_ends_on_sigterm(fakes: Fakes) -> None:
+    endpoint = free_endpoint()
+    router = start("router", "--listen", endpoint)
+    through = Endpoints(connect=(endpoint,))
+    try:
+        fakes("a", "plant", endpoints=through)
+        two = fakes("a", "controller", endpoints=through)
+
+        def both_answer() -> bool:
+            """The router hears of one before it hears of the other."""
+            content = status_of(through, "a", patience_s=60.0).as_json()["cars"]["a"]
+            return all(one is not None and one["answering"] for one in content.values())
+
+        until(both_answer, "answers of both through the router")
+        assert run("stop", "--endpoint", endpoint).returncode == 0
+        assert [one.command for one in two.heard] == ["stop"]
+    finally:
+        router.send_signal(signal.SIGTERM)
+        done = finish(router)
+    assert done.returncode == 0
+    assert done.stderr == f"bayesrace.router: router on {endpoint}\n"
+
+
+def test_a_router_that_cannot_listen_says_so(cli: Cli) -> None:
+    refused(cli("router", "--listen", "tcp/localhost"), "is not of the form protocol/address:port")

@@ -1,4 +1,5 @@
-"""The compose files are accepted by Podman's reader, and harden every service."""
+"""The compose files are accepted by Podman's reader, and the unit of a bare board by systemd; both
+harden every service."""
 
 import os
 import shutil
@@ -17,6 +18,8 @@ pytestmark = pytest.mark.check
 
 DOCKER: Final = ROOT / "docker"
 BASE: Final = "python@sha256:0"
+WORST: Final = 50
+"""Exposure that systemd would call medium, in tenths."""
 
 
 def config(*files: str, base: str = BASE) -> subprocess.CompletedProcess[str]:
@@ -76,3 +79,14 @@ def test_the_configurations_of_the_containers_are_valid() -> None:
     assert plain.network.insecure
     assert not secured.network.insecure
     assert secured.tls.folder == Path("/certs")
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
+def test_the_unit_is_valid_and_hardened(tmp_path: Path) -> None:
+    unit = tmp_path / "bayesrace@plant.service"
+    text = (ROOT / "examples" / "systemd" / "bayesrace@.service").read_text()
+    unit.write_text(text.replace("/opt/bayesrace/bin/bayesrace", "/bin/true"))
+    verified = subprocess.run(["systemd-analyze", "verify", unit], capture_output=True, text=True)
+    assert (verified.returncode, verified.stderr) == (0, "")
+    judged = ["systemd-analyze", "security", "--offline=yes", f"--threshold={WORST}", str(unit)]
+    assert subprocess.run(judged, capture_output=True).returncode == 0

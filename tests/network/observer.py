@@ -1,4 +1,5 @@
-"""Starts runs, follows and records them: in the test's own process, or on another host.
+"""Starts runs, follows and records them, in the test's own process or on another host; what a log
+holds of a drive.
 
     python -m tests.network.observer NAME TRACK LOG ENDPOINT...
 
@@ -17,10 +18,22 @@ from pathlib import Path
 from typing import Any
 
 import msgspec.structs
+import numpy as np
 import zenoh
 
 from bayesrace.errors import InputError
-from bayesrace.messages import STATE, State, car_key, decode
+from bayesrace.log import LogReader
+from bayesrace.messages import (
+    ACTUATION,
+    HEARTBEAT,
+    STATE,
+    TELEMETRY,
+    Actuation,
+    State,
+    Status,
+    car_key,
+    decode,
+)
 from bayesrace.operation.drive import RunPlan, run_request
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import Track, load_track
@@ -28,7 +41,12 @@ from bayesrace.transport import Director, Endpoints, open_session
 from tests.network.hosts import Host
 from tests.programs import PATIENCE_S, ROOT, environment, until
 
-__all__ = ["Observer", "Remote", "drive_on", "observing", "observing_from"]
+__all__ = [
+    "STANDING_MPS", "Journey", "Observer", "Remote", "drive_on", "observing", "observing_from",
+]  # fmt: skip
+
+STANDING_MPS = 0.05
+"""Speed below which a car counts as standing."""
 
 _ENDLESS_S = 1e5
 
@@ -153,6 +171,41 @@ def observing_from(
         assert process.stdin is not None
         process.stdin.close()
         assert process.wait(PATIENCE_S) == 0, log.with_suffix(".txt").read_text()
+
+
+class Journey:
+    """The messages of a log in the order of arrival."""
+
+    def __init__(self, log: Path, track: Track) -> None:
+        reader = LogReader(log)
+        self._track = track
+        topics = (STATE, ACTUATION, TELEMETRY, HEARTBEAT)
+        messages = [entry.message for entry in reader.messages(topics)]
+        self.states = [one for one in messages if isinstance(one, State)]
+        self.actuations = [one for one in messages if isinstance(one, Actuation)]
+        self.heartbeats = [one for one in messages if isinstance(one, Status)]
+        # Once in some hundred drives over a link that fails, the transport has delivered a garbled
+        # telemetry message to the recorder; it is refused, as it should be.
+        assert reader.refused <= 1, reader.last_reason
+        assert not reader.truncated
+
+    def between(self, begin_ns: int, end_ns: int) -> list[State]:
+        """States sampled in this interval."""
+        return [one for one in self.states if begin_ns <= one.source_time_ns < end_ns]
+
+    def off_track_m(self, states: Sequence[State] | None = None) -> float:
+        """How far outside of the track the car got at most (all states); negative inside."""
+        chosen = self.states if states is None else states
+        xy = np.array([state.x[:2] for state in chosen])
+        return float(self._track.project_path(xy).off_track_m.max())
+
+    def phases(self, begin_ns: int, end_ns: int) -> set[str]:
+        """What the controller said of itself in this interval."""
+        return {
+            one.phase
+            for one in self.heartbeats
+            if one.source == "controller" and begin_ns <= one.source_time_ns < end_ns
+        }
 
 
 def _obey(observer: Observer, line: str) -> Any:

@@ -7,6 +7,7 @@ declarations over it once as well, so a connection that is made over a bad link 
 is why the drive by UDP begins on a good one.
 """
 
+import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -20,9 +21,8 @@ from bayesrace.log import LogReader
 from bayesrace.messages import STATE
 from tests.network.cars import Course, Program, gentle_course, start_controller, start_plant
 from tests.network.hosts import CONTROLLER_IP, PLANT_IP, Network
-from tests.network.journey import STANDING_MPS, Journey
-from tests.network.observer import Remote, drive_on, observing_from
-from tests.programs import PATIENCE_S, until
+from tests.network.observer import STANDING_MPS, Journey, Remote, drive_on, observing_from
+from tests.programs import PATIENCE_S, run, until
 
 pytestmark = [pytest.mark.wall_clock, pytest.mark.unmeasured]
 
@@ -216,3 +216,43 @@ def test_losses_by_udp_are_counted_and_hold_up_nothing(net: Network, start: Star
     assert plant["actuations_lost"] > 0
     assert_nothing_was_broken(plant, controller)
     assert_all_is_accounted_for(plant, controller)
+
+
+@pytest.mark.check
+def test_two_machines_from_nothing(net: Network, tmp_path: Path) -> None:
+    """As docs/security.md sets them up: each with the folder of its certificate,
+    one configuration file, and addresses in the certificates that are verified."""
+    yours, folder = tmp_path / "yours", ("--folder", tmp_path / "yours" / "certs")
+    yours.mkdir()
+    course = gentle_course(tmp_path)
+    hosts = {"plant": (net.plant, PLANT_IP), "controller": (net.controller, CONTROLLER_IP)}
+    assert run("certs", "init", *folder).returncode == 0
+    for role, (_, address) in hosts.items():
+        of = ("--role", role, "--car", "orca", "--host", address)
+        assert run("certs", "add", role, *of, *folder).returncode == 0
+    assert run("certs", "add", "director", "--role", "director", *folder).returncode == 0
+    config = (
+        f'[network]\nplant = ["tls/{PLANT_IP}:7447"]\ncontroller = ["tls/{CONTROLLER_IP}:7448"]\n'
+        '[tls]\nfolder = "certs"\n'
+    )
+    given = {}
+    for name in ("yours", *hosts):
+        given[name] = ("--config", tmp_path / name / "bayesrace.toml")
+        (tmp_path / name).mkdir(exist_ok=True)
+        (tmp_path / name / "bayesrace.toml").write_text(config)
+    for name in hosts:  # and nothing else
+        shutil.copytree(yours / "certs" / name, tmp_path / name / "certs" / name)
+    out, log = tmp_path / "out", tmp_path / "run.mcap"
+    lap = ("drive", "--track", course.track_file, "--laps", "1", "--mode", "realtime", "--log", log)
+    drives = ("controller", *course.arguments, *given["controller"])
+    with (
+        Program(out, "plant", *given["plant"], host=net.plant),
+        Program(out, *drives, host=net.controller) as controller,
+        Program(tmp_path / "drive.txt", *lap, *given["yours"], host=net.plant) as drive,
+    ):
+        assert drive.process.wait(PATIENCE_S) == 0, drive.said() + controller.said()
+        doctor = Program(tmp_path / "doctor.txt", "doctor", *given["yours"], host=net.plant)
+        until(lambda: doctor.process.poll() is not None, "the doctor")
+        assert doctor.process.returncode == 0, doctor.said()
+        assert "car 'orca': controller and plant" in doctor.said()
+    assert max(state.lap for state in LogReader(log).select(STATE)) == 1

@@ -13,7 +13,7 @@ from bayesrace.operation.drive import RunPlan, run_request
 from bayesrace.recorder import Recorder
 from bayesrace.transport import Director, free_endpoint, open_session
 from tests.network.cars import Course, Program, gentle_course
-from tests.network.journey import Journey
+from tests.network.observer import Journey
 from tests.programs import PATIENCE_S
 from tests.security.authority import CAR, Bundles, written
 

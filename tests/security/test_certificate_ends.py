@@ -12,7 +12,7 @@ from bayesrace.messages import Role
 from bayesrace.operation.certificates import add, init
 from bayesrace.transport import Endpoints, free_endpoint, open_session
 from tests.network.cars import Course, Program
-from tests.network.journey import STANDING_MPS
+from tests.network.observer import STANDING_MPS
 from tests.programs import PATIENCE_S, until
 from tests.security.authority import CAR, Bundles, bundles, written
 from tests.security.rig import course, secured
