@@ -419,21 +419,6 @@ def test_the_table_shows_the_results_numbers_within_80_columns(tmp_path: Path) -
     assert sum(line.split()[:1] == ["updated"] for line in lines) == 3
 
 
-def test_on_the_papers_track_its_numbers_stand_beside_ours(tmp_path: Path) -> None:
-    result = analyse(race(tmp_path))
-    text = io.StringIO()
-    console = Console(file=text, width=80)
-    print_table(result, console)
-    assert "paper" not in text.getvalue()
-    on_ethz = result.settings.model_copy(update={"track": "ethz"})
-    print_table(result.model_copy(update={"settings": on_ethz}), console)
-    beside = text.getvalue().split("Beside the paper")[1]
-    assert "…" not in beside
-    for number in ("7.988", "7.932", "7.797", "0.176", "0.142"):
-        assert number in beside
-    assert f"{result.gp_updated['vy'].rmse:.3g}" in beside
-
-
 def test_analysis_reads_the_log_once_for_result_and_report(tmp_path: Path) -> None:
     analysis = read_race(race(tmp_path))
     assert analysis.result is analysis.result

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bayesrace.operation.analysis.published import compare_gp, compare_laps
 from bayesrace.operation.analysis.race import analyse, read_race
 from bayesrace.operation.analysis.results import RaceResult
 from bayesrace.operation.report import render, write_report
@@ -124,24 +123,6 @@ def test_where_drawing_fails_the_report_before_stays(
     with pytest.raises(ArithmeticError):
         write_report(path)
     assert {file.name: file.stat().st_mtime_ns for file in path.iterdir()} == before
-
-
-def test_the_papers_numbers_stand_only_beside_laps_on_its_track(
-    rendered: tuple[Path, RaceResult],
-) -> None:
-    result = rendered[1]
-    assert "published" not in parse(rendered[0]).rows
-    assert not compare_laps(result)
-    assert not compare_gp(result)
-    on_ethz = result.model_copy(
-        update={"settings": result.settings.model_copy(update={"track": "ethz"})}
-    )
-    rows = compare_laps(on_ethz)
-    assert [row["controller"] for row in rows] == [lap.controller for lap in result.laps]
-    assert (rows[0]["paper_lap"], rows[1]["paper_lap"], rows[1]["paper_off"]) == (
-        "DNF", "7.988", "9 / 0.015",
-    )  # fmt: skip
-    assert [row["output"] for row in compare_gp(on_ethz)] == ["vx", "vy", "omega"]
 
 
 def test_a_race_that_was_cut_off_still_gets_its_page(tmp_path: Path) -> None:

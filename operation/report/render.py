@@ -14,7 +14,6 @@ from pydantic import ValidationError
 
 from bayesrace.files import write_whole
 from bayesrace.manifest import Manifest
-from bayesrace.operation.analysis.published import LIMIT, SOURCE, compare_gp, compare_laps
 from bayesrace.operation.analysis.race import DrivenRun, RaceAnalysis, read_race
 from bayesrace.operation.analysis.results import RaceResult, write_result
 from bayesrace.operation.report.gp import gp_figures
@@ -81,11 +80,7 @@ def _page(run_dir: Path, analysis: RaceAnalysis, figures: Mapping[str, Sequence[
         uncertain=_uncertain(analysis),
         period_us=round(analysis.recording.settings.discretisation.step_s * 1e6),
         limit_sigma=UNCERTAIN,
-        laps_compared=compare_laps(result),
-        gp_compared=compare_gp(result),
         caution=analysis.recording.settings.mpc.caution,
-        source=SOURCE,
-        limit=LIMIT,
         title=f"{result.settings.track} · {analysis.track.length_m:.2f} m",
     )
 

@@ -10,7 +10,6 @@ from rich.table import Table
 from rich.text import Text
 
 from bayesrace.gp.weights import UNITS
-from bayesrace.operation.analysis.published import SOURCE, compare_gp, compare_laps
 from bayesrace.operation.analysis.results import GpMetrics, LapResult, RaceResult
 from bayesrace.operation.terminal.terminal import plain_table
 from bayesrace.vehicles.parts import GRAVITY_MPS2
@@ -209,33 +208,9 @@ def _print_cornering(result: RaceResult, console: Console) -> None:
         console.print(Text("  (linear tyres never saturate; 'race --tyres pacejka' does)"))
 
 
-def _print_published(result: RaceResult, console: Console) -> None:
-    """The paper's numbers beside ours, on its track."""
-    laps, outputs = compare_laps(result), compare_gp(result)
-    if not laps:
-        return
-    console.print(Text(f"\nBeside the paper ({SOURCE})"))
-    table = plain_table(
-        "controller", "paper\nlap s", "here\nlap s", "paper\noff track / m", "here\noff track / m"
-    )
-    for lap in laps:
-        names = "controller", "paper_lap", "our_lap", "paper_off", "our_off"
-        table.add_row(*(lap[name] for name in names))
-    console.print(table)
-    if not outputs:
-        return
-    rmse = "RMSE (without GP) · R²"
-    table = plain_table("output", "GP of", f"paper\n{rmse}", f"here\n{rmse}", left=2)
-    for row in outputs:
-        table.add_row(row["output"], "bayesrace", row["paper"], row["ours"])
-        table.add_row("", "updated", row["paper_updated"], row["ours_updated"])
-    console.print(table)
-
-
 def _print_notes(result: RaceResult, console: Console) -> None:
     if result.gp or result.gp_updated:
         console.print(_gp_table(result), new_line_start=True)
-    _print_published(result, console)
     if result.real_time_factor is not None:
         console.print(Text(f"lockstep at {result.real_time_factor:.1f} × real time"))
     for lap in result.laps:

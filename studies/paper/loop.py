@@ -13,7 +13,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bayesrace.arrays import Floats
-from bayesrace.operation.analysis.published import LAPS_OFF, LAPS_ON
 from bayesrace.operation.analysis.race import DrivenRun
 from bayesrace.operation.report.maps import draw_edges, show_all
 from bayesrace.operation.report.style import MUTED, WARNING, look, panel
@@ -23,6 +22,7 @@ from bayesrace.raceline import RaceLine, RaceLineSettings
 from bayesrace.raceline.nodes import timed_line
 from bayesrace.studies.paper.experiment import Experiment
 from bayesrace.studies.paper.finding import ELSEWHERE, Figures, Finding, Section, at_most
+from bayesrace.studies.paper.published import LAPS_OFF, LAPS_ON
 from bayesrace.tracks import Track
 from bayesrace.tracks.spline import fit_arc_length
 from bayesrace.tracks.tables import read_table
@@ -135,7 +135,7 @@ def _comparison(laps: _Laps, one: Experiment, controller: str, constraints: bool
     paper, same = LAPS_ON if constraints else LAPS_OFF, _is_ethz(one.track)
     findings, times = [], []
     for lap in (run, best):
-        name, (time_s, off, _), own = look(lap.controller).name, paper[lap.controller], lap.result()
+        name, (time_s, off), own = look(lap.controller).name, paper[lap.controller], lap.result()
         left = own.off_track_samples
         findings.append(at_most(f"lap of {name}", time_s or 0, own.lap_time_s, "s", "", same))
         findings.append(at_most(f"samples off track, {name}", off or 0, left, "", "", same))

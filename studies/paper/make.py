@@ -10,7 +10,6 @@ from typing import Final
 from bayesrace.files import write_whole
 from bayesrace.integrators import PREDICTION
 from bayesrace.learning.sources import dataset_from_npz
-from bayesrace.operation.analysis.published import SOURCE
 from bayesrace.operation.preparation import training_settings
 from bayesrace.operation.report.render import template
 from bayesrace.operation.report.style import figure_style, inline_svg, write_pdf
@@ -22,6 +21,7 @@ from bayesrace.studies.paper.experiment import Experiment, stored
 from bayesrace.studies.paper.finding import Finding, Section
 from bayesrace.studies.paper.loop import line_section, loop_sections, published_line, tenth_section
 from bayesrace.studies.paper.models import model_section
+from bayesrace.studies.paper.published import SOURCE
 from bayesrace.studies.paper.residual import (
     Learned,
     kernel_section,

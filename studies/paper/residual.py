@@ -23,7 +23,6 @@ from bayesrace.learning.residual import residual
 from bayesrace.learning.settings import TrainingSettings
 from bayesrace.learning.target import Target
 from bayesrace.learning.validation import Validation, validate
-from bayesrace.operation.analysis.published import GP
 from bayesrace.operation.preparation import trained_weights
 from bayesrace.operation.report.gp import gp_figures
 from bayesrace.operation.report.style import INK, WARNING, look, panel
@@ -32,6 +31,7 @@ from bayesrace.operation.terminal.progress import Stage, Stages
 from bayesrace.studies.paper.experiment import stored
 from bayesrace.studies.paper.finding import Figures, Finding, Section, at_most
 from bayesrace.studies.paper.loop import course
+from bayesrace.studies.paper.published import GP
 from bayesrace.tracks import Track
 
 __all__ = [
