@@ -107,7 +107,7 @@ def test_validate_writes_what_it_prints(
     files: Path, cli: Cli, fresh: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    arguments = ("--on", "fresh.npz", "--json", "v.json", "--out", "all", "--plot", "band.png")
+    arguments = ("--on", "fresh.npz", "--json", "v.json", "--out", "all")
     said = cli("validate", "weights.bin", *arguments).out
     assert "…" not in said
     assert max(map(len, said.splitlines())) <= 80
@@ -124,7 +124,7 @@ def test_validate_writes_what_it_prints(
     assert (result.one_step.predictions, result.horizon.predictions) == (90, 71)
     drift = result.horizon
     assert drift.corrected["position_m"].max < 0.3 * drift.nominal["position_m"].max
-    for picture in ("band.png", "all/error.png", "all/track.png"):
+    for picture in ("all/error.png", "all/track.png"):
         assert (files / picture).read_bytes().startswith(b"\x89PNG")
     assert (files / "all/validation.json").read_text() == (files / "v.json").read_text()
 
@@ -187,7 +187,7 @@ def test_train_chooses_the_kernel_and_prints_why(
     files: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    arguments = ("--data", "fresh.npz", "--restarts", "0", "--points", "60", "--plot", "k.png")
+    arguments = ("--data", "fresh.npz", "--restarts", "0", "--points", "60")
     said = cli("train", "driven.mcap", *arguments, "--out", "new.bin").out
     assert "…" not in said.replace("residual …", "")
     for word in ("matern05", "matern15", "matern25", "rbf", "250 samples"):
@@ -195,7 +195,6 @@ def test_train_chooses_the_kernel_and_prints_why(
     weights = read_weights(files / "new.bin")
     assert weights.counts == (60, 60, 60)
     assert weights.version in said
-    assert (files / "k.png").read_bytes().startswith(b"\x89PNG")
     assert cli("validate", "new.bin", "--on", "fresh.npz").code == 0
 
 
@@ -225,7 +224,6 @@ def test_train_takes_one_kernel(files: Path, cli: Cli) -> None:
         ("train driven.mcap --car lorry", "lorry"),
         ("train driven.mcap --artefact nowhere", "bayesrace build"),
         ("train driven.mcap --artefact ARTEFACT --points 20000", "room for"),
-        ("train driven.mcap --plot no/where.png", "where.png"),
         ("train --data short.npz", "at least 20"),
         ("train --data constant.npz", "d is 0.5 in every sample"),
     ],

@@ -73,7 +73,6 @@ def train(
     ),
     out: Path = options.out_file(Path("weights.bin")),
     points: int = options.value("Points per output.", 400, min=20, max=20000),
-    plot: Path | None = options.new_file("Draw the error against the kernel's smoothness (PNG)."),
     artefact: Path | None = _ARTEFACT,
     car: str = options.value("Car that drove.", "", shown="named by the files"),
     name: str = options.CAR_NAME,
@@ -109,10 +108,6 @@ def train(
     weights, console = training.weights, Terminal()
     write_weights(out, weights)
     learning_table.print_kernels(training.kernels, console)
-    if plot is not None:
-        from bayesrace.operation.report.gp import write_kernels
-
-        write_kernels(training.kernels, plot)
     typer.echo(
         f"{weights.version}: {len(samples.dataset)} samples "
         f"(left out: {left_out(samples.dataset.dropped)}), "
@@ -125,7 +120,6 @@ def validate(
     weights: Path = options.argument("WEIGHTS", "Weights file, as 'bayesrace train' writes it."),
     on: list[Path] = options.value("Run log (MCAP) or arrays (.npz); repeatable.", ...),
     json_file: Path | None = options.new_file("Write the numbers to this file.", "--json"),
-    plot: Path | None = options.new_file("Draw the error with its 95 % band (PNG)."),
     out: Path | None = options.out_folder("Folder for numbers, error.png and track.png."),
     track: str | None = options.value(
         "Track for track.png: name, random:SEED, random10:SEED or CSV file."
@@ -166,11 +160,10 @@ def validate(
         out.mkdir(parents=True, exist_ok=True)
     for path in (json_file, out and out / "validation.json"):
         options.write_json(path, judged.result)
-    if plot is not None or out is not None:
+    if out is not None:
         from bayesrace.operation.report.gp import write_validation
 
-        bands = [path for path in (plot, out and out / "error.png") if path is not None]
-        write_validation(judged, threshold, bands, out and out / "track.png", course)
+        write_validation(judged, threshold, out, course)
     print_validation(judged.result, Terminal())
 
 

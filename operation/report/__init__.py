@@ -1,4 +1,4 @@
-"""The report of a race: one self-contained HTML file, and one picture. Imports matplotlib."""
+"""The report of a race: one self-contained HTML file. Imports matplotlib."""
 
 from bayesrace.operation.report.render import write_report
 

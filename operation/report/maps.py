@@ -18,6 +18,7 @@ from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from bayesrace.operation.analysis.race import DrivenRun
+from bayesrace.operation.report.panels import Lap, first_laps, reference_of
 from bayesrace.operation.report.style import (
     INK,
     MUTED,
@@ -32,15 +33,13 @@ from bayesrace.operation.report.style import (
     speed_map,
     write_png,
 )
-from bayesrace.operation.report.traces import Lap, first_laps, reference_of
 from bayesrace.raceline import RaceLine
 from bayesrace.tracks import Track
 
 if TYPE_CHECKING:
     from bayesrace.tracks.maps import RosMap
 
-__all__ = ["LapMaps", "check_picture", "draw_edges", "show_all", "write_picture"]
-
+__all__ = ["check_picture", "draw_edges", "lap_maps", "show_all", "write_picture"]
 
 _MARGIN_M: Final = 0.12
 _SCALE: Final = 0.85
@@ -63,109 +62,96 @@ class _Shade(NamedTuple):
     label: str
 
 
-class LapMaps:
+def lap_maps(runs: Sequence[DrivenRun], track: Track, line: RaceLine) -> list[Figure]:
     """The first lap of each run on the track, later laps as a thin line.
 
     A lap that finished is coloured by the time that it loses on each metre to the reference lap;
     the reference itself, and a run without a lap, by speed. Off-track samples are those that the
     result table counts; a run without a lap is shown until the car left out a piece of the track.
     """
+    laps = {lap.run: lap for lap in first_laps(runs, track) if lap.run.finished}
+    reference = reference_of(list(laps.values()))
+    losses = {
+        lap.run: _loss(lap, reference)
+        for lap in laps.values()
+        if reference is not None and lap is not reference
+    }
+    size = np.concatenate([np.zeros(1), *(np.abs(loss) for loss in losses.values())])
+    limit = float(np.percentile(size, 95)) or 1.0
+    top = [float(np.max(run.record.x[run.counted, 3], initial=0.0)) for run in runs]
+    speed = Normalize(0.0, max([*top, float(line.vx_mps.max())]))
+    figures = []
+    for run in runs:
+        if run in losses:
+            loss = Normalize(-limit, limit)
+            shade = _Shade(losses[run], loss, gain_map(), "time lost [ms/m]")
+        else:
+            shade = _Shade(run.record.x[run.shown(), 3], speed, speed_map(), "speed vx [m/s]")
+        figures.append(_lap_map(run, track, line, shade))
+    return figures
 
-    def __init__(self, runs: Sequence[DrivenRun], track: Track, line: RaceLine) -> None:
-        self.runs, self._track, self._line = runs, track, line
-        self._edges = track.boundaries(0.04)
-        self._corners = np.concatenate(self._edges)
-        laps = {lap.run: lap for lap in first_laps(runs, track) if lap.run.finished}
-        self.reference = reference_of(list(laps.values()))
-        others = [lap for lap in laps.values() if lap is not self.reference]
-        losses = {lap.run: self._loss(lap, self.reference) for lap in others if self.reference}
-        size = np.concatenate([np.zeros(1), *(np.abs(loss) for loss in losses.values())])
-        limit = float(np.percentile(size, 95)) or 1.0
-        top = [float(np.max(run.record.x[run.counted, 3], initial=0.0)) for run in runs]
-        speed = Normalize(0.0, max([*top, float(line.vx_mps.max())]))
-        self._shades = {
-            run: _Shade(losses[run], Normalize(-limit, limit), gain_map(), "time lost [ms/m]")
-            if run in losses
-            else _Shade(run.record.x[run.shown(), 3], speed, speed_map(), "speed vx [m/s]")
-            for run in runs
-        }
 
-    @staticmethod
-    def _loss(lap: Lap, reference: Lap) -> Floats:
-        """Time lost on each metre at the samples of a lap [ms/m]."""
-        s, behind_s = lap.behind(reference)
-        return np.interp(lap.s_m, s, 1e3 * np.gradient(behind_s, s))
+def _loss(lap: Lap, reference: Lap) -> Floats:
+    """Time lost on each metre at the samples of a lap [ms/m]."""
+    s, behind_s = lap.behind(reference)
+    return np.interp(lap.s_m, s, 1e3 * np.gradient(behind_s, s))
 
-    def figures(self) -> list[Figure]:
-        """A figure for each run, with its scale."""
-        return [self._figure([run], 1) for run in self.runs]
 
-    def picture(self) -> Figure:
-        """All runs in one figure."""
-        return self._figure(self.runs, 1 if len(self.runs) == 1 else 2)
+def _lap_map(run: DrivenRun, track: Track, line: RaceLine, shade: _Shade) -> Figure:
+    """A map and its scale, at fixed places: a layout by what is drawn would draw everything
+    twice."""
+    edges = track.boundaries(0.04)
+    corners = np.concatenate(edges)
+    width, height = np.ptp(corners, axis=0) + 2 * _MARGIN_M
+    wide = PANEL_WIDTH - _SCALE
+    tall = min(wide * height / width, 6.0)
+    size = PANEL_WIDTH, tall + _TITLE
+    figure = Figure(figsize=size)
 
-    def _figure(self, runs: Sequence[DrivenRun], columns: int) -> Figure:
-        """Rows of maps, each with its scale, at fixed places: a layout by what is drawn would draw
-        everything twice."""
-        rows = max(1, -(-len(runs) // columns))
-        width, height = np.ptp(self._corners, axis=0) + 2 * _MARGIN_M
-        wide = PANEL_WIDTH - _SCALE
-        tall = min(wide * height / width, 6.0)
-        size = PANEL_WIDTH * columns, rows * (tall + _TITLE)
-        figure = Figure(figsize=size)
-
-        def place(left: float, bottom: float, width: float, height: float) -> Axes:
-            x, y = left / size[0], bottom / size[1]
-            return figure.add_axes((x, y, width / size[0], height / size[1]))
-
-        for i, run in enumerate(runs):
-            left, bottom = i % columns * PANEL_WIDTH, (rows - 1 - i // columns) * (tall + _TITLE)
-            axes = place(left + 0.05, bottom + 0.05, wide, tall)
-            axes.axis("off")
-            self._draw(axes, run)
-            scale = place(left + 0.1 + wide, bottom + 0.05 + 0.2 * tall, 0.11, 0.6 * tall)
-            self._draw_scale(scale, self._shades[run])
-        return figure
-
-    @staticmethod
-    def _draw_scale(axes: Axes, shade: _Shade) -> None:
-        bar = axes.figure.colorbar(
-            ScalarMappable(shade.norm, shade.colours), cax=axes, label=shade.label
+    def place(left: float, bottom: float, width: float, height: float) -> Axes:
+        return figure.add_axes(
+            (left / size[0], bottom / size[1], width / size[0], height / size[1])
         )
-        bar.outline.set_visible(False)
 
-    def _draw(self, axes: Axes, run: DrivenRun) -> None:
-        draw_edges(axes, *self._edges)
-        path = np.concatenate([self._line.xy_m, self._line.xy_m[:1]])
-        thin = path[:: max(1, len(path) // 600)]
-        axes.plot(thin[:, 0], thin[:, 1], color=INK, linewidth=0.5, linestyle=(0, (5, 3)))
-        self._draw_start(axes)
-        counted = run.counted if run.finished else run.shown()
-        everything = run.record.x[counted]
-        axes.plot(everything[:, 0], everything[:, 1], color=MUTED, linewidth=0.6)
-        shade, points = self._shades[run], run.record.x[run.shown(), :2]
-        trace = LineCollection(
-            list(np.stack([points[:-1], points[1:]], axis=1)), cmap=shade.colours, norm=shade.norm,
-            linewidth=2.4, capstyle="round",
-        )  # fmt: skip
-        trace.set_array((shade.values[:-1] + shade.values[1:]) / 2)
-        axes.add_collection(trace)
-        off = everything[run.off_track[counted]]
-        axes.plot(off[:, 0], off[:, 1], "x", color=WARNING, markersize=3.6, zorder=5)
-        show_all(axes, self._corners)
-        name, colour, _ = look(run.controller, run.number)
-        time = f"{run.laps.times_s[0]:.3f} s" if run.finished else "did not finish"
-        axes.set_title(name, color=colour, fontweight="bold")
-        axes.set_title(f"{time} · {int(run.off_track.sum())} off track", loc="right", color=INK)
+    axes = place(0.05, 0.05, wide, tall)
+    axes.axis("off")
+    draw_edges(axes, *edges)
+    path = np.concatenate([line.xy_m, line.xy_m[:1]])
+    thin = path[:: max(1, len(path) // 600)]
+    axes.plot(thin[:, 0], thin[:, 1], color=INK, linewidth=0.5, linestyle=(0, (5, 3)))
+    _draw_start(axes, track)
+    counted = run.counted if run.finished else run.shown()
+    everything = run.record.x[counted]
+    axes.plot(everything[:, 0], everything[:, 1], color=MUTED, linewidth=0.6)
+    points = run.record.x[run.shown(), :2]
+    trace = LineCollection(
+        list(np.stack([points[:-1], points[1:]], axis=1)), cmap=shade.colours, norm=shade.norm,
+        linewidth=2.4, capstyle="round",
+    )  # fmt: skip
+    trace.set_array((shade.values[:-1] + shade.values[1:]) / 2)
+    axes.add_collection(trace)
+    off = everything[run.off_track[counted]]
+    axes.plot(off[:, 0], off[:, 1], "x", color=WARNING, markersize=3.6, zorder=5)
+    show_all(axes, corners)
+    name, colour, _ = look(run.controller, run.number)
+    time = f"{run.laps.times_s[0]:.3f} s" if run.finished else "did not finish"
+    axes.set_title(name, color=colour, fontweight="bold")
+    axes.set_title(f"{time} · {int(run.off_track.sum())} off track", loc="right", color=INK)
+    scale = place(0.1 + wide, 0.05 + 0.2 * tall, 0.11, 0.6 * tall)
+    bar = figure.colorbar(ScalarMappable(shade.norm, shade.colours), cax=scale, label=shade.label)
+    bar.outline.set_visible(False)
+    return figure
 
-    def _draw_start(self, axes: Axes) -> None:
-        right, left = (edge[0] for edge in self._edges)
-        axes.plot(*np.stack([right, left], axis=1), color=INK, linewidth=1.8)
-        x, y, psi = self._track.start_pose()
-        ahead = np.array([np.cos(psi), np.sin(psi)])
-        tip, tail = (x, y) + 0.28 * ahead, (x, y) + 0.03 * ahead
-        arrow = {"arrowstyle": "-|>", "color": INK, "linewidth": 0.8, "shrinkA": 0}
-        axes.annotate("", tuple(tip), tuple(tail), arrowprops=arrow, zorder=6)
+
+def _draw_start(axes: Axes, track: Track) -> None:
+    """The start line, and an arrow in driving direction."""
+    right, left = (edge[0] for edge in track.boundaries())
+    axes.plot(*np.stack([right, left], axis=1), color=INK, linewidth=1.8, label="start")
+    x, y, psi = track.start_pose()
+    reach = 0.7 * float(np.linalg.norm(left - right))
+    tip = x + reach * np.cos(psi), y + reach * np.sin(psi)
+    arrow = {"arrowstyle": "-|>", "color": INK, "linewidth": 0.8, "shrinkA": 0}
+    axes.annotate("", tip, (x, y), arrowprops=arrow, zorder=6)
 
 
 def draw_edges(axes: Axes, right: Floats, left: Floats) -> None:
@@ -178,9 +164,9 @@ def draw_edges(axes: Axes, right: Floats, left: Floats) -> None:
         axes.plot(closed[:, 0], closed[:, 1], color="#a3a39b", linewidth=0.7)
 
 
-def show_all(axes: Axes, points: Floats) -> None:
+def show_all(axes: Axes, points: Floats, margin_m: float = _MARGIN_M) -> None:
     """Limits both axes, at one scale, to these points (n, 2) and a margin."""
-    low, high = points.min(axis=0) - _MARGIN_M, points.max(axis=0) + _MARGIN_M
+    low, high = points.min(axis=0) - margin_m, points.max(axis=0) + margin_m
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
 
 
@@ -195,11 +181,11 @@ def write_picture(path: Path, track: Track, grid: "RosMap | None" = None) -> Non
     check_picture(path)
     width_m = float(np.median(track.width_right_m + track.width_left_m))
     edges = track.boundaries(width_m / 12)
-    low, high = (limit(np.concatenate(edges), axis=0) for limit in (np.min, np.max))
-    low, high = low - width_m, high + width_m
+    points = np.concatenate(edges)
+    width, height = np.ptp(points, axis=0) + 2 * width_m
     with figure_style():
-        height = PICTURE_WIDTH * (high[1] - low[1]) / (high[0] - low[0])
-        figure = Figure(figsize=(PICTURE_WIDTH, min(height, 2 * PICTURE_WIDTH)), layout="tight")
+        tall = PICTURE_WIDTH * min(height / width, 2.0)
+        figure = Figure(figsize=(PICTURE_WIDTH, tall), layout="tight")
         axes = figure.add_subplot()
         if grid is not None:
             _draw_map(axes, grid)
@@ -208,8 +194,8 @@ def write_picture(path: Path, track: Track, grid: "RosMap | None" = None) -> Non
         for edge, label in zip(edges, ("edges", None), strict=True):
             closed = np.concatenate([edge, edge[:1]])
             axes.plot(closed[:, 0], closed[:, 1], color=_EDGE, linewidth=0.8, label=label)
-        _draw_start(axes, track, width_m)
-        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+        _draw_start(axes, track)
+        show_all(axes, points, width_m)
         axes.set(xlabel="x [m]", ylabel="y [m]", title=f"{track.name} · {track.length_m:.2f} m")
         axes.legend(loc="best")
         if path.suffix == ".png":
@@ -229,12 +215,3 @@ def _draw_map(axes: Axes, grid: "RosMap") -> None:
     )
     image.set_transform(placed + axes.transData)
     axes.grid(visible=False)
-
-
-def _draw_start(axes: Axes, track: Track, width_m: float) -> None:
-    """The start line, and an arrow in driving direction."""
-    ends = np.stack([edge[0] for edge in track.boundaries()], axis=1)
-    axes.plot(ends[0], ends[1], color=INK, linewidth=2.0, label="start")
-    x, y, psi = track.start_pose()
-    tip = x + width_m * np.cos(psi), y + width_m * np.sin(psi)
-    axes.annotate("", tip, (x, y), arrowprops={"arrowstyle": "-|>", "color": INK}, zorder=6)

@@ -1,7 +1,7 @@
 """The report: figures and tables put into the template, and the files beside the page."""
 
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -14,37 +14,27 @@ from pydantic import ValidationError
 
 from bayesrace.files import write_whole
 from bayesrace.manifest import Manifest
-from bayesrace.operation.analysis.race import DrivenRun, RaceAnalysis, read_race
+from bayesrace.operation.analysis.race import RaceAnalysis, read_race
 from bayesrace.operation.analysis.results import RaceResult, write_result
 from bayesrace.operation.report.gp import gp_figures
-from bayesrace.operation.report.maps import LapMaps
-from bayesrace.operation.report.runs import coverage_figures, solve_figure
-from bayesrace.operation.report.style import figure_style, inline_svg, look, png
-from bayesrace.operation.report.traces import (
-    caution_figures,
-    cornering_figures,
-    deviation_figures,
-    input_figures,
-    speed_figures,
-    time_figures,
-)
+from bayesrace.operation.report.maps import lap_maps
+from bayesrace.operation.report.panels import lap_figures, solve_figure, time_figures
+from bayesrace.operation.report.style import figure_style, inline_svg, look
 from bayesrace.operation.terminal.notation import UNCERTAIN
 from bayesrace.operation.terminal.race_table import COLUMNS, GP_COLUMNS, drive_text, gp_cells
 from bayesrace.processes import raise_if_interrupted
 
-__all__ = ["PICTURE", "REPORT", "RESULT", "template", "write_report"]
+__all__ = ["REPORT", "RESULT", "template", "write_report"]
 
 RESULT: Final = "result.json"
 REPORT: Final = "report.html"
-PICTURE: Final = "lap.png"
 
 _TEMPLATE: Final = "report.html.j2"
 _PACKAGES: Final = ("bayesrace", "casadi", "numpy", "scipy", "eclipse-zenoh")
 
 
 def write_report(run_dir: Path, analysis: RaceAnalysis | None = None) -> Path:
-    """Writes ``result.json``, ``lap.png`` and ``report.html`` into the run directory; returns the
-    page's path.
+    """Writes ``result.json`` and ``report.html`` into the run directory; returns the page's path.
 
     ``analysis`` saves reading the log a second time. Nothing is written before everything has been
     computed and drawn: an earlier report stays as it is otherwise. InputError if it is no run
@@ -53,13 +43,10 @@ def write_report(run_dir: Path, analysis: RaceAnalysis | None = None) -> Path:
     run_dir = Path(run_dir)
     analysis = analysis or read_race(run_dir)
     with figure_style():
-        figures = _svg(_panels(analysis, analysis.result))
-        maps, picture = _maps(analysis)
-        figures |= _svg(maps)
-    page = _page(run_dir, analysis, figures)
+        drawn = {name: [inline_svg(one) for one in some] for name, some in _figures(analysis)}
+    page = _page(run_dir, analysis, {name: some for name, some in drawn.items() if some})
     raise_if_interrupted()
     write_result(run_dir / RESULT, analysis.result)
-    write_whole(run_dir / PICTURE, picture)
     write_whole(run_dir / REPORT, page)
     return run_dir / REPORT
 
@@ -78,7 +65,7 @@ def _page(run_dir: Path, analysis: RaceAnalysis, figures: Mapping[str, Sequence[
         versions=_versions(run_dir),
         figures=figures,
         uncertain=_uncertain(analysis),
-        period_us=round(analysis.recording.settings.discretisation.step_s * 1e6),
+        period_us=_period_us(analysis),
         limit_sigma=UNCERTAIN,
         caution=analysis.recording.settings.mpc.caution,
         title=f"{result.settings.track} · {analysis.track.length_m:.2f} m",
@@ -151,42 +138,24 @@ def _uncertain(analysis: RaceAnalysis) -> list[tuple[str, int, int]]:
     ]
 
 
-def _maps(analysis: RaceAnalysis) -> tuple[dict[str, list[Figure]], bytes]:
-    """Laps on the track and the training drive, as panels, and the picture of the laps as PNG."""
-    driven = _driven(analysis)
-    maps = LapMaps(driven, analysis.track, analysis.line)
-    picture = png(maps.picture())
-    figures = {"laps": maps.figures()}
-    if (found := analysis.recording.training) is not None and analysis.training is not None:
-        training = LapMaps([analysis.training], found.track, found.line)
-        figures["training"] = [*training.figures(), *coverage_figures(analysis.training, driven)]
-    return figures, picture
-
-
-def _panels(analysis: RaceAnalysis, result: RaceResult) -> dict[str, list[Figure]]:
-    """What is drawn over the track's length, and the execution times; what has nothing to show is
-    left out."""
-    driven, track, line = _driven(analysis), analysis.track, analysis.line
-    figures: dict[str, list[Figure]] = {}
-    if driven:
-        figures["time"] = time_figures(driven, track)
-        figures["speed"] = speed_figures(driven, track, line)
-        figures["inputs"] = input_figures(driven, track, analysis.recording.settings.car)
-        figures["cornering"] = cornering_figures(driven, track, result.settings.friction)
-        figures["deviation"] = deviation_figures(driven, track)
-        figures["caution"] = caution_figures(driven, track)
+def _figures(analysis: RaceAnalysis) -> Iterator[tuple[str, list[Figure]]]:
+    """The figures of each section of the page."""
+    runs = [run for run in analysis.runs if len(run.record.truth) > 1]
+    settings, track, line = analysis.recording.settings, analysis.track, analysis.line
+    yield "laps", lap_maps(runs, track, line)
+    if runs:
+        yield "time", time_figures(runs, track)
+        friction = analysis.result.settings.friction
+        yield from lap_figures(runs, track, line, settings.car, friction).items()
     data = analysis.best_case
     if data is not None and analysis.validations:
         progress = track.project_path(data.x[:, :2]).progress_m
-        figures["gp"] = gp_figures(analysis.validations, progress, track.length_m)
-    if any(len(run.record.telemetry) for run in driven):
-        figures["solve"] = [solve_figure(driven)]
-    return figures
+        yield "gp", gp_figures(analysis.validations, progress, track.length_m)
+    if (found := analysis.recording.training) is not None and analysis.training is not None:
+        yield "training", lap_maps([analysis.training], found.track, found.line)
+    if any(len(run.record.telemetry) for run in runs):
+        yield "solve", [solve_figure(runs, _period_us(analysis))]
 
 
-def _driven(analysis: RaceAnalysis) -> list[DrivenRun]:
-    return [run for run in analysis.runs if len(run.record.truth) > 1]
-
-
-def _svg(figures: Mapping[str, Sequence[Figure]]) -> dict[str, list[str]]:
-    return {name: [inline_svg(one) for one in some] for name, some in figures.items() if some}
+def _period_us(analysis: RaceAnalysis) -> int:
+    return round(analysis.recording.settings.discretisation.step_s * 1e6)

@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from bayesrace.arrays import Floats
 from bayesrace.operation.analysis.race import DrivenRun
 from bayesrace.operation.report.maps import draw_edges, show_all
+from bayesrace.operation.report.panels import input_figures
 from bayesrace.operation.report.style import MUTED, WARNING, look, panel
-from bayesrace.operation.report.traces import input_figures
 from bayesrace.plant.simulator import PLANT
 from bayesrace.raceline import RaceLine, RaceLineSettings
 from bayesrace.raceline.nodes import timed_line

@@ -1,4 +1,5 @@
-"""Laps over the arc length of the centreline: time lost, speed, inputs, deviation."""
+"""Panels over the arc length of the centreline: time lost, speed, inputs, cornering, deviation,
+caution; and the execution times of the control steps."""
 
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
@@ -9,7 +10,6 @@ from matplotlib.figure import Figure
 from scipy.interpolate import CubicSpline
 
 from bayesrace.arrays import Floats
-from bayesrace.columns import Columns
 from bayesrace.operation.analysis.race import DrivenRun
 from bayesrace.operation.report.style import INK, MUTED, look, panel
 from bayesrace.raceline import RaceLine
@@ -19,13 +19,11 @@ from bayesrace.vehicles.parts import GRAVITY_MPS2
 
 __all__ = [
     "Lap",
-    "caution_figures",
-    "cornering_figures",
-    "deviation_figures",
     "first_laps",
     "input_figures",
+    "lap_figures",
     "reference_of",
-    "speed_figures",
+    "solve_figure",
     "time_figures",
 ]
 
@@ -36,6 +34,9 @@ _NEAR_MS: Final = 300.0
 """A lap that ends farther from the reference leaves the picture, so that the others remain
 legible."""
 _DASHES: Final = (0, (4, 2))
+_DOTS: Final = (0, (1, 2))
+_STANDING: Final = "first lap, from standstill"
+_FLYING: Final = "best flying lap"
 
 
 class Lap:
@@ -45,6 +46,7 @@ class Lap:
         self.run, self.length_m, self.number = run, track.length_m, number
         self.rows = run.shown(number)
         self.s_m: Floats = run.on_track.progress_m[self.rows] - number * track.length_m
+        self.colour = look(run.controller, run.number).colour
 
     def time_at(self, s: Floats) -> Floats:
         """Time since the start line at arc lengths (n,) [s]; the lap must be a finished one."""
@@ -74,7 +76,7 @@ class Lap:
             np.insert(np.asarray(one, dtype=float), leaps, np.nan)
             for one in (self.s_m, values[self.rows])
         )
-        axes.plot(s, y, color=look(self.run.controller, self.run.number).colour, linewidth=1.1)
+        axes.plot(s, y, color=self.colour, linewidth=1.1)
 
 
 def first_laps(runs: Sequence[DrivenRun], track: Track) -> list[Lap]:
@@ -89,15 +91,6 @@ def _flying_laps(runs: Sequence[DrivenRun], track: Track) -> list[Lap]:
         for run in runs
         if len(run.laps.times_s) > 1
     ]
-
-
-def _both(runs: Sequence[DrivenRun], track: Track) -> dict[str, list[Lap]]:
-    """The first and, where there are any, the best flying laps by their title."""
-    laps = {
-        "first lap, from standstill": first_laps(runs, track),
-        "best flying lap": _flying_laps(runs, track),
-    }
-    return {title: some for title, some in laps.items() if some}
 
 
 def reference_of(laps: Sequence[Lap]) -> Lap | None:
@@ -117,6 +110,10 @@ class _Trace(NamedTuple):
     """Drawn as dotted lines."""
     floor: float | None = None
     """Where the axis begins, if not where the values do."""
+    within: float = np.inf
+    """The axis shows no more to both sides of 0."""
+    dashed: tuple[Floats, Floats] | None = None
+    """Arc lengths and values to compare with."""
 
 
 def _panel(track: Track, title: str, label: str, height: float = 2.0) -> tuple[Figure, Axes]:
@@ -126,25 +123,24 @@ def _panel(track: Track, title: str, label: str, height: float = 2.0) -> tuple[F
     return figure, axes
 
 
-def _figures(track: Track, laps: Sequence[Lap], traces: Sequence[_Trace]) -> list[Figure]:
-    """A panel for each trace, with all laps."""
-    figures = []
-    for trace in traces:
-        figure, axes = _panel(track, trace.title, trace.label)
-        for limit in trace.limits:
-            axes.axhline(limit, color=INK, linewidth=0.6, linestyle=(0, (1, 2)))
-        for lap in laps:
-            lap.plot(axes, trace.values(lap.run))
-        if trace.floor is not None:
-            axes.set_ylim(trace.floor, None)
-        figures.append(figure)
-    return figures
+def _figure(track: Track, laps: Sequence[Lap], trace: _Trace) -> Figure:
+    figure, axes = _panel(track, trace.title, trace.label)
+    for limit in trace.limits:
+        axes.axhline(limit, color=INK, linewidth=0.6, linestyle=_DOTS)
+    if trace.dashed is not None:
+        axes.plot(*trace.dashed, color=MUTED, linewidth=0.9, linestyle=_DASHES)
+    for lap in laps:
+        lap.plot(axes, trace.values(lap.run))
+    low, high = axes.get_ylim() if trace.floor is None else (trace.floor, axes.get_ylim()[1])
+    axes.set_ylim(max(low, -trace.within), min(high, trace.within))
+    return figure
 
 
 def time_figures(runs: Sequence[DrivenRun], track: Track) -> list[Figure]:
     """Time behind the reference lap along the track: a line that rises loses time there."""
     figures = []
-    for title, laps in _both(runs, track).items():
+    both = {_STANDING: first_laps(runs, track), _FLYING: _flying_laps(runs, track)}
+    for title, laps in both.items():
         finished = [lap for lap in laps if lap.run.finished]
         reference = reference_of(finished)
         if reference is None or len(finished) < 2:
@@ -155,8 +151,7 @@ def time_figures(runs: Sequence[DrivenRun], track: Track) -> list[Figure]:
         for lap in finished:
             s, behind_s = lap.behind(reference)
             behind_ms = 1e3 * behind_s
-            colour = look(lap.run.controller, lap.run.number).colour
-            axes.plot(s, behind_ms, color=colour, linewidth=1.3)
+            axes.plot(s, behind_ms, color=lap.colour, linewidth=1.3)
             if abs(behind_ms[-1]) < _NEAR_MS:
                 near_ms.extend(behind_ms)
         room = 0.05 * (max(near_ms) - min(near_ms))
@@ -165,41 +160,8 @@ def time_figures(runs: Sequence[DrivenRun], track: Track) -> list[Figure]:
     return figures
 
 
-def speed_figures(runs: Sequence[DrivenRun], track: Track, line: RaceLine) -> list[Figure]:
-    """Speed on the first and on the best flying lap; the racing line's is that of a flying lap."""
-    figures = []
-    on_line = track.project_points(line.xy_m)
-    order = np.argsort(on_line.s_m)[:: max(1, len(line.s_m) // 800)]
-    for title, laps in _both(runs, track).items():
-        figure, axes = _panel(track, title, "vx [m/s]")
-        axes.plot(
-            on_line.s_m[order], line.vx_mps[order], color=MUTED, linewidth=0.9, linestyle=_DASHES
-        )
-        for lap in laps:
-            lap.plot(axes, lap.run.record.x[:, 3])
-        axes.set_ylim(0, None)
-        figures.append(figure)
-    return figures
-
-
-def deviation_figures(runs: Sequence[DrivenRun], track: Track) -> list[Figure]:
-    """Signed distance from the racing line on the first and on the best flying lap."""
-    figures = []
-    reach = float(np.max(track.width_right_m + track.width_left_m)) / 2
-    for title, laps in _both(runs, track).items():
-        figure, axes = _panel(track, title, "to the left [m]")
-        axes.axhline(0, color=MUTED, linewidth=0.8, linestyle=_DASHES)
-        for lap in laps:
-            lap.plot(axes, lap.run.offset_m)
-        largest = max(float(np.abs(lap.run.offset_m[lap.rows]).max()) for lap in laps)
-        limit = min(1.08 * largest, 1.5 * reach)
-        axes.set_ylim(-limit, limit)
-        figures.append(figure)
-    return figures
-
-
 def input_figures(runs: Sequence[DrivenRun], track: Track, car: CarParameters) -> list[Figure]:
-    """Drive command and steering on the first lap, with the car's limits."""
+    """Drive command, steering angle and steering rate on the first lap, with the car's limits."""
     unit, angle, rate = car.drive.unit, car.delta_max_rad, car.delta_rate_max_radps
     command = f"d [{ ({'1': '–', 'm/s2': 'm/s²'}[unit]) }]"
     traces = (
@@ -207,7 +169,58 @@ def input_figures(runs: Sequence[DrivenRun], track: Track, car: CarParameters) -
         _Trace("steering angle", "δ [rad]", lambda run: run.record.x[:, 6], (-angle, angle)),
         _Trace("steering rate", "dδ/dt [rad/s]", lambda run: _held(run, 1), (-rate, rate)),
     )
-    return _figures(track, first_laps(runs, track), traces)
+    return [_figure(track, first_laps(runs, track), trace) for trace in traces]
+
+
+def lap_figures(
+    runs: Sequence[DrivenRun],
+    track: Track,
+    line: RaceLine,
+    car: CarParameters,
+    friction: float | None,
+) -> dict[str, list[Figure]]:
+    """Panels with all laps, by the section of the report.
+
+    Speed and signed distance from the racing line on the first and on the best flying lap; inputs
+    on the first; lateral acceleration, with what the ``friction`` of the line would allow, and slip
+    on the flying one. Where there was caution, what the uncertainty of the model does on the first
+    lap: how far off the plan's last stage may be, the speed that the reference is left with, and by
+    how much the errors that were seen have widened the model's band.
+    """
+    first, flying = first_laps(runs, track), _flying_laps(runs, track)
+    by_s = np.argsort(s_m := track.project_points(line.xy_m).s_m)[:: max(1, len(line.s_m) // 800)]
+    of_line = s_m[by_s], line.vx_mps[by_s]
+    beside = np.array([0.0, track.length_m]), np.zeros(2)
+    reach = 0.75 * float(np.max(track.width_right_m + track.width_left_m))
+    grip = () if friction is None else (-friction, friction)
+    speed = _Trace("", "vx [m/s]", lambda run: run.record.x[:, 3], floor=0, dashed=of_line)
+    deviation = _Trace("", "to the left [m]", lambda run: run.offset_m, within=reach, dashed=beside)
+    cornering = (
+        _Trace("acceleration across the way", "to the left [g]",
+               lambda run: run.record.lateral_mps2 / GRAVITY_MPS2, grip),
+        _Trace("slip of the body", "β [°]", lambda run: np.degrees(run.record.slip_rad)),
+    )  # fmt: skip
+    caution = (
+        _Trace("uncertainty at the end of the plan", "either side [m]",
+               lambda run: _of_states(run, _ends_of_tube(run)), floor=0),
+        _Trace("speed of the reference", "share of the line's",
+               lambda run: _of_states(run, run.record.telemetry["pace"]), floor=0),
+        _Trace("band of the model", "widened by",
+               lambda run: _of_states(run, run.record.telemetry["widening"]), floor=0),
+    )  # fmt: skip
+    cautious = [lap for lap in first if _is_cautious(lap.run)]
+    both = {title: some for title, some in ((_STANDING, first), (_FLYING, flying)) if some}
+
+    def on_both(trace: _Trace) -> list[Figure]:
+        return [_figure(track, laps, trace._replace(title=title)) for title, laps in both.items()]
+
+    return {
+        "speed": on_both(speed),
+        "deviation": on_both(deviation),
+        "inputs": input_figures(runs, track, car),
+        "cornering": [_figure(track, flying or first, trace) for trace in cornering],
+        "caution": [_figure(track, cautious, trace) for trace in caution if cautious],
+    }
 
 
 def _held(run: DrivenRun, column: int) -> Floats:
@@ -216,44 +229,32 @@ def _held(run: DrivenRun, column: int) -> Floats:
     return np.append(u, u[-1:]) if len(u) else np.zeros(1)
 
 
-def cornering_figures(
-    runs: Sequence[DrivenRun], track: Track, friction: float | None
-) -> list[Figure]:
-    """Lateral acceleration, with what the friction would allow, and slip on the flying lap."""
-    limits = () if friction is None else (-friction, friction)
-    traces = (
-        _Trace("acceleration across the way", "to the left [g]",
-               lambda run: run.record.lateral_mps2 / GRAVITY_MPS2, limits),
-        _Trace("slip of the body", "β [°]", lambda run: np.degrees(run.record.slip_rad)),
-    )  # fmt: skip
-    return _figures(track, _flying_laps(runs, track) or first_laps(runs, track), traces)
+def _is_cautious(run: DrivenRun) -> bool:
+    telemetry = run.record.telemetry
+    return any(map(any, telemetry["tube_m"])) or bool((telemetry["pace"] < 1).any())
 
 
-def caution_figures(runs: Sequence[DrivenRun], track: Track) -> list[Figure]:
-    """What the uncertainty of the model does on the first lap: how far off the plan's last stage
-    may be, the speed that the reference is left with, and by how much the errors that were seen
-    have widened the model's band. Nothing if there was no caution."""
-
-    def cautious(telemetry: Columns) -> bool:
-        return any(map(any, telemetry["tube_m"])) or bool((telemetry["pace"] < 1).any())
-
-    laps = [lap for lap in first_laps(runs, track) if cautious(lap.run.record.telemetry)]
-    traces = (
-        _Trace("uncertainty at the end of the plan", "either side [m]",
-               lambda run: _of_states(run, _ends_of_tube(run.record.telemetry)), floor=0),
-        _Trace("speed of the reference", "share of the line's",
-               lambda run: _of_states(run, run.record.telemetry["pace"]), floor=0),
-        _Trace("band of the model", "widened by",
-               lambda run: _of_states(run, run.record.telemetry["widening"]), floor=0),
-    )  # fmt: skip
-    return _figures(track, laps, traces) if laps else []
-
-
-def _ends_of_tube(telemetry: Columns) -> Floats:
-    return np.array([tube_m[-1] if tube_m else np.nan for tube_m in telemetry["tube_m"]])
+def _ends_of_tube(run: DrivenRun) -> Floats:
+    tubes = run.record.telemetry["tube_m"]
+    return np.array([tube_m[-1] if tube_m else np.nan for tube_m in tubes])
 
 
 def _of_states(run: DrivenRun, values: Floats) -> Floats:
     """The value of each state's cycle; NaN where there was none."""
     known = dict(zip(run.record.telemetry["state_seq"].tolist(), values, strict=True))
     return np.array([known.get(seq, np.nan) for seq in run.record.truth["seq"].tolist()])
+
+
+def solve_figure(runs: Sequence[DrivenRun], period_us: float) -> Figure:
+    """The share of each run's steps that took longer than a time, up to the sampling period."""
+    figure, axes = panel(3.2)
+    for run in runs:
+        if len(times := np.maximum(run.record.telemetry["solve_us"], 1e-3)):
+            colour = look(run.controller, run.number).colour
+            axes.ecdf(times, complementary=True, color=colour, linewidth=1.3)
+    axes.axvline(period_us, color=INK, linewidth=0.6, linestyle=_DOTS)
+    axes.set(xscale="log", yscale="log", ylabel="share of the steps that took longer")
+    axes.set_xlabel("execution time of one step [µs]")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter("{x:g}")  # plain numbers read better than powers
+    return figure
