@@ -26,7 +26,7 @@ from bayesrace.controller.mpc import PredictiveController
 from bayesrace.gp.weights import read_weights
 from bayesrace.operation.preparation import Prepared, prepare
 from bayesrace.operation.settings import PreparationSettings
-from bayesrace.operation.terminal.progress import stages_on
+from bayesrace.operation.terminal.terminal import stages_on
 
 ROOT = Path(__file__).resolve().parents[1]
 Row = dict[str, Any]  # what is measured, in words, and numbers

@@ -14,7 +14,7 @@ from bayesrace.learning.search import search
 from bayesrace.operation.closed_loop import ClosedLoop, built_in_car
 from bayesrace.operation.preparation import prepare
 from bayesrace.operation.settings import BayesianSettings, PreparationSettings
-from bayesrace.operation.terminal.progress import Stages
+from bayesrace.operation.terminal.terminal import Stages
 from bayesrace.raceline import RaceLine, RaceLineSettings, racing_line
 from bayesrace.raceline.line import line_identity
 from bayesrace.raceline.nodes import NodeLines, roughness

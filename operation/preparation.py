@@ -26,7 +26,7 @@ from bayesrace.messages import STATE, TELEMETRY
 from bayesrace.operation.closed_loop import Driven
 from bayesrace.operation.collect import collect, drive_length_s, training_margin_m
 from bayesrace.operation.settings import PreparationSettings
-from bayesrace.operation.terminal.progress import Stages
+from bayesrace.operation.terminal.terminal import Stages
 from bayesrace.plant.simulator import PLANT
 from bayesrace.plant.vehicle import open_vehicle
 from bayesrace.raceline import (

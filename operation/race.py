@@ -32,7 +32,7 @@ from bayesrace.operation.preparation import (
 )
 from bayesrace.operation.settings import RaceSettings
 from bayesrace.operation.system import System, started_system
-from bayesrace.operation.terminal.progress import Stage, Stages
+from bayesrace.operation.terminal.terminal import Stage, Stages
 from bayesrace.plant.simulator import PLANT
 from bayesrace.plant.vehicle import FmuFault, open_vehicle
 from bayesrace.recorder import Recorder

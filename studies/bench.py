@@ -38,8 +38,7 @@ from bayesrace.messages import State
 from bayesrace.operation.closed_loop import built_in_car
 from bayesrace.operation.drive import RunPlan, run_request
 from bayesrace.operation.preparation import prepare, progress_artefact
-from bayesrace.operation.terminal.progress import Stages
-from bayesrace.operation.terminal.terminal import plain_table
+from bayesrace.operation.terminal.terminal import Stages, plain_table
 from bayesrace.plant.lockstep import CarRun, drive_lockstep
 from bayesrace.plant.simulator import PLANT
 from bayesrace.plant.vehicle import Vehicle

@@ -14,7 +14,7 @@ from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.operation.closed_loop import ClosedLoop, Driven
 from bayesrace.operation.preparation import Prepared, prepare
 from bayesrace.operation.settings import PreparationSettings
-from bayesrace.operation.terminal.progress import stages_on
+from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.raceline import RaceLine
 from bayesrace.tracks import Track
 from bayesrace.vehicles import CarParameters, get_car

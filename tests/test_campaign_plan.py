@@ -15,7 +15,7 @@ from bayesrace.learning.dataset import Dataset
 from bayesrace.operation.preparation import updated_weights
 from bayesrace.operation.race import race
 from bayesrace.operation.settings import RaceSettings
-from bayesrace.operation.terminal.progress import stages_on
+from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.studies.campaign.case import Case, factors
 from bayesrace.studies.campaign.execute import FAILED, run_case
 from bayesrace.studies.campaign.plan import Campaign, read_plan

@@ -20,7 +20,7 @@ from bayesrace.learning.validation import predictive_sigma
 from bayesrace.operation.closed_loop import ClosedLoop, built_in_car
 from bayesrace.operation.preparation import prepare
 from bayesrace.operation.settings import RaceSettings
-from bayesrace.operation.terminal.progress import stages_on
+from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.vehicles import CarParameters, default_car
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from bayesrace.vehicles.tuning import CautionTuning

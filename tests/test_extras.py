@@ -12,7 +12,7 @@ from bayesrace.operation.drive import RunPlan
 from bayesrace.operation.preparation import prepare
 from bayesrace.operation.settings import PreparationSettings
 from bayesrace.operation.system import started_system
-from bayesrace.operation.terminal.progress import stages_on
+from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.vehicles import DEFAULT_CAR
 from tests.car_fmu import packed_car
 from tests.command_line import Cli, refused

@@ -21,7 +21,7 @@ from bayesrace.messages import State
 from bayesrace.operation.closed_loop import ClosedLoop, built_in_car
 from bayesrace.operation.preparation import prepare
 from bayesrace.operation.settings import RaceSettings
-from bayesrace.operation.terminal.progress import stages_on
+from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.vehicles import CarParameters
 from tests.conftest import CAUTIOUS, Circuit, ready
 from tests.cycle_rig import state

@@ -22,7 +22,7 @@ from bayesrace.messages import STATE
 from bayesrace.operation.drive import RunPlan, run_request
 from bayesrace.operation.preparation import Prepared, prepare
 from bayesrace.operation.settings import PreparationSettings
-from bayesrace.operation.terminal.progress import stages_on
+from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.studies.latency.legs import BESIDE, LEGS
 from bayesrace.studies.latency.measure import _wait_for_run
 from bayesrace.studies.latency.results import new_histogram

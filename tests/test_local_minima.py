@@ -10,7 +10,7 @@ from bayesrace.gp.weights import read_weights
 from bayesrace.operation.closed_loop import drive_compiled
 from bayesrace.operation.preparation import prepare, updated_weights
 from bayesrace.operation.settings import PreparationSettings
-from bayesrace.operation.terminal.progress import stages_on
+from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.vehicles import default_car
 
 

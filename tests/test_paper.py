@@ -15,7 +15,7 @@ from bayesrace.integrators import PREDICTION
 from bayesrace.learning.likelihood import PairDistances, maximise, starts
 from bayesrace.learning.residual import residual
 from bayesrace.operation.settings import RaceSettings
-from bayesrace.operation.terminal.progress import Stage, stages_on
+from bayesrace.operation.terminal.terminal import Stage, stages_on
 from bayesrace.studies.paper import make
 from bayesrace.studies.paper import residual as learning
 from bayesrace.studies.paper.experiment import Experiment

@@ -12,7 +12,7 @@ from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
 from bayesrace.operation.preparation import Prepared, prepare
 from bayesrace.operation.settings import PreparationSettings
-from bayesrace.operation.terminal.progress import stages_on
+from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.raceline import RaceLineSettings
 from bayesrace.tracks import Track
 from tests.car_fmu import packed_car

@@ -25,7 +25,7 @@ from bayesrace.operation.analysis.results import RaceResult, read_result
 from bayesrace.operation.drive import RunPlan
 from bayesrace.operation.preparation import Prepared, prepare, updated_weights
 from bayesrace.operation.settings import RaceSettings
-from bayesrace.operation.terminal.progress import stages_on
+from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.raceline import read_raceline, write_raceline
 from bayesrace.vehicles import default_car, read_car, write_car
 from tests.car_fmu import packed_car

@@ -17,7 +17,7 @@ from bayesrace.learning.dataset import Dataset, concatenate, filter_dataset
 from bayesrace.learning.sources import dataset_from_npz
 from bayesrace.learning.training import train
 from bayesrace.learning.validation import Validation, validate
-from bayesrace.operation.terminal.learning_table import print_beyond_limits
+from bayesrace.operation.terminal.tables import print_beyond_limits
 from bayesrace.vehicles import get_car
 from tests.command_line import Cli
 from tests.reference import reference_file

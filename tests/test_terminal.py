@@ -5,7 +5,7 @@ import logging
 
 from rich.table import Table
 
-from bayesrace.operation.terminal.printable import PrintableFormatter
+from bayesrace.operation.terminal import PrintableFormatter
 from bayesrace.operation.terminal.terminal import Terminal
 
 EVIL = "a\x1b[2Jb\x07c"

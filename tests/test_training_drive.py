@@ -19,7 +19,7 @@ from bayesrace.operation.analysis.race import analyse
 from bayesrace.operation.closed_loop import Driven, built_in_car
 from bayesrace.operation.collect import collect, drive_length_s, training_line, training_margin_m
 from bayesrace.operation.report import write_report
-from bayesrace.operation.terminal.race_table import print_table
+from bayesrace.operation.terminal.tables import print_table
 from bayesrace.raceline import RaceLine, write_raceline
 from bayesrace.tracks import Track, load_track, write_track
 from bayesrace.vehicles import get_car

@@ -20,7 +20,7 @@ from bayesrace.learning.target import KernelScore
 from bayesrace.learning.training import train
 from bayesrace.learning.validation import mismatch, unbroken, validate
 from bayesrace.operation.analysis.validation import ValidationResult, validate_weights
-from bayesrace.operation.terminal.learning_table import print_kernels, print_validation
+from bayesrace.operation.terminal.tables import print_kernels, print_validation
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from tests.command_line import Cli, refused
 from tests.driven import CAR, QUICK, STEP_S, drive, write_log

@@ -15,7 +15,7 @@ from bayesrace.learning.residual import discretisation_of
 from bayesrace.learning.sources import read_samples
 from bayesrace.learning.validation import HORIZON, Validation, mismatch, validate
 from bayesrace.operation.analysis.results import GpMetrics, gp_metrics
-from bayesrace.operation.terminal.notation import UNCERTAIN
+from bayesrace.operation.terminal import UNCERTAIN
 from bayesrace.vehicles import CarParameters, get_car
 
 __all__ = [

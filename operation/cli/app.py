@@ -132,7 +132,7 @@ def _options(
         False, "--version", callback=_version, is_eager=True, help="Print the version and exit."
     ),
 ) -> None:
-    from bayesrace.operation.terminal.printable import PrintableFormatter
+    from bayesrace.operation.terminal import PrintableFormatter
 
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(PrintableFormatter("%(name)s: %(message)s"))
@@ -197,7 +197,7 @@ def _missing(package: str) -> str | None:
 
 
 def _fail(text: str, code: int = 2) -> None:
-    from bayesrace.operation.terminal.printable import printable
+    from bayesrace.operation.terminal import printable
 
     lines = [printable(line.strip()) for line in text.splitlines() if line.strip()]
     several = any(line.startswith("- ") for line in lines)  # faults, as of a map: a line each

@@ -8,7 +8,7 @@ import typer
 
 from bayesrace.operation.cli import options
 from bayesrace.operation.cli.declaration import Given, options_of
-from bayesrace.operation.terminal.notation import UNCERTAIN
+from bayesrace.operation.terminal import UNCERTAIN
 
 if TYPE_CHECKING:
     from bayesrace.learning.settings import TrainingSettings
@@ -88,7 +88,7 @@ def train(
     from bayesrace.learning.sources import read_samples
     from bayesrace.learning.training import fit
     from bayesrace.manifest import read_manifest
-    from bayesrace.operation.terminal import learning_table
+    from bayesrace.operation.terminal import tables
     from bayesrace.operation.terminal.terminal import Terminal
     from bayesrace.vehicles import get_car
 
@@ -107,13 +107,13 @@ def train(
         )  # fmt: skip
     weights, console = training.weights, Terminal()
     write_weights(out, weights)
-    learning_table.print_kernels(training.kernels, console)
+    tables.print_kernels(training.kernels, console)
     typer.echo(
         f"{weights.version}: {len(samples.dataset)} samples "
         f"(left out: {left_out(samples.dataset.dropped)}), "
         f"kernels {', '.join(weights.kernels)}: {out}"
     )
-    learning_table.print_beyond_limits(samples.dataset.dropped, len(samples.dataset), console)
+    tables.print_beyond_limits(samples.dataset.dropped, len(samples.dataset), console)
 
 
 def validate(
@@ -140,7 +140,7 @@ def validate(
 
     from bayesrace.gp.weights import read_weights
     from bayesrace.operation.analysis.validation import validate_weights
-    from bayesrace.operation.terminal.learning_table import print_validation
+    from bayesrace.operation.terminal.tables import print_validation
     from bayesrace.operation.terminal.terminal import Terminal
     from bayesrace.tracks import load_track
     from bayesrace.vehicles import get_car

@@ -17,7 +17,7 @@ from bayesrace.files import write_whole
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-    from bayesrace.operation.terminal.progress import Stages
+    from bayesrace.operation.terminal.terminal import Stages
 
 __all__ = [
     "ALL_SAMPLES", "ARTEFACT", "CAR", "CAR_NAME", "COURSE", "ENDPOINT", "GIVEN_LINE", "LOW_LATENCY",
@@ -81,8 +81,7 @@ def run_folder(given: Path | None, prefix: str = "") -> Path:
 @contextmanager
 def stages_shown() -> Iterator["Stages"]:
     """The stages of the work, shown on the terminal."""
-    from bayesrace.operation.terminal.progress import stages_on
-    from bayesrace.operation.terminal.terminal import Terminal
+    from bayesrace.operation.terminal.terminal import Terminal, stages_on
 
     with stages_on(Terminal()) as stages:
         yield stages

@@ -183,7 +183,7 @@ def _command(
     action: "Action", name: str, endpoints: "Endpoints", reason: str, all_cars: bool, timeout: float
 ) -> None:
     from bayesrace.operation.lifecycle import command_cars
-    from bayesrace.operation.terminal.printable import printable
+    from bayesrace.operation.terminal import printable
 
     done, failed = command_cars(endpoints, action, name, all_cars, reason, timeout)
     for answer in done:
@@ -198,7 +198,7 @@ def doctor(network: "Configuration") -> None:
     Tries everything as a process of this machine would. Exit code 1 if something is wrong.
     """
     from bayesrace.operation.doctor import examine
-    from bayesrace.operation.terminal.printable import printable
+    from bayesrace.operation.terminal import printable
 
     faults = 0
     for check in examine(network):

@@ -82,7 +82,7 @@ def report(
 
 
 def _print_result(analysis: "RaceAnalysis", page: Path) -> None:
-    from bayesrace.operation.terminal.race_table import print_table
+    from bayesrace.operation.terminal.tables import print_table
     from bayesrace.operation.terminal.terminal import Terminal
 
     print_table(analysis.result, Terminal())
@@ -188,7 +188,7 @@ def paper(
     Leaves paper.html, the figures as SVG and PDF, and numbers.json. What is computed is kept: the
     same command goes on after an interruption.
     """
-    from bayesrace.operation.terminal.printable import printable
+    from bayesrace.operation.terminal import printable
     from bayesrace.studies.paper.make import make_paper
 
     with options.stages_shown() as stages:

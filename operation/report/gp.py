@@ -25,7 +25,7 @@ from bayesrace.operation.report.style import (
     panel,
     write_png,
 )
-from bayesrace.operation.terminal.notation import SYMBOLS, UNCERTAIN
+from bayesrace.operation.terminal import SYMBOLS, UNCERTAIN
 from bayesrace.tracks import Track
 
 __all__ = ["gp_figures", "write_validation"]

@@ -20,8 +20,8 @@ from bayesrace.operation.report.gp import gp_figures
 from bayesrace.operation.report.maps import lap_maps
 from bayesrace.operation.report.panels import lap_figures, solve_figure, time_figures
 from bayesrace.operation.report.style import figure_style, inline_svg, look
-from bayesrace.operation.terminal.notation import UNCERTAIN
-from bayesrace.operation.terminal.race_table import COLUMNS, GP_COLUMNS, drive_text, gp_cells
+from bayesrace.operation.terminal import UNCERTAIN
+from bayesrace.operation.terminal.tables import COLUMNS, GP_COLUMNS, drive_text, gp_cells
 from bayesrace.processes import raise_if_interrupted
 
 __all__ = ["REPORT", "RESULT", "template", "write_report"]

@@ -9,7 +9,7 @@ from rich.console import Console, ConsoleOptions, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from bayesrace.operation.terminal.printable import printable
+from bayesrace.operation.terminal import printable
 from bayesrace.plant.fmu.inspection import items_of, range_of, steps_s
 from bayesrace.plant.fmu.units import unit_of
 

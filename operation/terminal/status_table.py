@@ -16,7 +16,7 @@ from bayesrace.errors import InputError
 from bayesrace.messages import Status
 from bayesrace.operation.analysis.network_status import SOURCES, NetworkStatus, ProcessStatus
 from bayesrace.operation.lifecycle import ask_statuses, find, follow
-from bayesrace.operation.terminal.printable import printable
+from bayesrace.operation.terminal import printable
 from bayesrace.operation.terminal.terminal import Terminal, plain_table
 from bayesrace.transport import Endpoints, open_session
 

@@ -24,7 +24,7 @@ from bayesrace.operation import preparation
 from bayesrace.operation.analysis.laps import trajectory_digest
 from bayesrace.operation.closed_loop import ClosedLoop, Driven, built_in_car
 from bayesrace.operation.settings import PreparationSettings
-from bayesrace.operation.terminal.progress import stages_on
+from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.studies.campaign.case import LEARNS_FROM, Case, Controller, software_identity
 
 __all__ = ["FAILED", "Row", "run_case"]

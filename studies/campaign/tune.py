@@ -21,8 +21,7 @@ from rich.text import Text
 from bayesrace.errors import InputError
 from bayesrace.operation.preparation import prepare
 from bayesrace.operation.settings import RaceSettings
-from bayesrace.operation.terminal.progress import Stages
-from bayesrace.operation.terminal.terminal import plain_table
+from bayesrace.operation.terminal.terminal import Stages, plain_table
 from bayesrace.studies.campaign.campaign import computed, connected
 from bayesrace.studies.campaign.case import Case, Controller, Files
 from bayesrace.studies.campaign.execute import FAILED, Row

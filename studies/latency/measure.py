@@ -16,7 +16,7 @@ from bayesrace.operation.drive import RunPlan, run_request
 from bayesrace.operation.preparation import Prepared, prepare
 from bayesrace.operation.settings import PreparationSettings
 from bayesrace.operation.system import Child, endings, started_system
-from bayesrace.operation.terminal.progress import Stages
+from bayesrace.operation.terminal.terminal import Stages
 from bayesrace.recorder import Recorder
 from bayesrace.studies.latency.analysis import Beside, analyse
 from bayesrace.studies.latency.beside import read_bare_loop, read_round_trips, running_beside

@@ -25,7 +25,7 @@ from bayesrace.operation.analysis.recording import RUN_COLUMNS, runs_of
 from bayesrace.operation.closed_loop import ClosedLoop, built_in_car
 from bayesrace.operation.preparation import PredictionModel, prepare, updated_weights
 from bayesrace.operation.settings import RaceSettings
-from bayesrace.operation.terminal.progress import Stages
+from bayesrace.operation.terminal.terminal import Stages
 from bayesrace.raceline import RaceLine
 from bayesrace.studies.campaign.case import software_identity
 

@@ -14,7 +14,7 @@ from bayesrace.operation.preparation import training_settings
 from bayesrace.operation.report.render import template
 from bayesrace.operation.report.style import figure_style, inline_svg, write_pdf
 from bayesrace.operation.settings import PreparationSettings
-from bayesrace.operation.terminal.progress import Stages
+from bayesrace.operation.terminal.terminal import Stages
 from bayesrace.raceline import write_raceline
 from bayesrace.studies.bench import BenchResult, run_bench
 from bayesrace.studies.paper.experiment import Experiment, stored

@@ -26,8 +26,8 @@ from bayesrace.learning.validation import Validation, validate
 from bayesrace.operation.preparation import trained_weights
 from bayesrace.operation.report.gp import gp_figures
 from bayesrace.operation.report.style import INK, WARNING, look, panel
-from bayesrace.operation.terminal.notation import SMOOTHNESS, SYMBOLS, UNCERTAIN
-from bayesrace.operation.terminal.progress import Stage, Stages
+from bayesrace.operation.terminal import SMOOTHNESS, SYMBOLS, UNCERTAIN
+from bayesrace.operation.terminal.terminal import Stage, Stages
 from bayesrace.studies.paper.experiment import stored
 from bayesrace.studies.paper.finding import Figures, Finding, Section, at_most
 from bayesrace.studies.paper.loop import course

@@ -1,24 +1,34 @@
-"""The result of a race on the terminal, legible from 80 columns on."""
+"""Results of a race, of training and of validation on the terminal, legible from 80 columns on."""
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final, NamedTuple
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bayesrace.gp.weights import UNITS
+from bayesrace.gp.weights import OUTPUTS, UNITS
+from bayesrace.learning.dataset import left_out
+from bayesrace.learning.target import KernelScore
 from bayesrace.operation.analysis.results import GpMetrics, LapResult, RaceResult
+from bayesrace.operation.analysis.validation import DRIFTS, HorizonResult, Spread, ValidationResult
+from bayesrace.operation.terminal import SMOOTHNESS
 from bayesrace.operation.terminal.terminal import plain_table
 from bayesrace.vehicles.parts import GRAVITY_MPS2
 
-__all__ = ["COLUMNS", "GP_COLUMNS", "Column", "drive_text", "gp_cells", "print_table"]
-
-
-_BEYOND: Final = 1.1
-"""Of the friction: measured accelerations err by some per cent."""
+__all__ = [
+    "COLUMNS",
+    "GP_COLUMNS",
+    "Column",
+    "drive_text",
+    "gp_cells",
+    "print_beyond_limits",
+    "print_kernels",
+    "print_table",
+    "print_validation",
+]
 
 
 class Column(NamedTuple):
@@ -65,6 +75,8 @@ def _slip(lap: LapResult) -> str:
 def _solve(name: str) -> Callable[[LapResult], str]:
     return lambda lap: _decimals(getattr(lap.solve_us, name, None), 0)
 
+
+_ERRORS: Final = "position m", "heading rad", "vx m/s", "vy m/s", "omega rad/s"
 
 COLUMNS: Final = (
     Column("controller", "", lambda lap: lap.name, "name of the controller", number=False),
@@ -121,7 +133,8 @@ def _gp_table(result: RaceResult) -> Table:
 
 
 def print_table(result: RaceResult, console: Console) -> None:
-    """Prints one row a controller, the GP's lines, and what went wrong, if anything."""
+    """Prints one row a controller, what drove it, the GP's lines, and what went wrong, if
+    anything."""
     summary = result.settings
     console.print(
         Text(
@@ -146,34 +159,38 @@ def print_table(result: RaceResult, console: Console) -> None:
             style="dim",
         )
     )
+    _print_limit(result, console)
     for lap in result.laps:
-        if lap.weights_version:
-            console.print(Text(f"{lap.name}: weights {lap.weights_version}"))
+        if facts := _facts(lap):
+            console.print(Text(f"{lap.name}: {', '.join(facts)}"))
     if (training := result.training) is not None:
         style = "yellow" if training.off_track_samples else ""
         text = f"training drive on {summary.train_track}: {drive_text(training)}"
         console.print(Text(text, style=style))
-    _print_limit(result, console)
-    _print_cornering(result, console)
     _print_notes(result, console)
 
 
+def _facts(lap: LapResult) -> list[str]:
+    """What drove, each lap over the limit, and where the car was between the samples."""
+    facts = [f"weights {lap.weights_version}"] if lap.weights_version else []
+    if lap.limit_ratios:
+        ratios = " ".join(f"{ratio:.3f}" for ratio in lap.limit_ratios)
+        facts.append(f"laps over the limit {ratios}")
+    if lap.off_track_ms:
+        facts.append(
+            f"{lap.off_track_ms} ms off the track by up to {_metres(lap.off_track_ms_max_m)} m"
+        )
+    return facts
+
+
 def _print_limit(result: RaceResult, console: Console) -> None:
-    """Each lap over the limit, and where the car was between the samples."""
     known = ", ".join(f"{kind} {time_s:.3f} s" for kind, time_s in result.limit_s.items())
     if not known and all(lap.off_track_ms is None for lap in result.laps):
         return
     if not known and result.settings.tyres == "linear":
         known = "linear tyres have no limit"
     known = known or "not known; 'bayesrace limit' computes it, or says why not"
-    console.print(Text(f"\nThe fastest that the car can drive: {known}"))
-    heads = "controller", "each lap over it", "off track\nms", "deepest\nm"
-    table = plain_table(*heads, left=2)
-    for lap in result.laps:
-        ratios = " ".join(f"{ratio:.3f}" for ratio in lap.limit_ratios or ()) or "–"
-        deepest = _metres(lap.off_track_ms_max_m) if lap.off_track_ms else "–"
-        table.add_row(lap.name, ratios, _decimals(lap.off_track_ms, 0), deepest)
-    console.print(table)
+    console.print(Text(f"the limit, the fastest that the car can drive: {known}"))
 
 
 def drive_text(drive: LapResult) -> str:
@@ -186,26 +203,6 @@ def drive_text(drive: LapResult) -> str:
         f"{f'laps {laps} s' if laps else 'no lap'}, {off}, "
         f"up to {_decimals(drive.speed_max_mps, 2)} m/s and {_slip(drive)}° of slip"
     )
-
-
-def _print_cornering(result: RaceResult, console: Console) -> None:
-    """Lateral acceleration and slip of each lap beyond the friction that the line assumes."""
-    friction = result.settings.friction
-    beyond = [
-        lap
-        for lap in result.laps
-        if friction is not None
-        and lap.finished
-        and (lap.lateral_max_mps2 or 0.0) > _BEYOND * friction * GRAVITY_MPS2
-    ]
-    if not beyond:
-        return
-    console.print(Text(f"beyond the friction of {friction:g} g that the line assumes:"))
-    for lap in beyond:
-        text = f"  {lap.name}: {_lateral(lap)} g across the way, {_slip(lap)}° of slip"
-        console.print(Text(text, style="yellow"))
-    if result.settings.tyres == "linear":
-        console.print(Text("  (linear tyres never saturate; 'race --tyres pacejka' does)"))
 
 
 def _print_notes(result: RaceResult, console: Console) -> None:
@@ -229,3 +226,68 @@ def _print_notes(result: RaceResult, console: Console) -> None:
             f"{result.gaps} message(s) missing" if result.gaps else "cut off or in part unreadable"
         )
         console.print(Text(f"the log is not complete: {lost}", style="yellow"))
+
+
+def print_kernels(scores: Sequence[KernelScore], console: Console) -> None:
+    """The paper's appendix: held-out error against the kernel's smoothness, per output."""
+    titles = [f"{output}\nRMSE {UNITS[output]}\nlog density" for output in OUTPUTS]
+    table = plain_table("kernel", "ν", *titles, padding=0)
+    found = {(score.output, score.kernel): score for score in scores}
+    for kernel, nu in SMOOTHNESS.items():
+        row = [found.get((output, kernel)) for output in OUTPUTS]
+        if any(row):
+            table.add_row(kernel, nu, *(_kernel_cell(score) for score in row))
+    console.print(Text("Kernel by smoothness, held out by parts of the drive", style="bold"))
+    console.print(table)
+    chosen = {score.output: score.kernel for score in scores if score.chosen}
+    text = ", ".join(f"{output}: {chosen[output]}" for output in OUTPUTS if output in chosen)
+    console.print(Text(f"chosen by log predictive density: {text}"))
+
+
+def _kernel_cell(score: KernelScore | None) -> Text:
+    if score is None:
+        return Text("–")
+    text = f"{score.rmse:.3g} · {score.log_density:.2f}{' ✓' if score.chosen else '  '}"
+    return Text(text, style="bold green" if score.chosen else "")
+
+
+def print_beyond_limits(dropped: Mapping[str, int], kept: int, console: Console) -> None:
+    """How to keep what exceeds the car's limits, where that is most of a drive."""
+    if (beyond := dropped.get("outside limits", 0)) > kept:
+        text = f"{beyond} samples are beyond the car's limits; --all-samples keeps them"
+        console.print(Text(text, style="yellow"), soft_wrap=True)
+
+
+def print_validation(result: ValidationResult, console: Console) -> None:
+    """Metrics per output, and the drift over one step and over the horizon."""
+    counts = f"{result.samples} samples (left out: {left_out(result.dropped)})"
+    console.print(Text(f"{result.weights_version} on {counts}", style="bold"))
+    print_beyond_limits(result.dropped, result.samples, console)
+    if result.learned_from:
+        text = "the weights were learned from these very samples: expect larger errors on others"
+        console.print(Text(text, style="yellow"))
+    table = plain_table("output", *GP_COLUMNS)
+    for output in OUTPUTS:
+        table.add_row(f"{output} {UNITS[output]}", *gp_cells(getattr(result, output)))
+    console.print(table)
+    large = f"largest sigma above {result.threshold:g}"
+    console.print(Text(f"{large} at {result.uncertain} of {result.samples} samples"))
+    for drift in (result.one_step, result.horizon):
+        if drift is not None:
+            _print_drift(drift, console)
+    if result.horizon is None:
+        console.print(Text("no stretch is long enough for the horizon", style="yellow"))
+
+
+def _print_drift(drift: HorizonResult, console: Console) -> None:
+    steps = "1 step" if drift.steps == 1 else f"{drift.steps} steps, open loop"
+    titles = ("nominal\nmean", "\np95", "\nmax", "corrected\nmean", "\np95", "\nmax")
+    table = plain_table("error", *titles)
+    for label, name in zip(_ERRORS, DRIFTS, strict=True):
+        table.add_row(label, *_cells(drift.nominal[name]), *_cells(drift.corrected[name]))
+    console.print(Text(f"{steps} ({drift.predictions} predictions)", style="bold"))
+    console.print(table)
+
+
+def _cells(spread: Spread) -> list[str]:
+    return [f"{value:.2g}" for value in (spread.mean, spread.p95, spread.max)]
