@@ -52,10 +52,10 @@ def arguments(text: str | None, *words: str, **defaults: Any) -> Namespace:
     return parser.parse_args()
 
 
-def prepared(*tracks: str, **settings: Any) -> Prepared:
+def prepared(*tracks: str) -> Prepared:
     """Lines, weights and controllers of these tracks, as a race makes them or has them cached."""
     with stages_on(Console(stderr=True)) as stages:
-        return prepare(PreparationSettings(**settings), tracks, stages)
+        return prepare(PreparationSettings(), tracks, stages)
 
 
 def controller(made: Prepared, number: int = 0) -> PredictiveController:

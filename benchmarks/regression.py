@@ -1,7 +1,7 @@
 """Two versions compared: benchmarks of this checkout run on the modules of both, in turn.
 
     python -m benchmarks.regression A B [--rounds 5] [--same] [--json FILE]
-    python -m benchmarks.regression A B --of "step --passes 2" "lockstep --laps 6" training
+    python -m benchmarks.regression A B --of "step --passes 2" "lockstep --laps 6"
 
 A and B are commits, or folders with a checkout. Each round runs each benchmark on both versions, in
 a process of its own, with the native code that the version builds. Versions need the interfaces

@@ -1,7 +1,5 @@
 """Training beyond the fit: kernels by smoothness, chosen samples, cross-validation and calibrated
 intervals, what is carried and reported, what is refused.
-
-That training is faster than scikit-learn is ``benchmarks/training.py``'s to say.
 """
 
 import threading

@@ -195,8 +195,7 @@ def test_each_cycle_names_its_weights_and_the_inputs_do_not_jump(
     rig: Rig, course: Course, good: GpWeights, again: GpWeights
 ) -> None:
     """Ten takeovers in some two laps: versions change at the cycles that answers name, and inputs
-    little more than between other cycles and by what the new model explains. What they cost in
-    time: benchmarks/takeover.py.
+    little more than between other cycles and by what the new model explains.
     """
     rig.start(1, lockstep=False, seconds=100.0)
     until(lambda: rig.counters()["ticks"] > 150, "three seconds of driving")

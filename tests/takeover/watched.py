@@ -13,7 +13,7 @@ from bayesrace.controller.weights.checks import Checks
 from bayesrace.controller.weights.settings import GateSettings
 from bayesrace.gp.weights import GpWeights, encode_weights, pack_weights, zero_weights
 from bayesrace.messages import State
-from bayesrace.operation.closed_loop import ClosedLoop, Driven
+from bayesrace.operation.closed_loop import ClosedLoop
 from bayesrace.raceline import racing_line
 from bayesrace.tracks import load_track
 from bayesrace.vehicles import CarParameters
@@ -74,16 +74,7 @@ class Course:
         loop = WatchedLoop(self._car, self._track, self._line, controller)
         loop.watch(controller.native)
         run = loop.drive(0, self._seconds)
-        return "; ".join(loop.found) or "kept", _excess_m(run)
-
-    def drive_unwatched(self, weights: GpWeights) -> float:
-        """The largest excess over the edge without checks and watch [m]."""
-        loop = ClosedLoop(self._car, self._track, self._line, self._controller(weights))
-        return _excess_m(loop.drive(0, self._seconds))
+        return "; ".join(loop.found) or "kept", float(run.off_track_m.max())
 
     def _controller(self, weights: GpWeights) -> PredictiveController:
         return compiled_controller(self._artefact, self._car, self._track, self._line, weights)
-
-
-def _excess_m(run: Driven) -> float:
-    return float(run.off_track_m.max())
