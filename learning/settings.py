@@ -62,21 +62,3 @@ class TrainingSettings(BaseModel):
         "is driven with them differs from the samples",
     )
     threads: int = Field(0, ge=0, description="parallel fits; 0 is one per core")
-
-
-class SearchSettings(BaseModel):
-    """How long and from where :func:`.search` looks, which gives its result."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-    evaluations: int = Field(
-        110, ge=1, le=2000, description="most evaluations, of which the first 10 are random"
-    )
-    initial: int = Field(10, ge=1, description="random evaluations before the first surrogate")
-    patience: int | None = Field(
-        None,
-        ge=1,
-        description="evaluations without a gain of 0.1 %, after which it ends; None: never",
-    )
-    gain: float = Field(1e-3, gt=0, description="decrease that counts, over the best value")
-    seed: int = Field(0, ge=0, le=2**32 - 1, description="seed of the search")

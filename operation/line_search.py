@@ -94,8 +94,8 @@ def searched_line(
         line = lines.line(shares)
         return math.inf if line is None else lap(line)
 
-    with stages.stage(f"bayesian search, seed {settings.search.seed}") as stage:
-        found = search(cost, settings.nodes, settings.search, features, progress=stage.update)
+    with stages.stage(f"bayesian search, seed {settings.seed}") as stage:
+        found = search(cost, features, settings.evaluations, settings.seed, stage.update)
     line, lap_s = lines.line(found.point), float(found.y.min())
     if line is None or not math.isfinite(lap_s):
         raise InputError(

@@ -10,7 +10,7 @@ from bayesrace.controller.pure_pursuit import PurePursuitSettings
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.defaults import Option
 from bayesrace.integrators import PREDICTION, Discretisation
-from bayesrace.learning.settings import DEFAULT_KERNELS, WIDEN, Kernel, SearchSettings
+from bayesrace.learning.settings import DEFAULT_KERNELS, WIDEN, Kernel
 from bayesrace.plant.settings import CarSimulation
 from bayesrace.raceline import RaceLineSettings
 from bayesrace.vehicles import CarParameters
@@ -188,4 +188,7 @@ class BayesianSettings(RaceLineSettings):
         "ideal", description="lap to minimise, ideal (by the line's own speeds) or driven"
     )
     nodes: int = Field(21, ge=6, le=60, description="nodes of the line, the search's dimension")
-    search: SearchSettings = SearchSettings()
+    evaluations: int = Field(
+        110, ge=1, le=2000, description="lines that are tried, of which the first 10 are random"
+    )
+    seed: int = Field(0, ge=0, le=2**32 - 1, description="seed of the search")

@@ -123,7 +123,7 @@ def cars(
 
 @options_of(
     "bayesrace.operation.settings.BayesianSettings",
-    "friction margin_m objective nodes search.evaluations search.patience search.seed",
+    "friction margin_m objective nodes evaluations seed",
 )
 def raceline(
     settings: "Given[BayesianSettings]",
