@@ -88,7 +88,7 @@ def _candidates(best: Floats, rng: np.random.Generator) -> Floats:
     shape = _CANDIDATES, len(best)
     mixed = np.where(rng.random(shape) < 0.25, rng.random(shape), best)
     near = [best + rng.normal(0.0, sd, shape) for sd in _NEAR]
-    return np.clip(np.vstack([rng.random(shape), mixed, *near]), 0.0, 1.0)
+    return np.asarray(np.clip(np.vstack([rng.random(shape), mixed, *near]), 0.0, 1.0))
 
 
 def log_improvement(process: GaussianProcessRegressor, x: Floats, best: float) -> Floats:

@@ -20,24 +20,45 @@ contains the difference between a held and a turning steering angle: fine for co
 paper, wrong for driving our cars. Nor does that drive keep to the limits of the car.
 """
 
+import json
+import os
 import zipfile
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
+from pydantic import ValidationError
 
-from bayesrace.arrays import AnyArray
-from bayesrace.errors import InputError
+from bayesrace.arrays import AnyArray, Flags
+from bayesrace.columns import Columns, LogColumns
+from bayesrace.errors import InputError, faults_in
 from bayesrace.integrators import PREDICTION, Discretisation
-from bayesrace.learning.dataset import Dataset, concatenate, dataset_from_arrays, filter_dataset
-from bayesrace.learning.logs import LogFacts, dataset_from_log, log_facts
+from bayesrace.learning.dataset import (
+    ROUNDING,
+    Dataset,
+    concatenate,
+    dataset_from_arrays,
+    filter_dataset,
+)
+from bayesrace.log import LogReader, topic_of
+from bayesrace.messages import STATE, TELEMETRY, TRUTH
 from bayesrace.vehicles import CarParameters, builtin_cars, car_text, described_car
 
-__all__ = ["MAX_BYTES", "Samples", "dataset_from_npz", "read_samples", "write_npz"]
+__all__ = ["CYCLES", "MAX_BYTES", "STATES", "LogFacts", "Samples", "dataset_from_columns"]
+__all__ += ["dataset_from_log", "dataset_from_npz", "log_facts", "read_samples", "write_npz"]
 
 T = TypeVar("T")
+
+STATES: Final = "seq run time_s x u_applied"
+"""Columns of the states that samples are made of ..."""
+CYCLES: Final = "run state_seq fallback sensor_fault"
+"""... and of the telemetry, which says what is left out of them."""
+
+_DOUBTFUL: Final = 16
+"""States up to one that is not believed which may be wrong as well: the controller looks back as
+far (controller/native/br_monitor.c)."""
 
 MAX_BYTES: Final = 1 << 30
 """Upper limit of an array file's unpacked size; larger ones are refused before they are read."""
@@ -51,86 +72,125 @@ _SCHEMA: Final = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Samples:
-    """Filtered samples, and the discretisation that the residual is to be made with."""
-
-    dataset: Dataset
-    discretisation: Discretisation
+# Logs --------------------------------------------------------------------------------------------
 
 
-def read_samples(
-    paths: Sequence[Path],
-    car: CarParameters | None = None,
-    name: str = "",
-    discretisation: Discretisation | None = None,
+@dataclass(frozen=True)
+class LogFacts:
+    """Keys and metadata of a log, as far as they concern the car."""
+
+    names: tuple[str, ...]
+    """Names in the network of the cars whose states it holds."""
+    true: frozenset[str]
+    """Names of the cars whose true states it holds besides the measured ones."""
+    car: CarParameters | None
+    """The recorded car; None if the log does not name it."""
+    discretisation: Discretisation | None
+    """The one that its controller predicted with; None if the log does not name it."""
+
+
+def log_facts(path: str | os.PathLike[str]) -> LogFacts:
+    """Reads keys and metadata; InputError if it is no log or its metadata are damaged."""
+    reader = LogReader(Path(path))
+    keys = [(topic_of(key), key.split("/")[1]) for key in reader.channels()]
+    metadata = reader.metadata()
+    settings: dict[str, Any] = dict(metadata.get("collect") or metadata.get("drive") or {})
+    try:
+        for program in ("race", "latency"):
+            if program in metadata:
+                settings = json.loads(metadata[program].get("settings", "{}"))
+        if settings.get("attach"):
+            settings = {}  # those of the program that has attached itself, not of the car
+        given = settings.get("discretisation")
+        return LogFacts(
+            names=tuple(sorted(name for topic, name in keys if topic is STATE)),
+            true=frozenset(name for topic, name in keys if topic is TRUTH),
+            car=described_car(settings["car"]) if settings.get("car") else None,
+            discretisation=None if given is None else Discretisation.model_validate(given),
+        )
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except ValidationError as error:
+        raise InputError(f"{path}: discretisation in its settings: {faults_in(error)}") from None
+    except (ValueError, AttributeError) as error:
+        raise InputError(f"{path}: its settings cannot be read ({error})") from error
+
+
+def dataset_from_columns(
+    states: Columns,
+    cycles: Columns,
+    car: CarParameters,
+    step_s: float,
     runs: Collection[int] | None = None,
+    *,
+    limits: bool = True,
+) -> Dataset:
+    """Filtered samples from consecutive states of the same run (all runs, or those named).
+
+    ``states`` has the columns :data:`STATES`: the measured ones to learn from, the true ones to
+    judge by. ``cycles`` has the columns :data:`CYCLES`. Left out are the states in whose cycles the
+    fallback acted, and those that were not believed, with the states just before, which may be as
+    wrong. The input of sample k is ``u_applied`` of the state after it, which acted, not the
+    requested one. A missing state is counted as "gap". ``limits``: as of
+    :func:`~bayesrace.learning.dataset.filter_dataset`.
+    """
+    if runs is not None:
+        states = states[np.isin(states["run"], list(runs))]
+    now, after = states[:-1], states[1:]
+    passed_s = after["time_s"] - now["time_s"]
+    # A fault of the plant repeats the last state: no time has passed.
+    pair = (now["run"] == after["run"]) & (passed_s != 0)
+    following = pair & (after["seq"] == now["seq"] + 1)
+    found = following & (np.abs(passed_s - step_s) <= ROUNDING)
+    if not found.any():
+        if not following.any():
+            raise InputError(
+                "no two states follow one another; was the car driven, or does the network or the "
+                "machine lose messages? Give them less to do"
+            )
+        raise InputError(
+            f"states are {float(np.median(passed_s[following])):.3g} s apart, the model's step is "
+            f"{step_s:g} s; drive with --rate {1 / step_s:g}, or learn for the controller that "
+            "drove: --artefact"
+        )
+    gaps = int(pair.sum() - found.sum())
+    now, after = now[found], after[found]
+    samples = Dataset(
+        car, step_s, now["x"], after["u_applied"], after["x"], dropped={"gap": gaps} if gaps else {}
+    )
+    return filter_dataset(samples.select(~_left_out(now, cycles), "fallback"), limits=limits)
+
+
+def _left_out(states: Columns, cycles: Columns) -> Flags:
+    """Which of the states are not driven by a solution, or not to be believed."""
+    fallback, doubted = cycles[cycles["fallback"] > 0], cycles[cycles["sensor_fault"] != ""]
+    keys = {(run, seq) for run, seq in fallback[["run", "state_seq"]].tolist()}
+    for run, seq in doubted[["run", "state_seq"]].tolist():
+        keys |= {(run, seq - n) for n in range(_DOUBTFUL)}
+    return np.array([key in keys for key in states[["run", "seq"]].tolist()], dtype=bool)
+
+
+def dataset_from_log(
+    path: str | os.PathLike[str],
+    car: CarParameters,
+    step_s: float,
+    runs: Collection[int] | None = None,
+    name: str = "",
     truth: bool = False,
     *,
     limits: bool = True,
-) -> Samples:
-    """All samples of logs (MCAP) and arrays (``.npz``), filtered, in the order given.
+) -> Dataset:
+    """Filtered samples of ``car`` from a run's MCAP log; see :func:`dataset_from_columns`.
 
-    ``car``: the driven one, where the files do not name it; ``name``: its name in the network,
-    where a log holds several; ``discretisation``: for the residual, by default the one that the
-    logs name, or ``PREDICTION``; ``runs``: the wanted runs of the logs, by default all; ``truth``:
-    the true states in place of the measured ones, of the logs that hold them; ``limits``: leave out
-    samples outside the car's limits. InputError if cars, discretisations or steps differ, or if two
-    files hold the same samples.
+    ``name``: the car's name in the network, if it differs from its own. ``truth``: the true states
+    in place of the measured ones. InputError if it is no log or holds no driving of this car.
     """
-    if not paths:
-        raise InputError("no samples given; name at least one log, or --data FILE.npz")
-    logs = {path: log_facts(path) for path in paths if path.suffix.lower() != ".npz"}
-    drivers = {path: _driver(path, facts, name) for path, facts in logs.items()}
-    files = {path: _read(path) for path in paths if path not in logs}
-    cars = {path: facts.car or builtin_cars().get(drivers[path]) for path, facts in logs.items()}
-    cars |= {path: file.car for path, file in files.items()}
-    driven = _common("cars", cars | {Path("--car"): car}, lambda one: f"'{one.identity}'")
-    if driven is None:
-        raise InputError("no file names its car; name it with --car")
-    named = {path: facts.discretisation for path, facts in logs.items()}
-    used = _common("discretisations", named | {Path("as asked for"): discretisation}, _described)
-    used = used or PREDICTION
-    datasets: list[Dataset] = []
-    seen: dict[str, Path] = {}
-    for path in paths:
-        if path in logs:
-            true = truth and drivers[path] in logs[path].true
-            samples = dataset_from_log(
-                path, driven, used.step_s, runs, drivers[path], true, limits=limits
-            )
-        else:
-            samples = filter_dataset(files[path].dataset(driven, used.step_s), limits=limits)
-        digest = samples.digest()
-        if digest in seen and len(samples):
-            raise InputError(f"{path} holds the same samples as {seen[digest]}; give them once")
-        seen[digest] = path
-        datasets.append(samples)
-    return Samples(concatenate(datasets), used)
-
-
-def _driver(path: Path, facts: LogFacts, name: str) -> str:
-    """The name in the network of the car whose messages are read from a log."""
-    names = [one for one in facts.names if not name or one == name]
-    if len(names) > 1:
-        raise InputError(f"{path} holds several cars ({', '.join(names)}); choose one with --name")
-    if not names:
-        which = f"car '{name}'" if name else "any car"
-        raise InputError(f"{path} holds no states of {which}; give the log of a drive")
-    return names[0]
-
-
-def _common(what: str, named: Mapping[Path, T | None], text: Callable[[T], str]) -> T | None:
-    """The first named value, None if there is none; InputError if others differ by ``text``."""
-    sources = {path: value for path, value in named.items() if value is not None}
-    if len({text(value) for value in sources.values()}) > 1:
-        listed = "; ".join(f"{text(value)} ({path})" for path, value in sources.items())
-        raise InputError(f"different {what} cannot be mixed: {listed}; give logs of one kind")
-    return next(iter(sources.values()), None)
-
-
-def _described(one: Discretisation) -> str:
-    return f"{one.scheme}x{one.substeps}, {one.pose} pose, {one.step_s!r} s"
+    topic = TRUTH if truth else STATE
+    log = LogColumns(Path(path), {topic: STATES, TELEMETRY: CYCLES}, name or car.name).read()
+    try:
+        return dataset_from_columns(log[topic], log[TELEMETRY], car, step_s, runs, limits=limits)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
 
 
 # Arrays ------------------------------------------------------------------------------------------
@@ -239,3 +299,88 @@ class _File:
         x = np.vstack((states[:6, :end], delta)).T
         u = np.column_stack((inputs[0, : end - 1], np.diff(delta) / step_s))
         return dataset_from_arrays(car, step_s, x, u)
+
+
+# Mixtures ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Filtered samples, and the discretisation that the residual is to be made with."""
+
+    dataset: Dataset
+    discretisation: Discretisation
+
+
+def read_samples(
+    paths: Sequence[Path],
+    car: CarParameters | None = None,
+    name: str = "",
+    discretisation: Discretisation | None = None,
+    runs: Collection[int] | None = None,
+    truth: bool = False,
+    *,
+    limits: bool = True,
+) -> Samples:
+    """All samples of logs (MCAP) and arrays (``.npz``), filtered, in the order given.
+
+    ``car``: the driven one, where the files do not name it; ``name``: its name in the network,
+    where a log holds several; ``discretisation``: for the residual, by default the one that the
+    logs name, or ``PREDICTION``; ``runs``: the wanted runs of the logs, by default all; ``truth``:
+    the true states in place of the measured ones, of the logs that hold them; ``limits``: leave out
+    samples outside the car's limits. InputError if cars, discretisations or steps differ, or if two
+    files hold the same samples.
+    """
+    if not paths:
+        raise InputError("no samples given; name at least one log, or --data FILE.npz")
+    logs = {path: log_facts(path) for path in paths if path.suffix.lower() != ".npz"}
+    drivers = {path: _driver(path, facts, name) for path, facts in logs.items()}
+    files = {path: _read(path) for path in paths if path not in logs}
+    cars = {path: facts.car or builtin_cars().get(drivers[path]) for path, facts in logs.items()}
+    cars |= {path: file.car for path, file in files.items()}
+    driven = _common("cars", cars | {Path("--car"): car}, lambda one: f"'{one.identity}'")
+    if driven is None:
+        raise InputError("no file names its car; name it with --car")
+    named = {path: facts.discretisation for path, facts in logs.items()}
+    used = _common("discretisations", named | {Path("as asked for"): discretisation}, _described)
+    used = used or PREDICTION
+    datasets: list[Dataset] = []
+    seen: dict[str, Path] = {}
+    for path in paths:
+        if path in logs:
+            true = truth and drivers[path] in logs[path].true
+            samples = dataset_from_log(
+                path, driven, used.step_s, runs, drivers[path], true, limits=limits
+            )
+        else:
+            samples = filter_dataset(files[path].dataset(driven, used.step_s), limits=limits)
+        digest = samples.digest()
+        if digest in seen and len(samples):
+            raise InputError(f"{path} holds the same samples as {seen[digest]}; give them once")
+        seen[digest] = path
+        datasets.append(samples)
+    return Samples(concatenate(datasets), used)
+
+
+def _driver(path: Path, facts: LogFacts, name: str) -> str:
+    """The name in the network of the car whose messages are read from a log."""
+    names = [one for one in facts.names if not name or one == name]
+    if len(names) > 1:
+        raise InputError(f"{path} holds several cars ({', '.join(names)}); choose one with --name")
+    if not names:
+        which = f"car '{name}'" if name else "any car"
+        raise InputError(f"{path} holds no states of {which}; give the log of a drive")
+    return names[0]
+
+
+def _common(what: str, named: Mapping[Path, T | None], text: Callable[[T], str]) -> T | None:
+    """The first named value, None if there is none; InputError if others differ by ``text``."""
+    sources = {path: value for path, value in named.items() if value is not None}
+    if len({text(value) for value in sources.values()}) > 1:
+        listed = "; ".join(f"{text(value)} ({path})" for path, value in sources.items())
+        raise InputError(f"different {what} cannot be mixed: {listed}; give logs of one kind")
+    return next(iter(sources.values()), None)
+
+
+def _described(one: Discretisation) -> str:
+    return f"{one.scheme}x{one.substeps}, {one.pose} pose, {one.step_s!r} s"

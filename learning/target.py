@@ -22,8 +22,7 @@ import numpy as np
 from bayesrace.arrays import Floats, Rows
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpOutput
-from bayesrace.learning.likelihood import Fit
-from bayesrace.learning.posterior import Covariance, Posterior
+from bayesrace.learning.gaussian_process import Covariance, Fit, Posterior
 from bayesrace.learning.subset import evenly
 
 __all__ = ["NORMAL_95", "KernelScore", "PredictionErrors", "Target"]

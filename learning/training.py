@@ -2,10 +2,10 @@
 
 1. Add each sample's mirror image, if the car's file says so, and standardise features and targets
    (:mod:`bayesrace.learning.target`). A sample and its image are in the same stretch.
-2. Per output and candidate kernel: hyperparameters by marginal likelihood
-   (:mod:`bayesrace.learning.likelihood`) on at most ``hyper_points`` samples. Seeded starts, or
-   given weights, are followed on a third of them, where an evaluation costs a tenth; the best is
-   refined on all.
+2. Per output and candidate kernel: hyperparameters by marginal likelihood, on at most
+   ``hyper_points`` samples (:mod:`bayesrace.learning.gaussian_process`). Seeded starts, or given
+   weights, are followed on a third of them, where an evaluation costs a tenth; the best is refined
+   on all.
 3. Per output: the kernel of largest log density held out by spans of the drive
    (:mod:`bayesrace.learning.subset`).
 4. Factorise all samples, or the most informative ones that fit (:mod:`bayesrace.learning.subset`).
@@ -37,10 +37,15 @@ from bayesrace.arrays import Floats, Rows
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import FEATURES, OUTPUTS, GpOutput, GpWeights, encode_weights
 from bayesrace.integrators import Discretisation
-from bayesrace.learning.dataset import Dataset, left_out
-from bayesrace.learning.likelihood import Fit, PairDistances, maximise, refine, starts
-from bayesrace.learning.posterior import Posterior
-from bayesrace.learning.residual import identity, residual
+from bayesrace.learning.dataset import Dataset, identity, left_out, residual
+from bayesrace.learning.gaussian_process import (
+    Fit,
+    PairDistances,
+    Posterior,
+    maximise,
+    refine,
+    starts,
+)
 from bayesrace.learning.settings import MIN_SAMPLES, Progress, TrainingSettings
 from bayesrace.learning.subset import evenly, most_informative, spans, stretches
 from bayesrace.learning.target import KernelScore, Target

@@ -19,9 +19,8 @@ from bayesrace.errors import InputError
 from bayesrace.gp.expression import corrected_function, evaluate_mean
 from bayesrace.gp.weights import OUTPUTS, GpWeights
 from bayesrace.integrators import Discretisation
-from bayesrace.learning.dataset import Dataset
-from bayesrace.learning.posterior import Covariance, Posterior
-from bayesrace.learning.residual import NOMINAL, identity, residual
+from bayesrace.learning.dataset import NOMINAL, Dataset, identity, residual
+from bayesrace.learning.gaussian_process import Covariance, Posterior
 from bayesrace.learning.subset import evenly
 from bayesrace.learning.target import NORMAL_95, PredictionErrors
 

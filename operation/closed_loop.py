@@ -26,7 +26,7 @@ from bayesrace.controller.interface import Controller, Environment
 from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.gp.weights import GpWeights
 from bayesrace.learning.dataset import Dataset
-from bayesrace.learning.logs import CYCLES, STATES, dataset_from_columns
+from bayesrace.learning.sources import CYCLES, STATES, dataset_from_columns
 from bayesrace.log import LogWriter
 from bayesrace.messages import (
     ACTUATION,

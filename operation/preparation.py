@@ -20,8 +20,8 @@ from bayesrace.files import read_whole, replacing
 from bayesrace.gp.weights import GpWeights, encode_weights, read_weights, write_weights
 from bayesrace.integrators import Discretisation
 from bayesrace.learning.dataset import Dataset, concatenate
-from bayesrace.learning.logs import CYCLES, STATES, dataset_from_columns
 from bayesrace.learning.settings import Progress, TrainingSettings
+from bayesrace.learning.sources import CYCLES, STATES, dataset_from_columns
 from bayesrace.messages import STATE, TELEMETRY
 from bayesrace.operation.closed_loop import Driven
 from bayesrace.operation.collect import collect, drive_length_s, training_margin_m

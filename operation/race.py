@@ -17,7 +17,7 @@ from bayesrace.errors import InputError
 from bayesrace.files import claimed, write_whole
 from bayesrace.gp.weights import read_weights
 from bayesrace.learning.dataset import Dataset
-from bayesrace.learning.logs import dataset_from_columns
+from bayesrace.learning.sources import dataset_from_columns
 from bayesrace.manifest import MANIFEST
 from bayesrace.operation.analysis.recording import RUN_COLUMNS, Recording, read_recording, runs_of
 from bayesrace.operation.drive import RunPlan

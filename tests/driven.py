@@ -10,8 +10,8 @@ from bayesrace.arrays import Floats
 from bayesrace.columns import columns_of
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.learning.dataset import Dataset, dataset_from_arrays
-from bayesrace.learning.logs import CYCLES, STATES, dataset_from_columns
 from bayesrace.learning.settings import TrainingSettings
+from bayesrace.learning.sources import CYCLES, STATES, dataset_from_columns
 from bayesrace.log import LogWriter
 from bayesrace.messages import Message, State, Telemetry, Truth, encode
 from bayesrace.vehicles import get_car

@@ -13,7 +13,7 @@ from bayesrace.controller.pure_pursuit import PurePursuit, PurePursuitSettings
 from bayesrace.controller.python_controller import PythonController
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.gp.weights import read_weights
-from bayesrace.learning.logs import dataset_from_log
+from bayesrace.learning.sources import dataset_from_log
 from bayesrace.log import LogReader, LogWriter
 from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY, TRUTH, Event, State
 from bayesrace.operation.closed_loop import ClosedLoop

@@ -19,7 +19,7 @@ import pytest
 
 from bayesrace.columns import LogColumns
 from bayesrace.errors import InputError
-from bayesrace.learning.logs import dataset_from_log
+from bayesrace.learning.sources import dataset_from_log
 from bayesrace.log import LogReader, LogWriter
 from bayesrace.messages import STATE, TELEMETRY, TRUTH, Truth, car_key, encode
 from bayesrace.operation.analysis.recording import RUN_COLUMNS, runs_of

@@ -23,8 +23,7 @@ from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights, decode_weights, write_weights, zero_weights
 from bayesrace.integrators import PERFECT, PREDICTION
-from bayesrace.learning.dataset import Dataset, concatenate
-from bayesrace.learning.residual import recalled
+from bayesrace.learning.dataset import Dataset, concatenate, recalled
 from bayesrace.learning.sources import write_npz
 from bayesrace.learning.trainer import Outcome
 from bayesrace.messages import HEARTBEAT, STATE, Message, Reply, Role, State, Status, encode

@@ -10,10 +10,21 @@ from bayesrace.errors import InputError
 from bayesrace.gp.expression import evaluate_mean
 from bayesrace.gp.weights import FEATURES, KERNELS, OUTPUTS, zero_weights
 from bayesrace.integrators import PREDICTION, Discretisation
-from bayesrace.learning.dataset import ROUNDING, Dataset, concatenate, filter_dataset
-from bayesrace.learning.likelihood import MarginalLikelihood, PairDistances, starts
-from bayesrace.learning.posterior import Covariance, Posterior
-from bayesrace.learning.residual import identity, residual
+from bayesrace.learning.dataset import (
+    ROUNDING,
+    Dataset,
+    concatenate,
+    filter_dataset,
+    identity,
+    residual,
+)
+from bayesrace.learning.gaussian_process import (
+    Covariance,
+    PairDistances,
+    Posterior,
+    likelihood,
+    starts,
+)
 from bayesrace.learning.settings import TrainingSettings
 from bayesrace.learning.subset import most_informative
 from bayesrace.learning.training import train
@@ -148,7 +159,7 @@ def test_gaps_fallback_and_other_runs_are_left_out(driven: Dataset) -> None:
 def test_likelihood_and_gradient_equal_scikit_learn(kind: str) -> None:
     z, y = gp_problem(50)
     for theta in starts(2, seed=3):
-        ours, our_gradient = MarginalLikelihood(kind, PairDistances(z), y)(theta)
+        ours, our_gradient = likelihood(kind, PairDistances(z), y, theta)
         gp = scikit_gp(kind, theta, z, y)
         theirs, their_gradient = gp.log_marginal_likelihood(theta, eval_gradient=True)
         assert ours == pytest.approx(theirs, rel=1e-9)
@@ -157,9 +168,8 @@ def test_likelihood_and_gradient_equal_scikit_learn(kind: str) -> None:
 
 def test_singular_covariance_is_minus_infinity_not_an_error() -> None:
     z, y = np.zeros((5, 6)), np.arange(5.0)
-    value, gradient = MarginalLikelihood("rbf", PairDistances(z), y)(
-        np.log([1.0] + [1.0] * 6 + [1e-30])
-    )
+    theta = np.log([1.0] + [1.0] * 6 + [1e-30])
+    value, gradient = likelihood("rbf", PairDistances(z), y, theta)
     assert value == -np.inf
     assert not gradient.any()
 
@@ -255,7 +265,7 @@ def test_the_posterior_equals_scikit_learn(kind: str, monkeypatch: pytest.Monkey
     new, _ = gp_problem(15, seed=5)
     theta = np.log([2.0] + [1.5] * 6 + [0.02])
     mean, sigma = scikit_gp(kind, theta, z, y).predict(new, return_std=True)
-    monkeypatch.setattr("bayesrace.learning.posterior._AT_ONCE", 7)
+    monkeypatch.setattr("bayesrace.learning.gaussian_process._AT_ONCE", 7)
     ours = Posterior(Covariance.of(kind, theta), z, y).predict(new)
     assert ours[0] == pytest.approx(mean, abs=1e-10)
     assert ours[1] == pytest.approx(sigma, abs=1e-10)

@@ -14,8 +14,7 @@ import pytest
 from bayesrace.gp.expression import evaluate_mean
 from bayesrace.gp.weights import GpWeights, write_weights, zero_weights
 from bayesrace.integrators import PREDICTION
-from bayesrace.learning.dataset import Dataset, concatenate
-from bayesrace.learning.residual import recalled, residual
+from bayesrace.learning.dataset import Dataset, concatenate, recalled, residual
 from bayesrace.learning.settings import TrainingSettings
 from bayesrace.learning.subset import MOST_NEW, bounded
 from bayesrace.learning.trainer import NICE, Outcome, Trainer, perform

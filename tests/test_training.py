@@ -16,10 +16,16 @@ from bayesrace.errors import InputError
 from bayesrace.gp.expression import evaluate_mean
 from bayesrace.gp.weights import KERNELS, OUTPUTS, decode_weights, encode_weights
 from bayesrace.integrators import PREDICTION, Discretisation
-from bayesrace.learning.dataset import Dataset, concatenate
-from bayesrace.learning.likelihood import BOUNDS, Fit, PairDistances, maximise, refine, starts
-from bayesrace.learning.posterior import Covariance
-from bayesrace.learning.residual import discretisation_of, identity, residual
+from bayesrace.learning.dataset import Dataset, concatenate, discretisation_of, identity, residual
+from bayesrace.learning.gaussian_process import (
+    BOUNDS,
+    Covariance,
+    Fit,
+    PairDistances,
+    maximise,
+    refine,
+    starts,
+)
 from bayesrace.learning.subset import stretches
 from bayesrace.learning.target import PredictionErrors, Target
 from bayesrace.learning.training import MAX_SAMPLES, Training, fit, train

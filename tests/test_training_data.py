@@ -16,8 +16,13 @@ from msgspec.structs import replace
 from bayesrace.errors import InputError
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.learning.dataset import Dataset
-from bayesrace.learning.logs import dataset_from_log, log_facts
-from bayesrace.learning.sources import dataset_from_npz, read_samples, write_npz
+from bayesrace.learning.sources import (
+    dataset_from_log,
+    dataset_from_npz,
+    log_facts,
+    read_samples,
+    write_npz,
+)
 from bayesrace.log import LogReader, LogWriter
 from bayesrace.messages import encode
 from bayesrace.vehicles import car_text

@@ -13,8 +13,7 @@ from bayesrace.errors import InputError
 from bayesrace.gp.expression import corrected_function
 from bayesrace.gp.weights import OUTPUTS, GpWeights, read_weights, write_weights, zero_weights
 from bayesrace.integrators import PREDICTION, Discretisation
-from bayesrace.learning.dataset import Dataset, concatenate
-from bayesrace.learning.residual import identity
+from bayesrace.learning.dataset import Dataset, concatenate, identity
 from bayesrace.learning.sources import write_npz
 from bayesrace.learning.target import KernelScore
 from bayesrace.learning.training import train

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from bayesrace.columns import columns_of
 from bayesrace.controller.driver import Level
-from bayesrace.learning.logs import CYCLES
+from bayesrace.learning.sources import CYCLES
 from bayesrace.log import LogWriter
 from bayesrace.messages import Telemetry
 from bayesrace.operation.analysis.laps import LapTimes

@@ -17,7 +17,7 @@ from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import read_weights
 from bayesrace.learning.dataset import Dataset
-from bayesrace.learning.logs import dataset_from_columns
+from bayesrace.learning.sources import dataset_from_columns
 from bayesrace.learning.validation import Validation, validate
 from bayesrace.operation.analysis.laps import positions_between, time_laps, trajectory_digest
 from bayesrace.operation.analysis.recording import Recording, RunRecord, read_recording

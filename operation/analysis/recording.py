@@ -13,7 +13,7 @@ from bayesrace.columns import Columns, LogColumns
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_text
 from bayesrace.integrators import PREDICTION, Discretisation
-from bayesrace.learning.logs import CYCLES, STATES
+from bayesrace.learning.sources import CYCLES, STATES
 from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY, TRUTH, Topic
 from bayesrace.operation.analysis.laps import Trajectory
 from bayesrace.raceline import RaceLine, read_raceline

@@ -9,7 +9,7 @@ import numpy as np
 from bayesrace.arrays import Floats, Rows
 from bayesrace.columns import Columns, LogColumns
 from bayesrace.controller.driver import Level
-from bayesrace.learning.logs import CYCLES, STATES
+from bayesrace.learning.sources import CYCLES, STATES
 from bayesrace.messages import STATE, TELEMETRY, TRUTH, Topic
 from bayesrace.operation.analysis.laps import LapTimes, time_laps
 from bayesrace.tracks import Track
@@ -35,8 +35,8 @@ class Cycles:
     state, and at which level the input was found."""
 
     def __init__(self, telemetry: Columns) -> None:
-        """``telemetry``: its columns :data:`bayesrace.learning.logs.CYCLES`; of several cycles for
-        one state the newest counts."""
+        """``telemetry``: its columns :data:`bayesrace.learning.sources.CYCLES`; of several cycles
+        for one state the newest counts."""
         seqs = telemetry["state_seq"].tolist()
         self._levels = dict(zip(seqs, telemetry["fallback"].tolist(), strict=True))
         self._faults = dict(zip(seqs, telemetry["sensor_fault"], strict=True))

@@ -10,7 +10,7 @@ import numpy as np
 from bayesrace.columns import columns_of
 from bayesrace.errors import InputError
 from bayesrace.learning.dataset import Dataset
-from bayesrace.learning.logs import CYCLES, STATES, dataset_from_columns
+from bayesrace.learning.sources import CYCLES, STATES, dataset_from_columns
 from bayesrace.messages import Actuation, State, Telemetry
 from bayesrace.operation.learn.records import LapRecord
 from bayesrace.tracks import StartLine, Track
@@ -38,7 +38,7 @@ _REMEDIES: Final = {
     "steering does not match its rate": "the steering angle does not follow the rate that the "
     "plant reports; correct the FMU's map, or the plant",
 }
-"""Remedy by the reason why samples are left out (:mod:`bayesrace.learning.logs`)."""
+"""Remedy by the reason why samples are left out (:mod:`bayesrace.learning.sources`)."""
 
 
 @dataclass(eq=False)
@@ -59,10 +59,10 @@ class Stretch:
 class Collector:
     """Makes stretches with their samples and laps of messages, given in the order of arrival.
 
-    Samples are those of :func:`bayesrace.learning.logs.dataset_from_columns`: the same pairs, gaps,
-    fallback cycles and filters as from a log of the same drive. A lap ends where the plant has
-    counted it. A stretch is given out when the telemetry of its last cycle, or of a later one, has
-    arrived.
+    Samples are those of :func:`bayesrace.learning.sources.dataset_from_columns`: the same pairs,
+    gaps, fallback cycles and filters as from a log of the same drive. A lap ends where the plant
+    has counted it. A stretch is given out when the telemetry of its last cycle, or of a later one,
+    has arrived.
     """
 
     def __init__(self, car: CarParameters, step_s: float, track: Track | None = None) -> None:

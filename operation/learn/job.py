@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import read_weights
-from bayesrace.learning.residual import discretisation_of, recalled
+from bayesrace.learning.dataset import discretisation_of, recalled
 from bayesrace.learning.settings import TrainingSettings
 from bayesrace.learning.sources import read_samples
 from bayesrace.learning.trainer import Trainer, perform

@@ -14,8 +14,8 @@ from rich.segment import Segment
 from rich.table import Table
 
 from bayesrace.cache import uses
-from bayesrace.processes import raise_if_interrupted
 from bayesrace.operation.terminal import printable_lines
+from bayesrace.processes import raise_if_interrupted
 
 __all__ = ["Stage", "Stages", "Terminal", "plain_table", "stages_on"]
 

@@ -17,7 +17,7 @@ from bayesrace.errors import InputError
 from bayesrace.files import read_text
 from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.learning.dataset import Dataset
-from bayesrace.learning.logs import dataset_from_columns
+from bayesrace.learning.sources import dataset_from_columns
 from bayesrace.log import LogWriter
 from bayesrace.messages import TELEMETRY
 from bayesrace.operation.analysis.race import DrivenRun

@@ -16,10 +16,8 @@ from threadpoolctl import threadpool_limits
 from bayesrace.arrays import Floats, Rows
 from bayesrace.gp.weights import OUTPUTS, UNITS, GpWeights, read_weights
 from bayesrace.integrators import PREDICTION
-from bayesrace.learning.dataset import Dataset, concatenate
-from bayesrace.learning.likelihood import PairDistances, maximise, starts
-from bayesrace.learning.posterior import Posterior
-from bayesrace.learning.residual import residual
+from bayesrace.learning.dataset import Dataset, concatenate, residual
+from bayesrace.learning.gaussian_process import PairDistances, Posterior, maximise, starts
 from bayesrace.learning.settings import TrainingSettings
 from bayesrace.learning.target import Target
 from bayesrace.learning.validation import Validation, validate
